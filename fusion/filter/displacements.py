@@ -227,12 +227,10 @@ class DisplacementUpdates:
         # Values that are not finite are rejected and counted by the filter.
         with np.errstate(invalid="ignore"):
             d_W, covariance_W = R_WN @ d_N, R_WN @ covariance_N @ R_WN.T
-            level, has_turn = self.error_level.level, self._ekf.state.has_turn
-            errors = (
-                displacement_errors(d_W, covariance_W, level, has_turn, f)
-                if f.correlated_errors
-                else None
-            )
+            errors = None
+            if f.correlated_errors and np.isfinite(covariance_W).all():
+                level, has_turn = self.error_level.level, self._ekf.state.has_turn
+                errors = displacement_errors(d_W, covariance_W, level, has_turn, f)
             limit = chi2_quantile(gate, 3)
             return self._ekf.update_displacement(
                 *(slot, None, d_W, f.overlap_scale * covariance_W),

@@ -116,10 +116,11 @@ class StateCloningEkf(ErrorStateEngine):
         """Propagate the current state and its covariances through a preintegrated segment."""
         s = self.state
         pose = s.X[0]
-        end = propagated(segment, pose[:, :3], pose[:, 3], pose[:, 4], s.b_g, s.b_a, self._accel_share)
+        start = pose[:, :3], pose[:, 3], pose[:, 4], s.b_g, s.b_a
+        end = propagated(segment, *start, self._accel_share)
         X = s.X.copy()
         X[0, :, :3], X[0, :, 3], X[0, :, 4] = end.R_WB, end.v_W, end.p_W
-        P = self._propagated(s.covariances, end.transition, end.noise)
+        P = self._propagated(s.covariances, end.transition, np.stack([end.noise, end.actual_noise]))
         kept = np.exp(-segment.duration / CONSIDERED_SECONDS)
         P[ACTUAL] = gauss_markov(P[ACTUAL], s.considered_rows, kept, 1.0)
         self.state = changed(s, time=segment.stop, X=X, covariances=P)

@@ -100,12 +100,14 @@ class EkfState:
     @property
     def P(self) -> FloatArray:
         """Covariance (n, n) of the error as assumed for the gains."""
-        return self.covariances[ASSUMED]
+        P: FloatArray = self.covariances[ASSUMED]
+        return P
 
     @property
     def P_actual(self) -> FloatArray:
         """Covariance (n, n) of the error as it is."""
-        return self.covariances[ACTUAL]
+        P: FloatArray = self.covariances[ACTUAL]
+        return P
 
     @property
     def R_WB(self) -> FloatArray:

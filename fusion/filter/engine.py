@@ -96,7 +96,8 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
     @property
     def P(self) -> FloatArray:
         """Covariance (n, n) of the error as assumed for the gains."""
-        return self.covariances[ASSUMED]
+        P: FloatArray = self.covariances[ASSUMED]
+        return P
 
     @P.setter
     def P(self, value: FloatArray) -> None:
@@ -242,9 +243,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         half = self.K @ (HP[which] - 0.5 * (HPH[which] + covariance) @ self.K.T)
         return np.asarray(P - half - half.T)
 
-    def _joseph(
-        self, P: FloatArray, blocks: Sequence[Block], covariance: FloatArray
-    ) -> FloatArray:
+    def _joseph(self, P: FloatArray, blocks: Sequence[Block], covariance: FloatArray) -> FloatArray:
         """Return (I - K H) P (I - K H)^T + K R K^T: slower, but without cancellation."""
         A = np.eye(len(P))
         for first, H in blocks:

@@ -151,7 +151,9 @@ class Propagation(NamedTuple):
     transition: FloatArray
     """(15, 15)."""
     noise: FloatArray
-    """(2, 15, 15) as assumed for the gains, and as it is."""
+    """(15, 15) as assumed for the gains."""
+    actual_noise: FloatArray
+    """(15, 15) as it is."""
 
 
 def propagated(
@@ -181,16 +183,16 @@ def propagated(
     adjoint[6:9, 3:6] = R
     adjoint[3:9, 0:3] = (skew(np.array((v, p))) @ R).reshape(6, 3)
     local = segment.pim.residualCovariance()
-    actual = local.copy()
-    actual[3:9] *= math.sqrt(accel_share)
-    actual[:, 3:9] *= math.sqrt(accel_share)
-    noise = adjoint @ np.stack([local, actual]) @ adjoint.T
+    share = np.ones(CORE)
+    share[3:9] = math.sqrt(accel_share)
+    noise = adjoint @ local @ adjoint.T
+    actual_noise = adjoint @ (share[:, None] * local * share) @ adjoint.T
 
     transition = _nav_transition(segment.duration, segment.gravity)
     by_bias = adjoint[:9, :9] @ bias_jacobian
     transition[:9, 9:12] = by_bias[:, 3:]
     transition[:9, 12:15] = by_bias[:, :3]
-    return Propagation(R, v, p, transition, noise)
+    return Propagation(R, v, p, transition, noise, actual_noise)
 
 
 _IDENTITY = np.eye(CORE)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf
 
 from stario.fusion.config import FilterConfig
 from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
@@ -96,8 +95,10 @@ def displacement_errors(
     climb = 2.0 * f.covariance_scale * slope_variance(d_W)
     predicted[2, 2] = max(predicted[2, 2] - climb, 1e-9)
     H = np.zeros((3, len(CONSIDERED_SECONDS)))
-    # An invalid covariance is refused by the update.
-    H[:, :3] = math.sqrt(level * DRIFTING) * dpotrf(predicted, lower=1, clean=1)[0]
+    # The symmetric root, so that the errors do not depend on the axes.
+    variances, axes = np.linalg.eigh(predicted)
+    sigmas = np.sqrt(np.maximum(level * DRIFTING * variances, 0.0))
+    H[:, :3] = (axes * sigmas) @ axes.T
     x, y, _ = d_W
     length = math.hypot(x, y)
     if length > 0.0:
@@ -105,7 +106,7 @@ def displacement_errors(
         directions = ((x, y), (-y, x))[: 1 if turn_is_estimated else 2]
         for column, direction in enumerate(directions, 3):
             u = np.array(direction) / length
-            sigma = math.sqrt(max(u @ predicted[:2, :2] @ u, 0.0))
+            sigma = math.sqrt(max(float(u @ predicted[:2, :2] @ u), 0.0))
             H[:2, column] = share * sigma * length * u
     H[2, -1] = math.sqrt(climb)
     overlap = f.overlap_scale / (2.0 * f.covariance_scale)  # a window's errors repeat in the next

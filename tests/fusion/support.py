@@ -19,6 +19,7 @@ FILTER = FilterConfig(
     covariance_scale=1.0,
     gyro_bias_sigma=3e-3,
     accel_bias_sigma=0.05,
+    correlated_errors=False,
 )
 NOISE = ImuNoise(gyro_noise=2e-3, accel_noise=0.1, gyro_walk=3e-5, accel_walk=1e-3)
 CONFIG = NavigatorConfig(NOISE, FILTER)

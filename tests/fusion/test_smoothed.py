@@ -23,6 +23,7 @@ CONFIG = NavigatorConfig(
         covariance_scale=1.0,
         gyro_bias_sigma=3e-3,
         accel_bias_sigma=0.05,
+        correlated_errors=False,
     ),
 )
 

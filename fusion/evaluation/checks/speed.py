@@ -15,7 +15,7 @@ import numpy as np
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.compare import DEMONSTRATION_SEED, demonstration
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.estimates import ACTUAL
+from stario.fusion.filter.estimates import ACTUAL, ASSUMED
 from stario.fusion.filter.jacobians import CORE, Block
 from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.navigator import Navigator
@@ -46,7 +46,7 @@ class DenseEkf(StateCloningEkf):
     ) -> FloatArray:
         actual = super()._propagated(covariances, transition, noise)[ACTUAL]
         self.F[:CORE, :CORE] = transition
-        self.Q[:CORE, :CORE] = noise
+        self.Q[:CORE, :CORE] = noise[ASSUMED]
         self.predict()
         return np.stack([self.P, actual])
 

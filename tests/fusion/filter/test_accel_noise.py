@@ -50,7 +50,7 @@ def test_five_seconds_of_outliers_hardly_raise_the_factor(make_walk, make_oracle
 @pytest.mark.parametrize(("nis", "sign"), [(1e9, 1), (0.0, -1)])
 def test_one_displacement_moves_the_log_factor_by_the_gain_at_most(nis: float, sign: int) -> None:
     before = AccelNoiseScale(log_factor=1.0, gain=0.05)
-    after = before.updated(UpdateResult(nis, 3, True))
+    after = before.updated(UpdateResult(nis, 3, True, gate_nis=nis))
     assert after.log_factor - before.log_factor == pytest.approx(sign * 0.05, abs=1e-6)
 
 

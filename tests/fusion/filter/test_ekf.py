@@ -66,8 +66,9 @@ def drive(ekf: StateCloningEkf, count: int, window: int = 6, seed: int = 0) -> l
 
 def turn_matrix(yaw: float, ekf: StateCloningEkf) -> np.ndarray:
     """Transformation of the filter's error state when the world is turned."""
-    turn = np.eye(ekf.dim_x)  # the network's turn and scale, the last errors, do not change
-    turn[:-2, :-2] = np.kron(np.eye(ekf.dim_x // 3), exp_so3(yaw * YAW))
+    turn = np.eye(ekf.dim_x)  # the network's errors, the last ones, do not change
+    n = ekf.state.turn_row
+    turn[:n, :n] = np.kron(np.eye(n // 3), exp_so3(yaw * YAW))
     return turn
 
 
@@ -471,5 +472,5 @@ def test_estimates_share_no_memory_with_the_filter(
 ) -> None:
     # Views would keep every covariance: an hour at 20 updates a second then took twenty gigabytes.
     for estimate in (driven.state.estimate(), driven.state.clone_estimate(2)):
-        assert not np.shares_memory(estimate.P, driven.P)
+        assert not np.shares_memory(estimate.covariances, driven.covariances)
         assert not np.shares_memory(estimate.X, driven.state.X)

@@ -1,0 +1,238 @@
+"""The network's correlated errors: part of the covariances, and of no gain."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stario.fusion import Navigator, NavigatorConfig
+from stario.fusion.config import FilterConfig
+from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
+from stario.fusion.filter.engine import UpdateResult
+from stario.fusion.filter.estimates import Estimate, with_actual_covariances
+from stario.fusion.filter.initial import PriorPose
+from stario.fusion.filter.map_frame import MapFrame
+from stario.fusion.filter.network_errors import (
+    DRIFTING,
+    LASTING,
+    MAX_LEVEL,
+    MIN_LEVEL,
+    WHITE,
+    ErrorLevel,
+    displacement_errors,
+)
+from stario.fusion.fixes import position_fix
+from stario.fusion.imu.preintegration import preintegrate
+from stario.fusion.state import NavState
+from stario.sequences.attitude.rotations import about_z
+from stario.sequences.noise import ImuNoise
+from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
+
+F = FilterConfig()
+SPEED = 1.2
+"""Speed of a straight walk [m/s]."""
+
+Make = Callable[..., Any]
+
+
+def config(correlated: bool) -> NavigatorConfig:
+    return NavigatorConfig(filter=replace(F, correlated_errors=correlated))
+
+
+# --- the model -----------------------------------------------------------------------------------
+
+
+def test_shares_add_up_along_a_displacement_and_vanish_with_the_level() -> None:
+    d_W, covariance = np.array([1.2, -0.5, 0.0]), np.diag([0.02, 0.02, 0.01])
+    u = d_W[:2] / np.linalg.norm(d_W)
+    white, considered = displacement_errors(d_W, covariance, 1.0, False, F)
+    total = white + considered @ considered.T
+    assert u @ total[:2, :2] @ u == pytest.approx(0.02 * (WHITE + DRIFTING + LASTING))
+    _, lasting = displacement_errors(d_W, covariance, 0.0, False, F)
+    assert u @ (lasting @ lasting.T)[:2, :2] @ u == pytest.approx(0.02 * LASTING)
+
+
+def test_errors_turn_with_the_world() -> None:
+    rng = np.random.default_rng(0)
+    R = about_z(1.1).as_matrix()
+    root = rng.normal(size=(3, 3))
+    d_W, covariance = rng.normal(size=3), 0.01 * root @ root.T + 0.01 * np.eye(3)
+    errors = displacement_errors(d_W, covariance, 0.7, False, F)
+    turned = displacement_errors(R @ d_W, R @ covariance @ R.T, 0.7, False, F)
+    np.testing.assert_allclose(turned.white, R @ errors.white @ R.T, atol=1e-12)
+    drifting = R @ errors.considered[:, :3] @ R.T  # they are those of W's axes
+    np.testing.assert_allclose(turned.considered[:, :3], drifting, atol=1e-12)
+    np.testing.assert_allclose(turned.considered[:, 3:], R @ errors.considered[:, 3:], atol=1e-12)
+
+
+def test_a_turn_that_is_a_state_is_not_counted_again() -> None:
+    d_W, covariance = np.array([1.0, 0.0, 0.0]), 0.01 * np.eye(3)
+    assert displacement_errors(d_W, covariance, 1.0, False, F).considered[1, 4] != 0.0
+    assert displacement_errors(d_W, covariance, 1.0, True, F).considered[1, 4] == 0.0
+
+
+@pytest.mark.parametrize(("nis", "bound"), [(0.0, MIN_LEVEL), (1e6, MAX_LEVEL)])
+def test_the_level_stays_within_its_bounds(nis: float, bound: float) -> None:
+    level = ErrorLevel()
+    for _ in range(1000):
+        level = level.updated(UpdateResult(nis, 3, True))
+    assert level.level == pytest.approx(bound)
+
+
+def test_five_false_seconds_do_not_double_the_level_twice() -> None:
+    level = ErrorLevel(gain=0.05)
+    for _ in range(10):
+        level = level.updated(UpdateResult(1e6, 3, True))
+    assert level.level < 3.0
+    assert level.updated(UpdateResult(float("nan"), 3, False)) == level
+
+
+# --- the covariance ------------------------------------------------------------------------------
+
+
+def straight_walk(
+    rng: np.random.Generator, seconds: int
+) -> tuple[StateCloningEkf, np.ndarray, float]:
+    """Walk straight with errors as the model has them; return filter, true end and mean NIS."""
+    ekf = StateCloningEkf(slots=1)
+    zero = np.zeros(3)
+    P = np.diag(np.repeat([1e-6, 1e-2, 1e-6, 1e-12, 1e-6], 3))
+    ekf.initialise(NavState(0.0, np.eye(3), np.array([SPEED, 0.0, 0.0]), zero, zero, zero, P))
+    noise = ImuNoise(gyro_noise=1e-5, accel_noise=0.1)
+    time = np.arange(0.0, 1.0 + 1e-9, 0.1)
+    accel = np.tile([0.0, 0.0, STANDARD_GRAVITY], (len(time), 1))
+    errors, nis = rng.normal(size=len(CONSIDERED_SECONDS)), []
+    kept = np.exp(-1.0 / CONSIDERED_SECONDS)
+    speed = np.array([SPEED, 0.0, 0.0]) - 0.1 * rng.normal(size=3)  # true minus estimate
+    slot = ekf.clone()
+    for second in range(seconds):
+        jolt = 0.1 * np.sqrt(10.0) * rng.normal(size=accel.shape)
+        samples = float(second) + time, np.zeros_like(accel), accel + jolt
+        segment = preintegrate(*samples, zero, zero, noise, STANDARD_GRAVITY)
+        ekf.propagate(segment)
+        errors = kept * errors + np.sqrt(1.0 - kept**2) * rng.normal(size=len(kept))
+        d_W, covariance = speed, 0.1**2 * np.eye(3)
+        model = displacement_errors(d_W, covariance, 1.0, False, F)
+        d_W = d_W + model.considered @ errors
+        d_W = d_W + np.linalg.cholesky(model.white) @ rng.normal(size=3)
+        result = ekf.update_displacement(slot, None, d_W, covariance, errors=model)
+        nis.append(result.nis)
+        slot = ekf.clone(instead_of=slot)
+    return ekf, seconds * speed, float(np.mean(nis[3:]))
+
+
+def test_the_covariance_is_that_of_drawn_errors() -> None:
+    """Of 200 walks; what the gains assume is a fraction of it."""
+    rng, seconds = np.random.default_rng(1), 30
+    filters, ends, nis = zip(*(straight_walk(rng, seconds) for _ in range(200)), strict=True)
+    found = np.square([ekf.state.p_W - end for ekf, end in zip(filters, ends, strict=True)])
+    reported = np.diag(filters[0].state.plain_covariance)[6:9]
+    np.testing.assert_allclose(found.mean(axis=0)[:2], reported[:2], rtol=0.3)
+    assert np.mean(nis) == pytest.approx(3.0, rel=0.1)
+    assert filters[0].P[6, 6] < 0.6 * reported[0]
+
+
+@pytest.mark.parametrize("backend", ["ekf", "graph"])
+def test_the_track_does_not_depend_on_them(
+    make_walk: Make, make_oracle: Make, backend: Any
+) -> None:
+    walk = make_walk(3, 40.0)
+    oracle = make_oracle(walk, walk.truth, config(True), sigma=0.05)
+    white, correlated = (
+        Navigator(oracle, config(each), backend=backend).run(walk) for each in (False, True)
+    )
+    np.testing.assert_allclose(
+        white.trajectory.position_W, correlated.trajectory.position_W, rtol=0.0, atol=1e-9
+    )
+    assert not np.allclose(white.covariance, correlated.covariance)
+
+
+@pytest.mark.parametrize("backend", ["ekf", "graph"])
+def test_a_stream_gives_the_covariances_of_its_filter(
+    make_walk: Make, make_oracle: Make, backend: Any
+) -> None:
+    walk = make_walk(3, 40.0)
+    oracle = make_oracle(walk, walk.truth, config(True), sigma=0.05)
+    recording = Navigator(oracle, config(True)).run(walk)
+    navigator = Navigator(oracle, config(True), backend=backend)
+    samples = zip(walk.time, walk.gyro, walk.accel, strict=True)
+    states = [state for sample in samples if (state := navigator.push(*sample)) is not None]
+    for state in states[20::20]:
+        k = int(np.argmin(np.abs(recording.time - state.time)))
+        expected = np.sqrt(np.diag(recording.covariance[k])[6:8])
+        found = np.sqrt(np.diag(state.position_covariance)[:2])
+        np.testing.assert_allclose(found, expected, rtol=0.15)
+
+
+def test_a_position_fix_removes_them(make_walk: Make, make_oracle: Make) -> None:
+    walk: ImuSequence = make_walk(3, 40.0)
+    oracle = make_oracle(walk, walk.truth, config(True), sigma=0.05)
+    truth = walk.truth.at(np.array([2.0, 20.0, 30.0]))
+    fixes = [
+        position_fix(t, p, 1e-4 * np.eye(3))
+        for t, p in zip(truth.time, truth.position_W, strict=True)
+    ]
+    track = Navigator(oracle, config(True)).run(walk, fixes=fixes)
+    variance = np.trace(track.covariance[:, 6:8, 6:8], axis1=1, axis2=2)
+    before, after = np.searchsorted(track.time, (29.85, 30.05))
+    assert variance[before] > 0.01
+    assert variance[after] < 0.05 * variance[before]
+
+
+def test_the_first_fix_after_a_straight_walk_is_believed() -> None:
+    """A lasting error moves the end of a straight walk by many sigmas of white errors."""
+    ekf = StateCloningEkf(slots=2)
+    zero = np.zeros(3)
+    P = np.diag(np.repeat([1e-4, 1e-2, 1e-4, 1e-8, 1e-4], 3))
+    ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, P))
+    rng, length, scale = np.random.default_rng(0), 1.2, 1.03
+    time = np.arange(0.0, 1.0 + 1e-9, 0.1)
+    accel = np.tile([0.0, 0.0, STANDARD_GRAVITY], (len(time), 1))
+    noise = ImuNoise(gyro_noise=1e-3, accel_noise=0.1)
+    frame = MapFrame(PriorPose(np.eye(3), zero, zero), 0.997, 0.0)
+    slot = ekf.clone()
+    for second in range(200):
+        samples = float(second) + time, np.zeros_like(accel), accel
+        ekf.propagate(preintegrate(*samples, zero, zero, noise, STANDARD_GRAVITY))
+        d_W, covariance = np.array([scale * length, 0.0, 0.0]), 0.1**2 * np.eye(3)
+        d_W = d_W + rng.normal(0.0, 0.05, 3)
+        errors = displacement_errors(d_W, covariance, 1.0, False, F)
+        ekf.update_displacement(slot, None, d_W, covariance, gate=14.0, errors=errors)
+        slot = ekf.clone(instead_of=slot)
+    truth = np.array([200.0 * length, 0.0, 0.0])
+    assert ekf.state.p_W[0] - truth[0] > 3.0 * np.sqrt(ekf.P[6, 6])
+    result = frame.update(ekf, position_fix(200.0, truth, np.eye(3)))
+    assert result.accepted
+    assert result.scale == 1.0
+    assert np.linalg.norm(ekf.state.p_W - truth) < 1.0
+
+
+# --- the graph's covariance ----------------------------------------------------------------------
+
+
+def random_covariance(rng: np.random.Generator) -> np.ndarray:
+    root = rng.normal(size=(15, 15))
+    return root @ root.T + np.eye(15)
+
+
+def estimate(P: np.ndarray, Q: np.ndarray) -> Estimate:
+    zero = np.zeros(3)
+    X = np.eye(3, 5)  # at the origin and at rest: plain errors equal invariant ones
+    return Estimate(0.0, X, zero, zero, zero, np.stack([P, Q]))
+
+
+def nav_state(covariance: np.ndarray) -> NavState:
+    zero = np.zeros(3)
+    return NavState(0.0, np.eye(3), zero, zero, zero, zero, covariance)
+
+
+def test_a_graph_as_certain_as_the_filter_gets_the_filters_covariance() -> None:
+    rng = np.random.default_rng(2)
+    P, Q, smaller = (random_covariance(rng) for _ in range(3))
+    (state,) = with_actual_covariances([nav_state(P)], [estimate(P, Q)])
+    np.testing.assert_allclose(state.covariance, Q, atol=1e-8 * np.abs(Q).max())
+    (unchanged,) = with_actual_covariances([nav_state(smaller)], [estimate(P, P)])
+    np.testing.assert_allclose(unchanged.covariance, smaller, atol=1e-8 * smaller.max())
