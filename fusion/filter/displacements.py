@@ -271,6 +271,5 @@ def propagated_turn(s: EkfState, seconds: float, sigma: float) -> EkfState:
     if not s.has_turn:
         return s
     correlation = math.exp(-seconds / TURN_SECONDS)
-    rows = slice(s.turn_row, s.turn_row + 1)
-    P = gauss_markov(s.covariances, rows, correlation, sigma)
+    P = gauss_markov(s.covariances, s.turn_row, correlation, sigma)
     return changed(s, covariances=P, network_turn=correlation * s.network_turn)

@@ -15,11 +15,10 @@ import numpy as np
 
 from stario.fusion.checked import check_covariance, checked
 from stario.fusion.filter.ekf_state import (
-    CONSIDERED_SECONDS,
     GYRO_BIAS,
     EkfState,
     FieldState,
-    gauss_markov,
+    with_considered_propagated,
 )
 from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult
 from stario.fusion.filter.estimates import ACTUAL
@@ -120,9 +119,7 @@ class StateCloningEkf(ErrorStateEngine):
         end = propagated(segment, *start, self._accel_share)
         X = s.X.copy()
         X[0, :, :3], X[0, :, 3], X[0, :, 4] = end.R_WB, end.v_W, end.p_W
-        P = self._propagated(s.covariances, end.transition, np.stack([end.noise, end.actual_noise]))
-        kept = np.exp(-segment.duration / CONSIDERED_SECONDS)
-        P[ACTUAL] = gauss_markov(P[ACTUAL], s.considered_rows, kept, 1.0)
+        P = self._propagated(s.covariances, end.transition, end.noise)
         self.state = changed(s, time=segment.stop, X=X, covariances=P)
 
     def clone(self, instead_of: int | None = None) -> int:
@@ -211,6 +208,7 @@ class StateCloningEkf(ErrorStateEngine):
         noise = None
         if errors is not None:
             noise = errors.white
+            self.state = s = with_considered_propagated(s)
             blocks.append((s.considered_rows.start, errors.considered))
         residual = d_W - (p_j - p_i)
         return self.update_linear(residual, blocks, covariance, gate, gate_mode, power, noise)
@@ -319,7 +317,7 @@ class StateCloningEkf(ErrorStateEngine):
                 half = K @ (HP - 0.5 * (HP[:, GYRO_BIAS] + R) @ K.T)
                 actual = actual - half - half.T
             self.x = (K @ -self.state.b_g)[:, None]
-            self._inject(np.stack([P + change, actual]))
+            self._inject(np.array((P + change, actual)))
             old = step
 
     def _inject(self, covariances: FloatArray) -> None:

@@ -69,6 +69,7 @@ class EkfState:
             for the gains, which take the network's errors for white, and as it is, given these
             gains and the errors' correlation (README.md, "Correlated errors").
         clone_times: times of the clones [s]; None for an empty slot.
+        considered_time: time up to which the considered errors are propagated [s].
         network_turn: yaw error (turn) of the network's displacements, positive left [rad]; fixed at
             zero until fixes determine the direction (`displacements.py`).
         field: the magnetic field; None before its first measurement.
@@ -81,6 +82,7 @@ class EkfState:
     b_a: FloatArray
     covariances: FloatArray
     clone_times: tuple[float | None, ...]
+    considered_time: float
     network_turn: float = 0.0
     field: FieldState | None = None
 
@@ -95,7 +97,8 @@ class EkfState:
         P = np.zeros((2, n, n))
         P[:, :CORE, :CORE] = plain_covariance(state.covariance, -X[0, :, 3:].T)
         P[ACTUAL, turn_row + 1 :, turn_row + 1 :] = np.eye(len(CONSIDERED_SECONDS))
-        return cls(state.time, X, origin_W, state.b_g, state.b_a, P, (None,) * slots)
+        times = (None,) * slots, state.time
+        return cls(state.time, X, origin_W, state.b_g, state.b_a, P, *times)
 
     @property
     def P(self) -> FloatArray:
@@ -258,19 +261,30 @@ class EkfState:
         return [(0, 6), *((first, first + 3) for first in rows)]
 
 
-def gauss_markov(
-    covariances: FloatArray, rows: slice, kept: FloatArray | float, sigma: float
-) -> FloatArray:
-    """Return covariances (..., n, n) after some errors have taken a Gauss-Markov step.
+def with_considered_propagated(s: EkfState) -> EkfState:
+    """Return the state with its considered errors propagated from their own time to the state's.
+
+    Each takes a Gauss-Markov step of unit variance. Only displacements ask for them.
+    """
+    kept, rows = np.exp((s.considered_time - s.time) / CONSIDERED_SECONDS), s.considered_rows
+    P = s.covariances.copy()
+    P[ACTUAL, rows] *= kept[:, None]
+    P[ACTUAL, :, rows] *= kept
+    P[ACTUAL, rows, rows] += np.diag(1.0 - kept * kept)
+    return changed(s, covariances=P, considered_time=s.time)
+
+
+def gauss_markov(covariances: FloatArray, row: int, kept: float, sigma: float) -> FloatArray:
+    """Return covariances (..., n, n) after one error has taken a Gauss-Markov step.
 
     Args:
         covariances: before the step.
-        rows: rows of the errors, which vary about zero.
-        kept: correlation of each error with its value before the step.
-        sigma: their stationary standard deviation of the error.
+        row: row of the error, which varies about zero.
+        kept: correlation of the error with its value before the step.
+        sigma: stationary standard deviation of the error.
     """
-    kept, P = np.atleast_1d(kept), covariances.copy()
-    P[..., rows, :] *= kept[:, None]
-    P[..., :, rows] *= kept
-    P[..., rows, rows] += sigma**2 * np.diag(1.0 - kept**2)
+    P = covariances.copy()
+    P[..., row, :] *= kept
+    P[..., :, row] *= kept
+    P[..., row, row] += (1.0 - kept**2) * sigma**2
     return P

@@ -160,7 +160,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
             self._set_gain(residual, covariance, HP[ACTUAL], HPH[ACTUAL], whitener)
             P = self._with_gain(ASSUMED, blocks, covariance, HP, HPH)
         actual = self._with_gain(ACTUAL, blocks, scale * noise, HP, HPH)
-        self._inject(np.stack([P, actual]))
+        self._inject(np.array((P, actual)))
         return UpdateResult(nis, m, True, scale, "", residual, sigma, gate_nis)
 
     def _inject(self, covariances: FloatArray) -> None:
@@ -182,7 +182,8 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         self, covariances: FloatArray, transition: FloatArray, noise: FloatArray
     ) -> FloatArray:
         P = covariances.copy()
-        P[:, :CORE] = transition @ P[:, :CORE]
+        for which in (ASSUMED, ACTUAL):
+            P[which, :CORE] = transition @ P[which, :CORE]
         P[:, CORE:, :CORE] = P[:, :CORE, CORE:].transpose(0, 2, 1)
         core = P[:, :CORE, :CORE] @ transition.T + noise
         P[:, :CORE, :CORE] = 0.5 * (core + core.transpose(0, 2, 1))

@@ -151,9 +151,7 @@ class Propagation(NamedTuple):
     transition: FloatArray
     """(15, 15)."""
     noise: FloatArray
-    """(15, 15) as assumed for the gains."""
-    actual_noise: FloatArray
-    """(15, 15) as it is."""
+    """(2, 15, 15) as assumed for the gains, and as it is."""
 
 
 def propagated(
@@ -183,16 +181,17 @@ def propagated(
     adjoint[6:9, 3:6] = R
     adjoint[3:9, 0:3] = (skew(np.array((v, p))) @ R).reshape(6, 3)
     local = segment.pim.residualCovariance()
-    share = np.ones(CORE)
-    share[3:9] = math.sqrt(accel_share)
-    noise = adjoint @ local @ adjoint.T
-    actual_noise = adjoint @ (share[:, None] * local * share) @ adjoint.T
+    noise = np.empty((2, CORE, CORE))
+    noise[0] = adjoint @ local @ adjoint.T
+    actual = adjoint.copy()
+    actual[:, 3:9] *= math.sqrt(accel_share)
+    noise[1] = actual @ local @ actual.T
 
     transition = _nav_transition(segment.duration, segment.gravity)
     by_bias = adjoint[:9, :9] @ bias_jacobian
     transition[:9, 9:12] = by_bias[:, 3:]
     transition[:9, 12:15] = by_bias[:, :3]
-    return Propagation(R, v, p, transition, noise, actual_noise)
+    return Propagation(R, v, p, transition, noise)
 
 
 _IDENTITY = np.eye(CORE)

@@ -238,8 +238,7 @@ def propagated_field(s: EkfState, seconds: float, sigma: float) -> EkfState:
     assert s.field is not None  # set by `first_field`
     metres = seconds * math.hypot(s.v_W[0], s.v_W[1])
     correlation = math.exp(-metres / WANDER_METRES - seconds / WANDER_SECONDS)
-    wander = slice(s.first_field + 1, s.first_field + 2)
-    P = gauss_markov(s.covariances, wander, correlation, sigma)
+    P = gauss_markov(s.covariances, s.first_field + 1, correlation, sigma)
     return changed(s, covariances=P, field=changed(s.field, wander=correlation * s.field.wander))
 
 

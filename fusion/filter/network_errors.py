@@ -95,19 +95,23 @@ def displacement_errors(
     climb = 2.0 * f.covariance_scale * slope_variance(d_W)
     predicted[2, 2] = max(predicted[2, 2] - climb, 1e-9)
     H = np.zeros((3, len(CONSIDERED_SECONDS)))
-    # The symmetric root, so that the errors do not depend on the axes.
-    variances, axes = np.linalg.eigh(predicted)
-    sigmas = np.sqrt(np.maximum(level * DRIFTING * variances, 0.0))
-    H[:, :3] = (axes * sigmas) @ axes.T
-    x, y, _ = d_W
+    # The symmetric root of the horizontal part: the errors do not depend on the axes.
+    (a, b, _), (_, c, _), (_, _, height) = (level * DRIFTING * predicted).tolist()
+    det = math.sqrt(max(a * c - b * b, 0.0))
+    root = math.sqrt(a + c + 2.0 * det)
+    if root > 0.0:
+        H[0, 0], H[1, 1], H[0, 1] = (a + det) / root, (c + det) / root, b / root
+        H[1, 0], H[2, 2] = H[0, 1], math.sqrt(height)
+    x, y, _ = d_W.tolist()
     length = math.hypot(x, y)
     if length > 0.0:
-        share = math.sqrt(LASTING) / max(length, _SHORT)
-        directions = ((x, y), (-y, x))[: 1 if turn_is_estimated else 2]
-        for column, direction in enumerate(directions, 3):
-            u = np.array(direction) / length
-            sigma = math.sqrt(max(float(u @ predicted[:2, :2] @ u), 0.0))
-            H[:2, column] = share * sigma * length * u
+        (a, b, _), (_, c, _), _ = predicted.tolist()
+        share = math.sqrt(LASTING) / (length * max(length, _SHORT))
+        along = share * math.sqrt(a * x * x + 2.0 * b * x * y + c * y * y)
+        H[0, 3], H[1, 3] = along * x, along * y
+        if not turn_is_estimated:
+            across = share * math.sqrt(a * y * y - 2.0 * b * x * y + c * x * x)
+            H[0, 4], H[1, 4] = -across * y, across * x
     H[2, -1] = math.sqrt(climb)
     overlap = f.overlap_scale / (2.0 * f.covariance_scale)  # a window's errors repeat in the next
     return DisplacementErrors(level * WHITE * overlap * predicted, H)

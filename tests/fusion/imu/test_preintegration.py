@@ -203,7 +203,7 @@ def test_noise_agrees_with_that_of_perturbed_samples() -> None:
                 expected += np.outer(column, column) * sigma**2
     noise = propagated(
         preintegrate(t, gyro, accel, b_g, b_a, NOISE, GRAVITY), R, v, p, b_g, b_a
-    ).noise
+    ).noise[0]
     sigma = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(
         noise / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-3
