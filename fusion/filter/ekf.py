@@ -62,15 +62,12 @@ class StateCloningEkf(ErrorStateEngine):
     Args:
         slots: number of poses that can be held at once.
         gravity: magnitude of gravity [m/s^2].
-        accel_share: actual variance of the accelerometer's noise, as a fraction of that assumed.
 
     Attributes:
         state: everything that varies; assign an earlier one to restore it.
     """
 
-    def __init__(
-        self, slots: int, gravity: float = STANDARD_GRAVITY, accel_share: float = 1.0
-    ) -> None:
+    def __init__(self, slots: int, gravity: float = STANDARD_GRAVITY) -> None:
         if slots < 0:
             raise InputError("slots", repr(slots), "a number of clones >= 0")
         zero = np.zeros(3)
@@ -81,7 +78,6 @@ class StateCloningEkf(ErrorStateEngine):
         self.covariances = covariances
         self.gravity = gravity
         self.slots = slots
-        self._accel_share = accel_share
 
     @property
     def covariances(self) -> FloatArray:
@@ -111,12 +107,18 @@ class StateCloningEkf(ErrorStateEngine):
         self.state = EkfState.initial(NavState(now, R, v, p, b_g, b_a, covariance), self.slots)
         self.x[:] = 0.0
 
-    def propagate(self, segment: Segment) -> None:
-        """Propagate the current state and its covariances through a preintegrated segment."""
+    def propagate(self, segment: Segment, accel_share: float = 1.0) -> None:
+        """Propagate the current state and its covariances through a preintegrated segment.
+
+        Args:
+            segment: the segment.
+            accel_share: actual variance of the accelerometer's noise, as a fraction of that in the
+                segment, which the gains assume.
+        """
         s = self.state
         pose = s.X[0]
         start = pose[:, :3], pose[:, 3], pose[:, 4], s.b_g, s.b_a
-        end = propagated(segment, *start, self._accel_share)
+        end = propagated(segment, *start, accel_share)
         X = s.X.copy()
         X[0, :, :3], X[0, :, 3], X[0, :, 4] = end.R_WB, end.v_W, end.p_W
         P = self._propagated(s.covariances, end.transition, end.noise)

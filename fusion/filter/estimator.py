@@ -70,9 +70,7 @@ class Estimator:
     ) -> None:
         f = config.filter
         self._config, self._start, self._streaming = config, start.time, streaming
-        self.ekf = StateCloningEkf(
-            f.window_updates, config.gravity, ACCEL_SHARE if f.correlated_errors else 1.0
-        )
+        self.ekf = StateCloningEkf(f.window_updates, config.gravity)
         self.frame = MapFrame(prior, f.gate, f.network_turn_sigma)
         self._stillness = StillnessDetector(
             round(f.output_rate * WINDOW_SECONDS), f.stillness_noise
@@ -181,8 +179,13 @@ class Estimator:
         def propagate() -> Segment:
             s = self.ekf.state
             segment = segment_of(interval, s.R_WB, s.b_g, s.b_a, self._config)
-            self.ekf.propagate(segment)
+            self.ekf.propagate(segment, accel_share)
             return segment
+
+        # The noise of gaps and faulty samples is what it may be.
+        faulty = interval.gap or any(interval.flags)
+        correlated = self._config.filter.correlated_errors
+        accel_share = ACCEL_SHARE if correlated and not faulty else 1.0
 
         before = self.ekf.state.p_W
         segment = self._hypotheses.apply_to_both(propagate)

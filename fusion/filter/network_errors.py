@@ -95,10 +95,11 @@ def displacement_errors(
     climb = 2.0 * f.covariance_scale * slope_variance(d_W)
     predicted[2, 2] = max(predicted[2, 2] - climb, 1e-9)
     H = np.zeros((3, len(CONSIDERED_SECONDS)))
-    # The symmetric root of the horizontal part: the errors do not depend on the axes.
+    # The symmetric root of the horizontal part: the errors do not depend on the axes. Roots of
+    # negative numbers belong to an invalid covariance, which the update refuses.
     (a, b, _), (_, c, _), (_, _, height) = (level * DRIFTING * predicted).tolist()
     det = math.sqrt(max(a * c - b * b, 0.0))
-    root = math.sqrt(a + c + 2.0 * det)
+    root = math.sqrt(max(a + c + 2.0 * det, 0.0))
     if root > 0.0:
         H[0, 0], H[1, 1], H[0, 1] = (a + det) / root, (c + det) / root, b / root
         H[1, 0], H[2, 2] = H[0, 1], math.sqrt(height)
@@ -107,10 +108,10 @@ def displacement_errors(
     if length > 0.0:
         (a, b, _), (_, c, _), _ = predicted.tolist()
         share = math.sqrt(LASTING) / (length * max(length, _SHORT))
-        along = share * math.sqrt(a * x * x + 2.0 * b * x * y + c * y * y)
+        along = share * math.sqrt(max(a * x * x + 2.0 * b * x * y + c * y * y, 0.0))
         H[0, 3], H[1, 3] = along * x, along * y
         if not turn_is_estimated:
-            across = share * math.sqrt(a * y * y - 2.0 * b * x * y + c * x * x)
+            across = share * math.sqrt(max(a * y * y - 2.0 * b * x * y + c * x * x, 0.0))
             H[0, 4], H[1, 4] = -across * y, across * x
     H[2, -1] = math.sqrt(climb)
     overlap = f.overlap_scale / (2.0 * f.covariance_scale)  # a window's errors repeat in the next

@@ -23,7 +23,7 @@ def test_a_gap_keeps_velocity_and_attitude_with_a_pedestrians_noise(seconds: flo
     np.testing.assert_allclose(after.R_WB, R, atol=1e-9)
     np.testing.assert_allclose(after.v_W, v, atol=1e-9)
     np.testing.assert_allclose(after.p_W, p + seconds * v, atol=1e-9)
-    variance, f = np.diag(after.noise), CONFIG.filter
+    variance, f = np.diag(after.noise[0]), CONFIG.filter
     np.testing.assert_allclose(variance[:3], seconds * f.gap_gyro_noise**2, rtol=0.02)
     # The velocity error of the other axes is mostly gravity turned by the attitude error.
     about_v = variance[5] - (v[0] ** 2 + v[1] ** 2) * seconds * f.gap_gyro_noise**2

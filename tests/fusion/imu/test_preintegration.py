@@ -214,7 +214,7 @@ def test_more_white_noise_does_not_change_the_random_walk_of_the_biases() -> Non
     x = state()
     loud = replace(NOISE, gyro_noise=3.0 * NOISE.gyro_noise, accel_noise=3.0 * NOISE.accel_noise)
     plain, scaled = (
-        propagated(preintegrate(*samples(200), x[3], x[4], noise, GRAVITY), *x).noise
+        propagated(preintegrate(*samples(200), x[3], x[4], noise, GRAVITY), *x).noise[0]
         for noise in (NOISE, loud)
     )
     np.testing.assert_allclose(np.diag(scaled)[:9], 9.0 * np.diag(plain)[:9], rtol=0.02)
@@ -233,24 +233,24 @@ def test_a_segment_with_noise_per_sample_equals_its_parts_in_sequence() -> None:
         segment = preintegrate(t[part], gyro[part], accel[part], *x[3:], density, GRAVITY)
         ahead = propagated(segment, *y, *x[3:])
         transition = ahead.transition @ transition
-        noise = ahead.transition @ noise @ ahead.transition.T + ahead.noise
+        noise = ahead.transition @ noise @ ahead.transition.T + ahead.noise[0]
         y = ahead[:3]
         parts += [density] * step
     whole = propagated(preintegrate(t, gyro, accel, *x[3:], parts, GRAVITY), *x)
     np.testing.assert_allclose(whole.transition, transition, atol=1e-2)
     sigma = np.sqrt(noise.diagonal())
     np.testing.assert_allclose(
-        whole.noise / np.outer(sigma, sigma), noise / np.outer(sigma, sigma), atol=2e-3
+        whole.noise[0] / np.outer(sigma, sigma), noise / np.outer(sigma, sigma), atol=2e-3
     )
     mean = replace(NOISE, accel_noise=NOISE.accel_noise * np.sqrt(np.mean([64, 1, 1, 16])))
-    other = propagated(preintegrate(t, gyro, accel, *x[3:], mean, GRAVITY), *x).noise
+    other = propagated(preintegrate(t, gyro, accel, *x[3:], mean, GRAVITY), *x).noise[0]
     assert other[6, 6] < 0.8 * noise[6, 6]
 
 
 def test_noise_does_not_depend_on_the_sensor_rate() -> None:
     x = state()
     slow, fast = (
-        propagated(preintegrate(*samples(rate), x[3], x[4], NOISE, GRAVITY), *x).noise
+        propagated(preintegrate(*samples(rate), x[3], x[4], NOISE, GRAVITY), *x).noise[0]
         for rate in (100, 400)
     )
     np.testing.assert_allclose(np.diag(fast), np.diag(slow), rtol=0.02)
