@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -153,6 +154,8 @@ class Health:
         bearings: numbers of magnetic bearings, likewise; 1 under "north" if they determined it.
         accel_noise_factor: final factor on the accelerometer's configured noise density, estimated
             from the innovations.
+        network_error_level: final variance of the network's errors that change within seconds, as a
+            fraction of what it predicts, estimated from the innovations; 1 if not estimated.
         final_sigma: final standard deviations, the largest in any direction (the semi-axis of the
             ellipse): tilt and yaw [rad], velocity [m/s], horizontal position and height [m], biases
             [rad/s], [m/s^2].
@@ -202,6 +205,9 @@ class Health:
             text.append(
                 f"accelerometer noise {self.accel_noise_factor:.1f} times the configured one"
             )
+        if self.network_error_level != 1.0:
+            level = math.sqrt(self.network_error_level)
+            text.append(f"network's errors within seconds {level:.1f} times their predicted sigma")
         sigma = ", ".join(f"{k} {v:.3g}" for k, v in self.final_sigma.items())
         return [*text, f"final sigma: {sigma}"]
 

@@ -80,7 +80,7 @@ def compare(
 
         for comparison in comparisons:
             inner = folder / comparison.sequence.name
-            written.append(write_comparison_report(inner, comparison, settings))
+            written.append(write_comparison_report(inner, comparison))
     if comparisons:
         lines = [line for comparison in comparisons for line in _lines(comparison)]
         lines.append(f"{len(written)} files in {folder}")

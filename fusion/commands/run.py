@@ -90,7 +90,7 @@ def _run(
 
         tracks, figures = {str(backend): track}, {str(backend): metrics}
         path = folder / "report.html"
-        written.append(write_report(path, sequence, tracks, navigator.config, figures, alignment))
+        written.append(write_report(path, sequence, tracks, figures, alignment))
     if view:
         from stario.fusion.report.view import open_view, write_view
 

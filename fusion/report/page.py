@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from plotly.offline import get_plotlyjs
 
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import Comparison, Metrics, metric_words
 from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.report.figures import map_figure, time_figure
@@ -39,7 +38,6 @@ def write_report(
     path: Path,
     sequence: ImuSequence,
     tracks: Mapping[str, Track],
-    config: NavigatorConfig,
     metrics: Mapping[str, Metrics],
     alignment: Alignment = "first",
 ) -> Path:
@@ -49,7 +47,6 @@ def write_report(
         path: the HTML file; its folder must exist.
         sequence: the recording; its ground truth is drawn if it has one.
         tracks: tracks by name, as from `compare`, or a run's only one, `ekf` or `graph`.
-        config: settings, for the filter's gate.
         metrics: metrics by track, for the table.
         alignment: alignment of the tracks with the truth.
 
@@ -76,7 +73,7 @@ def write_report(
     panels = motion_panels(drawn, true_series) + bias_panels(main, series[main])
     innovations = tracks[main].innovations
     if innovations is not None and len(innovations.time):
-        panels += innovation_panels(innovations, start, config.filter.gate)
+        panels += innovation_panels(innovations, start)
     mapped = drawn if truth is None else series
     known = shown_positions(sequence, tracks[main])
     data = {
@@ -102,13 +99,12 @@ def write_report(
     return path
 
 
-def write_comparison_report(folder: Path, comparison: Comparison, config: NavigatorConfig) -> Path:
+def write_comparison_report(folder: Path, comparison: Comparison) -> Path:
     """Write `report.html` for a comparison; raises the errors of `write_report`."""
     return write_report(
         folder / "report.html",
         comparison.sequence,
         comparison.tracks,
-        config,
         comparison.metrics,
         comparison.alignment,
     )

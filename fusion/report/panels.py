@@ -10,7 +10,6 @@ import plotly.graph_objects as go
 
 from stario.fusion.report.series import Series
 from stario.fusion.state import Innovations
-from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.arrays import interpolated
 from stario.sequences.drawing.figures import TRACK_STYLES, split_at_gaps, unbroken
 from stario.sequences.sequence import BoolArray, FloatArray
@@ -82,13 +81,12 @@ def bias_panels(name: str, series: Series) -> list[Panel]:
     return panels
 
 
-def innovation_panels(innovations: Innovations, start: float, gate: float) -> list[Panel]:
-    """Return panels of the innovations by axis with 3 sigma, and of their NIS with the gate.
+def innovation_panels(innovations: Innovations, start: float) -> list[Panel]:
+    """Return panels of the innovations by axis with 3 sigma, and of their NIS.
 
     Args:
         innovations: innovations of an estimator's updates.
         start: time of the recording's first sample [s].
-        gate: probability of the chi-square test.
     """
     count = len(innovations.time)
     rows = np.unique(np.linspace(0, count - 1, min(count, _MAX_INNOVATIONS)).round().astype(int))
@@ -102,15 +100,11 @@ def innovation_panels(innovations: Innovations, start: float, gate: float) -> li
         traces += _dots(time, residual, gated, "m")
         title = f"Innovation {axis} [m], band: 3 sigma"
         panels.append(Panel(title, traces, {"range": _limits(traces)}))
-    limit = chi2_quantile(gate, 3)
     nis = np.maximum(innovations.nis[rows], 1e-2)
     ends = time[[0, -1]]
     traces = _dots(time, nis, gated, "")
-    traces += [
-        _line(ends, limit, f"gate {limit:.1f} ({gate:.1%})", "dash"),
-        _line(ends, 3.0, "expected 3", "dot"),
-    ]
-    title = f"NIS [1], dotted: expected 3, dashed: gate {limit:.1f}"
+    traces.append(_expected_nis(ends))
+    title = "NIS [1], dotted: expected 3"
     panels.append(Panel(title, traces, {"type": "log", "dtick": 1}))
     return panels
 
@@ -192,13 +186,13 @@ def _dots(time: FloatArray, value: FloatArray, gated: BoolArray, unit: str) -> l
     ]
 
 
-def _line(ends: FloatArray, value: float, label: str, dash: str) -> go.Scatter:
+def _expected_nis(ends: FloatArray) -> go.Scatter:
     return go.Scatter(
         x=_rounded(ends),
-        y=[value, value],
-        name=label,
+        y=[3.0, 3.0],
+        name="expected 3",
         mode="lines",
-        line={"color": INK, "dash": dash, "width": 1.2},
+        line={"color": INK, "dash": "dot", "width": 1.2},
         hoverinfo="skip",
     )
 
