@@ -18,7 +18,7 @@ from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.imu.stateful import slope_variance
 from stario.sequences.sequence import FloatArray
 
-WHITE, DRIFTING, LASTING = 0.35, 0.35, 0.15
+WHITE, DRIFTING, LASTING = 0.35, 0.25, 0.15
 """Variances of the errors as fractions of the covariance that the network predicts: of those that
 are independent, of those that decay within seconds, and of those along and across the displacement
 that last. In unknown people's recordings the normalised errors have autocorrelations of 0.3 to 0.4
@@ -32,11 +32,11 @@ _SHORT = 0.5
 """Displacement [m] below which errors along and across it are in proportion to it: a slow one has
 hardly a direction."""
 
-_GAIN, _FIRST_GAIN, _MAX_EXCESS = 0.05, 0.2, 2.0
+_GAIN, _FIRST_GAIN, _MAX_EXCESS = 0.05, 0.2, 4.0
 """Step of the level's logarithm per displacement (in the long run, and for the first one), and the
 largest excess of NIS over its expectation that counts, so that five false seconds hardly do."""
 
-MIN_LEVEL, MAX_LEVEL = 0.1, 3.0
+MIN_LEVEL, MAX_LEVEL = 0.1, 5.0
 """Bounds of the level."""
 
 
