@@ -38,9 +38,8 @@ class FilterConfig:
     Attributes:
         update_rate: network updates per second.
         covariance_scale: factor on the network's covariance, in addition to update_rate x window
-            length, which accounts for overlapping windows. Successive errors of the network are
-            correlated, so innovations are smaller than single errors; fitted to NIS and position
-            NEES on the training recordings and on validation recordings unseen by the network.
+            length, which accounts for overlapping windows; fitted to the tracks of the training
+            recordings and of validation recordings unseen by the network.
         network_turn_sigma: standard deviation of the network's yaw error, correlated over about a
             minute [rad]; becomes a state once fixes make the direction observable.
         correlated_errors: whether covariances and NIS take the network's errors for correlated, as

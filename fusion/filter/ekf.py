@@ -9,7 +9,6 @@ to "Displacement measurement".
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,6 +33,7 @@ from stario.fusion.filter.jacobians import (
     velocity_jacobian,
     yaw_jacobian,
 )
+from stario.fusion.filter.network_errors import DisplacementErrors
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import exp_times, yaw_twist
 from stario.fusion.state import NavState, changed
@@ -42,9 +42,6 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 
 _NO_GAIN = np.zeros(3)
-
-if TYPE_CHECKING:
-    from stario.fusion.filter.network_errors import DisplacementErrors
 
 _CLONED = [0, 1, 2, 6, 7, 8]
 """Rows of theta and rho_p, which a clone copies."""

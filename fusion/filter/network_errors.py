@@ -1,4 +1,4 @@
-"""How the network's errors are correlated: what the filter's covariance contains of them.
+"""The correlation of the network's errors, which covariances contain and gains do not know.
 
 The gains take the error of each displacement for white. In truth part of it decays within seconds,
 and part lasts all along a track. README.md, "Correlated errors".
@@ -21,8 +21,8 @@ from stario.sequences.sequence import FloatArray
 WHITE, DRIFTING, LASTING = 0.35, 0.25, 0.15
 """Variances of the errors as fractions of the covariance that the network predicts: of those that
 are independent, of those that decay within seconds, and of those along and across the displacement
-that last. In unknown people's recordings the normalised errors have autocorrelations of 0.3 to 0.4
-after a second, and 0.2 from five seconds to a minute; single ones have a variance of 0.9."""
+that last. In unknown people's recordings the normalised errors have a variance of 0.5 to 1 and
+autocorrelations of 0.2 to 0.4 after a second, 0.05 to 0.25 from five seconds to a minute."""
 
 ACCEL_SHARE = 0.1
 """Actual variance of the accelerometer's noise as a fraction of that assumed for the gains, which
@@ -34,7 +34,7 @@ hardly a direction."""
 
 _GAIN, _FIRST_GAIN, _MAX_EXCESS = 0.05, 0.2, 4.0
 """Step of the level's logarithm per displacement (in the long run, and for the first one), and the
-largest excess of NIS over its expectation that counts, so that five false seconds hardly do."""
+largest excess of NIS over its expectation that counts."""
 
 MIN_LEVEL, MAX_LEVEL = 0.1, 5.0
 """Bounds of the level."""

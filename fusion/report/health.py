@@ -175,8 +175,8 @@ def _updates(health: Health) -> Iterator[Finding]:
     elif ratio < 1.0 / NIS_RATIO:
         text = (
             f"The network and the IMU agree more closely than their sigmas suggest ({nis}). It "
-            "does not mean that the track's sigmas are too large: errors that last from window to "
-            "window hardly show here."
+            "does not mean that the track's sigmas are too large: errors that last as long as the "
+            "track do not show here."
         )
         yield Finding("note", text)
     bearings = sum(n for name, n in health.bearings.items() if name != "gated")

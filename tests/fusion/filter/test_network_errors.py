@@ -82,11 +82,18 @@ def test_the_level_stays_within_its_bounds(nis: float, bound: float) -> None:
     assert level.level == pytest.approx(bound)
 
 
-def test_five_false_seconds_do_not_double_the_level_twice() -> None:
+def test_the_level_makes_the_mean_nis_three() -> None:
+    """Innovations twice as large as predicted: their variance, and so the level, is four times."""
+    rng, level, nis = np.random.default_rng(0), ErrorLevel(), []
+    for _ in range(2000):
+        nis.append(4.0 / level.level * rng.chisquare(3))
+        level = level.updated(UpdateResult(nis[-1], 3, True))
+    assert np.mean(nis[200:]) == pytest.approx(3.0, rel=0.1)
+
+
+def test_one_displacement_changes_the_level_by_a_fifth_at_most() -> None:
     level = ErrorLevel(gain=0.05)
-    for _ in range(10):
-        level = level.updated(UpdateResult(1e6, 3, True))
-    assert level.level < 3.0
+    assert level.updated(UpdateResult(1e6, 3, True)).level == pytest.approx(np.exp(0.2))
     assert level.updated(UpdateResult(float("nan"), 3, False)) == level
 
 
