@@ -21,7 +21,12 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, gauss_markov
 from stario.fusion.filter.engine import GateMode, UpdateResult
 from stario.fusion.filter.jacobians import CORE, plain_covariance
-from stario.fusion.filter.network_errors import ErrorLevel, displacement_errors
+from stario.fusion.filter.network_errors import (
+    FIRST_GAIN,
+    ErrorLevel,
+    displacement_errors,
+    next_gain,
+)
 from stario.fusion.lie import yaw_rotation
 from stario.fusion.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
@@ -47,9 +52,6 @@ _MAX_SECONDS = 6.0
 TARGET_NIS = 0.3
 """Target for the median NIS per degree of freedom: the network's errors are correlated over
 seconds, so consistent innovations are smaller than single errors."""
-
-GAIN, FIRST_GAIN = 0.05, 0.2
-"""Step of the noise factor's logarithm per displacement: in the long run, and for the first one."""
 
 MAX_FACTOR = 30.0
 """Maximum noise factor: the accelerometer then rules out little more than jumps."""
@@ -155,8 +157,8 @@ class AccelNoiseScale:
         ratio = (result.gate_nis / (TARGET_NIS * result.dof)) ** 2
         excess = 1.0 - 2.0 / (ratio + 1.0)
         log_factor = self.log_factor + self.gain * excess
-        gain = max(1.0 / (1.0 / self.gain + 1.0), GAIN)  # 1/5, 1/6, 1/7, ...
-        return AccelNoiseScale(min(max(log_factor, 0.0), math.log(MAX_FACTOR)), gain)
+        log_factor = min(max(log_factor, 0.0), math.log(MAX_FACTOR))
+        return AccelNoiseScale(log_factor, next_gain(self.gain))
 
 
 class DisplacementUpdates:

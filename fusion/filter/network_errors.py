@@ -32,9 +32,12 @@ _SHORT = 0.5
 """Displacement [m] below which errors along and across it are in proportion to it: a slow one has
 hardly a direction."""
 
-_GAIN, _FIRST_GAIN, _MAX_EXCESS = 0.05, 0.2, 4.0
-"""Step of the level's logarithm per displacement (in the long run, and for the first one), and the
-largest excess of NIS over its expectation that counts."""
+GAIN, FIRST_GAIN = 0.05, 0.2
+"""Step per displacement of a logarithm that is estimated from innovations: in the long run, and for
+the first one."""
+
+_MAX_EXCESS = 4.0
+"""Largest excess of NIS over its expectation that counts for the level."""
 
 MIN_LEVEL, MAX_LEVEL = 0.1, 5.0
 """Bounds of the level."""
@@ -62,7 +65,7 @@ class ErrorLevel:
     """
 
     log_level: float = 0.0
-    gain: float = _FIRST_GAIN
+    gain: float = FIRST_GAIN
 
     @property
     def level(self) -> float:
@@ -75,8 +78,13 @@ class ErrorLevel:
             return self
         excess = min(result.nis / result.dof - 1.0, _MAX_EXCESS)
         log_level = self.log_level + self.gain * excess
-        gain = max(1.0 / (1.0 / self.gain + 1.0), _GAIN)  # 1/5, 1/6, 1/7, ...
-        return ErrorLevel(min(max(log_level, math.log(MIN_LEVEL)), math.log(MAX_LEVEL)), gain)
+        log_level = min(max(log_level, math.log(MIN_LEVEL)), math.log(MAX_LEVEL))
+        return ErrorLevel(log_level, next_gain(self.gain))
+
+
+def next_gain(gain: float) -> float:
+    """Return the step for the next displacement: 1/5, 1/6, 1/7, ... (Robbins and Monro 1951)."""
+    return max(1.0 / (1.0 / gain + 1.0), GAIN)
 
 
 def displacement_errors(

@@ -142,12 +142,18 @@ def test_the_covariance_is_that_of_drawn_errors() -> None:
     assert filters[0].P[6, 6] < 0.6 * reported[0]
 
 
+@pytest.fixture(scope="module")
+def walk(make_walk: Make) -> ImuSequence:
+    return make_walk(3, 40.0)
+
+
+@pytest.fixture(scope="module")
+def oracle(walk: ImuSequence, make_oracle: Make) -> Any:
+    return make_oracle(walk, walk.truth, config(True), sigma=0.05)
+
+
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_the_track_does_not_depend_on_them(
-    make_walk: Make, make_oracle: Make, backend: Any
-) -> None:
-    walk = make_walk(3, 40.0)
-    oracle = make_oracle(walk, walk.truth, config(True), sigma=0.05)
+def test_the_track_does_not_depend_on_them(walk: ImuSequence, oracle: Any, backend: Any) -> None:
     white, correlated = (
         Navigator(oracle, config(each), backend=backend).run(walk) for each in (False, True)
     )
@@ -159,10 +165,8 @@ def test_the_track_does_not_depend_on_them(
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
 def test_a_stream_gives_the_covariances_of_its_filter(
-    make_walk: Make, make_oracle: Make, backend: Any
+    walk: ImuSequence, oracle: Any, backend: Any
 ) -> None:
-    walk = make_walk(3, 40.0)
-    oracle = make_oracle(walk, walk.truth, config(True), sigma=0.05)
     recording = Navigator(oracle, config(True)).run(walk)
     navigator = Navigator(oracle, config(True), backend=backend)
     samples = zip(walk.time, walk.gyro, walk.accel, strict=True)
@@ -174,9 +178,7 @@ def test_a_stream_gives_the_covariances_of_its_filter(
         np.testing.assert_allclose(found, expected, rtol=0.15)
 
 
-def test_a_position_fix_removes_them(make_walk: Make, make_oracle: Make) -> None:
-    walk: ImuSequence = make_walk(3, 40.0)
-    oracle = make_oracle(walk, walk.truth, config(True), sigma=0.05)
+def test_a_position_fix_removes_them(walk: ImuSequence, oracle: Any) -> None:
     truth = walk.truth.at(np.array([2.0, 20.0, 30.0]))
     fixes = [
         position_fix(t, p, 1e-4 * np.eye(3))
