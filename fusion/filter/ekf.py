@@ -19,7 +19,7 @@ from stario.fusion.filter.ekf_state import (
     FieldState,
     with_considered_propagated,
 )
-from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult
+from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult, with_gain
 from stario.fusion.filter.estimates import ACTUAL
 from stario.fusion.filter.jacobians import (
     CLONE,
@@ -313,8 +313,7 @@ class StateCloningEkf(ErrorStateEngine):
                 actual = actual + change
             else:  # what the update removes from the error depends on how large that is
                 HP, R = actual[GYRO_BIAS], old * step / (old - step) * np.eye(3)
-                half = K @ (HP - 0.5 * (HP[:, GYRO_BIAS] + R) @ K.T)
-                actual = actual - half - half.T
+                actual = with_gain(actual, K, HP, HP[:, GYRO_BIAS] + R)
             self.x = (K @ -self.state.b_g)[:, None]
             self._inject(np.array((P + change, actual)))
             old = step

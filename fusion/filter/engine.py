@@ -234,15 +234,11 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         HP: FloatArray,
         HPH: FloatArray,
     ) -> FloatArray:
-        """Return a covariance after the update with the gain K, whatever determined it.
-
-        (I - K H) P (I - K H)^T + K R K^T = P - K H P - (K H P)^T + K (H P H^T + R) K^T
-        """
+        """Return a covariance after the update with the gain K, whatever determined it."""
         P = self.covariances[which]
         if (HPH[which].diagonal() > _JOSEPH_RATIO * covariance.diagonal()).any():
             return self._joseph(P, blocks, covariance)
-        half = self.K @ (HP[which] - 0.5 * (HPH[which] + covariance) @ self.K.T)
-        return np.asarray(P - half - half.T)
+        return with_gain(P, self.K, HP[which], HPH[which] + covariance)
 
     def _joseph(self, P: FloatArray, blocks: Sequence[Block], covariance: FloatArray) -> FloatArray:
         """Return (I - K H) P (I - K H)^T + K R K^T: slower, but without cancellation."""
@@ -251,6 +247,15 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
             A[:, first : first + H.shape[1]] -= self.K @ H
         P = A @ P @ A.T + self.K @ covariance @ self.K.T
         return np.asarray(0.5 * (P + P.T))
+
+
+def with_gain(P: FloatArray, K: FloatArray, HP: FloatArray, S: FloatArray) -> FloatArray:
+    """Return a covariance after an update with any gain, S being H P H^T + R.
+
+    (I - K H) P (I - K H)^T + K R K^T = P - K H P - (K H P)^T + K S K^T
+    """
+    half = K @ (HP - 0.5 * S @ K.T)
+    return np.asarray(P - half - half.T)
 
 
 def _normalised(residual: FloatArray, covariance: FloatArray) -> tuple[float, FloatArray]:
