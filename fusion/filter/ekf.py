@@ -306,7 +306,7 @@ class StateCloningEkf(ErrorStateEngine):
             P = self.state.P
             rows = P[GYRO_BIAS]
             S = rows[:, GYRO_BIAS] + old * step / (old - step) * np.eye(3)
-            K: FloatArray = np.linalg.solve(S, rows).T
+            K = np.asarray(np.linalg.solve(S, rows).T, dtype=np.float64)
             change = -0.5 * (K @ rows + rows.T @ K.T)
             actual = self.state.P_actual
             if step > old:
