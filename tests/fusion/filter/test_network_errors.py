@@ -13,6 +13,7 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.estimates import Estimate, with_actual_covariances
+from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.map_frame import MapFrame
 from stario.fusion.filter.network_errors import (
@@ -26,6 +27,7 @@ from stario.fusion.filter.network_errors import (
 )
 from stario.fusion.fixes import position_fix
 from stario.fusion.imu.preintegration import preintegrate
+from stario.fusion.recording import cut_recording
 from stario.fusion.state import NavState
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.noise import ImuNoise
@@ -217,6 +219,37 @@ def test_the_first_fix_after_a_straight_walk_is_believed() -> None:
     assert result.accepted
     assert result.scale == 1.0
     assert np.linalg.norm(ekf.state.p_W - truth) < 1.0
+
+
+def test_a_gap_is_as_uncertain_as_the_gains_assume(walk: ImuSequence) -> None:
+    """Elsewhere the accelerometer is better than they assume."""
+    kept = (walk.time < 20.0) | (walk.time > 22.0)
+    samples = (each[kept] for each in (walk.time, walk.gyro, walk.accel))
+    intervals, front_end = cut_recording(ImuSequence("gap", *samples), config(True))
+    assert front_end.start is not None
+    estimator = Estimator(config(True), front_end.start)
+    added: dict[bool, np.ndarray] = {}  # by the first interval of its kind, before biases matter
+    for interval in intervals:
+        before = estimator.estimate().covariances[:, 5, 5]
+        estimator.step(interval, None)
+        added.setdefault(interval.gap, estimator.estimate().covariances[:, 5, 5] - before)
+    assert added[True][1] == pytest.approx(added[True][0], rel=0.05)
+    assert added[False][1] < 0.5 * added[False][0]
+
+
+def test_no_measurement_estimates_them() -> None:
+    """Their gain is zero, also where a fix is weighted by the covariance that contains them."""
+    ekf, end, _ = straight_walk(np.random.default_rng(3), 30)
+    rows = ekf.state.considered_rows
+    for update in (
+        lambda: ekf.update_position_W(end, 0.01 * np.eye(3)),
+        lambda: ekf.update_velocity_W(end / 30.0, 0.01 * np.eye(3)),
+        lambda: ekf.update_yaw(0.0, 0.1),
+    ):
+        update()
+        assert not ekf.K[rows].any()
+        np.testing.assert_allclose(np.diag(ekf.state.P_actual)[rows], 1.0, rtol=1e-9)
+        assert not ekf.P[rows].any()
 
 
 # --- the graph's covariance ----------------------------------------------------------------------
