@@ -13,13 +13,8 @@ import math
 import numpy as np
 
 from stario.fusion.checked import check_covariance, checked
-from stario.fusion.filter.ekf_state import (
-    GYRO_BIAS,
-    EkfState,
-    FieldState,
-    with_considered_propagated,
-)
-from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult, with_gain
+from stario.fusion.filter.ekf_state import EkfState, FieldState, with_considered_propagated
+from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult
 from stario.fusion.filter.estimates import ACTUAL
 from stario.fusion.filter.jacobians import (
     CLONE,
@@ -45,9 +40,6 @@ _NO_GAIN = np.zeros(3)
 
 _CLONED = [0, 1, 2, 6, 7, 8]
 """Rows of theta and rho_p, which a clone copies."""
-
-_PRIOR_TOLERANCE = 1e-6
-"""Relative difference up to which two variances count as equal."""
 
 
 class StateCloningEkf(ErrorStateEngine):
@@ -286,39 +278,7 @@ class StateCloningEkf(ErrorStateEngine):
         blocks = bearing_jacobian(s.R_WB, m_W, s.first_field)
         return self.update_linear(np.array([residual]), blocks, np.array([[variance]]), gate)
 
-    def replace_gyro_bias_prior(self, old: float, new: float) -> None:
-        """Replace the gyroscope bias's zero-mean prior as if the new one had been used throughout.
-
-        The old prior's information is removed and the new one's added: an update by a measurement
-        of zero, with negative variance if the prior widens; exact as far as the filter is linear
-        and the bias constant. A bias that has wandered may be less certain than its prior: since no
-        more information can be removed than there is, both priors are then widened by one factor.
-
-        Args:
-            old: variance per axis of the previous prior [rad^2/s^2].
-            new: variance per axis of the new prior [rad^2/s^2].
-        """
-        if new > (1.0 + _PRIOR_TOLERANCE) * old:
-            widest = float(np.linalg.eigvalsh(self.state.P[GYRO_BIAS, GYRO_BIAS])[-1])
-            old, new = max(old, widest), new * max(1.0, widest / old)
-        while abs(new - old) > _PRIOR_TOLERANCE * old:
-            step = min(new, 2.0 * old)  # a larger one would be badly conditioned
-            P = self.state.P
-            rows = P[GYRO_BIAS]
-            S = rows[:, GYRO_BIAS] + old * step / (old - step) * np.eye(3)
-            K = np.asarray(np.linalg.solve(S, rows).T, dtype=np.float64)
-            change = -0.5 * (K @ rows + rows.T @ K.T)
-            actual = self.state.P_actual
-            if step > old:
-                actual = actual + change
-            else:  # what the update removes from the error depends on how large that is
-                HP, R = actual[GYRO_BIAS], old * step / (old - step) * np.eye(3)
-                actual = with_gain(actual, K, HP, HP[:, GYRO_BIAS] + R)
-            self.x = (K @ -self.state.b_g)[:, None]
-            self._inject(np.array((P + change, actual)))
-            old = step
-
-    def _inject(self, covariances: FloatArray) -> None:
+    def inject(self, covariances: FloatArray) -> None:
         """Move the error's mean into the state, X <- exp(x) X, and set it to zero."""
         s, dx = self.state, self.x[:, 0]
         xi = np.zeros((self.slots + 1, 3, 3))  # rows theta, rho_v, rho_p of each pose

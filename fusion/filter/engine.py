@@ -160,10 +160,10 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
             self._set_gain(residual, covariance, HP[ACTUAL], HPH[ACTUAL], whitener)
             P = self._with_gain(ASSUMED, blocks, covariance, HP, HPH)
         actual = self._with_gain(ACTUAL, blocks, scale * noise, HP, HPH)
-        self._inject(np.array((P, actual)))
+        self.inject(np.array((P, actual)))
         return UpdateResult(nis, m, True, scale, "", residual, sigma, gate_nis)
 
-    def _inject(self, covariances: FloatArray) -> None:
+    def inject(self, covariances: FloatArray) -> None:
         """Move the error's mean `x` into the state and set it to zero, with new covariances."""
         raise NotImplementedError
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import numpy as np
-
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.displacements import DisplacementUpdates
 from stario.fusion.filter.ekf import StateCloningEkf
@@ -19,7 +17,6 @@ from stario.fusion.filter.estimator_state import (
     Displacement,
     EstimatorState,
     IntervalMeasurements,
-    Step,
     UpdateCounts,
     innovation_row,
     innovations_from_rows,
@@ -27,20 +24,17 @@ from stario.fusion.filter.estimator_state import (
 from stario.fusion.filter.frame_transform import with_undirected
 from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior
 from stario.fusion.filter.initial import PriorPose, initialise, reinitialise
-from stario.fusion.filter.magnetic import MagneticReference, north_fix, update_bearing
+from stario.fusion.filter.late_fixes import History, rewound, with_step
+from stario.fusion.filter.magnetic import MagneticUpdates, north_fix
 from stario.fusion.filter.map_frame import MapFrame
 from stario.fusion.filter.network_errors import ACCEL_SHARE
-from stario.fusion.filter.zero_velocity import StillnessDetector, ZeroVelocity, update_zero_velocity
+from stario.fusion.filter.zero_velocity import StillnessDetector, ZeroVelocity, ZeroVelocityUpdates
 from stario.fusion.fixes import Accepted, Fix, by_time
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start, split_at_fixes
 from stario.fusion.imu.preintegration import Segment, gap_yaw_variance, segment_of
 from stario.fusion.state import Health, Innovations, NavState, SmoothedPose, changed
-from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
-
-_TIME_TOLERANCE = 1e-6
-"""Tolerance when comparing times [s]."""
 
 
 class Estimator:
@@ -72,18 +66,17 @@ class Estimator:
         self._config, self._start, self._streaming = config, start.time, streaming
         self.ekf = StateCloningEkf(f.window_updates, config.gravity)
         self.frame = MapFrame(prior, f.gate, f.network_turn_sigma)
-        self._stillness = StillnessDetector(
-            round(f.output_rate * WINDOW_SECONDS), f.stillness_noise
-        )
-        self._magnetic = MagneticReference()
         self._displacements = DisplacementUpdates(self.ekf, f)
         self._hypotheses = self._displacements.hypotheses
         self.bias = AdaptiveBiasPrior(self._hypotheses, config, start.time)
+        detector = StillnessDetector(round(f.output_rate * WINDOW_SECONDS), f.stillness_noise)
+        self._rest = ZeroVelocityUpdates(self._hypotheses, self.bias, detector, f.gate)
+        self._magnetic = MagneticUpdates(self._hypotheses)
         self._clones: tuple[int, ...] = ()
         self._counts = UpdateCounts()
         self._innovations: list[tuple[float, ...]] = []
         self.in_gap = False
-        self._history: tuple[Step, ...] = ()
+        self._history: History = ()
         self.released: Estimate | None = None
         initialise(self.ekf, start, prior, config)
         self.bias.begin()
@@ -104,7 +97,8 @@ class Estimator:
         factor = self._displacements.accel_noise.factor
         if factor != interval.accel_factor:
             interval = changed(interval, accel_factor=factor)
-        self._record_step(interval, displacement, fixes)
+        if self._streaming:
+            self._history = with_step(self.state, interval, displacement, fixes)
         if interval.gap or fixes:
             self._hypotheses.alternative = None
         segment, accepted = self._propagate(interval, fixes)
@@ -128,28 +122,15 @@ class Estimator:
         Returns:
             All fixes applied since then, in order.
         """
-        steps = self._history
-        oldest = max(self._start, self.time - WINDOW_SECONDS - _TIME_TOLERANCE)
-        if fix.time < oldest or not steps or fix.time < steps[0].interval.start:
+        found = rewound(self.state, self._start, fix.time)
+        if found is None:
             return None
-        stops = [step.interval.stop for step in steps[:-1]]
-        k = int(np.searchsorted(stops, fix.time))
-        self.state = changed(steps[k].before, history=steps[:k])
+        self.state, steps = found
         accepted = []
-        for n, step in enumerate(steps[k:]):
+        for n, step in enumerate(steps):
             fixes = sorted((*step.fixes, fix), key=by_time) if n == 0 else step.fixes
             accepted += self.step(step.interval, step.displacement, fixes).fixes
         return accepted
-
-    def _record_step(
-        self, interval: ImuInterval, displacement: Displacement | None, fixes: Sequence[Fix]
-    ) -> None:
-        if self._streaming:
-            before = changed(self.state, history=())
-            step = Step(before, interval.without_window(), displacement, tuple(fixes))
-            oldest = interval.stop - WINDOW_SECONDS - _TIME_TOLERANCE
-            recent = (s for s in self._history if s.interval.stop >= oldest)
-            self._history = (*recent, step)
 
     def _propagate(
         self, interval: ImuInterval, fixes: Sequence[Fix]
@@ -204,22 +185,12 @@ class Estimator:
         return Accepted(fix, result.scale) if result.accepted else None
 
     def _update_zero_velocity(self, interval: ImuInterval) -> ZeroVelocity | None:
-        if not self._stillness.is_still(interval):
-            self.bias.note_refused_rest(0.0)
+        tested = self._rest.update(interval)
+        if tested is None:
             return None
-        measured = self._stillness.measurement()
-        before = self.ekf.state, self.bias.prior, self._hypotheses.alternative
-        self.bias.widen_for_rest()
-        gate = chi2_quantile(self._config.filter.gate, 6)
-        result = update_zero_velocity(self.ekf, measured, gate)
+        result, measured = tested
         self._counts = self._counts.add("zero_velocity", *result.outcomes)
-        if not result.accepted:
-            self.ekf.state, self.bias.prior, self._hypotheses.alternative = before
-            self.bias.note_refused_rest(interval.stop - interval.start)
-            return None
-        self.bias.note_refused_rest(0.0)
-        self._hypotheses.alternative = None
-        return measured
+        return measured if result.accepted else None
 
     def _update_displacement(
         self, interval: ImuInterval, d_N: FloatArray, covariance_N: FloatArray
@@ -239,7 +210,7 @@ class Estimator:
         declination = self._config.filter.declination
         if declination is None or self.frame.state.oriented:
             return []
-        fix = north_fix(self.ekf.state, self._magnetic, declination)
+        fix = north_fix(self.ekf.state, self._magnetic.reference, declination)
         if fix is None:
             return []
         result = self.frame.update(self.ekf, fix)
@@ -251,12 +222,10 @@ class Estimator:
 
     def _update_bearing(self, interval: ImuInterval) -> tuple[EkfState, EkfState] | None:
         """Update with the magnetic field; for streams return the state before and after."""
-        if interval.field_B is None or not self._magnetic.is_due(interval.stop):
+        before = self.ekf.state
+        result = self._magnetic.update(interval)
+        if result is None:
             return None
-        field_B, before = interval.field_B, self.ekf.state
-        result, self._magnetic = self._hypotheses.apply_to_both(
-            lambda: update_bearing(self.ekf, self._magnetic, field_B)
-        )
         self._counts = self._counts.add("bearings", *result.outcomes)
         return (before, self.ekf.state) if self._streaming else None
 
@@ -286,8 +255,8 @@ class Estimator:
             self.ekf.state,
             self._clones,
             self.frame.state,
-            self._stillness.window,
-            self._magnetic,
+            self._rest.detector.window,
+            self._magnetic.reference,
             self._displacements.outlier_share,
             self.bias.prior,
             self._displacements.accel_noise,
@@ -302,8 +271,9 @@ class Estimator:
     @state.setter
     def state(self, s: EstimatorState) -> None:
         self.ekf.state, self._clones = s.ekf, s.clones
-        self.frame.state, self._stillness.window = s.map_frame, s.stillness
-        self._magnetic, self.bias.prior, self._counts = s.magnetic, s.bias_prior, s.counts
+        self.frame.state, self._rest.detector.window = s.map_frame, s.stillness
+        self._magnetic.reference, self.bias.prior = s.magnetic, s.bias_prior
+        self._counts = s.counts
         self._displacements.outlier_share = s.outlier_share
         self._displacements.accel_noise = s.accel_noise
         self._displacements.error_level = s.error_level

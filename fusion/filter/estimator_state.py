@@ -15,7 +15,7 @@ from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.estimates import Estimate
 from stario.fusion.filter.frame_transform import MapFrameState
 from stario.fusion.filter.gyro_bias import GyroBiasPrior
-from stario.fusion.filter.magnetic import MagneticReference
+from stario.fusion.filter.magnetic_reference import MagneticReference
 from stario.fusion.filter.network_errors import ErrorLevel
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Accepted, Fix

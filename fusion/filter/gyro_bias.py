@@ -15,7 +15,9 @@ import numpy as np
 
 from stario.fusion.config import MIN_PRIOR_SIGMA, NavigatorConfig
 from stario.fusion.filter.displacements import HypothesisPair
+from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import GYRO_BIAS
+from stario.fusion.filter.engine import with_gain
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import BIAS_SIGMA
@@ -47,6 +49,9 @@ reject a glide that turns."""
 _LONG_STILLNESS, _RAW_SIGMA = 30.0, 0.1
 """After apparent stillness has been rejected for this long [s], the minimum sigma is this [rad/s]:
 gravity cannot reveal an uncorrected vertical bias, and nobody turns so evenly for so long."""
+
+_PRIOR_TOLERANCE = 1e-6
+"""Relative difference up to which two variances count as equal."""
 
 _TIME_TOLERANCE = 1e-6
 """Tolerance when comparing times [s]."""
@@ -166,7 +171,7 @@ class AdaptiveBiasPrior:
         """Replace the prior in both filters as if the new one had been used from the start."""
         old, new = self.prior.variance + self._wander, updated.variance + self._wander
         ekf = self._hypotheses.ekf
-        self._hypotheses.apply_to_both(lambda: ekf.replace_gyro_bias_prior(old, new))
+        self._hypotheses.apply_to_both(lambda: replace_prior(ekf, old, new))
         self.prior = updated
 
     def _half_seconds(self, time: float) -> int:
@@ -178,3 +183,37 @@ class AdaptiveBiasPrior:
         """Variance by which the bias may have changed since the start."""
         seconds = max(0.0, self._hypotheses.ekf.state.time - self._start)
         return float(self._config.noise.gyro_walk**2 * seconds)
+
+
+def replace_prior(ekf: StateCloningEkf, old: float, new: float) -> None:
+    """Replace the gyroscope bias's zero-mean prior as if the new one had been used throughout.
+
+    The old prior's information is removed and the new one's added: an update by a measurement of
+    zero, with negative variance if the prior widens; exact as far as the filter is linear and the
+    bias constant. A bias that has wandered may be less certain than its prior: since no more
+    information can be removed than there is, both priors are then widened by one factor.
+
+    Args:
+        ekf: the filter.
+        old: variance per axis of the previous prior [rad^2/s^2].
+        new: variance per axis of the new prior [rad^2/s^2].
+    """
+    if new > (1.0 + _PRIOR_TOLERANCE) * old:
+        widest = float(np.linalg.eigvalsh(ekf.state.P[GYRO_BIAS, GYRO_BIAS])[-1])
+        old, new = max(old, widest), new * max(1.0, widest / old)
+    while abs(new - old) > _PRIOR_TOLERANCE * old:
+        step = min(new, 2.0 * old)  # a larger one would be badly conditioned
+        P = ekf.state.P
+        rows = P[GYRO_BIAS]
+        S = rows[:, GYRO_BIAS] + old * step / (old - step) * np.eye(3)
+        K = np.asarray(np.linalg.solve(S, rows).T, dtype=np.float64)
+        change = -0.5 * (K @ rows + rows.T @ K.T)
+        actual = ekf.state.P_actual
+        if step > old:
+            actual = actual + change
+        else:  # what the update removes from the error depends on how large that is
+            HP, R = actual[GYRO_BIAS], old * step / (old - step) * np.eye(3)
+            actual = with_gain(actual, K, HP, HP[:, GYRO_BIAS] + R)
+        ekf.x = (K @ -ekf.state.b_g)[:, None]
+        ekf.inject(np.array((P + change, actual)))
+        old = step

@@ -17,9 +17,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stario.fusion.filter.displacements import HypothesisPair
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.engine import UpdateResult
+from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior
 from stario.fusion.imu.intervals import ImuInterval
+from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.inspection.stillness import looks_still, scatter_bound
 from stario.sequences.noise import PHONE_NOISE
 from stario.sequences.sequence import FloatArray
@@ -115,3 +118,45 @@ def update_zero_velocity(ekf: StateCloningEkf, measured: ZeroVelocity, gate: flo
     residual = np.concatenate([-s.v_W, measured.b_g - s.b_g])
     blocks = [(3, _H_VELOCITY), (9, _H_BIAS)]
     return ekf.update_linear(residual, blocks, measured.covariance, gate, "reject")
+
+
+class ZeroVelocityUpdates:
+    """Updates of a device at rest.
+
+    Args:
+        hypotheses: the filter and its alternative, which ends where rest is measured.
+        bias: the prior of the gyroscope's bias, which is widened before rest measures the bias.
+        detector: detects rest.
+        gate: probability of the chi-square test.
+
+    Attributes:
+        detector: the detector.
+    """
+
+    def __init__(
+        self,
+        hypotheses: HypothesisPair,
+        bias: AdaptiveBiasPrior,
+        detector: StillnessDetector,
+        gate: float,
+    ) -> None:
+        self._hypotheses, self._bias, self._gate = hypotheses, bias, chi2_quantile(gate, 6)
+        self.detector = detector
+
+    def update(self, interval: ImuInterval) -> tuple[UpdateResult, ZeroVelocity] | None:
+        """Update if the second that ends with an interval was still; None if the device moved."""
+        hypotheses, bias = self._hypotheses, self._bias
+        if not self.detector.is_still(interval):
+            bias.note_refused_rest(0.0)
+            return None
+        measured, ekf = self.detector.measurement(), hypotheses.ekf
+        before = ekf.state, bias.prior, hypotheses.alternative
+        bias.widen_for_rest()
+        result = update_zero_velocity(ekf, measured, self._gate)
+        if result.accepted:
+            bias.note_refused_rest(0.0)
+            hypotheses.alternative = None
+        else:
+            ekf.state, bias.prior, hypotheses.alternative = before
+            bias.note_refused_rest(interval.stop - interval.start)
+        return result, measured

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.gyro_bias import GyroBiasPrior
+from stario.fusion.filter.gyro_bias import GyroBiasPrior, replace_prior
 from stario.fusion.state import NavState
 
 
@@ -27,7 +27,7 @@ def ekf_with_measured_bias(sigma: float) -> StateCloningEkf:
 def test_replacing_the_prior_equals_having_started_with_it(new: float) -> None:
     old = 1e-3
     ekf = ekf_with_measured_bias(old)
-    ekf.replace_gyro_bias_prior(old**2, new**2)
+    replace_prior(ekf, old**2, new**2)
     expected = ekf_with_measured_bias(new).state
     # Both compute the second residual with b_a as zero, so the comparison is linear.
     np.testing.assert_allclose(ekf.state.P, expected.P, rtol=1e-6, atol=1e-12)
@@ -41,7 +41,7 @@ def test_a_bias_that_has_wandered_beyond_its_prior_keeps_a_valid_covariance() ->
     ekf.P = P
     core = slice(0, 15)  # a new clone duplicates the pose, so that the whole P is singular
     before = np.linalg.eigvalsh(P[core, core]).min()
-    ekf.replace_gyro_bias_prior(1e-6, 1e-5)
+    replace_prior(ekf, 1e-6, 1e-5)
     assert np.linalg.eigvalsh(ekf.P[core, core]).min() > 0.5 * before
     assert (np.diag(ekf.P)[9:12] <= 10.0 * np.diag(P)[9:12] * (1.0 + 1e-6)).all()
     assert (np.diag(ekf.P)[9:12] > np.diag(P)[9:12]).all()
