@@ -15,6 +15,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from stario.fusion.checked import check_type
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.estimates import (
     ASSUMED,
@@ -38,6 +39,7 @@ from stario.fusion.graph.fixed_lag import FixedLagEstimator
 from stario.fusion.imu.intervals import Start
 from stario.fusion.recording import PreprocessedRecording, Progress
 from stario.fusion.state import NavState, Track, track_from_states
+from stario.sequences.errors import InputError
 from stario.sequences.sequence import Trajectory
 
 BackendName = Literal["ekf", "graph"]
@@ -124,7 +126,20 @@ def track_recording(
     fixes: Iterable[Fix],
     progress: Progress,
 ) -> Track:
-    """Filter a recording, then solve it with the back end."""
+    """Filter a recording, then solve it with the back end.
+
+    Raises:
+        InputError: it was preprocessed for another update rate, or an argument has the wrong type.
+    """
+    check_type("preprocessed", recording, PreprocessedRecording, "observe(sequence) returns one")
+    if recording.update_rate != config.filter.update_rate:
+        raise InputError(
+            "preprocessed: update_rate",
+            str(recording.update_rate),
+            f"this navigator's {config.filter.update_rate}",
+            "observe with the same update rate",
+        )
+    check_type("fixes", fixes, Iterable, "a list of them")
     began = perf_counter()
     queue = FixQueue(fixes, most=math.inf)  # all fixes of a recording are known from the start
     filtered = _filtered(recording, config, prior, queue, progress)

@@ -255,12 +255,6 @@ class Navigator:
         Raises:
             InputError: as for `run`.
         """
-        check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
-        if not callable(progress):
-            remedy = "pass fixes by name: fixes=[...]"
-            raise InputError(
-                "progress", f"{progress!r:.60}", "a function of the fraction done", remedy
-            )
         return preprocess(sequence, self.model, self.config, progress)
 
     def track(
@@ -274,17 +268,6 @@ class Navigator:
         Raises:
             InputError: it was preprocessed for another update rate.
         """
-        check_type(
-            "preprocessed", preprocessed, PreprocessedRecording, "observe(sequence) returns one"
-        )
-        if preprocessed.update_rate != self.config.filter.update_rate:
-            raise InputError(
-                "preprocessed: update_rate",
-                str(preprocessed.update_rate),
-                f"this navigator's {self.config.filter.update_rate}",
-                "observe with the same update rate",
-            )
-        check_type("fixes", fixes, Iterable, "a list of them")
         backend = BACKENDS[self.backend]
         return track_recording(backend, preprocessed, self.config, self.prior, fixes, progress)
 

@@ -9,6 +9,7 @@ from time import perf_counter
 
 import numpy as np
 
+from stario.fusion.checked import check_type
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
@@ -59,8 +60,13 @@ def preprocess(
     """Cut a recording into intervals and predict the displacements of its windows.
 
     Raises:
-        InputError: the recording is shorter than 1.5 s, or its units or rate are wrong.
+        InputError: the recording is shorter than 1.5 s, its units or rate are wrong, or an argument
+            has the wrong type.
     """
+    check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
+    if not callable(progress):
+        remedy = "pass fixes by name: fixes=[...]"
+        raise InputError("progress", f"{progress!r:.60}", "a function of the fraction done", remedy)
     check_units(sequence)
     began = perf_counter()
     intervals, front_end = cut_recording(sequence, config)

@@ -16,15 +16,17 @@ from stario.fusion.filter.estimates import Estimate, nav_states, smoothed_poses
 from stario.fusion.filter.estimator_state import (
     Displacement,
     EstimatorState,
+    History,
     IntervalMeasurements,
     UpdateCounts,
     innovation_row,
     innovations_from_rows,
+    rewound,
+    with_step,
 )
 from stario.fusion.filter.frame_transform import with_undirected
 from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior
 from stario.fusion.filter.initial import PriorPose, initialise, reinitialise
-from stario.fusion.filter.late_fixes import History, rewound, with_step
 from stario.fusion.filter.magnetic import MagneticUpdates, north_fix
 from stario.fusion.filter.map_frame import MapFrame
 from stario.fusion.filter.network_errors import ACCEL_SHARE

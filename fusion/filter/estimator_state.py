@@ -1,4 +1,8 @@
-"""Input and output of an estimator's step, counts of its updates, and its complete state."""
+"""Input and output of an estimator's step, counts of its updates, and its complete state.
+
+States are immutable, so that keeping those of the last second costs references only: a late fix
+returns to one of them and repeats the steps since then. README.md, "Fixes".
+"""
 
 from __future__ import annotations
 
@@ -24,6 +28,10 @@ from stario.fusion.imu.preintegration import Segment
 from stario.fusion.imu.stateful import Displacement as Displacement
 from stario.fusion.state import Health, Innovations, NavState, changed
 from stario.sequences.sequence import FloatArray
+from stario.sequences.windows import WINDOW_SECONDS
+
+_TIME_TOLERANCE = 1e-6
+"""Tolerance when comparing times [s]."""
 
 
 class IntervalMeasurements(NamedTuple):
@@ -180,4 +188,48 @@ class EstimatorState:
     counts: UpdateCounts
     in_gap: bool
     released: Estimate | None
-    history: tuple[Step, ...] = ()
+    history: History = ()
+
+
+History = tuple[Step, ...]
+"""Steps of the last second, in order."""
+
+
+def with_step(
+    state: EstimatorState,
+    interval: ImuInterval,
+    displacement: Displacement | None,
+    fixes: Sequence[Fix],
+) -> History:
+    """Return the history with the step that is about to begin, without those too old for a fix.
+
+    Args:
+        state: the state before the step, with the history so far.
+        interval: interval of the step.
+        displacement: displacement given with it; None if there is none.
+        fixes: fixes given with it.
+    """
+    step = Step(changed(state, history=()), interval.without_window(), displacement, tuple(fixes))
+    oldest = interval.stop - WINDOW_SECONDS - _TIME_TOLERANCE
+    return (*(s for s in state.history if s.interval.stop >= oldest), step)
+
+
+def rewound(
+    state: EstimatorState, start: float, time: float
+) -> tuple[EstimatorState, History] | None:
+    """Return the state before the step that contains a time, and the steps to be repeated.
+
+    Args:
+        state: the newest state, with its history.
+        start: start of the stream [s].
+        time: time of a late fix [s].
+
+    Returns:
+        None if the time is more than a window ago, or before the stream began.
+    """
+    steps = state.history
+    oldest = max(start, state.ekf.time - WINDOW_SECONDS - _TIME_TOLERANCE)
+    if time < oldest or not steps or time < steps[0].interval.start:
+        return None
+    k = int(np.searchsorted([step.interval.stop for step in steps[:-1]], time))
+    return changed(steps[k].before, history=steps[:k]), steps[k:]
