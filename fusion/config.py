@@ -143,7 +143,7 @@ class NavigatorConfig:
     """Everything that a run depends on, except the recording and the weights.
 
     Attributes:
-        noise: IMU noise densities assumed by the filter, ten to thirty times those of a stationary
+        noise: IMU noise densities assumed by the filter, 30 to 100 times those of a stationary
             phone: errors of scale and alignment act like noise in motion, and with smaller
             densities the biases would absorb the network's slow errors.
         filter: settings of the EKF.
@@ -153,7 +153,7 @@ class NavigatorConfig:
 
     noise: ImuNoise = field(
         default_factory=lambda: ImuNoise(
-            gyro_noise=6e-3, accel_noise=0.1, gyro_walk=1e-5, accel_walk=3e-4
+            gyro_noise=6e-3, accel_noise=0.2, gyro_walk=1e-5, accel_walk=3e-4
         )
     )
     filter: FilterConfig = field(default_factory=FilterConfig)

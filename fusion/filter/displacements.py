@@ -53,7 +53,7 @@ TARGET_NIS = 0.3
 """Target for the median NIS per degree of freedom: the network's errors are correlated over
 seconds, so consistent innovations are smaller than single errors."""
 
-MAX_FACTOR = 30.0
+MAX_FACTOR = 15.0
 """Maximum noise factor: the accelerometer then rules out little more than jumps."""
 
 _STEPS = 4

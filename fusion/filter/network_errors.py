@@ -24,7 +24,7 @@ are independent, of those that decay within seconds, and of those along and acro
 that last. In unknown people's recordings the normalised errors have a variance of 0.5 to 1 and
 autocorrelations of 0.2 to 0.4 after a second, 0.05 to 0.25 from five seconds to a minute."""
 
-ACCEL_SHARE = 0.1
+ACCEL_SHARE = 0.025
 """Actual variance of the accelerometer's noise as a fraction of that assumed for the gains, which
 is so large because the network's errors are correlated."""
 

@@ -14,6 +14,7 @@ design", 1998 (coning, sculling).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -212,6 +213,11 @@ def preintegrate(
     """
     dt, rate, force = corrected_increments(time, gyro - b_g, accel - b_a)
     densities = [noise] * len(dt) if isinstance(noise, ImuNoise) else noise
+    turn = float(np.linalg.norm(np.cumsum(rate * dt[:, None], axis=0), axis=1).max())
+    if turn > _MAX_TURN:
+        # gtsam's tangent is singular at a full turn.
+        rate, density = rate * (_MAX_TURN / turn), math.pi / math.sqrt(time[-1] - time[0])
+        densities = [replace(d, gyro_noise=max(d.gyro_noise, density)) for d in densities]
     current = densities[0]
     params = _params(current, gravity) if current is noise else _new_params(current, gravity)
     pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(b_a, b_g))
@@ -258,6 +264,10 @@ def corrected_increments(
     force = force + turn @ (0.5 * force + turn @ force / 6.0)
     return dt, constant[:, :, 0], force[:, :, 0]
 
+
+_MAX_TURN = 6.0
+"""Maximum rotation of a segment [rad]; over a tenth of a second no device turns by so much, and its
+turn is then unknown: a gyroscope in deg/s that has not been noticed yet."""
 
 _CROSS_WEIGHTS = np.array([1.0 / 24.0, 1.0 / 12.0])
 _EYE = np.eye(3)

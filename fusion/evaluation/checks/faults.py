@@ -74,6 +74,7 @@ def matched_config(errors: ImuErrors) -> NavigatorConfig:
     """Return the configuration of a sensor whose errors are exactly as stated."""
     matched = FilterConfig(
         covariance_scale=1.0,
+        correlated_errors=False,
         gyro_bias_sigma=errors.gyro_turn_on,
         accel_bias_sigma=errors.accel_turn_on,
         adaptive=False,

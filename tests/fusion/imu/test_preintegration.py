@@ -254,3 +254,15 @@ def test_noise_does_not_depend_on_the_sensor_rate() -> None:
         for rate in (100, 400)
     )
     np.testing.assert_allclose(np.diag(fast), np.diag(slow), rtol=0.02)
+
+
+@pytest.mark.parametrize("turn", [2.0 * np.pi, 11.0])
+def test_more_than_a_full_turn_in_a_segment_leaves_its_jacobians_bounded(turn: float) -> None:
+    # As of a gyroscope in deg/s, before the stream is refused.
+    time = np.linspace(0.0, 0.1, 11)
+    gyro, accel = np.tile([0.0, 0.0, turn / 0.1], (11, 1)), np.tile([0.0, 0.0, 9.81], (11, 1))
+    segment = preintegrate(time, gyro, accel, np.zeros(3), np.zeros(3), NOISE, 9.81)
+    end = propagated(segment, np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    assert np.abs(end.transition).max() < 10.0
+    assert np.abs(end.noise).max() < 100.0
+    assert end.noise[0][2, 2] > 1.0  # the yaw is not known any more [rad^2]
