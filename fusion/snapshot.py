@@ -35,7 +35,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 18
+FORMAT, VERSION = "stario snapshot", 19
 
 
 _HOLDS = """

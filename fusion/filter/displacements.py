@@ -37,6 +37,13 @@ _RARE_SHARE, _RARE_POWER, _SHARE_SECONDS = 0.35, 4.0, 20.0
 to the network and inflated by this power of NIS / gate; a filter that gates more of them may itself
 be wrong. This bridges about five seconds of false displacements."""
 
+_OFFSET_GAIN = 0.5
+"""Share of the latest outlier's residual in the alternative's offset, which may turn with the
+device."""
+
+_OFFSET_SCALE = 4.0
+"""Factor on the covariance of a displacement less the offset, which is not known exactly either."""
+
 _ALTERNATIVE_GATE = 0.95
 """Probability of the chi-square test beyond which a displacement does not fit the alternative."""
 
@@ -67,11 +74,16 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, eq=False)
 class AlternativeHypothesis:
-    """State of the filter if it had rejected the displacements that failed the gate.
+    """State of the filter if the displacements since an outlier contained one steady error.
+
+    Less this error they still measure how the velocity changes. Without that, tilt and bias of the
+    accelerometer would soon explain any displacement.
 
     Attributes:
         ekf: state of the filter under this hypothesis.
         start_time: time of the first outlier [s].
+        offset_W: (3,) the steady error, from the residuals of the outliers [m].
+        outliers: times of the displacements that do not fit as they are [s].
         exclusive_fits: number of displacements that fitted only the alternative since the last one
             that fitted only the filter.
         shared_fits: number of latest displacements in a row that fitted both.
@@ -79,6 +91,8 @@ class AlternativeHypothesis:
 
     ekf: EkfState
     start_time: float
+    offset_W: FloatArray
+    outliers: tuple[float, ...] = ()
     exclusive_fits: int = 0
     shared_fits: int = 0
 
@@ -108,29 +122,38 @@ class HypothesisPair:
             self.ekf.state = filter_state
         return result
 
-    def compare(self, fits: Callable[[], bool], fits_filter: bool) -> None:
+    def compare(
+        self, test: Callable[[AlternativeHypothesis], AlternativeHypothesis], fits_filter: bool
+    ) -> tuple[float, ...]:
         """Test the alternative with a displacement that the filter has applied; adopt or drop it.
 
         Args:
-            fits: updates the filter's current state with the displacement if that fits, and returns
-                whether it does.
+            test: updates the filter's current state, which is that of the alternative, with the
+                displacement, and returns the alternative with one more outlier if it does not fit.
             fits_filter: whether the displacement fitted the filter.
+
+        Returns:
+            Times of the displacements [s] that were false after all, since the alternative without
+            them is adopted; empty otherwise.
         """
         alternative = self.alternative
         if alternative is None:
-            return
+            return ()
         filter_state, self.ekf.state = self.ekf.state, alternative.ekf
-        fitted = fits()
+        tested = test(alternative)
+        fitted = len(tested.outliers) == len(alternative.outliers)
         exclusive = alternative.exclusive_fits + (fitted and not fits_filter)
         if fits_filter and not fitted:
             exclusive = 0
         shared = alternative.shared_fits + 1 if fits_filter and fitted else 0
         self.alternative = None
         if exclusive >= _FITS_TO_REPLACE:
-            return
+            return tested.outliers
         ekf, self.ekf.state = self.ekf.state, filter_state
         if shared < _FITS_TO_DROP and ekf.time - alternative.start_time <= _MAX_SECONDS:
-            self.alternative = AlternativeHypothesis(ekf, alternative.start_time, exclusive, shared)
+            fits = {"exclusive_fits": exclusive, "shared_fits": shared}
+            self.alternative = changed(tested, ekf=ekf, **fits)
+        return ()
 
 
 @dataclass(frozen=True)
@@ -184,8 +207,10 @@ class DisplacementUpdates:
 
     def update(
         self, slot: int, R_NB: FloatArray, d_N: FloatArray, covariance_N: FloatArray
-    ) -> UpdateResult:
+    ) -> tuple[UpdateResult, tuple[float, ...]]:
         """Update with the displacement of the window that ends now.
+
+        Return the outcome, and the times [s] of earlier displacements that were false after all.
 
         Args:
             slot: slot of the clone at the window's start.
@@ -204,11 +229,12 @@ class DisplacementUpdates:
             if f.correlated_errors:
                 self.error_level = self.error_level.updated(result)
         if self.hypotheses.alternative is None and rare and result.gated:
-            self.hypotheses.alternative = AlternativeHypothesis(before, before.time)
+            assert result.residual is not None  # it has been compared with the gate
+            first = AlternativeHypothesis(before, before.time, result.residual, (before.time,))
+            self.hypotheses.alternative = first
         elif result.accepted:
-            fits = partial(update, _ALTERNATIVE_GATE, "reject")
-            self.hypotheses.compare(lambda: fits().accepted, not result.gated)
-        return result
+            return result, self.hypotheses.compare(partial(_tested, update), not result.gated)
+        return result, ()
 
     def _update(
         self,
@@ -216,11 +242,12 @@ class DisplacementUpdates:
         R_NB: FloatArray,
         d_N: FloatArray,
         covariance_N: FloatArray,
-        gate: float,
+        gate: float | None,
         gate_mode: GateMode = "inflate",
         power: float = 1.0,
+        offset_W: FloatArray | None = None,
     ) -> UpdateResult:
-        """Update the filter's current state."""
+        """Update the filter's current state, with the displacement less an offset (3,) [m]."""
         f = self._config
         self._ekf.state = propagated_turn(
             self._ekf.state, 1.0 / f.update_rate, f.network_turn_sigma
@@ -229,15 +256,39 @@ class DisplacementUpdates:
         # Values that are not finite are rejected and counted by the filter.
         with np.errstate(invalid="ignore"):
             d_W, covariance_W = R_WN @ d_N, R_WN @ covariance_N @ R_WN.T
+            if offset_W is not None:
+                d_W, covariance_W = d_W - offset_W, _OFFSET_SCALE * covariance_W
             errors = None
             if f.correlated_errors and np.isfinite(covariance_W).all():
                 level, has_turn = self.error_level.level, self._ekf.state.has_turn
                 errors = displacement_errors(d_W, covariance_W, level, has_turn, f)
-            limit = chi2_quantile(gate, 3)
+            limit = None if gate is None else chi2_quantile(gate, 3)
             return self._ekf.update_displacement(
                 *(slot, None, d_W, f.overlap_scale * covariance_W),
                 *(limit, gate_mode, power, errors),
             )
+
+
+def _tested(
+    update: Callable[..., UpdateResult], alternative: AlternativeHypothesis
+) -> AlternativeHypothesis:
+    """Update an alternative with a displacement: as it is if it fits, otherwise less the offset.
+
+    Args:
+        update: updates the filter's current state, which is the alternative's.
+        alternative: the alternative.
+
+    Returns:
+        The alternative, with one more outlier if the displacement did not fit.
+    """
+    result = update(_ALTERNATIVE_GATE, "reject")
+    if result.accepted or result.residual is None:
+        return alternative
+    offset_W = alternative.offset_W
+    offset_W = offset_W + _OFFSET_GAIN * (result.residual - offset_W)
+    update(None, offset_W=offset_W)
+    outliers = (*alternative.outliers, alternative.ekf.time)
+    return changed(alternative, offset_W=offset_W, outliers=outliers)
 
 
 class TurnEstimate(NamedTuple):

@@ -35,7 +35,6 @@ from stario.fusion.fixes import Accepted, Fix, by_time
 from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start, split_at_fixes
 from stario.fusion.imu.preintegration import Segment, gap_yaw_variance, segment_of
 from stario.fusion.state import Health, Innovations, NavState, SmoothedPose, changed
-from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
 
 
@@ -107,13 +106,15 @@ class Estimator:
         zupt = self._update_zero_velocity(interval)
         # Zero velocity is more accurate than a network trained on walks, off by 1 cm/s at rest.
         offered = displacement if zupt is None else None
-        applied = None if offered is None else self._update_displacement(interval, *offered)
+        applied, revoked = self._update_displacement(interval, offered)
         bearing = self._update_bearing(interval)
         accepted += self._update_north()
         self.bias.update(interval)
         if interval.update or interval.gap:
             self._clone()
-        return IntervalMeasurements(interval, offered, applied, bearing, zupt, accepted, segment)
+        return IntervalMeasurements(
+            interval, offered, applied, revoked, bearing, zupt, accepted, segment
+        )
 
     def late_fix(self, fix: Fix) -> list[Accepted] | None:
         """Apply a fix from the past; return None if it is more than a window late.
@@ -195,17 +196,23 @@ class Estimator:
         return measured if result.accepted else None
 
     def _update_displacement(
-        self, interval: ImuInterval, d_N: FloatArray, covariance_N: FloatArray
-    ) -> Displacement | None:
-        """Update with a displacement from the oldest clone; return it as inflated, or None."""
+        self, interval: ImuInterval, displacement: Displacement | None
+    ) -> tuple[Displacement | None, tuple[float, ...]]:
+        """Update with a displacement from the oldest clone.
+
+        Return it as inflated, None if rejected, and the times of earlier ones that were false [s].
+        """
+        if displacement is None:
+            return None, ()
         assert interval.R_NB_window is not None  # a window comes with its initial attitude
-        result = self._displacements.update(
+        d_N, covariance_N = displacement
+        result, revoked = self._displacements.update(
             self._clones[0], interval.R_NB_window, d_N, covariance_N
         )
         self._counts = self._counts.add_displacement(result)
         if not self._streaming and (row := innovation_row(interval.stop, result)) is not None:
             self._innovations.append(row)
-        return (d_N, result.scale * covariance_N) if result.accepted else None
+        return (d_N, result.scale * covariance_N) if result.accepted else None, revoked
 
     def _update_north(self) -> list[Accepted]:
         """Apply the yaw from magnetic north once, if a declination is set and yaw is unknown."""

@@ -42,6 +42,8 @@ class IntervalMeasurements(NamedTuple):
     """Predicted displacement of the window ending here; None if no window ends, or at rest."""
     displacement: Displacement | None
     """The same with its inflated covariance; None if it was rejected."""
+    revoked: tuple[float, ...]
+    """Times of earlier displacements that were false after all [s] (README.md, "Gates")."""
     bearing: tuple[EkfState, EkfState] | None
     """Filter state before and after the update with a bearing; None if there was none, and for
     recordings, whose measurements all stay in memory."""

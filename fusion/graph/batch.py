@@ -53,9 +53,11 @@ def smooth(
     local = [state.shifted(-origin) for state in filtered]
     first = _inflated(local[0], prior, transforms)
     builder = GraphBuilder(config, first, turn_sigma=turn_sigma)
+    revoked = {time for m in measurements for time in m.revoked}
     for m, state in zip(measurements, local[1:], strict=True):
         fixes = [accepted.fix.shifted(-origin) for accepted in m.fixes]
-        builder.step(m.interval, m.offered, fixes, m.zero_velocity, state, m.segment)
+        offered = None if m.interval.stop in revoked else m.offered
+        builder.step(m.interval, offered, fixes, m.zero_velocity, state, m.segment)
     builder.close(local[-1])
     if gyro_bias is not None:
         builder.graph.add(GyroBias(builder.graph.last, *gyro_bias), gated=False)
