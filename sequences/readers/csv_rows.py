@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.clocks import time_unit
+from stario.sequences.readers.clocks import refuse_row_numbers, time_unit
 from stario.sequences.readers.columns import IMU, MAGNETIC, TRUTH, Column, Header, unit_factor
 from stario.sequences.readers.lines import (
     decimal_mark,
@@ -173,6 +173,7 @@ def _seconds(
 def _per_second(path: Path, column: Column, time: FloatArray) -> int:
     """Return the units per second, as the header names them or else inferred from the rate."""
     if not column.unit:
+        refuse_row_numbers(path, column.title, time)
         with suppress(ReadError):
             return time_unit(path, time)
     return unit_factor(path, column, TIME_UNITS)

@@ -369,3 +369,19 @@ def test_a_malformed_json_export_is_refused_in_one_line(
         read_recording(tmp_path / "x.json")
     assert "\n" not in str(error.value)
     assert "stario-" not in str(error.value)
+
+
+@pytest.mark.parametrize("per_second", [10**4, 10**6])  # MT devices and DOTs
+def test_the_clock_of_xsens_is_in_ticks_or_microseconds(tmp_path: Path, per_second: int) -> None:
+    names = [f"{name}_{axis}" for name in ("Acc", "Gyr") for axis in "XYZ"]
+    rows = [f"{k}\t{10**5 + k * per_second // 100}\t0\t0\t9.8\t0\t0\t0" for k in range(200)]
+    path = tmp_path / "MT_0.txt"
+    lines = [
+        "// Update Rate: 100.0Hz",
+        "\t".join(["PacketCounter", "SampleTimeFine", *names]),
+        *rows,
+    ]
+    path.write_text("\n".join(lines) + "\n")
+    read = read_recording(path)
+    assert read.rate == pytest.approx(100.0)
+    assert read.duration == pytest.approx(1.99)
