@@ -6,7 +6,8 @@ x y z position [m] or velocity [m/s] in W; a yaw [rad] is given in x, with y and
 sx    standard deviation [m], [m/s] or [rad]
 sy sz standard deviations of the other axes; empty, or no column, where they equal sx
 
-Columns may be in any order, separated by commas, semicolons or tabs; `yaw [deg]` is a kind as well.
+Columns may be in any order, separated by commas, semicolons or tabs; numbers may have a
+decimal comma where that is not the separator. `yaw [deg]` is a kind as well.
 A position without z is horizontal; its height is unknown.
 """
 
@@ -22,6 +23,7 @@ import numpy as np
 from stario.fusion.fixes import KINDS, MAX_YAW, Fix, make_fix
 from stario.fusion.lie import UNKNOWN_YAW
 from stario.sequences.errors import InputError, ReadError
+from stario.sequences.readers.lines import decimal_mark
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.time_order import increasing_mask
 
@@ -45,6 +47,7 @@ def read_fixes(path: Path | str) -> list[Fix]:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
         separator = max(",;\t", key=lines[0].count) if lines else ","
+        decimal = decimal_mark(lines[1:], separator)
         rows = list(csv.reader(lines, delimiter=separator))
     except FileNotFoundError:
         raise ReadError(path, "file", "no such file", "a CSV of fixes") from None
@@ -59,7 +62,8 @@ def read_fixes(path: Path | str) -> list[Fix]:
     fixes = []
     for number, row in enumerate(rows[1:], start=2):
         if any(word.strip() for word in row):
-            fixes.append(_read_row(path, f"line {number}", header, row))
+            cells = [word.strip().replace(decimal, ".") for word in row]
+            fixes.append(_read_row(path, f"line {number}", header, cells))
     return fixes
 
 
@@ -88,7 +92,7 @@ def check_within(fixes: Sequence[Fix], sequence: ImuSequence) -> None:
 def _read_row(path: Path, where: str, header: Sequence[str], row: Sequence[str]) -> Fix:
     if len(row) > len(header):
         raise ReadError(path, where, f"{len(row)} values", f"at most {len(header)}")
-    words = [word.strip() for word in row] + [""] * len(header)
+    words = [*row, *[""] * len(header)]
     cells = dict.fromkeys(_COLUMNS, "") | dict(zip(header, words, strict=False))
     kind, _, unit = cells["kind"].lower().replace(" ", "").partition("[")
     if kind not in KINDS or unit not in ("", "deg]", "rad]") or (unit and kind != "yaw"):

@@ -34,6 +34,9 @@ recording: the cost does not grow with its length."""
 _NO_SENSOR = 1e4
 """Largest median magnitude that a sensor can have, in deg/s, m/s^2 or any unit in between."""
 
+_ROUNDED_TIMES = 1.5
+"""Least number of samples that share a time on average if times are rounded too coarsely."""
+
 _OFF_GRAVITY = 0.1
 """Relative error of the average force above any calibration error; recordings reach 0.008."""
 
@@ -117,6 +120,14 @@ def _check_time(sequence: ImuSequence) -> None:
     rate = sequence.rate
     if MIN_RATE <= rate <= MAX_RATE:
         return
+    times = sequence.time[np.isfinite(sequence.time)]
+    shared = len(times) / len(np.unique(times))
+    if shared >= _ROUNDED_TIMES:
+        raise InputError(
+            f"{sequence.name}: time", f"{shared:.3g} samples on average at each time",
+            "a time for each sample",
+            "a logger or spreadsheet rounded the times: export them with fractions of a second",
+        )  # fmt: skip
     fix = "set the app to 50 Hz or more" if 1.0 <= rate < MIN_RATE else ""
     for unit, per_second in TIME_UNITS.items():
         if rate and unit != "s" and MIN_RATE <= rate * per_second <= MAX_RATE:

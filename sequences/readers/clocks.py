@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,18 @@ from stario.sequences.sequence import MAX_TRUTH_GAP, FloatArray
 from stario.sequences.units import TIME_UNITS
 from stario.sequences.windows import MAX_RATE
 
+_log = logging.getLogger(__name__)
+
 _RATES = (9.0, 1.05 * MAX_RATE)
 """Plausible rates of sensors and captures [Hz], with slack for rounding; the range spans less than
 the factor between two units, so that only one unit fits."""
+
+
+_CLOCKS = {"sampletimefine": {"ticks of 100 us": 10**4, "us": 10**6}}
+"""Units of clocks by their title: Xsens counts 10 kHz ticks in MT devices, microseconds in DOTs."""
+
+_FEW_ROWS = 10
+"""Number of rows below which a count may be a coincidence."""
 
 
 def resample_to_gyro(
@@ -51,21 +61,42 @@ def resample_to_gyro(
     return gyro_ns[kept], gyro[kept], interpolated(time, t, accel)
 
 
+def refuse_row_numbers(file: Path, title: str, time: FloatArray) -> None:
+    """Refuse a column without a unit that only counts its rows, 0, 1, 2, ... or 1, 2, 3, ...
+
+    In one of the units it would always be a plausible time.
+
+    Raises:
+        ReadError: the column counts rows; not raised for fewer than ten.
+    """
+    count = len(time)
+    if count < _FEW_ROWS or not np.array_equal(time - time[0], np.arange(count)):
+        return
+    if time[0] in (0.0, 1.0):
+        found = f"{time[0]:.0f}, {time[0] + 1:.0f}, {time[0] + 2:.0f}, ..., which counts the rows"
+        fix = f"name a column of times `t [s]`; if these are times, name their unit: `{title} [ms]`"
+        raise ReadError(file, title, found, "times", fix)
+
+
 def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:
     """Return the number of time units in a second, inferred from the rate if no unit is named.
+
+    Samples that share a rounded time are spread over the time to the next one.
 
     Raises:
         ReadError: the unit is unknown, or no unit gives a plausible sample rate.
     """
     if unit in TIME_UNITS:
         return TIME_UNITS[unit]
-    if unit:
+    candidates = _CLOCKS.get(unit, TIME_UNITS)
+    if unit and unit not in _CLOCKS:
         raise ReadError(file, "time", f"unit {unit!r}", ", ".join(TIME_UNITS))
     steps = np.diff(time)
-    steps = steps[steps > 0]
-    step = float(np.median(steps)) if len(steps) else 0.0
-    for per_second in TIME_UNITS.values():
+    forward = steps[steps > 0]
+    step = float(np.median(forward)) * len(forward) / len(steps) if len(forward) else 0.0
+    for name, per_second in candidates.items():
         if step and _RATES[0] <= per_second / step <= _RATES[1]:
+            _log.info("%s: its times name no unit, their rate fits %s", file, name)
             return per_second
-    expected = f"10 to {MAX_RATE:.0f} samples per second in one of {', '.join(TIME_UNITS)}"
+    expected = f"10 to {MAX_RATE:.0f} samples per second in one of {', '.join(candidates)}"
     raise ReadError(file, "time", f"a step of {step:.4g}", expected)

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import csv
+import logging
 import os
 import re
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 
 from stario.sequences.errors import ReadError
 
+_log = logging.getLogger(__name__)
+
 _HEAD_BYTES = 32768
 _TAIL_BYTES = 16384
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(\.\d+)?(Z|[+-]\d\d:?\d\d)?")
+_MARK = re.compile(r'(?:^|[;\t"])\s*[-+]?\d*([.,])\d+(?:[eE][-+]?\d+)?\s*(?=[;\t"]|$)')
+_QUOTED_MARK = re.compile(
+    r'(?:^|[,"])\s*[-+]?\d*(\.|,(?=\d+(?:[eE][-+]?\d+)?\s*"))\d'  # a comma only within quotes
+)
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 """Byte order marks, with which spreadsheets begin a file of Unicode text."""
 
@@ -29,12 +37,29 @@ def read_lines(path: Path) -> list[str]:
         raise ReadError(path, "file", "no such file", "a readable file") from None
     except OSError as error:
         raise ReadError(path, "file", type(error).__name__, "a readable file") from None
-    if b"\0" in content and not content.startswith(_UTF_16):
-        raise ReadError(path, "file", "binary data", "UTF-8 text")
+    if not content.startswith(_UTF_16):
+        content = _without_padding(path, content)
     lines = _decoded(content).splitlines()
     if not any(line.strip() for line in lines):
         raise ReadError(path, "file", "no lines", "rows of numbers", "is the download complete?")
     return lines
+
+
+def _without_padding(path: Path, content: bytes) -> bytes:
+    """Return a file's text without the zeros that a recorder which lost power left at its end.
+
+    Raises:
+        ReadError: there are zeros elsewhere, as in binary files.
+    """
+    text = content.rstrip(b"\0")
+    if b"\0" in text:
+        raise ReadError(path, "file", "binary data", "UTF-8 text")
+    if len(text) < len(content):
+        count = len(content) - len(text)
+        _log.warning(
+            "%s: skipped %d zero bytes at the end: did the recorder lose power?", path, count
+        )
+    return text
 
 
 def first_line(path: Path, comments: bool = False) -> str | None:
@@ -59,6 +84,7 @@ def head_lines(path: Path) -> list[str]:
         return []
     if head.startswith(_UTF_16):
         return _decoded(head).splitlines()
+    head = head.rstrip(b"\0")
     if b"\0" in head:
         return []
     # The head may end within a character: decode its last line, cut anyway, separately.
@@ -104,14 +130,27 @@ def _decoded(content: bytes) -> str:
         return content.decode("latin-1")
 
 
-def unquoted(line: str, delimiter: str | None) -> str:
-    """Remove the quotes around a line's cells; a delimiter within a cell becomes a blank."""
-    if '"' not in line:
-        return line
-    if delimiter is None:
-        return line.replace('"', " ")
-    cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
-    return delimiter.join(cell.replace(delimiter, " ") for cell in cells)
+def decimal_mark(lines: Iterable[str], delimiter: str) -> str:
+    """Return the decimal mark of a file's numbers, that of the first one with a fraction.
+
+    A comma that separates cells is one only within quotes.
+    """
+    mark = _QUOTED_MARK if delimiter == "," else _MARK
+    return next((match[1] for line in lines if (match := mark.search(line))), ".")
+
+
+def unquoted(line: str, delimiter: str | None, decimal: str = ".") -> str:
+    """Write a line's cells without quotes and with decimal points.
+
+    A delimiter within a cell becomes a point if it is the decimal mark, otherwise a blank.
+    """
+    if '"' in line and delimiter is None:
+        line = line.replace('"', " ")
+    elif '"' in line and delimiter is not None:
+        cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+        inner = "." if delimiter == decimal else " "
+        line = delimiter.join(cell.replace(delimiter, inner) for cell in cells)
+    return line if decimal in (".", delimiter) else line.replace(decimal, ".")
 
 
 def with_seconds(line: str) -> str:
@@ -139,7 +178,13 @@ def ends_within_a_row(path: Path, delimiter: str | None) -> bool:
         with path.open("rb") as file:
             start = max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES)
             file.seek(start)
-            tail = file.read().replace(b"\0", b"")  # as in UTF-16
+            tail = file.read()
+            if tail.endswith(b"\0"):  # a loss of power leaves any number of them
+                file.seek(0)
+                text = file.read().rstrip(b"\0")
+                start = max(0, len(text) - _TAIL_BYTES)
+                tail = text[start:]
+            tail = tail.replace(b"\0", b"")  # as in UTF-16
     except OSError:
         return False
     if tail.endswith((b"\n", b"\r")):

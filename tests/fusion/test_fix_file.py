@@ -66,6 +66,18 @@ def test_columns_may_be_in_any_order_in_degrees_and_without_height(tmp_path: Pat
     np.testing.assert_allclose(yaw.covariance, [[np.radians(5.0) ** 2]])
 
 
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_decimal_commas_are_read(tmp_path: Path, separator: str) -> None:
+    lines = ["t;kind;x;y;sx", "5,0;position;0,5;-1;1,5", "20;position;3;4,25;1e0"]
+    path = tmp_path / "fixes.csv"
+    path.write_text("\n".join(lines).replace(";", separator))
+    first, second = read_fixes(path)
+    assert (first.time, second.time) == (5.0, 20.0)
+    np.testing.assert_allclose(first.value, [0.5, -1.0, 0.0])
+    np.testing.assert_allclose(second.value, [3.0, 4.25, 0.0])
+    assert first.covariance[0, 0] == pytest.approx(2.25)
+
+
 def test_a_missing_file_raises_an_error(tmp_path: Path) -> None:
     with pytest.raises(ReadError, match="fixes"):
         read_fixes(tmp_path / "fixes.csv")

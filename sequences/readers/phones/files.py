@@ -58,6 +58,12 @@ class PhoneFiles:
         """Gyroscope file, which names the recording if a folder holds several."""
         return self.tables["gyro"][0].file
 
+    @property
+    def shown(self) -> Path:
+        """The recording's path in messages: the only file, or else the folder."""
+        files = {table.file for tables in self.tables.values() for table in tables}
+        return self.gyro if len(files) == 1 else self.gyro.parent
+
     def first(self, sensor: Sensor) -> SensorTable | None:
         """Return the preferred file of a sensor, or None."""
         return next(iter(self.tables.get(sensor, [])), None)

@@ -216,7 +216,7 @@ def _force(
             folder, accel.stamps_ns, accel.values, gravity.stamps_ns, gravity.values
         )
         accel = replace(accel, stamps_ns=stamps, values=force + gravity_B)
-        _log.info("%s: added gravity from its separate file", folder)
+        _log.info("%s: added gravity from its own columns or file", files.shown)
     converted = {"accel"} if accel.unit not in ("", "m/s^2") else set()
     in_g = not accel.unit and is_in_g(accel.values)
     sign = -1.0 if in_g and core_motion else accel_sign(files, accel, attitude, separate_gravity)

@@ -48,6 +48,9 @@ _UNIT_WORDS = {
     **dict.fromkeys(("ms", "milli", "millis", "msec", "milliseconds"), "ms"),
     **dict.fromkeys(("s", "sec", "secs", "seconds"), "s"),
 }
+_XSENS_CLOCK = "sampletimefine"
+"""Clock of Xsens, whose unit `clocks.time_unit` determines."""
+
 _BRACKETS = re.compile(r"[\[(]\s*([^\])]*?)\s*[\])]")
 
 
@@ -141,6 +144,8 @@ def time_unit_of(name: str) -> str:
 
     Text in brackets is returned as it is, so that an unknown unit can be rejected.
     """
+    if "".join(words_of(name)) == _XSENS_CLOCK:
+        return _XSENS_CLOCK
     if (named := unit_of(name)) and (named in TIME_UNITS or named not in ("", "since")):
         return named
     return next((_UNIT_WORDS[word] for word in reversed(words_of(name)) if word in _UNIT_WORDS), "")

@@ -58,18 +58,14 @@ def accel_sign(
         sign = _by_system(folder, in_g)
     if sign is None and accel.unit == "g" and _has_core_motion(files):
         sign = -1.0
-    if sign is None and in_g and not accel.unit:
-        _log.warning(
-            "%s: the accelerometer seems to be in g: pass `--accel-unit g` and, if the files are "
-            "from an iPhone, `--accel-sign apple`", folder,
-        )  # fmt: skip
-    elif sign is None and gravity_in_own_file:
+    # If in g without a sign, `check_units` asks for both unless the caller has given them.
+    if sign is None and not (in_g and not accel.unit) and gravity_in_own_file:
         _log.warning(
             "%s: gravity is in a separate file, as Sensor Logger writes it on iPhones, whose sign "
-            "is inverted: if the files are from an iPhone, pass `--accel-sign apple`", folder,
+            "is inverted: if the files are from an iPhone, pass `--accel-sign apple`", files.shown,
         )  # fmt: skip
     if sign == -1.0:
-        _log.info("%s: inverted the accelerometer, which has Apple's sign", folder)
+        _log.info("%s: inverted the accelerometer, which has Apple's sign", files.shown)
     return sign or 1.0
 
 

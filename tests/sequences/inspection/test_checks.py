@@ -125,6 +125,16 @@ def test_a_sampling_rate_out_of_range_is_refused(walk: ImuSequence) -> None:
     assert "found 10 samples/s, expected 50 to 1000" in refusal(slow)
 
 
+@pytest.mark.parametrize(("step", "shared"), [(1.0, "194"), (0.1, "19.9")])
+def test_rounded_times_are_not_taken_for_a_slow_sensor_or_another_unit(
+    walk: ImuSequence, step: float, shared: str
+) -> None:
+    text = refusal(replace(walk.without_truth(), time=np.round(walk.time / step) * step))
+    assert f"found {shared} samples on average at each time" in text
+    assert "export them with fractions of a second" in text
+    assert "t [ms]" not in text
+
+
 def test_recordings_too_short_or_without_finite_samples_are_refused(walk: ImuSequence) -> None:
     assert "duration" in refusal(walk.without_truth().slice(0.0, 1.2))
     check_units(walk.without_truth().slice(0.0, 1.6))

@@ -127,3 +127,45 @@ def test_a_blank_cell_of_a_phones_sensor_loses_only_its_sample(
     assert 0.4 not in read.time.round(6)
     assert np.allclose(read.accel, [0.1, 0.2, 9.5])
     assert "Gyroscope.csv: dropped 1 samples of the gyro with a blank cell" in caplog.text
+
+
+@pytest.mark.parametrize(("separator", "quote"), [(";", ""), ("\t", ""), (";", '"'), (",", '"')])
+def test_decimal_commas_are_read_where_they_do_not_separate_cells(
+    tmp_path: Path, separator: str, quote: str
+) -> None:
+    rows = [
+        separator.join(f"{quote}{cell.replace('.', ',')}{quote}" for cell in row.split(","))
+        for row in ["0," + ROW, *ROWS[1:]]
+    ]
+    path = write(tmp_path / "own.csv", HEADER.replace(",", separator), *rows)
+    assert find_recordings(path) == [path]
+    read = read_recording(path)
+    assert read.time.tolist() == [0.0, 0.01, 0.02, 0.03, 0.04, 0.05]
+    assert np.allclose(read.gyro, [0.1, 0.2, 0.3])
+    assert np.allclose(read.accel, [1.5, 2.5, 9.25])
+
+
+def test_thousands_are_not_taken_for_fractions(tmp_path: Path) -> None:
+    rows = [f'"{time}",0.1,0.2,0.3,1.5,2.5,9.25' for time in ("995", "1,000", "1,005")]
+    with pytest.raises(ReadError, match="line 3, t"):
+        read_recording(write(tmp_path / "own.csv", HEADER.replace("t [s]", "t [ms]"), *rows))
+
+
+@pytest.mark.parametrize("cut", ["0.06,0.1", ""])
+@pytest.mark.parametrize("zeros", [7, 40_000])
+def test_zeros_left_by_a_loss_of_power_are_skipped(
+    tmp_path: Path, cut: str, zeros: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    text = "\n".join([HEADER, *ROWS, cut]).encode()
+    path = tmp_path / "own.csv"
+    path.write_bytes(text + bytes(zeros))
+    assert find_recordings(path) == [path]
+    assert len(read_recording(path)) == len(ROWS)
+    assert f"own.csv: skipped {zeros} zero bytes at the end" in caplog.text
+    folder = phone(tmp_path / "phone", phone_rows(), phone_rows())
+    with (folder / "Gyroscope.csv").open("ab") as file:
+        file.write(cut.encode() + bytes(zeros))
+    assert len(read_recording(folder)) == 60
+    path.write_bytes(text + bytes(3) + b"\n" + text)
+    with pytest.raises(ReadError, match="binary data"):
+        read_recording(path, format="csv")

@@ -14,7 +14,14 @@ from alike import assert_same_samples
 from phone_files import ZYX, field, gravity, ns, save, zyx
 from scipy.spatial.transform import Rotation
 
-from stario.sequences import ImuSequence, ReadError, find_recordings, read_recording
+from stario.sequences import (
+    ImuSequence,
+    InputError,
+    ReadError,
+    check_units,
+    find_recordings,
+    read_recording,
+)
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 
 METADATA = (
@@ -283,7 +290,7 @@ def test_sensors_of_different_rates_are_read_at_the_gyroscopes_rate(
     np.testing.assert_allclose(read.accel[1::2], halfway, atol=1e-6)
 
 
-def test_an_undetermined_accelerometer_sign_gives_a_warning(
+def test_an_undetermined_accelerometer_sign_is_reported(
     walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     iphone(tmp_path / "s", walk)
@@ -294,8 +301,9 @@ def test_an_undetermined_accelerometer_sign_gives_a_warning(
     ios_logger(tmp_path / "t", walk)
     for name in ("Motion.txt", "MotMagnFull.txt"):
         (tmp_path / "t" / name).unlink()
-    read_recording(tmp_path / "t")
-    assert "g` and, if the files are from an iPhone, `--accel-sign apple`" in caplog.text
+    with pytest.raises(InputError, match=r"`--accel-unit g` \(and `--accel-sign apple`"):
+        check_units(read_recording(tmp_path / "t"))
+    assert not caplog.text
 
 
 @pytest.mark.parametrize("code", ["TYPE", "AHRS"])
@@ -369,3 +377,37 @@ def test_a_malformed_json_export_is_refused_in_one_line(
         read_recording(tmp_path / "x.json")
     assert "\n" not in str(error.value)
     assert "stario-" not in str(error.value)
+
+
+@pytest.mark.parametrize("per_second", [10**4, 10**6])  # MT devices and DOTs
+def test_the_clock_of_xsens_is_in_ticks_or_microseconds(tmp_path: Path, per_second: int) -> None:
+    names = [f"{name}_{axis}" for name in ("Acc", "Gyr") for axis in "XYZ"]
+    rows = [f"{k}\t{10**5 + k * per_second // 100}\t0\t0\t9.8\t0\t0\t0" for k in range(200)]
+    path = tmp_path / "MT_0.txt"
+    lines = [
+        "// Update Rate: 100.0Hz",
+        "\t".join(["PacketCounter", "SampleTimeFine", *names]),
+        *rows,
+    ]
+    path.write_text("\n".join(lines) + "\n")
+    read = read_recording(path)
+    assert read.rate == pytest.approx(100.0)
+    assert read.duration == pytest.approx(1.99)
+
+
+def test_a_file_in_g_is_named_by_its_own_name_and_read_without_advice_on_options(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """`check_units` asks for the options, and only if they were not given."""
+    names = [
+        f"{name}.{axis}"
+        for name in ("gravity", "rotationRate", "userAcceleration")
+        for axis in "xyz"
+    ]
+    rows = [f"{0.01 * k:.2f},0,0,-1,0,0,0,0,0,{0.01 * (k % 3)}" for k in range(200)]
+    path = tmp_path / "walk.csv"
+    path.write_text("\n".join([",".join(["timestamp", *names]), *rows]) + "\n")
+    with caplog.at_level("INFO"):
+        read_recording(path)
+    assert "walk.csv: added gravity" in caplog.text
+    assert "--accel-unit" not in caplog.text
