@@ -216,8 +216,8 @@ def preintegrate(
     turn = float(np.linalg.norm(np.cumsum(rate * dt[:, None], axis=0), axis=1).max())
     if turn > _MAX_TURN:
         # gtsam's tangent is singular at a full turn.
-        rate, density = rate * (_MAX_TURN / turn), math.pi / math.sqrt(time[-1] - time[0])
-        densities = [replace(d, gyro_noise=max(d.gyro_noise, density)) for d in densities]
+        rate, unknown = rate * (_MAX_TURN / turn), math.pi / math.sqrt(time[-1] - time[0])
+        densities = [replace(d, gyro_noise=max(d.gyro_noise, unknown)) for d in densities]
     current = densities[0]
     params = _params(current, gravity) if current is noise else _new_params(current, gravity)
     pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(b_a, b_g))
