@@ -9,6 +9,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
+from stario.sequences.inspection.dead_axes import dead_axis_problems
 from stario.sequences.inspection.gyro_axes import GyroAxes, compare_gyro_axes
 from stario.sequences.inspection.magnetic import (
     MagneticFindings,
@@ -213,7 +214,7 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
     if not finite.any():
         raise InputError(f"{sequence.name}: samples", "no finite sample", "numbers")
     given = finite & usable(sequence) if (finite & usable(sequence)).any() else finite
-    problems, axes = sample_problems(sequence), None
+    problems, axes = sample_problems(sequence) + dead_axis_problems(sequence), None
     try:
         check_units(sequence)
         axes = compare_gyro_axes(sequence)
