@@ -15,6 +15,8 @@ from stario.sequences.sequence import (
     FloatArray,
     ImuSequence,
 )
+from stario.sequences.time_order import ahead_mask, increasing_mask
+from stario.sequences.windows import runs
 
 _log = logging.getLogger(__name__)
 
@@ -22,7 +24,10 @@ _OUT_OF_ORDER = 0.05
 """Share of backward steps above which the rows are out of order."""
 
 _SET_BACK = 5.0
-"""A step back by more than this [s] means that the clock was set."""
+"""Late samples that are late by more than this [s] come from a clock that was set back."""
+
+_LATE_SECONDS = 0.5
+"""Duration of late samples in a row [s] beyond which to report them; a few late ones do no harm."""
 
 _LARGE_RAD_S, _LARGE_M_S2 = 3.0, 15.0
 """Smallest maxima taken for a limit: below them, repeated values are coarsely rounded ones."""
@@ -33,14 +38,7 @@ _MIN_LIMIT_SHARE, _MIN_LIMIT_COUNT = 0.005, 3
 
 def sample_problems(sequence: ImuSequence) -> list[str]:
     """Return problems of the samples, one line each; `disorder` reports rows out of order."""
-    time, problems = sequence.time[np.isfinite(sequence.time)], []
-    steps = np.diff(time)
-    if len(steps) and steps.min() < -_SET_BACK and not disorder(time):
-        k = int(np.argmin(steps))
-        problems.append(
-            f"{sequence.name}: time: the clock jumps back by {-steps[k]:.3g} s at "
-            f"{time[k] - time[0]:.1f} s; split the recording there"
-        )
+    problems = _late_problems(sequence)
     invalid = int((np.isfinite(_values(sequence)).all(axis=1) & ~usable(sequence)).sum())
     if invalid:
         count = "1 sample" if invalid == 1 else f"{invalid} samples"
@@ -48,6 +46,29 @@ def sample_problems(sequence: ImuSequence) -> list[str]:
     given = usable(sequence) & np.isfinite(sequence.time)
     samples = sequence.time[given], sequence.gyro[given], sequence.accel[given]
     return problems + stuck_problems(sequence.name, *samples) + _limit_problems(sequence)
+
+
+def _late_problems(sequence: ImuSequence) -> list[str]:
+    """Report the longest run of late samples, as the health of a run does."""
+    time = sequence.time[np.isfinite(sequence.time)]
+    if disorder(time):
+        return []
+    newest = np.maximum.accumulate(time)
+    late = [(float(time[b - 1] - time[a]), a) for a, b in runs(time < newest)]
+    seconds, first = max(late, default=(0.0, 0))
+    if seconds < _LATE_SECONDS:
+        return []
+    by, at = float(newest[first] - time[first]), float(time[first - 1] - time[0])
+    if by > _SET_BACK:
+        return [
+            f"{sequence.name}: time: the clock jumps back by {by:.3g} s at {at:.1f} s; "
+            "split the recording there"
+        ]
+    return [
+        f"{sequence.name}: time: samples come late for {seconds:.1f} s in a row after {at:.1f} s: "
+        f"logged twice, or from a clock that was set back by {by:.3g} s; if so, that time is "
+        "missing: split the recording there"
+    ]
 
 
 def _limit_problems(sequence: ImuSequence) -> list[str]:
@@ -101,6 +122,23 @@ def in_order(sequence: ImuSequence) -> ImuSequence:
     return replace(
         sequence, time=time[order], gyro=sequence.gyro[order], accel=sequence.accel[order]
     )
+
+
+def without_times_ahead(sequence: ImuSequence) -> ImuSequence:
+    """Return the recording without the samples whose times are ahead of those after them.
+
+    One wild time would otherwise count as a gap of years and as a clock that is set back. Rows out
+    of order are kept, for `disorder` to report.
+    """
+    given = np.flatnonzero(np.isfinite(sequence.time))
+    time = sequence.time[given]
+    ahead = ahead_mask(time, increasing_mask(time))
+    if not ahead.any() or disorder(time):
+        return sequence
+    keep = np.ones(len(sequence), dtype=np.bool_)
+    keep[given[ahead]] = False
+    time, gyro, accel = sequence.time[keep], sequence.gyro[keep], sequence.accel[keep]
+    return replace(sequence, time=time, gyro=gyro, accel=accel)
 
 
 def usable(sequence: ImuSequence) -> BoolArray:
