@@ -22,6 +22,7 @@ from stario.fusion.imu.stateful import (
 )
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
+from stario.sequences.inspection.dead_axes import warn_of_dead_axes
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import MAX_IMU_GAP, WINDOW_SECONDS
 
@@ -68,6 +69,7 @@ def preprocess(
         remedy = "pass fixes by name: fixes=[...]"
         raise InputError("progress", f"{progress!r:.60}", "a function of the fraction done", remedy)
     check_units(sequence)
+    warn_of_dead_axes(sequence)
     began = perf_counter()
     intervals, front_end = cut_recording(sequence, config)
     if front_end.start is None or not any(e.window is not None for e in intervals):

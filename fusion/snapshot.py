@@ -46,7 +46,8 @@ fusion.filter.map_frame fusion.filter.network_errors fusion.filter.planar_alignm
 fusion.filter.zero_velocity fusion.fixes fusion.graph.bearing fusion.graph.builder
 fusion.graph.factors fusion.graph.fixed_lag fusion.graph.keyframe_state fusion.graph.keyframes
 fusion.graph.whitening fusion.imu.buffers fusion.imu.front_end fusion.imu.faults
-fusion.imu.intervals fusion.imu.preintegration sequences.attitude.levelling sequences.noise
+fusion.imu.frozen fusion.imu.intervals fusion.imu.preintegration sequences.attitude.levelling
+sequences.noise
 """
 """Modules whose classes a snapshot may hold: plain data, rebuilt from their attributes."""
 

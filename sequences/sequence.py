@@ -20,6 +20,8 @@ from stario.sequences.auxiliary import DeviceAttitude as DeviceAttitude
 from stario.sequences.auxiliary import Magnetometer as Magnetometer
 from stario.sequences.auxiliary import PositionTrack as PositionTrack
 from stario.sequences.errors import InputError
+from stario.sequences.time_order import MAX_IMU_GAP as MAX_IMU_GAP
+from stario.sequences.time_order import ahead_mask, increasing_mask
 
 STANDARD_GRAVITY = 9.80665
 """Default magnitude of gravity [m/s^2]."""
@@ -29,9 +31,6 @@ MAX_TRUTH_GAP = 0.1
 
 MAX_SENSOR_VALUE = 1e5
 """Bound above any sensor's values in any unit used here; also catches infinities."""
-
-MAX_IMU_GAP = 0.1
-"""Longest step [s] between IMU samples that is bridged by interpolation."""
 
 GAP_STEPS = 1.8
 """A step longer than this many median steps has lost a sample."""
@@ -227,8 +226,9 @@ class ImuSequence:
 
     @property
     def duration(self) -> float:
-        """Time between first and last sample [s]."""
-        return float(np.nanmax(self.time) - np.nanmin(self.time))
+        """Time between first and last sample [s], without those ahead of the ones after them."""
+        time = self.time[np.isfinite(self.time)]
+        return float(np.ptp(time[~ahead_mask(time, increasing_mask(time))])) if len(time) else 0.0
 
     @property
     def rate(self) -> float:

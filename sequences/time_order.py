@@ -10,7 +10,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from stario.sequences.sequence import MAX_IMU_GAP, BoolArray, FloatArray
+from stario.sequences.arrays import BoolArray, FloatArray
+
+MAX_IMU_GAP = 0.1
+"""Longest step [s] between IMU samples that is bridged by interpolation."""
 
 LONG_GAP = 10.0
 """A jump ahead by more than this [s] is far, and needs more samples to be confirmed."""
@@ -41,6 +44,12 @@ def increasing_mask(time: FloatArray) -> BoolArray:
     for start, stop in parts:
         kept[start:stop] = np.diff(time[start:stop], prepend=-np.inf) > 0.0
     return kept
+
+
+def ahead_mask(time: FloatArray, kept: BoolArray) -> BoolArray:
+    """Return which of the times (N,) [s] that were not `kept` are ahead of those after them."""
+    newest = np.maximum.accumulate(np.where(kept, time, -np.inf))
+    return np.asarray(time > newest)
 
 
 def _first_refuted(time: FloatArray, parts: list[tuple[int, int]], following: FloatArray) -> int:

@@ -36,7 +36,7 @@ from stario.sequences.sequence import (
     ImuSequence,
     Trajectory,
 )
-from stario.sequences.time_order import increasing_mask
+from stario.sequences.time_order import ahead_mask, increasing_mask
 
 log = logging.getLogger(__name__)
 
@@ -239,9 +239,7 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
     finite &= (np.abs(sequence.accel) < MAX_SENSOR_VALUE).all(axis=1)
     index = np.flatnonzero(finite)
     kept = increasing_mask(sequence.time[index])
-    # Dropped samples that are later than all kept ones before them.
-    newest = np.maximum.accumulate(np.where(kept, sequence.time[index], -np.inf))
-    if ahead := int((sequence.time[index] > newest).sum()):
+    if ahead := int(ahead_mask(sequence.time[index], kept).sum()):
         log.warning("%s: samples ahead of their time dropped: %d", sequence.name, ahead)
     index = index[kept]
     if len(index) < 2:

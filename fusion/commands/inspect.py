@@ -50,8 +50,9 @@ def _inspect(
     from stario.sequences.drawing.plots import imu_overview
     from stario.sequences.files import write_json
     from stario.sequences.inspection.report import inspect_recording
+    from stario.sequences.inspection.samples import without_times_ahead
 
-    found = inspect_recording(sequence)
+    found, sequence = inspect_recording(sequence), without_times_ahead(sequence)
     make_folder(folder)
     fit, rest = found.fit, found.rest
     figure = imu_overview(

@@ -1,12 +1,8 @@
-"""Faults of samples: a clock set back, a frozen sensor, spikes and saturation, gyro in deg/s.
+"""Faults of samples: a clock set back, spikes and saturation, a gyroscope in deg/s.
 
 Clock: single late samples are dropped, and so is a burst in the wrong order. Late samples that
 advance among themselves for seconds come from another clock, and how much time has passed between
 the two is unknown.
-
-Frozen sensor: no real sensor measures the same six numbers for long, since its noise changes the
-last digits. One that does has stopped, and its samples are treated as a gap. Values that have never
-changed are left to the checks of a stream's first second; they may be simulated without noise.
 
 Outliers: a spike is one sample that differs from both its neighbours by more than a carried device
 can cause; it is replaced by their mean. Saturation shows as values of a moving axis that repeat
@@ -21,8 +17,6 @@ so several, with no calm one in between, are needed to refuse the stream.
 """
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 
@@ -80,42 +74,6 @@ class ClockSetBackDetector:
         if time - self._first >= SET_BACK_SECONDS:
             raise ClockSetBackError(newest - self._first)
         return time - self._first
-
-
-_FROZEN_SECONDS = 0.1
-"""Maximum time that values may repeat [s]; loggers repeat slow samples for a few hundredths."""
-
-_FROZEN_RATE, _FROZEN_FORCE = 0.05, 1.5
-"""A coarse sensor at rest repeats values as well: its rate is below the first [rad/s], its force
-within the second of gravity [m/s^2]."""
-
-
-class FrozenSensorDetector:
-    """Detects a sensor that has stopped and repeats its last values.
-
-    Args:
-        gravity: magnitude [m/s^2].
-    """
-
-    def __init__(self, gravity: float) -> None:
-        self._gravity = gravity
-        self._values: tuple[float, ...] = ()
-        self._since = math.inf
-        self._changed = False
-
-    def is_frozen(self, sample: tuple[float, ...]) -> bool:
-        """Return whether a sample (time, gyro, accel) has repeated its values for too long."""
-        time, values = sample[0], sample[1:]
-        if values != self._values:
-            self._changed = bool(self._values)
-            self._values, self._since = values, time
-            return False
-        return self._changed and time - self._since > _FROZEN_SECONDS and not self._looks_at_rest()
-
-    def _looks_at_rest(self) -> bool:
-        gyro, accel = self._values[:3], self._values[3:]
-        off = abs(math.hypot(*accel) - self._gravity)
-        return math.hypot(*gyro) < _FROZEN_RATE and off < _FROZEN_FORCE
 
 
 SPIKE = np.array([12.0, 12.0, 12.0, 60.0, 60.0, 60.0])

@@ -24,10 +24,10 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.buffers import FieldBuffer, WindowBuffer
 from stario.fusion.imu.faults import (
     ClockSetBackDetector,
-    FrozenSensorDetector,
     GyroUnitCheck,
     OutlierDetector,
 )
+from stario.fusion.imu.frozen import FrozenSensorDetector
 from stario.fusion.imu.intervals import Flags, ImuInterval, SampleCounts, Start
 from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
@@ -92,8 +92,8 @@ class FrontEnd:
         if not (math.isfinite(time) and sum(map(abs, sample[1:])) < MAX_SENSOR_VALUE):
             self.counts.not_finite += 1
             return []
-        if self._frozen.is_frozen(sample):
-            self.counts.frozen += 1
+        if stopped := self._frozen.stopped(sample):
+            self.counts.add_frozen(stopped)
             return []
         if self._unconfirmed and time > self._newest:
             self._drop_ahead(time)

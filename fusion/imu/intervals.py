@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stario.fusion.fixes import Fix
+from stario.fusion.imu.frozen import Stopped
 from stario.fusion.state import Health, changed
 from stario.sequences.sequence import FloatArray
 
@@ -183,7 +184,10 @@ class SampleCounts:
     Attributes:
         used: samples used.
         not_finite: dropped: a value is NaN, infinite or absurdly large.
-        frozen: dropped: all values repeat those before, though the device is not at rest.
+        frozen: dropped: the values of both sensors, or of one alone, repeat those before, though
+            the device is not at rest.
+        frozen_gyro: those of them in which the gyroscope alone had stopped.
+        frozen_accel: those of them in which the accelerometer alone had stopped.
         duplicate: dropped: the time repeats the newest.
         out_of_order: dropped: the time is before the newest.
         longest_late: longest duration of consecutive samples out of order [s].
@@ -202,6 +206,8 @@ class SampleCounts:
     used: int = 0
     not_finite: int = 0
     frozen: int = 0
+    frozen_gyro: int = 0
+    frozen_accel: int = 0
     duplicate: int = 0
     out_of_order: int = 0
     longest_late: float = 0.0
@@ -215,6 +221,12 @@ class SampleCounts:
     windows: int = 0
     unfamiliar: int = 0
     set_back: float = 0.0
+
+    def add_frozen(self, stopped: Stopped) -> None:
+        """Count a sample in which sensors had stopped."""
+        self.frozen += 1
+        self.frozen_gyro += stopped == "gyroscope"
+        self.frozen_accel += stopped == "accelerometer"
 
     def add_gap(self, start: float, length: float) -> None:
         """Count a stretch without samples [s]."""
@@ -245,6 +257,15 @@ class SampleCounts:
                 f"samples arrived late for {self.longest_late:.1f} s in a row: logged twice, or "
                 "from a clock that was set back; if so, that time is missing and no sigma covers it"
             )
+        for count, sensor, other in (
+            (self.frozen_gyro, "gyroscope", "accelerometer"),
+            (self.frozen_accel, "accelerometer", "gyroscope"),
+        ):
+            if count:
+                notes.append(
+                    f"the {sensor} stopped: it repeats its value in {count} samples in which the "
+                    f"{other} shows motion; they were dropped"
+                )
         if self.field_dropped > FIELD_DROPS_NOTED:
             notes.append(
                 f"{self.field_dropped} magnetic fields were dropped: the sensor repeated its last "

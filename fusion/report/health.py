@@ -102,10 +102,19 @@ def _is_set_back(note: str) -> bool:
     return "clock was set back" in note
 
 
+def _is_stopped(note: str) -> bool:
+    return " stopped: it repeats" in note
+
+
 def _noted(note: str) -> Finding:
     text = f"{note[:1].upper()}{note[1:]}."
     if _is_set_back(note):
         return Finding("warning", text, "Split the recording there and run each part separately.")
+    if _is_stopped(note):
+        advice = (
+            "Restart the device and record again; if it recurs, the sensor or the app is faulty."
+        )
+        return Finding("warning", text, advice)
     if not _is_unfamiliar(note):
         return Finding("note", text)
     advice = "Fine-tune the weights on recordings of this kind: `stario train --start-from`."
@@ -117,6 +126,8 @@ def _samples(health: Health) -> Iterator[Finding]:
     dropped = {name: n for name, n in health.samples.items() if name != "used" and n}
     if any(map(_is_set_back, health.notes)):
         dropped.pop("out_of_order", None)  # explained by that note
+    if any(map(_is_stopped, health.notes)):
+        dropped.pop("frozen", None)
     count = sum(dropped.values())
     share = count / max(1, used + count)
     amount = f"{share:.1%}" if share >= 0.001 else "Fewer than 0.1%"

@@ -16,7 +16,8 @@ import numpy as np
 
 from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.errors import InputError
-from stario.sequences.inspection.samples import dead_gyro, disorder
+from stario.sequences.inspection.samples import disorder
+from stario.sequences.inspection.stuck import dead_gyro
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 from stario.sequences.truth.fit import fit_truth
 from stario.sequences.units import FAST_RAD_S, GYRO_UNITS, TIME_UNITS

@@ -9,13 +9,18 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
+from stario.sequences.inspection.dead_axes import dead_axis_problems
 from stario.sequences.inspection.gyro_axes import GyroAxes, compare_gyro_axes
 from stario.sequences.inspection.magnetic import (
     MagneticFindings,
     assess_magnetometer,
     magnetic_problems,
 )
-from stario.sequences.inspection.samples import sample_problems, usable
+from stario.sequences.inspection.samples import (
+    sample_problems,
+    usable,
+    without_times_ahead,
+)
 from stario.sequences.inspection.stillness import Rest, find_rest
 from stario.sequences.sequence import (
     GAP_STEPS,
@@ -43,6 +48,7 @@ class Timing:
         samples_lost_in_gaps: number of samples missing there.
         times_repeated: number of samples at the time of the previous one.
         times_backward: number of samples earlier than the previous one.
+        times_ahead: number of samples ahead of those after them; the others do not count these.
         samples_not_finite: number of samples with a time or a value that is not finite.
     """
 
@@ -54,6 +60,7 @@ class Timing:
     samples_lost_in_gaps: int
     times_repeated: int
     times_backward: int
+    times_ahead: int
     samples_not_finite: int
 
 
@@ -169,8 +176,9 @@ class Inspection:
             )
         else:
             lines.append("gaps: none")
+        ahead = f", {t.times_ahead} ahead of their time and left out" if t.times_ahead else ""
         lines.append(
-            f"times: {t.times_repeated} repeated, {t.times_backward} backward; "
+            f"times: {t.times_repeated} repeated, {t.times_backward} backward{ahead}; "
             f"{t.samples_not_finite} non-finite samples"
         )
         return lines
@@ -209,11 +217,12 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
     Raises:
         InputError: the recording holds no finite sample.
     """
+    given, sequence = len(sequence), without_times_ahead(sequence)
     finite = np.isfinite(np.column_stack([sequence.time, sequence.gyro, sequence.accel])).all(1)
     if not finite.any():
         raise InputError(f"{sequence.name}: samples", "no finite sample", "numbers")
-    given = finite & usable(sequence) if (finite & usable(sequence)).any() else finite
-    problems, axes = sample_problems(sequence), None
+    valid = finite & usable(sequence) if (finite & usable(sequence)).any() else finite
+    problems, axes = sample_problems(sequence) + dead_axis_problems(sequence), None
     try:
         check_units(sequence)
         axes = compare_gyro_axes(sequence)
@@ -240,9 +249,9 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
     problems += magnetic_problems(sequence.name, magnetic) if magnetic else ()
     return Inspection(
         name=sequence.name,
-        timing=_timing(sequence, int((~finite).sum())),
-        accel_norm=float(np.linalg.norm(sequence.accel[given], axis=1).mean()),
-        gyro_norm=float(np.linalg.norm(sequence.gyro[given], axis=1).mean()),
+        timing=_timing(sequence, given, int((~finite).sum())),
+        accel_norm=float(np.linalg.norm(sequence.accel[valid], axis=1).mean()),
+        gyro_norm=float(np.linalg.norm(sequence.gyro[valid], axis=1).mean()),
         rest=rest,
         coverage=coverage,
         fit=fit,
@@ -255,14 +264,14 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
     )
 
 
-def _timing(sequence: ImuSequence, not_finite: int) -> Timing:
+def _timing(sequence: ImuSequence, given: int, not_finite: int) -> Timing:
     time = sequence.time[np.isfinite(sequence.time)]
     steps = np.diff(time)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else math.nan
     gaps = np.flatnonzero(steps > GAP_STEPS * usual)
     forward = steps[(steps > 0) & (steps <= GAP_STEPS * usual)]
     return Timing(
-        samples=len(sequence),
+        samples=given,
         duration_s=sequence.duration,
         rate_hz=sequence.rate,
         jitter_s=float(np.median(np.abs(forward - usual))) if len(forward) else math.nan,
@@ -270,6 +279,7 @@ def _timing(sequence: ImuSequence, not_finite: int) -> Timing:
         samples_lost_in_gaps=int(np.round(steps[gaps] / usual - 1.0).sum()) if len(gaps) else 0,
         times_repeated=int((steps == 0).sum()),
         times_backward=int((steps < 0).sum()),
+        times_ahead=given - len(sequence),
         samples_not_finite=not_finite,
     )
 

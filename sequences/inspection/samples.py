@@ -6,8 +6,8 @@ import logging
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from stario.sequences.inspection.stuck import stuck_problems
 from stario.sequences.sequence import (
     MAX_IMU_GAP,
     MAX_SENSOR_VALUE,
@@ -15,7 +15,8 @@ from stario.sequences.sequence import (
     FloatArray,
     ImuSequence,
 )
-from stario.sequences.windows import MIN_RATE, runs
+from stario.sequences.time_order import ahead_mask, increasing_mask
+from stario.sequences.windows import runs
 
 _log = logging.getLogger(__name__)
 
@@ -23,10 +24,10 @@ _OUT_OF_ORDER = 0.05
 """Share of backward steps above which the rows are out of order."""
 
 _SET_BACK = 5.0
-"""A step back by more than this [s] means that the clock was set."""
+"""Late samples that are late by more than this [s] come from a clock that was set back."""
 
-_STUCK_S = 1.0
-"""Time [s] for which a stuck sensor's values repeat exactly; those of others repeat for 0.1 s."""
+_LATE_SECONDS = 0.5
+"""Duration of late samples in a row [s] beyond which to report them; a few late ones do no harm."""
 
 _LARGE_RAD_S, _LARGE_M_S2 = 3.0, 15.0
 """Smallest maxima taken for a limit: below them, repeated values are coarsely rounded ones."""
@@ -34,53 +35,40 @@ _LARGE_RAD_S, _LARGE_M_S2 = 3.0, 15.0
 _MIN_LIMIT_SHARE, _MIN_LIMIT_COUNT = 0.005, 3
 """Minimum share and number of samples at the limit for a report."""
 
-_SHAKEN_M_S2 = 0.5
-_TILTING_RAD_S = 0.1
-"""Scatter of the force, and of the rate perpendicular to it, above which a device moves."""
-
 
 def sample_problems(sequence: ImuSequence) -> list[str]:
     """Return problems of the samples, one line each; `disorder` reports rows out of order."""
-    time, problems = sequence.time[np.isfinite(sequence.time)], []
-    steps = np.diff(time)
-    if len(steps) and steps.min() < -_SET_BACK and not disorder(time):
-        k = int(np.argmin(steps))
-        problems.append(
-            f"{sequence.name}: time: the clock jumps back by {-steps[k]:.3g} s at "
-            f"{time[k] - time[0]:.1f} s; split the recording there"
-        )
+    problems = _late_problems(sequence)
     invalid = int((np.isfinite(_values(sequence)).all(axis=1) & ~usable(sequence)).sum())
     if invalid:
-        samples = "1 sample" if invalid == 1 else f"{invalid} samples"
-        problems.append(f"{sequence.name}: values that no sensor can measure, in {samples}")
-    return problems + _stuck_problems(sequence) + _limit_problems(sequence)
-
-
-def _stuck_problems(sequence: ImuSequence) -> list[str]:
-    """Report a sensor that repeats while the other moves; `check_units` reports a `dead_gyro`."""
+        count = "1 sample" if invalid == 1 else f"{invalid} samples"
+        problems.append(f"{sequence.name}: values that no sensor can measure, in {count}")
     given = usable(sequence) & np.isfinite(sequence.time)
-    time, gyro, accel = sequence.time[given], sequence.gyro[given], sequence.accel[given]
-    problems = []
-    for sensor, values, other, moves in (
-        ("gyroscope", gyro, "accelerometer", _shaken),
-        ("accelerometer", accel, "gyroscope", _tilting),
-    ):
-        repeated = np.asarray(~np.diff(values, axis=0).any(axis=1))
-        stuck = [
-            (float(time[a] - time[0]), float(time[b] - time[0]))
-            for a, b in runs(repeated)
-            if time[b] - time[a] >= _STUCK_S
-            and b - a >= MIN_RATE * _STUCK_S  # in another unit two samples make a second
-            and moves(time[a : b + 1], gyro[a : b + 1], accel[a : b + 1])
+    samples = sequence.time[given], sequence.gyro[given], sequence.accel[given]
+    return problems + stuck_problems(sequence.name, *samples) + _limit_problems(sequence)
+
+
+def _late_problems(sequence: ImuSequence) -> list[str]:
+    """Report the longest run of late samples, as the health of a run does."""
+    time = sequence.time[np.isfinite(sequence.time)]
+    if disorder(time):
+        return []
+    newest = np.maximum.accumulate(time)
+    late = [(float(time[b - 1] - time[a]), a) for a, b in runs(time < newest)]
+    seconds, first = max(late, default=(0.0, 0))
+    if seconds < _LATE_SECONDS:
+        return []
+    by, at = float(newest[first] - time[first]), float(time[first - 1] - time[0])
+    if by > _SET_BACK:
+        return [
+            f"{sequence.name}: time: the clock jumps back by {by:.3g} s at {at:.1f} s; "
+            "split the recording there"
         ]
-        if stuck and not (moves is _shaken and repeated.all()):
-            start, stop = max(stuck, key=lambda stretch: stretch[1] - stretch[0])
-            problems.append(
-                f"{sequence.name}: {sensor}: its values repeat exactly for "
-                f"{sum(b - a for a, b in stuck):.1f} s while the {other} shows motion, "
-                f"longest from {start:.1f} to {stop:.1f} s"
-            )
-    return problems
+    return [
+        f"{sequence.name}: time: samples come late for {seconds:.1f} s in a row after {at:.1f} s: "
+        f"logged twice, or from a clock that was set back by {by:.3g} s; if so, that time is "
+        "missing: split the recording there"
+    ]
 
 
 def _limit_problems(sequence: ImuSequence) -> list[str]:
@@ -106,31 +94,6 @@ def _limit_problems(sequence: ImuSequence) -> list[str]:
                 f"{limit:.3g} {unit}: stronger motion was not recorded"
             )
     return problems
-
-
-def dead_gyro(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
-    """Return whether the rate (n, 3) is constant and the force (n, 3) contradicts it."""
-    return not np.diff(gyro, axis=0).any() and _shaken(time, gyro, accel)
-
-
-def _shaken(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
-    """Return whether a force (n, 3) contradicts both rest and steady rotation at the first rate.
-
-    In steady rotation the force is constant, in the device's axes (moving in a circle) or in the
-    world's (turning in place).
-    """
-    turned = Rotation.from_rotvec(np.outer(time - time[0], gyro[0])).apply(accel)
-    scatter = min(float(np.linalg.norm(force.std(axis=0))) for force in (accel, turned))
-    return scatter > _SHAKEN_M_S2
-
-
-def _tilting(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
-    """Return whether the rate (n, 3) perpendicular to the force varies.
-
-    A constant force rules that out.
-    """
-    up = accel[0] / max(float(np.linalg.norm(accel[0])), 1e-9)
-    return float(np.linalg.norm(np.cross(gyro, up).std(axis=0))) > _TILTING_RAD_S
 
 
 def disorder(time: FloatArray) -> str:
@@ -159,6 +122,23 @@ def in_order(sequence: ImuSequence) -> ImuSequence:
     return replace(
         sequence, time=time[order], gyro=sequence.gyro[order], accel=sequence.accel[order]
     )
+
+
+def without_times_ahead(sequence: ImuSequence) -> ImuSequence:
+    """Return the recording without the samples whose times are ahead of those after them.
+
+    One wild time would otherwise count as a gap of years and as a clock that is set back. Rows out
+    of order are kept, for `disorder` to report.
+    """
+    given = np.flatnonzero(np.isfinite(sequence.time))
+    time = sequence.time[given]
+    ahead = ahead_mask(time, increasing_mask(time))
+    if not ahead.any() or disorder(time):
+        return sequence
+    keep = np.ones(len(sequence), dtype=np.bool_)
+    keep[given[ahead]] = False
+    time, gyro, accel = sequence.time[keep], sequence.gyro[keep], sequence.accel[keep]
+    return replace(sequence, time=time, gyro=gyro, accel=accel)
 
 
 def usable(sequence: ImuSequence) -> BoolArray:

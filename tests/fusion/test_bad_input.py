@@ -421,3 +421,10 @@ def test_a_tenth_of_a_second_without_samples_hardly_changes_the_end(
         assert off < 0.02 * walk.truth.path_length()
         turned = track.attitude_WB[-1] * whole.attitude_WB[-1].inv()
         assert abs(np.degrees(turned.as_rotvec()[2])) < 3.0
+
+
+def test_a_dead_axis_is_logged_once_per_run(
+    walk: ImuSequence, still_model: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    Navigator(still_model).run(replace(walk, gyro=walk.gyro * [1.0, 1.0, 0.0]))
+    assert caplog.text.count("its z axis never changes") == 1

@@ -26,6 +26,7 @@ from stario.sequences.datasets.stream_cache import recording_key
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_write
 from stario.sequences.inspection.checks import check_units
+from stario.sequences.inspection.dead_axes import warn_of_dead_axes
 from stario.sequences.legs import gaps_and_jumps
 from stario.sequences.levelled_stream import LevelledStream, levelled_streams
 from stario.sequences.sequence import (
@@ -96,6 +97,7 @@ def prepare(sequence: ImuSequence, path: Path) -> Prepared:
         InputError: there is no truth of any kind, no unbroken stretch of 2 s, or a wrong unit.
     """
     check_units(sequence)
+    warn_of_dead_axes(sequence)
     streams = levelled_streams(sequence)
     if not streams:
         raise InputError(f"{sequence.name}: samples", "no unbroken stretch", "one of 2 s")

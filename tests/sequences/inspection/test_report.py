@@ -90,6 +90,31 @@ def test_gaps_and_wrong_times_are_counted(walk: ImuSequence) -> None:
     assert timing.jitter_s < 1e-9
 
 
+def test_one_wild_time_is_counted_and_nothing_else(
+    walk: ImuSequence, caplog: pytest.LogCaptureFixture
+) -> None:
+    for wild in (1e9, -1e9):
+        time = walk.time.copy()
+        time[1000] = wild
+        found = inspect_recording(replace(walk, time=time))
+        assert found.problems == ()
+        assert found.timing.times_ahead + found.timing.times_backward == 1
+        assert found.timing.samples == len(walk)
+        assert "ahead" not in caplog.text
+        if wild > 0.0:
+            assert found.timing.duration_s == pytest.approx(walk.duration)
+            assert found.timing.samples_lost_in_gaps == 1
+            assert any("1 ahead of their time" in line for line in found.lines())
+
+
+@pytest.mark.parametrize("by", [3.0, 100.0])
+def test_a_clock_set_back_is_a_problem(walk: ImuSequence, by: float) -> None:
+    time = np.where(walk.time >= 10.0, walk.time - by, walk.time)
+    text = " ".join(inspect_recording(replace(walk.without_truth(), time=time)).problems)
+    assert f"back by {by - 0.01:.3g} s" in text
+    assert "split the recording there" in text
+
+
 @pytest.mark.parametrize(
     ("corrupt", "option"),
     [
