@@ -41,8 +41,8 @@ _OFFSET_GAIN = 0.5
 """Share of the latest outlier's residual in the alternative's offset, which may turn with the
 device."""
 
-_OFFSET_SCALE = 4.0
-"""Factor on the covariance of a displacement less the offset, which is not known exactly either."""
+_OFFSET_SCALE = 10.0
+"""Factor on the covariance of a displacement less the offset, which comes from such residuals."""
 
 _ALTERNATIVE_GATE = 0.95
 """Probability of the chi-square test beyond which a displacement does not fit the alternative."""
