@@ -15,7 +15,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from stario.fusion.checked import check_type
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.estimates import (
     ASSUMED,
@@ -39,6 +38,7 @@ from stario.fusion.graph.fixed_lag import FixedLagEstimator
 from stario.fusion.imu.intervals import Start
 from stario.fusion.recording import PreprocessedRecording, Progress
 from stario.fusion.state import NavState, Track, track_from_states
+from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import Trajectory
 

@@ -14,23 +14,6 @@ Vector = Sequence[float] | FloatArray
 """Three numbers."""
 
 
-def check_type(name: str, value: object, kind: type, otherwise: str | None = "") -> None:
-    """Check the type of an argument.
-
-    Args:
-        name: name of the argument.
-        value: value given.
-        kind: required type.
-        otherwise: how to obtain a value of that type; None if the argument may be None.
-
-    Raises:
-        InputError: the type differs; names the argument.
-    """
-    if not (isinstance(value, kind) or (otherwise is None and value is None)):
-        expected = f"a value of type {kind.__name__}" + (" or None" if otherwise is None else "")
-        raise InputError(name, f"{value!r:.60}", expected, otherwise or "")
-
-
 def shaped(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
     """Return a copy of `value` as float64 of the given shape.
 

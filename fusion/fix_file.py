@@ -41,7 +41,8 @@ def read_fixes(path: Path | str) -> list[Fix]:
     """Read fixes from a CSV file in the format described at the top of this module.
 
     Raises:
-        ReadError: the file cannot be read, or its header or a line is invalid; names the line.
+        ReadError: the file cannot be read, its header or a line is invalid, or it holds no fix;
+            names line and column.
     """
     path = Path(path)
     try:
@@ -54,17 +55,33 @@ def read_fixes(path: Path | str) -> list[Fix]:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ReadError(path, "file", str(error), "a readable CSV of fixes") from error
     header = [_without_unit(word).lower() for word in rows[0]] if rows else []
-    unknown = [word for word in header if word not in _COLUMNS]
-    missing = [word for word in _REQUIRED if word not in header]
-    if unknown or missing or len(set(header)) < len(header):
-        found = ",".join(header) or "nothing"
+    for number, row in enumerate(rows, start=1):
+        if row and row[0].lstrip().startswith("#"):
+            expected = "only the header and fixes"
+            raise ReadError(path, f"line {number}", "a comment", expected, "remove it")
+    if found := _wrong_column(header):
         raise ReadError(path, "line 1", found, f"the header {','.join(_COLUMNS)}")
     fixes = []
     for number, row in enumerate(rows[1:], start=2):
         if any(word.strip() for word in row):
             cells = [word.strip().replace(decimal, ".") for word in row]
             fixes.append(_read_row(path, f"line {number}", header, cells))
+    if not fixes:
+        raise ReadError(path, "file", "a header only", "at least one fix")
     return fixes
+
+
+def _wrong_column(header: Sequence[str]) -> str:
+    """Return in words which column is unknown, missing or given twice; empty if none is."""
+    if not header:
+        return "nothing"
+    for word in header:
+        if word not in _COLUMNS:
+            return f"an unknown column {word!r}"
+        if header.count(word) > 1:
+            return f"two columns {word!r}"
+    missing = [word for word in _REQUIRED if word not in header]
+    return f"no column {missing[0]!r}" if missing else ""
 
 
 def _without_unit(title: str) -> str:

@@ -16,8 +16,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from stario.fusion.checked import check_type, floored, shaped
+from stario.fusion.checked import floored, shaped
 from stario.fusion.state import Health
+from stario.sequences.arrays import check_type
 from stario.sequences.sequence import FloatArray
 
 FixKind = Literal["position", "yaw", "velocity"]

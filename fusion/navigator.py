@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stario.fusion.backends import BACKENDS, BackendName, StreamEstimator, track_recording
-from stario.fusion.checked import Vector, check_type, seconds, three
+from stario.fusion.checked import Vector, seconds, three
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.continuous import ContinuousPose, advanced, copied
 from stario.fusion.filter.initial import PriorPose
@@ -28,6 +28,7 @@ from stario.fusion.imu.stateful import Predictor, StatefulInference, displacemen
 from stario.fusion.recording import PreprocessedRecording, Progress, preprocess
 from stario.fusion.snapshot import check_same, pack, unpack
 from stario.fusion.state import Health, NavState, SmoothedPose, Track
+from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 
@@ -64,8 +65,8 @@ class Navigator:
         if not hasattr(model, "predict") or isinstance(model, type):
             remedy = "load_model(name) returns one"
             raise InputError("model", repr(model), "a model with `predict`", remedy)
-        check_type("config", config, NavigatorConfig, None)
-        check_type("prior", prior, PriorPose, None)
+        check_type("config", config, NavigatorConfig, optional=True)
+        check_type("prior", prior, PriorPose, optional=True)
         self.backend = backend
         self.model = model
         self.prior = prior

@@ -9,7 +9,6 @@ from time import perf_counter
 
 import numpy as np
 
-from stario.fusion.checked import check_type
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
@@ -20,6 +19,7 @@ from stario.fusion.imu.stateful import (
     StatefulInference,
     displacements_of,
 )
+from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.inspection.dead_axes import warn_of_dead_axes

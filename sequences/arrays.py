@@ -31,13 +31,54 @@ def number_in(text: str) -> float:
         return float("nan")
 
 
+def check_type(
+    name: str, value: object, kind: type, remedy: str = "", optional: bool = False
+) -> None:
+    """Check the type of an argument.
+
+    Args:
+        name: name of the argument.
+        value: value given.
+        kind: required type.
+        remedy: how to obtain a value of that type.
+        optional: whether the argument may be None.
+
+    Raises:
+        InputError: the type differs; names the argument.
+    """
+    if not (isinstance(value, kind) or (optional and value is None)):
+        expected = f"a value of type {kind.__name__}" + (" or None" if optional else "")
+        raise InputError(name, shown(value), expected, remedy)
+
+
+def shown(value: object) -> str:
+    """Return a value as text for an error's single line."""
+    return f"{' '.join(repr(value).split()):.60}"
+
+
+def numbers(name: str, value: object) -> FloatArray:
+    """Return an array-like as float64.
+
+    Raises:
+        InputError: it holds dates, text or rows of unequal length; names it.
+    """
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind not in "Mm":
+            return np.asarray(array, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(name, shown(value), "an array of numbers") from None
+    remedy = f"({name} - {name}[0]) / np.timedelta64(1, 's') gives seconds since the first"
+    raise InputError(name, f"values of type {array.dtype}", "numbers", remedy)
+
+
 def checked_time(name: str, value: FloatArray) -> FloatArray:
     """Return times (N,) [s], checked to be finite and strictly increasing.
 
     Raises:
         InputError: a time is not finite, or the times do not strictly increase.
     """
-    time = np.asarray(value, dtype=np.float64)
+    time = numbers(name, value)
     if time.ndim != 1 or time.size == 0:
         raise InputError(name, f"shape {time.shape}", "(N,) with at least one sample")
     if not np.isfinite(time).all():
@@ -59,7 +100,7 @@ def checked_array(
     Raises:
         InputError: the shape differs, or a row at `where` has a value that is not finite.
     """
-    array = np.asarray(value, dtype=np.float64)
+    array = numbers(name, value)
     if array.shape != shape:
         raise InputError(name, f"shape {array.shape}", f"{shape}")
     bad = ~np.isfinite(array.reshape(len(array), -1)).all(axis=1) & where

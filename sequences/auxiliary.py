@@ -8,7 +8,7 @@ from typing import Literal, Self
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import BoolArray, FloatArray, checked_array, checked_time
+from stario.sequences.arrays import BoolArray, FloatArray, check_type, checked_array, checked_time
 from stario.sequences.errors import InputError
 
 
@@ -29,6 +29,9 @@ class _Timed:
         return replace(self, **{k: v[keep] for k, v in vars(self).items() if k != "kind"})
 
 
+_KINDS = ("positions", "waypoints")
+
+
 @dataclass(frozen=True, eq=False)
 class PositionTrack(_Timed):
     """Known positions without attitude: a position track, or waypoints that the user passed.
@@ -40,7 +43,8 @@ class PositionTrack(_Timed):
         valid: (N,) bool, False where the position must not be used; all True by default.
 
     Raises:
-        InputError: lengths differ, time does not increase, or a valid value is not finite.
+        InputError: lengths differ, time does not increase, a valid value is not finite, or the kind
+            is another.
     """
 
     position_W: FloatArray
@@ -48,6 +52,8 @@ class PositionTrack(_Timed):
     valid: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
 
     def __post_init__(self) -> None:
+        if self.kind not in _KINDS:
+            raise InputError("positions' kind", repr(self.kind), f"one of {', '.join(_KINDS)}")
         time = checked_time("positions' time", self.time)
         valid = np.asarray(self.valid, dtype=np.bool_)
         valid = np.ones(len(time), dtype=np.bool_) if valid.size == 0 else valid
@@ -103,6 +109,8 @@ class DeviceAttitude(_Timed):
 
     def __post_init__(self) -> None:
         time = checked_time("device attitude's time", self.time)
+        remedy = "Rotation.from_quat(quat_xyzw)"
+        check_type("device attitude's attitude_WB", self.attitude_WB, Rotation, remedy)
         if len(self.attitude_WB) != len(time):
             found = f"{len(self.attitude_WB)} rotations"
             raise InputError("device attitude", found, f"{len(time)} as time")

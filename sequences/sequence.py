@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from stario.sequences.arrays import BoolArray as BoolArray
 from stario.sequences.arrays import FloatArray as FloatArray
-from stario.sequences.arrays import checked_array, checked_time, interpolated
+from stario.sequences.arrays import check_type, checked_array, checked_time, interpolated, numbers
 from stario.sequences.auxiliary import DeviceAttitude as DeviceAttitude
 from stario.sequences.auxiliary import Magnetometer as Magnetometer
 from stario.sequences.auxiliary import PositionTrack as PositionTrack
@@ -52,7 +52,8 @@ class Trajectory:
         valid: (N,) bool, False where the pose must not be used (glitch, gap); all True by default.
 
     Raises:
-        InputError: lengths differ, time does not increase, or a valid value is not finite.
+        InputError: lengths differ, time does not increase, a valid value is not finite, or a value
+            has the wrong type.
     """
 
     time: FloatArray
@@ -69,6 +70,7 @@ class Trajectory:
         valid = np.ones(n, dtype=np.bool_) if valid.size == 0 else valid
         if valid.shape != (n,):
             raise InputError("valid", f"shape {valid.shape}", f"({n},) as time")
+        check_type("attitude_WB", self.attitude_WB, Rotation, "Rotation.from_quat(quat_xyzw)")
         if len(self.attitude_WB) != n:
             raise InputError("attitude_WB", f"{len(self.attitude_WB)} rotations", f"{n} as time")
         arrays: dict[str, Any] = {"time": time, "valid": valid}
@@ -193,7 +195,8 @@ class ImuSequence:
         source: format or app of the recording, for display.
 
     Raises:
-        InputError: the arrays' shapes do not agree or there is no sample.
+        InputError: the arrays' shapes do not agree, there is no sample, time, gyro or accel holds
+            anything but numbers, or another part has the wrong type.
     """
 
     name: str
@@ -209,12 +212,15 @@ class ImuSequence:
     source: str = ""
 
     def __post_init__(self) -> None:
-        time = np.asarray(self.time, dtype=np.float64)
+        for name, kind in _PARTS.items():
+            remedy = f"create one with {kind.__name__}(...)"
+            check_type(name, getattr(self, name), kind, remedy, optional=True)
+        time = numbers("time", self.time)
         if time.ndim != 1 or time.size == 0:
             raise InputError("time", f"shape {time.shape}", "(N,) with at least one sample")
         arrays = {"time": time}
         for name in ("gyro", "accel"):
-            value = np.asarray(getattr(self, name), dtype=np.float64)
+            value = numbers(name, getattr(self, name))
             if value.shape != (len(time), 3):
                 raise InputError(name, f"shape {value.shape}", f"({len(time)}, 3) as time")
             arrays[name] = value
@@ -279,6 +285,14 @@ class ImuSequence:
             positions=None if positions is None else positions.slice(start, stop),
             device_attitude=None if own is None else own.slice(start, stop),
         )
+
+
+_PARTS: dict[str, type] = {
+    "truth": Trajectory,
+    "magnetometer": Magnetometer,
+    "positions": PositionTrack,
+    "device_attitude": DeviceAttitude,
+}
 
 
 def is_gap(steps: FloatArray, longest: float = MAX_TRUTH_GAP) -> BoolArray:

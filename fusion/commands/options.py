@@ -155,7 +155,11 @@ class EstimatorOptions:
     ] = None
 
     def settings(self) -> NavigatorConfig:
-        """Return the navigator's settings."""
+        """Return the navigator's settings.
+
+        Raises:
+            InputError: there is a declination, but the magnetometer is not used.
+        """
         from stario.fusion.config import NavigatorConfig, read_config
 
         config = NavigatorConfig() if self.config is None else read_config(self.config)
@@ -163,6 +167,8 @@ class EstimatorOptions:
         if not self.magnetometer:
             chosen = replace(chosen, magnetometer=False)
         if self.declination is not None:
+            unused = {"--declination": not chosen.magnetometer}
+            refuse_unused(unused, "with --no-magnetometer", "use with the magnetometer")
             chosen = replace(chosen, declination=math.radians(self.declination))
         return replace(config, filter=chosen)
 

@@ -144,6 +144,13 @@ def train(
         recipe.shares,
         recipe.reach,
     )
+    if recorded_only and material.legs and not material.streams:
+        raise InputError(
+            "--recorded-only",
+            "only positions or waypoints to learn from",
+            "some recordings with poses",
+            "omit it: the poses of simulated walks will do",
+        )
     validation_data = mix_sources(held_out, [])
     if recorded and not (validation_data.streams or validation_data.legs):
         raise InputError(

@@ -80,7 +80,9 @@ def write_recording(folder: Path, comparison: Comparison, config: NavigatorConfi
     make_folder(inner)
     written = _track_files(inner, comparison)
     truth = comparison.sequence.truth
-    if truth is not None:
+    if truth is None:
+        (inner / "truth.tum").unlink(missing_ok=True)  # of an earlier run into this folder
+    else:
         write_tum(inner / "truth.tum", truth)
         written.append(inner / "truth.tum")
     return written + _figures(inner, comparison, comparison.tracks["ekf"])
@@ -133,6 +135,8 @@ def _figures(folder: Path, found: Comparison, track: Track) -> list[Path]:
     if drawn is not None and len(drawn.time):
         values = drawn.time, drawn.residual_W, drawn.sigma, drawn.nis, drawn.gated
         figures["innovations.png"] = innovations(*values, f"{name}: innovations")
+    for file in {"error.png", "innovations.png"} - figures.keys():
+        (folder / file).unlink(missing_ok=True)  # of an earlier run into this folder
     for file, figure in figures.items():
         save_figure(figure, folder / file)
     return [folder / file for file in figures]

@@ -34,6 +34,10 @@ YAW_SIGMA = math.radians(15.0)
 LOST_YAW_SIGMA = 1.5
 """Yaw sigma beyond which the yaw is unknown [rad], not drifted: standing still does not help."""
 
+_APART = "at least six times their sigma apart"
+"""How far apart two positions determine the direction (`filter.map_frame.MAX_POSITION_YAW_SIGMA`):
+the root of two over that sigma, and some more for the drift between them."""
+
 LONG_GAP = 1.0
 """Length of a gap [s] after which the heading is no longer known."""
 
@@ -215,7 +219,7 @@ def _fixes(health: Health) -> Iterator[Finding]:
     wrong = refused or other.get("gated", 0) > GATED_SHARE * applied
     advice = "Check the fixes' clock, frame, units and sigmas." if wrong else ""
     if not wrong and other.get("yaw not known", 0) > applied:
-        advice = "Positions give the heading once you have walked some metres; so does a yaw fix."
+        advice = f"Two positions {_APART} give the heading; so does a yaw fix."
     yield Finding("warning" if wrong else "note", f"{text}; {reasons}.", advice)
 
 
@@ -223,10 +227,11 @@ def _direction(health: Health) -> Iterator[Finding]:
     yaw = health.final_sigma.get("yaw_rad", 0.0)
     if yaw > YAW_SIGMA:
         text = f"The heading is known only to {math.degrees(yaw):.0f} degrees (1 sigma)."
-        advice = "A yaw fix or two position fixes determine it."
+        advice = f"A yaw fix or two position fixes {_APART} determine it."
         if health.longest_gap < LONG_GAP and yaw < LOST_YAW_SIGMA:
             advice = (
-                "Keep still for two seconds now and then; a yaw fix or two position fixes help too."
+                "Keep still for two seconds now and then; a yaw fix or two position fixes "
+                f"{_APART} help too."
             )
         yield Finding("warning", text, advice)
 

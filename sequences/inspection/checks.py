@@ -14,6 +14,7 @@ import math
 
 import numpy as np
 
+from stario.sequences.arrays import check_type
 from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.samples import disorder
@@ -74,8 +75,10 @@ def check_units(sequence: ImuSequence) -> None:
     Raises:
         InputError: it is too short or holds no number, time is in another unit, the gyroscope is
             dead or in deg/s, the accelerometer is in g, lacks gravity or has the opposite sign
-            (detected only with a true attitude). The text names the option that fixes it.
+            (detected only with a true attitude). The text names the option that fixes it. Or
+            `sequence` has the wrong type.
     """
+    check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
     _check_content(sequence)
     _check_time(sequence)
     time, gyro, accel = clean_samples(sequence)

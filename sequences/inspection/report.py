@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.inspection.dead_axes import dead_axis_problems
@@ -215,8 +216,9 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
     """Inspect a recording; problems are returned, not raised.
 
     Raises:
-        InputError: the recording holds no finite sample.
+        InputError: the recording holds no finite sample, or `sequence` has the wrong type.
     """
+    check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
     given, sequence = len(sequence), without_times_ahead(sequence)
     finite = np.isfinite(np.column_stack([sequence.time, sequence.gyro, sequence.accel])).all(1)
     if not finite.any():

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stario.sequences.arrays import check_type
 from stario.sequences.files import atomic_write
 from stario.sequences.readers.columns import HEADER, IMU, MAGNETIC_HEADER, TRUTH_HEADER
 from stario.sequences.sequence import FloatArray, ImuSequence
@@ -19,8 +20,9 @@ def write_csv(path: Path | str, sequence: ImuSequence) -> None:
     have no column. The reader counts time from the first IMU sample.
 
     Raises:
-        InputError: the folder does not exist.
+        InputError: the folder does not exist, or `sequence` has the wrong type.
     """
+    check_type("sequence", sequence, ImuSequence, "call write_csv(path, sequence)")
     truth, field = sequence.truth, sequence.magnetometer
     header, rows = HEADER, _Written(sequence)
     if field is not None:

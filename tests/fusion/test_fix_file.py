@@ -42,6 +42,12 @@ def test_a_file_of_fixes_is_read(tmp_path: Path) -> None:
         (HEADER + "1,position,1,2,3,0,,\n", "sigma.*> 0"),
         (HEADER + "1,position,1,2,nan,1,,\n", "line 2, z.*nan"),
         (HEADER + "1,position,1,2,3,1,1,1,1\n", "9 values"),
+        (HEADER.strip() + ",note\n1,position,1,2,3,1,1,1,a\n", "line 1.*unknown column 'note'"),
+        ("t,kind,x,y\n1,position,1,2\n", "line 1.*no column 'sx'"),
+        ("t,kind,x,y,y,sx\n1,position,1,2,2,1\n", "line 1.*two columns 'y'"),
+        ("# mine\n" + HEADER + "1,position,1,2,3,1,,\n", "line 1: found a comment.*remove"),
+        (HEADER + "# first\n1,position,1,2,3,1,,\n", "line 2: found a comment.*remove"),
+        (HEADER + "\n", "a header only, expected at least one fix"),
     ],
 )
 def test_an_invalid_file_raises_an_error_that_names_line_and_field(

@@ -12,6 +12,7 @@ import pytest
 from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
+from stario.sequences.sequence import PositionTrack
 
 
 @pytest.mark.parametrize(
@@ -141,6 +142,7 @@ def test_invalid_arguments_give_a_one_line_error(
         ("check faults RECORDING --where person=dan", "--where one recording"),
         ("check table --out cells --set a=. --sets oxiod", "--sets without --data"),
         ("check table --out cells --set a=. --per-group 3", "--per-group without --data"),
+        ("run RECORDING --declination 5 --no-magnetometer", "--declination --no-magnetometer"),
         ("train RECORDING --recorded-only --generated 5", "--generated with --recorded-only"),
         ("train --generated 1 --gyro-unit deg/s", "--gyro-unit without recordings"),
         ("train RECORDING --leave-out ridi", "--leave-out without --data"),
@@ -216,3 +218,15 @@ def test_a_missing_package_ends_a_batch_instead_of_leaving_out_recordings(
     monkeypatch.setitem(sys.modules, "h5py", None)
     done = stario(command, recording, where, "--out", "out")
     done.assert_one_line_error("h5py", "not installed", "stario[readers]")
+
+
+def test_waypoints_alone_cannot_be_all_recorded_data(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    sequence = read_generic_csv(recording)
+    truth = sequence.truth
+    legs = slice(None, None, len(truth) // 8)
+    known = PositionTrack(truth.time[legs], truth.position_W[legs], "waypoints")
+    write_csv(tmp_path / "legs.csv", replace(sequence, truth=None, positions=known))
+    done = stario("train", "legs.csv", "--validation", recording, "--recorded-only", "--out", "o")
+    done.assert_one_line_error("--recorded-only", "omit it")

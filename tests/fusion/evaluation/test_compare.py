@@ -196,6 +196,16 @@ def test_a_run_writes_its_files(tmp_path: Path, compared: Comparison, walk: ImuS
     assert health == json.loads(json.dumps(asdict(track.health)))
 
 
+def test_figures_of_an_earlier_run_with_truth_do_not_stay(
+    tmp_path: Path, compared: Comparison, walk: ImuSequence
+) -> None:
+    (tmp_path / "error.png").touch()
+    track = compared.tracks["ekf"]
+    blind = Comparison(walk.without_truth(), {"ekf": track}, {"ekf": {}})
+    files = write_run(tmp_path, blind, CONFIG)
+    assert sorted(files) == sorted(tmp_path.iterdir())
+
+
 def test_a_folder_that_cannot_be_created_raises_a_stario_error(
     tmp_path: Path, compared: Comparison
 ) -> None:

@@ -88,6 +88,7 @@ def test_standing_still_is_advised_only_where_the_yaw_drifts(
     health = Health(mean_nis=3.0, longest_gap=gap, final_sigma={"yaw_rad": yaw_sigma})
     advice = findings(health)[-1].advice
     assert "yaw fix" in advice
+    assert "six times their sigma apart" in advice
     assert ("still" in advice) == helps
 
 
@@ -106,7 +107,7 @@ def test_an_unusable_magnetic_field_is_reported() -> None:
 def test_standing_with_a_receiver_is_not_a_warning() -> None:
     standing = Health(fixes={"applied": 2, "yaw not known": 580})
     assert not warnings_of(standing)
-    assert any("walked" in line for line in health_lines(standing))
+    assert any("six times their sigma apart" in line for line in health_lines(standing))
 
 
 @pytest.mark.skipif(not BAGS.is_dir(), reason=f"no recordings at {BAGS}")

@@ -1,0 +1,61 @@
+"""Wrong arguments are refused at once, by name, with what was expected."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stario.sequences import (
+    DeviceAttitude,
+    ImuSequence,
+    InputError,
+    Magnetometer,
+    PositionTrack,
+    Trajectory,
+    check_units,
+    inspect_recording,
+    write_csv,
+)
+
+TIME = np.arange(200) / 100.0
+SEQUENCE = ImuSequence("s", TIME, np.zeros((200, 3)), np.tile([0.0, 0.0, 9.8], (200, 1)))
+ROWS = np.zeros((200, 3))
+DATES = np.datetime64("2026-01-01") + (1e9 * TIME).astype("timedelta64[ns]")
+
+
+@pytest.mark.parametrize(
+    ("make", "field", "text"),
+    [
+        (lambda: replace(SEQUENCE, truth=ROWS), "truth", "Trajectory"),
+        (lambda: replace(SEQUENCE, magnetometer=(TIME, ROWS)), "magnetometer", "Magnetometer(...)"),
+        (lambda: replace(SEQUENCE, positions=ROWS), "positions", "PositionTrack"),
+        (lambda: replace(SEQUENCE, device_attitude=ROWS), "device_attitude", "DeviceAttitude"),
+        (lambda: replace(SEQUENCE, time=DATES), "time", "np.timedelta64(1, 's')"),
+        (lambda: replace(SEQUENCE, gyro="fast"), "gyro", "an array of numbers"),
+        (lambda: replace(SEQUENCE, accel=[[1.0], [1.0, 2.0]]), "accel", "an array of numbers"),
+        (lambda: PositionTrack(TIME, ROWS, "foo"), "positions' kind", "positions, waypoints"),
+        (lambda: PositionTrack(DATES, ROWS, "positions"), "positions' time", "np.timedelta64"),
+        (lambda: Magnetometer(TIME, "north"), "magnetic field", "an array of numbers"),
+        (lambda: Trajectory(TIME, ROWS, np.zeros((200, 4))), "attitude_WB", "Rotation.from_quat"),
+        (lambda: DeviceAttitude(TIME, ROWS), "device attitude's attitude_WB", "Rotation"),
+        (lambda: write_csv(SEQUENCE, Path("s.csv")), "sequence", "write_csv(path, sequence)"),
+        (lambda: inspect_recording("x"), "sequence", "read_recording(path)"),
+        (lambda: check_units("x"), "sequence", "read_recording(path)"),
+    ],
+)
+def test_a_wrong_argument_is_named(make: Callable[[], Any], field: str, text: str) -> None:
+    with pytest.raises(InputError) as caught:
+        make()
+    assert caught.value.field == field
+    assert text in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_remedy_for_dates_gives_seconds() -> None:
+    seconds = (DATES - DATES[0]) / np.timedelta64(1, "s")
+    np.testing.assert_allclose(replace(SEQUENCE, time=seconds).time, TIME)
