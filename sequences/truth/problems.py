@@ -8,6 +8,7 @@ all right, so the slower fit to the gyroscope is needed only where they disagree
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +21,8 @@ from stario.sequences.truth.mounts import MIN_FIT_S
 from stario.sequences.truth.position_findings import position_problems
 from stario.sequences.truth.positions import PositionFit, fit_positions
 from stario.sequences.truth.tracking import tracking_faults, tracking_problems, without_lost
+
+_log = logging.getLogger(__name__)
 
 _AGREEING = 0.85
 """Correlation of the accelerations that needs no further check: most recorded truths have more."""
@@ -92,6 +95,12 @@ def truth_problems(sequence: ImuSequence) -> list[TruthProblem]:
         if positions is not None and positions.correlation > _AGREEING:
             return [*tracking_problems(faults), *position_problems(positions)]
     return list(examine_truth(sequence).problems)
+
+
+def warn_of_truth(sequence: ImuSequence) -> None:
+    """Log a warning for each problem of the true poses, which errors of tracks are relative to."""
+    for problem in truth_problems(sequence):
+        _log.warning("errors are unreliable: %s", problem.line(sequence.name))
 
 
 def check_truth(sequence: ImuSequence) -> None:
