@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from stario.sequences.simulation.magnetometer import MagneticField as MagneticField
     from stario.sequences.simulation.walks import WalkStyle as WalkStyle
     from stario.sequences.simulation.walks import generate_walk as generate_walk
+    from stario.sequences.truth.problems import truth_problems as truth_problems
     from stario.sequences.units import with_units as with_units
     from stario.sequences.windows import world_streams as world_streams
 
@@ -63,6 +64,7 @@ _NAMES = {
     "simulation.imu": "GOOD_IMU ImuErrors PERFECT_IMU PHONE_IMU simulate_imu",
     "simulation.magnetometer": "INDOOR_FIELD MagneticField",
     "simulation.walks": "WalkStyle generate_walk",
+    "truth.problems": "truth_problems",
     "units": "with_units",
     "windows": "world_streams",
 }

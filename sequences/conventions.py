@@ -102,6 +102,7 @@ def with_axes(sequence: ImuSequence, axes: str) -> ImuSequence:
         device_attitude=(
             None if own is None else DeviceAttitude(own.time, own.attitude_WB * turn.inv())
         ),
+        axes=axes_named(R @ axes_matrix(sequence.axes)),
     )
 
 

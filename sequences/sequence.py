@@ -193,6 +193,7 @@ class ImuSequence:
         attributes: other metadata of the recording (person, device, place, carry, ...).
         device_attitude: attitude estimated by the device's own sensor fusion, or None.
         source: format or app of the recording, for display.
+        axes: the axes x, y, z of all sensors in those of the file, see `with_axes`.
 
     Raises:
         InputError: the arrays' shapes do not agree, there is no sample, time, gyro or accel holds
@@ -210,6 +211,7 @@ class ImuSequence:
     attributes: Mapping[str, str | float] = field(default_factory=dict)
     device_attitude: DeviceAttitude | None = None
     source: str = ""
+    axes: str = "x,y,z"
 
     def __post_init__(self) -> None:
         for name, kind in _PARTS.items():

@@ -74,10 +74,12 @@ def _run(
     from stario.fusion.fix_file import check_within
     from stario.fusion.report.health import health_lines
     from stario.sequences.accuracy.metrics import align
+    from stario.sequences.truth.problems import warn_of_truth
 
     check_within(fixes, sequence)
     with progress_bar(f"run {sequence.name}") as progress:
         track = navigator.run(sequence, progress, fixes)
+    warn_of_truth(sequence)
     truth, backend = sequence.truth, navigator.backend
     alignment = alignment_with(fixes)
     metrics = measure(track, sequence, alignment)

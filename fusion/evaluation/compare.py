@@ -26,6 +26,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
+from stario.sequences.truth.problems import warn_of_truth
 
 log = logging.getLogger(__name__)
 
@@ -141,6 +142,7 @@ def compare(
     check_within(fixes, sequence)
     navigator = Navigator(model, config)
     preprocessed = navigator.observe(sequence, progress)
+    warn_of_truth(sequence)
     tracks = {
         "inertial": inertial_track(preprocessed, config),
         "network": network_track(preprocessed),

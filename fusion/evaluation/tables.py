@@ -27,6 +27,7 @@ from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.drawing.text_table import aligned
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.truth.problems import warn_of_truth
 
 TRUE_ATTITUDE, OWN_ATTITUDE, EKF = "network_true_attitude", "network", "ekf"
 
@@ -208,6 +209,7 @@ def _tracks(
     sequence = read(path)
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "a recording with true poses")
+    warn_of_truth(sequence)
     entries: list[Entry] = []
     sample = Sample(sequence.name, sequence.truth, {}, {})
     for weights, model in models:

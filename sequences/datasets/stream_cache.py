@@ -38,6 +38,7 @@ from stario.sequences.readers import FORMATS
 from stario.sequences.readers.archive import split_name
 from stario.sequences.readers.published.oxiod import capture_file
 from stario.sequences.sequence import ImuSequence, low_rate_message
+from stario.sequences.truth.problems import check_truth
 from stario.sequences.windows import Attitude, WorldStream, world_streams
 
 log = logging.getLogger(__name__)
@@ -187,6 +188,7 @@ def _streams(sequence: ImuSequence, attitude: Attitude) -> list[Stream]:
                 "legs of at least 1.5 s at walking speed",
             )
         return list(legs)
+    check_truth(sequence)
     streams: list[Stream] = list(world_streams(sequence, attitude=attitude))
     if not streams:
         raise InputError(

@@ -20,7 +20,9 @@ from stario.sequences.errors import InputError
 from stario.sequences.inspection.samples import disorder
 from stario.sequences.inspection.stuck import dead_gyro
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
-from stario.sequences.truth.fit import fit_truth
+from stario.sequences.truth.fit import TruthFit, fit_truth
+from stario.sequences.truth.part import without_spikes
+from stario.sequences.truth.positions import fit_positions
 from stario.sequences.units import FAST_RAD_S, GYRO_UNITS, TIME_UNITS
 from stario.sequences.windows import MAX_RATE, MIN_RATE, clean_samples, unbroken
 
@@ -64,6 +66,12 @@ _UNIT_NAMED = "its unit is the one named in the file: is that right?"
 
 _SAMPLES = 10_000
 """Maximum number of samples rotated by the true attitude; more do not improve the average force."""
+
+_SAME_MOTION = 0.5
+"""Correlation of accelerations from the positions and the accelerometer that is no accident."""
+
+_TO_Z_UP = "write px,-py,-pz,qw,-qz,qy,-qx as px,py,pz,qx,qy,qz,qw in the file"
+"""Remedy for a world with z down: half a turn about its x axis."""
 
 _MAX_TILT_RAD = math.radians(20.0)
 """Largest angle between the vertical and the average force, rotated by the true attitude."""
@@ -220,6 +228,8 @@ def _check_direction(sequence: ImuSequence, time: FloatArray, accel: FloatArray)
     truth = sequence.truth
     if truth is None or truth.valid.sum() < 2:
         return
+    used = without_spikes(accel)
+    time, accel = time[used], accel[used]
     step = -(-len(time) // _SAMPLES)
     time, accel = time[::step], accel[::step]
     pose = truth.at(time)
@@ -230,23 +240,46 @@ def _check_direction(sequence: ImuSequence, time: FloatArray, accel: FloatArray)
     if tilt < _MAX_TILT_RAD:
         return
     try:
-        axes = fit_truth(sequence).axes()
+        fit = fit_truth(sequence)
     except InputError:
-        axes = None
-    if tilt > math.pi - _MAX_TILT_RAD and axes is None:
-        fix = "pass `--accel-unit=-m/s^2` (or -g) or write `ax [-m/s^2]` in the CSV's header"
-        raise InputError(
-            f"{sequence.name}: accelerometer",
-            "a force that points down under the true attitude",
-            "specific force, which points up at rest",
-            _UNIT_NAMED if "accel" in sequence.converted else fix,
-        )
+        fit = None
+    remedy = fit and fit.axes_remedy()
+    if tilt > math.pi - _MAX_TILT_RAD and remedy is None:
+        raise _downward(sequence, fit)
     fix = "omit the truth if it is wrong: it is only needed for error metrics"
     raise InputError(
         f"{sequence.name}: truth's attitude",
         f"an average force {math.degrees(tilt):.0f} degrees off the vertical",
         "quaternion x y z w, body to a world with z up",
-        f"the IMU's axes are not the truth's: pass `--axes={axes}`" if axes else fix,
+        f"the IMU's axes are not the truth's: {remedy}" if remedy else fix,
+    )
+
+
+def _downward(sequence: ImuSequence, fit: TruthFit | None) -> InputError:
+    """Return the error for a force that points down under the true attitude.
+
+    Either the accelerometer has the opposite sign, or the truth's world has z down. The positions
+    decide: rotated by the attitude, the accelerometer then measures their acceleration or its
+    opposite.
+    """
+    sign = "pass `--accel-unit=-m/s^2` (or -g) or write `ax [-m/s^2]` in the CSV's header"
+    sign = _UNIT_NAMED if "accel" in sequence.converted else sign
+    fix = f"{sign}; or if the truth's world has z down, {_TO_Z_UP}"
+    positions = fit_positions(sequence, fit.time_offset) if fit and fit.consistent else None
+    if positions is not None and positions.correlation > _SAME_MOTION:
+        return InputError(
+            f"{sequence.name}: truth",
+            "a world with z down, in which its positions agree with the accelerometer",
+            "a world with z up",
+            f"{_TO_Z_UP}; only if that is wrong, the accelerometer's sign is: {sign}",
+        )
+    if positions is not None and positions.correlation < -_SAME_MOTION:
+        fix = sign
+    return InputError(
+        f"{sequence.name}: accelerometer",
+        "a force that points down under the true attitude",
+        "specific force, which points up at rest",
+        fix,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -29,10 +29,12 @@ from stario.sequences.sequence import (
     ImuSequence,
     Trajectory,
     is_gap,
-    low_rate_message,
 )
-from stario.sequences.truth.findings import fit_as_dict, fit_lines, fit_problems
-from stario.sequences.truth.fit import TruthFit, fit_truth
+from stario.sequences.truth.findings import fit_as_dict, fit_lines, scale_problem
+from stario.sequences.truth.fit import TruthFit
+from stario.sequences.truth.position_findings import position_line, positions_as_dict
+from stario.sequences.truth.positions import PositionFit
+from stario.sequences.truth.problems import examine_truth
 from stario.sequences.truth.yaw_drift import YawDrift, yaw_drift
 
 
@@ -96,6 +98,7 @@ class Inspection:
         rest: sensor statistics at rest; None if the device never rests.
         coverage: coverage by ground truth; None without one.
         fit: fit of truth and gyroscope; None if they cannot be compared.
+        positions: comparison of the truth's positions with the accelerometer, likewise.
         problems: problems found, one line each, with a remedy if there is one.
         truth: description of the ground truth.
         device_attitude: number of attitudes logged by the device's own sensor fusion.
@@ -111,6 +114,7 @@ class Inspection:
     rest: Rest | None
     coverage: Coverage | None
     fit: TruthFit | None
+    positions: PositionFit | None
     problems: tuple[str, ...]
     truth: str
     magnetic: MagneticFindings | None
@@ -138,6 +142,7 @@ class Inspection:
             "gyro_axes": self.axes and asdict(self.axes),
             "truth": self.coverage and asdict(self.coverage),
             "truth_against_gyroscope": self.fit and fit_as_dict(self.fit, self.yaw),
+            "positions_against_accelerometer": self.positions and positions_as_dict(self.positions),
             "device_attitudes": self.device_attitude,
             "known_of_truth": self.truth,
             "magnetometer": self.magnetic and self.magnetic.as_dict(),
@@ -208,7 +213,7 @@ class Inspection:
             f"(longest step {coverage.longest_gap_s:.2f} s), path of {coverage.path_m:.1f} m"
         ]
         if fit is not None:
-            lines += fit_lines(fit, self.yaw)
+            lines += [*fit_lines(fit, self.yaw), position_line(self.positions)]
         return lines
 
 
@@ -231,19 +236,12 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         problems += axes.problems(sequence.name)
     except InputError as error:
         problems.append(str(error))
-    coverage = fit = yaw = None
-    if sequence.truth is not None:
-        coverage = _coverage(sequence, sequence.truth)
-        if slow := low_rate_message(sequence.truth):
-            problems.append(f"{sequence.name}: truth: {slow}")
-        elif coverage.coverage > 0.0:
-            try:
-                fit = fit_truth(sequence)
-                yaw = yaw_drift(sequence, fit)
-                problems += fit_problems(sequence.name, fit, yaw, " ".join(problems))
-            except InputError as error:
-                if not problems:  # otherwise wrong units explain it
-                    problems.append(f"{sequence.name}: truth against gyroscope: {error}")
+    truth = examine_truth(sequence, " ".join(problems))
+    problems += [problem.line(sequence.name) for problem in truth.problems]
+    yaw = None
+    if truth.fit is not None:
+        yaw = yaw_drift(replace(sequence, truth=truth.truth), truth.fit)
+        problems += scale_problem(sequence.name, truth.fit, yaw)
     try:
         rest, magnetic = find_rest(sequence), assess_magnetometer(sequence)
     except InputError:  # an invalid rate, which `check_units` reports
@@ -255,8 +253,9 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         accel_norm=float(np.linalg.norm(sequence.accel[valid], axis=1).mean()),
         gyro_norm=float(np.linalg.norm(sequence.gyro[valid], axis=1).mean()),
         rest=rest,
-        coverage=coverage,
-        fit=fit,
+        coverage=None if sequence.truth is None else _coverage(sequence, sequence.truth),
+        fit=truth.fit,
+        positions=truth.positions,
         problems=tuple(problems),
         truth=sequence.truth_summary(),
         device_attitude=0 if sequence.device_attitude is None else len(sequence.device_attitude),

@@ -18,10 +18,8 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 from stario.sequences.truth.alignment import align_tracked_body
 from stario.sequences.truth.clock_offset import convolved
+from stario.sequences.truth.part import middle_part, without_spikes
 from stario.sequences.windows import MAX_IMU_GAP, clean_samples
-
-LONGEST_S = 600.0
-"""Length of the middle part that is used of a longer recording [s], which bounds the cost."""
 
 MAX_OFFSET_S = 5.0
 """Largest time offset searched, in either direction [s]."""
@@ -36,7 +34,7 @@ _MIN_CORRELATION, _MIN_AGREEING = 0.9, 0.7
 the same rotations; published recordings have at least 0.97 and 0.999. An even gait correlates with
 itself a few steps later by up to 0.94, but with a lower share."""
 
-_EDGE_S = 0.05
+EDGE_S = 0.05
 """An offset this close [s] to the largest one searched is the end of the search, not a maximum."""
 
 
@@ -53,6 +51,7 @@ class TruthFit:
         jumps: number of jumps of the truth's attitude that the gyroscope did not measure.
         accel_against: loss of the mean vertical force if `R_TB` is applied, as a share of the mean
             force: if it is large, the accelerometer agrees with the truth, not the gyroscope.
+        applied_axes: the recording's `axes`, in which `R_TB` is given.
         times: (M,) [s] on the IMU's clock, for a figure.
         speed: (M,) angular rate of the truth at `times` [rad/s], NaN where unknown.
     """
@@ -64,6 +63,7 @@ class TruthFit:
     agreeing: float
     jumps: int
     accel_against: float
+    applied_axes: str
     times: FloatArray
     speed: FloatArray
 
@@ -75,15 +75,30 @@ class TruthFit:
     @property
     def consistent(self) -> bool:
         """Whether both measured the same rotations, so that offset and axes are meaningful."""
-        inside = abs(self.time_offset) < MAX_OFFSET_S - _EDGE_S
-        return inside and self.correlation > _MIN_CORRELATION and self.agreeing > _MIN_AGREEING
+        return abs(self.time_offset) < MAX_OFFSET_S - EDGE_S and self.agrees
+
+    @property
+    def agrees(self) -> bool:
+        """Whether both rotations agree after all corrections, whatever the offset."""
+        return self.correlation > _MIN_CORRELATION and self.agreeing > _MIN_AGREEING
 
     def axes(self) -> str | None:
-        """Return `--axes` to rotate the IMU to the truth's axes; None if none is needed or fits."""
+        """Return the truth's axes in the IMU's; None if they are the same or none is near."""
         text = axes_named(self.R_TB.as_matrix())
         left = Rotation.from_matrix(axes_matrix(text)).inv() * self.R_TB
         near = self.consistent and left.magnitude() < _NEAR_RAD
         return text if near and text != SAME_AXES else None
+
+    def axes_remedy(self) -> str | None:
+        """Return how to rotate the IMU to the truth's axes; None if that is not needed or fits.
+
+        The option refers to the axes in the file, so it includes the rotation already applied.
+        """
+        further = self.axes()
+        if further is None:
+            return None
+        text = axes_named(axes_matrix(further) @ axes_matrix(self.applied_axes))
+        return "omit `--axes`" if text == SAME_AXES else f"pass `--axes={text}`"
 
 
 def fit_truth(sequence: ImuSequence) -> TruthFit:
@@ -95,6 +110,8 @@ def fit_truth(sequence: ImuSequence) -> TruthFit:
     if sequence.truth is None or sequence.truth.valid.sum() < 2:
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory to compare with")
     time, gyro, accel = clean_samples(middle_part(sequence))
+    used = without_spikes(accel)
+    time, gyro, accel = time[used], gyro[used], accel[used]
     truth = sequence.truth
     coarse = _coarse_offset(time, gyro, truth)
     truth = replace(truth, time=truth.time + coarse)
@@ -119,6 +136,7 @@ def fit_truth(sequence: ImuSequence) -> TruthFit:
             pose.attitude_WB[aligned.valid],
             mount,
         ),
+        applied_axes=sequence.axes,
         times=grid + aligned.lag,
         speed=_speed(pose.attitude_WB, pose.valid),
     )
@@ -131,14 +149,6 @@ def _accel_against(force_B: FloatArray, attitude_WT: Rotation, R_TB: Rotation) -
         float(attitude_WT.apply(force).mean(axis=0)[2]) for force in (force_B, R_TB.apply(force_B))
     )
     return (upright - turned) / max(float(np.linalg.norm(force_B, axis=1).mean()), 1e-9)
-
-
-def middle_part(sequence: ImuSequence) -> ImuSequence:
-    """Return the part of a recording that is used, at most `LONGEST_S` from its middle."""
-    if sequence.duration <= LONGEST_S:
-        return sequence
-    centre = float(np.nanmedian(sequence.time))
-    return sequence.slice(centre - LONGEST_S / 2, centre + LONGEST_S / 2)
 
 
 def _grid(start: float, stop: float) -> FloatArray:

@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.truth.fit import TruthFit, middle_part
+from stario.sequences.truth.fit import TruthFit
+from stario.sequences.truth.part import middle_part
 from stario.sequences.windows import clean_samples, unbroken
 
 _STEP_S = 0.1

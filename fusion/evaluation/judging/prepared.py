@@ -37,6 +37,7 @@ from stario.sequences.sequence import (
     Trajectory,
     is_gap,
 )
+from stario.sequences.truth.problems import truth_problems
 
 log = logging.getLogger(__name__)
 
@@ -81,6 +82,7 @@ class Prepared:
         kind: kind of its ground truth.
         attributes: person, device, place and similar, where known.
         pieces: its unbroken stretches.
+        problems: problems of its ground truth, one line each.
     """
 
     path: Path
@@ -88,6 +90,7 @@ class Prepared:
     kind: Kind
     attributes: dict[str, str]
     pieces: list[PreparedPiece]
+    problems: tuple[str, ...] = ()
 
 
 def prepare(sequence: ImuSequence, path: Path) -> Prepared:
@@ -115,7 +118,8 @@ def prepare(sequence: ImuSequence, path: Path) -> Prepared:
     else:
         raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
     attributes = {name: str(value) for name, value in sequence.attributes.items()}
-    return Prepared(path, sequence.name, kind, attributes, pieces)
+    problems = tuple(problem.line(sequence.name) for problem in truth_problems(sequence))
+    return Prepared(path, sequence.name, kind, attributes, pieces, problems)
 
 
 def prepared_recordings(
@@ -147,6 +151,8 @@ def _cached(
     if found is None:
         found = prepare(read(path), path)
         _store(file, found)
+    for problem in found.problems:
+        log.warning("errors are unreliable: %s", problem)
     return found
 
 
@@ -207,6 +213,7 @@ def _store(file: Path, prepared: Prepared) -> None:
         "kind": prepared.kind,
         "attributes": prepared.attributes,
         "pieces": len(prepared.pieces),
+        "problems": prepared.problems,
     }
     content = safetensors.numpy.save(arrays, metadata={"recording": json.dumps(description)})
     try:
@@ -236,4 +243,4 @@ def _load(file: Path, path: Path) -> Prepared | None:
         log.warning("%s: unreadable, prepared again: %s", file, error)
         return None
     name, kind, attributes = (description[key] for key in ("name", "kind", "attributes"))
-    return Prepared(path, name, kind, attributes, pieces)
+    return Prepared(path, name, kind, attributes, pieces, tuple(description["problems"]))

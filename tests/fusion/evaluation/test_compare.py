@@ -273,3 +273,14 @@ def test_demonstration_is_reproducible_with_a_seed_outside_the_training_range() 
     np.testing.assert_array_equal(first.truth.position_W, second.truth.position_W)
     assert compare_module.DEMONSTRATION_SEED >= 2**31
     assert first.duration == pytest.approx(120.0)
+
+
+def test_a_wrong_truth_is_warned_of(
+    walk: ImuSequence, model: OracleWithFallback, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its errors are computed, but they say nothing about the tracks."""
+    compare(model, walk, CONFIG)
+    assert "truth" not in caplog.text
+    wrong = replace(walk.truth, position_W=1e3 * walk.truth.position_W)
+    compare(model, replace(walk, truth=wrong), CONFIG)
+    assert "truth: positions that seem to be in mm: divide them by 1000" in caplog.text

@@ -296,3 +296,14 @@ def test_readers_levelling_windows_and_simulation_are_part_of_the_key() -> None:
         "simulation/imu.py",
         "datasets/stream_cache.py",
     } <= names
+
+
+def test_a_truth_that_contradicts_the_imu_is_skipped_with_the_reason(tmp_path: Path) -> None:
+    walk = simulate_imu(generate_walk(6, 20.0), 100.0, seed=4, name="walk")
+    truth = walk.truth
+    assert truth is not None
+    path = tmp_path / "walk.csv"
+    write_csv(path, replace(walk, truth=replace(truth, position_W=1e3 * truth.position_W)))
+    (outcome,) = recorded([path], Reader(), {}, tmp_path / "cache")
+    assert isinstance(outcome, Skipped)
+    assert "truth: found positions that seem to be in mm, expected poses that" in outcome.reason

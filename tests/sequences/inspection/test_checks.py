@@ -6,7 +6,7 @@ import pytest
 from recorded import DATA
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.conventions import with_axes, with_conventions
+from stario.sequences.conventions import SAME_AXES, with_axes, with_conventions
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.inspection.report import inspect_recording
@@ -106,10 +106,34 @@ def test_a_truth_with_another_quaternion_order_is_refused(walk: ImuSequence) -> 
 def test_axes_that_differ_from_the_truths_are_named(walk: ImuSequence) -> None:
     """Also if gravity points exactly down, which a wrong sign would explain too."""
     for axes, undone in (("y,z,x", "z,x,y"), ("x,-y,-z", "x,-y,-z"), ("z,y,-x", "-z,y,x")):
-        turned = with_axes(walk, axes)
+        turned = replace(with_axes(walk, axes), axes=SAME_AXES)
         assert f"--axes={undone}" in refusal(turned)
         check_units(with_axes(turned, undone))
         check_units(turned.without_truth())
+
+
+def test_a_truth_with_z_down_is_told_from_a_reversed_sign_by_its_positions(
+    walk: ImuSequence,
+) -> None:
+    """Passing the other sign for the accelerometer would break a good recording."""
+    turn = Rotation.from_euler("x", np.pi)
+    truth = walk.truth
+    down = replace(
+        truth, position_W=turn.apply(truth.position_W), attitude_WB=turn * truth.attitude_WB
+    )
+    text = refusal(replace(walk, truth=down))
+    assert "a world with z down" in text
+    assert "--accel-unit" in text.split("only if that is wrong")[1]
+    x, y, z, w = down.quat_xyzw.T
+    px, py, pz = down.position_W.T
+    assert "write px,-py,-pz,qw,-qz,qy,-qx as px,py,pz,qx,qy,qz,qw" in text
+    position, quat_xyzw = np.column_stack([px, -py, -pz]), np.column_stack([w, -z, y, -x])
+    right = replace(truth, position_W=position, attitude_WB=Rotation.from_quat(quat_xyzw))
+    assert inspect_recording(replace(walk, truth=right)).problems == ()
+    at_rest = replace(down, position_W=0.0 * down.position_W)
+    undecided = refusal(replace(walk, truth=at_rest))
+    assert "--accel-unit=-m/s^2" in undecided
+    assert "or if the truth's world has z down" in undecided
 
 
 @pytest.mark.parametrize("unit", ["ms", "us", "ns"])

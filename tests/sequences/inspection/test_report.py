@@ -8,7 +8,7 @@ import pytest
 from recorded import DATA
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.conventions import with_axes
+from stario.sequences.conventions import SAME_AXES, with_axes
 from stario.sequences.drawing.plots import imu_overview
 from stario.sequences.errors import InputError
 from stario.sequences.files import json_text
@@ -121,8 +121,8 @@ def test_a_clock_set_back_is_a_problem(walk: ImuSequence, by: float) -> None:
         (lambda s: replace(s, gyro=np.degrees(s.gyro), truth=None), "--gyro-unit deg/s"),
         (lambda s: replace(s, accel=s.accel / STANDARD_GRAVITY), "--accel-unit g"),
         (lambda s: replace(s, accel=-s.accel), "--accel-unit=-m/s^2"),
-        (lambda s: with_axes(s, "y,-x,z"), "--axes=-y,x,z"),
-        (lambda s: with_axes(s, "y,z,x"), "--axes=z,x,y"),
+        (lambda s: replace(with_axes(s, "y,-x,z"), axes=SAME_AXES), "--axes=-y,x,z"),
+        (lambda s: replace(with_axes(s, "y,z,x"), axes=SAME_AXES), "--axes=z,x,y"),
         (
             lambda s: replace(
                 s,

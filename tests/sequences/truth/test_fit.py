@@ -6,13 +6,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.conventions import with_axes
+from stario.sequences.conventions import SAME_AXES, with_axes
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.truth.findings import fit_problems
 from stario.sequences.truth.fit import fit_truth
+
+
+def recorded_in(sequence: ImuSequence, axes: str) -> ImuSequence:
+    """Return the recording of an IMU with other axes, to which no option was applied."""
+    return replace(with_axes(sequence, axes), axes=SAME_AXES)
 
 
 @pytest.fixture(scope="module")
@@ -112,8 +117,11 @@ def test_a_truth_that_may_be_of_another_walk_gives_neither_offset_nor_axes(
     assert fit.axes() == "-y,x,z"
     other = replace(fit, **{"time_offset": -2.0} | found)
     assert other.axes() is None
-    (problem,) = fit_problems("w", other, None, "")
-    assert "clocks more than 5 s apart, truth of another" in problem
+    (problem,) = fit_problems(other, "")
+    if "time_offset" in found:  # all else agrees
+        assert "add +4.97 s" in problem.fix
+    else:
+        assert "clocks more than 5 s apart, is the truth of another" in problem.fix
 
 
 @pytest.mark.parametrize("signs", [(-1.0, -1.0, -1.0), (1.0, 1.0, -1.0)])
@@ -122,18 +130,35 @@ def test_wrong_gyroscope_signs_are_not_blamed_on_the_truth(
 ) -> None:
     style = WalkStyle(carry="pocket")
     walk = simulate_imu(generate_walk(8, 40.0, style=style), 100.0, seed=2)
-    (problem,) = fit_problems("w", fit_truth(replace(walk, gyro=walk.gyro * signs)), None, "")
-    assert "gyroscope" in problem
-    assert "sign" in problem
-    for right in (walk, with_axes(walk, "y,-x,z"), with_axes(walk, "y,z,x")):
-        assert "sign" not in " ".join(fit_problems("w", fit_truth(right), None, ""))
+    (problem,) = fit_problems(fit_truth(replace(walk, gyro=walk.gyro * signs)), "")
+    assert "gyroscope" in problem.line("w")
+    assert "sign" in problem.fix
+    for right in (walk, recorded_in(walk, "y,-x,z"), recorded_in(walk, "y,z,x")):
+        assert "sign" not in " ".join(p.line("w") for p in fit_problems(fit_truth(right), ""))
 
 
 def test_the_accelerometer_decides_whether_gyroscope_or_truth_is_turned(walk: ImuSequence) -> None:
     fit = fit_truth(replace(walk, gyro=walk.gyro @ Rotation.from_rotvec([0.5, 0, 0]).as_matrix().T))
-    (problem,) = fit_problems("w", fit, None, "")
-    assert "gyroscope: its axes or signs are not those of the accelerometer" in problem
+    (problem,) = fit_problems(fit, "")
+    assert "gyroscope: its axes or signs are not those of the accelerometer" in problem.fix
     truth = walk.truth
     turned = replace(truth, attitude_WB=truth.attitude_WB * Rotation.from_rotvec([0.5, 0, 0]))
-    problems = fit_problems("w", fit_truth(replace(walk, truth=turned)), None, "")
-    assert "truth: its axes are" in problems[0]
+    problems = fit_problems(fit_truth(replace(walk, truth=turned)), "")
+    assert "truth: axes" in problems[0].line("w")
+
+
+@pytest.mark.parametrize("axes", ["y,z,x", "y,-x,z", "-z,y,x"])
+def test_the_axes_remedy_refers_to_the_file_and_converges(walk: ImuSequence, axes: str) -> None:
+    """Followed literally, it leaves nothing to correct, whatever option was given before."""
+    assert fit_truth(with_axes(walk, axes)).axes_remedy() == "omit `--axes`"
+    recorded = recorded_in(walk, "-x,-y,z")
+    remedy = fit_truth(with_axes(recorded, axes)).axes_remedy()
+    assert remedy is not None
+    right = remedy.removeprefix("pass `--axes=").removesuffix("`")
+    assert fit_truth(with_axes(recorded, right)).axes_remedy() is None
+
+
+def test_a_spike_of_the_accelerometer_does_not_tilt_the_world(walk: ImuSequence) -> None:
+    accel = walk.accel.copy()
+    accel[3000] = [1e4, 0.0, 0.0]
+    assert fit_truth(replace(walk, accel=accel)).tilt < np.radians(1.0)

@@ -292,3 +292,16 @@ def test_a_group_may_be_called_all(walk: ImuSequence) -> None:
     alone = rows_of(judged[1:], "person", "ours", "theirs")
     assert verdict(alone) == ""
     assert len(groups_figure(alone, "ours", "theirs").axes[0].get_yticks()) == 1
+
+
+def test_a_wrong_truth_is_warned_of_also_from_the_cache(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    truth = walk.truth
+    wrong = replace(walk, truth=replace(truth, position_W=truth.position_W * [-1.0, 1.0, 1.0]))
+    path = tmp_path / "walk.csv"
+    path.touch()
+    for _ in range(2):
+        caplog.clear()
+        next(prepared_recordings([path], lambda _: wrong, {}, tmp_path / "cache", 1))
+        assert "walk: truth: positions mirrored" in caplog.text

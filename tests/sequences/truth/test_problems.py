@@ -1,0 +1,133 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.errors import InputError
+from stario.sequences.inspection.report import inspect_recording
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
+from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk
+from stario.sequences.truth.problems import check_truth, examine_truth, truth_problems
+
+LATE_S = 20.0
+
+
+@pytest.fixture(scope="module")
+def walk() -> ImuSequence:
+    """A walk whose truth is noisy and slow, as a phone's visual odometry."""
+    walk = simulate_imu(generate_walk(8, 40.0, style=WalkStyle()), 100.0, PHONE_IMU, 2, name="w")
+    truth = walk.truth.at(np.arange(0.0, 40.0, 0.05))
+    noise = 0.005 * np.random.default_rng(0).normal(size=(len(truth), 3))
+    return replace(walk, truth=replace(truth, position_W=truth.position_W + noise))
+
+
+def moved(walk: ImuSequence, change: Callable[[Trajectory], FloatArray]) -> ImuSequence:
+    truth = walk.truth
+    return replace(walk, truth=replace(truth, position_W=change(truth)))
+
+
+def jumping(truth: Trajectory) -> FloatArray:
+    return truth.position_W + np.outer(truth.time > LATE_S, [5.0, 0.0, 0.0])
+
+
+POSITIONS = {
+    "in mm": (lambda t: 1000.0 * t.position_W, "divide them by 1000"),
+    "in cm": (lambda t: 100.0 * t.position_W, "divide them by 100 "),
+    "in feet": (lambda t: t.position_W / 0.3048, "divide them by 3.281"),
+    "positions mirrored": (lambda t: t.position_W * [-1, 1, 1], "write -px,py,pz as"),
+    "mirrored relative": (lambda t: t.position_W[:, [1, 0, 2]], "write py,px,pz as"),
+    "turned by 9": (lambda t: t.position_W[:, [0, 2, 1]] * [1, 1, -1], "write px,-pz,py as"),
+    "turned by 6": (
+        lambda t: Rotation.from_euler("z", np.pi / 3).apply(t.position_W),
+        "give both in the same world",
+    ),
+    "jumps by 5 m at 20.05 s": (jumping, "split the recording"),
+    "repeats exactly for": (lambda t: 0.0 * t.position_W, "leave the truth's cells blank"),
+    "do not move as the accelerometer": (lambda t: t.position_W[::-1], "of another recording"),
+}
+
+
+@pytest.mark.parametrize("found", POSITIONS)
+def test_wrong_positions_are_named_with_the_remedy(walk: ImuSequence, found: str) -> None:
+    change, fix = POSITIONS[found]
+    wrong = moved(walk, change)
+    (problem,) = inspect_recording(wrong).problems
+    assert problem.startswith("w: truth: ")
+    assert found in problem
+    assert fix in problem
+    assert [p.line("w") for p in truth_problems(wrong)] == [problem]
+    with pytest.raises(
+        InputError, match=r"w: truth: found a? ?position.*expected poses that agree"
+    ):
+        check_truth(wrong)
+
+
+@pytest.mark.parametrize("carry", CARRYING_MODES)
+def test_right_positions_raise_nothing_however_the_device_is_carried(carry: str) -> None:
+    style = WalkStyle(carry=carry, vigor=1.5)
+    walk = simulate_imu(generate_walk(3, 40.0, style=style), 100.0, PHONE_IMU, 3)
+    kept = (walk.time % 9.0) > 0.5
+    gappy = replace(walk, time=walk.time[kept], gyro=walk.gyro[kept], accel=walk.accel[kept])
+    for recording in (walk, gappy, replace(walk, truth=walk.truth.at(np.arange(0.0, 40.0, 0.1)))):
+        assert truth_problems(recording) == []
+        found = examine_truth(recording)
+        assert found.positions is not None
+        assert found.positions.scale == pytest.approx(1.0, abs=0.2)
+        assert not found.positions.mirrored
+
+
+def test_positions_of_a_device_that_hardly_accelerates_are_not_compared() -> None:
+    time = np.arange(0.0, 40.0, 0.01)
+    attitude_WB = Rotation.from_euler("xyz", np.column_stack([np.sin(time), np.cos(time), time]))
+    steady = Trajectory(time, np.outer(time, [0.3, 0.0, 0.0]), attitude_WB)
+    rolling = simulate_imu(steady, 100.0, PHONE_IMU, 1)
+    mirrored = moved(rolling, lambda truth: -truth.position_W)
+    assert examine_truth(mirrored).positions is None
+    assert any("positions not compared" in line for line in inspect_recording(mirrored).lines())
+    assert truth_problems(mirrored) == []
+
+
+def test_lost_tracking_written_as_zeros_is_not_taken_for_a_wrong_clock(walk: ImuSequence) -> None:
+    truth = walk.truth
+    lost = (truth.time > 15.0) & (truth.time < 23.0)
+    quat_xyzw = np.where(lost[:, None], [0.0, 0.0, 0.0, 1.0], truth.quat_xyzw)
+    position_W = np.where(lost[:, None], 0.0, truth.position_W)
+    zeros = replace(truth, position_W=position_W, attitude_WB=Rotation.from_quat(quat_xyzw))
+    (problem,) = inspect_recording(replace(walk, truth=zeros)).problems
+    assert "repeats exactly for 7.9 s" in problem
+
+
+def test_a_jump_of_the_attitude_is_not_taken_for_an_error_of_the_gyroscope(
+    walk: ImuSequence,
+) -> None:
+    truth = walk.truth
+    turn = Rotation.from_euler("z", np.where(truth.time > LATE_S, 3.0, 0.0)[:, None])
+    flipped = replace(walk, truth=replace(truth, attitude_WB=turn * truth.attitude_WB))
+    (problem,) = inspect_recording(flipped).problems
+    assert "an attitude that jumps once" in problem
+    with pytest.raises(InputError, match="jumps once"):
+        check_truth(flipped)
+
+
+@pytest.mark.parametrize(
+    ("late", "named"), [(5.08, "add -5.08 s"), (1e6, "none of them at a sample's time")]
+)
+def test_a_truth_on_a_distant_clock_is_named(walk: ImuSequence, late: float, named: str) -> None:
+    shifted = replace(walk, truth=replace(walk.truth, time=walk.truth.time + late))
+    (problem,) = inspect_recording(shifted).problems
+    assert named in problem
+    with pytest.raises(InputError, match="expected poses that agree with the IMU"):
+        check_truth(shifted)
+
+
+def test_the_comparison_is_part_of_the_findings(walk: ImuSequence) -> None:
+    found = inspect_recording(walk)
+    values = found.as_dict()["positions_against_accelerometer"]
+    assert values["axes"] == ["x", "y", "z"]
+    assert values["correlation"] > 0.8
+    assert any("positions scaled by 1" in line for line in found.lines())
