@@ -17,10 +17,10 @@ import math
 
 import numpy as np
 
-from stario.fusion.filter.displacements import HypothesisPair
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, FieldState, gauss_markov
 from stario.fusion.filter.engine import UpdateResult
+from stario.fusion.filter.hypotheses import HypothesisPair
 from stario.fusion.filter.magnetic_reference import WANDER_SIGMA, MagneticReference
 from stario.fusion.fixes import Fix, yaw_fix
 from stario.fusion.imu.intervals import ImuInterval
