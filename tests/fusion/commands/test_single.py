@@ -158,6 +158,19 @@ def test_run_prints_json(stario, recording: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("no_figures")
+def test_run_warns_of_a_truth_whose_positions_are_wrong(
+    stario, recording: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert stario("run", recording, "--json").code == 0
+    assert "unreliable" not in caplog.text
+    walk = read_generic_csv(recording)
+    truth = replace(walk.truth, position_W=1e3 * walk.truth.position_W)
+    write_csv(tmp_path / "mm.csv", replace(walk, truth=truth))
+    assert stario("run", "mm.csv", "--json").code == 0
+    assert "errors are unreliable: mm: truth: positions that seem to be in mm" in caplog.text
+
+
+@pytest.mark.usefixtures("no_figures")
 def test_run_gives_the_same_track_without_truth(stario, recording: Path, tmp_path: Path) -> None:
     write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
     assert stario("run", recording, "--out", "seen").code == 0
