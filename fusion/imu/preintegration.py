@@ -213,11 +213,9 @@ def preintegrate(
     """
     dt, rate, force = corrected_increments(time, gyro - b_g, accel - b_a)
     densities = [noise] * len(dt) if isinstance(noise, ImuNoise) else noise
-    turn = float(np.linalg.norm(np.cumsum(rate * dt[:, None], axis=0), axis=1).max())
-    if turn > _MAX_TURN:
-        # gtsam's tangent is singular at a full turn.
-        rate, unknown = rate * (_MAX_TURN / turn), math.pi / math.sqrt(time[-1] - time[0])
-        densities = [replace(d, gyro_noise=max(d.gyro_noise, unknown)) for d in densities]
+    seconds = float(time[-1] - time[0])
+    if seconds * math.sqrt(3.0) * float(np.abs(rate).max()) > _MAX_TURN:
+        rate, densities = _within_a_turn(rate, dt, densities)
     current = densities[0]
     params = _params(current, gravity) if current is noise else _new_params(current, gravity)
     pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(b_a, b_g))
@@ -230,6 +228,28 @@ def preintegrate(
             _set_white_noise(params, current)
         integrate(step_force, step_rate, step)
     return Segment(float(time[0]), float(time[-1]), gravity, pim)
+
+
+def _within_a_turn(
+    rate: FloatArray, dt: FloatArray, densities: Sequence[ImuNoise]
+) -> tuple[FloatArray, Sequence[ImuNoise]]:
+    """Limit the rotation of a segment, since gtsam's tangent is singular at a full turn.
+
+    Args:
+        rate: (n, 3) rates of its steps [rad/s].
+        dt: (n,) their lengths [s].
+        densities: n noise densities.
+
+    Returns:
+        Rates and densities; if the rotation was too large, the turn is unknown.
+    """
+    turn = float(np.linalg.norm(np.cumsum(rate * dt[:, None], axis=0), axis=1).max())
+    if turn <= _MAX_TURN:
+        return rate, densities
+    unknown = math.pi / math.sqrt(dt.sum())
+    return rate * (_MAX_TURN / turn), [
+        replace(d, gyro_noise=max(d.gyro_noise, unknown)) for d in densities
+    ]
 
 
 def corrected_increments(
