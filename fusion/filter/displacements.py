@@ -1,6 +1,6 @@
 """Updates with the network's displacements, including false ones, and what their innovations tell.
 
-README.md, "Gates" (the alternative hypothesis: a state without the outliers of the last seconds),
+README.md, "Gates" (the alternative hypothesis: recent outliers share a steady error),
 "Noise and the gyroscope's bias" (the accelerometer's factor, by stochastic approximation: Robbins
 and Monro 1951) and "Fixes" (the network's turn, a Gauss-Markov state once fixes tell the direction;
 without them it cannot be distinguished from the yaw, and is zero).
@@ -98,7 +98,7 @@ class DisplacementUpdates:
         config: settings of the filter.
 
     Attributes:
-        hypotheses: the filter, and the alternative without the outliers of the last seconds.
+        hypotheses: the filter, and the alternative to it.
         outlier_share: fraction of outliers among recent displacements.
         accel_noise: estimated scale of the accelerometer's noise.
         error_level: estimated level of the network's errors.

@@ -1,4 +1,4 @@
-"""The filter and its alternative hypothesis: a state without the outliers of the last seconds.
+"""The filter and its alternative hypothesis, under which recent outliers share a steady error.
 
 README.md, "Gates".
 """
@@ -21,7 +21,7 @@ _FITS_TO_DROP = 4
 """Consecutive displacements that fit both before the alternative is dropped: outliers were few."""
 
 _MAX_SECONDS = 6.0
-"""Maximum age of the alternative [s]: the IMU alone is not accurate for longer."""
+"""Maximum age of the alternative [s]: an error that lasts longer is not taken for false."""
 
 Result = TypeVar("Result")
 

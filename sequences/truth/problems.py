@@ -9,6 +9,7 @@ all right, so the slower fit to the gyroscope is needed only where they disagree
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -99,8 +100,13 @@ def truth_problems(sequence: ImuSequence) -> list[TruthProblem]:
 
 def warn_of_truth(sequence: ImuSequence) -> None:
     """Log a warning for each problem of the true poses, which errors of tracks are relative to."""
-    for problem in truth_problems(sequence):
-        _log.warning("errors are unreliable: %s", problem.line(sequence.name))
+    warn_of_problems([problem.line(sequence.name) for problem in truth_problems(sequence)])
+
+
+def warn_of_problems(lines: Sequence[str]) -> None:
+    """Log a warning for each problem of true poses, given as `TruthProblem.line`."""
+    for line in lines:
+        _log.warning("errors are unreliable: %s", line)
 
 
 def check_truth(sequence: ImuSequence) -> None:

@@ -14,7 +14,6 @@ from stario.fusion.config import NavigatorConfig
 from stario.sequences.accuracy.metrics import align
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.simulation.walks import CARRYING_MODES
 
 Make = Callable[..., Any]
 
@@ -145,98 +144,6 @@ def test_after_a_gap_speed_recovers_and_sigma_covers_the_error(
         assert after > before
     assert np.max(np.mean(covered, axis=1)) < 2.0
     assert np.max(speed_errors) < 0.25
-
-
-@pytest.mark.parametrize(
-    ("scale_gyro", "scale_accel", "option"),
-    [(180 / np.pi, 1.0, "--gyro-unit deg/s"), (1.0, 1 / 9.80665, "--accel-unit g")],
-)
-def test_wrong_units_are_refused_with_the_option_that_fixes_them(
-    walk: ImuSequence, still_model: Any, scale_gyro: float, scale_accel: float, option: str
-) -> None:
-    wrong = replace(walk, gyro=scale_gyro * walk.gyro, accel=scale_accel * walk.accel)
-    with pytest.raises(InputError, match=option) as caught:
-        Navigator(still_model).run(wrong.without_truth())
-    assert "\n" not in str(caught.value)
-
-
-def test_missing_gravity_is_refused(walk: ImuSequence, still_model: Any) -> None:
-    up_B = walk.truth.attitude_WB.apply([0.0, 0.0, 9.80665], inverse=True)
-    with pytest.raises(InputError, match="accelerometer"):
-        Navigator(still_model).run(replace(walk, accel=walk.accel - up_B))
-
-
-@pytest.mark.parametrize("scale", [1 / 9.80665, 0.0])
-def test_a_stream_in_wrong_units_is_refused_after_its_first_second(
-    walk: ImuSequence, make_oracle: Make, scale: float
-) -> None:
-    navigator = Navigator(make_oracle(walk, walk.truth, CONFIG))
-    with pytest.raises(InputError, match="accel: found an average"):
-        stream(navigator, replace(walk, accel=scale * walk.accel))
-    assert navigator.state is None
-    assert stream_deviation(stream(navigator, walk), Navigator(navigator.model).run(walk)) < 1e-9
-
-
-def after_a_still_start(walk: ImuSequence) -> ImuSequence:
-    """The walk, preceded by ten seconds at rest in its first attitude."""
-    step = walk.time[1] - walk.time[0]
-    rest = round(10.0 / step)
-    noise = 0.01 * np.random.default_rng(0).standard_normal((rest, 6))
-    up_B = walk.truth.attitude_WB[0].apply([0.0, 0.0, 9.80665], inverse=True)
-    return replace(
-        walk,
-        time=step * np.arange(rest + len(walk)),
-        gyro=np.vstack([noise[:, :3], walk.gyro]),
-        accel=np.vstack([up_B + noise[:, 3:], walk.accel]),
-        truth=None,
-    )
-
-
-@pytest.mark.parametrize("carry", CARRYING_MODES)
-def test_a_stream_in_degrees_is_refused_once_the_device_turns(
-    make_walk: Make, still_model: Any, carry: str
-) -> None:
-    right = after_a_still_start(make_walk(3, 26.0, carry=carry))
-    navigator, expected = Navigator(still_model), Navigator(still_model)
-    for row in zip(right.time[:300], right.gyro[:300], right.accel[:300], strict=True):
-        navigator.push(*row)
-    with pytest.raises(InputError, match=r"gyro: found rotations .*, expected rad/s; .*deg/s"):
-        stream(navigator, replace(right, gyro=np.degrees(right.gyro)).slice(3.0, 36.0))
-    assert navigator.state is None
-    # The stream has restarted; in rad/s it is never refused.
-    states = stream(navigator, right)
-    assert len(states) == len(stream(expected, right)) > 300
-    np.testing.assert_array_equal(states[-1].p_W, expected.state.p_W)
-
-
-def test_a_briefly_tumbling_device_is_not_mistaken_for_a_stream_in_degrees(
-    make_walk: Make, still_model: Any
-) -> None:
-    walk = make_walk(3, 26.0)
-    gyro = walk.gyro.copy()
-    gyro[1150:1250] += [0.0, 0.0, 30.0]  # across the end of a piece, faster than anyone turns it
-    assert stream(Navigator(still_model), replace(walk, gyro=gyro))
-
-
-def test_the_check_for_degrees_survives_a_snapshot(walk: ImuSequence, still_model: Any) -> None:
-    wrong = after_a_still_start(walk)
-    wrong = replace(wrong, gyro=np.degrees(wrong.gyro))
-
-    def refused_at(stop: float) -> float:
-        """Time at which the stream is refused if another navigator continues it at `stop`."""
-        navigator = Navigator(still_model)
-        for time, gyro, accel in zip(wrong.time, wrong.gyro, wrong.accel, strict=True):
-            if time == stop:
-                data, navigator = navigator.snapshot(), Navigator(still_model)
-                navigator.restore(data)
-            try:
-                navigator.push(time, gyro, accel)
-            except InputError:
-                return float(time)
-        return np.inf
-
-    whole = refused_at(np.nan)
-    assert refused_at(float(wrong.time[1710])) == whole < 26.0
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.02, 0.9, 1.4])

@@ -7,22 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 import support
-from scipy.spatial.transform import Rotation
-from se23 import exp_se23
 
 from stario.fusion import Navigator, NavState, PriorPose, Track
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.jacobians import (
-    position_jacobian,
-    velocity_jacobian,
-    yaw_jacobian,
-)
 from stario.fusion.fixes import Fix, position_fix, velocity_fix, yaw_fix
 from stario.fusion.imu.intervals import split_at
-from stario.fusion.lie import UNKNOWN_YAW, yaw_twist
+from stario.fusion.lie import UNKNOWN_YAW
 from stario.fusion.recording import cut_recording
 from stario.sequences.attitude.rotations import about_z, yaw_of
-from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence
@@ -89,47 +81,6 @@ def assert_same(state: NavState, track: Track, atol: float = 1e-9) -> None:
     np.testing.assert_allclose(state.v_W, track.trajectory.velocity_W[k], atol=atol)
     np.testing.assert_allclose(state.R_WB, track.trajectory.attitude_WB[k].as_matrix(), atol=atol)
     np.testing.assert_allclose(state.covariance, track.covariance[k], atol=atol)
-
-
-# --- Jacobians -------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("kind", ["position", "velocity", "yaw"])
-@pytest.mark.parametrize("seed", range(4))
-def test_jacobians_agree_with_finite_differences(kind: str, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    tilt = Rotation.from_rotvec([*rng.normal(0.0, 0.8, 2), 0.0])
-    R = (about_z(rng.uniform(-3.0, 3.0)) * tilt).as_matrix()
-    v, p = rng.normal(0.0, 2.0, 3), rng.normal(0.0, 20.0, 3)
-
-    def measured(error: np.ndarray) -> np.ndarray:
-        turn, shift_v, shift_p = exp_se23(error)
-        if kind == "position":
-            return turn @ p + shift_p
-        return turn @ v + shift_v if kind == "velocity" else np.array([yaw_twist(turn @ R)])
-
-    step, H = 1e-6, np.zeros((1 if kind == "yaw" else 3, 9))
-    jacobian = {
-        "position": lambda: position_jacobian(p),
-        "velocity": lambda: velocity_jacobian(v),
-        "yaw": lambda: yaw_jacobian(R),
-    }[kind]()
-    for first, block in jacobian:
-        H[:, first : first + block.shape[1]] = block
-    numeric = np.stack(
-        [(measured(d) - measured(-d)) / (2 * step) for d in step * np.eye(9)], axis=1
-    )
-    np.testing.assert_allclose(H, numeric, atol=1e-7 * max(1.0, np.abs(numeric).max()))
-
-
-def test_yaw_twist_agrees_with_yaw_of_and_is_undefined_upside_down() -> None:
-    attitude = Rotation.random(50, rng=np.random.default_rng(0))
-    ours = np.array([yaw_twist(R) for R in attitude.as_matrix()])
-    known = np.isfinite(ours)
-    assert known.sum() > 45
-    off = ours[known] - yaw_of(attitude[known])
-    np.testing.assert_allclose(np.sin(off), 0.0, atol=1e-9)
-    assert np.isnan(yaw_twist(exp_so3(np.array([np.pi, 0.0, 0.0]))))
 
 
 # --- time ------------------------------------------------------------------------------------

@@ -1,10 +1,12 @@
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
 from se23 import exp_se23
 
 from stario.fusion import lie
 from stario.sequences.attitude import so3
+from stario.sequences.attitude.rotations import yaw_of
 
 ANGLES = [0.0, 1e-9, 1e-4, 0.0316, 0.0317, 0.2, 1.0, 2.5, np.pi - 1e-6]
 
@@ -46,3 +48,13 @@ def test_exp_times_is_the_product_with_the_exponential(angle: float) -> None:
     expected = R @ X
     expected[:, :, 3:] += J @ rho
     np.testing.assert_allclose(lie.exp_times(theta, rho, X), expected, atol=1e-13)
+
+
+def test_yaw_twist_agrees_with_yaw_of_and_is_undefined_upside_down() -> None:
+    attitude = Rotation.random(50, rng=np.random.default_rng(0))
+    ours = np.array([lie.yaw_twist(R) for R in attitude.as_matrix()])
+    known = np.isfinite(ours)
+    assert known.sum() > 45
+    off = ours[known] - yaw_of(attitude[known])
+    np.testing.assert_allclose(np.sin(off), 0.0, atol=1e-9)
+    assert np.isnan(lie.yaw_twist(so3.exp_so3(np.array([np.pi, 0.0, 0.0]))))

@@ -37,7 +37,7 @@ from stario.sequences.sequence import (
     Trajectory,
     is_gap,
 )
-from stario.sequences.truth.problems import truth_problems
+from stario.sequences.truth.problems import truth_problems, warn_of_problems
 
 log = logging.getLogger(__name__)
 
@@ -151,8 +151,7 @@ def _cached(
     if found is None:
         found = prepare(read(path), path)
         _store(file, found)
-    for problem in found.problems:
-        log.warning("errors are unreliable: %s", problem)
+    warn_of_problems(found.problems)
     return found
 
 

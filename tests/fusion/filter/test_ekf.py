@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from se23 import exp_se23
+from initial_ekf import initialised
 
 from stario.fusion.evaluation.checks.speed import DenseEkf
 from stario.fusion.filter.ekf import StateCloningEkf
@@ -8,29 +8,13 @@ from stario.fusion.filter.estimates import plain_covariances
 from stario.fusion.filter.jacobians import displacement_jacobian, mean_velocity_jacobian
 from stario.fusion.imu.preintegration import Segment, preintegrate
 from stario.fusion.state import NavState
-from stario.sequences.attitude.so3 import exp_so3, log_so3, skew
+from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
 
 NOISE = ImuNoise()
 YAW = np.array([0.0, 0.0, 1.0])
-
-
-def initialised(slots: int, engine: type[StateCloningEkf] = StateCloningEkf) -> StateCloningEkf:
-    sigma = np.repeat([0.05, 0.3, 0.1, 0.003, 0.05], 3)
-    ekf = engine(slots)
-    state = NavState(
-        10.0,
-        exp_so3(np.array([0.5, -0.7, 2.0])),
-        np.array([1.0, -0.5, 0.1]),
-        np.array([30.0, -20.0, 1.0]),
-        np.array([0.001, 0.002, -0.001]),
-        np.array([0.02, -0.01, 0.03]),
-        np.diag(sigma**2),
-    )
-    ekf.initialise(state)
-    return ekf
 
 
 def segments(count: int, seed: int = 0) -> list[Segment]:
@@ -79,56 +63,6 @@ def driven() -> StateCloningEkf:
     return ekf
 
 
-# --- Jacobians -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("slot_j", [1, None])
-def test_displacement_jacobian_agrees_with_finite_differences(slot_j: int | None) -> None:
-    p_i, p_j = np.array([30.0, -20.0, 1.0]), np.array([31.0, -19.4, 1.2])
-    dim, step = 27, 1e-6
-    columns = {0: (0, 6), 1: (15, 18), 2: (21, 24)}
-    pose_j = 0 if slot_j is None else 2
-
-    def measured(error: np.ndarray) -> np.ndarray:
-        """Displacement measured by a network that is turned by the estimate's yaw error."""
-        ends = []
-        for pose, p in ((1, p_i), (pose_j, p_j)):
-            theta, rho = (error[c : c + 3] for c in columns[pose])
-            R, _, shift = exp_se23(np.concatenate([theta, np.zeros(3), rho]))
-            ends.append(R @ p + shift)
-        yaw = error[columns[1][0] + 2]
-        return exp_so3(-yaw * YAW) @ (ends[1] - ends[0])
-
-    numeric = np.stack(
-        [(measured(d) - measured(-d)) / (2 * step) for d in step * np.eye(dim)], axis=1
-    )
-    H = np.zeros((3, dim))
-    for first, block in displacement_jacobian(p_i, p_j, 0, slot_j):
-        H[:, first : first + block.shape[1]] += block
-    np.testing.assert_allclose(H, numeric, atol=1e-6)
-
-
-def test_mean_velocity_jacobian_agrees_with_finite_differences() -> None:
-    """The mean is the current velocity minus what specific force and gravity have added since."""
-    v, force, step = np.array([1.0, -0.5, 0.2]), np.array([0.4, -0.3, 5.1]), 1e-6
-    R_WB, seconds = exp_so3(np.array([0.5, -0.2, 1.0])), 0.8
-    fall = 0.5 * seconds * STANDARD_GRAVITY * YAW
-
-    def measured(error: np.ndarray) -> np.ndarray:
-        R, shift, _ = exp_se23(error[:9])
-        by_bias = -0.5 * seconds * R @ R_WB @ error[12:]
-        mean = R @ v + shift - (R @ force + by_bias - fall)
-        return exp_so3(-error[2] * YAW) @ mean
-
-    numeric = np.stack(
-        [(measured(d) - measured(-d)) / (2 * step) for d in step * np.eye(15)], axis=1
-    )
-    H = np.zeros((3, 15))
-    for first, block in mean_velocity_jacobian(v, force, R_WB, seconds):
-        H[:, first : first + block.shape[1]] += block
-    np.testing.assert_allclose(H, numeric, atol=1e-6)
-
-
 def test_measurements_do_not_observe_yaw(driven: StateCloningEkf) -> None:
     yaw = np.zeros(driven.dim_x)
     yaw[2] = 1.0
@@ -139,67 +73,6 @@ def test_measurements_do_not_observe_yaw(driven: StateCloningEkf) -> None:
     for blocks in (displacement_jacobian(p_i, p_j, 0, None), by_velocity):
         turned = sum(H @ yaw[first : first + H.shape[1]] for first, H in blocks)
         np.testing.assert_array_equal(turned, 0.0)
-
-
-def injected(dx: np.ndarray) -> StateCloningEkf:
-    """A filter after an exact measurement of its error: an identity update without noise."""
-    ekf = initialised(1)
-    ekf.clone()
-    ekf.P = np.eye(ekf.dim_x)
-    n = len(dx)
-    ekf.update_linear(dx, [(0, np.eye(n))], 1e-14 * np.eye(n))
-    return ekf
-
-
-def test_retraction_agrees_with_its_first_order_expansion() -> None:
-    before, step = injected(np.zeros(21)), 1e-5
-    for k in range(21):
-        d = step * np.eye(21)[k]
-        plus, minus = injected(d), injected(-d)
-        clone = [ekf.state.clone_pose(0) for ekf in (plus, minus, before)]
-        e = np.eye(21)[k]
-        for theta, rotations, rho, positions, position in (
-            (
-                e[0:3],
-                (plus.state.R_WB, minus.state.R_WB),
-                e[6:9],
-                (plus.state.p_W, minus.state.p_W),
-                before.state.p_W,
-            ),
-            (
-                e[0:3],
-                (plus.state.R_WB, minus.state.R_WB),
-                e[3:6],
-                (plus.state.v_W, minus.state.v_W),
-                before.state.v_W,
-            ),
-            (
-                e[15:18],
-                (clone[0][0], clone[1][0]),
-                e[18:21],
-                (clone[0][1], clone[1][1]),
-                clone[2][1],
-            ),
-        ):
-            rotation = log_so3(rotations[0] @ rotations[1].T) / (2 * step)
-            np.testing.assert_allclose(rotation, theta, atol=1e-6)
-            shift = (positions[0] - positions[1]) / (2 * step)
-            np.testing.assert_allclose(shift, rho - skew(position) @ theta, atol=1e-6)
-        np.testing.assert_allclose(
-            (plus.state.b_g - minus.state.b_g) / (2 * step), e[9:12], atol=1e-6
-        )
-        np.testing.assert_allclose(
-            (plus.state.b_a - minus.state.b_a) / (2 * step), e[12:15], atol=1e-6
-        )
-
-
-def test_large_corrections_follow_the_exponential_map() -> None:
-    dx = np.random.default_rng(0).normal(size=21)
-    before, after = injected(np.zeros(21)), injected(dx)
-    R, v, p = exp_se23(dx[:9])
-    np.testing.assert_allclose(after.state.R_WB, R @ before.state.R_WB, atol=1e-9)
-    np.testing.assert_allclose(after.state.v_W, R @ before.state.v_W + v, atol=1e-9)
-    np.testing.assert_allclose(after.state.p_W, R @ before.state.p_W + p, atol=1e-9)
 
 
 # --- algebra -------------------------------------------------------------------------------------

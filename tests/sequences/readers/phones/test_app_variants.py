@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from stario.sequences import (
     ImuSequence,
     InputError,
-    ReadError,
     check_units,
     find_recordings,
     read_recording,
@@ -333,50 +332,6 @@ def test_the_rotation_vector_of_a_trace_is_the_devices_attitude(
     cut = (tmp_path / "trace.txt").read_text().replace(";1;2;3;", ";1;2;").replace("\t3\n", "\n")
     (tmp_path / "trace.txt").write_text(cut)
     assert (read_recording(tmp_path / "trace.txt").device_attitude is None) == (code == "AHRS")
-
-
-@pytest.mark.parametrize(
-    ("start", "message"),
-    [
-        (b"SQLite format 3\0" + bytes(40), "an SQLite database"),
-        (b"PK\x03\x04xl/workbook.xml", "a zip without text files"),
-        (b"\x1f\x8b\x08\0\0\0", "compressed with gzip"),
-    ],
-)
-def test_an_unsupported_container_is_named(start: bytes, message: str, tmp_path: Path) -> None:
-    (tmp_path / "export.data").write_bytes(start)
-    with pytest.raises(ReadError, match=rf"found [\w ,]*{message}.*; export as CSV"):
-        read_recording(tmp_path / "export.data")
-
-
-def test_two_recordings_in_a_zip_are_named(walk: ImuSequence, tmp_path: Path) -> None:
-    android(tmp_path / "s", walk)
-    with zipfile.ZipFile(tmp_path / "two.zip", "w") as file:
-        for one in (tmp_path / "s").iterdir():
-            file.write(one, f"a/{one.name}")
-            file.write(one, f"b/{one.name}")
-    expected = r"two\.zip: content: found 2 recordings \(a, b\), expected one; unpack the zip"
-    with pytest.raises(ReadError, match=rf"^[^:]*/{expected}$"):
-        read_recording(tmp_path / "two.zip")
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('[{"sensor": "Gyroscope", "time"', r"x\.json: file: found .*, expected JSON"),
-        ('[{"sensor": "../up", "time": "1"}]', r"x\.json: sensor: found no name"),
-        ('[{"sensor": "Gyroscope", "time": "1"}, 3]', r"found other JSON, expected an array"),
-        ('[{"sensor": "Gyroscope", "time": "1"}]', r"x\.json: .*found"),
-    ],
-)
-def test_a_malformed_json_export_is_refused_in_one_line(
-    text: str, message: str, tmp_path: Path
-) -> None:
-    (tmp_path / "x.json").write_text(text)
-    with pytest.raises(ReadError, match=message) as error:
-        read_recording(tmp_path / "x.json")
-    assert "\n" not in str(error.value)
-    assert "stario-" not in str(error.value)
 
 
 @pytest.mark.parametrize("per_second", [10**4, 10**6])  # MT devices and DOTs

@@ -1,0 +1,158 @@
+"""The filter's Jacobians and its retraction, against finite differences and the exponential."""
+
+import numpy as np
+import pytest
+from initial_ekf import initialised
+from scipy.spatial.transform import Rotation
+from se23 import exp_se23
+
+from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.jacobians import (
+    displacement_jacobian,
+    mean_velocity_jacobian,
+    position_jacobian,
+    velocity_jacobian,
+    yaw_jacobian,
+)
+from stario.fusion.lie import yaw_twist
+from stario.sequences.attitude.rotations import about_z
+from stario.sequences.attitude.so3 import exp_so3, log_so3, skew
+from stario.sequences.sequence import STANDARD_GRAVITY
+
+YAW = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("slot_j", [1, None])
+def test_displacement_jacobian_agrees_with_finite_differences(slot_j: int | None) -> None:
+    p_i, p_j = np.array([30.0, -20.0, 1.0]), np.array([31.0, -19.4, 1.2])
+    dim, step = 27, 1e-6
+    columns = {0: (0, 6), 1: (15, 18), 2: (21, 24)}
+    pose_j = 0 if slot_j is None else 2
+
+    def measured(error: np.ndarray) -> np.ndarray:
+        """Displacement measured by a network that is turned by the estimate's yaw error."""
+        ends = []
+        for pose, p in ((1, p_i), (pose_j, p_j)):
+            theta, rho = (error[c : c + 3] for c in columns[pose])
+            R, _, shift = exp_se23(np.concatenate([theta, np.zeros(3), rho]))
+            ends.append(R @ p + shift)
+        yaw = error[columns[1][0] + 2]
+        return exp_so3(-yaw * YAW) @ (ends[1] - ends[0])
+
+    numeric = np.stack(
+        [(measured(d) - measured(-d)) / (2 * step) for d in step * np.eye(dim)], axis=1
+    )
+    H = np.zeros((3, dim))
+    for first, block in displacement_jacobian(p_i, p_j, 0, slot_j):
+        H[:, first : first + block.shape[1]] += block
+    np.testing.assert_allclose(H, numeric, atol=1e-6)
+
+
+def test_mean_velocity_jacobian_agrees_with_finite_differences() -> None:
+    """The mean is the current velocity minus what specific force and gravity have added since."""
+    v, force, step = np.array([1.0, -0.5, 0.2]), np.array([0.4, -0.3, 5.1]), 1e-6
+    R_WB, seconds = exp_so3(np.array([0.5, -0.2, 1.0])), 0.8
+    fall = 0.5 * seconds * STANDARD_GRAVITY * YAW
+
+    def measured(error: np.ndarray) -> np.ndarray:
+        R, shift, _ = exp_se23(error[:9])
+        by_bias = -0.5 * seconds * R @ R_WB @ error[12:]
+        mean = R @ v + shift - (R @ force + by_bias - fall)
+        return exp_so3(-error[2] * YAW) @ mean
+
+    numeric = np.stack(
+        [(measured(d) - measured(-d)) / (2 * step) for d in step * np.eye(15)], axis=1
+    )
+    H = np.zeros((3, 15))
+    for first, block in mean_velocity_jacobian(v, force, R_WB, seconds):
+        H[:, first : first + block.shape[1]] += block
+    np.testing.assert_allclose(H, numeric, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["position", "velocity", "yaw"])
+@pytest.mark.parametrize("seed", range(4))
+def test_jacobians_agree_with_finite_differences(kind: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    tilt = Rotation.from_rotvec([*rng.normal(0.0, 0.8, 2), 0.0])
+    R = (about_z(rng.uniform(-3.0, 3.0)) * tilt).as_matrix()
+    v, p = rng.normal(0.0, 2.0, 3), rng.normal(0.0, 20.0, 3)
+
+    def measured(error: np.ndarray) -> np.ndarray:
+        turn, shift_v, shift_p = exp_se23(error)
+        if kind == "position":
+            return turn @ p + shift_p
+        return turn @ v + shift_v if kind == "velocity" else np.array([yaw_twist(turn @ R)])
+
+    step, H = 1e-6, np.zeros((1 if kind == "yaw" else 3, 9))
+    jacobian = {
+        "position": lambda: position_jacobian(p),
+        "velocity": lambda: velocity_jacobian(v),
+        "yaw": lambda: yaw_jacobian(R),
+    }[kind]()
+    for first, block in jacobian:
+        H[:, first : first + block.shape[1]] = block
+    numeric = np.stack(
+        [(measured(d) - measured(-d)) / (2 * step) for d in step * np.eye(9)], axis=1
+    )
+    np.testing.assert_allclose(H, numeric, atol=1e-7 * max(1.0, np.abs(numeric).max()))
+
+
+def injected(dx: np.ndarray) -> StateCloningEkf:
+    """A filter after an exact measurement of its error: an identity update without noise."""
+    ekf = initialised(1)
+    ekf.clone()
+    ekf.P = np.eye(ekf.dim_x)
+    n = len(dx)
+    ekf.update_linear(dx, [(0, np.eye(n))], 1e-14 * np.eye(n))
+    return ekf
+
+
+def test_retraction_agrees_with_its_first_order_expansion() -> None:
+    before, step = injected(np.zeros(21)), 1e-5
+    for k in range(21):
+        d = step * np.eye(21)[k]
+        plus, minus = injected(d), injected(-d)
+        clone = [ekf.state.clone_pose(0) for ekf in (plus, minus, before)]
+        e = np.eye(21)[k]
+        for theta, rotations, rho, positions, position in (
+            (
+                e[0:3],
+                (plus.state.R_WB, minus.state.R_WB),
+                e[6:9],
+                (plus.state.p_W, minus.state.p_W),
+                before.state.p_W,
+            ),
+            (
+                e[0:3],
+                (plus.state.R_WB, minus.state.R_WB),
+                e[3:6],
+                (plus.state.v_W, minus.state.v_W),
+                before.state.v_W,
+            ),
+            (
+                e[15:18],
+                (clone[0][0], clone[1][0]),
+                e[18:21],
+                (clone[0][1], clone[1][1]),
+                clone[2][1],
+            ),
+        ):
+            rotation = log_so3(rotations[0] @ rotations[1].T) / (2 * step)
+            np.testing.assert_allclose(rotation, theta, atol=1e-6)
+            shift = (positions[0] - positions[1]) / (2 * step)
+            np.testing.assert_allclose(shift, rho - skew(position) @ theta, atol=1e-6)
+        np.testing.assert_allclose(
+            (plus.state.b_g - minus.state.b_g) / (2 * step), e[9:12], atol=1e-6
+        )
+        np.testing.assert_allclose(
+            (plus.state.b_a - minus.state.b_a) / (2 * step), e[12:15], atol=1e-6
+        )
+
+
+def test_large_corrections_follow_the_exponential_map() -> None:
+    dx = np.random.default_rng(0).normal(size=21)
+    before, after = injected(np.zeros(21)), injected(dx)
+    R, v, p = exp_se23(dx[:9])
+    np.testing.assert_allclose(after.state.R_WB, R @ before.state.R_WB, atol=1e-9)
+    np.testing.assert_allclose(after.state.v_W, R @ before.state.v_W + v, atol=1e-9)
+    np.testing.assert_allclose(after.state.p_W, R @ before.state.p_W + p, atol=1e-9)
