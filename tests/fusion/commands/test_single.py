@@ -20,7 +20,7 @@ from stario.fusion.config import read_config
 from stario.network.architectures import build_network
 from stario.network.card import Card
 from stario.network.displacement import DisplacementNetwork
-from stario.network.model import save_model
+from stario.network.model import load_model, save_model
 from stario.sequences.conventions import with_axes
 from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.files import read_tum
@@ -362,11 +362,20 @@ def test_inspect_names_the_option_that_helps(stario, recording: Path, tmp_path: 
 # --- export ------------------------------------------------------------------------------------
 
 
-def test_export_accepts_the_name_of_a_network(stario, tmp_path: Path) -> None:
+def test_export_accepts_the_name_of_a_network(
+    stario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Of its run; without one, StarIO is the default and others require training first."""
     pytest.importorskip("onnx")
-    done = stario("export", "--model", "StarIO")
+    exported = []
+    with monkeypatch.context() as patch:  # tracing all blocks takes ten seconds
+        patch.setattr(
+            "stario.network.runtime.export.export_onnx", lambda *given: exported.append(given)
+        )
+        done = stario("export", "--model", "StarIO")
     assert (done.code, done.out) == (0, "StarIO.onnx\n")
+    [(model, path)] = exported
+    assert (model.card, path) == (load_model("default").card, Path("StarIO.onnx"))
     stario("export", "--model", "R-ResNet").assert_one_line_error(
         "runs/R-ResNet/model.safetensors", "stario train --model 'R-ResNet'"
     )

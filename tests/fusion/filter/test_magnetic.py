@@ -197,13 +197,12 @@ def test_a_streams_graph_estimates_the_same_bias_as_its_filter(
     biased_walk: ImuSequence, make_oracle: Make
 ) -> None:
     config = replace(GRAPH, filter=replace(GRAPH.filter, gyro_bias_sigma=1e-2))
-    oracle = make_oracle(biased_walk, biased_walk.truth, config, noise=0.1, sigma=0.1)
-    filtered = pushed(Stream(oracle, config), biased_walk)[-1]
+    walk = biased_walk.slice(0.0, 60.0)
+    oracle = make_oracle(walk, walk.truth, config, noise=0.1, sigma=0.1)
+    filtered = pushed(Stream(oracle, config), walk)[-1]
     with_field, without_field = (
-        pushed(Stream(oracle, config, backend="graph"), replace(biased_walk, magnetometer=field))[
-            -1
-        ]
-        for field in (biased_walk.magnetometer, None)
+        pushed(Stream(oracle, config, backend="graph"), replace(walk, magnetometer=field))[-1]
+        for field in (walk.magnetometer, None)
     )
     assert abs(with_field.b_g[2] - filtered.b_g[2]) < 0.2 * abs(
         without_field.b_g[2] - filtered.b_g[2]
