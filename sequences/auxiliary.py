@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Literal, Self
 
@@ -26,7 +27,8 @@ class _Timed:
         keep = (self.time >= start) & (self.time <= stop)
         if not keep.any():
             return None
-        return replace(self, **{k: v[keep] for k, v in vars(self).items() if k != "kind"})
+        rows = {k: v for k, v in vars(self).items() if k != "kind" and v is not None}
+        return replace(self, **{k: v[keep] for k, v in rows.items()})
 
 
 _KINDS = ("positions", "waypoints")
@@ -41,15 +43,18 @@ class PositionTrack(_Timed):
         position_W: (N, 3), or horizontal (N, 2) [m].
         kind: "positions" (a continuous track) or "waypoints" (single instants).
         valid: (N,) bool, False where the position must not be used; all True by default.
+        sigma: (N,) standard deviations [m] per horizontal axis that their source states, for
+            example a satellite receiver; None if it states none.
 
     Raises:
-        InputError: lengths differ, time does not increase, a valid value is not finite, or the kind
-            is another.
+        InputError: lengths differ, time does not increase, a valid value is not finite, a valid
+            standard deviation is not positive, or the kind is another.
     """
 
     position_W: FloatArray
     kind: Literal["positions", "waypoints"]
     valid: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+    sigma: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if self.kind not in _KINDS:
@@ -62,8 +67,20 @@ class PositionTrack(_Timed):
         columns = 2 if np.ndim(self.position_W) == 2 and np.shape(self.position_W)[1] == 2 else 3
         shape = (len(time), columns)
         position_W = checked_array("positions", self.position_W, shape, where=valid)
+        if self.sigma is not None:
+            sigma = checked_array("positions' sigma", self.sigma, time.shape, where=valid)
+            if sigma[valid].min(initial=math.inf) <= 0.0:
+                raise InputError("positions' sigma", f"{sigma[valid].min():g}", "above 0 m")
+            object.__setattr__(self, "sigma", sigma)
         for name, value in (("time", time), ("position_W", position_W), ("valid", valid)):
             object.__setattr__(self, name, value)
+
+    @property
+    def typical_sigma(self) -> float | None:
+        """Median of the valid standard deviations [m]; None if the source states none."""
+        if self.sigma is None or not self.valid.any():
+            return None
+        return float(np.median(self.sigma[self.valid]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -260,10 +260,11 @@ class ImuSequence:
             return f"{int(self.truth.valid.sum())} poses"
         if self.positions is None:
             return "none"
-        count = int(self.positions.valid.sum())
-        if self.positions.kind == "waypoints":
-            return f"{count} waypoints, no poses"
-        return f"{count} positions without attitude, no poses"
+        words = f"{int(self.positions.valid.sum())} {self.positions.kind}"
+        if sigma := self.positions.typical_sigma:
+            words += f" known to {sigma:.2g} m"
+        waypoints = self.positions.kind == "waypoints"
+        return f"{words}, no poses" if waypoints else f"{words} without attitude, no poses"
 
     def without_truth(self) -> ImuSequence:
         """Return the recording without its ground truth."""

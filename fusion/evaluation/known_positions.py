@@ -61,4 +61,7 @@ def position_error_words(track: Track, known: PositionTrack) -> str:
     coverage = f"{count} of {int(known.valid.sum())} {known.kind} lie within the track"
     if np.isnan(error):
         return f"{coverage}: too few to compare with"
-    return f"{coverage}: {error:.2f} m rms from them, after a fit of yaw and position"
+    words = f"{coverage}: {error:.2f} m rms from them, after a fit of yaw and position"
+    if sigma := known.typical_sigma:
+        words += f"; they are known to {sigma:.2g} m per axis"
+    return words

@@ -101,4 +101,6 @@ def _position_columns(sequence: ImuSequence, track: PositionTrack) -> dict[str, 
     columns: dict[str, Any] = {f"{stem}/t": track.time, f"{stem}/{place}": track.position_W}
     if not track.valid.all():
         columns[f"{stem}/valid"] = track.valid
+    if track.sigma is not None:
+        columns[f"{stem}/sigma"] = track.sigma
     return columns

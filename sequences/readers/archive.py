@@ -227,7 +227,14 @@ def _positions(
     time = _column(path, group, f"{stem}/t")
     keep = increasing_mask(time)
     position_W = _column(path, group, field, finite=False)
-    return PositionTrack(time[keep], position_W[keep], kind, _valid(group, stem, time)[keep])
+    sigma = f"{stem}/sigma"
+    return PositionTrack(
+        time[keep],
+        position_W[keep],
+        kind,
+        _valid(group, stem, time)[keep],
+        _column(path, group, sigma, finite=False)[keep] if sigma in group else None,
+    )
 
 
 def _valid(group: Any, stem: str, time: FloatArray) -> BoolArray:

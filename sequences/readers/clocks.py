@@ -24,6 +24,9 @@ the factor between two units, so that only one unit fits."""
 _CLOCKS = {"sampletimefine": {"ticks of 100 us": 10**4, "us": 10**6}}
 """Units of clocks by their title: Xsens counts 10 kHz ticks in MT devices, microseconds in DOTs."""
 
+_MARGIN_S = 60.0
+"""Maximum time [s] by which rare rows may precede or follow their recording."""
+
 _FEW_ROWS = 10
 """Number of rows below which a count may be a coincidence."""
 
@@ -76,6 +79,32 @@ def refuse_row_numbers(file: Path, title: str, time: FloatArray) -> None:
         found = f"{time[0]:.0f}, {time[0] + 1:.0f}, {time[0] + 2:.0f}, ..., which counts the rows"
         fix = f"name a column of times `t [s]`; if these are times, name their unit: `{title} [ms]`"
         raise ReadError(file, title, found, "times", fix)
+
+
+def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.int64) -> int:
+    """Return the number of time units in a second with which most times lie within a recording.
+
+    For rows too rare for `time_unit`.
+
+    Args:
+        file: the file, for messages.
+        time: (N,) in an unknown unit.
+        start_ns: time of the recording's first sample on the same clock [ns].
+        stop_ns: time of its last sample [ns].
+
+    Raises:
+        ReadError: no unit gives a time within a minute of the recording.
+    """
+    start, stop = float(start_ns) * 1e-9 - _MARGIN_S, float(stop_ns) * 1e-9 + _MARGIN_S
+    # Times from zero fit finer units as well, but all at the start.
+    fitting = {
+        unit: int(((time / unit > start) & (time / unit < stop)).sum())
+        for unit in sorted(TIME_UNITS.values())
+    }
+    unit = max(fitting, key=lambda unit: fitting[unit])
+    if not fitting[unit]:
+        raise ReadError(file, "time", "other times", "times of the recording")
+    return unit
 
 
 def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:

@@ -25,6 +25,7 @@ from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked, magnetometer
 from stario.sequences.readers.clocks import resample_to_gyro
+from stario.sequences.readers.geodesy import east_north
 from stario.sequences.readers.lines import head_lines, read_lines
 from stario.sequences.readers.phones.attitude import agreeing_attitude, device_attitude
 from stario.sequences.readers.phones.sensor_table import Samples
@@ -42,7 +43,6 @@ _WAYPOINT, _ROTATION = "TYPE_WAYPOINT", "TYPE_ROTATION_VECTOR"
 _EVENT = re.compile(r"(ACCE|GYRO|MAGN);\s*-?\d")
 _CODES = {"accel": "ACCE", "gyro": "GYRO", "mag": "MAGN"}
 _POINT, _AHRS = "POSI", "AHRS"
-_EARTH_M = 6_371_000.0
 
 Rows = tuple[IntArray, FloatArray]
 """Time stamps (N,) [ns] and values (N, K) of one sensor's events."""
@@ -157,14 +157,7 @@ def _logfile(path: Path) -> Events:
     offsets = [float(row[0]) - float(row[1]) for row in events["ACCE"]]  # the app's clock differs
     stamps, degrees = _rows(path, _POINT, events[_POINT], 10**9, slice(2, 4))
     stamps = stamps - round(float(np.median(offsets)) * 1e9)
-    return sensors, attitude, (stamps, _metres(degrees))
-
-
-def _metres(degrees: FloatArray) -> FloatArray:
-    """Convert latitude and longitude (N, 2) [deg] to east and north of the first point [m]."""
-    latitude, longitude = np.radians(degrees - degrees[0]).T
-    east = longitude * np.cos(np.radians(degrees[0, 0]))
-    return _EARTH_M * np.stack([east, latitude], axis=1)
+    return sensors, attitude, (stamps, east_north(degrees))
 
 
 def _rows(path: Path, kind: str, rows: Iterable[list[str]], unit_ns: int, used: slice) -> Rows:

@@ -40,6 +40,7 @@ from stario.sequences.readers.phones.files import (
     phone_recordings,
 )
 from stario.sequences.readers.phones.reference_points import reference_points
+from stario.sequences.readers.phones.satellites import satellite_positions
 from stario.sequences.readers.phones.sensor_table import (
     Samples,
     SensorTable,
@@ -161,7 +162,10 @@ def assemble_recording(
     sequence = with_pose(sequence, stamps[0], poses, orders)
     if sequence.truth is not None:
         return sequence
-    return replace(sequence, positions=reference_points(folder, files.key, stamps[0], stamps[-1]))
+    positions = reference_points(folder, files.key, stamps[0], stamps[-1])
+    if positions is None:
+        positions = satellite_positions(folder, files.gyro, stamps[0], stamps[-1])
+    return replace(sequence, positions=positions)
 
 
 def is_phone(path: Path) -> bool:

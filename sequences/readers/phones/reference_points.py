@@ -6,19 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
-from stario.sequences.errors import ReadError
+from stario.sequences.readers.clocks import unit_within
 from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.sensor_table import first_row
 from stario.sequences.readers.phones.sensor_words import words_of
 from stario.sequences.readers.text import read_table, seconds
 from stario.sequences.sequence import PositionTrack
 from stario.sequences.time_order import increasing_mask
-from stario.sequences.units import TIME_UNITS
 
 _NAMES = {"ref", "reference", "references", "waypoints", "waypoint", "checkpoints", "landmarks"}
-
-_MARGIN_S = 60.0
-"""Maximum time [s] by which reference points may precede or follow their recording."""
 
 
 def reference_points(
@@ -45,16 +41,7 @@ def reference_points(
             continue
         first, delimiter, decimal = found
         table = read_table(file, 3, lines[first][0], delimiter, None, decimal, killed=True)
-        start, stop = float(start_ns) * 1e-9 - _MARGIN_S, float(stop_ns) * 1e-9 + _MARGIN_S
-        stamps = table.values[:, 0]
-        # Stamps from zero fit finer units as well, but with all points at the start.
-        fitting = {
-            unit: int(((stamps / unit > start) & (stamps / unit < stop)).sum())
-            for unit in sorted(TIME_UNITS.values())
-        }
-        unit = max(fitting, key=lambda unit: fitting[unit])
-        if not fitting[unit]:
-            raise ReadError(file, "time", "other times", "times of the recording")
+        unit = unit_within(file, table.values[:, 0], start_ns, stop_ns)
         time = seconds(table.stamps_ns(0, unit), start_ns)
         kept = increasing_mask(time)
         return PositionTrack(time[kept], table.values[kept, 1:3], "waypoints")

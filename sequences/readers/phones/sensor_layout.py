@@ -90,6 +90,12 @@ def by_header(titles: list[str], head: FloatArray) -> Layout | None:
     )
 
 
+def clock_of(titles: list[str], head: FloatArray) -> Column | None:
+    """Return the clock that `by_header` would choose for all sensors; None if there is none."""
+    clocks = _clocks(titles, head)
+    return _finest(clocks, head) if clocks else None
+
+
 def _preference(words: tuple[str, ...]) -> tuple[bool, bool, int]:
     """Return a sort key: calibrated sensors first, then total force, then fewer words."""
     return is_uncalibrated(words), not {"gf", "total"} & set(words), len(words)

@@ -1,0 +1,29 @@
+"""Latitude and longitude to metres in a local plane."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stario.sequences.sequence import FloatArray
+
+_EQUATOR_M, _ECCENTRICITY_2 = 6_378_137.0, 6.694_379_990_14e-3
+"""Semi-major axis and squared eccentricity of the WGS 84 ellipsoid."""
+
+
+def east_north(degrees: FloatArray) -> FloatArray:
+    """Return metres (N, 2) east and north of the first of N points.
+
+    To first order about that point: off by centimetres within a kilometre.
+
+    Args:
+        degrees: (N, 2) latitude and longitude on WGS 84 [deg].
+    """
+    latitude = math.radians(degrees[0, 0])
+    w = 1.0 - _ECCENTRICITY_2 * math.sin(latitude) ** 2
+    north = _EQUATOR_M * (1.0 - _ECCENTRICITY_2) / w**1.5  # radius of curvature of the meridian
+    east = _EQUATOR_M / math.sqrt(w) * math.cos(latitude)
+    away = degrees - degrees[0]
+    away[:, 1] = (away[:, 1] + 180.0) % 360.0 - 180.0
+    return np.asarray(np.radians(away[:, ::-1]) * [east, north])

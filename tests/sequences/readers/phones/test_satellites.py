@@ -1,0 +1,122 @@
+"""Satellite positions next to the sensors of a phone's recording."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from phone_exports import androsensor, phyphox, sensor_logger
+from phone_files import START_NS, save
+
+from stario.sequences import ImuSequence, read_recording
+from stario.sequences.readers.geodesy import east_north
+from stario.sequences.sequence import FloatArray, PositionTrack
+
+PHYPHOX = '"Time (s)","Latitude (°)","Longitude (°)","Height (m)","Velocity (m/s)","Direction (°)"'
+SENSOR_LOGGER = (
+    "time,seconds_elapsed,bearingAccuracy,speedAccuracy,verticalAccuracy,horizontalAccuracy,"
+    "speed,bearing,altitude,longitude,latitude"
+)
+NORTH, EAST = 111_132.95, 78_846.8
+"""Length of a degree of latitude and of longitude at 45 degrees [m] (WGS 84)."""
+
+TIME = np.arange(1.0, 13.0)
+METRES = np.stack([1.2 * TIME, -0.5 * TIME], axis=1)
+
+
+def degrees(metres: FloatArray) -> FloatArray:
+    """Latitude and longitude of points east and north of 45 degrees north, 7 east."""
+    return np.array([45.0, 7.0]) + metres[:, ::-1] / [NORTH, EAST]
+
+
+def positions_of(path: Path) -> PositionTrack:
+    found = read_recording(path).positions
+    assert found is not None
+    assert found.kind == "positions"
+    return found
+
+
+def test_a_degree_has_its_length_on_the_ellipsoid() -> None:
+    north, east = east_north(np.array([[45.0, 7.0], [45.001, 7.0], [45.0, 7.001]]))[1:]
+    np.testing.assert_allclose(north, [0.0, 1e-3 * NORTH], atol=0.02)
+    np.testing.assert_allclose(east, [1e-3 * EAST, 0.0], atol=0.02)
+
+
+def test_the_antimeridian_is_no_jump() -> None:
+    _, there = east_north(np.array([[0.0, 179.999], [0.0, -179.999]]))
+    np.testing.assert_allclose(there, [222.64, 0.0], atol=0.01)
+
+
+def test_positions_of_phyphox_are_read_with_their_accuracy(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
+    phyphox(tmp_path / "p", walk)
+    radius = np.where(TIME == 5.0, 200.0, 4.53)  # one from the cells of the network
+    header = f'{PHYPHOX},"Horizontal Accuracy (m)","Vertical Accuracy (°)"'
+    save(tmp_path / "p/Location.csv", header, TIME, degrees(METRES), *[TIME] * 3, radius, TIME)
+    found = positions_of(tmp_path / "p")
+    np.testing.assert_allclose(found.time, TIME, atol=1e-9)
+    np.testing.assert_allclose(found.position_W, METRES - METRES[0], atol=0.02)
+    assert found.sigma is not None
+    np.testing.assert_allclose(found.sigma[found.valid], 3.0)
+    np.testing.assert_array_equal(found.valid, TIME != 5.0)
+    summary = read_recording(tmp_path / "p").truth_summary()
+    assert summary == "11 positions known to 3 m without attitude, no poses"
+
+
+def test_sensor_loggers_own_clock_is_used_and_satellites_are_preferred(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
+    sensor_logger(tmp_path / "s", walk)
+    time = np.append(-20.0, TIME)  # the last position known before the recording
+    stamps = [START_NS + round(t * 1e9) for t in time]
+    place = degrees(np.vstack([[-900.0, 0.0], METRES]))
+    others, radius = np.ones((13, 3)), np.full(13, 4.53)
+    for name, off in (("LocationGps", 0.0), ("Location", 0.01)):
+        columns = [stamps, time, others, radius, others, place[:, ::-1] + off]
+        save(tmp_path / f"s/{name}.csv", SENSOR_LOGGER, *columns)
+    found = positions_of(tmp_path / "s")
+    np.testing.assert_allclose(found.time, TIME, atol=1e-6)
+    np.testing.assert_allclose(found.position_W, METRES - METRES[0], atol=0.02)
+
+
+def test_positions_repeated_in_every_row_are_read_once(walk: ImuSequence, tmp_path: Path) -> None:
+    androsensor(tmp_path / "a", walk)
+    [file] = (tmp_path / "a").glob("*.csv")
+    header, *rows = file.read_text(encoding="utf-8").splitlines()
+    sep = ";" if ";" in header else ","
+    place = degrees(1.2 * np.floor(walk.time)[:, None] * [1.0, 0.0])
+    added = [sep.join(["0.0"] * 3 if t < 1.0 else [*map(repr, p), "6.04"])
+             for t, p in zip(walk.time, place.tolist(), strict=True)]  # fmt: skip
+    names = ["LOCATION Latitude : ", "LOCATION Longitude : ", "LOCATION Accuracy ( m)"]
+    lines = [sep.join([names[0], names[1], names[2], header])]
+    lines += [f"{a}{sep}{row}" for a, row in zip(added, rows, strict=True)]
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    found = positions_of(file)
+    np.testing.assert_allclose(found.time, np.arange(1.0, 16.0), atol=0.02)
+    assert found.sigma is not None
+    np.testing.assert_allclose(found.sigma, 4.0)
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ("", None),
+        ("1.0,45.0,7.0,0,0,0\n", None),
+        ("1.0,45.0,7.0,0,0,0\n2.0,45.0,x,0,0,0\n3.0,45.0,7.0,0,0,0\n", "'x', expected a number"),
+        ("9001.0,45.0,7.0,0,0,0\n9002.0,45.1,7.0,0,0,0\n", None),
+    ],
+)
+def test_positions_that_cannot_be_used_cost_no_recording(
+    walk: ImuSequence,
+    tmp_path: Path,
+    rows: str,
+    words: str | None,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    phyphox(tmp_path / "p", walk)
+    (tmp_path / "p/Location.csv").write_text(f"{PHYPHOX}\n{rows}", encoding="utf-8")
+    recording = read_recording(tmp_path / "p")
+    assert recording.positions is None
+    assert len(recording) > 1000
+    assert ("satellite positions skipped" in caplog.text) == (words is not None)
+    assert words is None or words in caplog.text
