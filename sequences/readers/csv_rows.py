@@ -15,12 +15,8 @@ import numpy as np
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.clocks import refuse_row_numbers, time_unit
 from stario.sequences.readers.columns import IMU, MAGNETIC, TRUTH, Column, Header, unit_factor
-from stario.sequences.readers.lines import (
-    decimal_mark,
-    ends_within_a_row,
-    unquoted,
-    with_seconds,
-)
+from stario.sequences.readers.dates import with_seconds
+from stario.sequences.readers.lines import decimal_mark, ends_within_a_row, unquoted
 from stario.sequences.readers.text import cell_value, is_missing, read_quickly, rows_below
 from stario.sequences.sequence import BoolArray, FloatArray
 from stario.sequences.units import TIME_UNITS
@@ -82,8 +78,9 @@ def _rows_carefully(path: Path, lines: list[str], header: Header, decimal: str) 
     columns = header.columns
     below = rows_below(path, lines, header.lines)
     numbered = [(number, unquoted(line, header.separator, decimal)) for number, line in below]
-    if with_seconds(numbered[0][1]) != numbered[0][1]:
-        numbered = [(number, with_seconds(line)) for number, line in numbered]
+    if _is_dated(numbered[0][1], header):
+        lines = with_seconds(line for _, line in numbered)
+        numbered = [(number, line) for (number, _), line in zip(numbered, lines, strict=True)]
         columns = {**columns, "t": replace(columns["t"], unit="s")}
         header = replace(header, columns=columns)
     used = [name for name in (*IMU, *MAGNETIC, *TRUTH) if name in columns]
@@ -97,6 +94,12 @@ def _rows_carefully(path: Path, lines: list[str], header: Header, decimal: str) 
         is_imu=is_imu,
         line_numbers=[number for number, _ in numbered],
     )
+
+
+def _is_dated(row: str, header: Header) -> bool:
+    """Return whether a row's time is a date or a time of day."""
+    cell = row.split(header.separator)[header.columns["t"].index :][:1]
+    return with_seconds(cell) != cell
 
 
 def _numbers(

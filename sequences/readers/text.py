@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stario.sequences.errors import ReadError
+from stario.sequences.readers.dates import with_seconds
 from stario.sequences.readers.lines import (
     ends_within_a_row,
     is_row,
     read_lines,
     unquoted,
-    with_seconds,
 )
 from stario.sequences.sequence import FloatArray
 
@@ -115,7 +115,7 @@ def read_table(
         used: the columns to return, in this order; the first `columns` if None.
         decimal: decimal mark, a point or a comma.
         killed: whether to skip a last row that is cut short because the app was killed.
-        dated: whether to read ISO dates as seconds since 1970.
+        dated: whether to read dates and times of day as seconds, as `with_seconds` does.
 
     Raises:
         ReadError: a row is cut short or holds something that is not a number.
@@ -179,7 +179,7 @@ def _read_carefully(
     if decimal != ".":
         lines = [line.replace(decimal, ".") for line in lines]
     if dated:
-        lines = [with_seconds(line) for line in lines]
+        lines = with_seconds(lines)
     numbered = rows_below(path, lines, skip)
     if killed and len(numbered) > 1:
         try:

@@ -17,7 +17,8 @@ from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.clocks import time_unit
 from stario.sequences.readers.columns import Column
-from stario.sequences.readers.lines import head_lines, with_seconds
+from stario.sequences.readers.dates import with_seconds
+from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.sensor_layout import Layout, by_header, by_rows
 from stario.sequences.readers.text import IntArray, Table, read_table
 from stario.sequences.sequence import FloatArray
@@ -46,7 +47,7 @@ class SensorTable(Layout):
         delimiter: separator of the cells; None for blanks.
         decimal: decimal mark, a point or a comma.
         skip: number of lines before the first row.
-        dated: whether the times are ISO dates.
+        dated: whether the times are dates or times of day.
     """
 
     file: Path
@@ -69,12 +70,16 @@ def sensor_table(file: Path) -> SensorTable | None:
     """Return how to read a file's rows, or None if that cannot be determined; never raises."""
     numbered = [(k, line) for k, line in enumerate(head_lines(file)) if line.strip()]
     numbered = numbered[: 4 * _HEAD_ROWS]
-    dated = [(k, with_seconds(line)) for k, line in numbered]
     table = _table(file, numbered)
-    if table is None and dated != numbered:
-        table = _table(file, dated)
-        return None if table is None else replace(table, dated=True)
-    return table
+    if table is not None:
+        return table
+    lines = with_seconds(line for _, line in numbered)
+    dated = [(k, line) for (k, _), line in zip(numbered, lines, strict=True)]
+    table = _table(file, dated) if dated != numbered else None
+    if table is None:
+        return None
+    clocks = {sensor: replace(clock, unit="s") for sensor, clock in table.clocks.items()}
+    return replace(table, dated=True, clock=replace(table.clock, unit="s"), clocks=clocks)
 
 
 def _table(file: Path, numbered: list[tuple[int, str]]) -> SensorTable | None:
