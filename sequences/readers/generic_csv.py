@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -31,9 +32,18 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
-from stario.sequences.readers.columns import TRUTH, Header, is_header, read_header, unit_factor
+from stario.sequences.readers.clocks import resample_to_gyro
+from stario.sequences.readers.columns import (
+    IMU,
+    TRUTH,
+    Header,
+    columns_named,
+    read_header,
+    unit_factor,
+)
 from stario.sequences.readers.csv_rows import Rows, read_rows
 from stario.sequences.readers.lines import first_lines, read_lines
+from stario.sequences.readers.text import seconds
 from stario.sequences.sequence import (
     FloatArray,
     ImuSequence,
@@ -48,6 +58,9 @@ _log = logging.getLogger(__name__)
 _MIN_WAYPOINT_INTERVAL = 2.0
 """Minimum median interval between waypoints [s]; positions at a shorter one are a track."""
 
+_SHARED_ROWS = 0.75
+"""Share of the gyroscope's rows with an accelerometer below which that is interpolated."""
+
 _HEAD_LINES = 200
 """Number of lines within which the header must be for a file to be recognised."""
 
@@ -59,30 +72,54 @@ def read_generic_csv(path: Path) -> ImuSequence:
     rows = read_rows(path, lines, header)
     gyro, gyro_converted = _vectors(path, header, rows, "g", GYRO_UNITS)
     accel, accel_converted = _vectors(path, header, rows, "a", ACCEL_UNITS)
+    rows, time, gyro, accel = _samples(path, rows, gyro, accel)
     truth, positions = _ground_truth(path, rows)
     field = None
     if "mx" in rows.table:
         vectors, _ = _vectors(path, header, rows, "m", MAGNETIC_UNITS)
         field = magnetometer(rows.time, vectors, held=False)
+    converted = {"gyro": gyro_converted, "accel": accel_converted}
     return ImuSequence(
         name=path.stem,
-        time=rows.time[rows.is_imu],
-        gyro=gyro[rows.is_imu],
-        accel=accel[rows.is_imu],
+        time=time,
+        gyro=gyro,
+        accel=accel,
         truth=truth,
         positions=positions,
         magnetometer=field,
-        converted=frozenset(
-            sensor
-            for sensor, done in (("gyro", gyro_converted), ("accel", accel_converted))
-            if done
-        ),
+        converted=frozenset(sensor for sensor, done in converted.items() if done),
     )
 
 
 def is_generic_csv(path: Path) -> bool:
-    """Return whether a file starts with a header that names columns of this format."""
-    return is_header(first_lines(path, _HEAD_LINES, comments=True))
+    """Return whether a file starts with a header that names IMU columns of this format."""
+    return bool(named_columns(path) & set(IMU))
+
+
+def named_columns(path: Path) -> set[str]:
+    """Return the canonical names of the columns that a file's header names."""
+    return columns_named(first_lines(path, _HEAD_LINES, comments=True))
+
+
+def _samples(
+    path: Path, rows: Rows, gyro: FloatArray, accel: FloatArray
+) -> tuple[Rows, FloatArray, FloatArray, FloatArray]:
+    """Return the rows, and times (N,), gyroscope and accelerometer (N, 3) of the IMU samples.
+
+    If the sensors are mostly in different rows, the accelerometer is interpolated to those of the
+    gyroscope, and the time of all rows starts at the first one at which both are known.
+    """
+    known = rows.is_imu & np.isfinite(rows.time)
+    with_gyro, with_accel = (known & ~np.isnan(values).any(axis=1) for values in (gyro, accel))
+    shared = (with_gyro & with_accel).sum()
+    if with_accel.sum() < 2 or shared >= _SHARED_ROWS * with_gyro.sum():
+        return rows, rows.time[rows.is_imu], gyro[rows.is_imu], accel[rows.is_imu]
+    ns = np.rint(np.where(known, rows.time, 0.0) * 1e9).astype(np.int64)
+    stamps, rate, force = resample_to_gyro(
+        path, ns[with_gyro], gyro[with_gyro], ns[with_accel], accel[with_accel]
+    )
+    rows = replace(rows, time=rows.time - float(stamps[0]) * 1e-9)
+    return rows, seconds(stamps, stamps[0]), rate, force
 
 
 def _vectors(

@@ -29,7 +29,8 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import resample_to_gyro
-from stario.sequences.readers.generic_csv import is_generic_csv
+from stario.sequences.readers.columns import IMU, POSITION
+from stario.sequences.readers.generic_csv import named_columns
 from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.attitude import device_attitude, logged_attitude
 from stario.sequences.readers.phones.files import (
@@ -83,23 +84,33 @@ def read_wide(path: Path) -> ImuSequence:
         found = repr(lines[0].strip()[:60]) if lines else "no lines"
         expected = "a header that names a clock and the axes of gyroscope and accelerometer"
         raise ReadError(path, "header", found, expected)
+    gyro = files.tables["gyro"][0]
+    if gyro.unused:
+        _log.warning(
+            "%s: several IMUs: read the one with %s, not those with %s; to read another, remove "
+            "the columns of this one", path, gyro.axes["gyro"][0].title, ", ".join(gyro.unused),
+        )  # fmt: skip
     return assemble_recording(path.stem, files, _wide_poses(path, files))
 
 
 def is_wide(path: Path) -> bool:
     """Return whether a file's header names a clock and the axes of both sensors.
 
-    A generic CSV does not count unless poses lie next to it or it holds two kinds of force.
+    A generic CSV counts only if poses lie next to it, or if it has two kinds of force (gFx and ax,
+    or gravity apart) and no ground truth.
     """
     if not path.is_file() or path.suffix.lower() not in SUFFIXES:
         return False
     files = _wide(path)
     if files is None:
         return False
+    named = named_columns(path)
+    if not named >= {"t", *IMU} or _wide_poses(path, files):
+        return True
     axes = files.tables["gyro"][0].axes
-    # Two kinds of force: gFx and ax.
-    has_both = "linear" in axes or axes["accel"][0].title.lower().startswith("g")
-    return not is_generic_csv(path) or bool(_wide_poses(path, files)) or has_both
+    in_two_parts = bool({"linear", "gravity"} & set(axes))
+    in_two_parts |= "accel" in axes and axes["accel"][0].title.lower().startswith("g")
+    return in_two_parts and not named & set(POSITION)
 
 
 def _wide(path: Path) -> PhoneFiles | None:

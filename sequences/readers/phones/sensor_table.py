@@ -16,9 +16,9 @@ import numpy as np
 from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.clocks import time_unit
-from stario.sequences.readers.columns import Column
+from stario.sequences.readers.columns import Column, with_units_below
 from stario.sequences.readers.dates import with_seconds
-from stario.sequences.readers.lines import head_lines
+from stario.sequences.readers.lines import head_lines, unquoted
 from stario.sequences.readers.phones.sensor_layout import Layout, by_header, by_rows
 from stario.sequences.readers.text import IntArray, Table, read_table
 from stario.sequences.sequence import FloatArray
@@ -98,14 +98,21 @@ def _table(file: Path, numbered: list[tuple[int, str]]) -> SensorTable | None:
         return None
     head = np.array([[_number(cell) for cell in row] for row in rows])
     layout = None
-    if first:
-        titles = [c.strip(" #\"'\ufeff") for c in numbered[first - 1][1].split(delimiter)]
-        if len(titles) == width or delimiter is not None:
-            layout = by_header(titles[:width], head)
+    titles = _titles([line for _, line in numbered[:first]], delimiter)
+    if titles and (len(titles) == width or delimiter is not None):
+        layout = by_header(titles[:width], head)
     layout = layout or by_rows(head)
     if layout is None:
         return None
     return SensorTable(**vars(layout), file=file, delimiter=delimiter, decimal=decimal, skip=skip)
+
+
+def _titles(above: list[str], delimiter: str | None) -> list[str]:
+    """Return the titles in the last line above the rows, or above a line of their units."""
+    lines = [unquoted(line, delimiter).split(delimiter) for line in above[-2:]]
+    titles = with_units_below(*lines) if len(lines) == 2 else None
+    titles = titles or (lines[-1] if lines else [])
+    return [title.strip(" #\"'\ufeff") for title in titles]
 
 
 def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
@@ -114,8 +121,12 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
     They are in rad/s, m/s^2 or uT if the file names a unit.
 
     Raises:
-        ReadError: a row is malformed, a unit is unknown, or a value exceeds any sensor's.
+        ReadError: a row is malformed, a unit is unknown, a value exceeds any sensor's, or the
+            file holds several IMUs of which none can be chosen.
     """
+    if table.conflict:
+        fix = "keep the columns and rows of one"
+        raise ReadError(table.file, "header", f"several IMUs ({table.conflict})", "one", fix)
     places, clock = table.axes[axes], table.clocks.get(axes, table.clock)
     rows = _rows(table, [clock, *places, *table.biases])
     blank = np.isnan(rows.values[:, 1:])
