@@ -25,8 +25,9 @@ from stario.sequences.readers.generic_csv import is_generic_csv, read_generic_cs
 from stario.sequences.readers.lines import first_bytes, first_line
 from stario.sequences.readers.lists import is_list, list_entries
 from stario.sequences.readers.phones.event_lines import is_event_lines, read_event_lines
-from stario.sequences.readers.phones.files import incomplete_sensors
+from stario.sequences.readers.phones.files import incomplete_sensors, names_both_sensors
 from stario.sequences.readers.phones.json_export import is_json_export, unpack_json
+from stario.sequences.readers.phones.long_form import is_long_form, unpack_long_form
 from stario.sequences.readers.phones.phone import is_phone, is_wide, read_phone, read_wide
 from stario.sequences.readers.poses import pose_files
 from stario.sequences.readers.published.advio import is_advio, read_advio
@@ -37,6 +38,7 @@ from stario.sequences.readers.published.ridi import is_ridi, read_ridi
 from stario.sequences.readers.published.rnin import is_rnin, read_rnin
 from stario.sequences.readers.published.ronin import is_ronin, read_ronin
 from stario.sequences.readers.published.tlio import is_tlio, read_tlio
+from stario.sequences.readers.unpacked_names import named_after
 from stario.sequences.readers.zipped import is_zip, unpacked
 from stario.sequences.sequence import ImuSequence
 
@@ -74,14 +76,14 @@ def _read_unpacked(
             raise ReadError(
                 path, "content", found, "one", f"unpack the {path.suffix[1:].lower() or 'zip'}"
             )
-        try:
+        with named_after(path, folder):
             sequence = read_recording(inside[0])
-        except ReadError as error:
-            file = str(error.path).replace(str(folder), str(path))
-            field = error.field.removeprefix(f"{error.path}: ")
-            found, fix = (text.replace(f"{folder}/", "") for text in (error.found, error.fix))
-            raise ReadError(file, field, found, error.expected, fix) from None
     return replace(sequence, name=path.stem) if inside == [folder] else sequence
+
+
+def _read_long_form(path: Path) -> ImuSequence:
+    words = "logger with the sensor named in each row"
+    return replace(_read_unpacked(unpack_long_form, path), source=words)
 
 
 FORMATS: dict[str, Format] = {
@@ -101,6 +103,7 @@ FORMATS: dict[str, Format] = {
     "zip": Format(is_zip, partial(_read_unpacked, unpacked), "zip"),
     "json": Format(is_json_export, partial(_read_unpacked, unpack_json), "Sensor Logger"),
     "csv": Format(is_generic_csv, read_generic_csv, "generic CSV"),
+    "long": Format(is_long_form, _read_long_form, "phone"),
 }
 """Known formats by name, tried in this order, more specific ones first; `euroc` also covers TUM-VI,
 `ridi` also IMUNet's processed recordings."""
@@ -272,6 +275,9 @@ def _unknown(path: Path) -> ReadError:
     elif sensors := incomplete_sensors(path):
         expected = "a gyroscope and an accelerometer"
         return ReadError(path, "sensors", f"only {' and '.join(sensors)}", expected, "log both")
+    elif names_both_sensors(path):
+        found, fix = "no column of times that grow", "name one `t [s]`; a count of samples is none"
+        return ReadError(path, "time", found, "one next to the sensors'", fix)
     elif path.is_dir() and (poses := pose_files(path)):
         expected = "a gyroscope file and an accelerometer file"
         fix = "put the IMU files into the same folder"

@@ -24,6 +24,9 @@ the factor between two units, so that only one unit fits."""
 _CLOCKS = {"sampletimefine": {"ticks of 100 us": 10**4, "us": 10**6}}
 """Units of clocks by their title: Xsens counts 10 kHz ticks in MT devices, microseconds in DOTs."""
 
+_SINCE_1970_S = 1e8
+"""Times beyond this [s] are counted from 1970 rather than from a start."""
+
 _FEW_ROWS = 10
 """Number of rows below which a count may be a coincidence."""
 
@@ -76,6 +79,23 @@ def refuse_row_numbers(file: Path, title: str, time: FloatArray) -> None:
         found = f"{time[0]:.0f}, {time[0] + 1:.0f}, {time[0] + 2:.0f}, ..., which counts the rows"
         fix = f"name a column of times `t [s]`; if these are times, name their unit: `{title} [ms]`"
         raise ReadError(file, title, found, "times", fix)
+
+
+def assumed_unit(per_second: int, first: float) -> str:
+    """Return the unit that times without one were taken for, empty if no other is possible.
+
+    Args:
+        per_second: units per second, as `time_unit` returns it.
+        first: the first time in that unit; one counted from 1970 fits no other unit.
+    """
+    if first / per_second > _SINCE_1970_S:
+        return ""
+    return next(unit for unit, count in TIME_UNITS.items() if count == per_second)
+
+
+def source_words(source: str, unit: str) -> str:
+    """Return a recording's source with the unit that its times were taken for, if there is one."""
+    return f"{source}, times taken as {unit}" if unit else source
 
 
 def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:

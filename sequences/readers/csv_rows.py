@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.clocks import refuse_row_numbers, time_unit
+from stario.sequences.readers.clocks import assumed_unit, refuse_row_numbers, time_unit
 from stario.sequences.readers.columns import IMU, MAGNETIC, TRUTH, Column, Header, unit_factor
 from stario.sequences.readers.dates import with_seconds
 from stario.sequences.readers.lines import decimal_mark, ends_within_a_row, unquoted
@@ -26,12 +26,21 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Rows:
-    """Columns by canonical name, times [s], mask of IMU samples, and line numbers of the rows."""
+    """Content of the rows.
+
+    Attributes:
+        table: columns (N,) by canonical name.
+        time: (N,) times [s].
+        is_imu: (N,) mask of IMU samples.
+        line_numbers: line number of each row.
+        assumed_unit: unit that times without one were taken for; empty if it is certain.
+    """
 
     table: dict[str, FloatArray]
     time: FloatArray
     is_imu: BoolArray
     line_numbers: Sequence[int]
+    assumed_unit: str = ""
 
 
 def read_rows(path: Path, lines: list[str], header: Header) -> Rows:
@@ -58,7 +67,7 @@ def _rows_quickly(path: Path, header: Header, decimal: str) -> Rows | None:
     if quick is None:
         return None
     stamps = quick.numbers(columns["t"].index)
-    per_second = _per_second(path, columns["t"], quick.values[:, 0])
+    per_second, assumed = _per_second(path, columns["t"], quick.values[:, 0])
     if stamps is not None and stamps.dtype.kind == "i":
         time = np.asarray((stamps - stamps[0]) / per_second, dtype=np.float64)
     elif stamps is not None and per_second == 1 and stamps[0] == 0.0:
@@ -71,6 +80,7 @@ def _rows_quickly(path: Path, header: Header, decimal: str) -> Rows | None:
         time=time,
         is_imu=np.ones(count, dtype=np.bool_),
         line_numbers=range(quick.first_row, quick.first_row + count),
+        assumed_unit=assumed,
     )
 
 
@@ -88,11 +98,13 @@ def _rows_carefully(path: Path, lines: list[str], header: Header, decimal: str) 
     is_imu = _imu_rows(numbered, header, values[:, : len(IMU)])
     if not is_imu.any():
         raise ReadError(path, "gx", "no row with IMU samples", "numbers in every IMU column")
+    time, assumed = _seconds(path, numbered, header, int(np.argmax(is_imu)))
     return Rows(
         table={name: values[:, k] for k, name in enumerate(used)},
-        time=_seconds(path, numbered, header, int(np.argmax(is_imu))),
+        time=time,
         is_imu=is_imu,
         line_numbers=[number for number, _ in numbered],
+        assumed_unit=assumed,
     )
 
 
@@ -156,8 +168,8 @@ def _imu_rows(numbered: list[tuple[int, str]], header: Header, values: FloatArra
 
 def _seconds(
     path: Path, numbered: list[tuple[int, str]], header: Header, origin: int
-) -> FloatArray:
-    """Return seconds since the row `origin`, computed exactly from the digits."""
+) -> tuple[FloatArray, str]:
+    """Return seconds since the row `origin`, exactly from the digits, and their assumed unit."""
     column = header.columns["t"]
     stamps = []
     for number, line in numbered:
@@ -168,15 +180,16 @@ def _seconds(
             where = f"line {number}, {column.title}"
             raise ReadError(path, where, repr(cell), "a time") from None
     finite = np.array([float(stamp) for stamp in stamps if stamp.is_finite()])
-    per_second = _per_second(path, column, finite)
+    per_second, assumed = _per_second(path, column, finite)
     start = next((stamp for stamp in stamps[origin:] if stamp.is_finite()), Decimal(0))
-    return np.array([float((stamp - start) / per_second) for stamp in stamps])
+    return np.array([float((stamp - start) / per_second) for stamp in stamps]), assumed
 
 
-def _per_second(path: Path, column: Column, time: FloatArray) -> int:
-    """Return the units per second, as the header names them or else inferred from the rate."""
+def _per_second(path: Path, column: Column, time: FloatArray) -> tuple[int, str]:
+    """Return the units per second and the unit assumed if the header names none, by the rate."""
     if not column.unit:
         refuse_row_numbers(path, column.title, time)
         with suppress(ReadError):
-            return time_unit(path, time)
-    return unit_factor(path, column, TIME_UNITS)
+            per_second = time_unit(path, time)
+            return per_second, assumed_unit(per_second, float(time[0]))
+    return unit_factor(path, column, TIME_UNITS), ""

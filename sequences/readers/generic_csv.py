@@ -32,7 +32,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
-from stario.sequences.readers.clocks import resample_to_gyro
+from stario.sequences.readers.clocks import resample_to_gyro, source_words
 from stario.sequences.readers.columns import (
     IMU,
     TRUTH,
@@ -87,6 +87,7 @@ def read_generic_csv(path: Path) -> ImuSequence:
         truth=truth,
         positions=positions,
         magnetometer=field,
+        source=source_words("generic CSV", rows.assumed_unit),
         converted=frozenset(sensor for sensor, done in converted.items() if done),
     )
 

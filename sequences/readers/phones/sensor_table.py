@@ -15,7 +15,7 @@ import numpy as np
 
 from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.clocks import time_unit
+from stario.sequences.readers.clocks import assumed_unit, refuse_row_numbers, time_unit
 from stario.sequences.readers.columns import Column, with_units_below
 from stario.sequences.readers.dates import with_seconds
 from stario.sequences.readers.lines import head_lines, unquoted
@@ -59,11 +59,19 @@ class SensorTable(Layout):
 
 @dataclass(frozen=True)
 class Samples:
-    """Samples of a sensor: times (N,) [ns], values (N, 3), and the named unit, empty if none."""
+    """Samples of a sensor.
+
+    Attributes:
+        stamps_ns: (N,) times [ns].
+        values: (N, 3) values.
+        unit: unit named in the file; empty if none.
+        assumed_time_unit: unit that times without one were taken for; empty if it is certain.
+    """
 
     stamps_ns: IntArray
     values: FloatArray
     unit: str = ""
+    assumed_time_unit: str = ""
 
 
 def sensor_table(file: Path) -> SensorTable | None:
@@ -148,9 +156,13 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
         raise ReadError(table.file, "header", f"unit {unit!r}", ", ".join(known))
     values = values * (known[unit] if unit else 1.0)
     _check_size(table.file, titles, sensor, values[kept])
-    per_second = time_unit(table.file, rows.values[kept, 0], clock.unit)
+    if not clock.unit:
+        refuse_row_numbers(table.file, clock.title or "time", rows.values[:, 0])
+    time = rows.values[kept, 0]
+    per_second = time_unit(table.file, time, clock.unit)
     stamps = rows.stamps_ns(clock.index, per_second, np.flatnonzero(kept))
-    return Samples(stamps, values[kept], unit)
+    assumed = "" if clock.unit else assumed_unit(per_second, float(time[0]))
+    return Samples(stamps, values[kept], unit, assumed)
 
 
 def _rows(table: SensorTable, used: Sequence[Column]) -> Table:
