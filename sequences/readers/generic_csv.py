@@ -4,10 +4,12 @@ The header names each column and its unit, `t [s],gx [rad/s],...,ax [m/s^2],...`
 separated by commas, semicolons or tabs like the rows below it; comments (`#`) may precede it:
 
 - numbers may have a decimal comma where that does not separate cells, or if they are quoted;
-- `t` in s, ms, us or ns, from any origin, or as ISO dates, read exactly and returned as seconds
-  since the first IMU row; `gx,gy,gz` angular rate in rad/s or deg/s; `ax,ay,az` specific force in
-  m/s^2 or g (-m/s^2 or -g if the device reports gravity, as Apple's do). Units that are not named
-  are rad/s, m/s^2 and, for time, the unit that gives a plausible sample rate.
+- `t` in s, ms, us or ns, from any origin, or as dates or times of day, read exactly and returned
+  as seconds since the first IMU row; `gx,gy,gz` angular rate in rad/s or deg/s; `ax,ay,az` specific
+  force in m/s^2 or g (-m/s^2 or -g if the device reports gravity, as Apple's do). Units may be in a
+  row below the titles; those that are not named are rad/s, m/s^2 and, for time, the unit that gives
+  a plausible sample rate.
+- gyroscope and accelerometer may be in separate rows, with blank cells for the other.
 - `mx,my,mz` magnetic field in uT (or nT, mT, T, gauss), in separate rows or in those of the IMU;
   blank, `NA` or `nan` where it was not sampled.
 - ground truth: `px,py,pz` [m] in a world with z up and `qx,qy,qz,qw`, body to world. A row may

@@ -20,7 +20,7 @@ from stario.sequences.readers.phones.sensor_words import (
     time_unit_of,
     unit_of,
 )
-from stario.sequences.readers.phones.which_imu import Axes, Group, choose
+from stario.sequences.readers.phones.which_imu import Axes, choose
 from stario.sequences.sequence import FloatArray
 
 _CLOCK_FROM = 1e6
@@ -74,7 +74,7 @@ def by_header(titles: list[str], head: FloatArray) -> Layout | None:
             groups.setdefault(axis[1], {}).setdefault(axis[0], place)
         elif bias is not None:
             biases.setdefault(bias, Column(k, title))
-    choice = choose(_groups(groups))
+    choice = choose(_complete(groups))
     axes = choice.axes
     attitude = tuple(quaternion[part] for part in "xyzw") if len(quaternion) == 4 else ()
     clocks = _clocks(titles, head)
@@ -93,14 +93,16 @@ def by_header(titles: list[str], head: FloatArray) -> Layout | None:
     )
 
 
-def _groups(columns: dict[tuple[str, ...], dict[str, Column]]) -> list[Group]:
+def _complete(
+    columns: dict[tuple[str, ...], dict[str, Column]],
+) -> dict[tuple[str, ...], Axes]:
     """Return the groups of columns that have all three axes."""
-    groups = []
+    groups: dict[tuple[str, ...], Axes] = {}
     for words, by_axis in columns.items():
         if set(by_axis) == set("xyz"):
             x, y, z = (by_axis[axis] for axis in "xyz")
             x = replace(x, unit="g") if "gf" in words and not x.unit else x
-            groups.append(Group(words, (x, y, z)))
+            groups[words] = x, y, z
     return groups
 
 

@@ -117,7 +117,7 @@ def _table(file: Path, numbered: list[tuple[int, str]]) -> SensorTable | None:
 
 def _titles(above: list[str], delimiter: str | None) -> list[str]:
     """Return the titles in the last line above the rows, or above a line of their units."""
-    lines = [unquoted(line, delimiter).split(delimiter) for line in above[-2:]]
+    lines = [unquoted(line.lstrip("# "), delimiter).split(delimiter) for line in above[-2:]]
     titles = with_units_below(*lines) if len(lines) == 2 else None
     titles = titles or (lines[-1] if lines else [])
     return [title.strip(" #\"'\ufeff") for title in titles]

@@ -41,7 +41,7 @@ _NOT_SAMPLES = {
     *("meta", "metadata", "down", "step", "steps", "estimated"),
 }
 _TIME = {"t", "time", "times", "timestamp", "timestamps", "seconds", "elapsed", "millis", "nanos"}
-_TIME |= {"datetime", "epoch", "epoc", "zeit", "tiempo", "temps", "tempo"}
+_TIME |= {"datetime", "epoch", "epoc", "uptime", "zeit", "tiempo", "temps", "tempo"}
 _NO_TIME = {"date", "zone", "timezone", "txt", "gps", "location", "utc", "format"}
 _UNIT_WORDS = {
     **dict.fromkeys(("ns", "nano", "nanos", "nanosecond", "nanoseconds"), "ns"),
@@ -180,7 +180,8 @@ def quaternion_of(name: str) -> str | None:
 def is_time(name: str) -> bool:
     """Return whether a column is a clock."""
     words = set(words_of(name))
-    return bool(words & _TIME) and not words & _NO_TIME
+    only_a_unit = len(words) == 1 and bool(words & ({*_UNIT_WORDS} - {"s"}))
+    return (only_a_unit or bool(words & _TIME)) and not words & _NO_TIME
 
 
 def time_unit_of(name: str) -> str:

@@ -7,8 +7,8 @@ devices apart, whose sensors must not be mixed.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 from stario.sequences.readers.columns import Column
 from stario.sequences.readers.phones.sensor_words import (
@@ -27,17 +27,16 @@ _IN_VARIANTS = {
 """Words of variants of a sensor and words that say nothing, besides `is_sensor_word`."""
 
 
+_OF_UNIT: dict[str, Sensor] = {"rad/s": "gyro", "deg/s": "gyro", "m/s^2": "accel", "g": "accel"}
+
+
 @dataclass(frozen=True)
 class Group:
-    """The three axes that share all other words of their titles."""
+    """The three axes that share all other words of their titles, and the sensor they belong to."""
 
     words: tuple[str, ...]
     axes: Axes
-
-    @property
-    def sensor(self) -> Sensor | None:
-        """The sensor that the words name."""
-        return sensor_of(self.words)
+    sensor: Sensor | None
 
     @property
     def device(self) -> tuple[str, ...]:
@@ -67,9 +66,12 @@ class Choice:
     conflict: str = ""
 
 
-def choose(groups: Iterable[Group]) -> Choice:
-    """Return the best group of each sensor, all of the first device that has both sensors."""
-    groups = [group for group in groups if group.sensor != "attitude"]
+def choose(columns: Mapping[tuple[str, ...], Axes]) -> Choice:
+    """Return the best group of each sensor, all of the first device that has both sensors.
+
+    `columns` has the axes of each group by the other words of their titles.
+    """
+    groups = [group for group in _groups(columns) if group.sensor != "attitude"]
     by_column = sorted(groups, key=lambda group: min(place.index for place in group.axes))
     gyros = [group for group in by_column if group.sensor == "gyro"]
     forces = [group for group in by_column if group.sensor in ("accel", "linear")]
@@ -86,6 +88,18 @@ def choose(groups: Iterable[Group]) -> Choice:
     used = [group for group in groups if group.device == device or group.sensor not in mine]
     others = [group for group in (*gyros, *forces) if group.device in set(whole) - {device}]
     return Choice(_best(used), tuple(group.axes[0].title for group in others))
+
+
+def _groups(columns: Mapping[tuple[str, ...], Axes]) -> list[Group]:
+    """Return the groups; a unit tells the sensor where no name does: `AsX(°/s)`."""
+    named = [Group(words, axes, sensor_of(words)) for words, axes in columns.items()]
+    known = {group.sensor for group in named}
+    groups = []
+    for group in named:
+        by_unit = _OF_UNIT.get(next((place.unit for place in group.axes if place.unit), ""))
+        guessed = group.sensor is None and bool(group.words) and by_unit not in known
+        groups.append(replace(group, sensor=by_unit) if guessed else group)
+    return groups
 
 
 def _best(groups: list[Group]) -> dict[str, Axes]:
