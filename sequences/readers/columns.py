@@ -55,6 +55,9 @@ _LIKE_TRUTH = re.compile(
     r"gt|truth|pos|quat|(ori|orientation)_?[wxyz]$|[ptq]?_?[xyz]$|q_?[w0-3]$", flags=re.IGNORECASE
 )
 _UNITS = {*ACCEL_UNITS, *GYRO_UNITS, *MAGNETIC_UNITS, *TIME_UNITS}
+_FEWEST_UNITS = 3
+"""Number of cells that make a row of units: those of one sensor."""
+
 _CELL = re.compile(r"\s*[\"']?\s*(?P<name>[^\[\(\"']*?)\s*(?:[\[\(](?P<unit>[^\]\)]*)[\]\)])?\W*$")
 
 
@@ -114,7 +117,7 @@ def columns_named(lines: list[str]) -> set[str]:
 def with_units_below(titles: list[str], below: list[str]) -> list[str] | None:
     """Return a header's titles with the units in the line below it, None if it holds none."""
     units = [re.sub(r"[\s\"'\[\]()]", "", cell) for cell in below]
-    if sum(unit_named(unit) in _UNITS for unit in units) < len(IMU):
+    if sum(unit_named(unit) in _UNITS for unit in units) < _FEWEST_UNITS:
         return None
     units += [""] * (len(titles) - len(units))
     pairs = zip(titles, units, strict=False)

@@ -47,6 +47,7 @@ from stario.sequences.readers.csv_rows import Rows, read_rows
 from stario.sequences.readers.lines import first_lines, read_lines
 from stario.sequences.readers.text import seconds
 from stario.sequences.sequence import (
+    BoolArray,
     FloatArray,
     ImuSequence,
     PositionTrack,
@@ -62,6 +63,9 @@ _MIN_WAYPOINT_INTERVAL = 2.0
 
 _SHARED_ROWS = 0.75
 """Share of the gyroscope's rows with an accelerometer below which that is interpolated."""
+
+_ALTERNATING = 0.1
+"""Share of neighbouring rows of which one holds it, above which the rows alternate."""
 
 _HEAD_LINES = 200
 """Number of lines within which the header must be for a file to be recognised."""
@@ -114,8 +118,7 @@ def _samples(
     """
     known = rows.is_imu & np.isfinite(rows.time)
     with_gyro, with_accel = (known & ~np.isnan(values).any(axis=1) for values in (gyro, accel))
-    shared = (with_gyro & with_accel).sum()
-    if with_accel.sum() < 2 or shared >= _SHARED_ROWS * with_gyro.sum():
+    if with_accel.sum() < 2 or not _in_separate_rows(with_accel[with_gyro]):
         return rows, rows.time[rows.is_imu], gyro[rows.is_imu], accel[rows.is_imu]
     ns = np.rint(np.where(known, rows.time, 0.0) * 1e9).astype(np.int64)
     stamps, rate, force = resample_to_gyro(
@@ -123,6 +126,16 @@ def _samples(
     )
     rows = replace(rows, time=rows.time - float(stamps[0]) * 1e-9)
     return rows, seconds(stamps, stamps[0]), rate, force
+
+
+def _in_separate_rows(shared: BoolArray) -> bool:
+    """Return whether rows of the gyroscope (N,), of which some hold the accelerometer, alternate.
+
+    A sensor that fails for a while does not: its samples stay NaN, to be counted.
+    """
+    if not shared.any():
+        return len(shared) > 0
+    return bool(shared.mean() < _SHARED_ROWS and np.diff(shared).mean() > _ALTERNATING)
 
 
 def _vectors(

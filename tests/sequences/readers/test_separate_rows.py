@@ -47,6 +47,26 @@ def test_blank_cells_of_the_other_sensor_are_interpolated(tmp_path: Path, header
     np.testing.assert_allclose(read.accel, accel, atol=1e-9)
 
 
+def test_a_slower_accelerometer_is_interpolated(tmp_path: Path) -> None:
+    cells = [text(force(t)) if k % 3 == 0 else ",," for k, t in enumerate(GYRO_TIMES.tolist())]
+    rows = [f"{t},{text(rate(t))},{cells[k]}" for k, t in enumerate(GYRO_TIMES.tolist())]
+    path = tmp_path / "own.csv"
+    path.write_text("\n".join([HEADER, *rows]) + "\n")
+    read = read_recording(path)
+    assert len(read) == 298
+    np.testing.assert_allclose(read.accel, expected(read.time, 0.0)[1], atol=1e-9)
+
+
+def test_an_accelerometer_that_fails_halfway_leaves_its_rows_to_be_counted(tmp_path: Path) -> None:
+    cells = [text(force(t)) if t < 1.0 else "nan,nan,nan" for t in GYRO_TIMES.tolist()]
+    rows = [f"{t},{text(rate(t))},{cells[k]}" for k, t in enumerate(GYRO_TIMES.tolist())]
+    path = tmp_path / "own.csv"
+    path.write_text("\n".join([HEADER, *rows]) + "\n")
+    read = read_recording(path)
+    assert len(read) == 300
+    assert np.isnan(read.accel).all(axis=1).sum() == 200
+
+
 def test_ground_truth_in_rows_of_its_own_stays_on_the_samples_clock(tmp_path: Path) -> None:
     header = f"{HEADER},px,py,pz,qx,qy,qz,qw"
     rows = [(t, f"{t:.3f},{text(rate(t))},,,,,,,,,,") for t in GYRO_TIMES.tolist()]

@@ -41,6 +41,15 @@ def shimmer(folder: Path, walk: ImuSequence) -> None:
          np.degrees(walk.gyro), blank, sep="\t")  # fmt: skip
 
 
+def units_below_the_titles(folder: Path, walk: ImuSequence) -> None:
+    for name, unit, values in (
+        ("acc", "g", walk.accel / STANDARD_GRAVITY),
+        ("gyr", "deg/s", np.degrees(walk.gyro)),
+    ):
+        header = f"time,x,y,z\n(us),({unit}),({unit}),({unit})"
+        save(folder / f"{name}.csv", header, micros(walk), values)
+
+
 def matlab_mobile(folder: Path, walk: ImuSequence) -> None:
     """Names of months, across midnight."""
     for name, values in (("Acceleration", walk.accel), ("AngularVelocity", walk.gyro)):
@@ -129,8 +138,9 @@ def quoted_titles_with_commas(folder: Path, walk: ImuSequence) -> None:
 LOGGERS: dict[str, Callable[[Path, ImuSequence], None]] = {
     write.__name__: write
     for write in (
-        shimmer, matlab_mobile, metawear, polar, witmotion, vectornav, movella, hyperimu,
-        microcontroller, date_and_time, titles_in_a_comment, quoted_titles_with_commas,
+        shimmer, units_below_the_titles, matlab_mobile, metawear, polar, witmotion, vectornav,
+        movella, hyperimu, microcontroller, date_and_time, titles_in_a_comment,
+        quoted_titles_with_commas,
     )
 }  # fmt: skip
 
