@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -17,7 +16,8 @@ from stario.sequences.readers.clocks import assumed_unit, refuse_row_numbers, ti
 from stario.sequences.readers.columns import IMU, MAGNETIC, TRUTH, Column, Header, unit_factor
 from stario.sequences.readers.dates import with_seconds
 from stario.sequences.readers.lines import decimal_mark, ends_within_a_row, unquoted
-from stario.sequences.readers.text import cell_value, is_missing, read_quickly, rows_below
+from stario.sequences.readers.rows import NumberedLine, is_missing, parsed_rows, rows_below
+from stario.sequences.readers.text import read_quickly
 from stario.sequences.sequence import BoolArray, FloatArray
 from stario.sequences.units import TIME_UNITS
 
@@ -94,7 +94,8 @@ def _rows_carefully(path: Path, lines: list[str], header: Header, decimal: str) 
         columns = {**columns, "t": replace(columns["t"], unit="s")}
         header = replace(header, columns=columns)
     used = [name for name in (*IMU, *MAGNETIC, *TRUTH) if name in columns]
-    values = _numbers(path, numbered, header.separator, [columns[name] for name in used])
+    places, titles = [columns[name].index for name in used], [columns[name].title for name in used]
+    values = parsed_rows(path, numbered, header.separator, places, titles)
     is_imu = _imu_rows(numbered, header, values[:, : len(IMU)])
     if not is_imu.any():
         raise ReadError(path, "gx", "no row with IMU samples", "numbers in every IMU column")
@@ -114,49 +115,7 @@ def _is_dated(row: str, header: Header) -> bool:
     return with_seconds(cell) != cell
 
 
-def _numbers(
-    path: Path, numbered: list[tuple[int, str]], separator: str, columns: list[Column]
-) -> FloatArray:
-    """Return the given columns as (N, K), with blank cells as NaN."""
-    text = "\n".join(line for _, line in numbered)
-    used = [column.index for column in columns]
-    with suppress(ValueError, IndexError):
-        return np.loadtxt(text.split("\n"), delimiter=separator, ndmin=2, usecols=used)
-    text = _blank(separator).sub("nan", text)
-    with suppress(ValueError, IndexError):
-        return np.loadtxt(text.split("\n"), delimiter=separator, ndmin=2, usecols=used)
-    return np.array([_row(path, number, line, separator, columns) for number, line in numbered])
-
-
-def _blank(separator: str) -> re.Pattern[str]:
-    """Return a pattern for blank cells within a line; a line end is not a blank."""
-    blanks = rf"[^\S\n{separator}]*"
-    return re.compile(
-        rf"(?<={separator}){blanks}(?={separator}|$)|^{blanks}(?={separator})", flags=re.MULTILINE
-    )
-
-
-def _row(path: Path, number: int, line: str, separator: str, columns: list[Column]) -> list[float]:
-    """Parse one row slowly, to raise an error that names its line and column."""
-    cells = line.split(separator)
-    needed = 1 + max(column.index for column in columns)
-    if len(cells) < needed:
-        separator_fix = f"separate the values by {separator!r} as in the header"
-        fix = separator_fix if len(cells) == 1 else "is the file cut short?"
-        raise ReadError(path, f"line {number}", f"{len(cells)} values", f"{needed}", fix)
-    row = []
-    for column in columns:
-        cell = cells[column.index].strip()
-        try:
-            row.append(cell_value(cell))
-        except ValueError:
-            where = f"line {number}, {column.title}"
-            fix = "write a decimal point" if "," in cell else ""
-            raise ReadError(path, where, repr(cell), "a number", fix) from None
-    return row
-
-
-def _imu_rows(numbered: list[tuple[int, str]], header: Header, values: FloatArray) -> BoolArray:
+def _imu_rows(numbered: list[NumberedLine], header: Header, values: FloatArray) -> BoolArray:
     """Return the mask of IMU samples: rows whose IMU cells are not all blank."""
     is_imu = np.ones(len(values), dtype=np.bool_)
     indices = [header.columns[name].index for name in IMU]
@@ -167,7 +126,7 @@ def _imu_rows(numbered: list[tuple[int, str]], header: Header, values: FloatArra
 
 
 def _seconds(
-    path: Path, numbered: list[tuple[int, str]], header: Header, origin: int
+    path: Path, numbered: list[NumberedLine], header: Header, origin: int
 ) -> tuple[FloatArray, str]:
     """Return seconds since the row `origin`, exactly from the digits, and their assumed unit."""
     column = header.columns["t"]

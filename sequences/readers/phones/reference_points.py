@@ -44,7 +44,7 @@ def reference_points(
         if found is None or not set(key.split()) <= words:
             continue
         first, delimiter, decimal = found
-        table = read_table(file, 3, lines[first][0], delimiter, None, decimal, killed=True)
+        table = read_table(file, 3, lines[first][0], delimiter, decimal, killed=True)
         start, stop = float(start_ns) * 1e-9 - _MARGIN_S, float(stop_ns) * 1e-9 + _MARGIN_S
         stamps = table.values[:, 0]
         # Stamps from zero fit finer units as well, but with all points at the start.

@@ -168,9 +168,8 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
 def _rows(table: SensorTable, used: Sequence[Column]) -> Table:
     """Read the given columns, skipping a last row that a killed recorder cut short."""
     indices = [place.index for place in used]
-    columns = max(indices) + 1
     return read_table(
-        table.file, columns, table.skip, table.delimiter, indices, table.decimal,
+        table.file, indices, table.skip, table.delimiter, table.decimal,
         killed=True, dated=table.dated,
     )  # fmt: skip
 
