@@ -194,6 +194,8 @@ class ImuSequence:
         device_attitude: attitude estimated by the device's own sensor fusion, or None.
         source: format or app of the recording, for display.
         axes: the axes x, y, z of all sensors in those of the file, see `with_axes`.
+        maybe_apple: whether the accelerometer may have Apple's sign, which nothing in the file
+            tells: `with_conventions` warns of it.
 
     Raises:
         InputError: the arrays' shapes do not agree, there is no sample, time, gyro or accel holds
@@ -212,6 +214,7 @@ class ImuSequence:
     device_attitude: DeviceAttitude | None = None
     source: str = ""
     axes: str = "x,y,z"
+    maybe_apple: bool = False
 
     def __post_init__(self) -> None:
         for name, kind in _PARTS.items():

@@ -11,13 +11,15 @@ from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 TIME_UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
 """Units per second: whole numbers, so that nanoseconds since 1970 can be read exactly."""
 
-GYRO_UNITS = {"rad/s": 1.0, "deg/s": math.pi / 180.0}
+GYRO_UNITS = {"rad/s": 1.0, "deg/s": math.pi / 180.0, "mdps": math.pi / 180e3}
 
 ACCEL_UNITS = {
     "m/s^2": 1.0,
     "g": STANDARD_GRAVITY,
     "-m/s^2": -1.0,
     "-g": -STANDARD_GRAVITY,
+    "mg": 1e-3 * STANDARD_GRAVITY,
+    "-mg": -1e-3 * STANDARD_GRAVITY,
 }
 """The minus is for devices that report gravity instead of specific force: Apple's."""
 
@@ -25,7 +27,7 @@ FAST_RAD_S = 15.0
 """Largest 95th percentile of the rate of a carried device; recordings have at most 2.7, but at
 least 41 if deg/s are taken for rad/s."""
 
-MAGNETIC_UNITS = {"uT": 1.0, "nT": 1e-3, "mT": 1e3, "T": 1e6, "gauss": 100.0, "mG": 0.1}
+MAGNETIC_UNITS = {"uT": 1.0, "nT": 1e-3, "mT": 1e3, "T": 1e6, "gauss": 100.0, "mg": 0.1}
 
 _SPELLINGS = {
     spelling: unit
@@ -34,14 +36,14 @@ _SPELLINGS = {
         "nT": ("nt",),
         "mT": ("mt",),
         "T": ("t", "tesla"),
-        "mG": ("mg", "milligauss"),
+        "mg": ("milligauss",),
         "s": ("sec", "second", "seconds"),
         "ms": ("msec", "millisecond", "milliseconds"),
         "us": ("usec", "microsecond", "microseconds", "µs", "μs"),
         "ns": ("nsec", "nanosecond", "nanoseconds"),
-        "rad/s": ("rads-1", "rad/sec"),
-        "deg/s": ("dps", "°/s", "\ufffd/s", "deg/sec", "degs-1"),
-        "m/s^2": ("m/s2", "m/s/s", "m/s²", "m/s\ufffd", "ms-2"),
+        "rad/s": ("rads", "rads-1", "rad/sec", "radps"),
+        "deg/s": ("dps", "°/s", "\ufffd/s", "deg/sec", "degs", "degs-1"),
+        "m/s^2": ("m/s2", "m/s/s", "m/s²", "m/s\ufffd", "ms2", "ms-2", "mps2", "m/(s2)"),
         "-m/s^2": ("-m/s2",),
     }.items()
     for spelling in spellings
@@ -51,9 +53,11 @@ _SPELLINGS = {
 def unit_named(text: str) -> str:
     """Return a unit in the tables' spelling, ignoring case, blanks and `^` (`rad s^-1`: `rad/s`).
 
+    In the names of columns a `_` stands for the `/`, as in `deg_s`.
+
     Characters garbled by a wrong encoding (`m/sÂ²`, `\ufffdT`) are recognised as well.
     """
-    plain = text.lower().replace(" ", "").replace("^", "").replace("â", "")
+    plain = text.lower().replace(" ", "").replace("^", "").replace("â", "").replace("_", "/")
     return _SPELLINGS.get(plain, plain)
 
 

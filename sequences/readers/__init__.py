@@ -19,14 +19,13 @@ from stario.sequences.readers.archive import (
     split_name,
 )
 from stario.sequences.readers.bag import is_bag, read_bag
-from stario.sequences.readers.columns import HEADER
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import is_generic_csv, read_generic_csv
-from stario.sequences.readers.lines import first_bytes, first_line
 from stario.sequences.readers.lists import is_list, list_entries
 from stario.sequences.readers.phones.event_lines import is_event_lines, read_event_lines
 from stario.sequences.readers.phones.files import incomplete_sensors
 from stario.sequences.readers.phones.json_export import is_json_export, unpack_json
+from stario.sequences.readers.phones.long_form import is_long_form, unpack_long_form
 from stario.sequences.readers.phones.phone import is_phone, is_wide, read_phone, read_wide
 from stario.sequences.readers.poses import pose_files
 from stario.sequences.readers.published.advio import is_advio, read_advio
@@ -37,6 +36,8 @@ from stario.sequences.readers.published.ridi import is_ridi, read_ridi
 from stario.sequences.readers.published.rnin import is_rnin, read_rnin
 from stario.sequences.readers.published.ronin import is_ronin, read_ronin
 from stario.sequences.readers.published.tlio import is_tlio, read_tlio
+from stario.sequences.readers.unpacked_names import named_after
+from stario.sequences.readers.unrecognised import unrecognised
 from stario.sequences.readers.zipped import is_zip, unpacked
 from stario.sequences.sequence import ImuSequence
 
@@ -74,14 +75,14 @@ def _read_unpacked(
             raise ReadError(
                 path, "content", found, "one", f"unpack the {path.suffix[1:].lower() or 'zip'}"
             )
-        try:
+        with named_after(path, folder):
             sequence = read_recording(inside[0])
-        except ReadError as error:
-            file = str(error.path).replace(str(folder), str(path))
-            field = error.field.removeprefix(f"{error.path}: ")
-            found, fix = (text.replace(f"{folder}/", "") for text in (error.found, error.fix))
-            raise ReadError(file, field, found, error.expected, fix) from None
     return replace(sequence, name=path.stem) if inside == [folder] else sequence
+
+
+def _read_long_form(path: Path) -> ImuSequence:
+    words = "logger with the sensor named in each row"
+    return replace(_read_unpacked(unpack_long_form, path), source=words)
 
 
 FORMATS: dict[str, Format] = {
@@ -101,6 +102,7 @@ FORMATS: dict[str, Format] = {
     "zip": Format(is_zip, partial(_read_unpacked, unpacked), "zip"),
     "json": Format(is_json_export, partial(_read_unpacked, unpack_json), "Sensor Logger"),
     "csv": Format(is_generic_csv, read_generic_csv, "generic CSV"),
+    "long": Format(is_long_form, _read_long_form, "phone"),
 }
 """Known formats by name, tried in this order, more specific ones first; `euroc` also covers TUM-VI,
 `ridi` also IMUNet's processed recordings."""
@@ -112,16 +114,6 @@ _SUFFIXES = (
     *(".bag", ".mcap", ".db3", ".hdf5", ".h5"),
 )
 """Suffixes of files that may be a recording by themselves."""
-
-_CONTAINERS = (
-    (b"SQLite format 3", "an SQLite database"),
-    (b"PK\x03\x04", "a zip without text files (such as a spreadsheet), or one that is cut short"),
-    (b"\xd0\xcf\x11\xe0", "a spreadsheet"),
-    (b"\x1f\x8b", "a file compressed with gzip"),
-    (b"7z\xbc\xaf", "a file compressed with 7-Zip"),
-    (b"MATLAB", "a MATLAB file"),
-)
-"""First bytes of files that may hold a recording but are not unpacked, and their description."""
 
 
 def read_recording(path: str | Path, format: str = "auto", **options: str) -> ImuSequence:
@@ -145,7 +137,7 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
         raise ReadError(path, "path", "no such file or folder", "a recording")
     name = _recognised(path) if format == "auto" else format
     if name is None:
-        raise _unknown(path)
+        raise unrecognised(path, sorted(_below(path)), _KNOWN)
     for option in options:
         if option not in FORMATS[name].options:
             known = ", ".join(FORMATS[name].options) or "none"
@@ -190,7 +182,7 @@ def find_recordings(
     found = [path] if path.is_file() else sorted(_below(path))
     if not found:
         if pose_files(path) or incomplete_sensors(path):
-            raise _unknown(path)
+            raise unrecognised(path, [], _KNOWN)
         raise ReadError(path, "folder", "no recording", f"recordings in {_KNOWN}")
     return _with_attributes(found, where)
 
@@ -262,34 +254,3 @@ def _is_recording(path: Path) -> bool:
 def _recognised(path: Path) -> str | None:
     """Return the name of the format that matches a path's content, or None."""
     return next((name for name, known in FORMATS.items() if known.recognises(path)), None)
-
-
-def _unknown(path: Path) -> ReadError:
-    """Return an error that describes what was found instead of a recording."""
-    fix = ""
-    if path.is_dir() and (inside := sorted(_below(path))):
-        found, fix = f"a folder of {len(inside)} recordings", f"name one, such as {inside[0]}"
-    elif sensors := incomplete_sensors(path):
-        expected = "a gyroscope and an accelerometer"
-        return ReadError(path, "sensors", f"only {' and '.join(sensors)}", expected, "log both")
-    elif path.is_dir() and (poses := pose_files(path)):
-        expected = "a gyroscope file and an accelerometer file"
-        fix = "put the IMU files into the same folder"
-        return ReadError(path, "content", f"only poses, {poses[0].name}", expected, fix)
-    elif path.is_dir():
-        entries = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
-        names = ", ".join(entries[:5]) + (
-            f" and {len(entries) - 5} more" if len(entries) > 5 else ""
-        )
-        found, fix = f"a folder with {names or 'nothing'}", "name one recording in it"
-    elif kind := next(
-        (words for start, words in _CONTAINERS if first_bytes(path).startswith(start)), ""
-    ):
-        found, fix = kind, "export as CSV, or as the zip or folder that the app writes"
-    elif first_bytes(path, 2)[:1] == b"\x80":
-        found, fix = "a pickle, which may run code", "save it as CSV or npy of plain numbers"
-    elif (line := first_line(path)) is None:
-        found, fix = "no line of text", "is it empty or compressed?"
-    else:
-        found, fix = f"{line.strip()[:60]!r}", f"a CSV of your own must start with {HEADER}"
-    return ReadError(path, "content", found, _KNOWN, fix)

@@ -8,16 +8,16 @@ carried which device where. Poses may come with `truth/{velocity,position_covari
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from stario.sequences.errors import ReadError, StarioError
+from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked, optional_package, rotations
+from stario.sequences.readers.hdf5 import DAMAGED, opened_hdf5
 from stario.sequences.readers.lines import first_bytes
 from stario.sequences.sequence import (
     BoolArray,
@@ -37,13 +37,11 @@ AttributeFilter = Mapping[str, Sequence[str]]
 
 _HDF5_MAGIC = b"\x89HDF"
 _RONIN = "data.hdf5"
+_EXPECTED = "an intact HDF5 archive"
 _OPTIONAL = {
     "velocity_W": "truth/velocity",
     "position_covariance_W": "truth/position_covariance",
 }
-
-_DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, AttributeError)
-"""Exceptions of h5py and NumPy for a damaged file, or for one with other content."""
 
 
 def split_name(path: Path) -> tuple[Path, str | None]:
@@ -69,7 +67,7 @@ def is_archive(path: Path) -> bool:
         with h5py.File(path) as file:
             first = next(iter(file.values()), None)
             return isinstance(first, h5py.Group) and ("imu/t" in first or "truth/t" in first)
-    except _DAMAGED:
+    except DAMAGED:
         return path.name != _RONIN
 
 
@@ -86,7 +84,7 @@ def archive_members(path: Path, where: AttributeFilter | None = None) -> list[Pa
             values present.
     """
     wanted = where or {}
-    with _opened(path) as file:
+    with opened_hdf5(path, _EXPECTED) as file:
         known = {
             name: {"name": name, **(_attributes(group) if wanted else {})}
             for name, group in file.items()
@@ -103,7 +101,7 @@ def archive_attributes(path: Path) -> dict[str, str | float]:
     file_path, name = split_name(path)
     if name is None:
         return {}
-    with _opened(file_path) as file:
+    with opened_hdf5(file_path, _EXPECTED) as file:
         return _attributes(file[name])
 
 
@@ -148,7 +146,7 @@ def read_archive(path: Path) -> ImuSequence:
         ReadError: the file or the recording does not exist, or its content is malformed.
     """
     file_path, name = split_name(path)
-    with _opened(file_path) as file:
+    with opened_hdf5(file_path, _EXPECTED) as file:
         names = list(file)
         if name is None and len(names) == 1:
             name = names[0]
@@ -259,18 +257,3 @@ def _plain(value: Any) -> str | float:
         return value if isinstance(value, str) else float(value)
     except (TypeError, ValueError):
         return str(value)
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    """Open the file; turn errors from damage or other content within the block into ReadError."""
-    h5py = optional_package("h5py", "readers")
-    try:
-        with h5py.File(path) as file:
-            yield file
-    except StarioError:
-        raise
-    except _DAMAGED as error:
-        found = " ".join(str(error).split())[:200] or type(error).__name__
-        fix = "is the download complete?"
-        raise ReadError(path, "content", found, "an intact HDF5 archive", fix) from error

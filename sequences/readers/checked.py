@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import MissingPackageError, ReadError
-from stario.sequences.sequence import FloatArray, Magnetometer, Trajectory
+from stario.sequences.sequence import BoolArray, FloatArray, Magnetometer, Trajectory
 from stario.sequences.time_order import increasing_mask
 
 _HELD_SHARE = 1.0 / 3.0
@@ -50,6 +50,16 @@ def rotations(
             path, where, f"norm {norm[k]:.4g}", "a unit quaternion", "cut the recording there"
         )
     return Rotation.from_quat(quat if order == "xyzw" else quat[:, [1, 2, 3, 0]])
+
+
+def captured_rotations(quat_xyzw: FloatArray) -> tuple[Rotation, BoolArray]:
+    """Return rotations from (N, 4) and the mask of those with a unit quaternion, else identity.
+
+    Captures that lose track write zeros, NaN or other numbers instead.
+    """
+    norm = np.linalg.norm(quat_xyzw, axis=1)
+    known = np.isfinite(norm) & (np.abs(norm - 1.0) <= NORM_TOLERANCE)
+    return Rotation.from_quat(np.where(known[:, None], quat_xyzw, [0.0, 0.0, 0.0, 1.0])), known
 
 
 def magnetometer(time: FloatArray, field: FloatArray, held: bool = True) -> Magnetometer | None:

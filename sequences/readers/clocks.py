@@ -27,6 +27,9 @@ _CLOCKS = {"sampletimefine": {"ticks of 100 us": 10**4, "us": 10**6}}
 _MARGIN_S = 60.0
 """Maximum time [s] by which rare rows may precede or follow their recording."""
 
+_SINCE_1970_S = 1e8
+"""Times beyond this [s] are counted from 1970 rather than from a start."""
+
 _FEW_ROWS = 10
 """Number of rows below which a count may be a coincidence."""
 
@@ -105,6 +108,23 @@ def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.in
     if not fitting[unit]:
         raise ReadError(file, "time", "other times", "times of the recording")
     return unit
+
+
+def assumed_unit(per_second: int, first: float) -> str:
+    """Return the unit that times without one were taken for, empty if no other is possible.
+
+    Args:
+        per_second: units per second, as `time_unit` returns it.
+        first: the first time in that unit; one counted from 1970 fits no other unit.
+    """
+    if first / per_second > _SINCE_1970_S:
+        return ""
+    return next(unit for unit, count in TIME_UNITS.items() if count == per_second)
+
+
+def source_words(source: str, unit: str) -> str:
+    """Return a recording's source with the unit that its times were taken for, if there is one."""
+    return f"{source}, times taken as {unit}" if unit else source
 
 
 def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:

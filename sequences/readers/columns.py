@@ -10,7 +10,14 @@ from pathlib import Path
 from typing import TypeVar
 
 from stario.sequences.errors import ReadError
-from stario.sequences.units import unit_named
+from stario.sequences.readers.phones.sensor_words import is_time
+from stario.sequences.units import (
+    ACCEL_UNITS,
+    GYRO_UNITS,
+    MAGNETIC_UNITS,
+    TIME_UNITS,
+    unit_named,
+)
 
 HEADER = "t [s],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2]"
 """The required columns of a header, as they are written."""
@@ -47,6 +54,10 @@ _ALIASES = dict.fromkeys(("t", "time", "times", "timestamp", "datetime"), "t") |
 _LIKE_TRUTH = re.compile(
     r"gt|truth|pos|quat|(ori|orientation)_?[wxyz]$|[ptq]?_?[xyz]$|q_?[w0-3]$", flags=re.IGNORECASE
 )
+_UNITS = {*ACCEL_UNITS, *GYRO_UNITS, *MAGNETIC_UNITS, *TIME_UNITS}
+_FEWEST_UNITS = 3
+"""Number of cells that make a row of units: those of one sensor."""
+
 _CELL = re.compile(r"\s*[\"']?\s*(?P<name>[^\[\(\"']*?)\s*(?:[\[\(](?P<unit>[^\]\)]*)[\]\)])?\W*$")
 
 
@@ -81,7 +92,10 @@ def read_header(path: Path, lines: list[str]) -> Header:
     if not _names_columns(line):
         found = repr(line.strip()[:60])
         raise ReadError(path, f"line {number}, header", found, HEADER, "put it above the rows")
-    return Header(number, _separator(line), _columns(path, number, line))
+    titles, below = _titles(line), lines[number] if number < len(lines) else ""
+    with_units = with_units_below(titles, below.split(_separator(line)))
+    columns = _columns(path, number, with_units or titles)
+    return Header(number + (with_units is not None), _separator(line), columns)
 
 
 def _header_index(lines: list[str]) -> int | None:
@@ -94,19 +108,28 @@ def _header_index(lines: list[str]) -> int | None:
     return None
 
 
-def is_header(lines: list[str]) -> bool:
-    """Return whether a file's lines begin with a header that names columns of this format."""
+def columns_named(lines: list[str]) -> set[str]:
+    """Return the canonical names of the columns in a header, empty without one."""
     index = _header_index(lines)
-    return index is not None and _names_columns(lines[index])
+    return set() if index is None else {*_names(_titles(lines[index]))} - {""}
 
 
-def _columns(path: Path, number: int, line: str) -> dict[str, Column]:
+def with_units_below(titles: list[str], below: list[str]) -> list[str] | None:
+    """Return a header's titles with the units in the line below it, None if it holds none."""
+    units = [re.sub(r"[\s\"'\[\]()]", "", cell) for cell in below]
+    if sum(unit_named(unit) in _UNITS for unit in units) < _FEWEST_UNITS:
+        return None
+    units += [""] * (len(titles) - len(units))
+    pairs = zip(titles, units, strict=False)
+    return [f"{title} [{unit}]" if unit else title for title, unit in pairs]
+
+
+def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
     columns: dict[str, Column] = {}
     ignored = []
-    for index, text in enumerate(_titles(line)):
+    for index, (text, name) in enumerate(zip(titles, _names(titles), strict=True)):
         title, unit = _cell(text)
-        name = _ALIASES.get(title.lower())
-        if name is None:
+        if not name:
             ignored.append(title)
         elif name in columns:
             found = f"both {title} and {columns[name].title}"
@@ -152,8 +175,16 @@ def unit_factor(path: Path, column: Column, known: Mapping[str, Factor]) -> Fact
 
 def _names_columns(line: str) -> bool:
     """Return whether a line names any IMU column of this format."""
-    names = {_ALIASES.get(_cell(text)[0].lower(), "") for text in _titles(line)}
-    return bool(names & set(IMU))
+    return bool(set(_names(_titles(line))) & set(IMU))
+
+
+def _names(titles: list[str]) -> list[str]:
+    """Return the canonical name of each title, empty for one of no interest."""
+    plain = [_cell(text)[0] for text in titles]
+    temperature = sum(map(is_time, plain)) > 1  # what `T` is next to a clock, as in ArduPilot's
+    return [
+        "" if title == "T" and temperature else _ALIASES.get(title.lower(), "") for title in plain
+    ]
 
 
 def _titles(line: str) -> list[str]:

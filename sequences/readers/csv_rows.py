@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -13,15 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.clocks import refuse_row_numbers, time_unit
+from stario.sequences.readers.clocks import assumed_unit, refuse_row_numbers, time_unit
 from stario.sequences.readers.columns import IMU, MAGNETIC, TRUTH, Column, Header, unit_factor
-from stario.sequences.readers.lines import (
-    decimal_mark,
-    ends_within_a_row,
-    unquoted,
-    with_seconds,
-)
-from stario.sequences.readers.text import cell_value, is_missing, read_quickly, rows_below
+from stario.sequences.readers.dates import with_seconds
+from stario.sequences.readers.lines import decimal_mark, ends_within_a_row, unquoted
+from stario.sequences.readers.rows import NumberedLine, is_missing, parsed_rows, rows_below
+from stario.sequences.readers.text import read_quickly
 from stario.sequences.sequence import BoolArray, FloatArray
 from stario.sequences.units import TIME_UNITS
 
@@ -30,12 +26,21 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Rows:
-    """Columns by canonical name, times [s], mask of IMU samples, and line numbers of the rows."""
+    """Content of the rows.
+
+    Attributes:
+        table: columns (N,) by canonical name.
+        time: (N,) times [s].
+        is_imu: (N,) mask of IMU samples.
+        line_numbers: line number of each row.
+        assumed_unit: unit that times without one were taken for; empty if it is certain.
+    """
 
     table: dict[str, FloatArray]
     time: FloatArray
     is_imu: BoolArray
     line_numbers: Sequence[int]
+    assumed_unit: str = ""
 
 
 def read_rows(path: Path, lines: list[str], header: Header) -> Rows:
@@ -62,7 +67,7 @@ def _rows_quickly(path: Path, header: Header, decimal: str) -> Rows | None:
     if quick is None:
         return None
     stamps = quick.numbers(columns["t"].index)
-    per_second = _per_second(path, columns["t"], quick.values[:, 0])
+    per_second, assumed = _per_second(path, columns["t"], quick.values[:, 0])
     if stamps is not None and stamps.dtype.kind == "i":
         time = np.asarray((stamps - stamps[0]) / per_second, dtype=np.float64)
     elif stamps is not None and per_second == 1 and stamps[0] == 0.0:
@@ -75,6 +80,7 @@ def _rows_quickly(path: Path, header: Header, decimal: str) -> Rows | None:
         time=time,
         is_imu=np.ones(count, dtype=np.bool_),
         line_numbers=range(quick.first_row, quick.first_row + count),
+        assumed_unit=assumed,
     )
 
 
@@ -82,66 +88,34 @@ def _rows_carefully(path: Path, lines: list[str], header: Header, decimal: str) 
     columns = header.columns
     below = rows_below(path, lines, header.lines)
     numbered = [(number, unquoted(line, header.separator, decimal)) for number, line in below]
-    if with_seconds(numbered[0][1]) != numbered[0][1]:
-        numbered = [(number, with_seconds(line)) for number, line in numbered]
+    if _is_dated(numbered[0][1], header):
+        lines = with_seconds(line for _, line in numbered)
+        numbered = [(number, line) for (number, _), line in zip(numbered, lines, strict=True)]
         columns = {**columns, "t": replace(columns["t"], unit="s")}
         header = replace(header, columns=columns)
     used = [name for name in (*IMU, *MAGNETIC, *TRUTH) if name in columns]
-    values = _numbers(path, numbered, header.separator, [columns[name] for name in used])
+    places, titles = [columns[name].index for name in used], [columns[name].title for name in used]
+    values = parsed_rows(path, numbered, header.separator, places, titles)
     is_imu = _imu_rows(numbered, header, values[:, : len(IMU)])
     if not is_imu.any():
         raise ReadError(path, "gx", "no row with IMU samples", "numbers in every IMU column")
+    time, assumed = _seconds(path, numbered, header, int(np.argmax(is_imu)))
     return Rows(
         table={name: values[:, k] for k, name in enumerate(used)},
-        time=_seconds(path, numbered, header, int(np.argmax(is_imu))),
+        time=time,
         is_imu=is_imu,
         line_numbers=[number for number, _ in numbered],
+        assumed_unit=assumed,
     )
 
 
-def _numbers(
-    path: Path, numbered: list[tuple[int, str]], separator: str, columns: list[Column]
-) -> FloatArray:
-    """Return the given columns as (N, K), with blank cells as NaN."""
-    text = "\n".join(line for _, line in numbered)
-    used = [column.index for column in columns]
-    with suppress(ValueError, IndexError):
-        return np.loadtxt(text.split("\n"), delimiter=separator, ndmin=2, usecols=used)
-    text = _blank(separator).sub("nan", text)
-    with suppress(ValueError, IndexError):
-        return np.loadtxt(text.split("\n"), delimiter=separator, ndmin=2, usecols=used)
-    return np.array([_row(path, number, line, separator, columns) for number, line in numbered])
+def _is_dated(row: str, header: Header) -> bool:
+    """Return whether a row's time is a date or a time of day."""
+    cell = row.split(header.separator)[header.columns["t"].index :][:1]
+    return with_seconds(cell) != cell
 
 
-def _blank(separator: str) -> re.Pattern[str]:
-    """Return a pattern for blank cells within a line; a line end is not a blank."""
-    blanks = rf"[^\S\n{separator}]*"
-    return re.compile(
-        rf"(?<={separator}){blanks}(?={separator}|$)|^{blanks}(?={separator})", flags=re.MULTILINE
-    )
-
-
-def _row(path: Path, number: int, line: str, separator: str, columns: list[Column]) -> list[float]:
-    """Parse one row slowly, to raise an error that names its line and column."""
-    cells = line.split(separator)
-    needed = 1 + max(column.index for column in columns)
-    if len(cells) < needed:
-        separator_fix = f"separate the values by {separator!r} as in the header"
-        fix = separator_fix if len(cells) == 1 else "is the file cut short?"
-        raise ReadError(path, f"line {number}", f"{len(cells)} values", f"{needed}", fix)
-    row = []
-    for column in columns:
-        cell = cells[column.index].strip()
-        try:
-            row.append(cell_value(cell))
-        except ValueError:
-            where = f"line {number}, {column.title}"
-            fix = "write a decimal point" if "," in cell else ""
-            raise ReadError(path, where, repr(cell), "a number", fix) from None
-    return row
-
-
-def _imu_rows(numbered: list[tuple[int, str]], header: Header, values: FloatArray) -> BoolArray:
+def _imu_rows(numbered: list[NumberedLine], header: Header, values: FloatArray) -> BoolArray:
     """Return the mask of IMU samples: rows whose IMU cells are not all blank."""
     is_imu = np.ones(len(values), dtype=np.bool_)
     indices = [header.columns[name].index for name in IMU]
@@ -152,9 +126,9 @@ def _imu_rows(numbered: list[tuple[int, str]], header: Header, values: FloatArra
 
 
 def _seconds(
-    path: Path, numbered: list[tuple[int, str]], header: Header, origin: int
-) -> FloatArray:
-    """Return seconds since the row `origin`, computed exactly from the digits."""
+    path: Path, numbered: list[NumberedLine], header: Header, origin: int
+) -> tuple[FloatArray, str]:
+    """Return seconds since the row `origin`, exactly from the digits, and their assumed unit."""
     column = header.columns["t"]
     stamps = []
     for number, line in numbered:
@@ -165,15 +139,16 @@ def _seconds(
             where = f"line {number}, {column.title}"
             raise ReadError(path, where, repr(cell), "a time") from None
     finite = np.array([float(stamp) for stamp in stamps if stamp.is_finite()])
-    per_second = _per_second(path, column, finite)
+    per_second, assumed = _per_second(path, column, finite)
     start = next((stamp for stamp in stamps[origin:] if stamp.is_finite()), Decimal(0))
-    return np.array([float((stamp - start) / per_second) for stamp in stamps])
+    return np.array([float((stamp - start) / per_second) for stamp in stamps]), assumed
 
 
-def _per_second(path: Path, column: Column, time: FloatArray) -> int:
-    """Return the units per second, as the header names them or else inferred from the rate."""
+def _per_second(path: Path, column: Column, time: FloatArray) -> tuple[int, str]:
+    """Return the units per second and the unit assumed if the header names none, by the rate."""
     if not column.unit:
         refuse_row_numbers(path, column.title, time)
         with suppress(ReadError):
-            return time_unit(path, time)
-    return unit_factor(path, column, TIME_UNITS)
+            per_second = time_unit(path, time)
+            return per_second, assumed_unit(per_second, float(time[0]))
+    return unit_factor(path, column, TIME_UNITS), ""

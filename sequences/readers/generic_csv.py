@@ -4,10 +4,12 @@ The header names each column and its unit, `t [s],gx [rad/s],...,ax [m/s^2],...`
 separated by commas, semicolons or tabs like the rows below it; comments (`#`) may precede it:
 
 - numbers may have a decimal comma where that does not separate cells, or if they are quoted;
-- `t` in s, ms, us or ns, from any origin, or as ISO dates, read exactly and returned as seconds
-  since the first IMU row; `gx,gy,gz` angular rate in rad/s or deg/s; `ax,ay,az` specific force in
-  m/s^2 or g (-m/s^2 or -g if the device reports gravity, as Apple's do). Units that are not named
-  are rad/s, m/s^2 and, for time, the unit that gives a plausible sample rate.
+- `t` in s, ms, us or ns, from any origin, or as dates or times of day, read exactly and returned
+  as seconds since the first IMU row; `gx,gy,gz` angular rate in rad/s or deg/s; `ax,ay,az` specific
+  force in m/s^2 or g (-m/s^2 or -g if the device reports gravity, as Apple's do). Units may be in a
+  row below the titles; those that are not named are rad/s, m/s^2 and, for time, the unit that gives
+  a plausible sample rate.
+- gyroscope and accelerometer may be in separate rows, with blank cells for the other.
 - `mx,my,mz` magnetic field in uT (or nT, mT, T, gauss), in separate rows or in those of the IMU;
   blank, `NA` or `nan` where it was not sampled.
 - ground truth: `px,py,pz` [m] in a world with z up and `qx,qy,qz,qw`, body to world. A row may
@@ -22,6 +24,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -31,10 +34,20 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
-from stario.sequences.readers.columns import TRUTH, Header, is_header, read_header, unit_factor
+from stario.sequences.readers.clocks import resample_to_gyro, source_words
+from stario.sequences.readers.columns import (
+    IMU,
+    TRUTH,
+    Header,
+    columns_named,
+    read_header,
+    unit_factor,
+)
 from stario.sequences.readers.csv_rows import Rows, read_rows
 from stario.sequences.readers.lines import first_lines, read_lines
+from stario.sequences.readers.text import seconds
 from stario.sequences.sequence import (
+    BoolArray,
     FloatArray,
     ImuSequence,
     PositionTrack,
@@ -48,6 +61,12 @@ _log = logging.getLogger(__name__)
 _MIN_WAYPOINT_INTERVAL = 2.0
 """Minimum median interval between waypoints [s]; positions at a shorter one are a track."""
 
+_SHARED_ROWS = 0.75
+"""Share of the gyroscope's rows with an accelerometer below which that is interpolated."""
+
+_ALTERNATING = 0.1
+"""Share of neighbouring rows of which one holds it, above which the rows alternate."""
+
 _HEAD_LINES = 200
 """Number of lines within which the header must be for a file to be recognised."""
 
@@ -59,30 +78,64 @@ def read_generic_csv(path: Path) -> ImuSequence:
     rows = read_rows(path, lines, header)
     gyro, gyro_converted = _vectors(path, header, rows, "g", GYRO_UNITS)
     accel, accel_converted = _vectors(path, header, rows, "a", ACCEL_UNITS)
+    rows, time, gyro, accel = _samples(path, rows, gyro, accel)
     truth, positions = _ground_truth(path, rows)
     field = None
     if "mx" in rows.table:
         vectors, _ = _vectors(path, header, rows, "m", MAGNETIC_UNITS)
         field = magnetometer(rows.time, vectors, held=False)
+    converted = {"gyro": gyro_converted, "accel": accel_converted}
     return ImuSequence(
         name=path.stem,
-        time=rows.time[rows.is_imu],
-        gyro=gyro[rows.is_imu],
-        accel=accel[rows.is_imu],
+        time=time,
+        gyro=gyro,
+        accel=accel,
         truth=truth,
         positions=positions,
         magnetometer=field,
-        converted=frozenset(
-            sensor
-            for sensor, done in (("gyro", gyro_converted), ("accel", accel_converted))
-            if done
-        ),
+        source=source_words("generic CSV", rows.assumed_unit),
+        converted=frozenset(sensor for sensor, done in converted.items() if done),
     )
 
 
 def is_generic_csv(path: Path) -> bool:
-    """Return whether a file starts with a header that names columns of this format."""
-    return is_header(first_lines(path, _HEAD_LINES, comments=True))
+    """Return whether a file starts with a header that names IMU columns of this format."""
+    return bool(named_columns(path) & set(IMU))
+
+
+def named_columns(path: Path) -> set[str]:
+    """Return the canonical names of the columns that a file's header names."""
+    return columns_named(first_lines(path, _HEAD_LINES, comments=True))
+
+
+def _samples(
+    path: Path, rows: Rows, gyro: FloatArray, accel: FloatArray
+) -> tuple[Rows, FloatArray, FloatArray, FloatArray]:
+    """Return the rows, and times (N,), gyroscope and accelerometer (N, 3) of the IMU samples.
+
+    If the sensors are mostly in different rows, the accelerometer is interpolated to those of the
+    gyroscope, and the time of all rows starts at the first one at which both are known.
+    """
+    known = rows.is_imu & np.isfinite(rows.time)
+    with_gyro, with_accel = (known & ~np.isnan(values).any(axis=1) for values in (gyro, accel))
+    if with_accel.sum() < 2 or not _in_separate_rows(with_accel[with_gyro]):
+        return rows, rows.time[rows.is_imu], gyro[rows.is_imu], accel[rows.is_imu]
+    ns = np.rint(np.where(known, rows.time, 0.0) * 1e9).astype(np.int64)
+    stamps, rate, force = resample_to_gyro(
+        path, ns[with_gyro], gyro[with_gyro], ns[with_accel], accel[with_accel]
+    )
+    rows = replace(rows, time=rows.time - float(stamps[0]) * 1e-9)
+    return rows, seconds(stamps, stamps[0]), rate, force
+
+
+def _in_separate_rows(shared: BoolArray) -> bool:
+    """Return whether rows of the gyroscope (N,), of which some hold the accelerometer, alternate.
+
+    A sensor that fails for a while does not: its samples stay NaN, to be counted.
+    """
+    if not shared.any():
+        return len(shared) > 0
+    return bool(shared.mean() < _SHARED_ROWS and np.diff(shared).mean() > _ALTERNATING)
 
 
 def _vectors(

@@ -7,7 +7,6 @@ import logging
 import os
 import re
 from collections.abc import Iterable
-from datetime import UTC, datetime
 from pathlib import Path
 
 from stario.sequences.errors import ReadError
@@ -16,7 +15,6 @@ _log = logging.getLogger(__name__)
 
 _HEAD_BYTES = 32768
 _TAIL_BYTES = 16384
-_DATE = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(\.\d+)?(Z|[+-]\d\d:?\d\d)?")
 _MARK = re.compile(r'(?:^|[;\t"])\s*[-+]?\d*([.,])\d+(?:[eE][-+]?\d+)?\s*(?=[;\t"]|$)')
 _QUOTED_MARK = re.compile(
     r'(?:^|[,"])\s*[-+]?\d*(\.|,(?=\d+(?:[eE][-+]?\d+)?\s*"))\d'  # a comma only within quotes
@@ -151,21 +149,6 @@ def unquoted(line: str, delimiter: str | None, decimal: str = ".") -> str:
         inner = "." if delimiter == decimal else " "
         line = delimiter.join(cell.replace(delimiter, inner) for cell in cells)
     return line if decimal in (".", delimiter) else line.replace(decimal, ".")
-
-
-def with_seconds(line: str) -> str:
-    """Replace ISO dates with their seconds since 1970; without a zone they are taken as UTC."""
-    return _DATE.sub(_seconds_of, line)
-
-
-def _seconds_of(match: re.Match[str]) -> str:
-    day, clock, fraction, zone = match.groups(default="")
-    try:
-        time = datetime.fromisoformat(f"{day}T{clock}{zone}")
-    except ValueError:  # such as 24:60:00
-        return match[0]
-    time = time if time.tzinfo else time.replace(tzinfo=UTC)
-    return f"{int(time.timestamp())}{fraction}"  # the digits of the fraction stay exact
 
 
 def ends_within_a_row(path: Path, delimiter: str | None) -> bool:

@@ -140,7 +140,7 @@ def pose_rows(file: Path) -> list[PoseCandidate]:
     if width < 8:
         return []
     columns = 13 if width >= 13 else 8
-    table = read_table(file, columns, lines[first][0], delimiter, None, decimal, killed=True)
+    table = read_table(file, columns, lines[first][0], delimiter, decimal, killed=True)
     stamps = table.stamps_ns(0, time_unit(file, table.values[:, 0]))
     numbers = table.values[:, 1:]
     if columns == 13:

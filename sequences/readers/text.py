@@ -13,13 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.lines import (
-    ends_within_a_row,
-    is_row,
-    read_lines,
-    unquoted,
-    with_seconds,
-)
+from stario.sequences.readers.dates import with_seconds
+from stario.sequences.readers.lines import ends_within_a_row, read_lines, unquoted
+from stario.sequences.readers.rows import parsed_rows, rows_below
 from stario.sequences.sequence import FloatArray
 
 _log = logging.getLogger(__name__)
@@ -97,10 +93,9 @@ class Table:
 
 def read_table(
     path: Path,
-    columns: int,
+    columns: int | list[int],
     skip: int = 0,
     delimiter: str | None = ",",
-    used: list[int] | None = None,
     decimal: str = ".",
     killed: bool = False,
     dated: bool = False,
@@ -109,23 +104,20 @@ def read_table(
 
     Args:
         path: the file; lines that start with `#` are skipped.
-        columns: minimum number of cells in a row; further ones are ignored.
+        columns: number of columns to return, or the indices of those to return.
         skip: number of header lines.
         delimiter: separator of the cells; None for blanks.
-        used: the columns to return, in this order; the first `columns` if None.
         decimal: decimal mark, a point or a comma.
         killed: whether to skip a last row that is cut short because the app was killed.
-        dated: whether to read ISO dates as seconds since 1970.
+        dated: whether to read dates and times of day as seconds, as `with_seconds` does.
 
     Raises:
         ReadError: a row is cut short or holds something that is not a number.
     """
-    wanted = list(range(columns)) if used is None else used
+    wanted = list(range(columns)) if isinstance(columns, int) else columns
     cut = killed and ends_within_a_row(path, delimiter)
     quick = None if cut or dated else read_quickly(path, skip, delimiter, wanted, decimal)
-    return quick or _read_carefully(
-        path, columns, skip, delimiter, wanted, decimal, killed, cut, dated
-    )
+    return quick or _read_carefully(path, skip, delimiter, wanted, decimal, killed, cut, dated)
 
 
 def read_quickly(
@@ -134,8 +126,8 @@ def read_quickly(
     """Read a large file with pandas, five times as fast as with NumPy; return None if it cannot.
 
     It cannot read a small file, or any without pandas, nor blank or malformed cells or rows cut
-    short, which only the slow reader reports. Arguments are those of `read_table`; `wanted` is its
-    `used`.
+    short, which only the slow reader reports. Arguments are those of `read_table`; `wanted` are the
+    indices of its columns.
     """
     try:
         if path.stat().st_size < _LARGE_BYTES:
@@ -158,15 +150,13 @@ def read_quickly(
     values = frame[wanted].to_numpy(dtype=np.float64)
 
     def cells(column: int) -> list[str]:
-        rows = _read_carefully(path, column + 1, skip, delimiter, [column], decimal)
-        return rows.cells(column)
+        return _read_carefully(path, skip, delimiter, [column], decimal).cells(column)
 
     return Table(path, values, skip + 1, cells, frame)
 
 
 def _read_carefully(
     path: Path,
-    columns: int,
     skip: int,
     delimiter: str | None,
     wanted: list[int],
@@ -179,73 +169,24 @@ def _read_carefully(
     if decimal != ".":
         lines = [line.replace(decimal, ".") for line in lines]
     if dated:
-        lines = [with_seconds(line) for line in lines]
+        lines = with_seconds(lines)
     numbered = rows_below(path, lines, skip)
     if killed and len(numbered) > 1:
         try:
-            _row(path, *numbered[-1], columns, delimiter, wanted)
+            parsed_rows(path, numbered[-1:], delimiter, wanted)
         except ReadError:
             cut = True
         if cut:
             _log.warning("%s: skipped the last row, which is cut short", path)
             numbered.pop()
-    rows = [line for _, line in numbered]
-    try:
-        values = np.loadtxt(rows, delimiter=delimiter, ndmin=2, usecols=wanted, comments=None)
-    except (ValueError, IndexError):
-        values = np.array([_row(path, k, line, columns, delimiter, wanted) for k, line in numbered])
     return Table(
         path,
-        values,
+        parsed_rows(path, numbered, delimiter, wanted),
         numbered[0][0],
-        lambda column: [line.split(delimiter, column + 1)[column] for line in rows],
+        lambda column: [line.split(delimiter, column + 1)[column] for _, line in numbered],
     )
 
 
 def seconds(stamps_ns: IntArray, origin_ns: np.int64 | int) -> FloatArray:
     """Convert time stamps [ns] to seconds since an origin."""
     return (stamps_ns - origin_ns).astype(np.float64) * 1e-9
-
-
-def rows_below(path: Path, lines: list[str], skip: int) -> list[tuple[int, str]]:
-    """Return a file's lines below its header that hold cells, with their numbers.
-
-    Raises:
-        ReadError: there is none.
-    """
-    numbered = [(k, line) for k, line in enumerate(lines[skip:], skip + 1) if is_row(line)]
-    if not numbered:
-        raise ReadError(path, "rows", "none below the header", "rows of numbers")
-    return numbered
-
-
-def _row(
-    path: Path, number: int, text: str, columns: int, delimiter: str | None, wanted: list[int]
-) -> list[float]:
-    """Parse one row slowly, to raise an error that names its line and column."""
-    cells = text.split(delimiter)
-    if len(cells) < columns:
-        fix = "the file looks cut short" if number > 1 else ""
-        raise ReadError(path, f"line {number}", f"{len(cells)} values", f"{columns}", fix)
-    values = []
-    for k in wanted:
-        try:
-            values.append(cell_value(cells[k]))
-        except ValueError:
-            where = f"line {number}, column {k + 1}"
-            raise ReadError(path, where, repr(cells[k].strip()), "a number") from None
-    return values
-
-
-def cell_value(cell: str) -> float:
-    """Return the number in a cell; NaN if it is blank or says that there is none, such as NA.
-
-    Raises:
-        ValueError: it holds anything else.
-    """
-    return float("nan") if is_missing(cell) else float(cell)
-
-
-def is_missing(cell: str) -> bool:
-    """Return whether a cell is blank or says that there is no value."""
-    return cell.strip().lower() in ("", "na", "n/a", "null", "none")

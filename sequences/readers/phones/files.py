@@ -7,6 +7,7 @@ folder are read as two recordings, each named by its gyroscope file.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,7 @@ from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.sensor_table import SensorTable, sensor_table
 from stario.sequences.readers.phones.sensor_words import (
     Sensor,
+    axis_of,
     is_sensor_word,
     is_uncalibrated,
     sensor_of,
@@ -89,7 +91,7 @@ def phone_recordings(folder: Path) -> list[PhoneFiles]:
     return [merged] if is_complete(merged.tables) else []
 
 
-def is_complete(sensors: Collection[str]) -> bool:
+def is_complete(sensors: Collection[str | None]) -> bool:
     """Return whether sensors include a gyroscope and an accelerometer of either kind."""
     return "gyro" in sensors and bool({"accel", "linear"} & set(sensors))
 
@@ -101,6 +103,15 @@ def incomplete_sensors(path: Path) -> list[Sensor]:
     """
     sensors = _sensors(path)
     return [] if is_complete(sensors) else sensors
+
+
+def names_both_sensors(path: Path) -> bool:
+    """Return whether a line at the start of a file names axes of both sensors, clock or not."""
+    for line in head_lines(path) if _may_hold(path) else ():
+        axes = (axis_of(cell.strip(" \"'")) for cell in re.split("[,;\t]", line))
+        if is_complete({sensor_of(axis[1]) for axis in axes if axis is not None}):
+            return True
+    return False
 
 
 def _sensors(path: Path) -> list[Sensor]:

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,8 +28,9 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
-from stario.sequences.readers.clocks import resample_to_gyro
-from stario.sequences.readers.generic_csv import is_generic_csv
+from stario.sequences.readers.clocks import resample_to_gyro, source_words
+from stario.sequences.readers.columns import IMU, POSITION
+from stario.sequences.readers.generic_csv import named_columns
 from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.attitude import device_attitude, logged_attitude
 from stario.sequences.readers.phones.files import (
@@ -84,23 +85,33 @@ def read_wide(path: Path) -> ImuSequence:
         found = repr(lines[0].strip()[:60]) if lines else "no lines"
         expected = "a header that names a clock and the axes of gyroscope and accelerometer"
         raise ReadError(path, "header", found, expected)
+    gyro = files.tables["gyro"][0]
+    if gyro.unused:
+        _log.warning(
+            "%s: several IMUs: read the one with %s, not those with %s; to read another, remove "
+            "the columns of this one", path, gyro.axes["gyro"][0].title, ", ".join(gyro.unused),
+        )  # fmt: skip
     return assemble_recording(path.stem, files, _wide_poses(path, files))
 
 
 def is_wide(path: Path) -> bool:
     """Return whether a file's header names a clock and the axes of both sensors.
 
-    A generic CSV does not count unless poses lie next to it or it holds two kinds of force.
+    A generic CSV counts only if poses lie next to it, or if it has two kinds of force (gFx and ax,
+    or gravity apart) and no ground truth.
     """
     if not path.is_file() or path.suffix.lower() not in SUFFIXES:
         return False
     files = _wide(path)
     if files is None:
         return False
+    named = named_columns(path)
+    if not named >= {"t", *IMU} or _wide_poses(path, files):
+        return True
     axes = files.tables["gyro"][0].axes
-    # Two kinds of force: gFx and ax.
-    has_both = "linear" in axes or axes["accel"][0].title.lower().startswith("g")
-    return not is_generic_csv(path) or bool(_wide_poses(path, files)) or has_both
+    in_two_parts = bool({"linear", "gravity"} & set(axes))
+    in_two_parts |= "accel" in axes and axes["accel"][0].title.lower().startswith("g")
+    return in_two_parts and not named & set(POSITION)
 
 
 def _wide(path: Path) -> PhoneFiles | None:
@@ -143,21 +154,21 @@ def assemble_recording(
     folder = files.gyro.parent
     gyro = _read(files.tables["gyro"][0], "gyro")
     attitude = logged_attitude(files, gyro)
-    accel, converted = _force(files, attitude, core_motion)
+    accel = _force(files, attitude, core_motion)
     stamps, rate, force = resample_to_gyro(
-        folder, gyro.stamps_ns, gyro.values, accel.stamps_ns, accel.values
+        folder, gyro.stamps_ns, gyro.values, accel.samples.stamps_ns, accel.samples.values
     )
-    if gyro.unit not in ("", "rad/s"):
-        converted |= {"gyro"}
+    converted = {"gyro": gyro.unit not in ("", "rad/s"), "accel": accel.converted}
     sequence = ImuSequence(
         name=name,
         time=seconds(stamps, stamps[0]),
         gyro=rate,
         accel=force,
-        converted=frozenset(converted),
+        converted=frozenset(sensor for sensor, done in converted.items() if done),
         magnetometer=_magnetometer(files, stamps[0], stamps[-1]),
         device_attitude=device_attitude(attitude, stamps[0]),
-        source="" if core_motion else app_of(files),
+        source="" if core_motion else source_words(app_of(files), gyro.assumed_time_unit),
+        maybe_apple=accel.maybe_apple,
     )
     sequence = with_pose(sequence, stamps[0], poses, orders)
     if sequence.truth is not None:
@@ -204,31 +215,42 @@ def _read(table: SensorTable, sensor: Sensor) -> Samples:
     return read_samples(table, sensor, axes)
 
 
+@dataclass(frozen=True)
+class _Force:
+    """Specific force, whether its unit or sign was converted, and whether Apple's sign is left."""
+
+    samples: Samples
+    converted: bool
+    maybe_apple: bool
+
+
 def _force(
     files: PhoneFiles, attitude: tuple[IntArray, Rotation] | None, core_motion: bool
-) -> tuple[Samples, set[str]]:
-    """Return the specific force, and {"accel"} if its unit or sign was converted."""
+) -> _Force:
+    """Return the specific force, with gravity added if that was logged apart."""
     candidates = [_read(table, "accel") for table in files.tables.get("accel", [])]
     gravity_table = files.first("gravity")
     gravity = None if gravity_table is None else _read(gravity_table, "gravity")
     total = _with_gravity(candidates, or_g=gravity is None)
     accel = total or (candidates[0] if candidates else _read(files.tables["linear"][0], "linear"))
-    separate_gravity = total is None and gravity is not None
+    in_two_parts = total is None and gravity is not None
     if total is None and gravity is not None:
-        folder = files.gyro.parent
         stamps, force, gravity_B = resample_to_gyro(
-            folder, accel.stamps_ns, accel.values, gravity.stamps_ns, gravity.values
+            files.gyro.parent, accel.stamps_ns, accel.values, gravity.stamps_ns, gravity.values
         )
         accel = replace(accel, stamps_ns=stamps, values=force + gravity_B)
         _log.info("%s: added gravity from its own columns or file", files.shown)
-    converted = {"accel"} if accel.unit not in ("", "m/s^2") else set()
     in_g = not accel.unit and is_in_g(accel.values)
-    sign = -1.0 if in_g and core_motion else accel_sign(files, accel, attitude, separate_gravity)
-    in_g &= sign < 0
-    if sign < 0:
-        converted |= {"accel"}
-    factor = sign * (STANDARD_GRAVITY if in_g else 1.0)
-    return replace(accel, values=factor * accel.values), converted
+    sign = -1.0 if in_g and core_motion else accel_sign(files, accel, attitude)
+    inverted = sign == -1.0
+    factor = -1.0 if inverted else 1.0
+    # In g without a sign, `check_units` asks for both unless the caller has given them.
+    factor *= STANDARD_GRAVITY if in_g and inverted else 1.0
+    return _Force(
+        samples=replace(accel, values=factor * accel.values),
+        converted=inverted or accel.unit not in ("", "m/s^2"),
+        maybe_apple=sign is None and in_two_parts and not in_g,
+    )
 
 
 def _with_gravity(candidates: list[Samples], or_g: bool) -> Samples | None:

@@ -40,7 +40,7 @@ def reference_points(
         if found is None or not set(key.split()) <= words:
             continue
         first, delimiter, decimal = found
-        table = read_table(file, 3, lines[first][0], delimiter, None, decimal, killed=True)
+        table = read_table(file, 3, lines[first][0], delimiter, decimal, killed=True)
         unit = unit_within(file, table.values[:, 0], start_ns, stop_ns)
         time = seconds(table.stamps_ns(0, unit), start_ns)
         kept = increasing_mask(time)

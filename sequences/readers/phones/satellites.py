@@ -122,11 +122,9 @@ def _read(
 ) -> PositionTrack | None:
     used = [header.clock.index, header.latitude, header.longitude]
     used += [] if header.radius is None else [header.radius]
-    table = read_table(
-        file, max(used) + 1, header.skip, header.delimiter, used, header.decimal, killed=True
-    )
+    table = read_table(file, used, header.skip, header.delimiter, header.decimal, killed=True)
     place = table.values[:, 1:3]
-    known = np.isfinite(place).all(axis=1) & (np.abs(place) <= [90.0, 180.0]).all(axis=1)
+    known = np.asarray((np.abs(place) <= [90.0, 180.0]).all(axis=1))  # not where NaN
     known &= place.any(axis=1)  # some apps write zeros until there is a position
     known[1:] &= (np.diff(place, axis=0) != 0.0).any(axis=1)  # repeated until there is another
     rows = np.flatnonzero(known)

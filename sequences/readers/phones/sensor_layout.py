@@ -7,7 +7,7 @@ is skipped.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,16 +16,19 @@ from stario.sequences.readers.phones.sensor_words import (
     axis_of,
     bias_axis_of,
     is_time,
-    is_uncalibrated,
     quaternion_of,
-    sensor_of,
     time_unit_of,
     unit_of,
 )
+from stario.sequences.readers.phones.which_imu import Axes, choose
 from stario.sequences.sequence import FloatArray
 
 _CLOCK_FROM = 1e6
 """A second column that grows and exceeds this is another clock."""
+
+_INSTANCE = {"i", "instance", "imu", "imu_id", "imu id"}
+_MAX_IMUS = 9
+"""Titles of a column that numbers IMUs, and their maximum number."""
 
 _SAME_PACE = 0.02
 """Relative tolerance within which a column as fast as the time, in any unit, is another clock."""
@@ -41,13 +44,17 @@ class Layout:
         quaternion: x, y, z and w of an attitude, if any.
         biases: columns to subtract from an uncalibrated sensor's values, if any.
         clocks: a sensor's own clock, by the key of its axes, if one precedes them.
+        unused: titles of the first columns of other IMUs, which are not read.
+        conflict: names of IMUs of which none can be chosen, empty if one can.
     """
 
     clock: Column
-    axes: dict[str, tuple[Column, Column, Column]]
+    axes: dict[str, Axes]
     quaternion: tuple[Column, ...] = ()
     biases: tuple[Column, ...] = ()
     clocks: dict[str, Column] = field(default_factory=dict)
+    unused: tuple[str, ...] = ()
+    conflict: str = ""
 
 
 def by_header(titles: list[str], head: FloatArray) -> Layout | None:
@@ -67,14 +74,8 @@ def by_header(titles: list[str], head: FloatArray) -> Layout | None:
             groups.setdefault(axis[1], {}).setdefault(axis[0], place)
         elif bias is not None:
             biases.setdefault(bias, Column(k, title))
-    axes: dict[str, tuple[Column, Column, Column]] = {}
-    for words in sorted(groups, key=_preference):
-        sensor = sensor_of(words)
-        if set(groups[words]) == set("xyz") and sensor != "attitude":
-            x, y, z = (groups[words][axis] for axis in "xyz")
-            if "gf" in words and not x.unit:
-                x = Column(x.index, x.title, "g")
-            axes.setdefault(sensor or "", (x, y, z))
+    choice = choose(_complete(groups))
+    axes = choice.axes
     attitude = tuple(quaternion[part] for part in "xyzw") if len(quaternion) == 4 else ()
     clocks = _clocks(titles, head)
     if not clocks or not (axes or attitude):
@@ -87,6 +88,8 @@ def by_header(titles: list[str], head: FloatArray) -> Layout | None:
         quaternion=attitude,
         biases=tuple(biases[axis] for axis in "xyz") if raw else (),
         clocks={key: _finest(run, head) for key, run in before.items() if run},
+        unused=choice.unused,
+        conflict=choice.conflict or _instances(titles, head),
     )
 
 
@@ -96,9 +99,26 @@ def clock_of(titles: list[str], head: FloatArray) -> Column | None:
     return _finest(clocks, head) if clocks else None
 
 
-def _preference(words: tuple[str, ...]) -> tuple[bool, bool, int]:
-    """Return a sort key: calibrated sensors first, then total force, then fewer words."""
-    return is_uncalibrated(words), not {"gf", "total"} & set(words), len(words)
+def _complete(
+    columns: dict[tuple[str, ...], dict[str, Column]],
+) -> dict[tuple[str, ...], Axes]:
+    """Return the groups of columns that have all three axes."""
+    groups: dict[tuple[str, ...], Axes] = {}
+    for words, by_axis in columns.items():
+        if set(by_axis) == set("xyz"):
+            x, y, z = (by_axis[axis] for axis in "xyz")
+            x = replace(x, unit="g") if "gf" in words and not x.unit else x
+            groups[words] = x, y, z
+    return groups
+
+
+def _instances(titles: list[str], head: FloatArray) -> str:
+    """Describe a column that numbers the IMUs whose rows alternate, as `I` in ArduPilot's logs."""
+    for title, column in zip(titles, head.T, strict=False):
+        numbers = sorted(set(column.tolist()))
+        if title.lower() in _INSTANCE and 1 < len(numbers) <= _MAX_IMUS:
+            return f"{title} " + " and ".join(f"{number:.0f}" for number in numbers)
+    return ""
 
 
 def _clocks(titles: list[str], head: FloatArray) -> list[Column]:

@@ -15,9 +15,10 @@ import numpy as np
 
 from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.clocks import time_unit
-from stario.sequences.readers.columns import Column
-from stario.sequences.readers.lines import head_lines, with_seconds
+from stario.sequences.readers.clocks import assumed_unit, refuse_row_numbers, time_unit
+from stario.sequences.readers.columns import Column, with_units_below
+from stario.sequences.readers.dates import with_seconds
+from stario.sequences.readers.lines import head_lines, unquoted
 from stario.sequences.readers.phones.sensor_layout import Layout, by_header, by_rows
 from stario.sequences.readers.text import IntArray, Table, read_table
 from stario.sequences.sequence import FloatArray
@@ -46,7 +47,7 @@ class SensorTable(Layout):
         delimiter: separator of the cells; None for blanks.
         decimal: decimal mark, a point or a comma.
         skip: number of lines before the first row.
-        dated: whether the times are ISO dates.
+        dated: whether the times are dates or times of day.
     """
 
     file: Path
@@ -58,23 +59,35 @@ class SensorTable(Layout):
 
 @dataclass(frozen=True)
 class Samples:
-    """Samples of a sensor: times (N,) [ns], values (N, 3), and the named unit, empty if none."""
+    """Samples of a sensor.
+
+    Attributes:
+        stamps_ns: (N,) times [ns].
+        values: (N, 3) values.
+        unit: unit named in the file; empty if none.
+        assumed_time_unit: unit that times without one were taken for; empty if it is certain.
+    """
 
     stamps_ns: IntArray
     values: FloatArray
     unit: str = ""
+    assumed_time_unit: str = ""
 
 
 def sensor_table(file: Path) -> SensorTable | None:
     """Return how to read a file's rows, or None if that cannot be determined; never raises."""
     numbered = [(k, line) for k, line in enumerate(head_lines(file)) if line.strip()]
     numbered = numbered[: 4 * _HEAD_ROWS]
-    dated = [(k, with_seconds(line)) for k, line in numbered]
     table = _table(file, numbered)
-    if table is None and dated != numbered:
-        table = _table(file, dated)
-        return None if table is None else replace(table, dated=True)
-    return table
+    if table is not None:
+        return table
+    lines = with_seconds(line for _, line in numbered)
+    dated = [(k, line) for (k, _), line in zip(numbered, lines, strict=True)]
+    table = _table(file, dated) if dated != numbered else None
+    if table is None:
+        return None
+    clocks = {sensor: replace(clock, unit="s") for sensor, clock in table.clocks.items()}
+    return replace(table, dated=True, clock=replace(table.clock, unit="s"), clocks=clocks)
 
 
 def _table(file: Path, numbered: list[tuple[int, str]]) -> SensorTable | None:
@@ -93,14 +106,21 @@ def _table(file: Path, numbered: list[tuple[int, str]]) -> SensorTable | None:
         return None
     head = np.array([[_number(cell) for cell in row] for row in rows])
     layout = None
-    if first:
-        titles = [c.strip(" #\"'\ufeff") for c in numbered[first - 1][1].split(delimiter)]
-        if len(titles) == width or delimiter is not None:
-            layout = by_header(titles[:width], head)
+    titles = _titles([line for _, line in numbered[:first]], delimiter)
+    if titles and (len(titles) == width or delimiter is not None):
+        layout = by_header(titles[:width], head)
     layout = layout or by_rows(head)
     if layout is None:
         return None
     return SensorTable(**vars(layout), file=file, delimiter=delimiter, decimal=decimal, skip=skip)
+
+
+def _titles(above: list[str], delimiter: str | None) -> list[str]:
+    """Return the titles in the last line above the rows, or above a line of their units."""
+    lines = [unquoted(line.lstrip("# "), delimiter).split(delimiter) for line in above[-2:]]
+    titles = with_units_below(*lines) if len(lines) == 2 else None
+    titles = titles or (lines[-1] if lines else [])
+    return [title.strip(" #\"'\ufeff") for title in titles]
 
 
 def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
@@ -109,8 +129,12 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
     They are in rad/s, m/s^2 or uT if the file names a unit.
 
     Raises:
-        ReadError: a row is malformed, a unit is unknown, or a value exceeds any sensor's.
+        ReadError: a row is malformed, a unit is unknown, a value exceeds any sensor's, or the
+            file holds several IMUs of which none can be chosen.
     """
+    if table.conflict:
+        fix = "keep the columns and rows of one"
+        raise ReadError(table.file, "header", f"several IMUs ({table.conflict})", "one", fix)
     places, clock = table.axes[axes], table.clocks.get(axes, table.clock)
     rows = _rows(table, [clock, *places, *table.biases])
     blank = np.isnan(rows.values[:, 1:])
@@ -132,17 +156,20 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
         raise ReadError(table.file, "header", f"unit {unit!r}", ", ".join(known))
     values = values * (known[unit] if unit else 1.0)
     _check_size(table.file, titles, sensor, values[kept])
-    per_second = time_unit(table.file, rows.values[kept, 0], clock.unit)
+    if not clock.unit:
+        refuse_row_numbers(table.file, clock.title or "time", rows.values[:, 0])
+    time = rows.values[kept, 0]
+    per_second = time_unit(table.file, time, clock.unit)
     stamps = rows.stamps_ns(clock.index, per_second, np.flatnonzero(kept))
-    return Samples(stamps, values[kept], unit)
+    assumed = "" if clock.unit else assumed_unit(per_second, float(time[0]))
+    return Samples(stamps, values[kept], unit, assumed)
 
 
 def _rows(table: SensorTable, used: Sequence[Column]) -> Table:
     """Read the given columns, skipping a last row that a killed recorder cut short."""
     indices = [place.index for place in used]
-    columns = max(indices) + 1
     return read_table(
-        table.file, columns, table.skip, table.delimiter, indices, table.decimal,
+        table.file, indices, table.skip, table.delimiter, table.decimal,
         killed=True, dated=table.dated,
     )  # fmt: skip
 

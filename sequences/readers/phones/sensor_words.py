@@ -22,7 +22,7 @@ _WITHOUT_G = re.compile(r"\bwithout[-_ ]g\b", flags=re.IGNORECASE)
 _GLUED = re.compile(r"(?P<stem>[a-z]*?)(?P<axis>[xyz])")
 
 _BEGINNINGS: dict[Sensor, tuple[str, ...]] = {
-    "linear": ("lin", "user"),
+    "linear": ("lin", "user", "free"),
     "gravity": ("grav",),
     "gyro": ("gyr", "giro", "angular", "omega"),
     "mag": ("mag",),
@@ -35,12 +35,13 @@ _WHOLE: dict[Sensor, tuple[str, ...]] = {
     "mag": ("m", "b"),
     "attitude": ("rv", "ori"),
 }
+_VARIANTS = ("total", "uncal", "calibrated", "field", "vector", "rate", "measurement")
 _NOT_SAMPLES = {
     *("bias", "drift", "offset", "calib", "calibration", "accuracy", "std", "variance"),
     *("meta", "metadata", "down", "step", "steps", "estimated"),
 }
 _TIME = {"t", "time", "times", "timestamp", "timestamps", "seconds", "elapsed", "millis", "nanos"}
-_TIME |= {"zeit", "tiempo", "temps", "tempo"}
+_TIME |= {"datetime", "epoch", "epoc", "uptime", "zeit", "tiempo", "temps", "tempo"}
 _NO_TIME = {"date", "zone", "timezone", "txt", "gps", "location", "utc", "format"}
 _UNIT_WORDS = {
     **dict.fromkeys(("ns", "nano", "nanos", "nanosecond", "nanoseconds"), "ns"),
@@ -52,19 +53,50 @@ _XSENS_CLOCK = "sampletimefine"
 """Clock of Xsens, whose unit `clocks.time_unit` determines."""
 
 _BRACKETS = re.compile(r"[\[(]\s*([^\])]*?)\s*[\])]")
+_INDEX = re.compile(r"\[([012])\]\s*$")
+_UNIT_WORD = re.compile(
+    r"[\s_.,-]+(m[/_ ]?s\^?2|m/s²|mps2|m/s/s|rad[/_ ]?s|radps|deg[/_ ]?s|°/s|m?dps|m?g|[unmµμ]t)"
+    r"(?=[\s_.,-]|$)",
+    flags=re.IGNORECASE,
+)
+"""A unit that is a word of a column's name: `acc_x_g`, `Gyroscope X deg/s`, `gyro_dps_x`."""
 
 
 def words_of(name: str) -> list[str]:
     """Return the words of a name in lower case, without text in brackets."""
     plain = _G_FORCE.sub("gf ", _BRACKETS.sub(" ", name))
-    plain = _WITHOUT_G.sub(" linear ", _WITH_G.sub(" ", plain))
+    plain = _WITHOUT_G.sub(" linear ", _WITH_G.sub(" ", plain)).replace("MetaWear", "Metawear")
     return [word.lower() for word in _WORD.findall(plain)]
 
 
 def unit_of(name: str) -> str:
-    """Return the unit in brackets, in the unit tables' spelling; empty without one."""
-    match = _BRACKETS.search(name)
+    """Return the unit of an axis, in brackets or a word of its name; empty without one."""
+    return _bracketed_unit(name) or _without_unit(name)[1]
+
+
+def _bracketed_unit(name: str) -> str:
+    match = _BRACKETS.search(_with_axis(name))
     return unit_named(match[1]) if match else ""
+
+
+def _without_unit(name: str) -> tuple[str, str]:
+    """Return an axis's name without the word that is its unit, and the unit; else (name, "").
+
+    A `g` is one only next to the name of a sensor: `acc_x_g`, but not `imu_g_x` of a gyroscope.
+    """
+    match = _UNIT_WORD.search(name)
+    if match is None:
+        return name, ""
+    rest, unit = name[: match.start()] + name[match.end() :], unit_named(match[1])
+    axis = _plain_axis_of(rest)
+    if unit in ("g", "mg") and (axis is None or sensor_of(axis[1]) in (None, "gyro")):
+        return name, ""
+    return rest, unit
+
+
+def _with_axis(name: str) -> str:
+    """Return a name whose index is replaced by the axis: `gyro_rad[0]` becomes `gyro_rad_x`."""
+    return _INDEX.sub(lambda match: "_" + "xyz"[int(match[1])], name)
 
 
 def sensor_of(words: Iterable[str]) -> Sensor | None:
@@ -72,12 +104,17 @@ def sensor_of(words: Iterable[str]) -> Sensor | None:
     words = list(words)
     if set(words) & _NOT_SAMPLES:
         return None
-    sensors = {sensor for word in words if (sensor := _sensor(word)) is not None}
+    # A single letter names a sensor only if no word does: in `Shimmer_A_Gyro_X` it does not.
+    sensors = _sensors(word for word in words if len(word) > 1) or _sensors(words)
     if "linear" in sensors:  # linear acceleration, user acceleration
         return "linear" if sensors <= {"linear", "accel"} else None
     if sensors == {"gyro", "attitude"} or (sensors == {"attitude"} and "rate" in words):
         return "gyro"  # gyro rotation, rotation rate
     return next(iter(sensors)) if len(sensors) == 1 else None
+
+
+def _sensors(words: Iterable[str]) -> set[Sensor]:
+    return {sensor for word in words if (sensor := _sensor(word)) is not None}
 
 
 def _sensor(word: str) -> Sensor | None:
@@ -89,8 +126,7 @@ def _sensor(word: str) -> Sensor | None:
 
 def is_sensor_word(word: str) -> bool:
     """Return whether a word names a sensor or one of its variants, rather than a recording."""
-    variants = ("total", "uncal", "calibrated", "field", "vector", "rate", "measurement")
-    return _sensor(word) is not None or word.startswith(variants)
+    return _sensor(word) is not None or word.startswith(_VARIANTS)
 
 
 def without_sensor(stem: str) -> str:
@@ -101,11 +137,19 @@ def without_sensor(stem: str) -> str:
 
 def is_uncalibrated(words: Iterable[str]) -> bool:
     """Return whether words name a sensor's raw variant."""
-    return any(word.startswith(("uncal", "raw")) for word in words)
+    return any(word.startswith(("uncal", "uncomp", "raw")) for word in words)
 
 
 def axis_of(name: str) -> tuple[str, tuple[str, ...]] | None:
     """Return a column's axis and its other words; None if it is not an axis of samples."""
+    named = _with_axis(name)
+    axis = _plain_axis_of(_without_unit(named)[0])
+    if named != name and axis is not None and sensor_of(axis[1]) is None:
+        return None  # an element of some other array
+    return axis
+
+
+def _plain_axis_of(name: str) -> tuple[str, tuple[str, ...]] | None:
     words = words_of(name)
     if set(words) & _NOT_SAMPLES:
         return None
@@ -136,7 +180,8 @@ def quaternion_of(name: str) -> str | None:
 def is_time(name: str) -> bool:
     """Return whether a column is a clock."""
     words = set(words_of(name))
-    return bool(words & _TIME) and not words & _NO_TIME
+    only_a_unit = len(words) == 1 and bool(words & ({*_UNIT_WORDS} - {"s"}))
+    return (only_a_unit or bool(words & _TIME)) and not words & _NO_TIME
 
 
 def time_unit_of(name: str) -> str:
@@ -146,6 +191,6 @@ def time_unit_of(name: str) -> str:
     """
     if "".join(words_of(name)) == _XSENS_CLOCK:
         return _XSENS_CLOCK
-    if (named := unit_of(name)) and (named in TIME_UNITS or named not in ("", "since")):
+    if (named := _bracketed_unit(name)) and (named in TIME_UNITS or named not in ("", "since")):
         return named
     return next((_UNIT_WORDS[word] for word in reversed(words_of(name)) if word in _UNIT_WORDS), "")

@@ -42,31 +42,20 @@ def is_in_g(values: FloatArray) -> bool:
 
 
 def accel_sign(
-    files: PhoneFiles,
-    accel: Samples,
-    attitude: tuple[IntArray, Rotation] | None,
-    gravity_in_own_file: bool,
-) -> float:
-    """Return 1.0, or -1.0 if the accelerometer has Apple's sign.
+    files: PhoneFiles, accel: Samples, attitude: tuple[IntArray, Rotation] | None
+) -> float | None:
+    """Return 1.0, -1.0 if the accelerometer has Apple's sign, or None if nothing tells.
 
     `attitude` is the phone's own, as `logged_attitude` returns it.
     """
-    folder = files.gyro.parent
-    in_g = is_in_g(accel.values)
     sign = _by_attitude(attitude, accel)
     if sign is None:
-        sign = _by_system(folder, in_g)
+        sign = _by_system(files.gyro.parent, is_in_g(accel.values))
     if sign is None and accel.unit == "g" and _has_core_motion(files):
         sign = -1.0
-    # If in g without a sign, `check_units` asks for both unless the caller has given them.
-    if sign is None and not (in_g and not accel.unit) and gravity_in_own_file:
-        _log.warning(
-            "%s: gravity is in a separate file, as Sensor Logger writes it on iPhones, whose sign "
-            "is inverted: if the files are from an iPhone, pass `--accel-sign apple`", files.shown,
-        )  # fmt: skip
     if sign == -1.0:
         _log.info("%s: inverted the accelerometer, which has Apple's sign", files.shown)
-    return sign or 1.0
+    return sign
 
 
 def _by_system(folder: Path, in_g: bool) -> float | None:

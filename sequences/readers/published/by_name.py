@@ -47,7 +47,7 @@ class NamedColumns:
         read = [*names, *(axes_of(self._magnetic) if self._magnetic else [])]
         self._places = {name: k for k, name in enumerate(read)}
         self._columns = [header.index(name) for name in read]
-        self._table = read_table(path, max(self._columns) + 1, skip=1, used=self._columns)
+        self._table = read_table(path, self._columns, skip=1)
         for k, name in enumerate(names):
             checked(path, name, self._table.values[:, k], self._table.first_row)
 

@@ -13,10 +13,9 @@ import logging
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
+from stario.sequences.readers.checked import captured_rotations
 from stario.sequences.readers.lines import first_line
 from stario.sequences.readers.text import read_table, seconds
 from stario.sequences.sequence import ImuSequence, Trajectory
@@ -76,15 +75,14 @@ def _truth(path: Path, start_ns: np.int64) -> Trajectory:
     table, time = rows.values, seconds(rows.stamps_ns(), start_ns)
     keep = increasing_mask(time)
     table, time = table[keep], time[keep]
-    norm = np.linalg.norm(table[:, 4:8], axis=1)
-    valid = np.isfinite(table[:, 1:8]).all(axis=1) & (np.abs(norm - 1.0) <= NORM_TOLERANCE)
+    attitude_WB, valid = captured_rotations(table[:, [5, 6, 7, 4]])
+    valid &= np.isfinite(table[:, 1:4]).all(axis=1)
     if not valid.all():
         _log.warning("%s: rejected %d of %d poses as invalid", path, (~valid).sum(), len(valid))
-    quat_xyzw = np.where(valid[:, None], table[:, [5, 6, 7, 4]], [0.0, 0.0, 0.0, 1.0])
     return Trajectory(
         time=time,
         position_W=table[:, 1:4],
-        attitude_WB=Rotation.from_quat(quat_xyzw),
+        attitude_WB=attitude_WB,
         velocity_W=table[:, 8:11] if columns == 11 else None,
         valid=valid,
     )

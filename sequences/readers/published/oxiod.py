@@ -24,11 +24,9 @@ from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import binary_dilation, median_filter
-from scipy.spatial.transform import Rotation
 
-from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers.checked import magnetometer
+from stario.sequences.readers.checked import captured_rotations, magnetometer
 from stario.sequences.readers.clocks import resample_to_gyro, time_unit
 from stario.sequences.readers.lines import first_lines, first_numbers, numbers_in
 from stario.sequences.readers.text import IntArray, Table, read_table, seconds
@@ -128,12 +126,10 @@ def capture_file(path: Path) -> Path | None:
 
 def _truth(path: Path, phone: ImuSequence, start_ns: np.int64 | None) -> Trajectory | None:
     table = read_table(path, columns=max(8, len(first_numbers(path))))
-    position, quat_xyzw = table.values[:, -7:-4], table.values[:, -4:]
-    norm = np.linalg.norm(quat_xyzw, axis=1)
-    valid = np.isfinite(table.values[:, -7:]).all(axis=1) & (np.abs(norm - 1.0) <= NORM_TOLERANCE)
-    valid &= (position != 0.0).any(axis=1)  # written while the body was out of sight
-    quat_xyzw = np.where(valid[:, None], quat_xyzw, [0.0, 0.0, 0.0, 1.0])
-    attitude_WV = Rotation.from_quat(quat_xyzw)
+    position = table.values[:, -7:-4]
+    attitude_WV, valid = captured_rotations(table.values[:, -4:])
+    # Zeros are written while the body is out of sight.
+    valid &= np.isfinite(position).all(axis=1) & (position != 0.0).any(axis=1)
     known = np.isfinite(phone.gyro).all(axis=1) & np.isfinite(phone.accel).all(axis=1)
     imu = (phone.time[known], phone.gyro[known], phone.accel[known])
     try:

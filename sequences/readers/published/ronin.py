@@ -27,10 +27,10 @@ from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import (
     checked,
     magnetometer,
-    optional_package,
     rotations,
     trajectory,
 )
+from stario.sequences.readers.hdf5 import opened_hdf5
 from stario.sequences.readers.lines import first_bytes
 from stario.sequences.readers.published.by_name import JsonFields
 from stario.sequences.sequence import FloatArray, ImuSequence
@@ -90,19 +90,12 @@ def _data_file(path: Path) -> Path:
 
 def _fields(file: Path) -> dict[str, FloatArray]:
     """Return the required fields, finite and of one length, and the optional ones present."""
-    h5py = optional_package("h5py", "readers")
-    try:
-        with h5py.File(file, "r") as data:
-            names = [*_FIELDS, *(name for name in _OPTIONAL if name in data)]
-            missing = [name for name in names if name not in data]
-            if missing:
-                raise ReadError(file, missing[0], "no such field", ", ".join(_FIELDS))
-            fields = {name: np.asarray(data[name], dtype=np.float64) for name in names}
-    except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
-        if isinstance(error, ReadError):
-            raise
-        found = " ".join(str(error).split())
-        raise ReadError(file, "file", found, "HDF5 data", "is the download complete?") from None
+    with opened_hdf5(file, "HDF5 data") as data:
+        names = [*_FIELDS, *(name for name in _OPTIONAL if name in data)]
+        missing = [name for name in names if name not in data]
+        if missing:
+            raise ReadError(file, missing[0], "no such field", ", ".join(_FIELDS))
+        fields = {name: np.asarray(data[name], dtype=np.float64) for name in names}
     count = len(fields["synced/time"]) if fields["synced/time"].ndim == 1 else 0
     for name, values in fields.items():
         shape = (count, *(_FIELDS | _OPTIONAL)[name])

@@ -50,7 +50,7 @@ def ronin(tmp_path, walks) -> Path:
 def test_a_truncated_hdf5_is_refused(ronin, share) -> None:
     content = (ronin / "data.hdf5").read_bytes()
     (ronin / "data.hdf5").write_bytes(content[: int(share * len(content))])
-    assert_refused(ronin, "data.hdf5: file: found ", "expected HDF5")
+    assert_refused(ronin, "data.hdf5: content: found ", "expected HDF5")
     assert find_recordings(ronin) == [ronin]
 
 

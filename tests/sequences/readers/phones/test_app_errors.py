@@ -5,8 +5,9 @@ from __future__ import annotations
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
-from phone_files import zyx
+from phone_files import save, zyx
 
 from stario.sequences import ImuSequence, ReadError, read_recording
 
@@ -34,6 +35,29 @@ def test_two_recordings_in_a_zip_are_named(walk: ImuSequence, tmp_path: Path) ->
     expected = r"two\.zip: content: found 2 recordings \(a, b\), expected one; unpack the zip"
     with pytest.raises(ReadError, match=rf"^[^:]*/{expected}$"):
         read_recording(tmp_path / "two.zip")
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_count_of_rows_is_no_time(first: int, walk: ImuSequence, tmp_path: Path) -> None:
+    count = first + np.arange(len(walk))
+    wide = ",".join(f"{name} {axis}" for name in ("Gyroscope", "Accelerometer") for axis in "XYZ")
+    save(tmp_path / "wide.csv", f"timestamp,{wide}", count, walk.gyro, walk.accel)
+    for name, values in (("Gyroscope", walk.gyro), ("Accelerometer", walk.accel)):
+        save(tmp_path / f"titled/{name}.csv", "time,x,y,z", count, values)
+        save(tmp_path / f"bare/{name}.csv", "", count, values)
+    for name, title in (("wide.csv", "timestamp"), ("titled", "time"), ("bare", "time")):
+        message = rf"{title}: found {first}, {first + 1}, .*, which counts the rows, expected times"
+        with pytest.raises(ReadError, match=message):
+            read_recording(tmp_path / name)
+
+
+def test_sensors_without_a_time_are_refused_as_such(walk: ImuSequence, tmp_path: Path) -> None:
+    wide = ",".join(f"{name}_{axis}" for name in ("Gyr", "Acc") for axis in "XYZ")
+    columns = np.arange(len(walk)), walk.gyro, walk.accel
+    save(tmp_path / "MT.csv", f"// Update Rate: 100.0Hz\nPacketCounter,{wide}", *columns)
+    message = r"MT\.csv: time: found no column of times .*, expected one .*; name one `t \[s\]`"
+    with pytest.raises(ReadError, match=message):
+        read_recording(tmp_path / "MT.csv")
 
 
 @pytest.mark.parametrize(

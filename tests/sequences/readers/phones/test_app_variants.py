@@ -20,6 +20,7 @@ from stario.sequences import (
     check_units,
     find_recordings,
     read_recording,
+    with_conventions,
 )
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 
@@ -275,6 +276,26 @@ def test_a_recording_has_a_one_line_summary(walk: ImuSequence, tmp_path: Path) -
     )
 
 
+def test_the_summary_names_the_unit_that_times_were_taken_for(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
+    """Not if the file names it, or if the times are counted from 1970 and fit no other."""
+    wide = ",".join(f"{name} {axis}" for name in ("Gyro", "Acc") for axis in "XYZ")
+    generic = "gx,gy,gz,ax,ay,az"
+    millis = 10 * np.arange(len(walk)) + 7
+    for titles, times, words in (
+        (f"time,{wide}", millis, ", times taken as ms, 15.0 s"),
+        (f"time,{generic}", millis, ", times taken as ms, 15.0 s"),
+        (f"time,{generic}", walk.time, ", times taken as s, 15.0 s"),
+        (f"time (ms),{wide}", millis, "file, 15.0 s"),
+        (f"time [ms],{generic}", millis, "CSV, 15.0 s"),
+        (f"time,{wide}", ns(walk), "file, 15.0 s"),
+        (f"time,{generic}", ns(walk), "CSV, 15.0 s"),
+    ):
+        save(tmp_path / "a.csv", titles, times, walk.gyro, walk.accel)
+        assert words in read_recording(tmp_path / "a.csv").summary()
+
+
 def test_sensors_of_different_rates_are_read_at_the_gyroscopes_rate(
     walk: ImuSequence, tmp_path: Path
 ) -> None:
@@ -294,9 +315,14 @@ def test_an_undetermined_accelerometer_sign_is_reported(
 ) -> None:
     iphone(tmp_path / "s", walk)
     (tmp_path / "s/Metadata.csv").unlink()
-    read_recording(tmp_path / "s")
+    undetermined = read_recording(tmp_path / "s")
+    with_conventions(undetermined)
     assert "from an iPhone, pass `--accel-sign apple`" in caplog.text
     caplog.clear()
+    turned = with_conventions(undetermined, accel_sign="apple")
+    np.testing.assert_allclose(turned.accel, walk.accel, atol=1e-8)
+    with_conventions(turned)
+    assert not caplog.text
     ios_logger(tmp_path / "t", walk)
     for name in ("Motion.txt", "MotMagnFull.txt"):
         (tmp_path / "t" / name).unlink()

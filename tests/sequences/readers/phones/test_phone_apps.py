@@ -132,6 +132,24 @@ def test_an_error_in_a_zip_names_the_zip_and_the_file(walk: ImuSequence, tmp_pat
         read_recording(path)
 
 
+def test_messages_about_a_zip_name_the_zip_and_the_file(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name, values in (("Gyroscope", walk.gyro), ("TotalAcceleration", walk.accel)):
+        save(tmp_path / f"s/{name}.csv", "time,x,y,z", walk.time, values)
+    path = tmp_path / "export.zip"
+    with zipfile.ZipFile(path, "w") as file:
+        for one in (tmp_path / "s").iterdir():
+            file.writestr(f"walk/{one.name}", one.read_text()[:-20])
+    with caplog.at_level("INFO"):
+        read_recording(path)
+    assert f"{path}/walk/Gyroscope.csv: skipped the last row, which is cut short" in caplog.text
+    assert "stario-" not in caplog.text
+    caplog.clear()
+    read_recording(tmp_path / "s")
+    assert "export.zip" not in caplog.text
+
+
 @pytest.mark.parametrize("order", ["xyzw", "wxyz"])
 @pytest.mark.parametrize("turn", ["x,y,z", "camera"])
 def test_poses_next_to_the_imu_are_read_as_truth_in_its_axes(

@@ -1,0 +1,68 @@
+"""Description of a file or folder that is no recording in any known format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from stario.sequences.errors import ReadError
+from stario.sequences.readers.columns import HEADER
+from stario.sequences.readers.lines import first_bytes, first_line
+from stario.sequences.readers.phones.files import incomplete_sensors, names_both_sensors
+from stario.sequences.readers.poses import pose_files
+
+_EXPORT = "export as CSV, or as the zip or folder that the app writes"
+_CONTAINERS = {
+    b"SQLite format 3": "an SQLite database",
+    b"PK\x03\x04": "a zip without text files (such as a spreadsheet), or one that is cut short",
+    b"\xd0\xcf\x11\xe0": "a spreadsheet",
+    b"\x1f\x8b": "a file compressed with gzip",
+    b"7z\xbc\xaf": "a file compressed with 7-Zip",
+    b"MATLAB": "a MATLAB file",
+}
+"""First bytes of files that may hold a recording but are not unpacked, and their description."""
+
+
+def unrecognised(path: Path, inside: list[Path], known: str) -> ReadError:
+    """Return an error that describes what was found instead of a recording.
+
+    Args:
+        path: the file or folder.
+        inside: the recordings below it.
+        known: what would have been a recording.
+    """
+    if inside:
+        found, fix = f"a folder of {len(inside)} recordings", f"name one, such as {inside[0]}"
+    elif sensors := incomplete_sensors(path):
+        expected = "a gyroscope and an accelerometer"
+        return ReadError(path, "sensors", f"only {' and '.join(sensors)}", expected, "log both")
+    elif names_both_sensors(path):
+        found, fix = "no column of times that grow", "name one `t [s]`; a count of samples is none"
+        return ReadError(path, "time", found, "one next to the sensors'", fix)
+    elif path.is_dir() and (poses := pose_files(path)):
+        expected = "a gyroscope file and an accelerometer file"
+        fix = "put the IMU files into the same folder"
+        return ReadError(path, "content", f"only poses, {poses[0].name}", expected, fix)
+    else:
+        found, fix = _folder(path) if path.is_dir() else _file(path)
+    return ReadError(path, "content", found, known, fix)
+
+
+def _folder(path: Path) -> tuple[str, str]:
+    """Return what a folder holds and what to do about it."""
+    entries = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
+    names = ", ".join(entries[:5]) or "nothing"
+    more = f" and {len(entries) - 5} more" if len(entries) > 5 else ""
+    return f"a folder with {names}{more}", "name one recording in it"
+
+
+def _file(path: Path) -> tuple[str, str]:
+    """Return what a file holds and what to do about it."""
+    start, line = first_bytes(path), first_line(path)
+    for mark, words in _CONTAINERS.items():
+        if start.startswith(mark):
+            return words, _EXPORT
+    if start.startswith(b"\x80"):
+        return "a pickle, which may run code", "save it as CSV or npy of plain numbers"
+    if line is None:
+        return "no line of text", "is it empty or compressed?"
+    return f"{line.strip()[:60]!r}", f"a CSV of your own must start with {HEADER}"

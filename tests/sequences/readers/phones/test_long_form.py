@@ -1,0 +1,70 @@
+"""One table in which each row names its sensor."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from alike import assert_same_samples
+from phone_files import field
+
+from stario.sequences import ImuSequence, ReadError, find_recordings, read_recording
+
+NAMES = {
+    "words": ("gyroscope", "accelerometer", "magnetometer"),
+    "codes": ("GYR", "ACC", "MAG"),
+    "android": tuple(
+        f"android.sensor.{name}" for name in ("gyroscope", "accelerometer", "magnetic_field")
+    ),
+}
+
+
+def rows_of(walk: ImuSequence, names: tuple[str, ...], separator: str = ",") -> list[str]:
+    sensors = list(zip(names, (walk.gyro, walk.accel, field(walk)), strict=True))
+    return [
+        separator.join([f"{t:.4f}", name, *map(repr, values[k].tolist())])
+        for k, t in enumerate(walk.time.tolist())
+        for name, values in sensors
+    ]
+
+
+@pytest.mark.parametrize("names", NAMES.values(), ids=NAMES)
+@pytest.mark.parametrize("header", ["time,sensor,x,y,z", "timestamp;sensor_name;v_x;v_y;v_z", ""])
+def test_rows_are_sorted_by_their_sensor(
+    names: tuple[str, ...], header: str, walk: ImuSequence, tmp_path: Path
+) -> None:
+    rows = rows_of(walk, names, ";" if ";" in header else ",")
+    path = tmp_path / "own.csv"
+    path.write_text("\n".join([header, *rows] if header else rows) + "\n")
+    assert find_recordings(tmp_path) == [path]
+    read = read_recording(path)
+    assert read.name == "own"
+    assert "the sensor named in each row" in read.summary()
+    assert_same_samples(read, walk)
+    assert read.magnetometer is not None
+    np.testing.assert_allclose(read.magnetometer.field, field(walk), atol=1e-9)
+
+
+def test_one_sensor_after_the_other_is_read_too(walk: ImuSequence, tmp_path: Path) -> None:
+    rows = rows_of(walk, NAMES["codes"])
+    ordered = [row for code in ("ACC", "GYR") for row in rows if code in row]
+    path = tmp_path / "own.csv"
+    path.write_text("\n".join(["time,sensor,x,y,z", *ordered]) + "\n")
+    assert_same_samples(read_recording(path), walk)
+
+
+def test_messages_name_the_file_and_the_sensor(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "own.csv"
+    rows = rows_of(walk, NAMES["codes"])
+    path.write_text("\n".join(["time,sensor,x,y,z", *rows]) + "\n")
+    with caplog.at_level(logging.INFO):
+        read_recording(path)
+    assert f"{path}/GYR.csv: its times name no unit" in caplog.text
+    assert "stario-" not in caplog.text
+    path.write_text("\n".join(["time,sensor,x,y,z", *(row for row in rows if "ACC" in row)]) + "\n")
+    with pytest.raises(ReadError, match=r"own\.csv: sensors: found only accel"):
+        read_recording(path)

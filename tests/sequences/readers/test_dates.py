@@ -1,0 +1,95 @@
+"""Times as loggers write them for people: dates with zones, times of day, midnight in between."""
+
+from __future__ import annotations
+
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stario.sequences import ReadError, check_units, read_recording
+from stario.sequences.errors import InputError
+from stario.sequences.readers.dates import with_seconds
+
+NOON = datetime(2024, 5, 1, 12, 34, 56, 789000)
+LATE = datetime(2024, 12, 31, 23, 59, 59, 500000)
+GENERIC = "time,gx,gy,gz,ax,ay,az"
+WIDE = (
+    "Datetime;Gyroscope X;Gyroscope Y;Gyroscope Z;Accelerometer X;Accelerometer Y;Accelerometer Z"
+)
+
+
+def written(path: Path, header: str, form: str, start: datetime, count: int = 200) -> Path:
+    separator = max(",;", key=header.count)
+    times = [(start + timedelta(milliseconds=10 * k)).strftime(form) for k in range(count)]
+    rows = [separator.join([time, "0.1", "0.2", "0.3", "1", "2", "9.5"]) for time in times]
+    path.write_text("\n".join([header, *rows]) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("header", [GENERIC, WIDE])
+@pytest.mark.parametrize("start", [NOON, LATE])
+@pytest.mark.parametrize(
+    "form",
+    [
+        "%H:%M:%S.%f",
+        "%H:%M:%S:%f",
+        "%I:%M:%S.%f %p",
+        "%Y-%m-%d %H:%M:%S.%f UTC",
+        "%Y-%m-%dT%H:%M:%S.%f+00:00",
+        "%Y-%m-%d %H:%M:%S.%f GMT+02:00",
+        "%Y-%m-%d %H:%M:%S.%f -0330",
+        "%Y/%m/%d %H:%M:%S.%f",
+        "%d-%b-%Y %H:%M:%S.%f",
+        "%d.%m.%Y %H:%M:%S.%f",
+        "%m/%d/%Y %H:%M:%S.%f",
+    ],
+)
+def test_times_are_read_with_any_date_and_zone(
+    tmp_path: Path, header: str, start: datetime, form: str
+) -> None:
+    read = read_recording(written(tmp_path / "own.csv", header, form, start))
+    np.testing.assert_allclose(read.time, 0.01 * np.arange(200), atol=1e-9)
+    np.testing.assert_allclose(read.gyro[-1], [0.1, 0.2, 0.3])
+
+
+def test_zones_and_names_of_months_give_the_same_instant() -> None:
+    noon = "1714564800.5"
+    for text in ("2024-05-01T12:00:00.5Z", "2024-05-01 14:00:00.5 +02:00", "2024/05/01 12:00:00.5",
+                 "2024-05-01 08:30:00.5 GMT-0330", "01-May-2024 12:00:00.5"):  # fmt: skip
+        assert with_seconds([text]) == [noon]
+
+
+def test_midnight_passes_in_every_column_of_times_and_for_late_rows() -> None:
+    lines = ["23:59:59.9,23:59:58.9", "00:00:00.1,23:59:59.1", "23:59:59.95,00:00:00.1"]
+    first, second = np.array([[float(x) for x in row.split(",")] for row in with_seconds(lines)]).T
+    np.testing.assert_allclose(first - first[0], [0.0, 0.2, 0.05], atol=1e-9)
+    np.testing.assert_allclose(second - second[0], [0.0, 0.2, 1.2], atol=1e-9)
+
+
+@pytest.mark.parametrize("text", ["24:60:00", "2024-13-01 12:00:00", "01-Foo-2024 12:00:00"])
+def test_what_is_no_time_stays_as_it_is(text: str) -> None:
+    assert with_seconds([text]) == [text]
+    assert with_seconds([f"D4:22:CD:{text[-8:]}"]) == [f"D4:22:CD:{text[-8:]}"]
+
+
+def test_a_comma_after_the_seconds_separates_cells() -> None:
+    assert with_seconds(["00:00:01,5,6"])[0].endswith(",5,6")
+
+
+def test_a_date_beside_the_time_leaves_the_unit_of_the_time(tmp_path: Path) -> None:
+    rows = [f"2024-05-01 12:00:00,{10 * k},0.1,0.2,0.3,1,2,9" for k in range(200)]
+    path = tmp_path / "own.csv"
+    path.write_text("\n".join(["date,t [ms],gx,gy,gz,ax,ay,az", *rows]) + "\n")
+    assert read_recording(path).rate == pytest.approx(100.0)
+
+
+def test_times_in_whole_seconds_are_refused(tmp_path: Path) -> None:
+    path = written(tmp_path / "own.csv", GENERIC, "%H:%M:%S", NOON, 500)
+    with pytest.raises(InputError, match="export them with fractions of a second"):
+        check_units(read_recording(path))
+    bad = path.read_text().replace("12:34:58", "12:34:98")
+    path.write_text(bad)
+    with pytest.raises(ReadError, match=r"own\.csv: line \d+, time: found '12:34:98'"):
+        read_recording(path)
