@@ -169,10 +169,12 @@ def _complete_rows(file: Path, sensor: str, titles: str, values: FloatArray) -> 
 
 def _unit(file: Path, places: Axes, known: Mapping[str, float]) -> tuple[str, float]:
     """Return the unit that the axes' titles name, empty if none, and its factor."""
-    unit = next((place.unit for place in places if place.unit), "")
-    if unit and unit not in known:
-        raise ReadError(file, "header", f"unit {unit!r}", ", ".join(known))
-    return unit, known[unit] if unit else 1.0
+    place = next((place for place in places if place.unit), None)
+    if place is None:
+        return "", 1.0
+    if place.unit not in known:
+        raise ReadError(file, f"header, {place.title}", f"unit {place.unit!r}", ", ".join(known))
+    return place.unit, known[place.unit]
 
 
 def _rows(table: SensorTable, used: Sequence[Column]) -> Table:
