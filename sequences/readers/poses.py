@@ -24,8 +24,8 @@ from stario.sequences.attitude.rotations import NORM_TOLERANCE, tilt_aligning
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.clocks import time_unit
 from stario.sequences.readers.lines import head_lines
-from stario.sequences.readers.phones.sensor_table import first_row
 from stario.sequences.readers.phones.sensor_words import words_of
+from stario.sequences.readers.separators import first_row
 from stario.sequences.readers.text import IntArray, read_table, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.time_order import increasing_mask

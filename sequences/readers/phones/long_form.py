@@ -9,7 +9,6 @@ The rows are sorted into a file for each sensor, to be read as the folder of a p
 
 from __future__ import annotations
 
-import math
 import re
 import tempfile
 from collections.abc import Iterator
@@ -17,14 +16,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.lines import head_lines, is_row, read_lines, unquoted
 from stario.sequences.readers.phones.files import SUFFIXES
 from stario.sequences.readers.phones.sensor_words import sensor_of, words_of
-
-_MIN_CELLS = 5
-"""Number of cells of a row: the sensor, a time and three values."""
+from stario.sequences.readers.separators import first_row
 
 _HEAD_ROWS = 50
 _MIN_SHARE = 0.5
@@ -33,18 +29,18 @@ _MIN_SHARE = 0.5
 
 @dataclass(frozen=True)
 class _Layout:
-    """Separator of the cells, index of the column of sensors, and whether there are titles."""
+    """Index of the first row, separator of the cells, and index of the column of sensors."""
 
-    delimiter: str
+    first: int
+    delimiter: str | None
     column: int
-    has_titles: bool
 
 
 def is_long_form(path: Path) -> bool:
     """Return whether a file's rows name their sensors; never raises."""
     if path.suffix.lower() not in SUFFIXES or not path.is_file():
         return False
-    return _layout(head_lines(path)[:-1]) is not None
+    return _layout([line for line in head_lines(path)[:-1] if is_row(line)]) is not None
 
 
 @contextmanager
@@ -55,40 +51,40 @@ def unpack_long_form(path: Path) -> Iterator[Path]:
         ReadError: the file cannot be read or has another form.
     """
     lines = [line for line in read_lines(path) if is_row(line)]
-    layout = _layout(lines[:_HEAD_ROWS])
+    layout = _layout(lines)
     if layout is None:
         raise ReadError(path, "rows", "none that name a sensor", "a column of sensors' names")
-    rows = [unquoted(line, layout.delimiter).split(layout.delimiter) for line in lines]
-    titles = [rows.pop(0)] if layout.has_titles else []
+    above, below = lines[max(layout.first - 1, 0) : layout.first], lines[layout.first :]
+    titles = [_cells(line, layout.delimiter) for line in above]
     sensors: dict[str, list[list[str]]] = {}
-    for row in rows:
-        sensors.setdefault("".join(row[layout.column : layout.column + 1]).strip(), []).append(row)
+    for row in (_cells(line, layout.delimiter) for line in below):
+        sensors.setdefault("".join(row[layout.column : layout.column + 1]), []).append(row)
     with tempfile.TemporaryDirectory(prefix="stario-") as folder:
         for name, own in sensors.items():
             kept = ([cell for k, cell in enumerate(row) if k != layout.column]
                     for row in [*titles, *own])  # fmt: skip
-            text = "".join(layout.delimiter.join(row) + "\n" for row in kept)
+            text = "".join((layout.delimiter or " ").join(row) + "\n" for row in kept)
             stem = re.sub(r"\W+", "_", name) or "unnamed"
             (Path(folder) / f"{stem}.csv").write_text(text, encoding="utf-8")
         yield Path(folder)
 
 
 def _layout(lines: list[str]) -> _Layout | None:
-    """Return how the first lines are written, None if they are not of this form."""
-    lines = [line for line in lines if is_row(line)][:_HEAD_ROWS]
-    if len(lines) < 3:
+    """Return how lines without blank ones are written, None if they are not of this form."""
+    found = first_row(list(enumerate(lines[:_HEAD_ROWS])), least=3)  # the time may be a date
+    if found is None:
         return None
-    delimiter = max(",;\t", key=lines[1].count)
-    rows = [[cell.strip() for cell in unquoted(x, delimiter).split(delimiter)] for x in lines]
-    width = len(rows[1])
-    rows = [row for row in rows if len(row) == width]
-    if width < _MIN_CELLS or len(rows) < 3:
-        return None
-    has_titles = sum(math.isfinite(number_in(cell)) for cell in rows[0]) < 3
-    for column, cells in enumerate(zip(*rows[has_titles:], strict=True)):
-        if sum(map(_names_sensor, cells)) >= _MIN_SHARE * len(cells):
-            return _Layout(delimiter, column, has_titles)
+    first, delimiter, _ = found
+    rows = [_cells(line, delimiter) for line in lines[first : first + _HEAD_ROWS]]
+    rows = [row for row in rows if len(row) == len(rows[0])]
+    for column, cells in enumerate(zip(*rows, strict=True)):
+        if len(rows) > 1 and sum(map(_names_sensor, cells)) >= _MIN_SHARE * len(cells):
+            return _Layout(first, delimiter, column)
     return None
+
+
+def _cells(line: str, delimiter: str | None) -> list[str]:
+    return [cell.strip() for cell in unquoted(line, delimiter).split(delimiter)]
 
 
 def _names_sensor(cell: str) -> bool:

@@ -8,8 +8,8 @@ import numpy as np
 
 from stario.sequences.readers.clocks import unit_within
 from stario.sequences.readers.lines import head_lines
-from stario.sequences.readers.phones.sensor_table import first_row
 from stario.sequences.readers.phones.sensor_words import words_of
+from stario.sequences.readers.separators import first_row
 from stario.sequences.readers.text import read_table, seconds
 from stario.sequences.sequence import PositionTrack
 from stario.sequences.time_order import increasing_mask

@@ -1,25 +1,25 @@
 """A text file of sensor samples: how its rows are written, and reading them in known units.
 
-`sensor_layout` determines the columns' content. Cells are separated by commas, semicolons, tabs or
-blanks; with any of the latter three, numbers may have a decimal comma.
+`separators` determines how cells are separated, `sensor_layout` what the columns hold.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.clocks import assumed_unit, refuse_row_numbers, time_unit
 from stario.sequences.readers.columns import Column, with_units_below
 from stario.sequences.readers.dates import with_seconds
 from stario.sequences.readers.lines import head_lines, unquoted
 from stario.sequences.readers.phones.sensor_layout import Layout, by_header, by_rows
+from stario.sequences.readers.phones.which_imu import Axes
+from stario.sequences.readers.separators import cells_of, first_row, number_of
 from stario.sequences.readers.text import IntArray, Table, read_table
 from stario.sequences.sequence import FloatArray
 from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS
@@ -99,12 +99,12 @@ def _table(file: Path, numbered: list[tuple[int, str]]) -> SensorTable | None:
         return None
     first, delimiter, decimal = found
     skip = numbered[first][0]
-    rows = [_cells(line, delimiter, decimal) for _, line in numbered[first:-1]][:_HEAD_ROWS]
+    rows = [cells_of(line, delimiter, decimal) for _, line in numbered[first:-1]][:_HEAD_ROWS]
     width = max(set(map(len, rows)), key=list(map(len, rows)).count)
     rows = [row for row in rows if len(row) == width]
     if len(rows) < 2:
         return None
-    head = np.array([[_number(cell) for cell in row] for row in rows])
+    head = np.array([[number_of(cell) for cell in row] for row in rows])
     layout = None
     titles = _titles([line for _, line in numbered[:first]], delimiter)
     if titles and (len(titles) == width or delimiter is not None):
@@ -136,33 +136,45 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
         fix = "keep the columns and rows of one"
         raise ReadError(table.file, "header", f"several IMUs ({table.conflict})", "one", fix)
     places, clock = table.axes[axes], table.clocks.get(axes, table.clock)
-    rows = _rows(table, [clock, *places, *table.biases])
-    blank = np.isnan(rows.values[:, 1:])
-    kept = np.asarray(~blank.any(axis=1))
-    if not kept.all() and (partly := int((blank.any(axis=1) & ~blank.all(axis=1)).sum())):
-        # Rows without any of the three are those of other sensors in a wide file.
-        _log.warning(
-            "%s: dropped %d samples of the %s with a blank cell", table.file, partly, sensor
-        )
     titles = ", ".join(p.title or f"column {p.index + 1}" for p in places)
-    if not kept.any():
-        raise ReadError(table.file, titles, "no row with all three", "samples of three axes")
-    values = rows.values[:, 1:4]
-    if table.biases:
-        values = values - rows.values[:, 4:7]
-    unit = next((place.unit for place in places if place.unit), "")
-    known = UNITS[sensor]
-    if unit and unit not in known:
-        raise ReadError(table.file, "header", f"unit {unit!r}", ", ".join(known))
-    values = values * (known[unit] if unit else 1.0)
-    _check_size(table.file, titles, sensor, values[kept])
+    rows = _rows(table, [clock, *places, *table.biases])
+    kept = _complete_rows(table.file, sensor, titles, rows.values[:, 1:])
     if not clock.unit:
         refuse_row_numbers(table.file, clock.title or "time", rows.values[:, 0])
-    time = rows.values[kept, 0]
+    time, values = rows.values[kept, 0], rows.values[kept, 1:4]
+    if table.biases:
+        values = values - rows.values[kept, 4:7]
+    unit, factor = _unit(table.file, places, UNITS[sensor])
+    values = factor * values
+    _check_size(table.file, titles, sensor, values)
     per_second = time_unit(table.file, time, clock.unit)
-    stamps = rows.stamps_ns(clock.index, per_second, np.flatnonzero(kept))
+    stamps = rows.stamps_ns(clock.index, per_second, kept)
     assumed = "" if clock.unit else assumed_unit(per_second, float(time[0]))
-    return Samples(stamps, values[kept], unit, assumed)
+    return Samples(stamps, values, unit, assumed)
+
+
+def _complete_rows(file: Path, sensor: str, titles: str, values: FloatArray) -> IntArray:
+    """Return the rows without a blank cell, and warn of those that have some values.
+
+    Rows without any are those of other sensors in a wide file.
+    """
+    blank = np.isnan(values)
+    if partly := int((blank.any(axis=1) & ~blank.all(axis=1)).sum()):
+        _log.warning("%s: dropped %d samples of the %s with a blank cell", file, partly, sensor)
+    kept = np.flatnonzero(~blank.any(axis=1))
+    if not len(kept):
+        raise ReadError(file, titles, "no row with all three", "samples of three axes")
+    return kept
+
+
+def _unit(file: Path, places: Axes, known: Mapping[str, float]) -> tuple[str, float]:
+    """Return the unit that the axes' titles name, empty if none, and its factor."""
+    place = next((place for place in places if place.unit), None)
+    if place is None:
+        return "", 1.0
+    if place.unit not in known:
+        raise ReadError(file, f"header, {place.title}", f"unit {place.unit!r}", ", ".join(known))
+    return place.unit, known[place.unit]
 
 
 def _rows(table: SensorTable, used: Sequence[Column]) -> Table:
@@ -193,46 +205,3 @@ def read_quaternion(table: SensorTable) -> tuple[IntArray, FloatArray]:
     rows = _rows(table, [table.clock, *table.quaternion])
     per_second = time_unit(table.file, rows.values[:, 0], table.clock.unit)
     return rows.stamps_ns(table.clock.index, per_second), rows.values[:, 1:]
-
-
-_MARK_ROWS = 5
-"""Number of rows that determine the decimal mark."""
-
-
-def first_row(
-    numbered: list[tuple[int, str]], least: int = 4
-) -> tuple[int, str | None, str] | None:
-    """Return the index of the first row of `least` numbers, its delimiter and its decimal mark.
-
-    The lines have their numbers in the file; there are no blank ones among them.
-    """
-    for k, (_, line) in enumerate(numbered):
-        if line.lstrip().startswith("#"):
-            continue
-        for delimiter, decimal in ((";", "."), (";", ","), ("\t", "."), ("\t", ","), (",", "."),
-                                   (None, "."), (None, ",")):  # fmt: skip
-            cells = _cells(line, delimiter, decimal)
-            numbers = sum(np.isfinite(_number(cell)) for cell in cells)
-            if numbers >= least and 2 * numbers >= sum(bool(cell.strip()) for cell in cells):
-                return k, delimiter, _decimal_mark(numbered[k : k + _MARK_ROWS], delimiter, decimal)
-    return None
-
-
-def _decimal_mark(rows: list[tuple[int, str]], delimiter: str | None, first: str) -> str:
-    """Return the mark that gives the most numbers: a row of integers (0;0;0;0) fits either."""
-    if delimiter == ",":
-        return first
-
-    def numbers(decimal: str) -> int:
-        cells = (cell for _, line in rows for cell in _cells(line, delimiter, decimal))
-        return sum(bool(np.isfinite(_number(cell))) for cell in cells)
-
-    return max((first, "." if first == "," else ","), key=numbers)
-
-
-def _cells(line: str, delimiter: str | None, decimal: str) -> list[str]:
-    return (line.replace(",", ".") if decimal == "," else line).split(delimiter)
-
-
-def _number(cell: str) -> float:
-    return number_in(cell.strip(" \"'"))

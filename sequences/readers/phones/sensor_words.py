@@ -71,11 +71,12 @@ def words_of(name: str) -> list[str]:
 
 def unit_of(name: str) -> str:
     """Return the unit of an axis, in brackets or a word of its name; empty without one."""
-    return _bracketed_unit(name) or _without_unit(name)[1]
+    named = _with_axis(name)
+    return _bracketed_unit(named) or _without_unit(named)[1]
 
 
 def _bracketed_unit(name: str) -> str:
-    match = _BRACKETS.search(_with_axis(name))
+    match = _BRACKETS.search(name)
     return unit_named(match[1]) if match else ""
 
 

@@ -227,7 +227,7 @@ def test_invalid_or_missing_logger_files_are_refused(tmp_path, walks) -> None:
     gyro.write_text("\n".join([*lines[:30], lines[30].rsplit(",", 1)[0] + ",1e15", *lines[31:]]))
     assert_refused(path, "Gyroscope.csv: x, y, z: found 1e+15, expected a plausible value in rad/s")
     gyro.write_text("\n".join(lines).replace(",x", ",x [rpm]", 1))
-    assert_refused(path, "Gyroscope.csv: header: found unit 'rpm', expected rad/s, deg/s")
+    assert_refused(path, "Gyroscope.csv: header, ", "found unit 'rpm', expected rad/s, deg/s")
     gyro.unlink()
     assert_refused(path, "sensors: found only accel and mag, expected a gyroscope")
     with pytest.raises(ReadError, match=r"files: found Accelerometer\.csv, .*, expected a gyrosc"):

@@ -62,6 +62,7 @@ def test_numbered_elements_of_a_sensor_are_its_axes(walk: ImuSequence, tmp_path:
     save(tmp_path / "log_0.csv", titles, micros, walk.gyro, walk.accel, relative)
     assert_same_samples(read_recording(tmp_path / "log_0.csv"), walk)
     assert axis_of("delta_angle[0]") is None
+    assert unit_of("gyro_deg_s[0]") == "deg/s"
 
 
 def test_a_letter_in_a_devices_name_is_no_sensor(walk: ImuSequence, tmp_path: Path) -> None:

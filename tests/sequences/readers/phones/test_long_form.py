@@ -55,6 +55,14 @@ def test_one_sensor_after_the_other_is_read_too(walk: ImuSequence, tmp_path: Pat
     assert_same_samples(read_recording(path), walk)
 
 
+def test_times_may_be_those_of_the_day(walk: ImuSequence, tmp_path: Path) -> None:
+    rows = [row.split(",", 1) for row in rows_of(walk, NAMES["words"])]
+    path = tmp_path / "own.csv"
+    lines = [f"12:00:{float(t):07.4f},{rest}" for t, rest in rows]
+    path.write_text("\n".join(["Clock time,sensor,x,y,z", *lines]) + "\n")
+    assert_same_samples(read_recording(path), walk)
+
+
 def test_messages_name_the_file_and_the_sensor(
     walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
