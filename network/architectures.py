@@ -6,7 +6,7 @@ import importlib
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from stario.sequences.errors import InputError
+from stario.sequences.arrays import check_choice
 
 if TYPE_CHECKING:
     from torch import nn
@@ -62,8 +62,7 @@ def architecture(name: str) -> Architecture:
     Raises:
         InputError: no network has that name.
     """
-    if name not in ARCHITECTURES:
-        raise InputError("architecture", repr(name), f"one of {', '.join(ARCHITECTURES)}")
+    check_choice("architecture", name, ARCHITECTURES)
     return ARCHITECTURES[name]
 
 

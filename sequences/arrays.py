@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +23,17 @@ def correlation(x: FloatArray, y: FloatArray) -> float:
 def interpolated(at: FloatArray, time: FloatArray, values: FloatArray) -> FloatArray:
     """Interpolate columns of values (N, k) linearly at times (M,), clamped at the ends."""
     return np.stack([np.interp(at, time, column) for column in values.T], axis=1)
+
+
+def integral(time: FloatArray, values: FloatArray) -> FloatArray:
+    """Return the trapezoidal integral (N, k) over time (N,) of values (N, k), starting at 0."""
+    steps = 0.5 * np.diff(time)[:, None] * (values[1:] + values[:-1])
+    return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
+
+
+def samples_in(seconds: float, time: FloatArray) -> int:
+    """Return the number of median steps of times (N,) [s] in a span [s], at least 1."""
+    return max(1, round(seconds / float(np.median(np.diff(time)))))
 
 
 def number_in(text: str) -> float:
@@ -49,6 +62,16 @@ def check_type(
     if not (isinstance(value, kind) or (optional and value is None)):
         expected = f"a value of type {kind.__name__}" + (" or None" if optional else "")
         raise InputError(name, shown(value), expected, remedy)
+
+
+def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
+    """Check that an argument is one of the known names.
+
+    Raises:
+        InputError: it is not; names the argument and the choices.
+    """
+    if value not in (known := tuple(choices)):
+        raise InputError(name, repr(value), f"one of {', '.join(known)}")
 
 
 def shown(value: object) -> str:
@@ -90,6 +113,20 @@ def checked_time(name: str, value: FloatArray) -> FloatArray:
             name, f"{time[k + 1]!r} after {time[k]!r} at row {k + 1}", "strictly increasing seconds"
         )
     return time
+
+
+def checked_valid(name: str, value: BoolArray, time: FloatArray) -> BoolArray:
+    """Return flags (N,) of the rows at `time` (N,), all True if there are none.
+
+    Raises:
+        InputError: their number differs.
+    """
+    valid = np.asarray(value, dtype=np.bool_)
+    if valid.size == 0:
+        return np.ones(len(time), dtype=np.bool_)
+    if valid.shape != time.shape:
+        raise InputError(name, f"shape {valid.shape}", f"({len(time)},) as time")
+    return valid
 
 
 def checked_array(

@@ -11,6 +11,7 @@ from typing import Literal, cast, get_args
 
 import numpy as np
 
+from stario.sequences.arrays import check_choice
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, Trajectory, low_rate_message
@@ -129,7 +130,7 @@ def align(estimate: Trajectory, truth: Trajectory, mode: Alignment) -> Trajector
     Raises:
         InputError: unknown mode, or no overlap.
     """
-    _check_choice("alignment", mode, get_args(Alignment))
+    check_choice("alignment", mode, get_args(Alignment))
     if mode == "none":
         return estimate
     errors = pose_errors(estimate, truth)
@@ -168,7 +169,7 @@ def evaluate_track(
     Raises:
         InputError: no overlap, an unknown choice, or an interval that is not positive.
     """
-    _check_choice("convention", convention, get_args(Convention))
+    check_choice("convention", convention, get_args(Convention))
     if not (np.isfinite(rte_interval) and rte_interval > 0):
         raise InputError("rte_interval", repr(rte_interval), "seconds > 0")
     errors = pose_errors(align(estimate, truth, alignment), truth)
@@ -254,10 +255,5 @@ def check_convention(name: str) -> Convention:
     Raises:
         InputError: there is no such convention.
     """
-    _check_choice("convention", name, get_args(Convention))
+    check_choice("convention", name, get_args(Convention))
     return cast(Convention, name)
-
-
-def _check_choice(field: str, found: str, choices: tuple[str, ...]) -> None:
-    if found not in choices:
-        raise InputError(field, repr(found), "one of " + ", ".join(choices))

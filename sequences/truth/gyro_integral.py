@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import interpolated
-from stario.sequences.attitude.rotations import cumulative_rotations
+from stario.sequences.arrays import integral, interpolated
+from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.sequence import FloatArray
 
 _MAX_GYRO_GAP_S = 0.5
@@ -17,9 +17,8 @@ class GyroIntegral:
 
     def __init__(self, time: FloatArray, gyro: FloatArray) -> None:
         self.time = time
-        steps = np.diff(time)[:, None] * 0.5 * (gyro[1:] + gyro[:-1])
-        self.angle = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-        self._quat = cumulative_rotations(Rotation.from_rotvec(steps))
+        self.angle = integral(time, gyro)
+        self._attitude = integrated_gyro(time, gyro)
         self._rate = gyro
 
     def attitude(self, time: FloatArray) -> Rotation:
@@ -27,9 +26,7 @@ class GyroIntegral:
         clipped = np.clip(time, self.time[0], self.time[-1])
         left = np.clip(np.searchsorted(self.time, clipped, side="right") - 1, 0, len(self.time) - 2)
         tau = clipped - self.time[left]
-        return Rotation.from_quat(self._quat[left]) * Rotation.from_rotvec(
-            self._rate[left] * tau[:, None]
-        )
+        return self._attitude[left] * Rotation.from_rotvec(self._rate[left] * tau[:, None])
 
     def has_long_gap(self, start: float, stop: float) -> bool:
         """Return whether the samples between two times have a gap too long to integrate across."""

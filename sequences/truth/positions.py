@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import correlation, interpolated
+from stario.sequences.arrays import correlation, integral, interpolated
 from stario.sequences.sequence import (
     MAX_IMU_GAP,
     BoolArray,
@@ -129,17 +129,12 @@ def _accelerations(
     ticks = np.arange(time[0] + _H_S, time[-1] - _H_S, 0.5 * _H_S)
     first = np.searchsorted(time, ticks - _H_S, side="right") - 1
     ticks = ticks[gaps[first] == gaps[np.searchsorted(time, ticks + _H_S)]]
-    fallen = _integral(time, _integral(time, force_W - force_W[pose.valid].mean(axis=0)))
+    fallen = integral(time, integral(time, force_W - force_W[pose.valid].mean(axis=0)))
     known = truth.valid
     return (
         _second_difference(ticks, truth.time[known], truth.position_W[known]),
         _second_difference(ticks, time, fallen),
     )
-
-
-def _integral(time: FloatArray, values: FloatArray) -> FloatArray:
-    steps = 0.5 * np.diff(time)[:, None] * (values[1:] + values[:-1])
-    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
 
 def _second_difference(ticks: FloatArray, time: FloatArray, values: FloatArray) -> FloatArray:
