@@ -95,15 +95,25 @@ def numbers(name: str, value: object) -> FloatArray:
     raise InputError(name, f"values of type {array.dtype}", "numbers", remedy)
 
 
+def some_times(name: str, value: FloatArray) -> FloatArray:
+    """Return times (N,) [s] in any order, checked to be numbers and not empty.
+
+    Raises:
+        InputError: they are not.
+    """
+    time = numbers(name, value)
+    if time.ndim != 1 or time.size == 0:
+        raise InputError(name, f"shape {time.shape}", "(N,) with at least one sample")
+    return time
+
+
 def checked_time(name: str, value: FloatArray) -> FloatArray:
     """Return times (N,) [s], checked to be finite and strictly increasing.
 
     Raises:
         InputError: a time is not finite, or the times do not strictly increase.
     """
-    time = numbers(name, value)
-    if time.ndim != 1 or time.size == 0:
-        raise InputError(name, f"shape {time.shape}", "(N,) with at least one sample")
+    time = some_times(name, value)
     if not np.isfinite(time).all():
         raise InputError(name, "a value that is not finite", "finite seconds")
     steps = np.diff(time)

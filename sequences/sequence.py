@@ -23,6 +23,7 @@ from stario.sequences.arrays import (
     checked_valid,
     interpolated,
     numbers,
+    some_times,
 )
 from stario.sequences.auxiliary import DeviceAttitude as DeviceAttitude
 from stario.sequences.auxiliary import Magnetometer as Magnetometer
@@ -211,9 +212,7 @@ class ImuSequence:
         for name, kind in _PARTS.items():
             remedy = f"create one with {kind.__name__}(...)"
             check_type(name, getattr(self, name), kind, remedy, optional=True)
-        time = numbers("time", self.time)
-        if time.ndim != 1 or time.size == 0:
-            raise InputError("time", f"shape {time.shape}", "(N,) with at least one sample")
+        time = some_times("time", self.time)
         arrays = {"time": time}
         for name in ("gyro", "accel"):
             value = numbers(name, getattr(self, name))

@@ -138,12 +138,11 @@ def align(estimate: Trajectory, truth: Trajectory, mode: Alignment) -> Trajector
     if mode == "first":
         return _moved(estimate, -float(errors.yaw[0]), estimated[0], true[0])
     center, target = estimated.mean(axis=0), true.mean(axis=0)
-    x, y = (estimated - center)[:, :2].T
-    u, v = (true - target)[:, :2].T
-    if min(np.hypot(x, y).max(), np.hypot(u, v).max()) < _PLACE_M:
+    z, w = ((p - middle)[:, :2] @ [1.0, 1j] for p, middle in ((estimated, center), (true, target)))
+    if min(np.abs(z).max(), np.abs(w).max()) < _PLACE_M:
         yaw = -np.angle(np.exp(1j * errors.yaw).mean())
     else:
-        yaw = np.arctan2(np.sum(x * v - y * u), np.sum(x * u + y * v))
+        yaw = np.angle(np.vdot(z, w))
     return _moved(estimate, float(yaw), center, target)
 
 

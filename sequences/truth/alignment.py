@@ -20,10 +20,9 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import correlation, interpolated, samples_in
 from stario.sequences.attitude.levelling import MIN_GRAVITY_FORCE
-from stario.sequences.attitude.rotations import tilt_aligning
+from stario.sequences.attitude.rotations import GyroIntegral, tilt_aligning
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray
-from stario.sequences.truth.gyro_integral import GyroIntegral
 from stario.sequences.truth.mount_heading import heading_turn
 from stario.sequences.truth.mounts import (
     MIN_FIT_S,

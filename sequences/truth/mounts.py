@@ -11,8 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import samples_in
+from stario.sequences.attitude.rotations import GyroIntegral
 from stario.sequences.sequence import BoolArray, FloatArray
-from stario.sequences.truth.gyro_integral import GyroIntegral
 
 MIN_FIT_S = 10.0
 """Minimum length of a piece whose mount can be fitted [s]."""

@@ -29,8 +29,7 @@ from stario.sequences.sequence import (
     ImuSequence,
     Trajectory,
 )
-from stario.sequences.truth.part import middle_part, without_spikes
-from stario.sequences.windows import clean_samples
+from stario.sequences.truth.part import compared_samples
 
 _H_S = 0.3
 _MIN_ROWS = 50
@@ -90,10 +89,9 @@ def fit_positions(sequence: ImuSequence, time_offset: float) -> PositionFit | No
         InputError: as for `clean_samples`, or fewer than two valid poses.
     """
     assert sequence.truth is not None
-    time, _, accel = clean_samples(middle_part(sequence))
-    used = without_spikes(accel)
+    time, _, accel = compared_samples(sequence)
     truth = replace(sequence.truth, time=sequence.truth.time + time_offset)
-    moved, felt = _accelerations(time[used], accel[used], truth)
+    moved, felt = _accelerations(time, accel, truth)
     if len(felt) < _MIN_ROWS:
         return None
     used = _inliers(moved) & _inliers(felt)
