@@ -75,6 +75,10 @@ def _is_range(speeds: object) -> bool:
     return False
 
 
+UNVARIED = Augmentation((1.0, 1.0), *[0.0] * (len(fields(Augmentation)) - 1))
+"""No variation: windows as they were recorded."""
+
+
 def reach_of(augmentation: Augmentation, successive: int = 1) -> int:
     """Return the minimum number of samples for successive windows at the fastest replay."""
     # Windows that are not replayed keep speed 1.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from stario.network.displacement import DisplacementNetwork
 from stario.network.known_motion import KnownMotion
+from stario.network.training.augment import UNVARIED
 from stario.network.training.config import LEAST_SECONDS, TrainingConfig
 from stario.network.training.legs import LegBatch, LegSampler, by_kind
 from stario.network.training.weak_truth import leg_loss
@@ -189,10 +189,6 @@ def _minutes(streams: Sequence[WorldStream], every: int) -> list[WorldStream]:
 def _drawn_once(legs: Sequence[LegStream], config: TrainingConfig) -> dict[str, LegBatch]:
     """Return the same stretches for every epoch, without augmentation."""
     found = {}
-    plain = replace(
-        config.augmentation, mirrored=0.0, yaw=0.0, any_yaw=0.0, tilt=0.0, gyro_bias=0.0,
-        accel_bias=0.0, gyro_noise=0.0, accel_noise=0.0,
-    )  # fmt: skip
     for kind, members, usual, _ in by_kind(legs, config):
         # The held-out part of a short walk is shorter than a training stretch.
         longest = (max(len(stream) for stream in members) - 1) // WINDOW_SAMPLES
@@ -200,7 +196,7 @@ def _drawn_once(legs: Sequence[LegStream], config: TrainingConfig) -> dict[str, 
         if seconds < LEAST_SECONDS:
             continue
         try:
-            sampler = LegSampler(members, seconds, plain, torch.Generator().manual_seed(0))
+            sampler = LegSampler(members, seconds, UNVARIED, torch.Generator().manual_seed(0))
         except InputError as error:  # an error of 0 without legs would be the smallest
             log.warning("validation skips %s", error)
             continue
