@@ -272,17 +272,6 @@ def window_starts(samples: Sized, stride: int) -> NDArray[np.int64]:
     return np.arange(0, len(samples) - WINDOW_SAMPLES, stride)
 
 
-def windows_at(
-    stream: WorldStream, starts: NDArray[np.int64]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return windows (M, 6, 200) from samples `starts` (M,), and displacements (M, 3) [m], in W.
-
-    Rotating both by minus `headings_at` gives frame H.
-    """
-    windows = cut_windows(stream.imu_W, starts)
-    return windows, stream.position_W[starts + WINDOW_SAMPLES] - stream.position_W[starts]
-
-
 def cut_windows(imu: NDArray[np.float32], starts: NDArray[np.int64]) -> NDArray[np.float32]:
     """Return the windows (M, 6, 200) of samples (N, 6) that start at samples `starts` (M,)."""
     rows = starts[:, None] + np.arange(WINDOW_SAMPLES)

@@ -22,10 +22,10 @@ from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import (
     WINDOW_SAMPLES,
     WorldStream,
+    cut_windows,
     headings_at,
     rotated_windows,
     window_starts,
-    windows_at,
 )
 
 log = logging.getLogger(__name__)
@@ -124,10 +124,11 @@ class ValidationSet:
         """Yield windows (B, 6, 200) and displacements (B, 3) [m] in H, in order of time."""
         starts = window_starts(stream, self.stride)
         for first in range(0, len(starts), batch):
-            windows, target = windows_at(stream, starts[first : first + batch])
-            heading = headings_at(stream.facing_W, starts[first : first + batch])
-            windows = rotated_windows(windows, -heading)
-            yield windows, about_z(-heading).apply(target).astype(np.float32)
+            begin = starts[first : first + batch]
+            heading = headings_at(stream.facing_W, begin)
+            moved_W = stream.position_W[begin + WINDOW_SAMPLES] - stream.position_W[begin]
+            windows = rotated_windows(cut_windows(stream.imu_W, begin), -heading)
+            yield windows, about_z(-heading).apply(moved_W).astype(np.float32)
 
     def errors(
         self, network: DisplacementNetwork, residuals: np.ndarray | None = None
