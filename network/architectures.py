@@ -6,7 +6,7 @@ import importlib
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from stario.sequences.errors import InputError
+from stario.sequences.arrays import check_choice
 
 if TYPE_CHECKING:
     from torch import nn
@@ -46,7 +46,7 @@ ARCHITECTURES = {
     "I-MobileNet": Architecture("baselines.plain", "MobileNet", 3.179, 34.559),
     "I-MnasNet": Architecture("baselines.plain", "MnasNet", 2.979, 25.256),
     "I-EfficientNetB0": Architecture("baselines.plain", "EfficientNetB0", 3.232, 28.831),
-    "DeepILS": Architecture("baselines.deepils", "DeepIls", 2.291, 15.287),
+    "DeepILS": Architecture("baselines.plain", "DeepIls", 2.291, 15.287),
     "TLIO": Architecture("baselines.plain", "Tlio", 5.424, 39.436, heads=2),
     "StarIO without MSGCU": Architecture(
         "stario", "StarIO", 2.252, 21.555, options={"gated_unit": False}
@@ -62,8 +62,7 @@ def architecture(name: str) -> Architecture:
     Raises:
         InputError: no network has that name.
     """
-    if name not in ARCHITECTURES:
-        raise InputError("architecture", repr(name), f"one of {', '.join(ARCHITECTURES)}")
+    check_choice("architecture", name, ARCHITECTURES)
     return ARCHITECTURES[name]
 
 

@@ -23,7 +23,14 @@ from numpy.typing import NDArray
 from stario.sequences.attitude.levelling import STILL_ACCEL
 from stario.sequences.legs import LegStream
 from stario.sequences.sequence import STANDARD_GRAVITY, BoolArray, FloatArray
-from stario.sequences.windows import WINDOW_RATE, WINDOW_SAMPLES, WINDOW_SECONDS, WorldStream
+from stario.sequences.windows import (
+    WINDOW_RATE,
+    WINDOW_SAMPLES,
+    WINDOW_SECONDS,
+    WorldStream,
+    cut_windows,
+    window_starts,
+)
 
 FEATURES = ("acceleration", "turning", "fast", "middle", "vertical")
 """Root mean squares of linear acceleration [m/s^2] and angular rate [rad/s]; shares [1] of the
@@ -203,10 +210,9 @@ def known_motion(
 
 def _cut(imu: NDArray[np.float32], stride: int) -> Iterator[NDArray[np.float32]]:
     """Yield windows (B, 6, 200) every `stride` samples, a few at a time."""
-    starts = np.arange(0, len(imu) - WINDOW_SAMPLES, stride)
+    starts = window_starts(imu, stride)
     for first in range(0, len(starts), _AT_ONCE):
-        rows = starts[first : first + _AT_ONCE, None] + np.arange(WINDOW_SAMPLES)
-        yield imu[rows].transpose(0, 2, 1)
+        yield cut_windows(imu, starts[first : first + _AT_ONCE])
 
 
 def _speeds(stream: WorldStream, stride: int) -> FloatArray:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.resources
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -139,7 +140,7 @@ def save_model(path: Path, network: DisplacementNetwork, card: Card) -> Card:
     import safetensors.torch
 
     content = safetensors.torch.save(state, metadata={"architecture": card.architecture})
-    card = Card(**{**vars(card), "sha256": hashlib.sha256(content).hexdigest()})
+    card = replace(card, sha256=hashlib.sha256(content).hexdigest())
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path, "wb") as file:
         file.write(content)
@@ -177,9 +178,10 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
 
         return DisplacementModel(*load_onnx(path))
     packaged = Path(str(importlib.resources.files("stario.network.weights")), f"{path}.safetensors")
-    if path.parent == Path() and not path.suffix and packaged.is_file():
+    is_name = path.parent == Path() and not path.suffix
+    if is_name and packaged.is_file():
         path = packaged
-    if path.parent == Path() and not path.suffix and not path.exists():
+    elif is_name and not path.exists():
         raise WeightsError(path, "weights", "no such file", f"a file, or {packaged_names()}")
     card = read_card(path)
     if card.architecture not in ARCHITECTURES:

@@ -14,6 +14,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from stario.network.baselines.parts import linear_layers
+
 WIDTHS = (64, 128, 192, 256)
 BLOCKS = (2, 2, 2, 2)
 _LENGTH_AT_HEAD = 3
@@ -138,16 +140,9 @@ class StarIO(nn.Module):
             ]
             previous = width
         self.trunk = nn.Sequential(*layers)
-        self.head = nn.Sequential(
-            nn.Flatten(),
-            nn.Linear(previous * _LENGTH_AT_HEAD, 512),
-            nn.ReLU(),
-            nn.Dropout(0.5),
-            nn.Linear(512, 256),
-            nn.ReLU(),
-            nn.Dropout(0.5),
-            nn.Linear(256, outputs),
-        )
+        features = previous * _LENGTH_AT_HEAD
+        layers = linear_layers(features, 512, 256, outputs, dropout=0.5)
+        self.head = nn.Sequential(nn.Flatten(), *layers)
 
     def forward(self, windows: Tensor) -> Tensor:
         """Map (B, 6, 200) to (B, outputs)."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +23,17 @@ def correlation(x: FloatArray, y: FloatArray) -> float:
 def interpolated(at: FloatArray, time: FloatArray, values: FloatArray) -> FloatArray:
     """Interpolate columns of values (N, k) linearly at times (M,), clamped at the ends."""
     return np.stack([np.interp(at, time, column) for column in values.T], axis=1)
+
+
+def integral(time: FloatArray, values: FloatArray) -> FloatArray:
+    """Return the trapezoidal integral (N, k) over time (N,) of values (N, k), starting at 0."""
+    steps = 0.5 * np.diff(time)[:, None] * (values[1:] + values[:-1])
+    return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
+
+
+def samples_in(seconds: float, time: FloatArray) -> int:
+    """Return the number of median steps of times (N,) [s] in a span [s], at least 1."""
+    return max(1, round(seconds / float(np.median(np.diff(time)))))
 
 
 def number_in(text: str) -> float:
@@ -51,6 +64,16 @@ def check_type(
         raise InputError(name, shown(value), expected, remedy)
 
 
+def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
+    """Check that an argument is one of the known names.
+
+    Raises:
+        InputError: it is not; names the argument and the choices.
+    """
+    if value not in (known := tuple(choices)):
+        raise InputError(name, repr(value), f"one of {', '.join(known)}")
+
+
 def shown(value: object) -> str:
     """Return a value as text for an error's single line."""
     return f"{' '.join(repr(value).split()):.60}"
@@ -72,15 +95,25 @@ def numbers(name: str, value: object) -> FloatArray:
     raise InputError(name, f"values of type {array.dtype}", "numbers", remedy)
 
 
+def some_times(name: str, value: FloatArray) -> FloatArray:
+    """Return times (N,) [s] in any order, checked to be numbers and not empty.
+
+    Raises:
+        InputError: they are not.
+    """
+    time = numbers(name, value)
+    if time.ndim != 1 or time.size == 0:
+        raise InputError(name, f"shape {time.shape}", "(N,) with at least one sample")
+    return time
+
+
 def checked_time(name: str, value: FloatArray) -> FloatArray:
     """Return times (N,) [s], checked to be finite and strictly increasing.
 
     Raises:
         InputError: a time is not finite, or the times do not strictly increase.
     """
-    time = numbers(name, value)
-    if time.ndim != 1 or time.size == 0:
-        raise InputError(name, f"shape {time.shape}", "(N,) with at least one sample")
+    time = some_times(name, value)
     if not np.isfinite(time).all():
         raise InputError(name, "a value that is not finite", "finite seconds")
     steps = np.diff(time)
@@ -90,6 +123,20 @@ def checked_time(name: str, value: FloatArray) -> FloatArray:
             name, f"{time[k + 1]!r} after {time[k]!r} at row {k + 1}", "strictly increasing seconds"
         )
     return time
+
+
+def checked_valid(name: str, value: BoolArray, time: FloatArray) -> BoolArray:
+    """Return flags (N,) of the rows at `time` (N,), all True if there are none.
+
+    Raises:
+        InputError: their number differs.
+    """
+    valid = np.asarray(value, dtype=np.bool_)
+    if valid.size == 0:
+        return np.ones(len(time), dtype=np.bool_)
+    if valid.shape != time.shape:
+        raise InputError(name, f"shape {valid.shape}", f"({len(time)},) as time")
+    return valid
 
 
 def checked_array(

@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Literal, Self
+from typing import Literal, Self, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import BoolArray, FloatArray, check_type, checked_array, checked_time
+from stario.sequences.arrays import (
+    BoolArray,
+    FloatArray,
+    check_choice,
+    check_type,
+    checked_array,
+    checked_time,
+    checked_valid,
+)
 from stario.sequences.errors import InputError
 
 
 @dataclass(frozen=True, eq=False)
-class _Timed:
+class Timed:
     """Rows at increasing times."""
 
     time: FloatArray
@@ -22,20 +30,22 @@ class _Timed:
     def __len__(self) -> int:
         return len(self.time)
 
+    def select(self, keep: BoolArray) -> Self:
+        """Return the rows for which `keep` (N,) is True."""
+        rows = {k: v for k, v in vars(self).items() if v is not None and k != "kind"}
+        return replace(self, **{name: values[keep] for name, values in rows.items()})
+
     def slice(self, start: float, stop: float) -> Self | None:
         """Return the rows with start <= time <= stop [s], or None if there are none."""
         keep = (self.time >= start) & (self.time <= stop)
-        if not keep.any():
-            return None
-        rows = {k: v for k, v in vars(self).items() if k != "kind" and v is not None}
-        return replace(self, **{k: v[keep] for k, v in rows.items()})
+        return self.select(keep) if keep.any() else None
 
 
-_KINDS = ("positions", "waypoints")
+Kind = Literal["positions", "waypoints"]
 
 
 @dataclass(frozen=True, eq=False)
-class PositionTrack(_Timed):
+class PositionTrack(Timed):
     """Known positions without attitude: a position track, or waypoints that the user passed.
 
     Attributes:
@@ -52,18 +62,14 @@ class PositionTrack(_Timed):
     """
 
     position_W: FloatArray
-    kind: Literal["positions", "waypoints"]
+    kind: Kind
     valid: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
     sigma: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        if self.kind not in _KINDS:
-            raise InputError("positions' kind", repr(self.kind), f"one of {', '.join(_KINDS)}")
+        check_choice("positions' kind", self.kind, get_args(Kind))
         time = checked_time("positions' time", self.time)
-        valid = np.asarray(self.valid, dtype=np.bool_)
-        valid = np.ones(len(time), dtype=np.bool_) if valid.size == 0 else valid
-        if valid.shape != time.shape:
-            raise InputError("positions' valid", f"shape {valid.shape}", f"({len(time)},) as time")
+        valid = checked_valid("positions' valid", self.valid, time)
         columns = 2 if np.ndim(self.position_W) == 2 and np.shape(self.position_W)[1] == 2 else 3
         shape = (len(time), columns)
         position_W = checked_array("positions", self.position_W, shape, where=valid)
@@ -84,7 +90,7 @@ class PositionTrack(_Timed):
 
 
 @dataclass(frozen=True, eq=False)
-class Magnetometer(_Timed):
+class Magnetometer(Timed):
     """Magnetic field measured alongside the IMU, at its own times.
 
     Attributes:
@@ -111,7 +117,7 @@ class Magnetometer(_Timed):
 
 
 @dataclass(frozen=True, eq=False)
-class DeviceAttitude(_Timed):
+class DeviceAttitude(Timed):
     """Attitude estimated by the device's own sensor fusion, in its own world frame with z up.
 
     Attributes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,7 @@ class StarioError(Exception):
 
     def __reduce__(self) -> tuple[Any, ...]:
         # By default, unpickling calls the class with the text, which is not what these take.
-        return _with_text, (type(self), *self.args), vars(self)
-
-
-def _with_text(kind: type[StarioError], *args: object) -> StarioError:
-    """Create an error without calling `__init__`; pickle then restores the fields."""
-    return kind.__new__(kind, *args)
+        return copyreg.__newobj__, (type(self), *self.args), vars(self)  # type: ignore[attr-defined]
 
 
 class InputError(StarioError, ValueError):

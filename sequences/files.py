@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,7 +27,7 @@ _TUM_FIELDS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 @contextmanager
-def atomic_write(path: Path | str, mode: str = "w") -> Iterator[IO[Any]]:
+def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[IO[Any]]:
     """Open a file that appears under its name only when it is complete.
 
     The content goes to a temporary file in the same folder, which replaces `path` at the end of the
@@ -38,11 +38,9 @@ def atomic_write(path: Path | str, mode: str = "w") -> Iterator[IO[Any]]:
         mode: "w" for text (UTF-8, Unix line ends), "wb" for bytes.
 
     Raises:
-        InputError: the mode is invalid, the folder does not exist, `path` is a folder, or the
-            system refuses to write there.
+        InputError: the folder does not exist, `path` is a folder, or the system refuses to write
+            there.
     """
-    if mode not in ("w", "wb"):
-        raise InputError("mode", repr(mode), "'w' or 'wb'")
     text: dict[str, str] = {} if "b" in mode else {"encoding": "utf-8", "newline": "\n"}
     with atomic_path(path) as temporary:
         # Exclusive creation, unlike `tempfile`, leaves the permissions to the user's umask.

@@ -11,14 +11,24 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from stario.sequences.arrays import BoolArray as BoolArray
 from stario.sequences.arrays import FloatArray as FloatArray
-from stario.sequences.arrays import check_type, checked_array, checked_time, interpolated, numbers
+from stario.sequences.arrays import (
+    check_type,
+    checked_array,
+    checked_time,
+    checked_valid,
+    interpolated,
+    numbers,
+    some_times,
+)
 from stario.sequences.auxiliary import DeviceAttitude as DeviceAttitude
 from stario.sequences.auxiliary import Magnetometer as Magnetometer
 from stario.sequences.auxiliary import PositionTrack as PositionTrack
+from stario.sequences.auxiliary import Timed
 from stario.sequences.errors import InputError
 from stario.sequences.time_order import MAX_IMU_GAP as MAX_IMU_GAP
 from stario.sequences.time_order import ahead_mask, increasing_mask
@@ -40,7 +50,7 @@ _ROUNDING_S = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class Trajectory(Timed):
     """A track of poses in the world frame W.
 
     Attributes:
@@ -56,7 +66,6 @@ class Trajectory:
             has the wrong type.
     """
 
-    time: FloatArray
     position_W: FloatArray
     attitude_WB: Rotation
     velocity_W: FloatArray | None = None
@@ -66,10 +75,7 @@ class Trajectory:
     def __post_init__(self) -> None:
         time = checked_time("time", self.time)
         n = len(time)
-        valid = np.asarray(self.valid, dtype=np.bool_)
-        valid = np.ones(n, dtype=np.bool_) if valid.size == 0 else valid
-        if valid.shape != (n,):
-            raise InputError("valid", f"shape {valid.shape}", f"({n},) as time")
+        valid = checked_valid("valid", self.valid, time)
         check_type("attitude_WB", self.attitude_WB, Rotation, "Rotation.from_quat(quat_xyzw)")
         if len(self.attitude_WB) != n:
             raise InputError("attitude_WB", f"{len(self.attitude_WB)} rotations", f"{n} as time")
@@ -80,9 +86,6 @@ class Trajectory:
                 arrays[name] = checked_array(name, value, (n, *shape), where=valid)
         for name, value in arrays.items():
             object.__setattr__(self, name, value)
-
-    def __len__(self) -> int:
-        return len(self.time)
 
     @property
     def quat_xyzw(self) -> FloatArray:
@@ -140,20 +143,12 @@ class Trajectory:
         return np.asarray(inside & (bracketed | exact))
 
     def slice(self, start: float, stop: float) -> Trajectory:
-        """Return the samples with start <= time <= stop [s]."""
-        return self.select((self.time >= start) & (self.time <= stop))
+        """Return the poses with start <= time <= stop [s].
 
-    def select(self, keep: BoolArray) -> Trajectory:
-        """Return the samples for which `keep` (N,) is True."""
-        velocity, covariance = self.velocity_W, self.position_covariance_W
-        return Trajectory(
-            time=self.time[keep],
-            position_W=self.position_W[keep],
-            attitude_WB=self.attitude_WB[keep],
-            velocity_W=None if velocity is None else velocity[keep],
-            position_covariance_W=None if covariance is None else covariance[keep],
-            valid=self.valid[keep],
-        )
+        Raises:
+            InputError: there are none.
+        """
+        return self.select((self.time >= start) & (self.time <= stop))
 
     def path_length(self) -> float:
         """Return the length of the path [m] along 1 s chords, so that sensor noise adds nothing."""
@@ -220,9 +215,7 @@ class ImuSequence:
         for name, kind in _PARTS.items():
             remedy = f"create one with {kind.__name__}(...)"
             check_type(name, getattr(self, name), kind, remedy, optional=True)
-        time = numbers("time", self.time)
-        if time.ndim != 1 or time.size == 0:
-            raise InputError("time", f"shape {time.shape}", "(N,) with at least one sample")
+        time = some_times("time", self.time)
         arrays = {"time": time}
         for name in ("gyro", "accel"):
             value = numbers(name, getattr(self, name))
@@ -275,25 +268,19 @@ class ImuSequence:
 
     def slice(self, start: float, stop: float) -> ImuSequence:
         """Return the samples with start <= time <= stop [s], and all other data within them."""
-        keep = (self.time >= start) & (self.time <= stop)
-        truth, field = self.truth, self.magnetometer
-        positions, own = self.positions, self.device_attitude
-        if truth is not None:
-            inside = (truth.time >= start) & (truth.time <= stop)
-            truth = truth.select(inside) if inside.any() else None
-        return replace(
-            self,
-            time=self.time[keep],
-            gyro=self.gyro[keep],
-            accel=self.accel[keep],
-            truth=truth,
-            magnetometer=None if field is None else field.slice(start, stop),
-            positions=None if positions is None else positions.slice(start, stop),
-            device_attitude=None if own is None else own.slice(start, stop),
-        )
+        parts = {name: getattr(self, name) for name in _PARTS}
+        # Unlike `Trajectory.slice`, that of `Timed` returns None if nothing is left.
+        rest: dict[str, Any] = {
+            name: Timed.slice(part, start, stop) for name, part in parts.items() if part is not None
+        }
+        return replace(self.select((self.time >= start) & (self.time <= stop)), **rest)
+
+    def select(self, keep: BoolArray | NDArray[np.intp]) -> ImuSequence:
+        """Return the recording with samples `keep` only: (N,) bool, or indices in their order."""
+        return replace(self, time=self.time[keep], gyro=self.gyro[keep], accel=self.accel[keep])
 
 
-_PARTS: dict[str, type] = {
+_PARTS: dict[str, type[Timed]] = {
     "truth": Trajectory,
     "magnetometer": Magnetometer,
     "positions": PositionTrack,

@@ -15,6 +15,7 @@ down throughout, for which any heading is acceptable.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sized
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import interpolated
+from stario.sequences.arrays import integral, interpolated, samples_in
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import InputError
@@ -142,11 +143,10 @@ def resample(time: FloatArray, values: FloatArray, grid: FloatArray) -> FloatArr
     steps = time[1:] - time[:-1]
     if len(time) < 2 or np.sort(steps)[len(steps) // 2] > 0.67 * step:
         return interpolated(grid, time, values)
-    areas = 0.5 * steps[:, None] * (values[1:] + values[:-1])
-    integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(areas, axis=0)])
+    total = integral(time, values)
     edges = np.clip(np.append(grid - 0.5 * step, grid[-1] + 0.5 * step), time[0], time[-1])
     widths = np.diff(edges)
-    means = np.diff(interpolated(edges, time, integral), axis=0) / np.maximum(widths, 1e-9)[:, None]
+    means = np.diff(interpolated(edges, time, total), axis=0) / np.maximum(widths, 1e-9)[:, None]
     return np.where((widths > 0.25 * step)[:, None], means, interpolated(grid, time, values))
 
 
@@ -218,13 +218,19 @@ def _levelled(
         R_NB[part] = levelled_attitudes(time[part], gyro[part], accel[part])
     levelled_NB = Rotation.from_matrix(R_NB)
     turn = yaw_of(true_WB * levelled_NB.inv())
-    second = round(WINDOW_SECONDS / float(np.median(np.diff(time))))
+    second = samples_in(WINDOW_SECONDS, time)
     changes = np.flatnonzero(np.diff(known.astype(np.int8))) + 1
     edges = np.union1d([part.start for part in parts], changes)
     for start, stop in pairwise([*edges.tolist(), len(time)]):
         part = slice(start, stop)
         turn[part] = uniform_filter1d(np.unwrap(turn[part]), second, mode="nearest")
     return about_z(turn) * levelled_NB
+
+
+def usable(sequence: ImuSequence) -> BoolArray:
+    """Return which samples (N,) are numbers that a sensor can measure, whatever their time."""
+    values = np.column_stack([sequence.gyro, sequence.accel])
+    return np.asarray((np.abs(values) < MAX_SENSOR_VALUE).all(axis=1))
 
 
 def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -235,9 +241,7 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
     Raises:
         InputError: fewer than two samples are left, or their rate is not accepted.
     """
-    finite = np.isfinite(sequence.time) & (np.abs(sequence.gyro) < MAX_SENSOR_VALUE).all(axis=1)
-    finite &= (np.abs(sequence.accel) < MAX_SENSOR_VALUE).all(axis=1)
-    index = np.flatnonzero(finite)
+    index = np.flatnonzero(np.isfinite(sequence.time) & usable(sequence))
     kept = increasing_mask(sequence.time[index])
     if ahead := int(ahead_mask(sequence.time[index], kept).sum()):
         log.warning("%s: samples ahead of their time dropped: %d", sequence.name, ahead)
@@ -258,20 +262,14 @@ def unbroken(time: FloatArray) -> list[tuple[int, int]]:
     return list(pairwise([0, *breaks.tolist(), len(time)]))
 
 
-def window_starts(stream: WorldStream, stride: int) -> NDArray[np.int64]:
-    """Return the first samples (M,) of windows every `stride` samples."""
-    return np.arange(0, len(stream) - WINDOW_SAMPLES, stride)
+def longest_unbroken(time: FloatArray) -> slice:
+    """Return the longest of the stretches of `unbroken`, by its samples."""
+    return slice(*max(unbroken(time), key=lambda piece: piece[1] - piece[0]))
 
 
-def windows_at(
-    stream: WorldStream, starts: NDArray[np.int64]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return windows (M, 6, 200) from samples `starts` (M,), and displacements (M, 3) [m], in W.
-
-    Rotating both by minus `headings_at` gives frame H.
-    """
-    windows = cut_windows(stream.imu_W, starts)
-    return windows, stream.position_W[starts + WINDOW_SAMPLES] - stream.position_W[starts]
+def window_starts(samples: Sized, stride: int) -> NDArray[np.int64]:
+    """Return the first samples (M,) of windows every `stride` of some samples."""
+    return np.arange(0, len(samples) - WINDOW_SAMPLES, stride)
 
 
 def cut_windows(imu: NDArray[np.float32], starts: NDArray[np.int64]) -> NDArray[np.float32]:

@@ -1,5 +1,8 @@
-from stario.sequences.windows import window_starts, windows_at
+from stario.sequences.windows import WINDOW_SAMPLES, cut_windows, window_starts
 
 
 def windows_of(stream, stride):
-    return windows_at(stream, window_starts(stream, stride))
+    """Windows (M, 6, 200) of a stream and their displacements (M, 3), both in W."""
+    begin = window_starts(stream, stride)
+    moved_W = stream.position_W[begin + WINDOW_SAMPLES] - stream.position_W[begin]
+    return cut_windows(stream.imu_W, begin), moved_W

@@ -5,6 +5,8 @@ Shapes below: B windows, C channels, L time steps.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 from torch import Tensor, nn
 
 
@@ -43,14 +45,16 @@ class FCOut(nn.Sequential):
         super().__init__(
             ConvNorm(channels, 128),
             nn.Flatten(),
-            nn.Linear(128 * length, 512),
-            nn.ReLU(),
-            nn.Dropout(0.5),
-            nn.Linear(512, 512),
-            nn.ReLU(),
-            nn.Dropout(0.5),
-            nn.Linear(512, outputs),
+            *linear_layers(128 * length, 512, 512, outputs, dropout=0.5),
         )
+
+
+def linear_layers(*widths: int, dropout: float) -> list[nn.Module]:
+    """Return linear layers from each width to the next, all but the last with ReLU and dropout."""
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(widths):
+        layers += [nn.Linear(inputs, outputs), nn.ReLU(), nn.Dropout(dropout)]
+    return layers[:-2]
 
 
 class BasicBlock(nn.Module):

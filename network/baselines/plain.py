@@ -5,6 +5,10 @@
   than RoNIN's own.
 - TLIO: Liu et al.: TLIO: Tight Learned Inertial Odometry, IEEE Robotics and Automation Letters
   5(4), 2020. RoNIN's trunk with two heads, for the displacement and for its log standard deviation.
+- DeepILS: Tariq et al.: DeepILS: Toward Accurate Domain-Invariant AIoT-Enabled Inertial
+  Localization System, IEEE Internet of Things Journal, 2025. RoNIN's residual network with
+  separable convolutions and, in every block, the attention of Woo et al.: CBAM: Convolutional Block
+  Attention Module, ECCV 2018, in one dimension.
 - I-MobileNet, I-MnasNet, I-EfficientNetB0 in one dimension, as compared by IMUNet's authors
   (Zeinali, Zanddizari, Chang: IMUNet, 2024). Howard et al.: MobileNets, 2017; Tan et al.: MnasNet,
   CVPR 2019; Tan, Le: EfficientNet, ICML 2019, without squeeze and excitation.
@@ -26,6 +30,7 @@ from stario.network.baselines.parts import (
     mobile_head,
     residual_groups,
     resnet_stem,
+    shortcut,
 )
 from stario.sequences.windows import WINDOW_SAMPLES
 
@@ -77,6 +82,55 @@ class Tlio(nn.Module):
         """Map (B, 6, 200) to (B, outputs)."""
         features = self.trunk(windows)
         return torch.cat([self.mean(features), self.log_sigma(features)], dim=1)
+
+
+class Attention(nn.Module):
+    """CBAM: weights over channels, then weights over time."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.average = nn.AdaptiveAvgPool1d(1)
+        self.shared = nn.Sequential(
+            nn.Conv1d(channels, channels // 16, 1, bias=False),
+            nn.ReLU(),
+            nn.Conv1d(channels // 16, channels, 1, bias=False),
+        )
+        self.spatial = nn.Conv1d(2, 1, 7, padding=3, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, C, L) to (B, C, L)."""
+        average, largest = self.average(x), x.amax(2, keepdim=True)
+        x = x * torch.sigmoid(self.shared(average) + self.shared(largest))
+        pooled = torch.cat([x.mean(1, keepdim=True), x.amax(1, keepdim=True)], dim=1)
+        return x * torch.sigmoid(self.spatial(pooled))
+
+
+class SeparableBlock(nn.Module):
+    """Residual block of two separable convolutions and attention."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            _depthwise(inputs, stride),
+            ConvNorm(inputs, outputs),
+            nn.ReLU(),
+            _depthwise(outputs, 1),
+            ConvNorm(outputs, outputs),
+            Attention(outputs),
+        )
+        self.shortcut = shortcut(inputs, outputs, stride)
+        self.relu = nn.ReLU()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map (B, C, L) to (B, outputs, L / stride)."""
+        result: Tensor = self.relu(self.layers(x) + self.shortcut(x))
+        return result
+
+
+class DeepIls(RoninResNet):
+    """R-ResNet with separable attention blocks."""
+
+    block = SeparableBlock
 
 
 class RoninLstm(nn.Module):
@@ -144,3 +198,7 @@ class EfficientNetB0(_Layers):
             inverted_residuals(32, _EFFICIENT_ROWS, nn.SiLU),
             mobile_head(nn.SiLU, outputs),
         )
+
+
+def _depthwise(channels: int, stride: int) -> nn.Conv1d:
+    return nn.Conv1d(channels, channels, 3, stride, padding=1, groups=channels, bias=False)

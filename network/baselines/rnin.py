@@ -9,7 +9,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from stario.network.baselines.parts import BasicBlock, ConvNorm, residual_groups, resnet_stem
+from stario.network.baselines.parts import (
+    BasicBlock,
+    ConvNorm,
+    linear_layers,
+    residual_groups,
+    resnet_stem,
+)
 
 _HIDDEN = 256
 
@@ -28,8 +34,9 @@ class Rnin(nn.Module):
             resnet_stem(pool=False), residual_groups(BasicBlock), ConvNorm(512, 64), nn.Flatten()
         )
         self.lstm = nn.LSTM(64 * 13, _HIDDEN, batch_first=True)
-        self.mean = _head(outputs // 2)
-        self.log_sigma = _head(outputs // 2)
+        widths = _HIDDEN, 256, 256, outputs // 2
+        self.mean = nn.Sequential(*linear_layers(*widths, dropout=0.2))
+        self.log_sigma = nn.Sequential(*linear_layers(*widths, dropout=0.2))
 
     def forward(self, windows: Tensor) -> Tensor:
         """Map (B, 6, 200) to (B, outputs), or (B, K, 6, 200) to (B, K, outputs)."""
@@ -58,15 +65,3 @@ class Rnin(nn.Module):
 
     def _heads(self, features: Tensor) -> Tensor:
         return torch.cat([self.mean(features), self.log_sigma(features)], dim=-1)
-
-
-def _head(outputs: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Linear(_HIDDEN, 256),
-        nn.ReLU(),
-        nn.Dropout(0.2),
-        nn.Linear(256, 256),
-        nn.ReLU(),
-        nn.Dropout(0.2),
-        nn.Linear(256, outputs),
-    )

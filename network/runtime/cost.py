@@ -63,22 +63,6 @@ def cost(network: nn.Module) -> Cost:
     return Cost(sum(counted.values()), flops)
 
 
-def _convolution(module: nn.Conv1d, x: Tensor, y: Tensor) -> int:
-    return y.numel() * (module.in_channels // module.groups) * module.kernel_size[0]
-
-
-def _linear(module: nn.Linear, x: Tensor, y: Tensor) -> int:
-    return module.in_features * y.numel()
-
-
-def _norm(module: nn.BatchNorm1d, x: Tensor, y: Tensor) -> int:
-    return 4 * x.numel()
-
-
-def _global_pool(module: nn.AdaptiveAvgPool1d, x: Tensor, y: Tensor) -> int:
-    return y.numel() * (x.shape[2] // y.shape[2] + 1)
-
-
 def _lstm(module: nn.LSTM, x: Tensor, y: Any) -> int:
     hidden = module.hidden_size
     steps = x.shape[0] * x.shape[1]
@@ -87,9 +71,10 @@ def _lstm(module: nn.LSTM, x: Tensor, y: Any) -> int:
 
 
 _RULES: dict[type[nn.Module], Callable[..., int]] = {
-    nn.Conv1d: _convolution,
-    nn.Linear: _linear,
-    nn.BatchNorm1d: _norm,
-    nn.AdaptiveAvgPool1d: _global_pool,
+    nn.Conv1d: lambda m, x, y: y.numel() * (m.in_channels // m.groups) * m.kernel_size[0],
+    nn.Linear: lambda m, x, y: m.in_features * y.numel(),
+    nn.BatchNorm1d: lambda m, x, y: 4 * x.numel(),
+    nn.AdaptiveAvgPool1d: lambda m, x, y: y.numel() * (x.shape[2] // y.shape[2] + 1),
     nn.LSTM: _lstm,
 }
+"""FLOPs of a module m from its input x and output y."""

@@ -20,6 +20,7 @@ from torch import Tensor
 from stario.network.training.lever_arm import Swing, apply_swing, sample_swing
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
+from stario.sequences.settings import check_number
 from stario.sequences.windows import HEADING_STEP, WINDOW_RATE, WINDOW_SAMPLES, WorldStream
 
 log = logging.getLogger(__name__)
@@ -64,9 +65,7 @@ class Augmentation:
         if not _is_range(self.speeds):
             raise ConfigError("speeds", repr(self.speeds), "two factors in (0, 10], slow then fast")
         for item in fields(self)[1:]:
-            value = getattr(self, item.name)
-            if not (isinstance(value, int | float) and 0.0 <= value < 100.0):
-                raise ConfigError(item.name, repr(value), "a number of 0 or more and below 100")
+            check_number(self, item.name, 0.0, 100.0)
 
 
 def _is_range(speeds: object) -> bool:
@@ -74,6 +73,10 @@ def _is_range(speeds: object) -> bool:
         case (int() | float() as slow, int() | float() as fast):
             return 0.0 < slow <= fast <= 10.0
     return False
+
+
+UNVARIED = Augmentation((1.0, 1.0), *[0.0] * (len(fields(Augmentation)) - 1))
+"""No variation: windows as they were recorded."""
 
 
 def reach_of(augmentation: Augmentation, successive: int = 1) -> int:

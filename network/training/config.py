@@ -68,6 +68,13 @@ _COUNTS = {
     "track_seconds": LEAST_SECONDS,
 }
 
+_CHOICES = {
+    "architecture": tuple(ARCHITECTURES),
+    "precision": ("float32", "bfloat16"),
+    "device": ("auto", "cpu", "cuda"),
+    "attitude": ("levelled", "true"),
+}
+
 _RANGES = (
     ("rate", 1e-8, 1.0),
     ("warm_up", 0.0, 1.0),
@@ -162,24 +169,18 @@ class TrainingConfig:
         recorded = sum(share for name, share in self.shares.items() if name != SIMULATED)
         if recorded > 1.0 + 1e-9:
             raise ConfigError("shares", f"a sum of {recorded:g} over recorded sources", "1 or less")
-        if self.architecture not in ARCHITECTURES:
-            known = f"one of {', '.join(ARCHITECTURES)}"
-            raise ConfigError("architecture", repr(self.architecture), known)
+        for name, choices in _CHOICES.items():
+            if getattr(self, name) not in choices:
+                raise ConfigError(name, repr(getattr(self, name)), f"one of {', '.join(choices)}")
         if not (isinstance(self.seed, int) and 0 <= self.seed < 2**31):
             raise ConfigError("seed", repr(self.seed), "an integer from 0 to 2^31 - 1")
         dropout = 0.0 if self.dropout is None else self.dropout
         if not (isinstance(dropout, int | float) and 0.0 <= dropout < 1.0):
             raise ConfigError("dropout", repr(self.dropout), "a share from 0 to below 1, or none")
-        if self.precision not in ("float32", "bfloat16"):
-            raise ConfigError("precision", repr(self.precision), "float32 or bfloat16")
         if self.batch % self.successive:
             raise ConfigError(
                 "batch", str(self.batch), f"a multiple of successive={self.successive}"
             )
-        if self.device not in ("auto", "cpu", "cuda"):
-            raise ConfigError("device", repr(self.device), "auto, cpu or cuda")
-        if self.attitude not in ("levelled", "true"):
-            raise ConfigError("attitude", repr(self.attitude), "levelled or true")
 
     @property
     def reach(self) -> int:

@@ -33,8 +33,8 @@ log = logging.getLogger(__name__)
 VARIANCE_RATE = 0.05
 """Variance per axis that a second of the network's displacements adds, q [m^2/s]."""
 
-_SECONDS = {"waypoints": "waypoint_seconds", "positions": "track_seconds"}
-"""Recipe setting for the length of stretches of each kind."""
+_SETTINGS = {"waypoints": "waypoint", "positions": "track"}
+"""How the recipe's settings for stretches of each kind begin: `waypoint_seconds`, for example."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +150,7 @@ def _too_far_apart(streams: Sequence[LegStream], seconds: int) -> InputError:
     interval = float(np.median(np.concatenate([s.stop - s.start for s in streams])))
     longest = max(len(stream) for stream in streams) / WINDOW_RATE
     needed = math.ceil(2.0 * interval) + 1
-    fix = f"set `{_SECONDS[kind]}` in the recipe to about {needed}"
+    fix = f"set `{_SETTINGS[kind]}_seconds` in the recipe to about {needed}"
     if needed > longest:
         fix = "use longer recordings; `--validation` names those to validate on"
     found = f"one every {interval:.1f} s in stretches of up to {longest:.0f} s"
@@ -211,13 +211,9 @@ def by_kind(
     streams: Sequence[LegStream], config: TrainingConfig
 ) -> list[tuple[str, list[LegStream], int, int]]:
     """Return name, streams, windows per stretch and stretches per step of each kind present."""
-    kinds = (
-        ("waypoints", config.waypoint_seconds, config.waypoint_stretches),
-        ("positions", config.track_seconds, config.track_stretches),
-    )
     return [
-        (kind, members, seconds, stretches)
-        for kind, seconds, stretches in kinds
+        (kind, members, getattr(config, f"{name}_seconds"), getattr(config, f"{name}_stretches"))
+        for kind, name in _SETTINGS.items()
         if (members := [stream for stream in streams if stream.kind == kind])
     ]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from stario.network.displacement import DisplacementNetwork
 from stario.network.known_motion import KnownMotion
+from stario.network.training.augment import UNVARIED
 from stario.network.training.config import LEAST_SECONDS, TrainingConfig
 from stario.network.training.legs import LegBatch, LegSampler, by_kind
 from stario.network.training.weak_truth import leg_loss
@@ -22,10 +22,10 @@ from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import (
     WINDOW_SAMPLES,
     WorldStream,
+    cut_windows,
     headings_at,
     rotated_windows,
     window_starts,
-    windows_at,
 )
 
 log = logging.getLogger(__name__)
@@ -124,10 +124,11 @@ class ValidationSet:
         """Yield windows (B, 6, 200) and displacements (B, 3) [m] in H, in order of time."""
         starts = window_starts(stream, self.stride)
         for first in range(0, len(starts), batch):
-            windows, target = windows_at(stream, starts[first : first + batch])
-            heading = headings_at(stream.facing_W, starts[first : first + batch])
-            windows = rotated_windows(windows, -heading)
-            yield windows, about_z(-heading).apply(target).astype(np.float32)
+            begin = starts[first : first + batch]
+            heading = headings_at(stream.facing_W, begin)
+            moved_W = stream.position_W[begin + WINDOW_SAMPLES] - stream.position_W[begin]
+            windows = rotated_windows(cut_windows(stream.imu_W, begin), -heading)
+            yield windows, about_z(-heading).apply(moved_W).astype(np.float32)
 
     def errors(
         self, network: DisplacementNetwork, residuals: np.ndarray | None = None
@@ -189,10 +190,6 @@ def _minutes(streams: Sequence[WorldStream], every: int) -> list[WorldStream]:
 def _drawn_once(legs: Sequence[LegStream], config: TrainingConfig) -> dict[str, LegBatch]:
     """Return the same stretches for every epoch, without augmentation."""
     found = {}
-    plain = replace(
-        config.augmentation, mirrored=0.0, yaw=0.0, any_yaw=0.0, tilt=0.0, gyro_bias=0.0,
-        accel_bias=0.0, gyro_noise=0.0, accel_noise=0.0,
-    )  # fmt: skip
     for kind, members, usual, _ in by_kind(legs, config):
         # The held-out part of a short walk is shorter than a training stretch.
         longest = (max(len(stream) for stream in members) - 1) // WINDOW_SAMPLES
@@ -200,7 +197,7 @@ def _drawn_once(legs: Sequence[LegStream], config: TrainingConfig) -> dict[str, 
         if seconds < LEAST_SECONDS:
             continue
         try:
-            sampler = LegSampler(members, seconds, plain, torch.Generator().manual_seed(0))
+            sampler = LegSampler(members, seconds, UNVARIED, torch.Generator().manual_seed(0))
         except InputError as error:  # an error of 0 without legs would be the smallest
             log.warning("validation skips %s", error)
             continue

@@ -11,6 +11,7 @@ from typing import Literal, cast, get_args
 
 import numpy as np
 
+from stario.sequences.arrays import check_choice
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, Trajectory, low_rate_message
@@ -129,7 +130,7 @@ def align(estimate: Trajectory, truth: Trajectory, mode: Alignment) -> Trajector
     Raises:
         InputError: unknown mode, or no overlap.
     """
-    _check_choice("alignment", mode, get_args(Alignment))
+    check_choice("alignment", mode, get_args(Alignment))
     if mode == "none":
         return estimate
     errors = pose_errors(estimate, truth)
@@ -137,12 +138,11 @@ def align(estimate: Trajectory, truth: Trajectory, mode: Alignment) -> Trajector
     if mode == "first":
         return _moved(estimate, -float(errors.yaw[0]), estimated[0], true[0])
     center, target = estimated.mean(axis=0), true.mean(axis=0)
-    x, y = (estimated - center)[:, :2].T
-    u, v = (true - target)[:, :2].T
-    if min(np.hypot(x, y).max(), np.hypot(u, v).max()) < _PLACE_M:
+    z, w = ((p - middle)[:, :2] @ [1.0, 1j] for p, middle in ((estimated, center), (true, target)))
+    if min(np.abs(z).max(), np.abs(w).max()) < _PLACE_M:
         yaw = -np.angle(np.exp(1j * errors.yaw).mean())
     else:
-        yaw = np.arctan2(np.sum(x * v - y * u), np.sum(x * u + y * v))
+        yaw = np.angle(np.vdot(z, w))
     return _moved(estimate, float(yaw), center, target)
 
 
@@ -168,7 +168,7 @@ def evaluate_track(
     Raises:
         InputError: no overlap, an unknown choice, or an interval that is not positive.
     """
-    _check_choice("convention", convention, get_args(Convention))
+    check_choice("convention", convention, get_args(Convention))
     if not (np.isfinite(rte_interval) and rte_interval > 0):
         raise InputError("rte_interval", repr(rte_interval), "seconds > 0")
     errors = pose_errors(align(estimate, truth, alignment), truth)
@@ -254,10 +254,5 @@ def check_convention(name: str) -> Convention:
     Raises:
         InputError: there is no such convention.
     """
-    _check_choice("convention", name, get_args(Convention))
+    check_choice("convention", name, get_args(Convention))
     return cast(Convention, name)
-
-
-def _check_choice(field: str, found: str, choices: tuple[str, ...]) -> None:
-    if found not in choices:
-        raise InputError(field, repr(found), "one of " + ", ".join(choices))

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stario.sequences.arrays import check_choice
 from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_folder, atomic_write
@@ -80,8 +81,8 @@ def layout_of(path: Path, layout: str | None = None) -> str:
     Raises:
         InputError: the layout or the path's suffix is unknown, or they contradict each other.
     """
-    if layout is not None and layout not in LAYOUTS:
-        raise InputError("layout", repr(layout), f"one of {', '.join(LAYOUTS)}")
+    if layout is not None:
+        check_choice("layout", layout, LAYOUTS)
     by_suffix = {".csv": "csv", "": "euroc", **dict.fromkeys(ARCHIVE_SUFFIXES, "archive")}
     implied = by_suffix.get(path.suffix.lower())
     if layout is None and implied is None:

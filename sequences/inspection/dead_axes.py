@@ -11,8 +11,8 @@ import logging
 
 import numpy as np
 
-from stario.sequences.inspection.samples import usable
 from stario.sequences.sequence import STANDARD_GRAVITY, BoolArray, FloatArray, ImuSequence
+from stario.sequences.windows import usable
 
 _log = logging.getLogger(__name__)
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stario.sequences.arrays import samples_in
 from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 from stario.sequences.windows import clean_samples, unbroken
@@ -79,7 +80,7 @@ def compare_gyro_axes(sequence: ImuSequence) -> GyroAxes:
 
 def _changes(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:
     """Return unexplained and all squared changes (M, 2) of successive mean forces that count."""
-    size = max(1, round(1.0 / float(np.median(np.diff(time)))))
+    size = samples_in(1.0, time)
     count = len(time) // size
     R_0B = integrated_gyro(time, gyro)
     whole = slice(0, count * size)

@@ -19,10 +19,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.sequences.arrays import correlation, interpolated
+from stario.sequences.arrays import correlation, integral, interpolated, samples_in
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.sequence import FloatArray, ImuSequence
-from stario.sequences.windows import clean_samples, unbroken
+from stario.sequences.windows import clean_samples, longest_unbroken
 
 _LONGEST_S = 600.0
 _SHORTEST_S = 10.0
@@ -151,9 +151,10 @@ def assess_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
     if sequence.magnetometer is None:
         return None
     time, gyro, accel = clean_samples(sequence)
-    start, stop = max(unbroken(time), key=lambda piece: piece[1] - piece[0])
-    stop = min(stop, int(np.searchsorted(time, time[start] + _LONGEST_S)))
-    time, gyro, accel = time[start:stop], gyro[start:stop], accel[start:stop]
+    part = longest_unbroken(time)
+    time, gyro, accel = time[part], gyro[part], accel[part]
+    part = slice(int(np.searchsorted(time, time[0] + _LONGEST_S)))
+    time, gyro, accel = time[part], gyro[part], accel[part]
     field = sequence.magnetometer
     inside = slice(*np.searchsorted(field.time, time[[0, -1]]))
     stamps, values = field.time[inside], field.field[inside]
@@ -198,8 +199,7 @@ def _against_gyro(
     grid = np.arange(max(time[0], stamps[0]) + edge, min(time[-1], stamps[-1]) - edge, _STEP_S)
     if len(grid) < 20:
         return None, None, None, None
-    steps = 0.5 * np.diff(time)[:, None] * (gyro[1:] + gyro[:-1])
-    angle = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+    angle = integral(time, gyro)
     half = 0.5 * _SPAN_S
     before, after = (interpolated(grid + d, time, angle) for d in (-half, half))
     rate = (after - before) / _SPAN_S
@@ -256,7 +256,7 @@ def _steadiness(time: FloatArray, level: FloatArray) -> tuple[float, float]:
         time: (N,) [s].
         level: (N, 2) horizontal field.
     """
-    count = max(1, round(1.0 / float(np.median(np.diff(time)))))
+    count = samples_in(1.0, time)
     field = level[:, 0] + 1j * level[:, 1]
     smooth = np.convolve(field, np.ones(count) / count, mode="same")
     spreads, slopes = [], []

@@ -17,11 +17,7 @@ from stario.sequences.inspection.magnetic import (
     assess_magnetometer,
     magnetic_problems,
 )
-from stario.sequences.inspection.samples import (
-    sample_problems,
-    usable,
-    without_times_ahead,
-)
+from stario.sequences.inspection.samples import sample_problems, without_times_ahead
 from stario.sequences.inspection.stillness import Rest, find_rest
 from stario.sequences.sequence import (
     GAP_STEPS,
@@ -36,6 +32,7 @@ from stario.sequences.truth.position_findings import position_line, positions_as
 from stario.sequences.truth.positions import PositionFit
 from stario.sequences.truth.problems import examine_truth
 from stario.sequences.truth.yaw_drift import YawDrift, yaw_drift
+from stario.sequences.windows import usable
 
 
 @dataclass(frozen=True)

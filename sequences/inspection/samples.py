@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 
 import numpy as np
 
 from stario.sequences.inspection.stuck import stuck_problems
-from stario.sequences.sequence import (
-    MAX_IMU_GAP,
-    MAX_SENSOR_VALUE,
-    BoolArray,
-    FloatArray,
-    ImuSequence,
-)
+from stario.sequences.sequence import MAX_IMU_GAP, FloatArray, ImuSequence
 from stario.sequences.time_order import ahead_mask, increasing_mask
-from stario.sequences.windows import runs
+from stario.sequences.windows import runs, usable
 
 _log = logging.getLogger(__name__)
 
@@ -39,7 +32,8 @@ _MIN_LIMIT_SHARE, _MIN_LIMIT_COUNT = 0.005, 3
 def sample_problems(sequence: ImuSequence) -> list[str]:
     """Return problems of the samples, one line each; `disorder` reports rows out of order."""
     problems = _late_problems(sequence)
-    invalid = int((np.isfinite(_values(sequence)).all(axis=1) & ~usable(sequence)).sum())
+    values = np.column_stack([sequence.gyro, sequence.accel])
+    invalid = int((np.isfinite(values).all(axis=1) & ~usable(sequence)).sum())
     if invalid:
         count = "1 sample" if invalid == 1 else f"{invalid} samples"
         problems.append(f"{sequence.name}: values that no sensor can measure, in {count}")
@@ -118,10 +112,7 @@ def in_order(sequence: ImuSequence) -> ImuSequence:
     _log.warning(
         "%s: %s, by up to %.0f ms: sorted by time", sequence.name, disorder(time), 1e3 * back
     )
-    order = np.argsort(time, kind="stable")
-    return replace(
-        sequence, time=time[order], gyro=sequence.gyro[order], accel=sequence.accel[order]
-    )
+    return sequence.select(np.argsort(time, kind="stable"))
 
 
 def without_times_ahead(sequence: ImuSequence) -> ImuSequence:
@@ -137,14 +128,4 @@ def without_times_ahead(sequence: ImuSequence) -> ImuSequence:
         return sequence
     keep = np.ones(len(sequence), dtype=np.bool_)
     keep[given[ahead]] = False
-    time, gyro, accel = sequence.time[keep], sequence.gyro[keep], sequence.accel[keep]
-    return replace(sequence, time=time, gyro=gyro, accel=accel)
-
-
-def usable(sequence: ImuSequence) -> BoolArray:
-    """Return which samples (n,) are numbers that a sensor can measure."""
-    return np.asarray((np.abs(_values(sequence)) < MAX_SENSOR_VALUE).all(axis=1))
-
-
-def _values(sequence: ImuSequence) -> FloatArray:
-    return np.column_stack([sequence.gyro, sequence.accel])
+    return sequence.select(keep)

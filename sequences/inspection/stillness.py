@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.sequences.accuracy.chi_square import chi2_quantile
+from stario.sequences.arrays import samples_in
 from stario.sequences.noise import PHONE_NOISE
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import MAX_IMU_GAP, clean_samples, runs
@@ -114,7 +115,7 @@ def find_rest(sequence: ImuSequence) -> Rest | None:
         InputError: as for `clean_samples`.
     """
     time, gyro, accel = clean_samples(sequence)
-    per_bin = max(1, round(_BIN_S / float(np.median(np.diff(time)))))
+    per_bin = samples_in(_BIN_S, time)
     per_block = per_bin * _BLOCK_BINS
     blocks = len(time) // per_block
     if blocks == 0:

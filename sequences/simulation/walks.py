@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import check_choice
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, Trajectory
@@ -63,11 +64,9 @@ class WalkStyle:
     mount_rotvec: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        for name, known in (("carry", CARRYING_MODES), ("next_carry", (*CARRYING_MODES, ""))):
-            if getattr(self, name) not in known:
-                raise InputError(
-                    name, repr(getattr(self, name)), f"one of {', '.join(CARRYING_MODES)}"
-                )
+        check_choice("carry", self.carry, CARRYING_MODES)
+        if self.next_carry:
+            check_choice("next_carry", self.next_carry, CARRYING_MODES)
         for name, low, high in _RANGES:
             check_number(self, name, low, high)
         if len(self.mount_rotvec) != 3 or not all(map(math.isfinite, self.mount_rotvec)):

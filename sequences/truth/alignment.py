@@ -18,12 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import correlation, interpolated
+from stario.sequences.arrays import correlation, interpolated, samples_in
 from stario.sequences.attitude.levelling import MIN_GRAVITY_FORCE
-from stario.sequences.attitude.rotations import tilt_aligning
+from stario.sequences.attitude.rotations import GyroIntegral, tilt_aligning
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray
-from stario.sequences.truth.gyro_integral import GyroIntegral
 from stario.sequences.truth.mount_heading import heading_turn
 from stario.sequences.truth.mounts import (
     MIN_FIT_S,
@@ -168,7 +167,7 @@ def _agreement(
     Magnitudes alone (`sizes_only`) need no mount. Glitches are rare but huge: only rates that do
     not differ grossly are compared.
     """
-    stride = max(1, round(span / float(np.median(np.diff(time)))))
+    stride = samples_in(span, time)
     rates = (attitude[:-stride].inv() * attitude[stride:]).as_rotvec()
     rates = rates / (time[stride:] - time[:-stride])[:, None]
     good = valid[:-stride] & valid[stride:] & (np.linalg.norm(rates, axis=1) < 12.0)

@@ -18,8 +18,8 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 from stario.sequences.truth.alignment import align_tracked_body
 from stario.sequences.truth.clock_offset import convolved
-from stario.sequences.truth.part import middle_part, without_spikes
-from stario.sequences.windows import MAX_IMU_GAP, clean_samples
+from stario.sequences.truth.part import compared_samples
+from stario.sequences.windows import MAX_IMU_GAP
 
 MAX_OFFSET_S = 5.0
 """Largest time offset searched, in either direction [s]."""
@@ -109,9 +109,7 @@ def fit_truth(sequence: ImuSequence) -> TruthFit:
     """
     if sequence.truth is None or sequence.truth.valid.sum() < 2:
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory to compare with")
-    time, gyro, accel = clean_samples(middle_part(sequence))
-    used = without_spikes(accel)
-    time, gyro, accel = time[used], gyro[used], accel[used]
+    time, gyro, accel = compared_samples(sequence)
     truth = sequence.truth
     coarse = _coarse_offset(time, gyro, truth)
     truth = replace(truth, time=truth.time + coarse)

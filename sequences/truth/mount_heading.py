@@ -18,6 +18,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter1d, uniform_filter1d
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import integral, samples_in
 from stario.sequences.sequence import BoolArray, FloatArray
 
 _H_S = 0.3
@@ -78,9 +79,8 @@ def _gyro_information(
     time: FloatArray, gyro: FloatArray, attitude_WB: Rotation, valid: BoolArray, up_B: FloatArray
 ) -> float:
     """Return the inverse variance [1/rad^2] of the gyroscope's fit for rotation about `up_B`."""
-    stride = max(1, round(_TURN_S / float(np.median(np.diff(time)))))
-    steps = 0.5 * np.diff(time)[:, None] * (gyro[1:] + gyro[:-1])
-    angle = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+    stride = samples_in(_TURN_S, time)
+    angle = integral(time, gyro)
     use = valid[:-stride] & valid[stride:]
     use &= np.arange(len(use)) % stride == 0
     phi_B = (angle[stride:] - angle[:-stride])[use]
@@ -110,7 +110,7 @@ def _rows(
     rotated by 90 degrees, and the second difference of the position.
     """
     dt = float(np.median(np.diff(time)))
-    k = max(1, round(_H_S / dt))
+    k = samples_in(_H_S, time)
     whole = minimum_filter1d(valid.astype(np.int8), 2 * k + 1, mode="constant") > 0
     moments = np.flatnonzero(whole)[:: max(1, k // 2)]
     if not len(moments):

@@ -10,8 +10,9 @@ import itertools
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import samples_in
+from stario.sequences.attitude.rotations import GyroIntegral
 from stario.sequences.sequence import BoolArray, FloatArray
-from stario.sequences.truth.gyro_integral import GyroIntegral
 
 MIN_FIT_S = 10.0
 """Minimum length of a piece whose mount can be fitted [s]."""
@@ -26,9 +27,8 @@ _MIN_PIECE_S = 1.0
 def disagreeing(time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation) -> BoolArray:
     """Return whether each sample's rotation to most neighbours contradicts the gyroscope."""
     n = len(time)
-    dt = float(np.median(np.diff(time)))
     ahead, behind = np.zeros(n), np.zeros(n)
-    for stride in sorted({max(1, round(s / dt)) for s in _STRIDES_S}):
+    for stride in sorted({samples_in(span, time) for span in _STRIDES_S}):
         error = _angle_error(attitude_WV, attitude_B, stride) > _GLITCH_RAD
         ahead[: n - stride] += error
         behind[stride:] += error
@@ -99,7 +99,7 @@ def _fit(
     start, stop = piece
     if time[stop - 1] - time[start] < MIN_FIT_S:
         return None
-    stride = max(1, round(0.1 / float(np.median(np.diff(time)))))
+    stride = samples_in(0.1, time)
     # Rotations that overlap by more than two thirds add little information.
     before = np.arange(start, stop - stride, max(1, stride // 3))
     phi_V = (attitude_WV[before].inv() * attitude_WV[before + stride]).as_rotvec()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence
+from stario.sequences.windows import clean_samples
 
 LONGEST_S = 600.0
 """Length of the middle part that is used of a longer recording [s], which bounds the cost."""
@@ -19,6 +20,17 @@ def middle_part(sequence: ImuSequence) -> ImuSequence:
         return sequence
     centre = float(np.nanmedian(sequence.time))
     return sequence.slice(centre - LONGEST_S / 2, centre + LONGEST_S / 2)
+
+
+def compared_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return time, gyroscope and accelerometer of the middle part, without spikes.
+
+    Raises:
+        InputError: as for `clean_samples`.
+    """
+    time, gyro, accel = clean_samples(middle_part(sequence))
+    used = without_spikes(accel)
+    return time[used], gyro[used], accel[used]
 
 
 def without_spikes(accel: FloatArray) -> BoolArray:

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import correlation, interpolated
+from stario.sequences.arrays import correlation, integral, interpolated
 from stario.sequences.sequence import (
     MAX_IMU_GAP,
     BoolArray,
@@ -29,8 +29,7 @@ from stario.sequences.sequence import (
     ImuSequence,
     Trajectory,
 )
-from stario.sequences.truth.part import middle_part, without_spikes
-from stario.sequences.windows import clean_samples
+from stario.sequences.truth.part import compared_samples
 
 _H_S = 0.3
 _MIN_ROWS = 50
@@ -90,10 +89,9 @@ def fit_positions(sequence: ImuSequence, time_offset: float) -> PositionFit | No
         InputError: as for `clean_samples`, or fewer than two valid poses.
     """
     assert sequence.truth is not None
-    time, _, accel = clean_samples(middle_part(sequence))
-    used = without_spikes(accel)
+    time, _, accel = compared_samples(sequence)
     truth = replace(sequence.truth, time=sequence.truth.time + time_offset)
-    moved, felt = _accelerations(time[used], accel[used], truth)
+    moved, felt = _accelerations(time, accel, truth)
     if len(felt) < _MIN_ROWS:
         return None
     used = _inliers(moved) & _inliers(felt)
@@ -129,17 +127,12 @@ def _accelerations(
     ticks = np.arange(time[0] + _H_S, time[-1] - _H_S, 0.5 * _H_S)
     first = np.searchsorted(time, ticks - _H_S, side="right") - 1
     ticks = ticks[gaps[first] == gaps[np.searchsorted(time, ticks + _H_S)]]
-    fallen = _integral(time, _integral(time, force_W - force_W[pose.valid].mean(axis=0)))
+    fallen = integral(time, integral(time, force_W - force_W[pose.valid].mean(axis=0)))
     known = truth.valid
     return (
         _second_difference(ticks, truth.time[known], truth.position_W[known]),
         _second_difference(ticks, time, fallen),
     )
-
-
-def _integral(time: FloatArray, values: FloatArray) -> FloatArray:
-    steps = 0.5 * np.diff(time)[:, None] * (values[1:] + values[:-1])
-    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
 
 def _second_difference(ticks: FloatArray, time: FloatArray, values: FloatArray) -> FloatArray:

@@ -44,10 +44,10 @@ class TruthFindings:
         problems: problems found.
     """
 
-    truth: Trajectory | None
-    fit: TruthFit | None
-    positions: PositionFit | None
-    problems: tuple[TruthProblem, ...]
+    truth: Trajectory | None = None
+    fit: TruthFit | None = None
+    positions: PositionFit | None = None
+    problems: tuple[TruthProblem, ...] = ()
 
 
 def examine_truth(sequence: ImuSequence, known: str = "") -> TruthFindings:
@@ -57,28 +57,30 @@ def examine_truth(sequence: ImuSequence, known: str = "") -> TruthFindings:
         sequence: the recording.
         known: problems of the recording reported already, which are not repeated.
     """
-    if problems := _unusable_times(sequence):
-        return TruthFindings(None, None, None, tuple(problems))
     if sequence.truth is None or sequence.truth.valid.sum() < 2:
-        return TruthFindings(None, None, None, ())
+        return TruthFindings()
+    if problems := _unusable_times(sequence, sequence.truth):
+        return TruthFindings(problems=tuple(problems))
     faults = tracking_faults(sequence)
     problems = tracking_problems(faults)
-    tracked = replace(sequence, truth=without_lost(sequence.truth, faults))
+    truth = without_lost(sequence.truth, faults)
+    tracked = replace(sequence, truth=truth)
     try:
         fit = fit_truth(tracked)
     except InputError as error:
-        if _compared_s(tracked) > 2.0 * MIN_FIT_S and not known:  # else wrong units explain it
+        # What is known already, such as wrong units, would explain it.
+        if _compared_s(tracked, truth) > 2.0 * MIN_FIT_S and not known:
             problems.append(
                 TruthProblem(f"an attitude that cannot be compared with the gyroscope ({error})")
             )
-        return TruthFindings(None, None, None, tuple(problems))
+        return TruthFindings(problems=tuple(problems))
     problems += fit_problems(fit, known)
     positions = None
     if fit.consistent and not fit.jumps and fit.misalignment < _NEAR_AXES_RAD:
         positions = fit_positions(tracked, fit.time_offset)
         if positions and "accelerometer: found" not in known:  # its unit or sign would explain all
             problems += position_problems(positions)
-    return TruthFindings(tracked.truth, fit, positions, tuple(problems))
+    return TruthFindings(truth, fit, positions, tuple(problems))
 
 
 def truth_problems(sequence: ImuSequence) -> list[TruthProblem]:
@@ -87,8 +89,9 @@ def truth_problems(sequence: ImuSequence) -> list[TruthProblem]:
     Where positions and accelerometer agree well, the gyroscope is not compared: an offset of the
     clocks of a few hundredths of a second then goes unnoticed, unlike in `examine_truth`.
     """
-    problems = _unusable_times(sequence)
-    if problems or sequence.truth is None or sequence.truth.valid.sum() < 2:
+    if sequence.truth is None or sequence.truth.valid.sum() < 2:
+        return []
+    if problems := _unusable_times(sequence, sequence.truth):
         return problems
     faults = tracking_faults(sequence)
     if not faults.lost.any():
@@ -123,14 +126,11 @@ def check_truth(sequence: ImuSequence) -> None:
             )  # fmt: skip
 
 
-def _unusable_times(sequence: ImuSequence) -> list[TruthProblem]:
+def _unusable_times(sequence: ImuSequence, truth: Trajectory) -> list[TruthProblem]:
     """Return a problem if the true poses are too few, or at other times than the samples."""
-    truth = sequence.truth
-    if truth is None or truth.valid.sum() < 2:
-        return []
     if slow := low_rate_message(truth):
         return [TruthProblem(slow, unusable=False)]
-    if _compared_s(sequence) > 0.0:
+    if _compared_s(sequence, truth) > 0.0:
         return []
     known, time = truth.time[truth.valid], sequence.time
     return [
@@ -142,10 +142,9 @@ def _unusable_times(sequence: ImuSequence) -> list[TruthProblem]:
     ]
 
 
-def _compared_s(sequence: ImuSequence) -> float:
+def _compared_s(sequence: ImuSequence, truth: Trajectory) -> float:
     """Return how long the true pose is known during the recording [s]."""
-    assert sequence.truth is not None
     times = np.unique(sequence.time[np.isfinite(sequence.time)])
-    if len(times) < 2 or sequence.truth.valid.sum() < 2:
+    if len(times) < 2 or truth.valid.sum() < 2:
         return 0.0
-    return float(sequence.truth.covers(times).mean() * (times[-1] - times[0]))
+    return float(truth.covers(times).mean() * (times[-1] - times[0]))

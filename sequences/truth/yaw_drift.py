@@ -21,7 +21,7 @@ from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.truth.fit import TruthFit
 from stario.sequences.truth.part import middle_part
-from stario.sequences.windows import clean_samples, unbroken
+from stario.sequences.windows import clean_samples, longest_unbroken
 
 _STEP_S = 0.1
 _MIN_TURNED_RAD = 0.3
@@ -59,17 +59,17 @@ def yaw_drift(sequence: ImuSequence, fit: TruthFit) -> YawDrift | None:
     assert sequence.truth is not None  # a fit of it exists
     time, gyro, accel = clean_samples(middle_part(sequence))
     truth = replace(sequence.truth, time=sequence.truth.time + fit.time_offset)
-    start, stop = max(unbroken(time), key=lambda piece: piece[1] - piece[0])
-    part = slice(start, stop)
-    R_NB = levelled_attitudes(time[part], gyro[part], accel[part])
+    part = longest_unbroken(time)
+    time = time[part]
+    R_NB = levelled_attitudes(time, gyro[part], accel[part])
     # Without the last sample, which rounding may place before the grid's last time.
-    grid = np.arange(time[start], time[stop - 1], _STEP_S)
-    at = np.unique(np.searchsorted(time[part][:-1], grid))
-    pose = truth.at(time[part][at])
+    grid = np.arange(time[0], time[-1], _STEP_S)
+    at = np.unique(np.searchsorted(time[:-1], grid))
+    pose = truth.at(time[at])
     attitude_NB = Rotation.from_matrix(R_NB[at])
     yaw = np.unwrap(yaw_of(attitude_NB))[pose.valid]
     off = np.unwrap(yaw_of(pose.attitude_WB[pose.valid] * fit.R_TB * attitude_NB[pose.valid].inv()))
-    seconds = time[part][at][pose.valid] - time[start]
+    seconds = time[at][pose.valid] - time[0]
     if len(off) < 3:
         return None
     even = np.column_stack([np.ones(len(off)), seconds])

@@ -12,15 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.clocks import unit_within
 from stario.sequences.readers.columns import Column
 from stario.sequences.readers.geodesy import east_north
-from stario.sequences.readers.lines import head_lines, unquoted
+from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.sensor_layout import clock_of
-from stario.sequences.readers.phones.sensor_table import first_row
 from stario.sequences.readers.phones.sensor_words import words_of
+from stario.sequences.readers.separators import cells_of, first_row, number_of
 from stario.sequences.readers.text import read_table, seconds
 from stario.sequences.sequence import PositionTrack
 from stario.sequences.time_order import increasing_mask
@@ -95,9 +94,9 @@ def _header(file: Path) -> _Header | None:
     places = [_place_of(title) for title in titles]
     if not {"latitude", "longitude"} <= set(places):
         return None
-    rows = [unquoted(line, delimiter, decimal).split(delimiter) for _, line in numbered[first:]]
+    rows = [cells_of(line, delimiter, decimal) for _, line in numbered[first:]]
     whole = [row for row in rows[:_HEAD_ROWS] if len(row) == len(titles)]
-    head = np.array([[number_in(cell) for cell in row] for row in whole])
+    head = np.array([[number_of(cell) for cell in row] for row in whole])
     clock = clock_of(titles, head) if len(whole) > 1 else None
     if clock is None:
         return None

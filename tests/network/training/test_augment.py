@@ -8,16 +8,13 @@ from cut_windows import windows_of
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from stario.network.training.augment import Augmentation, WindowSampler, heading_of
+from stario.network.training.augment import UNVARIED, Augmentation, WindowSampler, heading_of
 from stario.network.training.lever_arm import sample_swing
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.windows import WINDOW_SAMPLES, WorldStream, world_streams
 
-YAW_ONLY = Augmentation(
-    speeds=(1.0, 1.0), replayed=0.0, swung=0.0, any_yaw=1.0, tilt=0.0, gyro_bias=0.0,
-    accel_bias=0.0, gyro_noise=0.0, accel_noise=0.0,
-)  # fmt: skip
+YAW_ONLY = replace(UNVARIED, any_yaw=1.0, mirrored=0.5)
 """No augmentation except any yaw, and a mirror image of one window in two."""
 
 TO_MIRROR_IMAGE = np.diag([1.0, -1.0, 1.0])

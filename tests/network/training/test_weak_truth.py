@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from stario.network.displacement import DisplacementNetwork
-from stario.network.training.augment import Augmentation
+from stario.network.training.augment import UNVARIED, Augmentation
 from stario.network.training.config import TrainingConfig, training_config
 from stario.network.training.legs import LegBatch, LegSampler, ends_covariance, velocity_change
 from stario.network.training.parallel import Workers
@@ -26,10 +26,7 @@ from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
 from stario.sequences.windows import world_streams
 
-PLAIN = Augmentation(
-    speeds=(1.0, 1.0), replayed=0.0, swung=0.0, yaw=0.0, any_yaw=0.0, tilt=0.0, gyro_bias=0.0,
-    accel_bias=0.0, gyro_noise=0.0, accel_noise=0.0,
-)  # fmt: skip
+PLAIN = replace(UNVARIED, mirrored=0.5)
 SECONDS = 12
 WALK = simulate_imu(generate_walk(3, 60.0), 100.0, PERFECT_IMU, 0, name="walk")
 

@@ -1,6 +1,6 @@
 import numpy as np
 
-from stario.network.training.calibrate import calibrate
+from stario.network.training.result import calibrate
 from stario.sequences.sequence import FloatArray
 
 TRUE_SCALE = np.array([1.7, 1.7, 0.4])
