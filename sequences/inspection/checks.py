@@ -18,7 +18,7 @@ from stario.sequences.arrays import check_type
 from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.samples import disorder
-from stario.sequences.inspection.stuck import dead_gyro
+from stario.sequences.inspection.stuck import check_not_dead
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 from stario.sequences.truth.fit import TruthFit, fit_truth
 from stario.sequences.truth.part import without_spikes
@@ -81,9 +81,9 @@ def check_units(sequence: ImuSequence) -> None:
     """Check that a recording's numbers can be in s, rad/s and m/s^2.
 
     Raises:
-        InputError: it is too short or holds no number, time is in another unit, the gyroscope is
-            dead or in deg/s, the accelerometer is in g, lacks gravity or has the opposite sign
-            (detected only with a true attitude). The text names the option that fixes it. Or
+        InputError: it is too short or holds no number, time is in another unit, a sensor is dead,
+            the gyroscope is in deg/s, the accelerometer is in g, lacks gravity or has the opposite
+            sign (detected only with a true attitude). The text names the option that fixes it. Or
             `sequence` has the wrong type.
     """
     check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
@@ -94,11 +94,7 @@ def check_units(sequence: ImuSequence) -> None:
         raise InputError(
             f"{sequence.name}: duration", f"{time[-1] - time[0]:.2f} s", f"at least {MIN_SECONDS} s"
         )
-    if dead_gyro(time, gyro, accel):
-        raise InputError(
-            f"{sequence.name}: gyroscope", "values that never change while the accelerometer's do",
-            "angular rates", "is another column meant?",
-        )  # fmt: skip
+    check_not_dead(sequence.name, time, gyro, accel)
     pieces = _pieces(time)
     if pieces:  # otherwise gaps leave nothing to average over
         known = "gyro" in sequence.converted

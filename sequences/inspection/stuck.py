@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import MIN_RATE, runs
 
@@ -17,7 +18,7 @@ _TILTING_RAD_S = 0.1
 
 
 def stuck_problems(name: str, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> list[str]:
-    """Report a sensor that repeats while the other moves; `check_units` reports a `dead_gyro`."""
+    """Report a sensor that repeats while the other moves; `check_units` refuses a dead one."""
     problems = []
     for sensor, values, other, moves in (
         ("gyroscope", gyro, "accelerometer", shaken),
@@ -31,7 +32,7 @@ def stuck_problems(name: str, time: FloatArray, gyro: FloatArray, accel: FloatAr
             and b - a >= MIN_RATE * _STUCK_S  # in another unit two samples make a second
             and moves(time[a : b + 1], gyro[a : b + 1], accel[a : b + 1])
         ]
-        if stuck and not (moves is shaken and repeated.all()):
+        if stuck and not repeated.all():
             start, stop = max(stuck, key=lambda stretch: stretch[1] - stretch[0])
             problems.append(
                 f"{name}: {sensor}: its values repeat exactly for "
@@ -41,9 +42,19 @@ def stuck_problems(name: str, time: FloatArray, gyro: FloatArray, accel: FloatAr
     return problems
 
 
-def dead_gyro(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
-    """Return whether the rate (n, 3) is constant and the force (n, 3) contradicts it."""
-    return not np.diff(gyro, axis=0).any() and shaken(time, gyro, accel)
+def check_not_dead(name: str, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> None:
+    """Check that no sensor's values, (n, 3), are constant while the other shows motion.
+
+    Raises:
+        InputError: one's are.
+    """
+    remedy = "is another column meant, or is the sensor broken?"
+    if not np.diff(gyro, axis=0).any() and shaken(time, gyro, accel):
+        found = "values that never change while the accelerometer's do"
+        raise InputError(f"{name}: gyroscope", found, "angular rates", remedy)
+    if not np.diff(accel, axis=0).any() and tilting(time, gyro, accel):
+        found = "values that never change while the gyroscope tilts them"
+        raise InputError(f"{name}: accelerometer", found, "specific forces", remedy)
 
 
 def shaken(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:

@@ -245,6 +245,15 @@ def test_a_constant_gyroscope_is_refused_while_the_accelerometer_varies(
         assert len(inspect_recording(dead.without_truth()).problems) == 1
 
 
+@pytest.mark.parametrize("value", [0.0, 5.66])
+def test_a_constant_accelerometer_is_refused_while_the_device_tilts(
+    walk: ImuSequence, value: float
+) -> None:
+    dead = replace(walk, accel=np.full_like(walk.accel, value)).without_truth()
+    assert "accelerometer: found values that never change" in refusal(dead)
+    assert len(inspect_recording(dead).problems) == 1
+
+
 def test_a_constant_rate_without_noise_and_a_device_at_rest_pass() -> None:
     """At rest, on a circle, and rotating in place about an inclined axis."""
     time = np.arange(0.0, 20.0, 0.01)
