@@ -10,7 +10,12 @@ from pathlib import Path
 from typing import TypeVar
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.phones.sensor_words import is_time
+from stario.sequences.readers.phones.sensor_words import (
+    axis_of,
+    is_time,
+    is_uncalibrated,
+    sensor_of,
+)
 from stario.sequences.units import (
     ACCEL_UNITS,
     GYRO_UNITS,
@@ -153,6 +158,8 @@ def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
         raise ReadError(path, f"line {number}, header", f"no {', '.join(missing)}", expected, fix)
     if ignored:
         _log.info("%s: columns ignored: %s", path, ", ".join(ignored))
+        if others := [title for title in ignored if _is_of_an_imu(title)]:
+            _log.warning("%s: columns of another IMU are not read: %s", path, ", ".join(others))
         truth_like = [title for title in ignored if _LIKE_TRUTH.match(title)]
         if truth_like and not truth:
             _log.warning(
@@ -162,6 +169,14 @@ def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
     for name in truth:
         unit_factor(path, columns[name], {"m": 1.0, "": 1.0} if name in POSITION else {"": 1.0})
     return columns
+
+
+def _is_of_an_imu(title: str) -> bool:
+    """Return whether a title names an axis of a gyroscope or accelerometer, raw variants aside."""
+    axis = axis_of(title)
+    if axis is None or is_uncalibrated(axis[1]):
+        return False
+    return sensor_of(axis[1]) in ("gyro", "accel")
 
 
 def unit_factor(path: Path, column: Column, known: Mapping[str, Factor]) -> Factor:

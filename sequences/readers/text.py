@@ -6,6 +6,7 @@ import importlib
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.dates import with_seconds
 from stario.sequences.readers.lines import ends_within_a_row, read_lines, unquoted
-from stario.sequences.readers.rows import parsed_rows, rows_below
+from stario.sequences.readers.rows import NumberedLine, parsed_rows, rows_below
 from stario.sequences.sequence import FloatArray
 
 _log = logging.getLogger(__name__)
@@ -117,7 +118,14 @@ def read_table(
     wanted = list(range(columns)) if isinstance(columns, int) else columns
     cut = killed and ends_within_a_row(path, delimiter)
     quick = None if cut or dated else read_quickly(path, skip, delimiter, wanted, decimal)
-    return quick or _read_carefully(path, skip, delimiter, wanted, decimal, killed, cut, dated)
+    if quick is not None:
+        return quick
+    numbered = _numbered_rows(path, skip, delimiter, decimal, dated)
+    if killed and len(numbered) > 1 and (cut or not _is_row(path, numbered[-1], delimiter, wanted)):
+        _log.warning("%s: skipped the last row, which is cut short", path)
+        numbered.pop()
+    values = parsed_rows(path, numbered, delimiter, wanted)
+    return Table(path, values, numbered[0][0], partial(_column, numbered, delimiter))
 
 
 def read_quickly(
@@ -147,44 +155,31 @@ def read_quickly(
         return None
     if not all(kind.kind in "if" for kind in frame.dtypes) or not len(frame):
         return None
-    values = frame[wanted].to_numpy(dtype=np.float64)
 
     def cells(column: int) -> list[str]:
-        return _read_carefully(path, skip, delimiter, [column], decimal).cells(column)
+        return _column(_numbered_rows(path, skip, delimiter, decimal), delimiter, column)
 
-    return Table(path, values, skip + 1, cells, frame)
+    return Table(path, frame[wanted].to_numpy(dtype=np.float64), skip + 1, cells, frame)
 
 
-def _read_carefully(
-    path: Path,
-    skip: int,
-    delimiter: str | None,
-    wanted: list[int],
-    decimal: str = ".",
-    killed: bool = False,
-    cut: bool = False,
-    dated: bool = False,
-) -> Table:
-    lines = [unquoted(line, delimiter) for line in read_lines(path)]
-    if decimal != ".":
-        lines = [line.replace(decimal, ".") for line in lines]
-    if dated:
-        lines = with_seconds(lines)
-    numbered = rows_below(path, lines, skip)
-    if killed and len(numbered) > 1:
-        try:
-            parsed_rows(path, numbered[-1:], delimiter, wanted)
-        except ReadError:
-            cut = True
-        if cut:
-            _log.warning("%s: skipped the last row, which is cut short", path)
-            numbered.pop()
-    return Table(
-        path,
-        parsed_rows(path, numbered, delimiter, wanted),
-        numbered[0][0],
-        lambda column: [line.split(delimiter, column + 1)[column] for _, line in numbered],
-    )
+def _numbered_rows(
+    path: Path, skip: int, delimiter: str | None, decimal: str, dated: bool = False
+) -> list[NumberedLine]:
+    """Return the rows below `skip` lines, with decimal points and without quotes or dates."""
+    lines = [unquoted(line, delimiter, decimal) for line in read_lines(path)]
+    return rows_below(path, with_seconds(lines) if dated else lines, skip)
+
+
+def _is_row(path: Path, row: NumberedLine, delimiter: str | None, wanted: list[int]) -> bool:
+    try:
+        parsed_rows(path, [row], delimiter, wanted)
+    except ReadError:
+        return False
+    return True
+
+
+def _column(numbered: list[NumberedLine], delimiter: str | None, column: int) -> list[str]:
+    return [line.split(delimiter, column + 1)[column] for _, line in numbered]
 
 
 def seconds(stamps_ns: IntArray, origin_ns: np.int64 | int) -> FloatArray:

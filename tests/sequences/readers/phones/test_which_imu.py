@@ -35,6 +35,16 @@ def test_the_first_of_two_imus_is_read_and_named(
     assert f"read the one with {first}, not those with {', '.join(others)}" in caplog.text
 
 
+def test_a_second_imu_beside_the_columns_of_a_generic_csv_is_named(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    names = titles("g#", "a#", "gyro2_#", "acc_raw_#")
+    columns = walk.gyro, walk.accel, walk.gyro + 1.0, walk.accel + 1.0
+    save(tmp_path / "own.csv", names, walk.time, *columns)
+    assert_same_samples(read_recording(tmp_path / "own.csv"), walk)
+    assert "another IMU are not read: gyro2_x, gyro2_y, gyro2_z\n" in caplog.text
+
+
 def test_the_sensors_of_two_imus_are_not_mixed(walk: ImuSequence, tmp_path: Path) -> None:
     """The right accelerometer comes first, but the left gyroscope."""
     names = titles("right_acc_#", "left_acc_#", "left_gyro_#", "right_gyro_#")
