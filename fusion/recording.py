@@ -10,9 +10,10 @@ from time import perf_counter
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.health import SampleCounts
 from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
-from stario.fusion.imu.intervals import ImuInterval, SampleCounts
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.stateful import (
     Displacement,
     Predictor,

@@ -39,15 +39,15 @@ FORMAT, VERSION = "stario snapshot", 19
 
 
 _HOLDS = """
-fusion.config fusion.continuous fusion.filter.displacements fusion.filter.ekf_state
-fusion.filter.estimates fusion.filter.estimator_state fusion.filter.frame_transform
-fusion.filter.gyro_bias fusion.filter.hypotheses fusion.filter.initial
-fusion.filter.magnetic_reference fusion.filter.map_frame fusion.filter.network_errors
-fusion.filter.planar_alignment fusion.filter.zero_velocity fusion.fixes fusion.graph.bearing
-fusion.graph.builder fusion.graph.factors fusion.graph.fixed_lag fusion.graph.keyframe_state
-fusion.graph.keyframes fusion.graph.whitening fusion.imu.buffers fusion.imu.front_end
-fusion.imu.faults fusion.imu.frozen fusion.imu.intervals fusion.imu.preintegration
-sequences.attitude.levelling sequences.noise
+fusion.config fusion.filter.displacements fusion.filter.ekf_state fusion.filter.estimates
+fusion.filter.estimator_state fusion.filter.frame_transform fusion.filter.gyro_bias
+fusion.filter.hypotheses fusion.filter.initial fusion.filter.magnetic_reference
+fusion.filter.map_frame fusion.filter.network_errors fusion.filter.planar_alignment
+fusion.filter.zero_velocity fusion.fixes fusion.graph.bearing fusion.graph.builder
+fusion.graph.factors fusion.graph.fixed_lag fusion.graph.keyframe_state fusion.graph.keyframes
+fusion.graph.whitening fusion.health fusion.imu.faults fusion.imu.front_end fusion.imu.intervals
+fusion.imu.preintegration fusion.imu.stateful fusion.state sequences.attitude.levelling
+sequences.noise
 """
 """Modules whose classes a snapshot may hold: plain data, rebuilt from their attributes."""
 

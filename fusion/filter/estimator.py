@@ -32,9 +32,10 @@ from stario.fusion.filter.map_frame import MapFrame
 from stario.fusion.filter.network_errors import ACCEL_SHARE
 from stario.fusion.filter.zero_velocity import StillnessDetector, ZeroVelocity, ZeroVelocityUpdates
 from stario.fusion.fixes import Accepted, Fix, by_time
-from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start, split_at_fixes
+from stario.fusion.health import Health, SampleCounts
+from stario.fusion.imu.intervals import ImuInterval, Start, split_at_fixes
 from stario.fusion.imu.preintegration import Segment, gap_yaw_variance, segment_of
-from stario.fusion.state import Health, Innovations, NavState, SmoothedPose, changed
+from stario.fusion.state import Innovations, NavState, SmoothedPose, changed
 from stario.sequences.windows import WINDOW_SECONDS
 
 

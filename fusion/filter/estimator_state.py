@@ -24,10 +24,11 @@ from stario.fusion.filter.magnetic_reference import MagneticReference
 from stario.fusion.filter.network_errors import ErrorLevel
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Accepted, Fix
-from stario.fusion.imu.intervals import ImuInterval, SampleCounts
+from stario.fusion.health import Health, SampleCounts
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.imu.stateful import Displacement as Displacement
-from stario.fusion.state import Health, Innovations, NavState, changed
+from stario.fusion.state import Innovations, NavState, changed
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
 

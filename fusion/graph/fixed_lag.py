@@ -27,8 +27,9 @@ from stario.fusion.graph.bearing import Bearing, gained_information
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.whitening import IndeterminateError
-from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
-from stario.fusion.state import Health, NavState
+from stario.fusion.health import Health, SampleCounts
+from stario.fusion.imu.intervals import ImuInterval, Start
+from stario.fusion.state import NavState
 from stario.sequences.sequence import FloatArray
 
 _WIDER, _NARROWER = 1.2, 0.99

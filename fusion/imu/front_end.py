@@ -21,14 +21,15 @@ from typing import Any
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.imu.buffers import FieldBuffer, WindowBuffer
+from stario.fusion.health import SampleCounts
 from stario.fusion.imu.faults import (
     ClockSetBackDetector,
+    FrozenSensorDetector,
     GyroUnitCheck,
     OutlierDetector,
 )
-from stario.fusion.imu.frozen import FrozenSensorDetector
-from stario.fusion.imu.intervals import Flags, ImuInterval, SampleCounts, Start
+from stario.fusion.imu.intervals import FieldBuffer, Flags, ImuInterval, Sample, Start
+from stario.fusion.imu.stateful import WindowBuffer
 from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.errors import InputError
@@ -48,9 +49,6 @@ _ISOLATED_SAMPLES = 20
 
 _REPEATED_SAMPLES = 1000
 """This many samples with the first one's time show that times have too few digits."""
-
-Sample = tuple[float, float, float, float, float, float, float]
-"""Time [s], gyroscope xyz [rad/s], specific force xyz [m/s^2]."""
 
 
 class FrontEnd:
