@@ -39,9 +39,8 @@ FORMAT, VERSION = "stario snapshot", 19
 
 
 _HOLDS = """
-fusion.config fusion.filter.displacements fusion.filter.ekf_state fusion.filter.estimates
-fusion.filter.estimator_state fusion.filter.frame_transform fusion.filter.gyro_bias
-fusion.filter.hypotheses fusion.filter.initial fusion.filter.magnetic_reference
+fusion.config fusion.filter.displacements fusion.filter.ekf_state fusion.filter.estimator_state
+fusion.filter.frame_transform fusion.filter.gyro_bias fusion.filter.initial fusion.filter.magnetic
 fusion.filter.map_frame fusion.filter.network_errors fusion.filter.planar_alignment
 fusion.filter.zero_velocity fusion.fixes fusion.graph.bearing fusion.graph.builder
 fusion.graph.factors fusion.graph.fixed_lag fusion.graph.keyframe_state fusion.graph.keyframes

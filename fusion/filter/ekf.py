@@ -13,10 +13,10 @@ import math
 import numpy as np
 
 from stario.fusion.checked import check_covariance, checked
-from stario.fusion.filter.ekf_state import EkfState, FieldState, with_considered_propagated
+from stario.fusion.filter.ekf_state import EkfState, FieldState
 from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult
-from stario.fusion.filter.estimates import ACTUAL
 from stario.fusion.filter.jacobians import (
+    ACTUAL,
     CLONE,
     CORE,
     bearing_jacobian,
@@ -28,7 +28,7 @@ from stario.fusion.filter.jacobians import (
     velocity_jacobian,
     yaw_jacobian,
 )
-from stario.fusion.filter.network_errors import DisplacementErrors
+from stario.fusion.filter.network_errors import DisplacementErrors, with_considered_propagated
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import exp_times, yaw_twist
 from stario.fusion.state import NavState, changed

@@ -17,8 +17,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from scipy.linalg.blas import dgemm
 from scipy.linalg.lapack import dpotrf, dtrtri
 
-from stario.fusion.filter.estimates import ACTUAL, ASSUMED
-from stario.fusion.filter.jacobians import CORE, Block
+from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CORE, Block
 from stario.sequences.sequence import FloatArray
 
 GateMode = Literal["inflate", "reject"]
@@ -256,6 +255,24 @@ def with_gain(P: FloatArray, K: FloatArray, HP: FloatArray, S: FloatArray) -> Fl
     """
     half = K @ (HP - 0.5 * S @ K.T)
     return np.asarray(P - half - half.T)
+
+
+def gauss_markov(
+    covariances: FloatArray, rows: slice, kept: float | FloatArray, sigma: float
+) -> FloatArray:
+    """Return covariances (..., n, n) after errors have taken a Gauss-Markov step.
+
+    Args:
+        covariances: before the step.
+        rows: the k rows of the errors, which vary about zero, independently of each other.
+        kept: correlation of each error with its value before the step, (k,) or the same for all.
+        sigma: stationary standard deviation of the errors.
+    """
+    P, kept = covariances.copy(), np.broadcast_to(kept, rows.stop - rows.start)
+    P[..., rows, :] *= kept[:, None]
+    P[..., :, rows] *= kept
+    P[..., rows, rows] += np.diag((1.0 - kept * kept) * sigma**2)
+    return P
 
 
 def _normalised(residual: FloatArray, covariance: FloatArray) -> tuple[float, FloatArray]:

@@ -11,8 +11,7 @@ from collections.abc import Sequence
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.displacements import DisplacementUpdates
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.filter.estimates import Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.ekf_state import EkfState, Estimate, nav_states, smoothed_poses
 from stario.fusion.filter.estimator_state import (
     Displacement,
     EstimatorState,

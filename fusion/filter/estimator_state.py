@@ -13,15 +13,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stario.fusion.filter.displacements import AccelNoiseScale
-from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.filter.displacements import AlternativeHypothesis
+from stario.fusion.filter.ekf_state import EkfState, Estimate
 from stario.fusion.filter.engine import UpdateResult
-from stario.fusion.filter.estimates import Estimate
 from stario.fusion.filter.frame_transform import MapFrameState
 from stario.fusion.filter.gyro_bias import GyroBiasPrior
-from stario.fusion.filter.hypotheses import AlternativeHypothesis
-from stario.fusion.filter.magnetic_reference import MagneticReference
-from stario.fusion.filter.network_errors import ErrorLevel
+from stario.fusion.filter.magnetic import MagneticReference
+from stario.fusion.filter.network_errors import AccelNoiseScale, ErrorLevel
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.health import Health, SampleCounts

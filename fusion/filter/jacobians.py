@@ -26,6 +26,9 @@ CORE = 15
 CLONE = 6
 """Size of the error state of one cloned pose."""
 
+ASSUMED, ACTUAL = 0, 1
+"""Indices of the covariances: as assumed for the gains, and of the error that these gains leave."""
+
 Block = tuple[int, FloatArray]
 """First column of a Jacobian block in the error state, and the block (m, width)."""
 
@@ -182,10 +185,10 @@ def propagated(
     adjoint[3:9, 0:3] = (skew(np.array((v, p))) @ R).reshape(6, 3)
     local = segment.pim.residualCovariance()
     noise = np.empty((2, CORE, CORE))
-    noise[0] = adjoint @ local @ adjoint.T
+    noise[ASSUMED] = adjoint @ local @ adjoint.T
     actual = adjoint.copy()
     actual[:, 3:9] *= math.sqrt(accel_share)
-    noise[1] = actual @ local @ actual.T
+    noise[ACTUAL] = actual @ local @ actual.T
 
     transition = _nav_transition(segment.duration, segment.gravity)
     by_bias = adjoint[:9, :9] @ bias_jacobian

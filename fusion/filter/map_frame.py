@@ -14,12 +14,12 @@ import math
 import numpy as np
 from numpy.linalg import norm
 
-from stario.fusion.filter.displacements import with_turn
 from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.ekf_state import nav_states
 from stario.fusion.filter.engine import UpdateResult
-from stario.fusion.filter.estimates import nav_states
 from stario.fusion.filter.frame_transform import FrameTransform, MapFrameState, unoriented_stretch
 from stario.fusion.filter.initial import PriorPose
+from stario.fusion.filter.network_errors import with_turn
 from stario.fusion.filter.planar_alignment import (
     PlanarAlignment,
     plane_sigma,

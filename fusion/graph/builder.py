@@ -9,8 +9,8 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.displacements import TURN_SECONDS, TurnEstimate
 from stario.fusion.filter.estimator_state import Displacement as Measured
+from stario.fusion.filter.network_errors import TURN_SECONDS, TurnEstimate
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Fix
 from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Velocity, Yaw

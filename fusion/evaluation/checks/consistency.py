@@ -16,12 +16,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
-from stario.fusion.filter.estimates import ACTUAL, Estimate
+from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS, Estimate
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import Displacement
 from stario.fusion.filter.initial import PriorPose
-from stario.fusion.filter.jacobians import CORE
+from stario.fusion.filter.jacobians import ACTUAL, CORE
 from stario.fusion.filter.network_errors import ACCEL_SHARE, displacement_errors
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.stateful import slope_variance

@@ -15,8 +15,7 @@ import numpy as np
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.compare import DEMONSTRATION_SEED, demonstration
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.estimates import ACTUAL, ASSUMED
-from stario.fusion.filter.jacobians import CORE, Block
+from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CORE, Block
 from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.navigator import Navigator
 from stario.fusion.state import NavState

@@ -14,8 +14,8 @@ from stario.fusion import Navigator
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.checks.corruption import faults
 from stario.fusion.evaluation.checks.faults import matched_walk, run_faults
+from stario.fusion.filter.displacements import AlternativeHypothesis, HypothesisPair
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.hypotheses import AlternativeHypothesis, HypothesisPair
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence
 

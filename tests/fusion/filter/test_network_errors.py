@@ -10,9 +10,8 @@ import pytest
 from stario.fusion import Navigator, NavigatorConfig
 from stario.fusion.config import FilterConfig
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
+from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS, Estimate
 from stario.fusion.filter.engine import UpdateResult
-from stario.fusion.filter.estimates import Estimate, with_actual_covariances
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.map_frame import MapFrame
@@ -26,6 +25,7 @@ from stario.fusion.filter.network_errors import (
     displacement_errors,
 )
 from stario.fusion.fixes import position_fix
+from stario.fusion.graph.covariances import with_actual_covariances
 from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.recording import cut_recording
 from stario.fusion.state import NavState
