@@ -18,7 +18,7 @@ import numpy as np
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf_state import Estimate, nav_states, smoothed_poses
 from stario.fusion.filter.estimator import Estimator
-from stario.fusion.filter.estimator_state import IntervalMeasurements
+from stario.fusion.filter.estimator_state import IntervalMeasurements, innovations_of
 from stario.fusion.filter.frame_transform import (
     frame_rotation,
     smoothed_track,
@@ -144,7 +144,7 @@ def track_recording(
     health = queue.health(estimator.health(counts, solution.states[-1]))
     return track_from_states(
         solution.states,
-        estimator.innovations(),
+        innovations_of(filtered.measurements),
         replace(health, notes=[*health.notes, *solution.notes]),
         smoothed=solution.smoothed,
         seconds_network=recording.seconds_network,

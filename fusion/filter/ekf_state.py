@@ -157,14 +157,9 @@ class EkfState:
         """Position (3,) [m]."""
         return np.asarray(self.X[0, :, 4] + self.origin_W)
 
-    @property
-    def plain_covariance(self) -> FloatArray:
-        """Covariance (15, 15) of plain errors, each true minus estimate.
-
-        Order: rotation about W's axes [rad] (R = (I + [theta]x) R^), velocity [m/s] and position
-        [m] in W, biases [rad/s], [m/s^2].
-        """
-        return plain_covariance(self.P_actual[:CORE, :CORE], self.X[0, :, 3:].T)
+    def nav_state(self) -> NavState:
+        """Return the current state with plain errors."""
+        return nav_states([self.estimate()])[0]
 
     @property
     def turn_row(self) -> int:

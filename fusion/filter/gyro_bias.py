@@ -18,7 +18,7 @@ from stario.fusion.filter.displacements import HypothesisPair
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import GYRO_BIAS
 from stario.fusion.filter.engine import with_gain
-from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
 from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import BIAS_SIGMA
 from stario.sequences.sequence import FloatArray
@@ -52,9 +52,6 @@ gravity cannot reveal an uncorrected vertical bias, and nobody turns so evenly f
 
 _PRIOR_TOLERANCE = 1e-6
 """Relative difference up to which two variances count as equal."""
-
-_TIME_TOLERANCE = 1e-6
-"""Tolerance when comparing times [s]."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +173,7 @@ class AdaptiveBiasPrior:
 
     def _half_seconds(self, time: float) -> int:
         """Return the whole half seconds since the start; the information changes no faster."""
-        return math.floor(2.0 * (time - self._start) + _TIME_TOLERANCE)
+        return math.floor(2.0 * (time - self._start) + SAME_TIME)
 
     @property
     def _wander(self) -> float:

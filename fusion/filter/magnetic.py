@@ -24,7 +24,7 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, FieldState
 from stario.fusion.filter.engine import UpdateResult, gauss_markov
 from stario.fusion.fixes import Fix, yaw_fix
-from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
 from stario.fusion.lie import yaw_twist
 from stario.fusion.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
@@ -176,7 +176,7 @@ class MagneticReference:
 
     def is_due(self, time: float) -> bool:
         """Return whether a bearing may be applied at a time [s]."""
-        return time - self.time > _PERIOD - 1e-6
+        return time - self.time > _PERIOD - SAME_TIME
 
     def updated(self, time: float, size: float, dip: float, new_place: bool) -> MagneticReference:
         """Return the reference after one more bearing: clipped means, as robust as medians.

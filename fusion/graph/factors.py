@@ -23,9 +23,8 @@ from stario.fusion.filter.jacobians import CORE, plain_covariance
 from stario.fusion.filter.network_errors import TurnEstimate
 from stario.fusion.graph.covariances import root_information
 from stario.fusion.graph.keyframe_state import KeyframeState
-from stario.fusion.lie import twist, yaw_rotation
+from stario.fusion.lie import about_vertical, twist, yaw_rotation
 from stario.fusion.state import NavState
-from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.sequence import FloatArray
 
 _EYE = np.eye(3)
@@ -162,7 +161,7 @@ class Displacement(Between):
         (R_i, p_i), (R_j, p_j) = _pose(values, self.i), _pose(values, self.j)
         R_NW = yaw_rotation(R_i @ self.R_NB.T).T
         if self.turned:
-            R_NW = exp_so3(np.array([0.0, 0.0, turn_at(values, self.j)])) @ R_NW
+            R_NW = about_vertical(turn_at(values, self.j)) @ R_NW
         d_W = p_j - p_i
         H_i, H_j = np.zeros((3, 6)), np.zeros((3, 6))
         sideways = np.array([-d_W[1], d_W[0], 0.0])  # e3 x (p_j - p_i)

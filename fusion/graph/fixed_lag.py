@@ -17,7 +17,7 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, nav_states
 from stario.fusion.filter.estimator import Estimator
-from stario.fusion.filter.estimator_state import Displacement, EstimatorState
+from stario.fusion.filter.estimator_state import EstimatorState
 from stario.fusion.filter.frame_transform import with_undirected
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import ASSUMED
@@ -30,6 +30,7 @@ from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.health import Health, SampleCounts
 from stario.fusion.imu.intervals import ImuInterval, Start
+from stario.fusion.imu.stateful import Displacement
 from stario.fusion.state import NavState
 from stario.sequences.sequence import FloatArray
 

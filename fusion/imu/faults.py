@@ -34,7 +34,7 @@ from collections.abc import Callable
 import numpy as np
 
 from stario.fusion.health import Stopped
-from stario.fusion.imu.intervals import NO_FLAGS, Flags, ImuInterval, Sample
+from stario.fusion.imu.intervals import NO_FLAGS, SAME_TIME, Flags, ImuInterval, Sample
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_gyro
 from stario.sequences.inspection.stuck import shaken, tilting
@@ -303,7 +303,7 @@ class GyroUnitCheck:
             return
         table = np.column_stack([interval.time, interval.gyro, interval.accel])
         self._tables.append(table[1:] if self._tables else table)
-        if interval.stop - self._tables[0][0, 0] > _PIECE_SECONDS - 1e-6:
+        if interval.stop - self._tables[0][0, 0] > _PIECE_SECONDS - SAME_TIME:
             piece, self._tables = np.vstack(self._tables), []
             self._check_piece(piece[:, 0], piece[:, 1:4], piece[:, 4:7])
 

@@ -6,7 +6,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,8 +142,8 @@ class ImuInterval:
 
 _NO_ATTITUDES = np.empty((0, 3, 3))
 
-_SAME_TIME = 1e-6
-"""A fix within this time of an interval's start or end [s] counts as at it."""
+SAME_TIME = 1e-6
+"""Times that differ by no more than this [s] count as the same."""
 
 
 def split_at_fixes(
@@ -160,10 +160,10 @@ def split_at_fixes(
     pieces: list[tuple[ImuInterval | None, list[Fix]]] = []
     rest = interval
     for fix in fixes:
-        if fix.time <= rest.start + _SAME_TIME:
+        if fix.time <= rest.start + SAME_TIME:
             if not pieces:
                 pieces.append((None, []))
-        elif fix.time < rest.stop - _SAME_TIME:
+        elif fix.time < rest.stop - SAME_TIME:
             before, rest = split_at(rest, fix.time)
             pieces.append((before, []))
         else:
@@ -175,20 +175,21 @@ def split_at_fixes(
 
 def split_at(interval: ImuInterval, time: float) -> tuple[ImuInterval, ImuInterval]:
     """Split an interval at a time [s] inside it; the second part keeps window and update."""
+    table = np.column_stack([interval.time, interval.gyro, interval.accel])
     k = int(np.searchsorted(interval.time, time))
-    weight = (time - interval.time[k - 1]) / (interval.time[k] - interval.time[k - 1])
-    first: dict[str, Any] = {"time": np.append(interval.time[:k], time)}
-    second: dict[str, Any] = {"time": np.append(time, interval.time[k:])}
-    if second["time"][1] - time < 1e-9:
-        second["time"] = np.append(time, interval.time[k + 1 :])
-    for name in ("gyro", "accel"):
-        values = getattr(interval, name)
-        boundary = (1.0 - weight) * values[k - 1] + weight * values[k]
-        first[name] = np.vstack([values[:k], boundary])
-        second[name] = np.vstack([boundary, values[len(values) - len(second["time"]) + 1 :]])
-    return changed(interval, **first, update=False, window=None, R_NB_window=None), changed(
-        interval, **second
+    boundary = table[k - 1] + (time - table[k - 1, 0]) / (table[k, 0] - table[k - 1, 0]) * (
+        table[k] - table[k - 1]
     )
+    boundary[0] = time
+    later = table[k:] if table[k, 0] - time >= 1e-9 else table[k + 1 :]
+    first = _with_samples(interval, np.vstack([table[:k], boundary]))
+    second = _with_samples(interval, np.vstack([boundary, later]))
+    return changed(first, update=False, window=None, R_NB_window=None), second
+
+
+def _with_samples(interval: ImuInterval, table: FloatArray) -> ImuInterval:
+    """Return an interval with other samples: rows of time, gyro and accel (n, 7)."""
+    return changed(interval, time=table[:, 0], gyro=table[:, 1:4], accel=table[:, 4:])
 
 
 _MAX_FIELDS = 1000

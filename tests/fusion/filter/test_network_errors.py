@@ -138,7 +138,7 @@ def test_the_covariance_is_that_of_drawn_errors() -> None:
     rng, seconds = np.random.default_rng(1), 30
     filters, ends, nis = zip(*(straight_walk(rng, seconds) for _ in range(200)), strict=True)
     found = np.square([ekf.state.p_W - end for ekf, end in zip(filters, ends, strict=True)])
-    reported = np.diag(filters[0].state.plain_covariance)[6:9]
+    reported = np.diag(filters[0].state.nav_state().covariance)[6:9]
     np.testing.assert_allclose(found.mean(axis=0)[:2], reported[:2], rtol=0.3)
     assert np.mean(nis) == pytest.approx(3.0, rel=0.1)
     assert filters[0].P[6, 6] < 0.6 * reported[0]
@@ -203,7 +203,7 @@ def test_the_first_fix_after_a_straight_walk_is_believed() -> None:
     time = np.arange(0.0, 1.0 + 1e-9, 0.1)
     accel = np.tile([0.0, 0.0, STANDARD_GRAVITY], (len(time), 1))
     noise = ImuNoise(gyro_noise=1e-3, accel_noise=0.1)
-    frame = MapFrame(PriorPose(np.eye(3), zero, zero), 0.997, 0.0)
+    frame = MapFrame(ekf, PriorPose(np.eye(3), zero, zero), 0.997, 0.0)
     slot = ekf.clone()
     for second in range(200):
         samples = float(second) + time, np.zeros_like(accel), accel
