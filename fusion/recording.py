@@ -86,7 +86,10 @@ def preprocess(
     measurements = _displacements(intervals, network, front_end.counts, progress)
     seconds_network = perf_counter() - began
     return PreprocessedRecording(
-        *(intervals, config.filter.update_rate, measurements, front_end),
+        intervals=intervals,
+        update_rate=config.filter.update_rate,
+        measurements=measurements,
+        front_end=front_end,
         seconds_front_end=seconds_front_end,
         seconds_network=seconds_network,
     )

@@ -97,22 +97,25 @@ class HypothesisPair:
     def apply_to_both(self, work: Callable[[], Result]) -> Result:
         """Apply `work` to the filter and then to the alternative; return the filter's result."""
         result = work()
-        if self.alternative is not None:
-            filter_state, self.ekf.state = self.ekf.state, self.alternative.ekf
-            work()
-            self.alternative = changed(self.alternative, ekf=self.ekf.state)
-            self.ekf.state = filter_state
+        self.apply_to_alternative(work)
         return result
 
-    def compare(
-        self, test: Callable[[AlternativeHypothesis], AlternativeHypothesis], fits_filter: bool
-    ) -> tuple[float, ...]:
-        """Test the alternative with a displacement that the filter has applied; adopt or drop it.
+    def apply_to_alternative(self, work: Callable[[], Result]) -> Result | None:
+        """Apply `work` to the alternative, if there is one; return its result."""
+        if self.alternative is None:
+            return None
+        filter_state, self.ekf.state = self.ekf.state, self.alternative.ekf
+        result = work()
+        self.alternative = changed(self.alternative, ekf=self.ekf.state)
+        self.ekf.state = filter_state
+        return result
+
+    def judge(self, fits: bool, fits_filter: bool) -> tuple[float, ...]:
+        """Count a displacement that both have applied; adopt or drop the alternative.
 
         Args:
-            test: updates the filter's current state, which is that of the alternative, with the
-                displacement, and returns the alternative with one more outlier if it does not fit.
-            fits_filter: whether the displacement fitted the filter.
+            fits: whether it fitted the alternative as it is.
+            fits_filter: whether it fitted the filter.
 
         Returns:
             Times of the displacements [s] that were false after all, since the alternative without
@@ -121,20 +124,16 @@ class HypothesisPair:
         alternative = self.alternative
         if alternative is None:
             return ()
-        filter_state, self.ekf.state = self.ekf.state, alternative.ekf
-        tested = test(alternative)
-        fitted = len(tested.outliers) == len(alternative.outliers)
-        exclusive = alternative.exclusive_fits + (fitted and not fits_filter)
-        if fits_filter and not fitted:
+        exclusive = alternative.exclusive_fits + (fits and not fits_filter)
+        if fits_filter and not fits:
             exclusive = 0
-        shared = alternative.shared_fits + 1 if fits_filter and fitted else 0
-        self.alternative = None
+        shared = alternative.shared_fits + 1 if fits_filter and fits else 0
         if exclusive >= _FITS_TO_REPLACE:
-            return tested.outliers
-        ekf, self.ekf.state = self.ekf.state, filter_state
-        if shared < _FITS_TO_DROP and ekf.time - alternative.start_time <= _MAX_SECONDS:
-            fits = {"exclusive_fits": exclusive, "shared_fits": shared}
-            self.alternative = changed(tested, ekf=ekf, **fits)
+            self.ekf.state, self.alternative = alternative.ekf, None
+            return alternative.outliers
+        self.alternative = changed(alternative, exclusive_fits=exclusive, shared_fits=shared)
+        if shared >= _FITS_TO_DROP or alternative.ekf.time - alternative.start_time > _MAX_SECONDS:
+            self.alternative = None
         return ()
 
 
@@ -173,6 +172,7 @@ class DisplacementUpdates:
             covariance_N: (3, 3) covariance of the displacement [m^2].
         """
         f, before = self._config, self._ekf.state
+        self.hypotheses.apply_to_both(self._propagate_turn)
         rare = self.outlier_share < _RARE_SHARE
         update = partial(self._update, slot, R_NB, d_N, covariance_N)
         result = update(f.gate, power=_RARE_POWER if rare else 1.0)
@@ -187,8 +187,25 @@ class DisplacementUpdates:
             first = AlternativeHypothesis(before, before.time, result.residual, (before.time,))
             self.hypotheses.alternative = first
         elif result.accepted:
-            return result, self.hypotheses.compare(partial(_tested, update), not result.gated)
+            fits = self._update_alternative(update)
+            return result, self.hypotheses.judge(fits, not result.gated)
         return result, ()
+
+    def _update_alternative(self, update: Callable[..., UpdateResult]) -> bool:
+        """Update the alternative with a displacement: as it is if it fits, else less the offset.
+
+        Return whether it fits.
+        """
+        result = self.hypotheses.apply_to_alternative(partial(update, _ALTERNATIVE_GATE, "reject"))
+        alternative = self.hypotheses.alternative
+        if result is None or alternative is None or result.accepted or result.residual is None:
+            return True
+        offset_W = alternative.offset_W
+        offset_W = offset_W + _OFFSET_GAIN * (result.residual - offset_W)
+        outliers = (*alternative.outliers, alternative.ekf.time)
+        self.hypotheses.alternative = changed(alternative, offset_W=offset_W, outliers=outliers)
+        self.hypotheses.apply_to_alternative(partial(update, None, offset_W=offset_W))
+        return False
 
     def _update(
         self,
@@ -203,9 +220,6 @@ class DisplacementUpdates:
     ) -> UpdateResult:
         """Update the filter's current state, with the displacement less an offset (3,) [m]."""
         f = self._config
-        self._ekf.state = propagated_turn(
-            self._ekf.state, 1.0 / f.update_rate, f.network_turn_sigma
-        )
         R_WN = yaw_rotation(self._ekf.state.clone_pose(slot)[0] @ R_NB.T)
         # Values that are not finite are rejected and counted by the filter.
         with np.errstate(invalid="ignore"):
@@ -217,29 +231,13 @@ class DisplacementUpdates:
                 level, has_turn = self.error_level.level, self._ekf.state.has_turn
                 errors = displacement_errors(d_W, covariance_W, level, has_turn, f)
             limit = None if gate is None else chi2_quantile(gate, 3)
+            covariance_W = f.overlap_scale * covariance_W
             return self._ekf.update_displacement(
-                *(slot, None, d_W, f.overlap_scale * covariance_W),
-                *(limit, gate_mode, power, errors),
+                slot, None, d_W, covariance_W, limit, gate_mode, power, errors
             )
 
-
-def _tested(
-    update: Callable[..., UpdateResult], alternative: AlternativeHypothesis
-) -> AlternativeHypothesis:
-    """Update an alternative with a displacement: as it is if it fits, otherwise less the offset.
-
-    Args:
-        update: updates the filter's current state, which is the alternative's.
-        alternative: the alternative.
-
-    Returns:
-        The alternative, with one more outlier if the displacement did not fit.
-    """
-    result = update(_ALTERNATIVE_GATE, "reject")
-    if result.accepted or result.residual is None:
-        return alternative
-    offset_W = alternative.offset_W
-    offset_W = offset_W + _OFFSET_GAIN * (result.residual - offset_W)
-    update(None, offset_W=offset_W)
-    outliers = (*alternative.outliers, alternative.ekf.time)
-    return changed(alternative, offset_W=offset_W, outliers=outliers)
+    def _propagate_turn(self) -> None:
+        f = self._config
+        self._ekf.state = propagated_turn(
+            self._ekf.state, 1.0 / f.update_rate, f.network_turn_sigma
+        )

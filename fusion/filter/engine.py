@@ -14,7 +14,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
-from scipy.linalg.blas import dgemm
 from scipy.linalg.lapack import dpotrf, dtrtri
 
 from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CORE, Block
@@ -139,27 +138,22 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
             return UpdateResult(math.nan, m, False, reason="covariance not positive definite")
         HP = _sum([H @ self.covariances[:, first : first + H.shape[1]] for first, H in blocks])
         HPH = _sum([HP[:, :, first : first + H.shape[1]] @ H.T for first, H in blocks])
-        noise = covariance if noise is None else noise
-        nis, sigma = _normalised(residual, HPH[ACTUAL] + noise)
-        whitener = _whitener(HPH[gains_from] + covariance)
-        whitened = whitener @ residual
-        gate_nis = float(whitened @ whitened)
+        R = np.array((covariance, covariance if noise is None else noise))
+        S = HPH + R
+        nis, sigma = _square(_whitener(S[ACTUAL]) @ residual), np.sqrt(S[ACTUAL].diagonal())
+        whitener = _whitener(S[gains_from])
+        gate_nis = _square(whitener @ residual)
         scale = 1.0
         if gate is not None and gate_nis > gate:
             if gate_mode == "reject":
                 return UpdateResult(nis, m, False, 1.0, "gated", residual, sigma, gate_nis)
             scale = (gate_nis / gate) ** power
-            covariance = covariance * scale
-            whitener = _whitener(HPH[gains_from] + covariance)
+            R = R * scale
+            whitener = _whitener(HPH[gains_from] + R[gains_from])
         if not math.isfinite(gate_nis):
             return UpdateResult(math.nan, m, False, reason="innovation covariance not invertible")
-        if gains_from == ASSUMED:
-            P = self._correct(residual, blocks, covariance, HP[ASSUMED], HPH[ASSUMED], whitener)
-        else:
-            self._set_gain(residual, covariance, HP[ACTUAL], HPH[ACTUAL], whitener)
-            P = self._with_gain(ASSUMED, blocks, covariance, HP, HPH)
-        actual = self._with_gain(ACTUAL, blocks, scale * noise, HP, HPH)
-        self.inject(np.array((P, actual)))
+        self._set_gain(residual, R[gains_from], HP[gains_from], HPH[gains_from], whitener)
+        self.inject(self._with_gain(blocks, R, HP, HPH))
         return UpdateResult(nis, m, True, scale, "", residual, sigma, gate_nis)
 
     def inject(self, covariances: FloatArray) -> None:
@@ -188,23 +182,6 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         P[:, :CORE, :CORE] = 0.5 * (core + core.transpose(0, 2, 1))
         return P
 
-    def _correct(
-        self,
-        residual: FloatArray,
-        blocks: Sequence[Block],
-        covariance: FloatArray,
-        HP: FloatArray,
-        HPH: FloatArray,
-        whitener: FloatArray,
-    ) -> FloatArray:
-        """Return P - K S K^T, computed as P - W^T W with W = L^-1 H P, which is symmetric."""
-        W = self._set_gain(residual, covariance, HP, HPH, whitener)
-        if (HPH.diagonal() > _JOSEPH_RATIO * covariance.diagonal()).any():
-            return self._joseph(self.P, blocks, covariance)
-        # P is symmetric: its transpose is the same matrix in BLAS order.
-        P: FloatArray = dgemm(-1.0, W.T, W.T, beta=1.0, c=self.P.T, trans_b=1).T
-        return P
-
     def _set_gain(
         self,
         residual: FloatArray,
@@ -212,49 +189,39 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         HP: FloatArray,
         HPH: FloatArray,
         whitener: FloatArray,
-    ) -> FloatArray:
-        """Set the gain and filterpy's attributes of the step; return W."""
-        W: FloatArray = whitener @ HP
-        self.R, self.S = covariance, HPH + covariance
-        self.SI = whitener.T @ whitener
-        self.K = (whitener.T @ W).T
+    ) -> None:
+        """Set the gain and filterpy's attributes of the step."""
+        self.R, self.S, self.SI = covariance, HPH + covariance, whitener.T @ whitener
+        self.K = (self.SI @ HP).T
         self.K[self._considered] = 0.0
         self.y = self.z = residual[:, None]
         self.x = self.K @ self.y
         self.x_post, self.P_prior = self.x, self.P
         self._log_likelihood = self._likelihood = self._mahalanobis = None
-        return W
 
     def _with_gain(
-        self,
-        which: int,
-        blocks: Sequence[Block],
-        covariance: FloatArray,
-        HP: FloatArray,
-        HPH: FloatArray,
+        self, blocks: Sequence[Block], R: FloatArray, HP: FloatArray, HPH: FloatArray
     ) -> FloatArray:
-        """Return a covariance after the update with the gain K, whatever determined it."""
-        P = self.covariances[which]
-        if (HPH[which].diagonal() > _JOSEPH_RATIO * covariance.diagonal()).any():
-            return self._joseph(P, blocks, covariance)
-        return with_gain(P, self.K, HP[which], HPH[which] + covariance)
-
-    def _joseph(self, P: FloatArray, blocks: Sequence[Block], covariance: FloatArray) -> FloatArray:
-        """Return (I - K H) P (I - K H)^T + K R K^T: slower, but without cancellation."""
-        A = np.eye(len(P))
+        """Return both covariances after the update with the gain K, whatever determined it."""
+        P, K = self.covariances, self.K
+        ratio = HPH.diagonal(0, 1, 2) / R.diagonal(0, 1, 2)
+        if not (ratio > _JOSEPH_RATIO).any():
+            return with_gain(P, K, HP, HPH + R)
+        # Joseph's form is slower, but without cancellation.
+        A = np.eye(P.shape[1])
         for first, H in blocks:
-            A[:, first : first + H.shape[1]] -= self.K @ H
-        P = A @ P @ A.T + self.K @ covariance @ self.K.T
-        return np.asarray(0.5 * (P + P.T))
+            A[:, first : first + H.shape[1]] -= K @ H
+        P = A @ P @ A.T + K @ R @ K.T
+        return np.asarray(0.5 * (P + P.transpose(0, 2, 1)))
 
 
 def with_gain(P: FloatArray, K: FloatArray, HP: FloatArray, S: FloatArray) -> FloatArray:
-    """Return a covariance after an update with any gain, S being H P H^T + R.
+    """Return covariances (..., n, n) after an update with any gain, S being H P H^T + R.
 
     (I - K H) P (I - K H)^T + K R K^T = P - K H P - (K H P)^T + K S K^T
     """
     half = K @ (HP - 0.5 * S @ K.T)
-    return np.asarray(P - half - half.T)
+    return np.asarray(P - half - half.swapaxes(-1, -2))
 
 
 def gauss_markov(
@@ -275,10 +242,8 @@ def gauss_markov(
     return P
 
 
-def _normalised(residual: FloatArray, covariance: FloatArray) -> tuple[float, FloatArray]:
-    """Return the normalised square (NaN if there is none) and sigmas of a residual."""
-    white = _whitener(covariance) @ residual
-    return float(white @ white), np.sqrt(covariance.diagonal())
+def _square(white: FloatArray) -> float:
+    return float(white @ white)
 
 
 def _sum(terms: list[FloatArray]) -> FloatArray:

@@ -18,6 +18,7 @@ from stario.fusion.filter.displacements import HypothesisPair
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import GYRO_BIAS
 from stario.fusion.filter.engine import with_gain
+from stario.fusion.filter.jacobians import ACTUAL, ASSUMED
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
 from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import BIAS_SIGMA
@@ -200,17 +201,12 @@ def replace_prior(ekf: StateCloningEkf, old: float, new: float) -> None:
         old, new = max(old, widest), new * max(1.0, widest / old)
     while abs(new - old) > _PRIOR_TOLERANCE * old:
         step = min(new, 2.0 * old)  # a larger one would be badly conditioned
-        P = ekf.state.P
-        rows = P[GYRO_BIAS]
-        S = rows[:, GYRO_BIAS] + old * step / (old - step) * np.eye(3)
-        K = np.asarray(np.linalg.solve(S, rows).T, dtype=np.float64)
-        change = -0.5 * (K @ rows + rows.T @ K.T)
-        actual = ekf.state.P_actual
-        if step > old:
-            actual = actual + change
-        else:  # what the update removes from the error depends on how large that is
-            HP, R = actual[GYRO_BIAS], old * step / (old - step) * np.eye(3)
-            actual = with_gain(actual, K, HP, HP[:, GYRO_BIAS] + R)
+        P, HP = ekf.covariances, ekf.covariances[:, GYRO_BIAS]
+        S = HP[:, :, GYRO_BIAS] + old * step / (old - step) * np.eye(3)
+        K = np.asarray(np.linalg.solve(S[ASSUMED], HP[ASSUMED]).T, dtype=np.float64)
+        updated = with_gain(P, K, HP, S)
+        if step > old:  # the error gains what the gains forget, however large it is
+            updated[ACTUAL] = P[ACTUAL] + updated[ASSUMED] - P[ASSUMED]
         ekf.x = (K @ -ekf.state.b_g)[:, None]
-        ekf.inject(np.array((P + change, actual)))
+        ekf.inject(updated)
         old = step

@@ -81,18 +81,17 @@ def reinitialise(
 ) -> None:
     """Reset the state after a long gap: tilt from gravity, velocity and yaw unknown."""
     f, s = config.filter, ekf.state
-    P, seconds = s.nav_state().covariance, interval.stop - interval.start
-    covariance = np.zeros_like(P)
+    covariance, seconds = s.nav_state().covariance, interval.stop - interval.start
+    # The position stays correlated with the biases that led there.
+    covariance[:6], covariance[:, :6] = 0.0, 0.0
     tilt = STILL_TILT_SIGMA if start.still else f.tilt_sigma
     covariance[:3, :3] = np.diag(np.square([tilt, tilt, UNKNOWN_YAW]))
     covariance[3:6, 3:6] = max(f.velocity_sigma, MIN_PRIOR_SIGMA) ** 2 * np.eye(3)
     reach = min(GAP_VELOCITY_SIGMA * seconds, MAX_GAP_DISTANCE)
-    covariance[6:9, 6:9] = P[6:9, 6:9] + reach**2 * np.eye(3)
+    covariance[6:9, 6:9] += reach**2 * np.eye(3)
     walks = np.repeat([config.noise.gyro_walk, config.noise.accel_walk], 3)
     turn_on_sigma = np.repeat([f.gyro_bias_sigma, f.accel_bias_sigma], 3)  # limits the walk
     drift = np.minimum(seconds * np.square(walks), np.square(turn_on_sigma))
-    covariance[9:, 9:] = P[9:, 9:] + np.diag(drift)
-    # The position stays correlated with the biases that led there.
-    covariance[6:9, 9:], covariance[9:, 6:9] = P[6:9, 9:], P[9:, 6:9]
+    covariance[9:, 9:] += np.diag(drift)
     R_WB, v_W = yaw_rotation(s.R_WB) @ start.R_WB, np.zeros(3)
     ekf.initialise(NavState(interval.stop, R_WB, v_W, s.p_W, s.b_g, s.b_a, covariance))

@@ -215,7 +215,7 @@ def test_the_first_fix_after_a_straight_walk_is_believed() -> None:
         slot = ekf.clone(instead_of=slot)
     truth = np.array([200.0 * length, 0.0, 0.0])
     assert ekf.state.p_W[0] - truth[0] > 3.0 * np.sqrt(ekf.P[6, 6])
-    result = frame.update(ekf, position_fix(200.0, truth, np.eye(3)))
+    result = frame.update(position_fix(200.0, truth, np.eye(3)))
     assert result.accepted
     assert result.scale == 1.0
     assert np.linalg.norm(ekf.state.p_W - truth) < 1.0
