@@ -22,7 +22,7 @@ from stario.sequences.sequence import FloatArray
 GateMode = Literal["inflate", "reject"]
 
 _JOSEPH_RATIO = 1e9
-"""Ratio of state to measurement variance above which P - W^T W would lose its digits."""
+"""Ratio of innovation to measurement variance above which differences of P lose their digits."""
 
 
 class UpdateResult(NamedTuple):
@@ -132,10 +132,8 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
             are rejected with a reason; the state is then unchanged.
         """
         m = len(residual)
-        if not math.isfinite(residual @ residual + np.vdot(covariance, covariance)):
-            return UpdateResult(math.nan, m, False, reason="value that is not finite")
-        if dpotrf(covariance, lower=1)[1] != 0:
-            return UpdateResult(math.nan, m, False, reason="covariance not positive definite")
+        if reason := fault_of(residual, covariance):
+            return UpdateResult(math.nan, m, False, reason=reason)
         HP = _sum([H @ self.covariances[:, first : first + H.shape[1]] for first, H in blocks])
         HPH = _sum([HP[:, :, first : first + H.shape[1]] @ H.T for first, H in blocks])
         R = np.array((covariance, covariance if noise is None else noise))
@@ -149,11 +147,13 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
                 return UpdateResult(nis, m, False, 1.0, "gated", residual, sigma, gate_nis)
             scale = (gate_nis / gate) ** power
             R = R * scale
-            whitener = _whitener(HPH[gains_from] + R[gains_from])
+            S = HPH + R
+            whitener = _whitener(S[gains_from])
         if not math.isfinite(gate_nis):
             return UpdateResult(math.nan, m, False, reason="innovation covariance not invertible")
-        self._set_gain(residual, R[gains_from], HP[gains_from], HPH[gains_from], whitener)
-        self.inject(self._with_gain(blocks, R, HP, HPH))
+        self.R, self.S = R[gains_from], S[gains_from]
+        self._set_gain(residual, HP[gains_from], whitener)
+        self.inject(self._with_gain(blocks, R, HP, S))
         return UpdateResult(nis, m, True, scale, "", residual, sigma, gate_nis)
 
     def inject(self, covariances: FloatArray) -> None:
@@ -175,23 +175,15 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         self, covariances: FloatArray, transition: FloatArray, noise: FloatArray
     ) -> FloatArray:
         P = covariances.copy()
-        for which in (ASSUMED, ACTUAL):
-            P[which, :CORE] = transition @ P[which, :CORE]
+        P[:, :CORE] = transition @ P[:, :CORE]
         P[:, CORE:, :CORE] = P[:, :CORE, CORE:].transpose(0, 2, 1)
         core = P[:, :CORE, :CORE] @ transition.T + noise
         P[:, :CORE, :CORE] = 0.5 * (core + core.transpose(0, 2, 1))
         return P
 
-    def _set_gain(
-        self,
-        residual: FloatArray,
-        covariance: FloatArray,
-        HP: FloatArray,
-        HPH: FloatArray,
-        whitener: FloatArray,
-    ) -> None:
+    def _set_gain(self, residual: FloatArray, HP: FloatArray, whitener: FloatArray) -> None:
         """Set the gain and filterpy's attributes of the step."""
-        self.R, self.S, self.SI = covariance, HPH + covariance, whitener.T @ whitener
+        self.SI = whitener.T @ whitener
         self.K = (self.SI @ HP).T
         self.K[self._considered] = 0.0
         self.y = self.z = residual[:, None]
@@ -200,19 +192,25 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         self._log_likelihood = self._likelihood = self._mahalanobis = None
 
     def _with_gain(
-        self, blocks: Sequence[Block], R: FloatArray, HP: FloatArray, HPH: FloatArray
+        self, blocks: Sequence[Block], R: FloatArray, HP: FloatArray, S: FloatArray
     ) -> FloatArray:
         """Return both covariances after the update with the gain K, whatever determined it."""
         P, K = self.covariances, self.K
-        ratio = HPH.diagonal(0, 1, 2) / R.diagonal(0, 1, 2)
-        if not (ratio > _JOSEPH_RATIO).any():
-            return with_gain(P, K, HP, HPH + R)
+        if not (S.diagonal(0, 1, 2) > _JOSEPH_RATIO * R.diagonal(0, 1, 2)).any():
+            return with_gain(P, K, HP, S)
         # Joseph's form is slower, but without cancellation.
         A = np.eye(P.shape[1])
         for first, H in blocks:
             A[:, first : first + H.shape[1]] -= K @ H
         P = A @ P @ A.T + K @ R @ K.T
         return np.asarray(0.5 * (P + P.transpose(0, 2, 1)))
+
+
+def fault_of(value: FloatArray, covariance: FloatArray) -> str:
+    """Return why a measurement cannot be used; empty if it can."""
+    if not math.isfinite(np.vdot(value, value) + np.vdot(covariance, covariance)):
+        return "value that is not finite"
+    return "covariance not positive definite" if dpotrf(covariance, lower=1)[1] else ""
 
 
 def with_gain(P: FloatArray, K: FloatArray, HP: FloatArray, S: FloatArray) -> FloatArray:
@@ -225,17 +223,17 @@ def with_gain(P: FloatArray, K: FloatArray, HP: FloatArray, S: FloatArray) -> Fl
 
 
 def gauss_markov(
-    covariances: FloatArray, rows: slice, kept: float | FloatArray, sigma: float
+    covariances: FloatArray, rows: slice, kept: FloatArray, sigma: float
 ) -> FloatArray:
     """Return covariances (..., n, n) after errors have taken a Gauss-Markov step.
 
     Args:
         covariances: before the step.
         rows: the k rows of the errors, which vary about zero, independently of each other.
-        kept: correlation of each error with its value before the step, (k,) or the same for all.
+        kept: (k,) correlation of each error with its value before the step.
         sigma: stationary standard deviation of the errors.
     """
-    P, kept = covariances.copy(), np.broadcast_to(kept, rows.stop - rows.start)
+    P = covariances.copy()
     P[..., rows, :] *= kept[:, None]
     P[..., :, rows] *= kept
     P[..., rows, rows] += np.diag((1.0 - kept * kept) * sigma**2)

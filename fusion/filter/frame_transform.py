@@ -54,24 +54,15 @@ class FrameTransform:
     drift: float = 0.0
     position_covariance: FloatArray | None = None
 
-    def applies_to(self, time: float) -> bool:
-        """Return whether an earlier state at a time [s] is transformed."""
-        return self.since <= time < self.until
-
-    def turn_variance(self, yaw_variance: float) -> float:
-        """Return the turn's variance [rad^2] for an earlier state with this yaw variance."""
-        return self.yaw_sigma**2 + max(0.0, self.drift - yaw_variance)
-
     def state(self, state: NavState) -> NavState:
         """Return a state of the frame before, in the new one."""
-        if not self.applies_to(state.time):
+        if not self.since <= state.time < self.until:
             return changed(state, map_frame=state.map_frame + 1)
         v_W, p_W = self.R @ state.v_W, self.R @ state.p_W + self.shift
         A = frame_rotation(self.R)
         covariance = A @ state.covariance @ A.T
-        covariance += _turn_covariance(
-            self.turn_variance(state.covariance[2, 2]), v_W, p_W - self.pivot
-        )
+        turn_variance = self.yaw_sigma**2 + max(0.0, self.drift - state.covariance[2, 2])
+        covariance += _turn_covariance(turn_variance, v_W, p_W - self.pivot)
         if self.position_covariance is not None:
             covariance[6:9, 6:9] += self.position_covariance
         return changed(

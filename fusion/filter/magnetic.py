@@ -273,7 +273,7 @@ def propagated_field(s: EkfState, seconds: float, sigma: float) -> EkfState:
     metres = seconds * math.hypot(s.v_W[0], s.v_W[1])
     row = s.first_field + 1
     correlation = math.exp(-metres / WANDER_METRES - seconds / WANDER_SECONDS)
-    P = gauss_markov(s.covariances, slice(row, row + 1), correlation, sigma)
+    P = gauss_markov(s.covariances, slice(row, row + 1), np.array([correlation]), sigma)
     return changed(s, covariances=P, field=changed(s.field, wander=correlation * s.field.wander))
 
 

@@ -96,9 +96,7 @@ class ErrorLevel:
         if not math.isfinite(result.nis):
             return self
         excess = min(result.nis / result.dof - 1.0, _MAX_EXCESS)
-        log_level = self.log_level + self.gain * excess
-        log_level = min(max(log_level, math.log(MIN_LEVEL)), math.log(MAX_LEVEL))
-        return ErrorLevel(log_level, next_gain(self.gain))
+        return ErrorLevel(*_stepped(self.log_level, self.gain, excess, MIN_LEVEL, MAX_LEVEL))
 
 
 @dataclass(frozen=True)
@@ -124,14 +122,18 @@ class AccelNoiseScale:
             return self
         ratio = (result.gate_nis / (TARGET_NIS * result.dof)) ** 2
         excess = 1.0 - 2.0 / (ratio + 1.0)
-        log_factor = self.log_factor + self.gain * excess
-        log_factor = min(max(log_factor, 0.0), math.log(MAX_FACTOR))
-        return AccelNoiseScale(log_factor, next_gain(self.gain))
+        return AccelNoiseScale(*_stepped(self.log_factor, self.gain, excess, 1.0, MAX_FACTOR))
 
 
-def next_gain(gain: float) -> float:
-    """Return the step for the next displacement: 1/5, 1/6, 1/7, ... (Robbins and Monro 1951)."""
-    return max(1.0 / (1.0 / gain + 1.0), GAIN)
+def _stepped(
+    log: float, gain: float, excess: float, low: float, high: float
+) -> tuple[float, float]:
+    """Return a logarithm after one step, between those of two bounds, and its next gain.
+
+    The gains are 1/5, 1/6, 1/7, ... down to `GAIN` (Robbins and Monro 1951).
+    """
+    log = min(max(log + gain * excess, math.log(low)), math.log(high))
+    return log, max(1.0 / (1.0 / gain + 1.0), GAIN)
 
 
 def displacement_errors(
@@ -180,7 +182,7 @@ def with_considered_propagated(s: EkfState) -> EkfState:
     """
     kept = np.exp((s.considered_time - s.time) / CONSIDERED_SECONDS)
     actual = gauss_markov(s.P_actual, s.considered_rows, kept, 1.0)
-    return changed(s, covariances=np.stack([s.P, actual]), considered_time=s.time)
+    return changed(s, covariances=np.array((s.P, actual)), considered_time=s.time)
 
 
 class TurnEstimate(NamedTuple):
@@ -216,5 +218,6 @@ def propagated_turn(s: EkfState, seconds: float, sigma: float) -> EkfState:
     if not s.has_turn:
         return s
     correlation = math.exp(-seconds / TURN_SECONDS)
-    P = gauss_markov(s.covariances, slice(s.turn_row, s.turn_row + 1), correlation, sigma)
+    rows = slice(s.turn_row, s.turn_row + 1)
+    P = gauss_markov(s.covariances, rows, np.array([correlation]), sigma)
     return changed(s, covariances=P, network_turn=correlation * s.network_turn)

@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.filter.engine import fault_of
 from stario.fusion.filter.network_errors import TURN_SECONDS, TurnEstimate
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Fix
@@ -204,7 +204,7 @@ class GraphBuilder:
         self, i: int, interval: ImuInterval, d_N: FloatArray, covariance_N: FloatArray
     ) -> None:
         covariance = covariance_N * (self._overlap * self._config.filter.covariance_scale)
-        if not _usable(d_N, covariance):
+        if fault_of(d_N, covariance):
             return
         assert interval.R_NB_window is not None  # a window always comes with its first attitude
         j, R_NB = self.graph.last, interval.R_NB_window
@@ -235,13 +235,6 @@ class GraphBuilder:
             return Velocity(k, fix.value, fix.covariance + drift, v - v_k)
         turn = math.remainder(fix.value[0] - yaw_twist(R), 2.0 * math.pi)
         return Yaw(k, about_vertical(turn) @ R_k, fix.covariance + turned)
-
-
-def _usable(value: FloatArray, covariance: FloatArray) -> bool:
-    """Return whether a measurement is finite and its covariance positive definite."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        finite = math.isfinite(float(np.vdot(value, value) + np.vdot(covariance, covariance)))
-    return finite and dpotrf(covariance, lower=1)[1] == 0
 
 
 def _pose_between(start: Pose, end: Pose, fraction: float, duration: float) -> Pose:
