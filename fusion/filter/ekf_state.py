@@ -101,7 +101,7 @@ class EkfState:
         clone_times: times of the clones [s]; None for an empty slot.
         considered_time: time up to which the considered errors are propagated [s].
         network_turn: yaw error (turn) of the network's displacements, positive left [rad]; fixed at
-            zero until fixes determine the direction (`displacements.py`).
+            zero until fixes determine the direction (`network_errors.py`).
         field: the magnetic field; None before its first measurement.
     """
 
