@@ -301,7 +301,7 @@ class GyroUnitCheck:
             return
         if self._turned >= _MIN_TURNING_PIECES:
             return
-        table = np.column_stack([interval.time, interval.gyro, interval.accel])
+        table = interval.table
         self._tables.append(table[1:] if self._tables else table)
         if interval.stop - self._tables[0][0, 0] > _PIECE_SECONDS - SAME_TIME:
             piece, self._tables = np.vstack(self._tables), []

@@ -28,7 +28,14 @@ from stario.fusion.imu.faults import (
     GyroUnitCheck,
     OutlierDetector,
 )
-from stario.fusion.imu.intervals import FieldBuffer, Flags, ImuInterval, Sample, Start
+from stario.fusion.imu.intervals import (
+    FieldBuffer,
+    Flags,
+    ImuInterval,
+    Sample,
+    Start,
+    interpolated_sample,
+)
 from stario.fusion.imu.stateful import WindowBuffer
 from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
@@ -244,7 +251,10 @@ class FrontEnd:
         if flags.spikes:
             self._samples[later] = tuple(table[later].tolist())
         after = self._samples[later]
-        end = after if after[0] == stop else _interpolated(table[later - 1], table[later], stop)
+        if after[0] == stop:
+            end = after
+        else:
+            end = tuple(interpolated_sample(table[later - 1], table[later], stop).tolist())
         rest = self._samples[later:]
         self._samples = rest if rest[0][0] == stop else [end, *rest]
         self._index += 1
@@ -283,9 +293,3 @@ def _interval(
         levelled_bias_sigma=attitude.bias_sigma,
         **measured,
     )
-
-
-def _interpolated(before: FloatArray, after: FloatArray, time: float) -> Sample:
-    weight = (time - before[0]) / (after[0] - before[0])
-    values = before[1:] + weight * (after[1:] - before[1:])
-    return (time, *values.tolist())

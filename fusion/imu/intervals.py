@@ -130,6 +130,11 @@ class ImuInterval:
         return changed(self, window=None, attitudes=_NO_ATTITUDES)
 
     @property
+    def table(self) -> FloatArray:
+        """Samples (n + 1, 7): time, gyro and accel."""
+        return np.column_stack([self.time, self.gyro, self.accel])
+
+    @property
     def start(self) -> float:
         """Time of the first sample [s]."""
         return float(self.time[0])
@@ -175,12 +180,9 @@ def split_at_fixes(
 
 def split_at(interval: ImuInterval, time: float) -> tuple[ImuInterval, ImuInterval]:
     """Split an interval at a time [s] inside it; the second part keeps window and update."""
-    table = np.column_stack([interval.time, interval.gyro, interval.accel])
-    k = int(np.searchsorted(interval.time, time))
-    boundary = table[k - 1] + (time - table[k - 1, 0]) / (table[k, 0] - table[k - 1, 0]) * (
-        table[k] - table[k - 1]
-    )
-    boundary[0] = time
+    table = interval.table
+    k = int(np.searchsorted(table[:, 0], time))
+    boundary = interpolated_sample(table[k - 1], table[k], time)
     later = table[k:] if table[k, 0] - time >= 1e-9 else table[k + 1 :]
     first = _with_samples(interval, np.vstack([table[:k], boundary]))
     second = _with_samples(interval, np.vstack([boundary, later]))
@@ -190,6 +192,13 @@ def split_at(interval: ImuInterval, time: float) -> tuple[ImuInterval, ImuInterv
 def _with_samples(interval: ImuInterval, table: FloatArray) -> ImuInterval:
     """Return an interval with other samples: rows of time, gyro and accel (n, 7)."""
     return changed(interval, time=table[:, 0], gyro=table[:, 1:4], accel=table[:, 4:])
+
+
+def interpolated_sample(before: FloatArray, after: FloatArray, time: float) -> FloatArray:
+    """Return the sample (7,) at a time [s] between two samples of time, gyro and accel."""
+    sample = before + (time - before[0]) / (after[0] - before[0]) * (after - before)
+    sample[0] = time
+    return np.asarray(sample)
 
 
 _MAX_FIELDS = 1000
