@@ -14,8 +14,14 @@ from stario.fusion import Navigator
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.checks.corruption import faults
 from stario.fusion.evaluation.checks.faults import matched_walk, run_faults
-from stario.fusion.filter.displacements import AlternativeHypothesis, HypothesisPair
+from stario.fusion.filter.displacements import (
+    AlternativeHypothesis,
+    DisplacementUpdates,
+    HypothesisPair,
+)
 from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.network_errors import TURN_SECONDS, with_turn
+from stario.fusion.state import NavState
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence
 
@@ -143,3 +149,19 @@ def test_the_alternative_is_dropped_when_both_fit_or_when_it_is_too_old() -> Non
     assert aged.judge(False, fits_filter=True) == ()
     assert aged.alternative is None
     assert aged.ekf.state.b_a[0] == 0.0
+
+
+def test_a_false_displacement_lets_the_networks_turn_decay_once() -> None:
+    ekf, zero = StateCloningEkf(slots=1), np.zeros(3)
+    ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, 1e-4 * np.eye(15)))
+    slot = ekf.clone()
+    ekf.state = replace(with_turn(ekf.state, 0.05), network_turn=0.1)
+    updates = DisplacementUpdates(ekf, FilterConfig(update_rate=2))
+    updates.hypotheses.alternative = AlternativeHypothesis(ekf.state, 0.0, zero)
+    result, _ = updates.update(slot, np.eye(3), np.array([5.0, 0.0, 0.0]), 1e-4 * np.eye(3))
+    alternative = updates.hypotheses.alternative
+    assert result.gated
+    assert alternative is not None
+    assert len(alternative.outliers) == 1
+    for state in (ekf.state, alternative.ekf):
+        assert state.network_turn == pytest.approx(0.1 * np.exp(-0.5 / TURN_SECONDS), rel=1e-9)
