@@ -9,7 +9,6 @@ if TYPE_CHECKING:
     from stario.fusion.config import GraphConfig as GraphConfig
     from stario.fusion.config import NavigatorConfig as NavigatorConfig
     from stario.fusion.config import read_config as read_config
-    from stario.fusion.continuous import ContinuousPose as ContinuousPose
     from stario.fusion.evaluation.compare import Comparison as Comparison
     from stario.fusion.evaluation.compare import compare as compare
     from stario.fusion.evaluation.compare import demonstration as demonstration
@@ -26,11 +25,12 @@ if TYPE_CHECKING:
     from stario.fusion.fixes import position_fix as position_fix
     from stario.fusion.fixes import velocity_fix as velocity_fix
     from stario.fusion.fixes import yaw_fix as yaw_fix
+    from stario.fusion.health import Health as Health
     from stario.fusion.imu.stateful import Predictor as Predictor
     from stario.fusion.live.run import LiveServer as LiveServer
     from stario.fusion.navigator import Navigator as Navigator
     from stario.fusion.recording import PreprocessedRecording as PreprocessedRecording
-    from stario.fusion.state import Health as Health
+    from stario.fusion.state import ContinuousPose as ContinuousPose
     from stario.fusion.state import Innovations as Innovations
     from stario.fusion.state import NavState as NavState
     from stario.fusion.state import SmoothedPose as SmoothedPose
@@ -38,11 +38,11 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "Comparison": "evaluation.compare",
-    "ContinuousPose": "continuous",
+    "ContinuousPose": "state",
     "FilterConfig": "config",
     "Fix": "fixes",
     "GraphConfig": "config",
-    "Health": "state",
+    "Health": "health",
     "Innovations": "state",
     "LiveServer": "live.run",
     "NavState": "state",

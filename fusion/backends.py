@@ -16,15 +16,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.estimates import (
-    ASSUMED,
-    Estimate,
-    nav_states,
-    smoothed_poses,
-    with_actual_covariances,
-)
+from stario.fusion.filter.ekf_state import Estimate, nav_states, smoothed_poses
 from stario.fusion.filter.estimator import Estimator
-from stario.fusion.filter.estimator_state import IntervalMeasurements
+from stario.fusion.filter.estimator_state import IntervalMeasurements, innovations_of
 from stario.fusion.filter.frame_transform import (
     frame_rotation,
     smoothed_track,
@@ -32,8 +26,10 @@ from stario.fusion.filter.frame_transform import (
     with_undirected,
 )
 from stario.fusion.filter.initial import PriorPose
+from stario.fusion.filter.jacobians import ASSUMED
 from stario.fusion.fixes import Fix, FixQueue
 from stario.fusion.graph.batch import smooth
+from stario.fusion.graph.covariances import with_actual_covariances
 from stario.fusion.graph.fixed_lag import FixedLagEstimator
 from stario.fusion.imu.intervals import Start
 from stario.fusion.recording import PreprocessedRecording, Progress
@@ -148,7 +144,7 @@ def track_recording(
     health = queue.health(estimator.health(counts, solution.states[-1]))
     return track_from_states(
         solution.states,
-        estimator.innovations(),
+        innovations_of(filtered.measurements),
         replace(health, notes=[*health.notes, *solution.notes]),
         smoothed=solution.smoothed,
         seconds_network=recording.seconds_network,

@@ -13,6 +13,10 @@ from stario.sequences.sequence import FloatArray
 Vector = Sequence[float] | FloatArray
 """Three numbers."""
 
+_ROTATION_ERROR, _ROUNDING_ERROR = 1e-4, 1e-9
+"""Limits on |R R^T - I|: above the first a matrix is not a rotation; above the second its numbers
+were rounded."""
+
 
 def shaped(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
     """Return a copy of `value` as float64 of the given shape.
@@ -56,6 +60,22 @@ def checked(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
     if not np.isfinite(array).all():
         raise InputError(name, "a value that is not finite", "finite values")
     return array
+
+
+def checked_rotation(name: str, value: Any) -> FloatArray:
+    """Return a rotation matrix (3, 3); the nearest one if the numbers are rounded.
+
+    Raises:
+        InputError: as for `checked`, or the matrix is not a rotation.
+    """
+    R = checked(name, value, (3, 3))
+    error = np.abs(R @ R.T - np.eye(3)).max()
+    if error > _ROTATION_ERROR or np.linalg.det(R) < 0.0:
+        raise InputError(name, "a matrix that is not a rotation", "R R^T = I with det R = 1")
+    if error <= _ROUNDING_ERROR:
+        return R
+    left, _, right = np.linalg.svd(R)
+    return np.asarray(left @ right)
 
 
 def check_covariance(covariance: FloatArray) -> None:

@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from stario.fusion.checked import floored, shaped
-from stario.fusion.state import Health
+from stario.fusion.health import Health
 from stario.sequences.arrays import check_type
 from stario.sequences.sequence import FloatArray
 

@@ -72,6 +72,10 @@ def yaw_twist(R_WB: FloatArray) -> float:
 def yaw_rotation(R: FloatArray) -> FloatArray:
     """Return the rotation about the vertical (3, 3) with the yaw of R; identity if undefined."""
     s, c = twist(R)
-    norm = math.hypot(s, c)
-    s, c = (s / norm, c / norm) if norm > 0.0 else (0.0, 1.0)
+    return about_vertical(math.atan2(s, c))
+
+
+def about_vertical(angle: float) -> FloatArray:
+    """Return the rotation (3, 3) about the vertical by an angle [rad]."""
+    s, c = math.sin(angle), math.cos(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

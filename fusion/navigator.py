@@ -18,16 +18,16 @@ from numpy.typing import ArrayLike
 from stario.fusion.backends import BACKENDS, BackendName, StreamEstimator, track_recording
 from stario.fusion.checked import Vector, seconds, three
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.continuous import ContinuousPose, advanced, copied
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_fix
-from stario.fusion.imu.faults import ClockSetBackError, check_start
+from stario.fusion.health import Health
+from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
-from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.imu.intervals import ImuInterval, check_start
 from stario.fusion.imu.stateful import Predictor, StatefulInference, displacements_of
 from stario.fusion.recording import PreprocessedRecording, Progress, preprocess
 from stario.fusion.snapshot import check_same, pack, unpack
-from stario.fusion.state import Health, NavState, SmoothedPose, Track
+from stario.fusion.state import ContinuousPose, NavState, SmoothedPose, Track, advanced, copied
 from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence

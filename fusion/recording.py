@@ -10,9 +10,10 @@ from time import perf_counter
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.health import SampleCounts
 from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
-from stario.fusion.imu.intervals import ImuInterval, SampleCounts
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.stateful import (
     Displacement,
     Predictor,
@@ -85,7 +86,10 @@ def preprocess(
     measurements = _displacements(intervals, network, front_end.counts, progress)
     seconds_network = perf_counter() - began
     return PreprocessedRecording(
-        *(intervals, config.filter.update_rate, measurements, front_end),
+        intervals=intervals,
+        update_rate=config.filter.update_rate,
+        measurements=measurements,
+        front_end=front_end,
         seconds_front_end=seconds_front_end,
         seconds_network=seconds_network,
     )

@@ -4,7 +4,7 @@ Format: an npz (a zip of arrays). Its member `tree` is the UTF-8 text, as bytes,
 which `{"array": k}` stands for the member `a<k>`, `{"tuple": [...]}` and
 `{"deque": [...], "maxlen": n}` for such sequences, `{"map": [[key, value], ...]}` for a
 dictionary whose keys are not strings, and `{"is": name, "has": {...}}` for an object of a class in
-`_HOLDS`; NaN and infinity are written as NaN and Infinity. The tree contains
+`_PACKAGES` and `_MODULES`; NaN and infinity are written as NaN and Infinity. The tree contains
 
     format     "stario snapshot"
     version    version of this layout; others are refused
@@ -26,6 +26,7 @@ from __future__ import annotations
 import importlib
 import io
 import json
+import pkgutil
 import zipfile
 from collections import deque
 from functools import cache
@@ -38,24 +39,21 @@ from stario.sequences.errors import InputError
 FORMAT, VERSION = "stario snapshot", 19
 
 
-_HOLDS = """
-fusion.config fusion.continuous fusion.filter.displacements fusion.filter.ekf_state
-fusion.filter.estimates fusion.filter.estimator_state fusion.filter.frame_transform
-fusion.filter.gyro_bias fusion.filter.hypotheses fusion.filter.initial
-fusion.filter.magnetic_reference fusion.filter.map_frame fusion.filter.network_errors
-fusion.filter.planar_alignment fusion.filter.zero_velocity fusion.fixes fusion.graph.bearing
-fusion.graph.builder fusion.graph.factors fusion.graph.fixed_lag fusion.graph.keyframe_state
-fusion.graph.keyframes fusion.graph.whitening fusion.imu.buffers fusion.imu.front_end
-fusion.imu.faults fusion.imu.frozen fusion.imu.intervals fusion.imu.preintegration
-sequences.attitude.levelling sequences.noise
+_PACKAGES = ("fusion.filter", "fusion.graph", "fusion.imu")
+_MODULES = """
+fusion.config fusion.fixes fusion.health fusion.state sequences.attitude.levelling sequences.noise
 """
-"""Modules whose classes a snapshot may hold: plain data, rebuilt from their attributes."""
+"""Packages and modules whose classes a snapshot may hold: plain data, rebuilt from attributes."""
 
 
 @cache
 def _classes() -> dict[str, type]:
     """Return every class that a snapshot may hold, by name."""
-    modules = [importlib.import_module(f"stario.{name}") for name in _HOLDS.split()]
+    names = _MODULES.split()
+    for package in _PACKAGES:
+        path = importlib.import_module(f"stario.{package}").__path__
+        names += [f"{package}.{module.name}" for module in pkgutil.iter_modules(path)]
+    modules = [importlib.import_module(f"stario.{name}") for name in names]
     return {
         name: each
         for module in modules

@@ -1,14 +1,15 @@
-"""Results of a navigator: states, tracks, innovations and the health report."""
+"""Results of a navigator: states, poses, tracks and innovations."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.fusion.health import Health
 from stario.sequences.sequence import BoolArray, FloatArray, Trajectory
 
 T = TypeVar("T")
@@ -114,6 +115,61 @@ class SmoothedPose:
     map_frame: int = 0
 
 
+MAX_STEP = 0.01
+"""Largest part of the correction bled in from one state to the next [m]."""
+
+BLEED_SECONDS = 1.0
+"""Time constant for bleeding in a small correction [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class ContinuousPose:
+    """A pose whose position does not step at updates.
+
+    Attributes:
+        time: [s].
+        p_W: (3,) position [m].
+        R_WB: (3, 3) attitude, that of the corrected state.
+        v_W: (3,) velocity of the corrected state [m/s].
+        correction_W: (3,) corrected minus continuous position, not yet bled in [m].
+        map_frame: as in `NavState`; the position is reset when fixes move the frame.
+    """
+
+    time: float
+    p_W: FloatArray
+    R_WB: FloatArray
+    v_W: FloatArray
+    correction_W: FloatArray
+    map_frame: int = 0
+
+
+def advanced(before: ContinuousPose | None, state: NavState) -> ContinuousPose:
+    """Advance the pose to a state: by the mean velocity and a bounded part of the correction.
+
+    It starts at the corrected position, and is reset to it when the frame moves and after a gap,
+    in which the motion is unknown.
+
+    Args:
+        before: pose at the previous state, None at first.
+        state: the newest state.
+    """
+    p_W = state.p_W
+    if before is not None and before.map_frame == state.map_frame and not state.in_gap:
+        dt = state.time - before.time
+        integrated = before.p_W + 0.5 * dt * (before.v_W + state.v_W)
+        error = state.p_W - integrated
+        part = -math.expm1(-dt / BLEED_SECONDS) * error
+        p_W = integrated + part * min(1.0, MAX_STEP / max(float(np.linalg.norm(part)), 1e-12))
+    correction_W = state.p_W - p_W
+    return ContinuousPose(state.time, p_W, state.R_WB, state.v_W, correction_W, state.map_frame)
+
+
+def copied(pose: ContinuousPose) -> ContinuousPose:
+    """Return a copy whose arrays the caller may write to."""
+    arrays = {k: v.copy() for k, v in vars(pose).items() if isinstance(v, np.ndarray)}
+    return changed(pose, **arrays)
+
+
 @dataclass(frozen=True, eq=False)
 class Innovations:
     """Innovations (measured minus predicted displacement) of all updates.
@@ -131,90 +187,6 @@ class Innovations:
     sigma: FloatArray
     nis: FloatArray
     gated: BoolArray
-
-
-@dataclass
-class Health:
-    """Report of a run: counts by reason, and final uncertainty.
-
-    Attributes:
-        samples: number used, and numbers dropped by reason.
-        flagged: of those used, replaced spikes and samples at the sensor's limit.
-        gap_count: number of stretches without samples.
-        longest_gap: length of the longest gap [s].
-        gaps: start and length [s] of the latest gaps, at most a hundred.
-        updates: number of network measurements offered.
-        gated: of these, number whose covariance was inflated.
-        refused: of these, numbers refused by reason.
-        mean_nis: mean normalised innovation squared; its expectation is `nis_expected`.
-        nis_expected: degrees of freedom of a measurement.
-        fixes: numbers of fixes applied (of these gated), and refused by reason.
-        zero_velocity: numbers of zero-velocity updates (one per state) applied, and refused by
-            reason.
-        bearings: numbers of magnetic bearings, likewise; 1 under "north" if they determined it.
-        accel_noise_factor: final factor on the accelerometer's configured noise density, estimated
-            from the innovations.
-        network_error_level: final variance of the network's errors that change within seconds, as a
-            fraction of what it predicts, estimated from the innovations; 1 if not estimated.
-        final_sigma: final standard deviations, the largest in any direction (the semi-axis of the
-            ellipse): tilt and yaw [rad], velocity [m/s], horizontal position and height [m], biases
-            [rad/s], [m/s^2].
-        notes: further remarks, one line each, such as a graph that fell back to the filter.
-    """
-
-    samples: dict[str, int] = field(default_factory=dict)
-    flagged: dict[str, int] = field(default_factory=dict)
-    gap_count: int = 0
-    longest_gap: float = 0.0
-    gaps: list[tuple[float, float]] = field(default_factory=list)
-    updates: int = 0
-    gated: int = 0
-    refused: dict[str, int] = field(default_factory=dict)
-    mean_nis: float = float("nan")
-    nis_expected: int = 3
-    fixes: dict[str, int] = field(default_factory=dict)
-    zero_velocity: dict[str, int] = field(default_factory=dict)
-    bearings: dict[str, int] = field(default_factory=dict)
-    accel_noise_factor: float = 1.0
-    network_error_level: float = 1.0
-    final_sigma: dict[str, float] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-
-    def lines(self) -> list[str]:
-        """Format the counts as text; `stario.fusion.report.health` interprets them."""
-        dropped = {k: v for k, v in self.samples.items() if k != "used" and v}
-        text = [f"samples used {self.samples.get('used', 0)}, dropped {_counted(dropped)}"]
-        if any(self.flagged.values()):
-            text.append(f"samples flagged: {_counted(self.flagged)}")
-        text.append(f"gaps {self.gap_count}, longest {self.longest_gap:.2f} s")
-        if self.updates:
-            text.append(
-                f"updates {self.updates}, gated {self.gated / self.updates:.1%}, "
-                f"refused {_counted(self.refused)}, "
-                f"mean NIS {self.mean_nis:.2f} (expected {self.nis_expected})"
-            )
-        else:
-            text.append("updates none: no window was complete, or the device was stationary")
-        if self.fixes:
-            text.append(f"fixes {_counted(self.fixes)}")
-        if self.zero_velocity:
-            text.append(f"zero-velocity updates {_counted(self.zero_velocity)}")
-        if self.bearings:
-            text.append(f"bearings of the magnetic field {_counted(self.bearings)}")
-        if self.accel_noise_factor > 1.0:
-            text.append(
-                f"accelerometer noise {self.accel_noise_factor:.1f} times the configured one"
-            )
-        if self.network_error_level != 1.0:
-            level = math.sqrt(self.network_error_level)
-            text.append(f"network's errors within seconds {level:.1f} times their predicted sigma")
-        sigma = ", ".join(f"{k} {v:.3g}" for k, v in self.final_sigma.items())
-        return [*text, f"final sigma: {sigma}"]
-
-
-def _counted(counts: dict[str, int]) -> str:
-    """Format counts by reason; `none` if there are none."""
-    return ", ".join(f"{reason} {n}" for reason, n in counts.items()) or "none"
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ import numpy as np
 
 from stario.fusion.evaluation.judging.direction import Direction, direction
 from stario.fusion.evaluation.judging.network_alone import predict_stream
-from stario.fusion.imu.intervals import UNFAMILIAR_SHARE
+from stario.fusion.health import UNFAMILIAR_SHARE
 from stario.network.known_motion import FEATURES, features, step_rates
 from stario.network.model import DisplacementModel
 from stario.sequences.levelled_stream import levelled_streams

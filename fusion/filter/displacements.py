@@ -1,32 +1,26 @@
-"""Updates with the network's displacements, including false ones, and what their innovations tell.
+"""Updates with the network's displacements, and the alternative hypothesis that outliers open.
 
-README.md, "Gates" (the alternative hypothesis: recent outliers share a steady error),
-"Noise and the gyroscope's bias" (the accelerometer's factor, by stochastic approximation: Robbins
-and Monro 1951) and "Fixes" (the network's turn, a Gauss-Markov state once fixes tell the direction;
-without them it cannot be distinguished from the yaw, and is zero).
+Under the alternative, recent outliers share a steady error. README.md, "Gates".
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import TypeVar
 
 import numpy as np
 
 from stario.fusion.config import FilterConfig
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import EkfState, gauss_markov
+from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.engine import GateMode, UpdateResult
-from stario.fusion.filter.hypotheses import AlternativeHypothesis, HypothesisPair
-from stario.fusion.filter.jacobians import CORE, plain_covariance
 from stario.fusion.filter.network_errors import (
-    FIRST_GAIN,
+    AccelNoiseScale,
     ErrorLevel,
     displacement_errors,
-    next_gain,
+    propagated_turn,
 )
 from stario.fusion.lie import yaw_rotation
 from stario.fusion.state import changed
@@ -48,46 +42,99 @@ _OFFSET_SCALE = 10.0
 _ALTERNATIVE_GATE = 0.95
 """Probability of the chi-square test beyond which a displacement does not fit the alternative."""
 
-TARGET_NIS = 0.3
-"""Target for the median NIS per degree of freedom: the network's errors are correlated over
-seconds, so consistent innovations are smaller than single errors."""
+_FITS_TO_REPLACE = 2
+"""Displacements that must fit only the alternative before it replaces the filter's state."""
 
-MAX_FACTOR = 15.0
-"""Maximum noise factor: the accelerometer then rules out little more than jumps."""
+_FITS_TO_DROP = 4
+"""Consecutive displacements that fit both before the alternative is dropped: outliers were few."""
 
-_STEPS = 4
-"""Number of noise factors per doubling, so that few different noise models are created."""
+_MAX_SECONDS = 6.0
+"""Maximum age of the alternative [s]: an error that lasts longer is not taken for false."""
 
-TURN_SECONDS = 60.0
-"""Correlation time of the network's turn [s]."""
+Result = TypeVar("Result")
 
 
-@dataclass(frozen=True)
-class AccelNoiseScale:
-    """Factor by which the accelerometer is noisier than configured.
+@dataclass(frozen=True, eq=False)
+class AlternativeHypothesis:
+    """State of the filter if the displacements since an outlier contained one steady error.
+
+    Less this error they still measure how the velocity changes. Without that, tilt and bias of the
+    accelerometer would soon explain any displacement.
 
     Attributes:
-        log_factor: natural logarithm of the factor on its noise density.
-        gain: step size for the next displacement.
+        ekf: state of the filter under this hypothesis.
+        start_time: time of the first outlier [s].
+        offset_W: (3,) the steady error, from the residuals of the outliers [m].
+        outliers: times of the displacements that do not fit as they are [s].
+        exclusive_fits: number of displacements that fitted only the alternative since the last one
+            that fitted only the filter.
+        shared_fits: number of latest displacements in a row that fitted both.
     """
 
-    log_factor: float = 0.0
-    gain: float = FIRST_GAIN
+    ekf: EkfState
+    start_time: float
+    offset_W: FloatArray
+    outliers: tuple[float, ...] = ()
+    exclusive_fits: int = 0
+    shared_fits: int = 0
 
-    @property
-    def factor(self) -> float:
-        """Factor on the noise density, in steps."""
-        return float(2.0 ** (round(_STEPS * self.log_factor / math.log(2.0)) / _STEPS))
 
-    def updated(self, result: UpdateResult) -> AccelNoiseScale:
-        """Return the scale after one displacement; unchanged if it has no innovation."""
-        if not math.isfinite(result.gate_nis):
-            return self
-        ratio = (result.gate_nis / (TARGET_NIS * result.dof)) ** 2
-        excess = 1.0 - 2.0 / (ratio + 1.0)
-        log_factor = self.log_factor + self.gain * excess
-        log_factor = min(max(log_factor, 0.0), math.log(MAX_FACTOR))
-        return AccelNoiseScale(log_factor, next_gain(self.gain))
+class HypothesisPair:
+    """A filter and its alternative hypothesis, if there is one.
+
+    Args:
+        ekf: the filter; its state is set aside while the alternative is updated.
+
+    Attributes:
+        ekf: the filter.
+        alternative: the alternative hypothesis; None while all displacements fit.
+    """
+
+    def __init__(self, ekf: StateCloningEkf) -> None:
+        self.ekf = ekf
+        self.alternative: AlternativeHypothesis | None = None
+
+    def apply_to_both(self, work: Callable[[], Result]) -> Result:
+        """Apply `work` to the filter and then to the alternative; return the filter's result."""
+        result = work()
+        self.apply_to_alternative(work)
+        return result
+
+    def apply_to_alternative(self, work: Callable[[], Result]) -> Result | None:
+        """Apply `work` to the alternative, if there is one; return its result."""
+        if self.alternative is None:
+            return None
+        filter_state, self.ekf.state = self.ekf.state, self.alternative.ekf
+        result = work()
+        self.alternative = changed(self.alternative, ekf=self.ekf.state)
+        self.ekf.state = filter_state
+        return result
+
+    def judge(self, fits: bool, fits_filter: bool) -> tuple[float, ...]:
+        """Count a displacement that both have applied; adopt or drop the alternative.
+
+        Args:
+            fits: whether it fitted the alternative as it is.
+            fits_filter: whether it fitted the filter.
+
+        Returns:
+            Times of the displacements [s] that were false after all, since the alternative without
+            them is adopted; empty otherwise.
+        """
+        alternative = self.alternative
+        if alternative is None:
+            return ()
+        exclusive = alternative.exclusive_fits + (fits and not fits_filter)
+        if fits_filter and not fits:
+            exclusive = 0
+        shared = alternative.shared_fits + 1 if fits_filter and fits else 0
+        if exclusive >= _FITS_TO_REPLACE:
+            self.ekf.state, self.alternative = alternative.ekf, None
+            return alternative.outliers
+        self.alternative = changed(alternative, exclusive_fits=exclusive, shared_fits=shared)
+        if shared >= _FITS_TO_DROP or alternative.ekf.time - alternative.start_time > _MAX_SECONDS:
+            self.alternative = None
+        return ()
 
 
 class DisplacementUpdates:
@@ -125,6 +172,7 @@ class DisplacementUpdates:
             covariance_N: (3, 3) covariance of the displacement [m^2].
         """
         f, before = self._config, self._ekf.state
+        self.hypotheses.apply_to_both(self._propagate_turn)
         rare = self.outlier_share < _RARE_SHARE
         update = partial(self._update, slot, R_NB, d_N, covariance_N)
         result = update(f.gate, power=_RARE_POWER if rare else 1.0)
@@ -139,8 +187,25 @@ class DisplacementUpdates:
             first = AlternativeHypothesis(before, before.time, result.residual, (before.time,))
             self.hypotheses.alternative = first
         elif result.accepted:
-            return result, self.hypotheses.compare(partial(_tested, update), not result.gated)
+            fits = self._update_alternative(update)
+            return result, self.hypotheses.judge(fits, not result.gated)
         return result, ()
+
+    def _update_alternative(self, update: Callable[..., UpdateResult]) -> bool:
+        """Update the alternative with a displacement: as it is if it fits, else less the offset.
+
+        Return whether it fits.
+        """
+        result = self.hypotheses.apply_to_alternative(partial(update, _ALTERNATIVE_GATE, "reject"))
+        alternative = self.hypotheses.alternative
+        if result is None or alternative is None or result.accepted or result.residual is None:
+            return True
+        offset_W = alternative.offset_W
+        offset_W = offset_W + _OFFSET_GAIN * (result.residual - offset_W)
+        outliers = (*alternative.outliers, alternative.ekf.time)
+        self.hypotheses.alternative = changed(alternative, offset_W=offset_W, outliers=outliers)
+        self.hypotheses.apply_to_alternative(partial(update, None, offset_W=offset_W))
+        return False
 
     def _update(
         self,
@@ -155,9 +220,6 @@ class DisplacementUpdates:
     ) -> UpdateResult:
         """Update the filter's current state, with the displacement less an offset (3,) [m]."""
         f = self._config
-        self._ekf.state = propagated_turn(
-            self._ekf.state, 1.0 / f.update_rate, f.network_turn_sigma
-        )
         R_WN = yaw_rotation(self._ekf.state.clone_pose(slot)[0] @ R_NB.T)
         # Values that are not finite are rejected and counted by the filter.
         with np.errstate(invalid="ignore"):
@@ -169,66 +231,13 @@ class DisplacementUpdates:
                 level, has_turn = self.error_level.level, self._ekf.state.has_turn
                 errors = displacement_errors(d_W, covariance_W, level, has_turn, f)
             limit = None if gate is None else chi2_quantile(gate, 3)
+            covariance_W = f.overlap_scale * covariance_W
             return self._ekf.update_displacement(
-                *(slot, None, d_W, f.overlap_scale * covariance_W),
-                *(limit, gate_mode, power, errors),
+                slot, None, d_W, covariance_W, limit, gate_mode, power, errors
             )
 
-
-def _tested(
-    update: Callable[..., UpdateResult], alternative: AlternativeHypothesis
-) -> AlternativeHypothesis:
-    """Update an alternative with a displacement: as it is if it fits, otherwise less the offset.
-
-    Args:
-        update: updates the filter's current state, which is the alternative's.
-        alternative: the alternative.
-
-    Returns:
-        The alternative, with one more outlier if the displacement did not fit.
-    """
-    result = update(_ALTERNATIVE_GATE, "reject")
-    if result.accepted or result.residual is None:
-        return alternative
-    offset_W = alternative.offset_W
-    offset_W = offset_W + _OFFSET_GAIN * (result.residual - offset_W)
-    update(None, offset_W=offset_W)
-    outliers = (*alternative.outliers, alternative.ekf.time)
-    return changed(alternative, offset_W=offset_W, outliers=outliers)
-
-
-class TurnEstimate(NamedTuple):
-    """A filter's estimate of the network's turn, for a graph that starts from its state."""
-
-    turn: float
-    """The turn [rad]."""
-    covariance: FloatArray
-    """(16,) covariance with the plain errors of the state (order of `NavState.covariance`), then
-    the turn's variance."""
-
-
-def turn_estimate(s: EkfState) -> TurnEstimate | None:
-    """Return a filter's estimate of the network's turn; None while it is not estimated."""
-    if not s.has_turn:
-        return None
-    rows = [*range(CORE), s.turn_row]
-    P = plain_covariance(s.P[rows][:, rows], s.X[0, :, 3:].T)
-    return TurnEstimate(s.network_turn, P[CORE])
-
-
-def with_turn(s: EkfState, sigma: float) -> EkfState:
-    """Return the state with the network's turn estimated from now on, with prior sigma [rad]."""
-    if s.has_turn or sigma == 0.0:
-        return s
-    P = s.covariances.copy()
-    P[:, s.turn_row, s.turn_row] = sigma**2
-    return changed(s, covariances=P)
-
-
-def propagated_turn(s: EkfState, seconds: float, sigma: float) -> EkfState:
-    """Return the state with the network's turn propagated over a time [s], if it has one."""
-    if not s.has_turn:
-        return s
-    correlation = math.exp(-seconds / TURN_SECONDS)
-    P = gauss_markov(s.covariances, s.turn_row, correlation, sigma)
-    return changed(s, covariances=P, network_turn=correlation * s.network_turn)
+    def _propagate_turn(self) -> None:
+        f = self._config
+        self._ekf.state = propagated_turn(
+            self._ekf.state, 1.0 / f.update_rate, f.network_turn_sigma
+        )

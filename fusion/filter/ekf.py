@@ -12,11 +12,11 @@ import math
 
 import numpy as np
 
-from stario.fusion.checked import check_covariance, checked
-from stario.fusion.filter.ekf_state import EkfState, FieldState, with_considered_propagated
+from stario.fusion.checked import check_covariance, checked, checked_rotation
+from stario.fusion.filter.ekf_state import EkfState, FieldState
 from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult
-from stario.fusion.filter.estimates import ACTUAL
 from stario.fusion.filter.jacobians import (
+    ACTUAL,
     CLONE,
     CORE,
     bearing_jacobian,
@@ -28,11 +28,10 @@ from stario.fusion.filter.jacobians import (
     velocity_jacobian,
     yaw_jacobian,
 )
-from stario.fusion.filter.network_errors import DisplacementErrors
+from stario.fusion.filter.network_errors import DisplacementErrors, with_considered_propagated
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.lie import exp_times, yaw_twist
+from stario.fusion.lie import about_vertical, exp_times, yaw_twist
 from stario.fusion.state import NavState, changed
-from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 
@@ -87,10 +86,8 @@ class StateCloningEkf(ErrorStateEngine):
         v, p, b_g, b_a = (
             checked(name, getattr(state, name), (3,)) for name in ("v_W", "p_W", "b_g", "b_a")
         )
-        R = checked("R_WB", state.R_WB, (3, 3))
+        R = checked_rotation("R_WB", state.R_WB)
         covariance = checked("covariance", state.covariance, (CORE, CORE))
-        if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
-            raise InputError("R_WB", "a matrix that is not a rotation", "R R^T = I with det R = 1")
         check_covariance(covariance)
         now = checked("time", state.time, ()).item()
         self.state = EkfState.initial(NavState(now, R, v, p, b_g, b_a, covariance), self.slots)
@@ -194,7 +191,7 @@ class StateCloningEkf(ErrorStateEngine):
         p_i, p_j = X[1 + slot_i, :, 4], X[0 if slot_j is None else 1 + slot_j, :, 4]
         blocks = displacement_jacobian(p_i, p_j, slot_i, slot_j)
         if s.has_turn:
-            d_W = exp_so3(np.array([0.0, 0.0, -s.network_turn])) @ d_W
+            d_W = about_vertical(-s.network_turn) @ d_W
             blocks.append(turn_jacobian(p_j - p_i, s.turn_row))
         noise = None
         if errors is not None:

@@ -8,13 +8,13 @@ estimates of a recording are converted to them at its end.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.filter.estimates import ACTUAL, ASSUMED, Estimate
-from stario.fusion.filter.jacobians import CLONE, CORE, plain_covariance
-from stario.fusion.state import NavState, changed
+from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CLONE, CORE, plain_covariance
+from stario.fusion.state import NavState, SmoothedPose, changed
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
@@ -35,6 +35,9 @@ _MAX_ORIGIN_DISTANCE = 1e3
 right-invariant error they multiply the attitude error, which leaves no digits for centimetres when
 they are map coordinates."""
 
+_CHUNK = 2000
+"""Number of estimates converted at a time: all of an hour would take hundreds of megabytes."""
+
 
 @dataclass(frozen=True, eq=False)
 class FieldState:
@@ -50,6 +53,33 @@ class FieldState:
     azimuth: float
     wander: float
     hard_iron_B: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """A filter's estimate of its newest state, or of a clone.
+
+    Attributes:
+        time: [s].
+        X: (3, 5) R_WB, v_W, p_W; for a clone (3, 4) R_WB, p_W. The position is relative to
+            `origin_W`.
+        origin_W: (3,) [m].
+        b_g: (3,) gyroscope bias [rad/s].
+        b_a: (3,) accelerometer bias [m/s^2].
+        covariances: (2, 15, 15) of theta, rho_v, rho_p, d_bg, d_ba, or for a clone (2, 6, 6) of
+            theta, rho_p: as assumed for the gains, and as it is (see `EkfState`).
+        in_gap: as in `NavState`.
+        map_frame: as in `NavState`.
+    """
+
+    time: float
+    X: FloatArray
+    origin_W: FloatArray
+    b_g: FloatArray
+    b_a: FloatArray
+    covariances: FloatArray
+    in_gap: bool = False
+    map_frame: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +101,7 @@ class EkfState:
         clone_times: times of the clones [s]; None for an empty slot.
         considered_time: time up to which the considered errors are propagated [s].
         network_turn: yaw error (turn) of the network's displacements, positive left [rad]; fixed at
-            zero until fixes determine the direction (`displacements.py`).
+            zero until fixes determine the direction (`network_errors.py`).
         field: the magnetic field; None before its first measurement.
     """
 
@@ -127,14 +157,9 @@ class EkfState:
         """Position (3,) [m]."""
         return np.asarray(self.X[0, :, 4] + self.origin_W)
 
-    @property
-    def plain_covariance(self) -> FloatArray:
-        """Covariance (15, 15) of plain errors, each true minus estimate.
-
-        Order: rotation about W's axes [rad] (R = (I + [theta]x) R^), velocity [m/s] and position
-        [m] in W, biases [rad/s], [m/s^2].
-        """
-        return plain_covariance(self.P_actual[:CORE, :CORE], self.X[0, :, 3:].T)
+    def nav_state(self) -> NavState:
+        """Return the current state with plain errors."""
+        return nav_states([self.estimate()])[0]
 
     @property
     def turn_row(self) -> int:
@@ -261,30 +286,35 @@ class EkfState:
         return [(0, 6), *((first, first + 3) for first in rows)]
 
 
-def with_considered_propagated(s: EkfState) -> EkfState:
-    """Return the state with its considered errors propagated from their own time to the state's.
-
-    Each takes a Gauss-Markov step of unit variance. Only displacements ask for them.
-    """
-    kept, rows = np.exp((s.considered_time - s.time) / CONSIDERED_SECONDS), s.considered_rows
-    P = s.covariances.copy()
-    P[ACTUAL, rows] *= kept[:, None]
-    P[ACTUAL, :, rows] *= kept
-    P[ACTUAL, rows, rows] += np.diag(1.0 - kept * kept)
-    return changed(s, covariances=P, considered_time=s.time)
-
-
-def gauss_markov(covariances: FloatArray, row: int, kept: float, sigma: float) -> FloatArray:
-    """Return covariances (..., n, n) after one error has taken a Gauss-Markov step.
+def plain_covariances(estimates: Sequence[Estimate], which: int = ACTUAL) -> FloatArray:
+    """Return covariances (N, n, n) of plain errors in W's axes, each true minus estimate.
 
     Args:
-        covariances: before the step.
-        row: row of the error, which varies about zero.
-        kept: correlation of the error with its value before the step.
-        sigma: stationary standard deviation of the error.
+        estimates: N estimates of newest states, or of clones.
+        which: `ACTUAL` or `ASSUMED`.
     """
-    P = covariances.copy()
-    P[..., row, :] *= kept
-    P[..., :, row] *= kept
-    P[..., row, row] += (1.0 - kept**2) * sigma**2
-    return P
+    P = np.array([e.covariances[which] for e in estimates])
+    X = np.array([e.X for e in estimates])
+    return plain_covariance(P, X[:, :, 3:].transpose(0, 2, 1))
+
+
+def nav_states(estimates: Sequence[Estimate], which: int = ACTUAL) -> list[NavState]:
+    """Convert estimates of newest states to `NavState`; arguments as `plain_covariances`."""
+    states = []
+    for k in range(0, len(estimates), _CHUNK):
+        part = estimates[k : k + _CHUNK]
+        for e, covariance in zip(part, plain_covariances(part, which), strict=True):
+            pose = e.X[:, :3], e.X[:, 3], e.X[:, 4] + e.origin_W
+            biases = e.b_g.copy(), e.b_a.copy()  # those of `e` are the filter's own
+            states.append(NavState(e.time, *pose, *biases, covariance, e.in_gap, e.map_frame))
+    return states
+
+
+def smoothed_poses(clones: Sequence[Estimate]) -> list[SmoothedPose]:
+    """Convert estimates of clones to `SmoothedPose`."""
+    if not clones:
+        return []
+    return [
+        SmoothedPose(e.time, e.X[:, :3], e.X[:, 3] + e.origin_W, covariance, e.map_frame)
+        for e, covariance in zip(clones, plain_covariances(clones), strict=True)
+    ]

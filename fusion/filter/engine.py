@@ -14,17 +14,15 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
-from scipy.linalg.blas import dgemm
 from scipy.linalg.lapack import dpotrf, dtrtri
 
-from stario.fusion.filter.estimates import ACTUAL, ASSUMED
-from stario.fusion.filter.jacobians import CORE, Block
+from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CORE, Block
 from stario.sequences.sequence import FloatArray
 
 GateMode = Literal["inflate", "reject"]
 
 _JOSEPH_RATIO = 1e9
-"""Ratio of state to measurement variance above which P - W^T W would lose its digits."""
+"""Ratio of innovation to measurement variance above which differences of P lose their digits."""
 
 
 class UpdateResult(NamedTuple):
@@ -134,33 +132,28 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
             are rejected with a reason; the state is then unchanged.
         """
         m = len(residual)
-        if not math.isfinite(residual @ residual + np.vdot(covariance, covariance)):
-            return UpdateResult(math.nan, m, False, reason="value that is not finite")
-        if dpotrf(covariance, lower=1)[1] != 0:
-            return UpdateResult(math.nan, m, False, reason="covariance not positive definite")
+        if reason := fault_of(residual, covariance):
+            return UpdateResult(math.nan, m, False, reason=reason)
         HP = _sum([H @ self.covariances[:, first : first + H.shape[1]] for first, H in blocks])
         HPH = _sum([HP[:, :, first : first + H.shape[1]] @ H.T for first, H in blocks])
-        noise = covariance if noise is None else noise
-        nis, sigma = _normalised(residual, HPH[ACTUAL] + noise)
-        whitener = _whitener(HPH[gains_from] + covariance)
-        whitened = whitener @ residual
-        gate_nis = float(whitened @ whitened)
+        R = np.array((covariance, covariance if noise is None else noise))
+        S = HPH + R
+        nis, sigma = _square(_whitener(S[ACTUAL]) @ residual), np.sqrt(S[ACTUAL].diagonal())
+        whitener = _whitener(S[gains_from])
+        gate_nis = _square(whitener @ residual)
         scale = 1.0
         if gate is not None and gate_nis > gate:
             if gate_mode == "reject":
                 return UpdateResult(nis, m, False, 1.0, "gated", residual, sigma, gate_nis)
             scale = (gate_nis / gate) ** power
-            covariance = covariance * scale
-            whitener = _whitener(HPH[gains_from] + covariance)
+            R = R * scale
+            S = HPH + R
+            whitener = _whitener(S[gains_from])
         if not math.isfinite(gate_nis):
             return UpdateResult(math.nan, m, False, reason="innovation covariance not invertible")
-        if gains_from == ASSUMED:
-            P = self._correct(residual, blocks, covariance, HP[ASSUMED], HPH[ASSUMED], whitener)
-        else:
-            self._set_gain(residual, covariance, HP[ACTUAL], HPH[ACTUAL], whitener)
-            P = self._with_gain(ASSUMED, blocks, covariance, HP, HPH)
-        actual = self._with_gain(ACTUAL, blocks, scale * noise, HP, HPH)
-        self.inject(np.array((P, actual)))
+        self.R, self.S = R[gains_from], S[gains_from]
+        self._set_gain(residual, HP[gains_from], whitener)
+        self.inject(self._with_gain(blocks, R, HP, S))
         return UpdateResult(nis, m, True, scale, "", residual, sigma, gate_nis)
 
     def inject(self, covariances: FloatArray) -> None:
@@ -182,86 +175,73 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         self, covariances: FloatArray, transition: FloatArray, noise: FloatArray
     ) -> FloatArray:
         P = covariances.copy()
-        for which in (ASSUMED, ACTUAL):
-            P[which, :CORE] = transition @ P[which, :CORE]
+        P[:, :CORE] = transition @ P[:, :CORE]
         P[:, CORE:, :CORE] = P[:, :CORE, CORE:].transpose(0, 2, 1)
         core = P[:, :CORE, :CORE] @ transition.T + noise
         P[:, :CORE, :CORE] = 0.5 * (core + core.transpose(0, 2, 1))
         return P
 
-    def _correct(
-        self,
-        residual: FloatArray,
-        blocks: Sequence[Block],
-        covariance: FloatArray,
-        HP: FloatArray,
-        HPH: FloatArray,
-        whitener: FloatArray,
-    ) -> FloatArray:
-        """Return P - K S K^T, computed as P - W^T W with W = L^-1 H P, which is symmetric."""
-        W = self._set_gain(residual, covariance, HP, HPH, whitener)
-        if (HPH.diagonal() > _JOSEPH_RATIO * covariance.diagonal()).any():
-            return self._joseph(self.P, blocks, covariance)
-        # P is symmetric: its transpose is the same matrix in BLAS order.
-        P: FloatArray = dgemm(-1.0, W.T, W.T, beta=1.0, c=self.P.T, trans_b=1).T
-        return P
-
-    def _set_gain(
-        self,
-        residual: FloatArray,
-        covariance: FloatArray,
-        HP: FloatArray,
-        HPH: FloatArray,
-        whitener: FloatArray,
-    ) -> FloatArray:
-        """Set the gain and filterpy's attributes of the step; return W."""
-        W: FloatArray = whitener @ HP
-        self.R, self.S = covariance, HPH + covariance
+    def _set_gain(self, residual: FloatArray, HP: FloatArray, whitener: FloatArray) -> None:
+        """Set the gain and filterpy's attributes of the step."""
         self.SI = whitener.T @ whitener
-        self.K = (whitener.T @ W).T
+        self.K = (self.SI @ HP).T
         self.K[self._considered] = 0.0
         self.y = self.z = residual[:, None]
         self.x = self.K @ self.y
         self.x_post, self.P_prior = self.x, self.P
         self._log_likelihood = self._likelihood = self._mahalanobis = None
-        return W
 
     def _with_gain(
-        self,
-        which: int,
-        blocks: Sequence[Block],
-        covariance: FloatArray,
-        HP: FloatArray,
-        HPH: FloatArray,
+        self, blocks: Sequence[Block], R: FloatArray, HP: FloatArray, S: FloatArray
     ) -> FloatArray:
-        """Return a covariance after the update with the gain K, whatever determined it."""
-        P = self.covariances[which]
-        if (HPH[which].diagonal() > _JOSEPH_RATIO * covariance.diagonal()).any():
-            return self._joseph(P, blocks, covariance)
-        return with_gain(P, self.K, HP[which], HPH[which] + covariance)
-
-    def _joseph(self, P: FloatArray, blocks: Sequence[Block], covariance: FloatArray) -> FloatArray:
-        """Return (I - K H) P (I - K H)^T + K R K^T: slower, but without cancellation."""
-        A = np.eye(len(P))
+        """Return both covariances after the update with the gain K, whatever determined it."""
+        P, K = self.covariances, self.K
+        if not (S.diagonal(0, 1, 2) > _JOSEPH_RATIO * R.diagonal(0, 1, 2)).any():
+            return with_gain(P, K, HP, S)
+        # Joseph's form is slower, but without cancellation.
+        A = np.eye(P.shape[1])
         for first, H in blocks:
-            A[:, first : first + H.shape[1]] -= self.K @ H
-        P = A @ P @ A.T + self.K @ covariance @ self.K.T
-        return np.asarray(0.5 * (P + P.T))
+            A[:, first : first + H.shape[1]] -= K @ H
+        P = A @ P @ A.T + K @ R @ K.T
+        return np.asarray(0.5 * (P + P.transpose(0, 2, 1)))
+
+
+def fault_of(value: FloatArray, covariance: FloatArray) -> str:
+    """Return why a measurement cannot be used; empty if it can."""
+    if not math.isfinite(np.vdot(value, value) + np.vdot(covariance, covariance)):
+        return "value that is not finite"
+    return "covariance not positive definite" if dpotrf(covariance, lower=1)[1] else ""
 
 
 def with_gain(P: FloatArray, K: FloatArray, HP: FloatArray, S: FloatArray) -> FloatArray:
-    """Return a covariance after an update with any gain, S being H P H^T + R.
+    """Return covariances (..., n, n) after an update with any gain, S being H P H^T + R.
 
     (I - K H) P (I - K H)^T + K R K^T = P - K H P - (K H P)^T + K S K^T
     """
     half = K @ (HP - 0.5 * S @ K.T)
-    return np.asarray(P - half - half.T)
+    return np.asarray(P - half - half.swapaxes(-1, -2))
 
 
-def _normalised(residual: FloatArray, covariance: FloatArray) -> tuple[float, FloatArray]:
-    """Return the normalised square (NaN if there is none) and sigmas of a residual."""
-    white = _whitener(covariance) @ residual
-    return float(white @ white), np.sqrt(covariance.diagonal())
+def gauss_markov(
+    covariances: FloatArray, rows: slice, kept: FloatArray, sigma: float
+) -> FloatArray:
+    """Return covariances (..., n, n) after errors have taken a Gauss-Markov step.
+
+    Args:
+        covariances: before the step.
+        rows: the k rows of the errors, which vary about zero, independently of each other.
+        kept: (k,) correlation of each error with its value before the step.
+        sigma: stationary standard deviation of the errors.
+    """
+    P = covariances.copy()
+    P[..., rows, :] *= kept[:, None]
+    P[..., :, rows] *= kept
+    P[..., rows, rows] += np.diag((1.0 - kept * kept) * sigma**2)
+    return P
+
+
+def _square(white: FloatArray) -> float:
+    return float(white @ white)
 
 
 def _sum(terms: list[FloatArray]) -> FloatArray:

@@ -11,16 +11,13 @@ from collections.abc import Sequence
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.displacements import DisplacementUpdates
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.filter.estimates import Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.ekf_state import EkfState, Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.estimator_state import (
-    Displacement,
     EstimatorState,
     History,
     IntervalMeasurements,
     UpdateCounts,
-    innovation_row,
-    innovations_from_rows,
     rewound,
     with_step,
 )
@@ -32,9 +29,11 @@ from stario.fusion.filter.map_frame import MapFrame
 from stario.fusion.filter.network_errors import ACCEL_SHARE
 from stario.fusion.filter.zero_velocity import StillnessDetector, ZeroVelocity, ZeroVelocityUpdates
 from stario.fusion.fixes import Accepted, Fix, by_time
-from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start, split_at_fixes
+from stario.fusion.health import Health, SampleCounts
+from stario.fusion.imu.intervals import ImuInterval, Start, split_at_fixes
 from stario.fusion.imu.preintegration import Segment, gap_yaw_variance, segment_of
-from stario.fusion.state import Health, Innovations, NavState, SmoothedPose, changed
+from stario.fusion.imu.stateful import Displacement
+from stario.fusion.state import NavState, SmoothedPose, changed
 from stario.sequences.windows import WINDOW_SECONDS
 
 
@@ -45,8 +44,8 @@ class Estimator:
         config: noise and filter settings.
         start: time and levelled attitude of the first sample.
         prior: prior on the first pose; None starts levelled, at rest, at the origin.
-        streaming: True for streams: innovations are not kept, since memory must not grow, but the
-            steps of the last second are, since fixes may arrive late.
+        streaming: True for streams: the steps of the last second are kept, since fixes may arrive
+            late, and bearings are returned.
 
     Attributes:
         ekf: the filter.
@@ -66,7 +65,7 @@ class Estimator:
         f = config.filter
         self._config, self._start, self._streaming = config, start.time, streaming
         self.ekf = StateCloningEkf(f.window_updates, config.gravity)
-        self.frame = MapFrame(prior, f.gate, f.network_turn_sigma)
+        self.frame = MapFrame(self.ekf, prior, f.gate, f.network_turn_sigma)
         self._displacements = DisplacementUpdates(self.ekf, f)
         self._hypotheses = self._displacements.hypotheses
         self.bias = AdaptiveBiasPrior(self._hypotheses, config, start.time)
@@ -75,7 +74,6 @@ class Estimator:
         self._magnetic = MagneticUpdates(self._hypotheses)
         self._clones: tuple[int, ...] = ()
         self._counts = UpdateCounts()
-        self._innovations: list[tuple[float, ...]] = []
         self.in_gap = False
         self._history: History = ()
         self.released: Estimate | None = None
@@ -106,14 +104,14 @@ class Estimator:
         zupt = self._update_zero_velocity(interval)
         # Zero velocity is more accurate than a network trained on walks, off by 1 cm/s at rest.
         offered = displacement if zupt is None else None
-        applied, revoked = self._update_displacement(interval, offered)
+        outcome, revoked = self._update_displacement(interval, offered)
         bearing = self._update_bearing(interval)
         accepted += self._update_north()
         self.bias.update(interval)
         if interval.update or interval.gap:
             self._clone()
         return IntervalMeasurements(
-            interval, offered, applied, revoked, bearing, zupt, accepted, segment
+            interval, offered, outcome, revoked, bearing, zupt, accepted, segment
         )
 
     def late_fix(self, fix: Fix) -> list[Accepted] | None:
@@ -146,7 +144,7 @@ class Estimator:
             # Fixes within a long gap are useless: nothing links them to the track after it.
             self._counts = self._counts.add("fixes", *["in a long gap"] * len(fixes))
             reinitialise(self.ekf, interval, interval.restart, self._config)
-            self.frame.lose_yaw(self.ekf)
+            self.frame.lose_yaw()
             return None, []
         if not fixes:
             return self._propagate_piece(interval, interval.start), []
@@ -179,11 +177,11 @@ class Estimator:
                 - gap_yaw_variance(interval.start - interval_start)
             )
             self.ekf.state = self.ekf.state.with_yaw_inflated(before, sigma, field_too=False)
-            self.frame.lose_yaw(self.ekf)
+            self.frame.lose_yaw()
         return segment
 
     def _update_fix(self, fix: Fix) -> Accepted | None:
-        result = self.frame.update(self.ekf, fix)
+        result = self.frame.update(fix)
         self._counts = self._counts.add("fixes", *result.outcomes)
         return Accepted(fix, result.scale) if result.accepted else None
 
@@ -197,22 +195,19 @@ class Estimator:
 
     def _update_displacement(
         self, interval: ImuInterval, displacement: Displacement | None
-    ) -> tuple[Displacement | None, tuple[float, ...]]:
+    ) -> tuple[UpdateResult | None, tuple[float, ...]]:
         """Update with a displacement from the oldest clone.
 
-        Return it as inflated, None if rejected, and the times of earlier ones that were false [s].
+        Return the outcome, and the times of earlier displacements that were false [s].
         """
         if displacement is None:
             return None, ()
         assert interval.R_NB_window is not None  # a window comes with its initial attitude
-        d_N, covariance_N = displacement
         result, revoked = self._displacements.update(
-            self._clones[0], interval.R_NB_window, d_N, covariance_N
+            self._clones[0], interval.R_NB_window, *displacement
         )
         self._counts = self._counts.add_displacement(result)
-        if not self._streaming and (row := innovation_row(interval.stop, result)) is not None:
-            self._innovations.append(row)
-        return (d_N, result.scale * covariance_N) if result.accepted else None, revoked
+        return result, revoked
 
     def _update_north(self) -> list[Accepted]:
         """Apply the yaw from magnetic north once, if a declination is set and yaw is unknown."""
@@ -222,7 +217,7 @@ class Estimator:
         fix = north_fix(self.ekf.state, self._magnetic.reference, declination)
         if fix is None:
             return []
-        result = self.frame.update(self.ekf, fix)
+        result = self.frame.update(fix)
         if not result.accepted:
             return []
         self._counts = self._counts.add("bearings", "north")
@@ -259,7 +254,7 @@ class Estimator:
 
     @property
     def state(self) -> EstimatorState:
-        """All that varies except a recording's innovations; assign an earlier one to restore it."""
+        """All that varies; assign an earlier one to restore it."""
         return EstimatorState(
             self.ekf.state,
             self._clones,
@@ -311,10 +306,6 @@ class Estimator:
     def nav_state(self) -> NavState:
         """Return the newest state with plain errors and, if the map has one, its unknown yaw."""
         return with_undirected(nav_states([self.estimate()]), self.frame.state.undirected)[0]
-
-    def innovations(self) -> Innovations:
-        """Return every innovation so far."""
-        return innovations_from_rows(self._innovations)
 
     def health(self, counts: SampleCounts, state: NavState | None = None) -> Health:
         """Return the health report so far, with the sigmas of `state` if given."""

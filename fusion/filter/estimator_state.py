@@ -7,32 +7,28 @@ returns to one of them and repeats the steps since then. README.md, "Fixes".
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
-from stario.fusion.filter.displacements import AccelNoiseScale
-from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.filter.displacements import AlternativeHypothesis
+from stario.fusion.filter.ekf_state import EkfState, Estimate
 from stario.fusion.filter.engine import UpdateResult
-from stario.fusion.filter.estimates import Estimate
 from stario.fusion.filter.frame_transform import MapFrameState
 from stario.fusion.filter.gyro_bias import GyroBiasPrior
-from stario.fusion.filter.hypotheses import AlternativeHypothesis
-from stario.fusion.filter.magnetic_reference import MagneticReference
-from stario.fusion.filter.network_errors import ErrorLevel
+from stario.fusion.filter.magnetic import MagneticReference
+from stario.fusion.filter.network_errors import AccelNoiseScale, ErrorLevel
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Accepted, Fix
-from stario.fusion.imu.intervals import ImuInterval, SampleCounts
+from stario.fusion.health import Health, SampleCounts
+from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.imu.stateful import Displacement as Displacement
-from stario.fusion.state import Health, Innovations, NavState, changed
+from stario.fusion.imu.stateful import Displacement
+from stario.fusion.state import Innovations, NavState, changed
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
-
-_TIME_TOLERANCE = 1e-6
-"""Tolerance when comparing times [s]."""
 
 
 class IntervalMeasurements(NamedTuple):
@@ -41,8 +37,8 @@ class IntervalMeasurements(NamedTuple):
     interval: ImuInterval
     offered: Displacement | None
     """Predicted displacement of the window ending here; None if no window ends, or at rest."""
-    displacement: Displacement | None
-    """The same with its inflated covariance; None if it was rejected."""
+    outcome: UpdateResult | None
+    """Outcome of the update with it; None without one."""
     revoked: tuple[float, ...]
     """Times of earlier displacements that were false after all [s] (README.md, "Gates")."""
     bearing: tuple[EkfState, EkfState] | None
@@ -54,6 +50,14 @@ class IntervalMeasurements(NamedTuple):
     """Fixes applied, in order."""
     segment: Segment | None
     """The preintegrated samples; None if fixes split them."""
+
+    @property
+    def displacement(self) -> Displacement | None:
+        """The displacement with its inflated covariance; None if there is none or it is refused."""
+        if self.offered is None or self.outcome is None or not self.outcome.accepted:
+            return None
+        d_N, covariance_N = self.offered
+        return d_N, self.outcome.scale * covariance_N
 
 
 @dataclass(frozen=True)
@@ -128,16 +132,14 @@ class UpdateCounts:
         )
 
 
-def innovation_row(time: float, result: UpdateResult) -> tuple[float, ...] | None:
-    """Return a row for `innovations_from_rows`; None for an invalid measurement."""
-    if result.residual is None or result.sigma is None:
-        return None
-    return time, *result.residual, *result.sigma, result.nis, float(result.gated)
-
-
-def innovations_from_rows(rows: list[tuple[float, ...]]) -> Innovations:
-    """Return innovations from their rows."""
-    table = np.array(rows).reshape(-1, 9)
+def innovations_of(measurements: Iterable[IntervalMeasurements]) -> Innovations:
+    """Return the innovations of all valid displacements."""
+    rows = [
+        (m.interval.stop, *m.outcome.residual, *m.outcome.sigma, m.outcome.nis, m.outcome.gated)
+        for m in measurements
+        if m.outcome is not None and m.outcome.residual is not None and m.outcome.sigma is not None
+    ]
+    table = np.array(rows, dtype=np.float64).reshape(-1, 9)
     return Innovations(
         time=table[:, 0],
         residual_W=table[:, 1:4],
@@ -213,7 +215,7 @@ def with_step(
         fixes: fixes given with it.
     """
     step = Step(changed(state, history=()), interval.without_window(), displacement, tuple(fixes))
-    oldest = interval.stop - WINDOW_SECONDS - _TIME_TOLERANCE
+    oldest = interval.stop - WINDOW_SECONDS - SAME_TIME
     return (*(s for s in state.history if s.interval.stop >= oldest), step)
 
 
@@ -231,7 +233,7 @@ def rewound(
         None if the time is more than a window ago, or before the stream began.
     """
     steps = state.history
-    oldest = max(start, state.ekf.time - WINDOW_SECONDS - _TIME_TOLERANCE)
+    oldest = max(start, state.ekf.time - WINDOW_SECONDS - SAME_TIME)
     if time < oldest or not steps or time < steps[0].interval.start:
         return None
     k = int(np.searchsorted([step.interval.stop for step in steps[:-1]], time))

@@ -10,7 +10,7 @@ yaw drift since, including turns during gaps, is added as well.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -54,48 +54,15 @@ class FrameTransform:
     drift: float = 0.0
     position_covariance: FloatArray | None = None
 
-    def position(self, p_W: FloatArray) -> FloatArray:
-        """Return a position (3,) in the new frame [m]."""
-        return np.asarray(self.R @ p_W + self.shift)
-
-    def applies_to(self, time: float) -> bool:
-        """Return whether an earlier state at a time [s] is transformed."""
-        return self.since <= time < self.until
-
-    def turn_variance(self, yaw_variance: float) -> float:
-        """Return the turn's variance [rad^2] for an earlier state with this yaw variance."""
-        return self.yaw_sigma**2 + max(0.0, self.drift - yaw_variance)
-
-    def position_covariance_of(
-        self, p_W: FloatArray, covariance: FloatArray, yaw_variance: float
-    ) -> FloatArray:
-        """Return the covariance (3, 3) of a transformed position [m^2].
-
-        Args:
-            p_W: (3,) position after the transform [m].
-            covariance: (3, 3) covariance before the transform [m^2].
-            yaw_variance: variance of the yaw there, in the track's own frame [rad^2].
-        """
-        turned = _turn_covariance(self.turn_variance(yaw_variance), np.zeros(3), p_W - self.pivot)
-        covariance = self.R @ covariance @ self.R.T + turned[6:9, 6:9]
-        return (
-            covariance
-            if self.position_covariance is None
-            else (covariance + self.position_covariance)
-        )
-
     def state(self, state: NavState) -> NavState:
-        """Return an earlier state in the new frame; a later one is unchanged."""
-        if state.time >= self.time:
-            return state
-        if not self.applies_to(state.time):
+        """Return a state of the frame before, in the new one."""
+        if not self.since <= state.time < self.until:
             return changed(state, map_frame=state.map_frame + 1)
-        v_W, p_W = self.R @ state.v_W, self.position(state.p_W)
+        v_W, p_W = self.R @ state.v_W, self.R @ state.p_W + self.shift
         A = frame_rotation(self.R)
         covariance = A @ state.covariance @ A.T
-        covariance += _turn_covariance(
-            self.turn_variance(state.covariance[2, 2]), v_W, p_W - self.pivot
-        )
+        turn_variance = self.yaw_sigma**2 + max(0.0, self.drift - state.covariance[2, 2])
+        covariance += _turn_covariance(turn_variance, v_W, p_W - self.pivot)
         if self.position_covariance is not None:
             covariance[6:9, 6:9] += self.position_covariance
         return changed(
@@ -197,11 +164,17 @@ def _turn_covariance(variance: float, v_W: FloatArray, arm: FloatArray) -> Float
     return covariance
 
 
-def to_final_frame(states: list[NavState], transforms: Sequence[FrameTransform]) -> list[NavState]:
-    """Return the states of a track in its final frame."""
-    for transform in transforms:
-        states = [transform.state(state) for state in states]
-    return states
+def to_final_frame(
+    states: Iterable[NavState], transforms: Sequence[FrameTransform]
+) -> list[NavState]:
+    """Return the states of a track in its final frame, by the transforms after each of them."""
+
+    def moved(state: NavState) -> NavState:
+        for transform in transforms[state.map_frame :]:
+            state = transform.state(state)
+        return state
+
+    return [moved(state) for state in states]
 
 
 def with_undirected(states: list[NavState], undirected: Sequence[FrameTransform]) -> list[NavState]:
@@ -221,19 +194,19 @@ def smoothed_track(
     """Return smoothed poses as a track in its final frame; None if there are none."""
     if not poses:
         return None
-    rows = []
-    for pose in poses:
-        R_WB, p_W, covariance = pose.R_WB, pose.p_W, pose.covariance[3:, 3:]
-        for transform in transforms[pose.map_frame :]:
-            if transform.applies_to(pose.time):
-                R_WB, p_W = transform.R @ R_WB, transform.position(p_W)
-                yaw_variance = pose.covariance[2, 2]
-                covariance = transform.position_covariance_of(p_W, covariance, yaw_variance)
-        rows.append((pose.time, p_W, R_WB, covariance))
-    time, position, attitude, covariances = zip(*rows, strict=True)
+    states = to_final_frame(map(_as_state, poses), transforms)
     return Trajectory(
-        time=np.array(time),
-        position_W=np.array(position),
-        attitude_WB=Rotation.from_matrix(np.array(attitude)),
-        position_covariance_W=np.array(covariances),
+        time=np.array([s.time for s in states]),
+        position_W=np.array([s.p_W for s in states]),
+        attitude_WB=Rotation.from_matrix(np.array([s.R_WB for s in states])),
+        position_covariance_W=np.array([s.position_covariance for s in states]),
+    )
+
+
+def _as_state(pose: SmoothedPose) -> NavState:
+    """Return a pose as a state at rest without biases."""
+    rows, zero, covariance = [0, 1, 2, 6, 7, 8], np.zeros(3), np.zeros((CORE, CORE))
+    covariance[np.ix_(rows, rows)] = pose.covariance
+    return NavState(
+        pose.time, pose.R_WB, zero, pose.p_W, zero, zero, covariance, map_frame=pose.map_frame
     )

@@ -14,11 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.fusion.config import MIN_PRIOR_SIGMA, NavigatorConfig
+from stario.fusion.filter.displacements import HypothesisPair
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import GYRO_BIAS
 from stario.fusion.filter.engine import with_gain
-from stario.fusion.filter.hypotheses import HypothesisPair
-from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.filter.jacobians import ACTUAL, ASSUMED
+from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
 from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import BIAS_SIGMA
 from stario.sequences.sequence import FloatArray
@@ -52,9 +53,6 @@ gravity cannot reveal an uncorrected vertical bias, and nobody turns so evenly f
 
 _PRIOR_TOLERANCE = 1e-6
 """Relative difference up to which two variances count as equal."""
-
-_TIME_TOLERANCE = 1e-6
-"""Tolerance when comparing times [s]."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +174,7 @@ class AdaptiveBiasPrior:
 
     def _half_seconds(self, time: float) -> int:
         """Return the whole half seconds since the start; the information changes no faster."""
-        return math.floor(2.0 * (time - self._start) + _TIME_TOLERANCE)
+        return math.floor(2.0 * (time - self._start) + SAME_TIME)
 
     @property
     def _wander(self) -> float:
@@ -203,17 +201,12 @@ def replace_prior(ekf: StateCloningEkf, old: float, new: float) -> None:
         old, new = max(old, widest), new * max(1.0, widest / old)
     while abs(new - old) > _PRIOR_TOLERANCE * old:
         step = min(new, 2.0 * old)  # a larger one would be badly conditioned
-        P = ekf.state.P
-        rows = P[GYRO_BIAS]
-        S = rows[:, GYRO_BIAS] + old * step / (old - step) * np.eye(3)
-        K = np.asarray(np.linalg.solve(S, rows).T, dtype=np.float64)
-        change = -0.5 * (K @ rows + rows.T @ K.T)
-        actual = ekf.state.P_actual
-        if step > old:
-            actual = actual + change
-        else:  # what the update removes from the error depends on how large that is
-            HP, R = actual[GYRO_BIAS], old * step / (old - step) * np.eye(3)
-            actual = with_gain(actual, K, HP, HP[:, GYRO_BIAS] + R)
+        P, HP = ekf.covariances, ekf.covariances[:, GYRO_BIAS]
+        S = HP[:, :, GYRO_BIAS] + old * step / (old - step) * np.eye(3)
+        K = np.asarray(np.linalg.solve(S[ASSUMED], HP[ASSUMED]).T, dtype=np.float64)
+        updated = with_gain(P, K, HP, S)
+        if step > old:  # the error gains what the gains forget, however large it is
+            updated[ACTUAL] = P[ACTUAL] + updated[ASSUMED] - P[ASSUMED]
         ekf.x = (K @ -ekf.state.b_g)[:, None]
-        ekf.inject(np.array((P + change, actual)))
+        ekf.inject(updated)
         old = step

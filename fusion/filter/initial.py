@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.checked import checked
+from stario.fusion.checked import checked, checked_rotation
 from stario.fusion.config import MIN_PRIOR_SIGMA, NavigatorConfig
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.imu.intervals import ImuInterval, Start
-from stario.fusion.lie import UNKNOWN_YAW, yaw_twist
+from stario.fusion.lie import UNKNOWN_YAW, yaw_rotation
 from stario.fusion.state import NavState
-from stario.sequences.attitude.so3 import exp_so3
-from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 from stario.sequences.settings import check_number
 
@@ -23,10 +20,6 @@ STILL_TILT_SIGMA = 0.01
 
 GAP_VELOCITY_SIGMA = 1.5
 """Standard deviation of a pedestrian's mean velocity over a long gap, per axis [m/s]."""
-
-_ROTATION_ERROR, _ROUNDING_ERROR = 1e-4, 1e-9
-"""Limits on |R R^T - I|: above the first a matrix is not a rotation; above the second its input was
-rounded, and the nearest rotation is used."""
 
 MAX_GAP_DISTANCE = 1e4
 """Maximum distance assumed to be covered in a gap [m]: the covariance must keep its digits."""
@@ -61,13 +54,7 @@ class PriorPose:
     def __post_init__(self) -> None:
         for name in ("v_W", "p_W"):
             object.__setattr__(self, name, checked(name, getattr(self, name), (3,)))
-        R_WB = checked("R_WB", self.R_WB, (3, 3))
-        if np.abs(R_WB @ R_WB.T - np.eye(3)).max() > _ROTATION_ERROR or np.linalg.det(R_WB) < 0.0:
-            raise InputError("R_WB", "a matrix that is not a rotation", "a rotation from B to W")
-        if np.abs(R_WB @ R_WB.T - np.eye(3)).max() > _ROUNDING_ERROR:
-            left, _, right = np.linalg.svd(R_WB)
-            R_WB = left @ right  # the nearest rotation
-        object.__setattr__(self, "R_WB", R_WB)
+        object.__setattr__(self, "R_WB", checked_rotation("R_WB", self.R_WB))
         for name in ("tilt_sigma", "yaw_sigma", "velocity_sigma", "position_sigma"):
             object.__setattr__(self, name, float(checked(name, getattr(self, name), ())))
             check_number(self, name)
@@ -94,20 +81,17 @@ def reinitialise(
 ) -> None:
     """Reset the state after a long gap: tilt from gravity, velocity and yaw unknown."""
     f, s = config.filter, ekf.state
-    P, seconds = s.plain_covariance, interval.stop - interval.start
-    covariance = np.zeros_like(P)
+    covariance, seconds = s.nav_state().covariance, interval.stop - interval.start
+    # The position stays correlated with the biases that led there.
+    covariance[:6], covariance[:, :6] = 0.0, 0.0
     tilt = STILL_TILT_SIGMA if start.still else f.tilt_sigma
     covariance[:3, :3] = np.diag(np.square([tilt, tilt, UNKNOWN_YAW]))
     covariance[3:6, 3:6] = max(f.velocity_sigma, MIN_PRIOR_SIGMA) ** 2 * np.eye(3)
     reach = min(GAP_VELOCITY_SIGMA * seconds, MAX_GAP_DISTANCE)
-    covariance[6:9, 6:9] = P[6:9, 6:9] + reach**2 * np.eye(3)
+    covariance[6:9, 6:9] += reach**2 * np.eye(3)
     walks = np.repeat([config.noise.gyro_walk, config.noise.accel_walk], 3)
     turn_on_sigma = np.repeat([f.gyro_bias_sigma, f.accel_bias_sigma], 3)  # limits the walk
     drift = np.minimum(seconds * np.square(walks), np.square(turn_on_sigma))
-    covariance[9:, 9:] = P[9:, 9:] + np.diag(drift)
-    # The position stays correlated with the biases that led there.
-    covariance[6:9, 9:], covariance[9:, 6:9] = P[6:9, 9:], P[9:, 6:9]
-    yaw = yaw_twist(s.R_WB)
-    turn = exp_so3(np.array([0.0, 0.0, yaw if math.isfinite(yaw) else 0.0]))
-    R_WB, v_W = turn @ start.R_WB, np.zeros(3)
+    covariance[9:, 9:] += np.diag(drift)
+    R_WB, v_W = yaw_rotation(s.R_WB) @ start.R_WB, np.zeros(3)
     ekf.initialise(NavState(interval.stop, R_WB, v_W, s.p_W, s.b_g, s.b_a, covariance))

@@ -26,6 +26,9 @@ CORE = 15
 CLONE = 6
 """Size of the error state of one cloned pose."""
 
+ASSUMED, ACTUAL = 0, 1
+"""Indices of the covariances: as assumed for the gains, and of the error that these gains leave."""
+
 Block = tuple[int, FloatArray]
 """First column of a Jacobian block in the error state, and the block (m, width)."""
 
@@ -139,6 +142,20 @@ def plain_covariance(P: FloatArray, vectors_W: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (plain + plain.swapaxes(-1, -2)))
 
 
+def invariant_from_local(R_WB: FloatArray, v_W: FloatArray, p_W: FloatArray) -> FloatArray:
+    """Return the map (15, 15) from gtsam's local error of a state to the right-invariant one.
+
+    gtsam's tangent is R exp(w), p + R dp, v + R dv, in the order rotation, position, velocity,
+    accelerometer bias, gyroscope bias.
+    """
+    adjoint = _BIAS_SWAP.copy()
+    adjoint[0:3, 0:3] = R_WB
+    adjoint[3:6, 6:9] = R_WB
+    adjoint[6:9, 3:6] = R_WB
+    adjoint[3:9, 0:3] = (skew(np.array((v_W, p_W))) @ R_WB).reshape(6, 3)
+    return adjoint
+
+
 class Propagation(NamedTuple):
     """State at a segment's end and its linearisation, order theta, rho_v, rho_p, d_bg, d_ba."""
 
@@ -163,29 +180,20 @@ def propagated(
     b_a: FloatArray,
     accel_share: float = 1.0,
 ) -> Propagation:
-    """Return `Segment.predict` with the transition and noise of the right-invariant error.
-
-    gtsam's tangent is local, R exp(w), p + R dp, v + R dv, in the order rotation, position,
-    velocity, accelerometer bias, gyroscope bias; the adjoint of the end state converts it to the
-    right-invariant error.
-    """
+    """Return `Segment.predict` with the transition and noise of the right-invariant error."""
     start = gtsam.NavState(gtsam.Rot3(R_WB), p_W, v_W)
     bias_jacobian = np.empty((9, 6), order="F")
     bias = gtsam.imuBias.ConstantBias(b_a, b_g)
     end = segment.pim.predict(start, bias, None, bias_jacobian)
     R, v, p = end.attitude().matrix(), end.velocity(), end.position()
 
-    adjoint = _BIAS_SWAP.copy()
-    adjoint[0:3, 0:3] = R
-    adjoint[3:6, 6:9] = R
-    adjoint[6:9, 3:6] = R
-    adjoint[3:9, 0:3] = (skew(np.array((v, p))) @ R).reshape(6, 3)
+    adjoint = invariant_from_local(R, v, p)
     local = segment.pim.residualCovariance()
     noise = np.empty((2, CORE, CORE))
-    noise[0] = adjoint @ local @ adjoint.T
+    noise[ASSUMED] = adjoint @ local @ adjoint.T
     actual = adjoint.copy()
     actual[:, 3:9] *= math.sqrt(accel_share)
-    noise[1] = actual @ local @ actual.T
+    noise[ACTUAL] = actual @ local @ actual.T
 
     transition = _nav_transition(segment.duration, segment.gravity)
     by_bias = adjoint[:9, :9] @ bias_jacobian

@@ -14,12 +14,11 @@ import math
 import numpy as np
 from numpy.linalg import norm
 
-from stario.fusion.filter.displacements import with_turn
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.engine import UpdateResult
-from stario.fusion.filter.estimates import nav_states
 from stario.fusion.filter.frame_transform import FrameTransform, MapFrameState, unoriented_stretch
 from stario.fusion.filter.initial import PriorPose
+from stario.fusion.filter.network_errors import with_turn
 from stario.fusion.filter.planar_alignment import (
     PlanarAlignment,
     plane_sigma,
@@ -27,10 +26,9 @@ from stario.fusion.filter.planar_alignment import (
     without_yaw,
 )
 from stario.fusion.fixes import Fix
-from stario.fusion.lie import UNKNOWN_YAW
+from stario.fusion.lie import UNKNOWN_YAW, about_vertical
 from stario.fusion.state import NavState, changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
-from stario.sequences.attitude.so3 import exp_so3
 
 MAX_PRIOR_YAW_SIGMA = 0.5
 """A first yaw with a sigma up to this [rad] is kept; a coarser one is replaced by the fixes'."""
@@ -67,6 +65,7 @@ class MapFrame:
     """Fix updates of a filter, with the transforms of its frame that they require.
 
     Args:
+        ekf: the filter.
         prior: prior on the first pose; None if the track starts without one.
         gate: probability of the chi-square test.
         turn_sigma: sigma of the network's yaw error, `FilterConfig.network_turn_sigma` [rad].
@@ -75,34 +74,36 @@ class MapFrame:
         state: state of the map frame.
     """
 
-    def __init__(self, prior: PriorPose | None, gate: float, turn_sigma: float) -> None:
+    def __init__(
+        self, ekf: StateCloningEkf, prior: PriorPose | None, gate: float, turn_sigma: float
+    ) -> None:
         self.state = MapFrameState(placed=False, oriented=False, arbitrary_yaw=True)
         if prior is not None:
             oriented = prior.yaw_sigma <= MAX_PRIOR_YAW_SIGMA
             variance = 2.0 * prior.position_sigma**2
             self.state = MapFrameState(True, oriented, pivot=prior.p_W, pivot_variance=variance)
-        self._gate, self._turn_sigma = gate, turn_sigma
+        self._ekf, self._gate, self._turn_sigma = ekf, gate, turn_sigma
 
-    def update(self, ekf: StateCloningEkf, fix: Fix) -> UpdateResult:
+    def update(self, fix: Fix) -> UpdateResult:
         """Apply a fix at the filter's time."""
-        if fix.kind == "position" and self._needs_placing(ekf, fix):
-            transform: FrameTransform | None = self._place(ekf, fix)
+        if fix.kind == "position" and self._needs_placing(fix):
+            transform: FrameTransform | None = self._place(fix)
         elif self.state.oriented:
-            return self._update(ekf, fix)
+            return self._update(fix)
         else:
             doubtful = fix.kind == "position" and self.state.distance_mismatches > 0
-            transform = None if doubtful else self._orient(ekf, fix)
+            transform = None if doubtful else self._orient(fix)
         if transform is None:
             reason = "too coarse" if fix.kind == "yaw" else "yaw not known"
             return UpdateResult(math.nan, len(fix.value), False, reason=reason)
-        result = self._update(ekf, fix)
-        completed = self._with_uncertainty(transform, _nav_state(ekf))
+        result = self._update(fix)
+        completed = self._with_uncertainty(transform, self._ekf.state.nav_state())
         self.state = changed(self.state, transforms=(*self.state.transforms, completed))
         return result
 
-    def lose_yaw(self, ekf: StateCloningEkf) -> None:
+    def lose_yaw(self) -> None:
         """If a gap has lost the yaw, let later fixes place and turn the track from here on."""
-        now, s = _nav_state(ekf), self.state
+        now, s = self._ekf.state.nav_state(), self.state
         variance = now.covariance[2, 2] - (0.0 if s.oriented else s.yaw_variance)
         if not (s.placed or s.oriented) or variance <= MAX_PRIOR_YAW_SIGMA**2:
             return
@@ -114,7 +115,7 @@ class MapFrame:
             False, False, s.transforms, now.p_W, since, unoriented=unoriented, jumps=s.jumps
         )
 
-    def _needs_placing(self, ekf: StateCloningEkf, fix: Fix) -> bool:
+    def _needs_placing(self, fix: Fix) -> bool:
         """Return whether a position should place the track: the first, or a much better one later.
 
         While the yaw is unknown, a position further on hardly determines where the track is; but
@@ -124,7 +125,7 @@ class MapFrame:
             return not self.state.placed
         if _SIGMA_RATIO**2 * float(np.trace(fix.covariance[:2, :2])) < self.state.pivot_variance:
             return True
-        now, pivot = _nav_state(ekf), self.state.pivot
+        now, pivot = self._ekf.state.nav_state(), self.state.pivot
         fix_distance, track_distance = norm((fix.value - pivot)[:2]), norm((now.p_W - pivot)[:2])
         differs = abs(fix_distance - track_distance) > 3.0 * plane_sigma(
             now, 6, fix
@@ -134,18 +135,18 @@ class MapFrame:
         )
         return self.state.distance_mismatches >= _OUTLIERS_IN_A_ROW
 
-    def _place(self, ekf: StateCloningEkf, fix: Fix) -> FrameTransform:
-        now, since = _nav_state(ekf), self.state.since
+    def _place(self, fix: Fix) -> FrameTransform:
+        now, since = self._ekf.state.nav_state(), self.state.since
         transform = FrameTransform(fix.time, np.eye(3), fix.value - now.p_W, fix.value, True, since)
-        ekf.state = ekf.state.transformed(np.eye(3), transform.shift)
-        variance = np.trace(fix.covariance) + np.trace(ekf.state.plain_covariance[6:9, 6:9])
+        self._ekf.state = self._ekf.state.transformed(np.eye(3), transform.shift)
+        variance = np.trace(fix.covariance) + np.trace(now.position_covariance)
         sigma = min(_INFLATION_RATIO * math.sqrt(variance), _MAX_SIGMA)
-        ekf.state = ekf.state.with_position_inflated(sigma)
+        self._ekf.state = self._ekf.state.with_position_inflated(sigma)
         self.state = changed(self.state, placed=True)
-        self._begin_alignment(ekf, fix)
+        self._begin_alignment(fix)
         return transform
 
-    def _begin_alignment(self, ekf: StateCloningEkf, fix: Fix) -> None:
+    def _begin_alignment(self, fix: Fix) -> None:
         """Take a position as the pivot about which later fixes turn the track."""
         self.state = changed(
             self.state,
@@ -153,14 +154,14 @@ class MapFrame:
             pivot_variance=float(np.trace(fix.covariance[:2, :2])),
             alignment=PlanarAlignment(),
             distance_mismatches=0,
-            yaw_variance=float(_nav_state(ekf).covariance[2, 2]),
+            yaw_variance=float(self._ekf.state.nav_state().covariance[2, 2]),
         )
-        self._add_to_alignment(ekf, fix)
+        self._add_to_alignment(fix)
 
-    def _orient(self, ekf: StateCloningEkf, fix: Fix) -> FrameTransform | None:
+    def _orient(self, fix: Fix) -> FrameTransform | None:
         """Turn the frame to a fix; return None if the fix does not determine the direction."""
         pivot, since = self.state.pivot, self.state.since
-        now = _nav_state(ekf)
+        now = self._ekf.state.nav_state()
         turn, sigma = turn_from_fix(now, pivot, fix)
         inflation = UNKNOWN_YAW  # the fix itself then measures the turn
         max_sigma = MAX_YAW_SIGMA if fix.kind == "yaw" else MAX_POSITION_YAW_SIGMA
@@ -169,13 +170,13 @@ class MapFrame:
                 return None
             turn, inflation = self.state.alignment.turn
             if inflation > MAX_POSITION_YAW_SIGMA:
-                self._add_to_alignment(ekf, fix)
+                self._add_to_alignment(fix)
                 return None
-        R = exp_so3(np.array([0.0, 0.0, turn]))
+        R = about_vertical(turn)
         drift = float(now.covariance[2, 2])
         transform = FrameTransform(fix.time, R, pivot - R @ pivot, pivot, False, since, drift=drift)
-        turned = ekf.state.transformed(transform.R, transform.shift)
-        ekf.state = turned.with_yaw_inflated(pivot, inflation)
+        turned = self._ekf.state.transformed(transform.R, transform.shift)
+        self._ekf.state = turned.with_yaw_inflated(pivot, inflation)
         stretches = (changed(stretch, time=fix.time) for stretch in self.state.unoriented)
         transforms = (*self.state.transforms, *stretches)
         self.state = changed(
@@ -187,9 +188,9 @@ class MapFrame:
         )
         return transform
 
-    def _add_to_alignment(self, ekf: StateCloningEkf, fix: Fix) -> None:
+    def _add_to_alignment(self, fix: Fix) -> None:
         """Add a position to those that determine the direction together."""
-        now, pivot = _nav_state(ekf), self.state.pivot
+        now, pivot = self._ekf.state.nav_state(), self.state.pivot
         track, measured = (now.p_W - pivot)[:2], (fix.value - pivot)[:2]
         variance = 0.5 * float(np.trace(fix.covariance[:2, :2]))
         drift = 0.5 * float(np.trace(without_yaw(now.covariance, 6)))
@@ -205,21 +206,21 @@ class MapFrame:
             position_covariance=np.zeros((3, 3)) if oriented else P[6:9, 6:9],
         )
 
-    def _update(self, ekf: StateCloningEkf, fix: Fix) -> UpdateResult:
+    def _update(self, fix: Fix) -> UpdateResult:
         if self.state.oriented:
-            ekf.state = with_turn(ekf.state, self._turn_sigma)
+            self._ekf.state = with_turn(self._ekf.state, self._turn_sigma)
         gate = chi2_quantile(self._gate, len(fix.value))
         if fix.kind == "position":
-            return self._update_position(ekf, fix, gate)
+            return self._update_position(fix, gate)
         if fix.kind == "velocity":
-            return ekf.update_velocity_W(fix.value, fix.covariance, gate)
-        return ekf.update_yaw(float(fix.value[0]), math.sqrt(fix.covariance[0, 0]), gate)
+            return self._ekf.update_velocity_W(fix.value, fix.covariance, gate)
+        return self._ekf.update_yaw(float(fix.value[0]), math.sqrt(fix.covariance[0, 0]), gate)
 
-    def _update_position(self, ekf: StateCloningEkf, fix: Fix, gate: float) -> UpdateResult:
+    def _update_position(self, fix: Fix, gate: float) -> UpdateResult:
         """Update with a position; inflate an outlier, but move the track after similar ones."""
-        before = ekf.state
+        before = self._ekf.state
         self.state = changed(self.state, since_jump=self.state.since_jump + 1)
-        result = ekf.update_position_W(fix.value, fix.covariance, gate)
+        result = self._ekf.update_position_W(fix.value, fix.covariance, gate)
         residual = result.residual
         if residual is None or not result.gated:
             self.state = changed(self.state, outlier_residuals=())
@@ -236,19 +237,15 @@ class MapFrame:
         self.state = changed(
             self.state, outlier_residuals=(), jumps=self.state.jumps + 1, since_jump=0
         )
-        ekf.state = before.with_position_inflated(float(norm(residual)))
-        result = ekf.update_position_W(fix.value, fix.covariance, gate)
+        self._ekf.state = before.with_position_inflated(float(norm(residual)))
+        result = self._ekf.update_position_W(fix.value, fix.covariance, gate)
         if repeated and self.state.oriented:
-            self._reopen_direction(ekf, fix)
+            self._reopen_direction(fix)
         return result
 
-    def _reopen_direction(self, ekf: StateCloningEkf, fix: Fix) -> None:
+    def _reopen_direction(self, fix: Fix) -> None:
         """Let later fixes turn the track from here on: its direction has proved to be wrong."""
         self.state = changed(
             self.state, oriented=False, since=fix.time, arbitrary_yaw=True, since_jump=math.inf
         )
-        self._begin_alignment(ekf, fix)
-
-
-def _nav_state(ekf: StateCloningEkf) -> NavState:
-    return nav_states([ekf.state.estimate()])[0]
+        self._begin_alignment(fix)

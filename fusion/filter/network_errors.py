@@ -1,7 +1,11 @@
-"""The correlation of the network's errors, which covariances contain and gains do not know.
+"""Models of the network's errors, and what the innovations tell about them.
 
 The gains take the error of each displacement for white. In truth part of it decays within seconds,
-and part lasts all along a track. README.md, "Correlated errors".
+and part lasts all along a track, which only covariances contain: README.md, "Correlated errors".
+A rotation of all displacements is a Gauss-Markov state once fixes tell the direction; without them
+it cannot be distinguished from the yaw, and is zero: "Fixes". The innovations adapt the level of
+the errors and the noise that the accelerometer must have beside them, by stochastic approximation
+(Robbins and Monro 1951): "Noise and the gyroscope's bias".
 """
 
 from __future__ import annotations
@@ -13,9 +17,11 @@ from typing import NamedTuple
 import numpy as np
 
 from stario.fusion.config import FilterConfig
-from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
-from stario.fusion.filter.engine import UpdateResult
+from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS, EkfState
+from stario.fusion.filter.engine import UpdateResult, gauss_markov
+from stario.fusion.filter.jacobians import CORE, plain_covariance
 from stario.fusion.imu.stateful import slope_variance
+from stario.fusion.state import changed
 from stario.sequences.sequence import FloatArray
 
 WHITE, DRIFTING, LASTING = 0.35, 0.25, 0.15
@@ -41,6 +47,19 @@ _MAX_EXCESS = 4.0
 
 MIN_LEVEL, MAX_LEVEL = 0.1, 5.0
 """Bounds of the level."""
+
+TARGET_NIS = 0.3
+"""Target for the median NIS per degree of freedom: the network's errors are correlated over
+seconds, so consistent innovations are smaller than single errors."""
+
+MAX_FACTOR = 15.0
+"""Maximum noise factor: the accelerometer then rules out little more than jumps."""
+
+_STEPS = 4
+"""Number of noise factors per doubling, so that few different noise models are created."""
+
+TURN_SECONDS = 60.0
+"""Correlation time of the network's turn [s]."""
 
 
 class DisplacementErrors(NamedTuple):
@@ -77,14 +96,44 @@ class ErrorLevel:
         if not math.isfinite(result.nis):
             return self
         excess = min(result.nis / result.dof - 1.0, _MAX_EXCESS)
-        log_level = self.log_level + self.gain * excess
-        log_level = min(max(log_level, math.log(MIN_LEVEL)), math.log(MAX_LEVEL))
-        return ErrorLevel(log_level, next_gain(self.gain))
+        return ErrorLevel(*_stepped(self.log_level, self.gain, excess, MIN_LEVEL, MAX_LEVEL))
 
 
-def next_gain(gain: float) -> float:
-    """Return the step for the next displacement: 1/5, 1/6, 1/7, ... (Robbins and Monro 1951)."""
-    return max(1.0 / (1.0 / gain + 1.0), GAIN)
+@dataclass(frozen=True)
+class AccelNoiseScale:
+    """Factor by which the accelerometer is noisier than configured.
+
+    Attributes:
+        log_factor: natural logarithm of the factor on its noise density.
+        gain: step size for the next displacement.
+    """
+
+    log_factor: float = 0.0
+    gain: float = FIRST_GAIN
+
+    @property
+    def factor(self) -> float:
+        """Factor on the noise density, in steps."""
+        return float(2.0 ** (round(_STEPS * self.log_factor / math.log(2.0)) / _STEPS))
+
+    def updated(self, result: UpdateResult) -> AccelNoiseScale:
+        """Return the scale after one displacement; unchanged if it has no innovation."""
+        if not math.isfinite(result.gate_nis):
+            return self
+        ratio = (result.gate_nis / (TARGET_NIS * result.dof)) ** 2
+        excess = 1.0 - 2.0 / (ratio + 1.0)
+        return AccelNoiseScale(*_stepped(self.log_factor, self.gain, excess, 1.0, MAX_FACTOR))
+
+
+def _stepped(
+    log: float, gain: float, excess: float, low: float, high: float
+) -> tuple[float, float]:
+    """Return a logarithm after one step, between those of two bounds, and its next gain.
+
+    The gains are 1/5, 1/6, 1/7, ... down to `GAIN` (Robbins and Monro 1951).
+    """
+    log = min(max(log + gain * excess, math.log(low)), math.log(high))
+    return log, max(1.0 / (1.0 / gain + 1.0), GAIN)
 
 
 def displacement_errors(
@@ -124,3 +173,51 @@ def displacement_errors(
     H[2, -1] = math.sqrt(climb)
     overlap = f.overlap_scale / (2.0 * f.covariance_scale)  # a window's errors repeat in the next
     return DisplacementErrors(level * WHITE * overlap * predicted, H)
+
+
+def with_considered_propagated(s: EkfState) -> EkfState:
+    """Return the state with its considered errors propagated from their own time to the state's.
+
+    Each takes a Gauss-Markov step of unit variance. Only displacements ask for them.
+    """
+    kept = np.exp((s.considered_time - s.time) / CONSIDERED_SECONDS)
+    actual = gauss_markov(s.P_actual, s.considered_rows, kept, 1.0)
+    return changed(s, covariances=np.array((s.P, actual)), considered_time=s.time)
+
+
+class TurnEstimate(NamedTuple):
+    """A filter's estimate of the network's turn, for a graph that starts from its state."""
+
+    turn: float
+    """The turn [rad]."""
+    covariance: FloatArray
+    """(16,) covariance with the plain errors of the state (order of `NavState.covariance`), then
+    the turn's variance."""
+
+
+def turn_estimate(s: EkfState) -> TurnEstimate | None:
+    """Return a filter's estimate of the network's turn; None while it is not estimated."""
+    if not s.has_turn:
+        return None
+    rows = [*range(CORE), s.turn_row]
+    P = plain_covariance(s.P[rows][:, rows], s.X[0, :, 3:].T)
+    return TurnEstimate(s.network_turn, P[CORE])
+
+
+def with_turn(s: EkfState, sigma: float) -> EkfState:
+    """Return the state with the network's turn estimated from now on, with prior sigma [rad]."""
+    if s.has_turn or sigma == 0.0:
+        return s
+    P = s.covariances.copy()
+    P[:, s.turn_row, s.turn_row] = sigma**2
+    return changed(s, covariances=P)
+
+
+def propagated_turn(s: EkfState, seconds: float, sigma: float) -> EkfState:
+    """Return the state with the network's turn propagated over a time [s], if it has one."""
+    if not s.has_turn:
+        return s
+    correlation = math.exp(-seconds / TURN_SECONDS)
+    rows = slice(s.turn_row, s.turn_row + 1)
+    P = gauss_markov(s.covariances, rows, np.array([correlation]), sigma)
+    return changed(s, covariances=P, network_turn=correlation * s.network_turn)

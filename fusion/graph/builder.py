@@ -6,30 +6,27 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.displacements import TURN_SECONDS, TurnEstimate
-from stario.fusion.filter.estimator_state import Displacement as Measured
+from stario.fusion.filter.engine import fault_of
+from stario.fusion.filter.network_errors import TURN_SECONDS, TurnEstimate
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Fix
 from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Velocity, Yaw
 from stario.fusion.graph.keyframes import KeyframeGraph
-from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
 from stario.fusion.imu.preintegration import (
     Segment,
     gap_yaw_variance,
     segment_of,
     segment_of_all,
 )
-from stario.fusion.lie import yaw_twist
+from stario.fusion.imu.stateful import Displacement as Measured
+from stario.fusion.lie import about_vertical, yaw_twist
 from stario.fusion.state import NavState
 from stario.sequences.attitude.so3 import exp_so3, log_so3
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
-
-_SAME_TIME = 1e-6
-"""A fix within this time of a keyframe [s] counts as at it."""
 
 Pose = tuple[FloatArray, FloatArray, FloatArray]
 """R_WB (3, 3), v_W (3,), p_W (3,)."""
@@ -164,7 +161,7 @@ class GraphBuilder:
     def fix(self, fix: Fix) -> bool:
         """Add a fix up to now to the keyframe before it; return False if there is none."""
         graph = self.graph
-        before = [k for k in graph.keyframes if graph.time(k) <= fix.time + _SAME_TIME]
+        before = [k for k in graph.keyframes if graph.time(k) <= fix.time + SAME_TIME]
         if not before:
             return False
         graph.add(self._fix_term(fix, before[-1]), gated=not self._streaming)
@@ -207,7 +204,7 @@ class GraphBuilder:
         self, i: int, interval: ImuInterval, d_N: FloatArray, covariance_N: FloatArray
     ) -> None:
         covariance = covariance_N * (self._overlap * self._config.filter.covariance_scale)
-        if not _usable(d_N, covariance):
+        if fault_of(d_N, covariance):
             return
         assert interval.R_NB_window is not None  # a window always comes with its first attitude
         j, R_NB = self.graph.last, interval.R_NB_window
@@ -225,7 +222,7 @@ class GraphBuilder:
         graph = self.graph
         dt = fix.time - graph.time(k)
         R_k, v_k, p_k, _, _ = graph.pose(k)
-        R, v, p = (R_k, v_k, p_k) if dt <= _SAME_TIME else self.dead_reckoned(k, fix.time)
+        R, v, p = (R_k, v_k, p_k) if dt <= SAME_TIME else self.dead_reckoned(k, fix.time)
         dt, f = max(dt, 0.0), self._config.filter
         # Noise of the IMU since the keyframe, or of the motion in a gap.
         accel_noise = f.gap_accel_noise if k in self._gaps else self._config.noise.accel_noise
@@ -236,15 +233,8 @@ class GraphBuilder:
             return Position(k, fix.value, covariance, dt, p - p_k - dt * v_k)
         if fix.kind == "velocity":
             return Velocity(k, fix.value, fix.covariance + drift, v - v_k)
-        turn = np.array([0.0, 0.0, math.remainder(fix.value[0] - yaw_twist(R), 2.0 * math.pi)])
-        return Yaw(k, exp_so3(turn) @ R_k, fix.covariance + turned)
-
-
-def _usable(value: FloatArray, covariance: FloatArray) -> bool:
-    """Return whether a measurement is finite and its covariance positive definite."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        finite = math.isfinite(float(np.vdot(value, value) + np.vdot(covariance, covariance)))
-    return finite and dpotrf(covariance, lower=1)[1] == 0
+        turn = math.remainder(fix.value[0] - yaw_twist(R), 2.0 * math.pi)
+        return Yaw(k, about_vertical(turn) @ R_k, fix.covariance + turned)
 
 
 def _pose_between(start: Pose, end: Pose, fraction: float, duration: float) -> Pose:

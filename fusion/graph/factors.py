@@ -19,19 +19,15 @@ from typing import Any, Protocol
 import numpy as np
 from gtsam.symbol_shorthand import B, T, V, X
 
-from stario.fusion.filter.displacements import TurnEstimate
 from stario.fusion.filter.jacobians import CORE, plain_covariance
+from stario.fusion.filter.network_errors import TurnEstimate
+from stario.fusion.graph.covariances import root_information
 from stario.fusion.graph.keyframe_state import KeyframeState
-from stario.fusion.lie import twist, yaw_rotation
+from stario.fusion.lie import about_vertical, twist, yaw_rotation
 from stario.fusion.state import NavState
-from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.sequence import FloatArray
 
 _EYE = np.eye(3)
-
-_MIN_VARIANCE, _MIN_EIGENVALUE = 1e-16, 1e-12
-"""Lower bounds of a prior's variances and of its correlations' eigenvalues: less is rounding."""
-
 
 Linearised = tuple[FloatArray, list[tuple[int, FloatArray]]]
 """Residual (m,) of a term and the Jacobian blocks (key, (m, width)) of its prediction."""
@@ -110,7 +106,7 @@ class Prior:
             cross = turn.covariance[:CORE, None]
             covariance = np.block([[covariance, cross], [cross.T, turn.covariance[CORE:, None]]])
             turns = ((k, turn.turn),)
-        root = _root_information(plain_covariance(covariance, -np.stack([state.v_W, state.p_W])))
+        root = root_information(plain_covariance(covariance, -np.stack([state.v_W, state.p_W])))
         return cls(k, (reference,), root, np.zeros(len(root)), turns)
 
     @property
@@ -165,7 +161,7 @@ class Displacement(Between):
         (R_i, p_i), (R_j, p_j) = _pose(values, self.i), _pose(values, self.j)
         R_NW = yaw_rotation(R_i @ self.R_NB.T).T
         if self.turned:
-            R_NW = exp_so3(np.array([0.0, 0.0, turn_at(values, self.j)])) @ R_NW
+            R_NW = about_vertical(turn_at(values, self.j)) @ R_NW
         d_W = p_j - p_i
         H_i, H_j = np.zeros((3, 6)), np.zeros((3, 6))
         sideways = np.array([-d_W[1], d_W[0], 0.0])  # e3 x (p_j - p_i)
@@ -282,14 +278,6 @@ class GyroBias(AtKeyframe):
         """Linearise in B."""
         residual = self.b_g - values.atConstantBias(B(self.k)).gyroscope()
         return residual, [(B(self.k), np.eye(3, 6, k=3))]
-
-
-def _root_information(covariance: FloatArray) -> FloatArray:
-    """Return a square root of the inverse, with eigenvalues bounded below against rounding."""
-    scale = np.sqrt(np.maximum(covariance.diagonal(), _MIN_VARIANCE))
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    values = np.maximum(values, _MIN_EIGENVALUE)
-    return np.asarray((vectors / np.sqrt(values)).T / scale)
 
 
 def turn_at(values: Any, k: int) -> float:

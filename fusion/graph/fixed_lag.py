@@ -14,21 +14,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.displacements import turn_estimate
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.filter.estimates import ASSUMED, nav_states, with_actual_covariances
+from stario.fusion.filter.ekf_state import EkfState, nav_states
 from stario.fusion.filter.estimator import Estimator
-from stario.fusion.filter.estimator_state import Displacement, EstimatorState
+from stario.fusion.filter.estimator_state import EstimatorState
 from stario.fusion.filter.frame_transform import with_undirected
 from stario.fusion.filter.initial import PriorPose
+from stario.fusion.filter.jacobians import ASSUMED
+from stario.fusion.filter.network_errors import turn_estimate
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.graph.bearing import Bearing, gained_information
 from stario.fusion.graph.builder import GraphBuilder
+from stario.fusion.graph.covariances import with_actual_covariances
 from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.whitening import IndeterminateError
-from stario.fusion.imu.intervals import ImuInterval, SampleCounts, Start
-from stario.fusion.state import Health, NavState
+from stario.fusion.health import Health, SampleCounts
+from stario.fusion.imu.intervals import ImuInterval, Start
+from stario.fusion.imu.stateful import Displacement
+from stario.fusion.state import NavState
 from stario.sequences.sequence import FloatArray
 
 _WIDER, _NARROWER = 1.2, 0.99

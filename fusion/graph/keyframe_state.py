@@ -8,12 +8,9 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from stario.fusion.filter.jacobians import CORE
+from stario.fusion.filter.jacobians import invariant_from_local
 from stario.fusion.lie import log_se23
-from stario.sequences.attitude.so3 import skew
 from stario.sequences.sequence import FloatArray
-
-_EYE = np.eye(3)
 
 
 class KeyframeState(NamedTuple):
@@ -56,12 +53,6 @@ class KeyframeState(NamedTuple):
 
     def invariant_from_local(self) -> FloatArray:
         """Return the map (15, 15) from gtsam's w, dp, dv, b_a, b_g to the right-invariant error."""
-        matrix = np.zeros((CORE, CORE))
-        matrix[0:3, 0:3] = self.R_WB
-        matrix[3:6, 0:3] = skew(self.v_W) @ self.R_WB
-        matrix[3:6, 6:9] = _EYE
-        matrix[6:9, 0:3] = skew(self.p_W) @ self.R_WB
-        matrix[6:9, 3:6] = self.R_WB
-        matrix[9:12, 12:15] = _EYE
-        matrix[12:15, 9:12] = _EYE
+        matrix = invariant_from_local(self.R_WB, self.v_W, self.p_W)
+        matrix[3:6, 6:9] = np.eye(3)  # a graph's velocities are in W
         return matrix

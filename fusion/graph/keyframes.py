@@ -20,7 +20,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, T, V, X
 from scipy.linalg import block_diag
 
-from stario.fusion.filter.displacements import TurnEstimate
+from stario.fusion.filter.network_errors import TurnEstimate
 from stario.fusion.graph.factors import Prior, Term, TurnProcess, turn_at
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_factor

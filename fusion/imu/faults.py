@@ -1,8 +1,17 @@
-"""Faults of samples: a clock set back, spikes and saturation, a gyroscope in deg/s.
+"""Faults of a stream: a clock set back, stopped sensors, spikes and saturation, a rate in deg/s.
 
 Clock: single late samples are dropped, and so is a burst in the wrong order. Late samples that
 advance among themselves for seconds come from another clock, and how much time has passed between
 the two is unknown.
+
+Stopped sensors: no real sensor repeats its numbers for long, since noise changes the last digits.
+Six numbers that repeat for a tenth of a second come from sensors that have stopped, unless the
+device may be at rest. One sensor alone: loggers repeat samples of a slow one, and a coarse one at
+rest measures the same numbers for minutes. So its values must repeat for half a second in which the
+other one shows motion that they rule out, by the rules of `sequences.inspection.stuck`. From then
+on it counts as stopped until its values change. Values that have never changed are left to the
+checks of a stream's first second; they may be simulated without noise. Samples of a stopped sensor
+are dropped, so that they are treated as a gap.
 
 Outliers: a spike is one sample that differs from both its neighbours by more than a carried device
 can cause; it is replaced by their mean. Saturation shows as values of a moving axis that repeat
@@ -10,21 +19,27 @@ exactly and more than once at the largest magnitude measured so far; two that ar
 at a magnitude soon exceeded, do not count. What the sensor missed is unknown, so these are only
 flagged.
 
-Units of a stream: that of the accelerometer shows in the first second, that of the gyroscope not at
-rest. A recording is checked as a whole before it runs (`sequences.inspection.checks`), a stream
-piece by piece by the same physics. A single piece may fail because the device is thrown or dropped,
-so several, with no calm one in between, are needed to refuse the stream.
+Units of a stream: that of the accelerometer shows in the first second (`intervals.check_start`),
+that of the gyroscope not at rest. A recording is checked as a whole before it runs
+(`sequences.inspection.checks`), a stream piece by piece by the same physics. A single piece may
+fail because the device is thrown or dropped, so several, with no calm one in between, are needed to
+refuse the stream.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+
 import numpy as np
 
-from stario.fusion.imu.intervals import NO_FLAGS, Flags, ImuInterval, Start
+from stario.fusion.health import Stopped
+from stario.fusion.imu.intervals import NO_FLAGS, SAME_TIME, Flags, ImuInterval, Sample
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_gyro
+from stario.sequences.inspection.stuck import shaken, tilting
 from stario.sequences.sequence import BoolArray, FloatArray
-from stario.sequences.windows import MAX_RATE, MIN_RATE
+from stario.sequences.windows import MIN_RATE
 
 SET_BACK_SECONDS = 5.0
 """Late samples that advance for this long in a row [s] come from a clock that was set back; batches
@@ -74,6 +89,113 @@ class ClockSetBackDetector:
         if time - self._first >= SET_BACK_SECONDS:
             raise ClockSetBackError(newest - self._first)
         return time - self._first
+
+
+Moves = Callable[[FloatArray, FloatArray, FloatArray], bool]
+"""Whether times (n,), rates (n, 3) and forces (n, 3) show motion."""
+
+_FROZEN_SECONDS = 0.1
+"""Maximum time that all values may repeat [s]; loggers repeat slow samples for a few hundredths."""
+
+_FROZEN_RATE, _FROZEN_FORCE = 0.05, 1.5
+"""A coarse sensor at rest repeats values as well: its rate is below the first [rad/s], its force
+within the second of gravity [m/s^2]."""
+
+_ALONE_SECONDS = 0.5
+"""Time that the values of one sensor alone repeat [s] before the other one is asked for motion."""
+
+_ALONE_SAMPLES = round(MIN_RATE * _ALONE_SECONDS)
+"""Minimum number of samples in that time: a gap shows no motion."""
+
+_NEVER: Sample = (math.nan, math.nan, math.nan, math.nan, math.nan, math.nan, math.nan)
+"""Sample before the first: no value equals NaN."""
+
+
+class FrozenSensorDetector:
+    """Detects sensors that have stopped and repeat their last values.
+
+    Args:
+        gravity: magnitude [m/s^2].
+    """
+
+    def __init__(self, gravity: float) -> None:
+        self._gravity = gravity
+        self._last = _NEVER
+        self._since = math.inf  # time of the first of equal samples [s]
+        self._unclear = True  # whether a sensor repeats its values, or has never changed them
+        self._gyro, self._accel = _Repetition(), _Repetition()
+
+    def stopped(self, sample: Sample) -> Stopped | None:
+        """Return what has stopped according to a sample (time, gyro, accel); None if nothing."""
+        last, self._last = self._last, sample
+        # Nearly all samples end here: comparing two numbers is the cheapest proof.
+        if sample[1] != last[1] and sample[4] != last[4] and not self._unclear:
+            self._since = sample[0]
+            return None
+        return self._judged(last, sample)
+
+    def _judged(self, last: Sample, sample: Sample) -> Stopped | None:
+        same_gyro, same_accel = sample[1:4] == last[1:4], sample[4:] == last[4:]
+        if not (same_gyro and same_accel):
+            self._since = math.inf if math.isnan(last[0]) else sample[0]
+        elif sample[0] - self._since > _FROZEN_SECONDS and not self._looks_at_rest():
+            return "both"
+        gyro, accel = self._gyro, self._accel
+        # Both, whatever the first says: each has to know when its values change.
+        if same_gyro:
+            gyro.add(last, sample, shaken)
+        else:
+            gyro.restart(last)
+        if same_accel:
+            accel.add(last, sample, tilting)
+        else:
+            accel.restart(last)
+        self._unclear = same_gyro or same_accel or not (gyro.varied and accel.varied)
+        return "gyroscope" if gyro.stopped else "accelerometer" if accel.stopped else None
+
+    def _looks_at_rest(self) -> bool:
+        gyro, accel = self._last[1:4], self._last[4:]
+        off = abs(math.hypot(*accel) - self._gravity)
+        return math.hypot(*gyro) < _FROZEN_RATE and off < _FROZEN_FORCE
+
+
+class _Repetition:
+    """Samples in which one sensor repeats its values.
+
+    Attributes:
+        varied: whether its values have ever changed.
+        stopped: whether the other sensor has shown motion that its values rule out.
+    """
+
+    def __init__(self) -> None:
+        self.varied = self.stopped = False
+        self._samples: list[Sample] = []  # since the other sensor was last asked
+
+    def restart(self, last: Sample) -> None:
+        """Note that the sensor's values differ from those of the sample before, if there is one."""
+        self.varied, self.stopped = not math.isnan(last[0]), False
+        if self._samples:
+            self._samples = []
+
+    def add(self, last: Sample, sample: Sample, moves: Moves) -> None:
+        """Add a sample that repeats the values of the one before.
+
+        Args:
+            last: sample before.
+            sample: newest sample.
+            moves: whether samples show motion that the sensor's values rule out.
+        """
+        if self.stopped or not self.varied:
+            return
+        if sample[0] < last[0]:  # a late sample, or the one before was ahead of its time
+            self._samples = []
+        samples = self._samples
+        if not samples or sample[0] != last[0]:
+            samples.append(sample)
+        if len(samples) >= _ALONE_SAMPLES and sample[0] - samples[0][0] >= _ALONE_SECONDS:
+            table = np.array(samples)
+            self._samples = [sample]
+            self.stopped = moves(table[:, 0], table[:, 1:4], table[:, 4:7])
 
 
 SPIKE = np.array([12.0, 12.0, 12.0, 60.0, 60.0, 60.0])
@@ -146,27 +268,6 @@ class OutlierDetector:
         return np.asarray(np.where(self._repeats >= _MIN_REPEATS, count, 0.0))
 
 
-_START_FORCE = (5.0, 15.0)
-"""Accepted mean force of the first second [m/s^2]: allows for a jump, excludes units of g."""
-
-
-def check_start(start: Start, gravity: float) -> None:
-    """Check the first second of a stream, which cannot be checked as a whole.
-
-    Raises:
-        InputError: the rate is not about 50 Hz to 1 kHz, or the mean force cannot be gravity.
-    """
-    if not MIN_RATE <= start.rate <= MAX_RATE:
-        raise InputError("time", f"{start.rate:.3g} samples a second", "50 to 1000")
-    if not _START_FORCE[0] <= start.force <= _START_FORCE[1]:
-        raise InputError(
-            "accel",
-            f"an average of {start.force:.3g} over the first second",
-            f"about {gravity:.2f} m/s^2",
-            "give specific force in m/s^2 with gravity left in, and rates in rad/s",
-        )
-
-
 _PIECE_SECONDS = 4.0
 """Length of a piece [s], as in the check of recordings."""
 
@@ -200,9 +301,9 @@ class GyroUnitCheck:
             return
         if self._turned >= _MIN_TURNING_PIECES:
             return
-        table = np.column_stack([interval.time, interval.gyro, interval.accel])
+        table = interval.table
         self._tables.append(table[1:] if self._tables else table)
-        if interval.stop - self._tables[0][0, 0] > _PIECE_SECONDS - 1e-6:
+        if interval.stop - self._tables[0][0, 0] > _PIECE_SECONDS - SAME_TIME:
             piece, self._tables = np.vstack(self._tables), []
             self._check_piece(piece[:, 0], piece[:, 1:4], piece[:, 4:7])
 

@@ -21,14 +21,22 @@ from typing import Any
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.imu.buffers import FieldBuffer, WindowBuffer
+from stario.fusion.health import SampleCounts
 from stario.fusion.imu.faults import (
     ClockSetBackDetector,
+    FrozenSensorDetector,
     GyroUnitCheck,
     OutlierDetector,
 )
-from stario.fusion.imu.frozen import FrozenSensorDetector
-from stario.fusion.imu.intervals import Flags, ImuInterval, SampleCounts, Start
+from stario.fusion.imu.intervals import (
+    FieldBuffer,
+    Flags,
+    ImuInterval,
+    Sample,
+    Start,
+    interpolated_sample,
+)
+from stario.fusion.imu.stateful import WindowBuffer
 from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.errors import InputError
@@ -48,9 +56,6 @@ _ISOLATED_SAMPLES = 20
 
 _REPEATED_SAMPLES = 1000
 """This many samples with the first one's time show that times have too few digits."""
-
-Sample = tuple[float, float, float, float, float, float, float]
-"""Time [s], gyroscope xyz [rad/s], specific force xyz [m/s^2]."""
 
 
 class FrontEnd:
@@ -246,7 +251,10 @@ class FrontEnd:
         if flags.spikes:
             self._samples[later] = tuple(table[later].tolist())
         after = self._samples[later]
-        end = after if after[0] == stop else _interpolated(table[later - 1], table[later], stop)
+        if after[0] == stop:
+            end = after
+        else:
+            end = tuple(interpolated_sample(table[later - 1], table[later], stop).tolist())
         rest = self._samples[later:]
         self._samples = rest if rest[0][0] == stop else [end, *rest]
         self._index += 1
@@ -285,9 +293,3 @@ def _interval(
         levelled_bias_sigma=attitude.bias_sigma,
         **measured,
     )
-
-
-def _interpolated(before: FloatArray, after: FloatArray, time: float) -> Sample:
-    weight = (time - before[0]) / (after[0] - before[0])
-    values = before[1:] + weight * (after[1:] - before[1:])
-    return (time, *values.tolist())

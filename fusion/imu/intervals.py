@@ -1,18 +1,24 @@
-"""Output of the front end: IMU intervals, split at fixes, the start from gravity, sample counts."""
+"""Output of the front end: the start, IMU intervals, and the magnetic field at their ends."""
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stario.fusion.fixes import Fix
-from stario.fusion.imu.frozen import Stopped
-from stario.fusion.state import Health, changed
-from stario.sequences.sequence import FloatArray
+from stario.fusion.state import changed
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
+from stario.sequences.windows import MAX_RATE, MIN_RATE
+
+Sample = tuple[float, float, float, float, float, float, float]
+"""Time [s], gyroscope xyz [rad/s], specific force xyz [m/s^2]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +38,27 @@ class Start:
     still: bool
     force: float
     rate: float
+
+
+_START_FORCE = (5.0, 15.0)
+"""Accepted mean force of the first second [m/s^2]: allows for a jump, excludes units of g."""
+
+
+def check_start(start: Start, gravity: float) -> None:
+    """Check the first second of a stream, which cannot be checked as a whole.
+
+    Raises:
+        InputError: the rate is not about 50 Hz to 1 kHz, or the mean force cannot be gravity.
+    """
+    if not MIN_RATE <= start.rate <= MAX_RATE:
+        raise InputError("time", f"{start.rate:.3g} samples a second", "50 to 1000")
+    if not _START_FORCE[0] <= start.force <= _START_FORCE[1]:
+        raise InputError(
+            "accel",
+            f"an average of {start.force:.3g} over the first second",
+            f"about {gravity:.2f} m/s^2",
+            "give specific force in m/s^2 with gravity left in, and rates in rad/s",
+        )
 
 
 class Flags(NamedTuple):
@@ -103,6 +130,11 @@ class ImuInterval:
         return changed(self, window=None, attitudes=_NO_ATTITUDES)
 
     @property
+    def table(self) -> FloatArray:
+        """Samples (n + 1, 7): time, gyro and accel."""
+        return np.column_stack([self.time, self.gyro, self.accel])
+
+    @property
     def start(self) -> float:
         """Time of the first sample [s]."""
         return float(self.time[0])
@@ -115,8 +147,8 @@ class ImuInterval:
 
 _NO_ATTITUDES = np.empty((0, 3, 3))
 
-_SAME_TIME = 1e-6
-"""A fix within this time of an interval's start or end [s] counts as at it."""
+SAME_TIME = 1e-6
+"""Times that differ by no more than this [s] count as the same."""
 
 
 def split_at_fixes(
@@ -133,10 +165,10 @@ def split_at_fixes(
     pieces: list[tuple[ImuInterval | None, list[Fix]]] = []
     rest = interval
     for fix in fixes:
-        if fix.time <= rest.start + _SAME_TIME:
+        if fix.time <= rest.start + SAME_TIME:
             if not pieces:
                 pieces.append((None, []))
-        elif fix.time < rest.stop - _SAME_TIME:
+        elif fix.time < rest.stop - SAME_TIME:
             before, rest = split_at(rest, fix.time)
             pieces.append((before, []))
         else:
@@ -148,133 +180,88 @@ def split_at_fixes(
 
 def split_at(interval: ImuInterval, time: float) -> tuple[ImuInterval, ImuInterval]:
     """Split an interval at a time [s] inside it; the second part keeps window and update."""
-    k = int(np.searchsorted(interval.time, time))
-    weight = (time - interval.time[k - 1]) / (interval.time[k] - interval.time[k - 1])
-    first: dict[str, Any] = {"time": np.append(interval.time[:k], time)}
-    second: dict[str, Any] = {"time": np.append(time, interval.time[k:])}
-    if second["time"][1] - time < 1e-9:
-        second["time"] = np.append(time, interval.time[k + 1 :])
-    for name in ("gyro", "accel"):
-        values = getattr(interval, name)
-        boundary = (1.0 - weight) * values[k - 1] + weight * values[k]
-        first[name] = np.vstack([values[:k], boundary])
-        second[name] = np.vstack([boundary, values[len(values) - len(second["time"]) + 1 :]])
-    return changed(interval, **first, update=False, window=None, R_NB_window=None), changed(
-        interval, **second
-    )
+    table = interval.table
+    k = int(np.searchsorted(table[:, 0], time))
+    boundary = interpolated_sample(table[k - 1], table[k], time)
+    later = table[k:] if table[k, 0] - time >= 1e-9 else table[k + 1 :]
+    first = _with_samples(interval, np.vstack([table[:k], boundary]))
+    second = _with_samples(interval, np.vstack([boundary, later]))
+    return changed(first, update=False, window=None, R_NB_window=None), second
 
 
-GAPS_LISTED = 100
-"""Maximum number of gaps listed one by one; an endless stream may have any number."""
-
-LATE_NOTE_SECONDS = 0.5
-"""Duration of consecutive late samples beyond which the health report notes them [s]."""
-
-FIELD_DROPS_NOTED = 50
-"""Number of dropped magnetic fields beyond which the health report notes them."""
-
-UNFAMILIAR_SHARE = 0.3
-"""Share of unfamiliar windows beyond which health notes them; 0.05 of training windows are."""
+def _with_samples(interval: ImuInterval, table: FloatArray) -> ImuInterval:
+    """Return an interval with other samples: rows of time, gyro and accel (n, 7)."""
+    return changed(interval, time=table[:, 0], gyro=table[:, 1:4], accel=table[:, 4:])
 
 
-@dataclass
-class SampleCounts:
-    """Counts of the samples used, dropped and flagged, of gaps and of windows.
+def interpolated_sample(before: FloatArray, after: FloatArray, time: float) -> FloatArray:
+    """Return the sample (7,) at a time [s] between two samples of time, gyro and accel."""
+    sample = before + (time - before[0]) / (after[0] - before[0]) * (after - before)
+    sample[0] = time
+    return np.asarray(sample)
 
-    Attributes:
-        used: samples used.
-        not_finite: dropped: a value is NaN, infinite or absurdly large.
-        frozen: dropped: the values of both sensors, or of one alone, repeat those before, though
-            the device is not at rest.
-        frozen_gyro: those of them in which the gyroscope alone had stopped.
-        frozen_accel: those of them in which the accelerometer alone had stopped.
-        duplicate: dropped: the time repeats the newest.
-        out_of_order: dropped: the time is before the newest.
-        longest_late: longest duration of consecutive samples out of order [s].
-        future: dropped: the time is ahead of later samples.
-        spike: used, but replaced because they differ too much from their neighbours.
-        saturated: used, but at the sensor's limit.
-        field_dropped: magnetic fields dropped: a value or a time is wrong, or the sensor stopped.
-        gap_count: stretches without samples longer than `MAX_IMU_GAP`.
-        longest_gap: length of the longest [s].
-        gaps: (start, length) [s] of the newest `GAPS_LISTED`.
-        windows: windows given to the network.
-        unfamiliar: those of them outside what its weights were trained on.
-        set_back: amount by which a recording's clock was set back where its track ends [s].
-    """
 
-    used: int = 0
-    not_finite: int = 0
-    frozen: int = 0
-    frozen_gyro: int = 0
-    frozen_accel: int = 0
-    duplicate: int = 0
-    out_of_order: int = 0
-    longest_late: float = 0.0
-    future: int = 0
-    spike: int = 0
-    saturated: int = 0
-    field_dropped: int = 0
-    gap_count: int = 0
-    longest_gap: float = 0.0
-    gaps: list[tuple[float, float]] = field(default_factory=list)
-    windows: int = 0
-    unfamiliar: int = 0
-    set_back: float = 0.0
+_MAX_FIELDS = 1000
+"""Maximum number of fields that wait for their samples: ten seconds of a fast sensor."""
 
-    def add_frozen(self, stopped: Stopped) -> None:
-        """Count a sample in which sensors had stopped."""
-        self.frozen += 1
-        self.frozen_gyro += stopped == "gyroscope"
-        self.frozen_accel += stopped == "accelerometer"
+_MAX_AHEAD = 1.0
+"""A field further than this ahead of the newest sample [s] is dropped once an earlier one comes."""
 
-    def add_gap(self, start: float, length: float) -> None:
-        """Count a stretch without samples [s]."""
-        self.gap_count += 1
-        self.longest_gap = max(self.longest_gap, length)
-        self.gaps = [*self.gaps, (start, length)][-GAPS_LISTED:]
+_MAX_FIELD_AGE = 0.11
+"""Maximum age of the field used at an interval's end [s]; slow sensors measure ten per second."""
 
-    def health(self) -> Health:
-        """Return the part of the health report that concerns the samples."""
-        names = ("used", "not_finite", "frozen", "duplicate", "out_of_order", "future")
-        return Health(
-            samples={name: getattr(self, name) for name in names},
-            flagged={"spike": self.spike, "saturated": self.saturated},
-            gap_count=self.gap_count,
-            longest_gap=self.longest_gap,
-            gaps=list(self.gaps),
-            notes=self._notes(),
-        )
+_MAX_DELAY = 0.1
+"""A field older than the end of the last interval by more than this [s] is dropped as late."""
 
-    def _notes(self) -> list[str]:
-        notes = []
-        if self.set_back:
-            notes.append(
-                f"the recording's clock was set back by {self.set_back:.3g} s: the track ends there"
-            )
-        elif self.longest_late > LATE_NOTE_SECONDS:
-            notes.append(
-                f"samples arrived late for {self.longest_late:.1f} s in a row: logged twice, or "
-                "from a clock that was set back; if so, that time is missing and no sigma covers it"
-            )
-        for count, sensor, other in (
-            (self.frozen_gyro, "gyroscope", "accelerometer"),
-            (self.frozen_accel, "accelerometer", "gyroscope"),
+
+_MAX_REPEATED = 0.5
+"""Maximum time for which a field may repeat itself [s]: slow sensors are logged several times, but
+one that repeats its value for longer has stopped."""
+
+
+class FieldBuffer:
+    """The newest magnetic fields of a stream."""
+
+    def __init__(self) -> None:
+        self._value: tuple[float, ...] = ()
+        self._since = math.inf
+        self._fields: deque[tuple[float, FloatArray]] = deque(maxlen=_MAX_FIELDS)
+        self._last_query = -math.inf
+
+    def add(self, time: float, field_B: FloatArray, now: float) -> bool:
+        """Add a field; return False if its value or time cannot be right, or the sensor stopped.
+
+        It also returns False if too many fields wait, so that the first of them is dropped.
+
+        Args:
+            time: time of the field [s].
+            field_B: (3,) magnetic field in B [uT].
+            now: time of the newest sample [s]. A field far ahead of it is kept only until an
+                earlier one comes, so that one wild timestamp does not make later fields look late.
+        """
+        while (
+            self._fields
+            and time <= (last := self._fields[-1][0])
+            and -math.inf < now < last - _MAX_AHEAD
         ):
-            if count:
-                notes.append(
-                    f"the {sensor} stopped: it repeats its value in {count} samples in which the "
-                    f"{other} shows motion; they were dropped"
-                )
-        if self.field_dropped > FIELD_DROPS_NOTED:
-            notes.append(
-                f"{self.field_dropped} magnetic fields were dropped: the sensor repeated its last "
-                "value, or their times or values are wrong"
-            )
-        if self.unfamiliar > UNFAMILIAR_SHARE * self.windows:
-            share = self.unfamiliar / self.windows
-            notes.append(
-                f"{share:.0%} of the windows move unlike anything the weights were trained on: "
-                "the network's sigma is widened there"
-            )
-        return notes
+            self._fields.pop()
+        newest = self._fields[-1][0] if self._fields else -math.inf
+        newest = max(newest, self._last_query - _MAX_DELAY)
+        size = float(np.abs(field_B).sum())
+        if not (math.isfinite(time) and time > newest and size < MAX_SENSOR_VALUE):
+            return False
+        value = tuple(field_B.tolist())
+        if value != self._value:
+            self._value, self._since = value, time
+        if time - self._since > _MAX_REPEATED:
+            return False
+        room = len(self._fields) < _MAX_FIELDS
+        self._fields.append((time, field_B))
+        return room
+
+    def at(self, time: float) -> FloatArray | None:
+        """Return the newest field (3,) up to a time [s], None if it is too old; later ones wait."""
+        self._last_query = time
+        while self._fields and self._fields[0][0] < time - _MAX_FIELD_AGE:
+            self._fields.popleft()
+        return next((m_B for t, m_B in reversed(self._fields) if t <= time), None)

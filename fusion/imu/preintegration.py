@@ -161,18 +161,14 @@ def segment_of_all(
     Their mean noise would spread the effect of a heel strike from a tenth of a second over half a
     second, and correlate position and velocity at the end wrongly.
     """
-    first, rest = intervals[0], intervals[1:]
-
-    def joined(name: str) -> FloatArray:  # without the samples that intervals share
-        return np.concatenate([getattr(first, name), *(getattr(e, name)[1:] for e in rest)])
-
-    noise = (
+    first, *rest = intervals
+    table = np.vstack([first.table, *(e.table[1:] for e in rest)])  # without the shared samples
+    noise = [
         density
         for e in intervals
         for density in [_widened_noise(config, e.accel_factor, e.flags)] * (len(e.time) - 1)
-    )
-    samples = joined("time"), joined("gyro"), joined("accel")
-    return preintegrate(*samples, b_g, b_a, list(noise), config.gravity)
+    ]
+    return preintegrate(table[:, 0], table[:, 1:4], table[:, 4:], b_g, b_a, noise, config.gravity)
 
 
 @lru_cache(maxsize=64)  # successive intervals repeat it, and validating settings is slow

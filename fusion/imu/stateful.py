@@ -1,19 +1,33 @@
-"""Stateful inference: a track's windows in time order, with the memory cleared after each gap."""
+"""From intervals to displacements: windows of the last second, and the network's inference.
+
+Inference is stateful: a track's windows in time order, with the memory cleared after each gap.
+"""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stario.fusion.checked import floored
-from stario.fusion.imu.intervals import ImuInterval, SampleCounts
+from stario.fusion.health import SampleCounts
+from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.state import changed
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
-from stario.sequences.windows import rotated_windows
+from stario.sequences.windows import (
+    WINDOW_RATE,
+    WINDOW_SECONDS,
+    facing,
+    mean_heading,
+    resample,
+    rotated_windows,
+)
 
 MIN_DISPLACEMENT_SIGMA = 5e-3
 """Minimum standard deviation of a second's displacement [m], whatever the network predicts."""
@@ -33,6 +47,73 @@ Displacement = tuple[FloatArray, FloatArray]
 def slope_variance(d: FloatArray) -> FloatArray:
     """Return the variance [m^2] of the heights of displacements (..., 3) [m] due to slopes."""
     return np.asarray(SLOPE_SIGMA**2 * np.square(d[..., :2]).sum(axis=-1))
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """One interval's part of a window.
+
+    Attributes:
+        imu_N: (6, n) gyroscope [rad/s] and specific force [m/s^2] in N.
+        R_NB: (3, 3) levelled attitude at its start.
+        facing_N: (2,) direction that the device faces there, as given by `facing`.
+        flagged: whether it contains faulty or missing samples.
+    """
+
+    imu_N: NDArray[np.float32]
+    R_NB: FloatArray
+    facing_N: FloatArray
+    flagged: bool
+
+
+_TAIL_SAMPLES = 4
+"""Samples kept from the previous interval: half a step of the window's grid at the fastest rate."""
+
+
+class WindowBuffer:
+    """The last second of unbroken samples.
+
+    Args:
+        rate: number of intervals per second.
+    """
+
+    def __init__(self, rate: int) -> None:
+        self._grid = np.arange(round(WINDOW_RATE / rate)) / WINDOW_RATE
+        self._blocks: deque[Block] = deque(maxlen=round(rate * WINDOW_SECONDS))
+        self._tail: FloatArray | None = None  # time and turned IMU (k, 7) before the interval
+
+    def clear(self) -> None:
+        """Drop all samples, so that no window spans a gap."""
+        self._blocks.clear()
+        self._tail = None
+
+    def add(self, interval: ImuInterval) -> None:
+        """Add the samples of the next interval."""
+        attitudes, flags = interval.attitudes, interval.flags
+        rows = np.empty((len(interval.time), 7))
+        rows[:, 0] = interval.time
+        rows[:, 1:4] = (attitudes @ interval.gyro[:, :, None])[:, :, 0]
+        rows[:, 4:] = (attitudes @ interval.accel[:, :, None])[:, :, 0]
+        tail, self._tail = self._tail, rows[-_TAIL_SAMPLES - 1 : -1]
+        # The first average reaches half a grid step back, into the tail.
+        samples = rows if tail is None else np.concatenate([tail, rows])
+        imu_N = resample(samples[:, 0], samples[:, 1:], interval.start + self._grid)
+        R_NB = attitudes[0]
+        flagged = flags.gyro or flags.accel or flags.missing
+        self._blocks.append(Block(imu_N.astype(np.float32).T, R_NB, facing(R_NB), flagged))
+
+    def with_window(self, interval: ImuInterval) -> ImuInterval:
+        """Return the newest interval with the second that ends there, once that is complete."""
+        blocks = self._blocks
+        if len(blocks) < (blocks.maxlen or 0):
+            return interval
+        return changed(
+            interval,
+            window=np.concatenate([block.imu_N for block in blocks], axis=1),
+            R_NB_window=blocks[0].R_NB,
+            heading=float(mean_heading(np.array([block.facing_N for block in blocks]))),
+            window_flagged=any(block.flagged for block in blocks),
+        )
 
 
 class Predictor(Protocol):

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from stario.fusion.state import Health
+from stario.fusion.health import Health
 
 Level = Literal["good", "note", "warning"]
 """Severity: nothing to do, good to know, or worth acting on."""

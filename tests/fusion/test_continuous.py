@@ -7,7 +7,7 @@ import numpy as np
 from support import CONFIG
 
 from stario.fusion import Navigator, NavState
-from stario.fusion.continuous import MAX_STEP, ContinuousPose, advanced
+from stario.fusion.state import MAX_STEP, ContinuousPose, advanced
 from stario.sequences.sequence import ImuSequence
 
 Make = Callable[..., Any]

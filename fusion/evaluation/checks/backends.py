@@ -17,7 +17,7 @@ from stario.fusion.evaluation.checks.faults import (
     matched_config,
     with_true_displacements,
 )
-from stario.fusion.filter.estimator_state import innovations_from_rows
+from stario.fusion.filter.estimator_state import innovations_of
 from stario.fusion.graph.fixed_lag import FixedLagEstimator
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
@@ -191,4 +191,4 @@ def _streamed(
         states.append(estimator.nav_state())
         times.append(process_time() - began)
     health = estimator.health(preprocessed.front_end.counts)
-    return track_from_states(states, innovations_from_rows([]), health), np.array(times)
+    return track_from_states(states, innovations_of([]), health), np.array(times)

@@ -16,15 +16,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
-from stario.fusion.filter.estimates import ACTUAL, Estimate
+from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS, Estimate
 from stario.fusion.filter.estimator import Estimator
-from stario.fusion.filter.estimator_state import Displacement
+from stario.fusion.filter.estimator_state import innovations_of
 from stario.fusion.filter.initial import PriorPose
-from stario.fusion.filter.jacobians import CORE
+from stario.fusion.filter.jacobians import ACTUAL, CORE
 from stario.fusion.filter.network_errors import ACCEL_SHARE, displacement_errors
 from stario.fusion.imu.intervals import ImuInterval
-from stario.fusion.imu.stateful import slope_variance
+from stario.fusion.imu.stateful import Displacement, slope_variance
 from stario.fusion.lie import log_se23, yaw_rotation
 from stario.fusion.recording import cut_recording
 from stario.sequences.accuracy.nees import nees_bounds
@@ -212,13 +211,13 @@ def _run(
     assert front_end.start is not None  # two seconds are enough
     estimator = Estimator(config, front_end.start, prior)
     network = _DrawnNetwork(walk, config, rng)
-    rows = []
+    rows, steps = [], []
     for count, interval in enumerate(intervals, 1):
-        estimator.step(interval, network.displacement(interval))
+        steps.append(estimator.step(interval, network.displacement(interval)))
         if count % config.filter.output_rate == 0:
             k = round(interval.stop * RATE)
             rows.append(_errors(estimator.estimate(), walk, k, b_g[k], b_a[k]))
-    return np.array(rows), float(estimator.innovations().nis.mean())
+    return np.array(rows), float(innovations_of(steps).nis.mean())
 
 
 def _drawn_start(

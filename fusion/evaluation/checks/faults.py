@@ -18,10 +18,11 @@ from scipy.spatial.transform import Rotation
 from stario.fusion.backends import BackendName
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.checks.corruption import Fault, ModifyPredictions, faults
+from stario.fusion.health import Health
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.recording import PreprocessedRecording
-from stario.fusion.state import Health, Track
+from stario.fusion.state import Track
 from stario.sequences.accuracy.metrics import align, evaluate_track
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.drawing.text_table import aligned

@@ -15,8 +15,7 @@ import numpy as np
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.compare import DEMONSTRATION_SEED, demonstration
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.estimates import ACTUAL, ASSUMED
-from stario.fusion.filter.jacobians import CORE, Block
+from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CORE, Block
 from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.navigator import Navigator
 from stario.fusion.state import NavState
@@ -50,22 +49,17 @@ class DenseEkf(StateCloningEkf):
         self.predict()
         return np.stack([self.P, actual])
 
-    def _correct(
-        self,
-        residual: FloatArray,
-        blocks: Sequence[Block],
-        covariance: FloatArray,
-        HP: FloatArray,
-        HPH: FloatArray,
-        whitener: FloatArray,
+    def _with_gain(
+        self, blocks: Sequence[Block], R: FloatArray, HP: FloatArray, S: FloatArray
     ) -> FloatArray:
-        H = np.zeros((len(residual), self.dim_x))
+        actual, before = super()._with_gain(blocks, R, HP, S)[ACTUAL], self.covariances
+        H = np.zeros((R.shape[1], self.dim_x))
         for first, block in blocks:
             H[:, first : first + block.shape[1]] = block
-        self.R, before = covariance, self.covariances
-        self.update(residual[:, None], lambda x: H, lambda x: H @ x)
-        P, self.covariances = self.P, before  # the other covariance is yet to be updated
-        return P
+        self.x = np.zeros_like(self.x)  # filterpy finds the gain and moves it again
+        self.update(self.z, lambda x: H, lambda x: H @ x)
+        P, self.covariances = self.P, before
+        return np.stack([P, actual])
 
 
 def engine_speed() -> tuple[float, float]:

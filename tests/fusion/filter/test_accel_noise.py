@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from stario.fusion import Navigator, NavigatorConfig
-from stario.fusion.filter.displacements import AccelNoiseScale
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.estimator import Estimator
+from stario.fusion.filter.network_errors import AccelNoiseScale
 from stario.sequences.sequence import ImuSequence
 
 

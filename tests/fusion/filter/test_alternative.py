@@ -14,8 +14,14 @@ from stario.fusion import Navigator
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.checks.corruption import faults
 from stario.fusion.evaluation.checks.faults import matched_walk, run_faults
+from stario.fusion.filter.displacements import (
+    AlternativeHypothesis,
+    DisplacementUpdates,
+    HypothesisPair,
+)
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.hypotheses import AlternativeHypothesis, HypothesisPair
+from stario.fusion.filter.network_errors import TURN_SECONDS, with_turn
+from stario.fusion.state import NavState
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence
 
@@ -115,26 +121,18 @@ def hypotheses() -> HypothesisPair:
     filter_.state = replace(filter_.state, time=10.0)
     pair = HypothesisPair(filter_)
     other = replace(filter_.state, b_a=np.ones(3))
-    pair.alternative = AlternativeHypothesis(other, 10.0, np.zeros(3), (10.0,))
+    pair.alternative = AlternativeHypothesis(other, 10.0, np.zeros(3), (10.0, 10.5))
     return pair
-
-
-def fits(alternative: AlternativeHypothesis) -> AlternativeHypothesis:
-    return alternative
-
-
-def does_not_fit(alternative: AlternativeHypothesis) -> AlternativeHypothesis:
-    return replace(alternative, outliers=(*alternative.outliers, 10.5))
 
 
 def test_two_displacements_that_fit_only_the_alternative_adopt_it() -> None:
     pair = hypotheses()
-    assert pair.compare(does_not_fit, fits_filter=False) == ()
-    assert pair.compare(fits, fits_filter=False) == ()
+    assert pair.judge(False, fits_filter=False) == ()
+    assert pair.judge(True, fits_filter=False) == ()
     assert pair.alternative is not None
     assert pair.ekf.state.b_a[0] == 0.0
     # The displacements without which it was made were false.
-    assert pair.compare(fits, fits_filter=False) == (10.0, 10.5)
+    assert pair.judge(True, fits_filter=False) == (10.0, 10.5)
     assert pair.alternative is None
     assert pair.ekf.state.b_a[0] == 1.0
 
@@ -143,11 +141,27 @@ def test_the_alternative_is_dropped_when_both_fit_or_when_it_is_too_old() -> Non
     pair = hypotheses()
     for _ in range(4):
         assert pair.alternative is not None
-        assert pair.compare(fits, fits_filter=True) == ()
+        assert pair.judge(True, fits_filter=True) == ()
     assert pair.alternative is None
     aged = hypotheses()
     assert aged.alternative is not None
     aged.alternative = replace(aged.alternative, ekf=replace(aged.alternative.ekf, time=16.5))
-    assert aged.compare(does_not_fit, fits_filter=True) == ()
+    assert aged.judge(False, fits_filter=True) == ()
     assert aged.alternative is None
     assert aged.ekf.state.b_a[0] == 0.0
+
+
+def test_a_false_displacement_lets_the_networks_turn_decay_once() -> None:
+    ekf, zero = StateCloningEkf(slots=1), np.zeros(3)
+    ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, 1e-4 * np.eye(15)))
+    slot = ekf.clone()
+    ekf.state = replace(with_turn(ekf.state, 0.05), network_turn=0.1)
+    updates = DisplacementUpdates(ekf, FilterConfig(update_rate=2))
+    updates.hypotheses.alternative = AlternativeHypothesis(ekf.state, 0.0, zero)
+    result, _ = updates.update(slot, np.eye(3), np.array([5.0, 0.0, 0.0]), 1e-4 * np.eye(3))
+    alternative = updates.hypotheses.alternative
+    assert result.gated
+    assert alternative is not None
+    assert len(alternative.outliers) == 1
+    for state in (ekf.state, alternative.ekf):
+        assert state.network_turn == pytest.approx(0.1 * np.exp(-0.5 / TURN_SECONDS), rel=1e-9)

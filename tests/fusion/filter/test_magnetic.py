@@ -15,8 +15,7 @@ from stario.fusion.config import FilterConfig
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import bearing_jacobian
-from stario.fusion.filter.magnetic import first_field, update_bearing
-from stario.fusion.filter.magnetic_reference import MagneticReference
+from stario.fusion.filter.magnetic import MagneticReference, first_field, update_bearing
 from stario.fusion.navigator import Navigator as Stream
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.attitude.so3 import exp_so3

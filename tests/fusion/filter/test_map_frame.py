@@ -65,6 +65,18 @@ def test_fixes_far_from_the_maps_origin_are_as_accurate_as_near_ones(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
+def test_a_fix_at_the_first_sample_places_the_first_state_too(
+    make_walk: Make, make_oracle: Make, backend: Any
+) -> None:
+    walk = make_walk(3, 5.0)
+    oracle = make_oracle(walk, walk.truth, CONFIG)
+    fix = position_fix(walk.time[0], MAP, 0.01 * np.eye(3))
+    track = Navigator(oracle, CONFIG, backend=backend).run(walk, fixes=[fix])
+    np.testing.assert_allclose(track.trajectory.position_W[0], MAP, atol=1e-3)
+    np.testing.assert_allclose(np.diag(track.covariance[0, 6:9, 6:9]), 0.01, rtol=0.01)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("gap", [4.0, 15.0])
 def test_fixes_recover_the_yaw_after_a_gap_that_lost_it(
     make_walk: Make, make_oracle: Make, without: Make, backend: Any, gap: float

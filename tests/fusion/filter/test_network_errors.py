@@ -10,9 +10,8 @@ import pytest
 from stario.fusion import Navigator, NavigatorConfig
 from stario.fusion.config import FilterConfig
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
+from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS, Estimate
 from stario.fusion.filter.engine import UpdateResult
-from stario.fusion.filter.estimates import Estimate, with_actual_covariances
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.map_frame import MapFrame
@@ -26,6 +25,7 @@ from stario.fusion.filter.network_errors import (
     displacement_errors,
 )
 from stario.fusion.fixes import position_fix
+from stario.fusion.graph.covariances import with_actual_covariances
 from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.recording import cut_recording
 from stario.fusion.state import NavState
@@ -138,7 +138,7 @@ def test_the_covariance_is_that_of_drawn_errors() -> None:
     rng, seconds = np.random.default_rng(1), 30
     filters, ends, nis = zip(*(straight_walk(rng, seconds) for _ in range(200)), strict=True)
     found = np.square([ekf.state.p_W - end for ekf, end in zip(filters, ends, strict=True)])
-    reported = np.diag(filters[0].state.plain_covariance)[6:9]
+    reported = np.diag(filters[0].state.nav_state().covariance)[6:9]
     np.testing.assert_allclose(found.mean(axis=0)[:2], reported[:2], rtol=0.3)
     assert np.mean(nis) == pytest.approx(3.0, rel=0.1)
     assert filters[0].P[6, 6] < 0.6 * reported[0]
@@ -203,7 +203,7 @@ def test_the_first_fix_after_a_straight_walk_is_believed() -> None:
     time = np.arange(0.0, 1.0 + 1e-9, 0.1)
     accel = np.tile([0.0, 0.0, STANDARD_GRAVITY], (len(time), 1))
     noise = ImuNoise(gyro_noise=1e-3, accel_noise=0.1)
-    frame = MapFrame(PriorPose(np.eye(3), zero, zero), 0.997, 0.0)
+    frame = MapFrame(ekf, PriorPose(np.eye(3), zero, zero), 0.997, 0.0)
     slot = ekf.clone()
     for second in range(200):
         samples = float(second) + time, np.zeros_like(accel), accel
@@ -215,7 +215,7 @@ def test_the_first_fix_after_a_straight_walk_is_believed() -> None:
         slot = ekf.clone(instead_of=slot)
     truth = np.array([200.0 * length, 0.0, 0.0])
     assert ekf.state.p_W[0] - truth[0] > 3.0 * np.sqrt(ekf.P[6, 6])
-    result = frame.update(ekf, position_fix(200.0, truth, np.eye(3)))
+    result = frame.update(position_fix(200.0, truth, np.eye(3)))
     assert result.accepted
     assert result.scale == 1.0
     assert np.linalg.norm(ekf.state.p_W - truth) < 1.0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.imu.buffers import FieldBuffer
+from stario.fusion.imu.intervals import FieldBuffer
 from stario.fusion.recording import cut_recording
 from stario.sequences import PHONE_IMU, generate_walk, simulate_imu
 from stario.sequences.sequence import ImuSequence, Magnetometer

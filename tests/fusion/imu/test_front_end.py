@@ -10,8 +10,9 @@ from cut_windows import windows_of
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.health import SampleCounts
 from stario.fusion.imu.front_end import FrontEnd
-from stario.fusion.imu.intervals import ImuInterval, SampleCounts
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.recording import cut_recording
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU

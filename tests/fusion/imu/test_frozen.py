@@ -9,7 +9,7 @@ import pytest
 from support import CONFIG, stream
 
 from stario.fusion import Navigator
-from stario.fusion.imu.frozen import FrozenSensorDetector
+from stario.fusion.imu.faults import FrozenSensorDetector
 from stario.fusion.report.health import health_lines
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence

@@ -1,0 +1,210 @@
+"""Health report of a run, and the counts of samples from which it is made."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+Stopped = Literal["both", "gyroscope", "accelerometer"]
+"""What has stopped: both sensors, or one alone."""
+
+
+@dataclass
+class Health:
+    """Report of a run: counts by reason, and final uncertainty.
+
+    Attributes:
+        samples: number used, and numbers dropped by reason.
+        flagged: of those used, replaced spikes and samples at the sensor's limit.
+        gap_count: number of stretches without samples.
+        longest_gap: length of the longest gap [s].
+        gaps: start and length [s] of the latest gaps, at most a hundred.
+        updates: number of network measurements offered.
+        gated: of these, number whose covariance was inflated.
+        refused: of these, numbers refused by reason.
+        mean_nis: mean normalised innovation squared; its expectation is `nis_expected`.
+        nis_expected: degrees of freedom of a measurement.
+        fixes: numbers of fixes applied (of these gated), and refused by reason.
+        zero_velocity: numbers of zero-velocity updates (one per state) applied, and refused by
+            reason.
+        bearings: numbers of magnetic bearings, likewise; 1 under "north" if they determined it.
+        accel_noise_factor: final factor on the accelerometer's configured noise density, estimated
+            from the innovations.
+        network_error_level: final variance of the network's errors that change within seconds, as a
+            fraction of what it predicts, estimated from the innovations; 1 if not estimated.
+        final_sigma: final standard deviations, the largest in any direction (the semi-axis of the
+            ellipse): tilt and yaw [rad], velocity [m/s], horizontal position and height [m], biases
+            [rad/s], [m/s^2].
+        notes: further remarks, one line each, such as a graph that fell back to the filter.
+    """
+
+    samples: dict[str, int] = field(default_factory=dict)
+    flagged: dict[str, int] = field(default_factory=dict)
+    gap_count: int = 0
+    longest_gap: float = 0.0
+    gaps: list[tuple[float, float]] = field(default_factory=list)
+    updates: int = 0
+    gated: int = 0
+    refused: dict[str, int] = field(default_factory=dict)
+    mean_nis: float = float("nan")
+    nis_expected: int = 3
+    fixes: dict[str, int] = field(default_factory=dict)
+    zero_velocity: dict[str, int] = field(default_factory=dict)
+    bearings: dict[str, int] = field(default_factory=dict)
+    accel_noise_factor: float = 1.0
+    network_error_level: float = 1.0
+    final_sigma: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def lines(self) -> list[str]:
+        """Format the counts as text; `stario.fusion.report.health` interprets them."""
+        dropped = {k: v for k, v in self.samples.items() if k != "used" and v}
+        text = [f"samples used {self.samples.get('used', 0)}, dropped {_counted(dropped)}"]
+        if any(self.flagged.values()):
+            text.append(f"samples flagged: {_counted(self.flagged)}")
+        text.append(f"gaps {self.gap_count}, longest {self.longest_gap:.2f} s")
+        if self.updates:
+            text.append(
+                f"updates {self.updates}, gated {self.gated / self.updates:.1%}, "
+                f"refused {_counted(self.refused)}, "
+                f"mean NIS {self.mean_nis:.2f} (expected {self.nis_expected})"
+            )
+        else:
+            text.append("updates none: no window was complete, or the device was stationary")
+        if self.fixes:
+            text.append(f"fixes {_counted(self.fixes)}")
+        if self.zero_velocity:
+            text.append(f"zero-velocity updates {_counted(self.zero_velocity)}")
+        if self.bearings:
+            text.append(f"bearings of the magnetic field {_counted(self.bearings)}")
+        if self.accel_noise_factor > 1.0:
+            text.append(
+                f"accelerometer noise {self.accel_noise_factor:.1f} times the configured one"
+            )
+        if self.network_error_level != 1.0:
+            level = math.sqrt(self.network_error_level)
+            text.append(f"network's errors within seconds {level:.1f} times their predicted sigma")
+        sigma = ", ".join(f"{k} {v:.3g}" for k, v in self.final_sigma.items())
+        return [*text, f"final sigma: {sigma}"]
+
+
+def _counted(counts: dict[str, int]) -> str:
+    """Format counts by reason; `none` if there are none."""
+    return ", ".join(f"{reason} {n}" for reason, n in counts.items()) or "none"
+
+
+GAPS_LISTED = 100
+"""Maximum number of gaps listed one by one; an endless stream may have any number."""
+
+LATE_NOTE_SECONDS = 0.5
+"""Duration of consecutive late samples beyond which the health report notes them [s]."""
+
+FIELD_DROPS_NOTED = 50
+"""Number of dropped magnetic fields beyond which the health report notes them."""
+
+UNFAMILIAR_SHARE = 0.3
+"""Share of unfamiliar windows beyond which health notes them; 0.05 of training windows are."""
+
+
+@dataclass
+class SampleCounts:
+    """Counts of the samples used, dropped and flagged, of gaps and of windows.
+
+    Attributes:
+        used: samples used.
+        not_finite: dropped: a value is NaN, infinite or absurdly large.
+        frozen: dropped: the values of both sensors, or of one alone, repeat those before, though
+            the device is not at rest.
+        frozen_gyro: those of them in which the gyroscope alone had stopped.
+        frozen_accel: those of them in which the accelerometer alone had stopped.
+        duplicate: dropped: the time repeats the newest.
+        out_of_order: dropped: the time is before the newest.
+        longest_late: longest duration of consecutive samples out of order [s].
+        future: dropped: the time is ahead of later samples.
+        spike: used, but replaced because they differ too much from their neighbours.
+        saturated: used, but at the sensor's limit.
+        field_dropped: magnetic fields dropped: a value or a time is wrong, or the sensor stopped.
+        gap_count: stretches without samples longer than `MAX_IMU_GAP`.
+        longest_gap: length of the longest [s].
+        gaps: (start, length) [s] of the newest `GAPS_LISTED`.
+        windows: windows given to the network.
+        unfamiliar: those of them outside what its weights were trained on.
+        set_back: amount by which a recording's clock was set back where its track ends [s].
+    """
+
+    used: int = 0
+    not_finite: int = 0
+    frozen: int = 0
+    frozen_gyro: int = 0
+    frozen_accel: int = 0
+    duplicate: int = 0
+    out_of_order: int = 0
+    longest_late: float = 0.0
+    future: int = 0
+    spike: int = 0
+    saturated: int = 0
+    field_dropped: int = 0
+    gap_count: int = 0
+    longest_gap: float = 0.0
+    gaps: list[tuple[float, float]] = field(default_factory=list)
+    windows: int = 0
+    unfamiliar: int = 0
+    set_back: float = 0.0
+
+    def add_frozen(self, stopped: Stopped) -> None:
+        """Count a sample in which sensors had stopped."""
+        self.frozen += 1
+        self.frozen_gyro += stopped == "gyroscope"
+        self.frozen_accel += stopped == "accelerometer"
+
+    def add_gap(self, start: float, length: float) -> None:
+        """Count a stretch without samples [s]."""
+        self.gap_count += 1
+        self.longest_gap = max(self.longest_gap, length)
+        self.gaps = [*self.gaps, (start, length)][-GAPS_LISTED:]
+
+    def health(self) -> Health:
+        """Return the part of the health report that concerns the samples."""
+        names = ("used", "not_finite", "frozen", "duplicate", "out_of_order", "future")
+        return Health(
+            samples={name: getattr(self, name) for name in names},
+            flagged={"spike": self.spike, "saturated": self.saturated},
+            gap_count=self.gap_count,
+            longest_gap=self.longest_gap,
+            gaps=list(self.gaps),
+            notes=self._notes(),
+        )
+
+    def _notes(self) -> list[str]:
+        notes = []
+        if self.set_back:
+            notes.append(
+                f"the recording's clock was set back by {self.set_back:.3g} s: the track ends there"
+            )
+        elif self.longest_late > LATE_NOTE_SECONDS:
+            notes.append(
+                f"samples arrived late for {self.longest_late:.1f} s in a row: logged twice, or "
+                "from a clock that was set back; if so, that time is missing and no sigma covers it"
+            )
+        for count, sensor, other in (
+            (self.frozen_gyro, "gyroscope", "accelerometer"),
+            (self.frozen_accel, "accelerometer", "gyroscope"),
+        ):
+            if count:
+                notes.append(
+                    f"the {sensor} stopped: it repeats its value in {count} samples in which the "
+                    f"{other} shows motion; they were dropped"
+                )
+        if self.field_dropped > FIELD_DROPS_NOTED:
+            notes.append(
+                f"{self.field_dropped} magnetic fields were dropped: the sensor repeated its last "
+                "value, or their times or values are wrong"
+            )
+        if self.unfamiliar > UNFAMILIAR_SHARE * self.windows:
+            share = self.unfamiliar / self.windows
+            notes.append(
+                f"{share:.0%} of the windows move unlike anything the weights were trained on: "
+                "the network's sigma is widened there"
+            )
+        return notes
