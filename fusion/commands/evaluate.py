@@ -159,6 +159,7 @@ def _tracks(
     as_json: bool,
 ) -> list[Skipped]:
     """Write and print the table of recordings; return those that were skipped."""
+    from stario.fusion.evaluation.folders import fresh_folder
     from stario.fusion.evaluation.many import compare_recordings
     from stario.fusion.evaluation.results import write_recording, write_summary
     from stario.fusion.evaluation.summary import scores_of, summary, summary_table
@@ -173,6 +174,8 @@ def _tracks(
         )
         for comparison in collect_results(outcomes, skipped):
             if out is not None:
+                if not recordings:
+                    fresh_folder(out)
                 write_recording(out, comparison, settings)
             recordings.append(scores_of(comparison))
     if recordings:
@@ -195,7 +198,7 @@ def _networks(
 ) -> list[Skipped]:
     """Write and print the table of networks; return the recordings that were skipped."""
     from stario.fusion.evaluation.figures import write_table
-    from stario.fusion.evaluation.results import make_folder
+    from stario.fusion.evaluation.folders import make_folder
     from stario.fusion.evaluation.tables import compare_networks, table_dict, table_text
     from stario.network.model import load_model, weights_named
     from stario.sequences.accuracy.metrics import check_convention
@@ -232,6 +235,7 @@ def _groups(
     as_json: bool,
 ) -> list[Skipped]:
     """Write and print the table of groups; return the recordings that were skipped."""
+    from stario.fusion.evaluation.folders import make_folder
     from stario.fusion.evaluation.judging.judge import check_by, judge, rows_of
     from stario.fusion.evaluation.judging.prepared import prepared_recordings
     from stario.fusion.evaluation.judging.table import (
@@ -240,7 +244,6 @@ def _groups(
         judgement_text,
         write_judgement,
     )
-    from stario.fusion.evaluation.results import make_folder
     from stario.sequences.datasets.stream_cache import cache_folder
 
     grouping = check_by(by)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stario.fusion.evaluation.folders import fresh_folder
 from stario.fusion.evaluation.tables import PROTOCOLS, NetworkTable, Sample, table_dict
 from stario.sequences.drawing.figures import INK, apply_style, new_figure, save_figure
 from stario.sequences.files import write_json, write_rows
@@ -30,7 +31,8 @@ _BASELINE = "R-ResNet"
 
 
 def write_table(folder: Path, table: NetworkTable) -> None:
-    """Write `networks.csv`, `networks.json` and the figures into an existing folder."""
+    """Write `networks.csv`, `networks.json` and the figures; raises what `fresh_folder` does."""
+    fresh_folder(folder)
     write_rows(folder / "networks.csv", [asdict(entry) for entry in table.entries])
     write_json(folder / "networks.json", table_dict(table))
     for name, figure in figures(table).items():

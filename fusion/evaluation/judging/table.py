@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stario.fusion.evaluation.folders import fresh_folder
 from stario.fusion.evaluation.judging.bootstrap import CONFIDENCE, REPLICATES, Interval
 from stario.fusion.evaluation.judging.displacement_error import FIGURES
 from stario.fusion.evaluation.judging.judge import RecordingResult, Row
@@ -123,7 +124,12 @@ def judgement_dict(found: JudgingResult) -> dict[str, object]:
 
 
 def write_judgement(folder: Path, found: JudgingResult) -> None:
-    """Write `groups.csv`, `recordings.csv`, `groups.json` and `groups.png` into a folder."""
+    """Write `groups.csv`, `recordings.csv`, `groups.json` and `groups.png` into a folder.
+
+    Raises:
+        InputError: as `fresh_folder`.
+    """
+    fresh_folder(folder)
     rows = [
         {"group": row.name, "weights": name, "recordings": row.recordings, "path_km": row.path_km}
         | figures
