@@ -25,6 +25,7 @@ from stario.fusion.commands.options import (
     JsonOption,
     OptionalPathsArgument,
     ReadingOptions,
+    backend_named,
     changed,
     expand_option_groups,
     refuse_unused,
@@ -224,11 +225,12 @@ def fixes(
     """Supply periodic true positions; check that position and yaw errors match their sigmas."""
     from stario.fusion.evaluation.checks.with_fixes import fixes_table, track_with_fixes
 
+    chosen = backend_named(backend)
     _judge_each(
         "check fixes",
         (reading, paths, estimating, by, as_json),
         lambda model, recording, config, group: [
-            track_with_fixes(model, recording, config, group, every, sigma, backend=backend)  # type: ignore[arg-type]
+            track_with_fixes(model, recording, config, group, every, sigma, chosen)
         ],
         fixes_table,
     )

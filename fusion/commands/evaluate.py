@@ -89,6 +89,10 @@ def evaluate(
     as_json: JsonOption = False,
 ) -> None:
     """Evaluate accuracy and consistency over recordings with ground truth: medians and means."""
+    from stario.fusion.evaluation.folders import check_folder
+
+    if out is not None:
+        check_folder(out)
     _refuse_unused(estimating, paths, data, split, by, against, ekf, models, convention, runs)
     listed, skipped = _listed(reading, paths or [], data, split)
     files = [entry.path for entry in listed]
@@ -162,12 +166,12 @@ def _tracks(
     from stario.fusion.evaluation.folders import fresh_folder
     from stario.fusion.evaluation.many import compare_recordings
     from stario.fusion.evaluation.results import write_recording, write_summary
-    from stario.fusion.evaluation.summary import scores_of, summary, summary_table
+    from stario.fusion.evaluation.summary import Scores, scores_of, summary, summary_table
 
     settings, network = estimating.settings(), estimating.network()
     model = network if jobs == 1 else estimating.model  # each process loads the weights once
     skipped: list[Skipped] = []
-    recordings = []
+    recordings: list[Scores] = []
     with progress_bar("evaluate", 100 * len(files)) as progress:
         outcomes = compare_recordings(
             files, model, settings, reading.read, jobs, truth_needed=True, progress=progress
@@ -198,14 +202,11 @@ def _networks(
 ) -> list[Skipped]:
     """Write and print the table of networks; return the recordings that were skipped."""
     from stario.fusion.evaluation.figures import write_table
-    from stario.fusion.evaluation.folders import make_folder
     from stario.fusion.evaluation.tables import compare_networks, table_dict, table_text
     from stario.network.model import load_model, weights_named
     from stario.sequences.accuracy.metrics import check_convention
 
     networks = {name: load_model(weights_named(name, runs)) for name in names}
-    if out is not None:
-        make_folder(out)
     with progress_bar("evaluate", 100 * len(files)) as progress:
         table, skipped = compare_networks(
             files,
@@ -235,7 +236,6 @@ def _groups(
     as_json: bool,
 ) -> list[Skipped]:
     """Write and print the table of groups; return the recordings that were skipped."""
-    from stario.fusion.evaluation.folders import make_folder
     from stario.fusion.evaluation.judging.judge import check_by, judge, rows_of
     from stario.fusion.evaluation.judging.prepared import prepared_recordings
     from stario.fusion.evaluation.judging.table import (
@@ -252,8 +252,6 @@ def _groups(
     for name in names:
         if _GROUP not in name:
             _for_group(name, "")  # fail on unloadable weights before preparing anything
-    if out is not None:
-        make_folder(out)
     paths = [entry.path for entry in recordings]
     prepared = prepared_recordings(paths, reading.read, reading.as_read(), cache_folder(), jobs)
     groups = {entry.path: entry.group for entry in recordings}

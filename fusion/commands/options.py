@@ -9,13 +9,14 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
 from stario.sequences.errors import ConfigError, InputError, StarioError
 
 if TYPE_CHECKING:
+    from stario.fusion.backends import BackendName
     from stario.fusion.config import NavigatorConfig
     from stario.network.model import DisplacementModel
     from stario.sequences.datasets.batch import Skipped
@@ -235,6 +236,19 @@ def expand_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     return flat
 
 
+def backend_named(name: str) -> BackendName:
+    """Return the back end of this name.
+
+    Raises:
+        InputError: there is none.
+    """
+    from stario.fusion.backends import BACKENDS
+
+    if name not in BACKENDS:
+        raise InputError("--backend", repr(name), f"one of {', '.join(BACKENDS)}")
+    return cast("BackendName", name)
+
+
 def recipe_values(path: Path) -> dict[str, Any]:
     """Read the settings of a training recipe from a JSON file.
 
@@ -244,7 +258,8 @@ def recipe_values(path: Path) -> dict[str, Any]:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise ConfigError(str(path), str(error), "a JSON file with settings") from error
+        found = "no such file" if isinstance(error, FileNotFoundError) else str(error)
+        raise ConfigError(str(path), found, "a JSON file with settings") from error
     if not isinstance(values, dict):
         raise ConfigError(str(path), type(values).__name__, "a table of settings")
     return values

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from itertools import product
 from pathlib import Path
 
@@ -29,12 +30,26 @@ RESULTS = {
 Those of `inspect` are not here: they describe the recording, and it writes all of them anew."""
 
 
+def check_folder(folder: Path) -> None:
+    """Check a folder for results before any work that could not be written; create nothing.
+
+    Raises:
+        InputError: the folder, or one above it, is a file or cannot be written to.
+    """
+    existing = next(part for part in (folder, *folder.parents) if part.exists())
+    if not existing.is_dir():
+        raise InputError(str(existing), "a file", "a folder, new or existing")
+    if not os.access(existing, os.W_OK):
+        raise InputError(str(existing), "no permission to write", "a folder that can be written")
+
+
 def make_folder(folder: Path) -> None:
     """Create a folder and its parents.
 
     Raises:
         InputError: the path is taken by something else, or permission is denied.
     """
+    check_folder(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -85,13 +85,8 @@ def write_recording(folder: Path, comparison: Comparison, config: NavigatorConfi
     return written + _figures(inner, comparison, comparison.tracks["ekf"])
 
 
-def comparison_dict(comparisons: Sequence[Comparison]) -> dict[str, object]:
-    """Return the content of `metrics.json`."""
-    return scores_dict([scores_of(comparison) for comparison in comparisons])
-
-
 def scores_dict(recordings: Sequence[Scores]) -> dict[str, object]:
-    """Return the content of `metrics.json`, given the figures alone."""
+    """Return the content of `metrics.json`."""
     records = {scores.name: scores.record for scores in recordings}
     # Fixes change how tracks are aligned; they are given for a single recording only.
     words = next((scores.words for scores in recordings), METRIC_WORDS)

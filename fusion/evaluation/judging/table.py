@@ -210,7 +210,8 @@ def _draw_medians(
         if theirs:
             label = f"before: {theirs}" if k == 0 else None
             axes.plot(before, k, "o", color=_BEFORE, ms=8, label=label)
-        axes.plot(after, k, "o", color=_AFTER, ms=8, label=f"after: {ours}" if k == 0 else None)
+        label = (f"after: {ours}" if theirs else ours) if k == 0 else None
+        axes.plot(after, k, "o", color=_AFTER, ms=8, label=label)
         axes.annotate(f"{after:.2f}", (after, k), (0, 8), textcoords="offset points",
                       ha="center", fontsize=8, color=_AFTER)  # fmt: skip
     axes.margins(x=0.12)
