@@ -29,6 +29,7 @@ from stario.fusion.commands.options import (
     changed,
     expand_option_groups,
     refuse_unused,
+    refuse_unused_sources,
 )
 
 if TYPE_CHECKING:
@@ -90,12 +91,7 @@ def backends(
     )
     from stario.network.training.splits import split_paths
 
-    if paths:
-        refuse_unused({"--data": data is not None}, "with PATH", "one of the two")
-    if data is None:
-        refuse_unused({"--split": split != _SPLIT}, "without --data", "use with --data")
-    else:
-        refuse_unused(changed(reading, "where"), "with --data", "use with PATH: name the archive")
+    refuse_unused_sources(reading, paths, data, split != _SPLIT)
     simulated = {"--walks": walks != _WALKS, "--seconds": seconds != _SECONDS}
     if paths or data is not None:
         refuse_unused(simulated, "with recordings", "use with simulated walks")

@@ -165,21 +165,12 @@ def track_table(
         truth: ground truth, or None.
         words: meaning of each metric.
     """
-    titles = {
-        "ate_m": "ATE [m]",
-        "ate_fit_m": "fitted [m]",
-        "rte_m": "RTE [m]",
-        "pde": "PDE",
-        "aye_rad": "AYE [rad]",
-        "nees_median": "NEES",
-        "nis_mean": "NIS",
-        "seconds_network": "network [s]",
-        "seconds_filter": "other [s]",
-    }
+    from stario.fusion.evaluation.compare import METRIC_TITLES
+
     known = {
         key for values in metrics.values() for key, value in values.items() if value is not None
     }
-    columns = {key: title for key, title in titles.items() if key in known}
+    columns = {key: title for key, title in METRIC_TITLES.items() if key in known}
     rows = [
         [name, *(figure(values.get(key)) for key in columns)] for name, values in metrics.items()
     ]

@@ -25,6 +25,7 @@ from stario.fusion.commands.options import (
     changed,
     expand_option_groups,
     refuse_unused,
+    refuse_unused_sources,
 )
 from stario.sequences.errors import InputError
 
@@ -93,7 +94,8 @@ def evaluate(
 
     if out is not None:
         check_folder(out)
-    _refuse_unused(estimating, paths, data, split, by, against, ekf, models, convention, runs)
+    refuse_unused_sources(reading, paths, data, split != _SPLIT)
+    _refuse_unused(estimating, by, against, ekf, models, convention, runs)
     listed, skipped = _listed(reading, paths or [], data, split)
     files = [entry.path for entry in listed]
     if by is not None:
@@ -109,9 +111,6 @@ def evaluate(
 
 def _refuse_unused(
     estimating: EstimatorOptions,
-    paths: list[Path] | None,
-    data: Path | None,
-    split: str,
     by: str | None,
     against: str | None,
     ekf: bool,
@@ -120,10 +119,6 @@ def _refuse_unused(
     runs: Path,
 ) -> None:
     """Refuse options that the chosen kind of evaluation does not use."""
-    if paths:
-        refuse_unused({"--data": data is not None}, "with PATH", "one of the two")
-    if data is None:
-        refuse_unused({"--split": split != _SPLIT}, "without --data", "use with --data")
     if by is None:
         grouped = {"--against": against is not None, "--ekf": ekf}
         refuse_unused(grouped, "without --by", "a grouping, such as --by set")
@@ -150,7 +145,6 @@ def _listed(
         return [ListEntry(path, "") for path in files], skipped
     if data is None:
         raise InputError("PATH", "none", "recordings", "name some, or pass --data for a split")
-    refuse_unused(changed(reading, "where"), "with --data", "use with PATH: name the archive")
     return read_packaged_list(split, data), []
 
 

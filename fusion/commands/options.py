@@ -206,6 +206,18 @@ def refuse_unused(given: Mapping[str, bool], found: str, expected: str) -> None:
             raise InputError(option, f"use {found}", expected)
 
 
+def refuse_unused_sources(
+    reading: ReadingOptions, paths: list[Path] | None, data: Path | None, split_given: bool
+) -> None:
+    """Refuse options of recordings that are not read: from PATH, or from a split of --data."""
+    if paths:
+        refuse_unused({"--data": data is not None}, "with PATH", "one of the two")
+    if data is None:
+        refuse_unused({"--split": split_given}, "without --data", "use with --data")
+    else:
+        refuse_unused(changed(reading, "where"), "with --data", "use with PATH: name the archive")
+
+
 def expand_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     """Expand a command's parameters of an option group into one typer option per field.
 

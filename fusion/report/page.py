@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from plotly.offline import get_plotlyjs
 
-from stario.fusion.evaluation.compare import Comparison, metric_words
+from stario.fusion.evaluation.compare import METRIC_TITLES, Comparison, metric_words
 from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.report.figures import map_figure, time_figure
 from stario.fusion.report.health import Finding, findings
@@ -23,14 +23,8 @@ from stario.sequences.files import atomic_write
 from stario.sequences.sequence import ImuSequence, PositionTrack
 
 _LEVEL_WORDS = {"warning": "To do", "good": "Good", "note": "Note"}
-_COLUMNS = {
-    "ate_m": ("ATE [m]", 2),
-    "ate_fit_m": ("fitted [m]", 2),
-    "rte_m": ("RTE [m]", 2),
-    "aye_rad": ("AYE [rad]", 3),
-    "nees_median": ("NEES", 1),
-    "nis_mean": ("NIS", 1),
-}
+_DIGITS = {"ate_m": 2, "ate_fit_m": 2, "rte_m": 2, "aye_rad": 3, "nees_median": 1, "nis_mean": 1}
+"""Decimals of the table's columns."""
 
 
 def write_report(path: Path, found: Comparison) -> Path:
@@ -152,19 +146,19 @@ def _health(found: Sequence[Finding]) -> str:
 
 
 def _table(found: Comparison) -> str:
-    head = "".join(f"<th>{title}</th>" for title, _ in _COLUMNS.values())
+    head = "".join(f"<th>{METRIC_TITLES[key]}</th>" for key in _DIGITS)
     rows = []
     for name, figures in found.metrics.items():
         cells = []
-        for key, (_, digits) in _COLUMNS.items():
+        for key, digits in _DIGITS.items():
             value = figures.get(key)
             finite = value is not None and np.isfinite(value)
             cells.append(f"<td>{value:.{digits}f}</td>" if finite else "<td>-</td>")
         rows.append(f"<tr><th>{html.escape(style(name)[0])}</th>{''.join(cells)}</tr>")
     words = metric_words(found.alignment)
     explanations = "".join(
-        f"<li><b>{title.split()[0]}</b> {html.escape(words[key])}.</li>"
-        for key, (title, _) in _COLUMNS.items()
+        f"<li><b>{METRIC_TITLES[key].split()[0]}</b> {html.escape(words[key])}.</li>"
+        for key in _DIGITS
     )
     explanations += "".join(
         f"<li><b>{key.capitalize()}</b> {html.escape(words[key])}.</li>"
