@@ -32,7 +32,9 @@ CacheOption = Annotated[
     Path | None, typer.Option(help="Folder for cached windows. Default: STARIO_CACHE or ~/.cache.")
 ]
 ConfigOption = Annotated[Path | None, typer.Option(help="TOML or JSON file with settings.")]
-OutOption = Annotated[Path | None, typer.Option(help="Folder for the results.")]
+OutOption = Annotated[
+    Path | None, typer.Option(help="Folder for the results; replaces those of an earlier run.")
+]
 FixesOption = Annotated[
     Path | None,
     typer.Option(
