@@ -25,9 +25,11 @@ from stario.fusion.commands.options import (
     JsonOption,
     OptionalPathsArgument,
     ReadingOptions,
+    backend_named,
     changed,
     expand_option_groups,
     refuse_unused,
+    refuse_unused_sources,
 )
 
 if TYPE_CHECKING:
@@ -89,12 +91,7 @@ def backends(
     )
     from stario.network.training.splits import split_paths
 
-    if paths:
-        refuse_unused({"--data": data is not None}, "with PATH", "one of the two")
-    if data is None:
-        refuse_unused({"--split": split != _SPLIT}, "without --data", "use with --data")
-    else:
-        refuse_unused(changed(reading, "where"), "with --data", "use with PATH: name the archive")
+    refuse_unused_sources(reading, paths, data, split != _SPLIT)
     simulated = {"--walks": walks != _WALKS, "--seconds": seconds != _SECONDS}
     if paths or data is not None:
         refuse_unused(simulated, "with recordings", "use with simulated walks")
@@ -224,11 +221,12 @@ def fixes(
     """Supply periodic true positions; check that position and yaw errors match their sigmas."""
     from stario.fusion.evaluation.checks.with_fixes import fixes_table, track_with_fixes
 
+    chosen = backend_named(backend)
     _judge_each(
         "check fixes",
         (reading, paths, estimating, by, as_json),
         lambda model, recording, config, group: [
-            track_with_fixes(model, recording, config, group, every, sigma, backend=backend)  # type: ignore[arg-type]
+            track_with_fixes(model, recording, config, group, every, sigma, chosen)
         ],
         fixes_table,
     )

@@ -16,6 +16,7 @@ from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.fusion.recording import Progress
+    from stario.fusion.state import Track
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
@@ -67,12 +68,15 @@ def process_each(
         as_json: whether to print the records rather than the texts.
         single: name of an option in use that allows only one recording; empty if none.
     """
+    from stario.fusion.evaluation.folders import check_folder
     from stario.fusion.evaluation.many import distinct_name
     from stario.sequences.datasets.batch import each
 
     files, skipped = reading.recordings(paths)
     if single and len(files) > 1:
         raise InputError(single, f"{len(files)} recordings", "one recording")
+    if out is not None:
+        check_folder(out)
     names: set[str] = set()
 
     def recorded(file: Path) -> dict[str, object]:
@@ -136,6 +140,10 @@ def progress_bar(title: str, total: int = 100, shown: bool = True) -> Iterator[P
 _FULL_COVERAGE = 0.98
 """Share of a track below which the coverage by ground truth is reported as partial."""
 
+_UNTRACKED = 1.5
+"""Time at a recording's ends without a track [s] below which all of it counts as tracked: a track
+starts where the attitude is known, up to a second after the first sample."""
+
 _EXPLAINED = (
     *("ate_m", "horizontal", "alignment", "ate_fit_m", "rte_m", "pde", "aye_rad"),
     *("nees_median", "nis_mean"),
@@ -157,21 +165,12 @@ def track_table(
         truth: ground truth, or None.
         words: meaning of each metric.
     """
-    titles = {
-        "ate_m": "ATE [m]",
-        "ate_fit_m": "fitted [m]",
-        "rte_m": "RTE [m]",
-        "pde": "PDE",
-        "aye_rad": "AYE [rad]",
-        "nees_median": "NEES",
-        "nis_mean": "NIS",
-        "seconds_network": "network [s]",
-        "seconds_filter": "other [s]",
-    }
+    from stario.fusion.evaluation.compare import METRIC_TITLES
+
     known = {
         key for values in metrics.values() for key, value in values.items() if value is not None
     }
-    columns = {key: title for key, title in titles.items() if key in known}
+    columns = {key: title for key, title in METRIC_TITLES.items() if key in known}
     rows = [
         [name, *(figure(values.get(key)) for key in columns)] for name, values in metrics.items()
     ]
@@ -185,6 +184,14 @@ def track_table(
     if covered < _FULL_COVERAGE:
         lines.append(f"The truth covers {covered:.0%} of the track; metrics refer to that part.")
     return "\n".join(lines)
+
+
+def tracked_words(sequence: ImuSequence, track: Track) -> str:
+    """Return how much of a recording a track covers: less where a sensor stopped, for example."""
+    recorded, tracked = sequence.duration, float(track.time[-1] - track.time[0])
+    if recorded - tracked < _UNTRACKED:
+        return f"{recorded:.1f} s"
+    return f"{tracked:.1f} of {recorded:.1f} s tracked"
 
 
 def print_result(as_json: bool, record: object, text: str = "") -> None:

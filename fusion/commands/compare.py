@@ -13,6 +13,7 @@ from stario.fusion.commands.common import (
     print_result,
     progress_bar,
     track_table,
+    tracked_words,
 )
 from stario.fusion.commands.options import (
     EstimatorOptions,
@@ -47,8 +48,10 @@ def compare(
     """Compare tracks: inertial only, network only, EKF, graph. Without PATH: a simulated walk."""
     from stario.fusion.evaluation.compare import compare as compare_tracks
     from stario.fusion.evaluation.compare import demonstration
+    from stario.fusion.evaluation.folders import check_folder
     from stario.fusion.evaluation.many import compare_recordings
-    from stario.fusion.evaluation.results import comparison_dict, write_comparison
+    from stario.fusion.evaluation.results import scores_dict, write_comparison
+    from stario.fusion.evaluation.summary import scores_of
     from stario.fusion.fix_file import read_fixes
     from stario.sequences.readers.checked import optional_package
 
@@ -63,6 +66,8 @@ def compare(
     files, skipped = reading.recordings(paths or [])
     if fixes is not None and len(files) > 1:
         raise InputError("--fixes", f"{len(files)} recordings", "one recording")
+    folder = out or Path("runs") / "compare"
+    check_folder(folder)
     with progress_bar("compare", 100 * max(len(files), 1)) as progress:
         if not paths:
             typer.echo("demonstration: a simulated walk not used in training", err=True)
@@ -73,18 +78,18 @@ def compare(
             files, model, settings, reading.read, jobs, absolute_fixes, progress=progress
         )
         comparisons += collect_results(outcomes, skipped)
-    folder = out or Path("runs") / "compare"
     written = write_comparison(folder, comparisons, settings) if comparisons else []
     if report:
-        from stario.fusion.report.page import write_comparison_report
+        from stario.fusion.report.page import write_report
 
         for comparison in comparisons:
-            inner = folder / comparison.sequence.name
-            written.append(write_comparison_report(inner, comparison))
+            path = folder / comparison.sequence.name / "report.html"
+            written.append(write_report(path, comparison))
     if comparisons:
         lines = [line for comparison in comparisons for line in _lines(comparison)]
         lines.append(f"{len(written)} files in {folder}")
-        print_result(as_json, comparison_dict(comparisons), "\n".join(lines))
+        scores = [scores_of(comparison) for comparison in comparisons]
+        print_result(as_json, scores_dict(scores), "\n".join(lines))
     exit_if_skipped(skipped)
 
 
@@ -94,10 +99,10 @@ def _lines(comparison: Comparison) -> list[str]:
     sequence = comparison.sequence
     path = comparison.path_m
     length = f"truth: {sequence.truth_summary()}" if path is None else f"{path:.1f} m"
-    time, words = comparison.tracks["ekf"].time, metric_words(comparison.alignment)
+    track, words = comparison.tracks["ekf"], metric_words(comparison.alignment)
     lines = [
-        f"{sequence.name}: {sequence.duration:.1f} s, {length}",
-        track_table(comparison.metrics, time, sequence.truth, words),
+        f"{sequence.name}: {tracked_words(sequence, track)}, {length}",
+        track_table(comparison.metrics, track.time, sequence.truth, words),
     ]
     if sequence.truth is None and sequence.positions is not None:
         from stario.fusion.evaluation.known_positions import position_error_words

@@ -25,6 +25,7 @@ from stario.fusion.commands.options import (
     changed,
     expand_option_groups,
     refuse_unused,
+    refuse_unused_sources,
 )
 from stario.sequences.errors import InputError
 
@@ -89,7 +90,12 @@ def evaluate(
     as_json: JsonOption = False,
 ) -> None:
     """Evaluate accuracy and consistency over recordings with ground truth: medians and means."""
-    _refuse_unused(estimating, paths, data, split, by, against, ekf, models, convention, runs)
+    from stario.fusion.evaluation.folders import check_folder
+
+    if out is not None:
+        check_folder(out)
+    refuse_unused_sources(reading, paths, data, split != _SPLIT)
+    _refuse_unused(estimating, by, against, ekf, models, convention, runs)
     listed, skipped = _listed(reading, paths or [], data, split)
     files = [entry.path for entry in listed]
     if by is not None:
@@ -105,9 +111,6 @@ def evaluate(
 
 def _refuse_unused(
     estimating: EstimatorOptions,
-    paths: list[Path] | None,
-    data: Path | None,
-    split: str,
     by: str | None,
     against: str | None,
     ekf: bool,
@@ -116,10 +119,6 @@ def _refuse_unused(
     runs: Path,
 ) -> None:
     """Refuse options that the chosen kind of evaluation does not use."""
-    if paths:
-        refuse_unused({"--data": data is not None}, "with PATH", "one of the two")
-    if data is None:
-        refuse_unused({"--split": split != _SPLIT}, "without --data", "use with --data")
     if by is None:
         grouped = {"--against": against is not None, "--ekf": ekf}
         refuse_unused(grouped, "without --by", "a grouping, such as --by set")
@@ -146,7 +145,6 @@ def _listed(
         return [ListEntry(path, "") for path in files], skipped
     if data is None:
         raise InputError("PATH", "none", "recordings", "name some, or pass --data for a split")
-    refuse_unused(changed(reading, "where"), "with --data", "use with PATH: name the archive")
     return read_packaged_list(split, data), []
 
 
@@ -159,20 +157,23 @@ def _tracks(
     as_json: bool,
 ) -> list[Skipped]:
     """Write and print the table of recordings; return those that were skipped."""
+    from stario.fusion.evaluation.folders import fresh_folder
     from stario.fusion.evaluation.many import compare_recordings
     from stario.fusion.evaluation.results import write_recording, write_summary
-    from stario.fusion.evaluation.summary import scores_of, summary, summary_table
+    from stario.fusion.evaluation.summary import Scores, scores_of, summary, summary_table
 
     settings, network = estimating.settings(), estimating.network()
     model = network if jobs == 1 else estimating.model  # each process loads the weights once
     skipped: list[Skipped] = []
-    recordings = []
+    recordings: list[Scores] = []
     with progress_bar("evaluate", 100 * len(files)) as progress:
         outcomes = compare_recordings(
             files, model, settings, reading.read, jobs, truth_needed=True, progress=progress
         )
         for comparison in collect_results(outcomes, skipped):
             if out is not None:
+                if not recordings:
+                    fresh_folder(out)
                 write_recording(out, comparison, settings)
             recordings.append(scores_of(comparison))
     if recordings:
@@ -195,14 +196,11 @@ def _networks(
 ) -> list[Skipped]:
     """Write and print the table of networks; return the recordings that were skipped."""
     from stario.fusion.evaluation.figures import write_table
-    from stario.fusion.evaluation.results import make_folder
     from stario.fusion.evaluation.tables import compare_networks, table_dict, table_text
     from stario.network.model import load_model, weights_named
     from stario.sequences.accuracy.metrics import check_convention
 
     networks = {name: load_model(weights_named(name, runs)) for name in names}
-    if out is not None:
-        make_folder(out)
     with progress_bar("evaluate", 100 * len(files)) as progress:
         table, skipped = compare_networks(
             files,
@@ -240,7 +238,6 @@ def _groups(
         judgement_text,
         write_judgement,
     )
-    from stario.fusion.evaluation.results import make_folder
     from stario.sequences.datasets.stream_cache import cache_folder
 
     grouping = check_by(by)
@@ -249,8 +246,6 @@ def _groups(
     for name in names:
         if _GROUP not in name:
             _for_group(name, "")  # fail on unloadable weights before preparing anything
-    if out is not None:
-        make_folder(out)
     paths = [entry.path for entry in recordings]
     prepared = prepared_recordings(paths, reading.read, reading.as_read(), cache_folder(), jobs)
     groups = {entry.path: entry.group for entry in recordings}

@@ -45,7 +45,7 @@ def _inspect(
 ) -> tuple[dict[str, object], str]:
     """Write one recording's figure and findings; return its record and the findings in words."""
     from stario.fusion.evaluation.familiarity import familiarity
-    from stario.fusion.evaluation.results import make_folder
+    from stario.fusion.evaluation.folders import make_folder
     from stario.sequences.drawing.figures import save_figure
     from stario.sequences.drawing.plots import imu_overview
     from stario.sequences.files import write_json

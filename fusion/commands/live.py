@@ -33,10 +33,12 @@ def live(
 
     for package in ("starlette", "uvicorn", "plotly"):
         optional_package(package, "live")
+    from stario.fusion.evaluation.folders import check_folder
     from stario.fusion.live.run import LiveServer
     from stario.fusion.navigator import Navigator
 
     model, settings = estimating.network(), estimating.settings()
+    check_folder(out)
     server = LiveServer(
         lambda: Navigator(model, settings),
         out,

@@ -9,13 +9,14 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
 from stario.sequences.errors import ConfigError, InputError, StarioError
 
 if TYPE_CHECKING:
+    from stario.fusion.backends import BackendName
     from stario.fusion.config import NavigatorConfig
     from stario.network.model import DisplacementModel
     from stario.sequences.datasets.batch import Skipped
@@ -31,7 +32,9 @@ CacheOption = Annotated[
     Path | None, typer.Option(help="Folder for cached windows. Default: STARIO_CACHE or ~/.cache.")
 ]
 ConfigOption = Annotated[Path | None, typer.Option(help="TOML or JSON file with settings.")]
-OutOption = Annotated[Path | None, typer.Option(help="Folder for the results.")]
+OutOption = Annotated[
+    Path | None, typer.Option(help="Folder for the results; replaces those of an earlier run.")
+]
 FixesOption = Annotated[
     Path | None,
     typer.Option(
@@ -205,6 +208,18 @@ def refuse_unused(given: Mapping[str, bool], found: str, expected: str) -> None:
             raise InputError(option, f"use {found}", expected)
 
 
+def refuse_unused_sources(
+    reading: ReadingOptions, paths: list[Path] | None, data: Path | None, split_given: bool
+) -> None:
+    """Refuse options of recordings that are not read: from PATH, or from a split of --data."""
+    if paths:
+        refuse_unused({"--data": data is not None}, "with PATH", "one of the two")
+    if data is None:
+        refuse_unused({"--split": split_given}, "without --data", "use with --data")
+    else:
+        refuse_unused(changed(reading, "where"), "with --data", "use with PATH: name the archive")
+
+
 def expand_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     """Expand a command's parameters of an option group into one typer option per field.
 
@@ -235,6 +250,19 @@ def expand_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     return flat
 
 
+def backend_named(name: str) -> BackendName:
+    """Return the back end of this name.
+
+    Raises:
+        InputError: there is none.
+    """
+    from stario.fusion.backends import BACKENDS
+
+    if name not in BACKENDS:
+        raise InputError("--backend", repr(name), f"one of {', '.join(BACKENDS)}")
+    return cast("BackendName", name)
+
+
 def recipe_values(path: Path) -> dict[str, Any]:
     """Read the settings of a training recipe from a JSON file.
 
@@ -244,7 +272,8 @@ def recipe_values(path: Path) -> dict[str, Any]:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise ConfigError(str(path), str(error), "a JSON file with settings") from error
+        found = "no such file" if isinstance(error, FileNotFoundError) else str(error)
+        raise ConfigError(str(path), found, "a JSON file with settings") from error
     if not isinstance(values, dict):
         raise ConfigError(str(path), type(values).__name__, "a table of settings")
     return values

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import process_each, progress_bar, track_table
+from stario.fusion.commands.common import process_each, progress_bar, track_table, tracked_words
 from stario.fusion.commands.options import (
     BackendOption,
     EstimatorOptions,
@@ -19,6 +19,7 @@ from stario.fusion.commands.options import (
     PathsArgument,
     ReadingOptions,
     ReportOption,
+    backend_named,
     expand_option_groups,
 )
 
@@ -51,7 +52,8 @@ def run(
         optional_package("plotly", "report")
     if view:
         optional_package("rerun", "view")
-    navigator = Navigator(estimating.network(), estimating.settings(), backend=backend)  # type: ignore[arg-type]
+    chosen = backend_named(backend)
+    navigator = Navigator(estimating.network(), estimating.settings(), backend=chosen)
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
     work = partial(_run, navigator=navigator, fixes=absolute_fixes, report=report, view=view)
     process_each(reading, paths, out, work, as_json, single="--fixes" if fixes else "")
@@ -73,7 +75,6 @@ def _run(
     from stario.fusion.evaluation.results import write_run
     from stario.fusion.fix_file import check_within
     from stario.fusion.report.health import health_lines
-    from stario.sequences.accuracy.metrics import align
     from stario.sequences.truth.problems import warn_of_truth
 
     check_within(fixes, sequence)
@@ -83,26 +84,24 @@ def _run(
     truth, backend = sequence.truth, navigator.backend
     alignment = alignment_with(fixes)
     metrics = measure(track, sequence, alignment)
-    aligned = track.trajectory if truth is None else align(track.trajectory, truth, alignment)
     words = metric_words(alignment)
     found = Comparison(sequence, {backend: track}, {backend: metrics}, alignment)
     written = write_run(folder, found, navigator.config)
     if report:
         from stario.fusion.report.page import write_report
 
-        tracks, figures = {str(backend): track}, {str(backend): metrics}
-        path = folder / "report.html"
-        written.append(write_report(path, sequence, tracks, figures, alignment))
+        written.append(write_report(folder / "report.html", found))
     if view:
         from stario.fusion.report.view import open_view, write_view
 
-        written.append(write_view(folder / "track.rrd", sequence, track, aligned))
+        written.append(write_view(folder / "track.rrd", found))
         open_view(written[-1])
-    length = f"{sequence.name}: {sequence.duration:.1f} s, {track.trajectory.path_length():.1f} m"
+    duration, length = tracked_words(sequence, track), track.trajectory.path_length()
     ends = np.linalg.norm(np.diff(track.trajectory.position_W[[0, -1], :2], axis=0))
     lines = [
         sequence.summary(),
-        f"{length} travelled (estimated), ending {ends:.1f} m from the start",
+        f"{sequence.name}: {duration}, {length:.1f} m travelled (estimated), "
+        f"ending {ends:.1f} m from the start",
     ]
     if truth is not None:
         lines.append(track_table({backend: metrics}, track.time, truth, words))

@@ -62,7 +62,7 @@ def table(
 
     The paper's protocol: 8:1:1 by recordings, true attitude, same recipe and steps for all.
     """
-    from stario.fusion.evaluation.results import make_folder
+    from stario.fusion.evaluation.folders import make_folder
     from stario.fusion.table.files import known_costs, write_results
     from stario.fusion.table.filling import backend as on_backend
     from stario.fusion.table.filling import fill, table_cells

@@ -51,6 +51,19 @@ METRICS = (
 )
 """Figures of a track; null where unknown."""
 
+METRIC_TITLES = {
+    "ate_m": "ATE [m]",
+    "ate_fit_m": "fitted [m]",
+    "rte_m": "RTE [m]",
+    "pde": "PDE",
+    "aye_rad": "AYE [rad]",
+    "nees_median": "NEES",
+    "nis_mean": "NIS",
+    "seconds_network": "network [s]",
+    "seconds_filter": "other [s]",
+}
+"""Columns of a table of tracks."""
+
 METRIC_WORDS = {
     **CONVENTIONS,
     "ate_fit_m": "the same after a fit of yaw and position over all poses, which leaves errors "

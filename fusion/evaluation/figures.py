@@ -12,8 +12,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stario.fusion.evaluation.folders import fresh_folder
 from stario.fusion.evaluation.tables import PROTOCOLS, NetworkTable, Sample, table_dict
-from stario.sequences.drawing.figures import INK, apply_style, new_figure, save_figure
+from stario.sequences.drawing.figures import (
+    INK,
+    apply_style,
+    new_figure,
+    save_figure,
+    split_at_gaps,
+)
 from stario.sequences.files import write_json, write_rows
 
 if TYPE_CHECKING:
@@ -30,7 +37,8 @@ _BASELINE = "R-ResNet"
 
 
 def write_table(folder: Path, table: NetworkTable) -> None:
-    """Write `networks.csv`, `networks.json` and the figures into an existing folder."""
+    """Write `networks.csv`, `networks.json` and the figures; raises what `fresh_folder` does."""
+    fresh_folder(folder)
     write_rows(folder / "networks.csv", [asdict(entry) for entry in table.entries])
     write_json(folder / "networks.json", table_dict(table))
     for name, figure in figures(table).items():
@@ -108,8 +116,8 @@ def _pde_boxes(table: NetworkTable) -> Figure:
             axes.plot(np.full(len(values[k]), k + 1), values[k], ".", color=_colour(k), ms=6)
         axes.set_xticks(range(1, len(names) + 1), names, rotation=60, ha="right", fontsize=8)
         axes.set_title(words, loc="left", fontsize=10)
-        axes.set_ylim(bottom=0.0)
         apply_style(axes)
+    panels[0].set_ylim(bottom=0.0)  # after the last panel: it ends the shared axis's scaling
     panels[0].set_ylabel("PDE [% of the path]")
     return fig
 
@@ -130,9 +138,11 @@ def _trajectories(samples: list[Sample], colours: dict[str, str]) -> Figure:
 
 
 def _draw_sample(axes: Axes, sample: Sample, colours: dict[str, str]) -> None:
-    path = sample.truth.position_W[sample.truth.valid]
-    length = sample.truth.path_length()
+    truth, length = sample.truth, sample.truth.path_length()
+    _, path = split_at_gaps(truth.time, truth.position_W, truth.valid)
     axes.plot(path[:, 0], path[:, 1], color="black", lw=2.0, label=f"truth, {length:.0f} m")
+    known = truth.position_W[truth.valid]
+    axes.plot(*known[-1, :2], "s", color="black", ms=6, mec="white", zorder=3)
     names = list(sample.tracks)
     if _BASELINE in names:
         stario = [name for name in names if name.startswith("StarIO")]
@@ -143,7 +153,7 @@ def _draw_sample(axes: Axes, sample: Sample, colours: dict[str, str]) -> None:
         label = f"{name}: ATE {ate:.2f} m, RTE {rte:.2f} m"
         axes.plot(track[:, 0], track[:, 1], color=colour, lw=1.2, label=label)
         axes.plot(*track[-1, :2], "s", color=colour, ms=6, mec="white")
-    axes.plot(*path[0, :2], "o", mfc="white", mec=INK, ms=8)
+    axes.plot(*known[0, :2], "o", mfc="white", mec=INK, ms=8)
     axes.set_title(sample.recording, loc="left", fontsize=10)
     axes.set(xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal", adjustable="datalim")

@@ -10,12 +10,12 @@ from pathlib import Path
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import Comparison, compare
+from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.fixes import Fix
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.recording import Progress
 from stario.network.model import load_model
 from stario.sequences.datasets.batch import Skipped, each
-from stario.sequences.errors import InputError
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import ImuSequence
 
@@ -93,10 +93,8 @@ def _compare(
     progress: Progress,
 ) -> Comparison:
     sequence = read(path)
-    if truth_needed and sequence.truth is None:
-        raise InputError(
-            f"{sequence.name}: truth", sequence.truth_summary(), "a recording with true poses"
-        )
+    if truth_needed:
+        true_poses(sequence)
     network = _loaded(model) if isinstance(model, str) else model
     return compare(network, sequence, config, progress, fixes)
 

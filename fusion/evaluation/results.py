@@ -8,13 +8,13 @@ from pathlib import Path
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import METRIC_WORDS, Comparison, metric_words
+from stario.fusion.evaluation.folders import fresh_folder
 from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.evaluation.summary import Scores, scores_of
 from stario.fusion.state import Track
 from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.plan import plan_view
 from stario.sequences.drawing.plots import error_over_time, innovations
-from stario.sequences.errors import InputError
 from stario.sequences.files import write_json, write_npz, write_tum
 
 
@@ -23,12 +23,13 @@ def write_run(folder: Path, run: Comparison, config: NavigatorConfig) -> list[Pa
 
     These are `ekf.tum` (9 decimals), `ekf.npz` (velocity, biases, covariance), `metrics.json`,
     `config.json`, `health.json` and the figures; the graph's track is called `graph`. Without
-    truth, known positions in the track's frame (`known_positions.placed`) are drawn.
+    truth, known positions in the track's frame (`known_positions.placed`) are drawn. Results of an
+    earlier run into this folder are removed.
 
     Raises:
         InputError: the folder cannot be created.
     """
-    make_folder(folder)
+    fresh_folder(folder)
     [track] = run.tracks.values()
     written = _track_files(folder, run)
     words = metric_words(run.alignment)
@@ -47,9 +48,12 @@ def write_comparison(
 ) -> list[Path]:
     """Write `metrics.json`, `config.json` and a sub-folder of tracks and figures per recording.
 
+    Results of an earlier run into these folders are removed; other recordings' folders stay.
+
     Raises:
         InputError: a folder cannot be created.
     """
+    fresh_folder(folder)
     written = write_summary(folder, [scores_of(c) for c in comparisons], config)
     for comparison in comparisons:
         written += write_recording(folder, comparison, config)
@@ -59,12 +63,7 @@ def write_comparison(
 def write_summary(
     folder: Path, recordings: Sequence[Scores], config: NavigatorConfig
 ) -> list[Path]:
-    """Write `metrics.json` and `config.json` of several recordings.
-
-    Raises:
-        InputError: the folder cannot be created.
-    """
-    make_folder(folder)
+    """Write `metrics.json` and `config.json` of several recordings into an existing folder."""
     write_json(folder / "metrics.json", scores_dict(recordings))
     write_json(folder / "config.json", asdict(config))
     return [folder / "metrics.json", folder / "config.json"]
@@ -77,42 +76,21 @@ def write_recording(folder: Path, comparison: Comparison, config: NavigatorConfi
         InputError: a folder cannot be created.
     """
     inner = folder / comparison.sequence.name
-    make_folder(inner)
+    fresh_folder(inner)
     written = _track_files(inner, comparison)
     truth = comparison.sequence.truth
-    if truth is None:
-        (inner / "truth.tum").unlink(missing_ok=True)  # of an earlier run into this folder
-    else:
+    if truth is not None:
         write_tum(inner / "truth.tum", truth)
         written.append(inner / "truth.tum")
     return written + _figures(inner, comparison, comparison.tracks["ekf"])
 
 
-def comparison_dict(comparisons: Sequence[Comparison]) -> dict[str, object]:
-    """Return the content of `metrics.json`."""
-    return scores_dict([scores_of(comparison) for comparison in comparisons])
-
-
 def scores_dict(recordings: Sequence[Scores]) -> dict[str, object]:
-    """Return the content of `metrics.json`, given the figures alone."""
+    """Return the content of `metrics.json`."""
     records = {scores.name: scores.record for scores in recordings}
     # Fixes change how tracks are aligned; they are given for a single recording only.
     words = next((scores.words for scores in recordings), METRIC_WORDS)
     return {"recordings": records, "conventions": words}
-
-
-def make_folder(folder: Path) -> None:
-    """Create a folder and its parents.
-
-    Raises:
-        InputError: the path is taken by something else, or permission is denied.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            str(folder), error.strerror or "an error", "a folder that can be created"
-        ) from error
 
 
 def _track_files(folder: Path, found: Comparison) -> list[Path]:
@@ -135,8 +113,6 @@ def _figures(folder: Path, found: Comparison, track: Track) -> list[Path]:
     if drawn is not None and len(drawn.time):
         values = drawn.time, drawn.residual_W, drawn.sigma, drawn.nis, drawn.gated
         figures["innovations.png"] = innovations(*values, f"{name}: innovations")
-    for file in {"error.png", "innovations.png"} - figures.keys():
-        (folder / file).unlink(missing_ok=True)  # of an earlier run into this folder
     for file, figure in figures.items():
         save_figure(figure, folder / file)
     return [folder / file for file in figures]

@@ -8,7 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.evaluation.compare import METRIC_WORDS, TRACKS, Comparison, Metrics, metric_words
+from stario.fusion.evaluation.compare import (
+    METRIC_WORDS,
+    METRICS,
+    TRACKS,
+    Comparison,
+    Metrics,
+    metric_words,
+)
 from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.sequence import FloatArray
 
@@ -50,10 +57,7 @@ def scores_of(comparison: Comparison) -> Scores:
 def summary(recordings: Sequence[Scores]) -> dict[str, object]:
     """Return figures of every recording, with medians and means over them, as plain values."""
     records = {scores.name: scores.record for scores in recordings}
-    metrics = (
-        *("ate_m", "ate_fit_m", "rte_m", "pde", "aye_rad", "known_positions_m"),
-        *("nees_median", "nis_mean"),
-    )
+    metrics = [metric for metric in METRICS if not metric.startswith("seconds_")]
     over = {
         track: {
             metric: {"median": float(np.median(values)), "mean": float(np.mean(values))}

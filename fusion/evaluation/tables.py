@@ -17,7 +17,7 @@ import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.many import distinct_name
-from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude
+from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude, true_poses
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.network.model import DisplacementModel
@@ -25,7 +25,6 @@ from stario.network.runtime.cost import table_cost
 from stario.sequences.accuracy.metrics import CONVENTIONS, Convention, align, evaluate_track
 from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.drawing.text_table import aligned
-from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.truth.problems import warn_of_truth
 
@@ -207,17 +206,16 @@ def _tracks(
     convention: Convention,
 ) -> tuple[list[Entry], Sample]:
     sequence = read(path)
-    if sequence.truth is None:
-        raise InputError(f"{sequence.name}: truth", "none", "a recording with true poses")
+    truth = true_poses(sequence)
     warn_of_truth(sequence)
     entries: list[Entry] = []
-    sample = Sample(sequence.name, sequence.truth, {}, {})
+    sample = Sample(sequence.name, truth, {}, {})
     for weights, model in models:
         for protocol, track in protocol_tracks(model, sequence, config).items():
-            errors = metrics_of(track, sequence.truth, convention)
+            errors = metrics_of(track, truth, convention)
             entries.append(Entry(sequence.name, model.name, weights, protocol, **errors))
             if protocol == TRUE_ATTITUDE and model.name not in sample.tracks:
-                sample.tracks[model.name] = align(track, sequence.truth, "first")
+                sample.tracks[model.name] = align(track, truth, "first")
                 sample.errors[model.name] = errors["ate_m"], errors["rte_m"]
     return entries, sample
 

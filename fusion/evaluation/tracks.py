@@ -32,6 +32,18 @@ from stario.sequences.windows import (
 )
 
 
+def true_poses(sequence: ImuSequence) -> Trajectory:
+    """Return a recording's true poses.
+
+    Raises:
+        InputError: it has none; the error names what it has instead.
+    """
+    if sequence.truth is None:
+        field, found = f"{sequence.name}: truth", sequence.truth_summary()
+        raise InputError(field, found, "a recording with true poses")
+    return sequence.truth
+
+
 def inertial_track(preprocessed: PreprocessedRecording, config: NavigatorConfig) -> Track:
     """Integrate the IMU alone (strapdown) from the levelled start at rest, with zero biases."""
     began = perf_counter()
@@ -90,10 +102,8 @@ def network_track_true_attitude(
     Raises:
         InputError: the recording has no true poses, or no second of valid ones.
     """
-    if sequence.truth is None:
-        raise InputError(f"{sequence.name}: truth", "none", "a true trajectory for its attitude")
     began = perf_counter()
-    truth = _propagated_through_gaps(sequence, sequence.truth)
+    truth = _propagated_through_gaps(sequence, true_poses(sequence))
     time, windows, heading = _true_windows(sequence, truth, 1.0 / config.filter.update_rate)
     prepared = perf_counter()
     displacement = _predicted_displacements(

@@ -138,6 +138,11 @@ def _samples(health: Health) -> Iterator[Finding]:
     text = f"{amount} of the samples were dropped ({_counted(dropped)})."
     if share > DROPPED_SHARE:
         advice = "Log gyroscope and accelerometer at the same rate, and close other apps."
+        if dropped.get("frozen", 0) > 0.5 * count:  # both sensors: of one alone there is a note
+            advice = (
+                "The sensors repeat their values: log them at their own rate; if they stopped for "
+                "good, restart the device and record again."
+            )
         yield Finding("warning", text, advice)
     elif dropped:
         yield Finding("note", text)

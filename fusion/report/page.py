@@ -12,43 +12,28 @@ from typing import Any
 import numpy as np
 from plotly.offline import get_plotlyjs
 
-from stario.fusion.evaluation.compare import Comparison, Metrics, metric_words
+from stario.fusion.evaluation.compare import METRIC_TITLES, Comparison, metric_words
 from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.report.figures import map_figure, time_figure
 from stario.fusion.report.health import Finding, findings
 from stario.fusion.report.panels import bias_panels, innovation_panels, motion_panels, style
 from stario.fusion.report.series import Series, track_series, trajectory_series
 from stario.fusion.state import Track
-from stario.sequences.accuracy.metrics import Alignment, align
 from stario.sequences.files import atomic_write
 from stario.sequences.sequence import ImuSequence, PositionTrack
 
 _LEVEL_WORDS = {"warning": "To do", "good": "Good", "note": "Note"}
-_COLUMNS = {
-    "ate_m": ("ATE [m]", 2),
-    "ate_fit_m": ("fitted [m]", 2),
-    "rte_m": ("RTE [m]", 2),
-    "aye_rad": ("AYE [rad]", 3),
-    "nees_median": ("NEES", 1),
-    "nis_mean": ("NIS", 1),
-}
+_DIGITS = {"ate_m": 2, "ate_fit_m": 2, "rte_m": 2, "aye_rad": 3, "nees_median": 1, "nis_mean": 1}
+"""Decimals of the table's columns."""
 
 
-def write_report(
-    path: Path,
-    sequence: ImuSequence,
-    tracks: Mapping[str, Track],
-    metrics: Mapping[str, Metrics],
-    alignment: Alignment = "first",
-) -> Path:
+def write_report(path: Path, found: Comparison) -> Path:
     """Write the report of one recording's tracks, completely or not at all.
 
     Args:
         path: the HTML file; its folder must exist.
-        sequence: the recording; its ground truth is drawn if it has one.
-        tracks: tracks by name, as from `compare`, or a run's only one, `ekf` or `graph`.
-        metrics: metrics by track, for the table.
-        alignment: alignment of the tracks with the truth.
+        found: tracks and metrics of `compare`, or of a run's only track, `ekf` or `graph`; the
+            ground truth is drawn if the recording has one.
 
     Returns:
         The path.
@@ -56,15 +41,12 @@ def write_report(
     Raises:
         InputError: the folder does not exist.
     """
+    sequence, tracks = found.sequence, found.tracks
     start = float(sequence.time[np.isfinite(sequence.time)][0])
     truth = sequence.truth
     series = {
-        name: track_series(
-            track,
-            track.trajectory if truth is None else align(track.trajectory, truth, alignment),
-            start,
-        )
-        for name, track in tracks.items()
+        name: track_series(tracks[name], aligned, start)
+        for name, aligned in found.aligned().items()
     }
     true_series = None if truth is None else trajectory_series(truth, start)
     main = "ekf" if "ekf" in tracks else "graph"  # whose facts, health and innovations are shown
@@ -88,7 +70,7 @@ def write_report(
         "FACTS": _facts(sequence, tracks[main], series[main]),
         "LEGEND": _legend([*([] if truth is None else ["truth"]), *mapped], known),
         "HEALTH": "" if health is None else _health(findings(health)),
-        "TABLE": "" if truth is None else _table(metrics, alignment),
+        "TABLE": "" if truth is None else _table(found),
         "STYLE": _asset("report.css"),
         "SCRIPT": _asset("report.js"),
         "DATA": _script_json(data),
@@ -97,17 +79,6 @@ def write_report(
     with atomic_write(path) as file:
         file.write(_filled(parts))
     return path
-
-
-def write_comparison_report(folder: Path, comparison: Comparison) -> Path:
-    """Write `report.html` for a comparison; raises the errors of `write_report`."""
-    return write_report(
-        folder / "report.html",
-        comparison.sequence,
-        comparison.tracks,
-        comparison.metrics,
-        comparison.alignment,
-    )
 
 
 def _asset(name: str) -> str:
@@ -130,6 +101,7 @@ def _facts(sequence: ImuSequence, track: Track, series: Series) -> str:
     duration = sequence.duration
     facts = [
         (_clock(duration), "recorded (min:s)"),
+        (_clock(track.time[-1] - track.time[0]), "tracked (min:s)"),
         (f"{track.trajectory.path_length():.0f} m", "estimated path length"),
         (f"{len(sequence) / max(duration, 1e-9):.0f} Hz", "sampling rate"),
     ]
@@ -173,20 +145,20 @@ def _health(found: Sequence[Finding]) -> str:
     return f"<ul>{''.join(rows)}</ul>"
 
 
-def _table(metrics: Mapping[str, Metrics], alignment: Alignment) -> str:
-    head = "".join(f"<th>{title}</th>" for title, _ in _COLUMNS.values())
+def _table(found: Comparison) -> str:
+    head = "".join(f"<th>{METRIC_TITLES[key]}</th>" for key in _DIGITS)
     rows = []
-    for name, figures in metrics.items():
+    for name, figures in found.metrics.items():
         cells = []
-        for key, (_, digits) in _COLUMNS.items():
+        for key, digits in _DIGITS.items():
             value = figures.get(key)
             finite = value is not None and np.isfinite(value)
             cells.append(f"<td>{value:.{digits}f}</td>" if finite else "<td>-</td>")
         rows.append(f"<tr><th>{html.escape(style(name)[0])}</th>{''.join(cells)}</tr>")
-    words = metric_words(alignment)
+    words = metric_words(found.alignment)
     explanations = "".join(
-        f"<li><b>{title.split()[0]}</b> {html.escape(words[key])}.</li>"
-        for key, (title, _) in _COLUMNS.items()
+        f"<li><b>{METRIC_TITLES[key].split()[0]}</b> {html.escape(words[key])}.</li>"
+        for key in _DIGITS
     )
     explanations += "".join(
         f"<li><b>{key.capitalize()}</b> {html.escape(words[key])}.</li>"

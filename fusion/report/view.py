@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.fusion.evaluation.compare import Comparison
 from stario.fusion.state import Track
 from stario.sequences.drawing.figures import split_at_gaps, unbroken
 from stario.sequences.errors import InputError
@@ -28,14 +29,12 @@ _BLUE, _BLACK = (0, 114, 178), (0, 0, 0)
 _AXIS_COLOURS = ((0, 114, 178), (213, 94, 0), (0, 158, 115))
 
 
-def write_view(path: Path, sequence: ImuSequence, track: Track, trajectory: Trajectory) -> Path:
+def write_view(path: Path, run: Comparison) -> Path:
     """Write a run as a rerun file.
 
     Args:
         path: file to write, ending in .rrd; its folder must exist.
-        sequence: the recording, for the sensors and the ground truth.
-        track: the track, for biases and covariance.
-        trajectory: the track's poses as drawn, aligned with the truth if there is one.
+        run: the recording, with its sensors and ground truth, and its only track.
 
     Returns:
         The path.
@@ -43,6 +42,7 @@ def write_view(path: Path, sequence: ImuSequence, track: Track, trajectory: Traj
     Raises:
         InputError: the file cannot be written.
     """
+    sequence, [track], [aligned] = run.sequence, run.tracks.values(), run.aligned().values()
     stream = rr.RecordingStream("stario", recording_id=None)
     try:
         stream.save(path)
@@ -50,10 +50,10 @@ def write_view(path: Path, sequence: ImuSequence, track: Track, trajectory: Traj
         raise InputError("view", f"{path}: {error}", "a writable path") from error
     start = float(sequence.time[np.isfinite(sequence.time)][0])
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    _log_path(stream, "world/track", trajectory, _BLUE)
+    _log_path(stream, "world/track", aligned, _BLUE)
     if sequence.truth is not None:
         _log_path(stream, "world/truth", sequence.truth, _BLACK)
-    _log_device(stream, trajectory, start)
+    _log_device(stream, aligned, start)
     for entity, time, values, labels in _quantities(sequence, track):
         name, index = rr.new_entity_path(entity), _times(time - start)
         stream.send_columns(name, index, rr.Scalars.columns(scalars=values))

@@ -68,9 +68,7 @@ def write_results(
         samples = _samples([cell for cell in cells if cell.dataset.name == name], found, out)
         table = _network_table(found, samples)
         if table.entries:
-            folder = out / name / "figures"
-            folder.mkdir(parents=True, exist_ok=True)
-            write_table(folder, table)
+            write_table(out / name / "figures", table)
     return text
 
 

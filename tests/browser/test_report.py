@@ -8,7 +8,7 @@ import pytest
 from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import Comparison, compare, demonstration
-from stario.fusion.report.page import write_comparison_report, write_report
+from stario.fusion.report.page import write_report
 from stario.fusion.report.series import ellipse
 from stario.network import load_model
 from stario.sequences.sequence import ImuSequence
@@ -34,7 +34,7 @@ def comparison() -> Comparison:
 @pytest.fixture(scope="module")
 def report(comparison, tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
-    return write_comparison_report(folder, comparison)
+    return write_report(folder / "report.html", comparison)
 
 
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
@@ -88,7 +88,7 @@ def test_report_names_units_on_every_panel(report):
 def test_report_of_a_run_without_truth_has_no_table(tmp_path):
     sequence = start_of(demonstration(), "bare").without_truth()
     track = Navigator(load_model()).run(sequence)
-    path = write_report(tmp_path / "r.html", sequence, {"ekf": track}, {})
+    path = write_report(tmp_path / "r.html", Comparison(sequence, {"ekf": track}, {"ekf": {}}))
     assert "Accuracy against ground truth" not in path.read_text()
 
 

@@ -17,6 +17,7 @@ from stario.fusion.evaluation.checks.faults import (
     matched_config,
     with_true_displacements,
 )
+from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.filter.estimator_state import innovations_of
 from stario.fusion.graph.fixed_lag import FixedLagEstimator
 from stario.fusion.imu.stateful import Predictor
@@ -26,7 +27,6 @@ from stario.fusion.state import Track, track_from_states
 from stario.sequences.accuracy.metrics import evaluate_track
 from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.drawing.text_table import aligned
-from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, ImuErrors, simulate_imu
@@ -86,10 +86,9 @@ def score_recording(model: Predictor, sequence: ImuSequence, config: NavigatorCo
     Raises:
         InputError: it has no true poses, is too short, or its units or rate are wrong.
     """
-    if sequence.truth is None:
-        raise InputError(f"{sequence.name}: truth", "none", "a recording with true poses")
+    truth = true_poses(sequence)
     preprocessed = Navigator(model, config).observe(sequence)
-    return _scored(sequence.name, preprocessed, sequence.truth, config)
+    return _scored(sequence.name, preprocessed, truth, config)
 
 
 def summary(scores: Sequence[Score]) -> dict[str, object]:

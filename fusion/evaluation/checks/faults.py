@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from stario.fusion.backends import BackendName
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.checks.corruption import Fault, ModifyPredictions, faults
+from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.health import Health
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
@@ -26,7 +27,6 @@ from stario.fusion.state import Track
 from stario.sequences.accuracy.metrics import align, evaluate_track
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.drawing.text_table import aligned
-from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
@@ -104,15 +104,14 @@ def run_faults(
     Raises:
         InputError: the recording has no true poses, or is too short.
     """
-    if sequence.truth is None:
-        raise InputError(f"{sequence.name}: truth", "none", "a recording with true poses")
+    truth = true_poses(sequence)
     results: list[FaultResult] = []
     for backend in backends:
         unmodified = _run(Fault(""), sequence, config, model, seed, backend)
-        without = evaluate_track(unmodified.trajectory, sequence.truth).ate_m
+        without = evaluate_track(unmodified.trajectory, truth).ate_m
         for fault in faults(sequence.duration) if only is None else only:
             track = _run(fault, sequence, config, model, seed, backend)
-            results.append(_result(fault, backend, track, sequence.truth, without))
+            results.append(_result(fault, backend, track, truth, without))
     return results
 
 

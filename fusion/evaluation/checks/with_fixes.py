@@ -15,6 +15,7 @@ from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks.fusion_gain import SIGMA_BOUND
 from stario.fusion.evaluation.checks.groups import GroupedResult, by_group
+from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.fixes import Fix, position_fix
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
@@ -74,17 +75,16 @@ def track_with_fixes(
     Raises:
         InputError: it has no true poses, is too short for enough fixes, or cannot be run.
     """
-    if sequence.truth is None:
-        raise InputError(f"{sequence.name}: truth", "none", "poses")
-    known = true_fixes(sequence.truth, every, sigma, seed=0)
+    truth = true_poses(sequence)
+    known = true_fixes(truth, every, sigma, seed=0)
     fixes = [fix for fix in known if fix.time >= sequence.time[0]]  # truth may begin earlier
     if len(fixes) < _MIN_FIXES:
         raise InputError(f"{sequence.name}: fixes", str(len(fixes)), f"{_MIN_FIXES} or more")
     track = Navigator(model, config, backend=backend).run(sequence, fixes=fixes)
     assert track.covariance is not None  # both back ends give it
     assert track.health is not None
-    errors = pose_errors(track.trajectory, sequence.truth)
-    middle = 0.5 * (sequence.truth.time[0] + sequence.truth.time[-1])
+    errors = pose_errors(track.trajectory, truth)
+    middle = 0.5 * (truth.time[0] + truth.time[-1])
     second_half = errors.estimate.time > middle
     rows = np.searchsorted(track.time, errors.estimate.time[second_half])
     P, error, yaw = track.covariance[rows], errors.position_W[second_half], errors.yaw[second_half]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stario.fusion.evaluation.folders import fresh_folder
 from stario.fusion.evaluation.judging.bootstrap import CONFIDENCE, REPLICATES, Interval
 from stario.fusion.evaluation.judging.displacement_error import FIGURES
 from stario.fusion.evaluation.judging.judge import RecordingResult, Row
@@ -123,7 +124,12 @@ def judgement_dict(found: JudgingResult) -> dict[str, object]:
 
 
 def write_judgement(folder: Path, found: JudgingResult) -> None:
-    """Write `groups.csv`, `recordings.csv`, `groups.json` and `groups.png` into a folder."""
+    """Write `groups.csv`, `recordings.csv`, `groups.json` and `groups.png` into a folder.
+
+    Raises:
+        InputError: as `fresh_folder`.
+    """
+    fresh_folder(folder)
     rows = [
         {"group": row.name, "weights": name, "recordings": row.recordings, "path_km": row.path_km}
         | figures
@@ -204,7 +210,8 @@ def _draw_medians(
         if theirs:
             label = f"before: {theirs}" if k == 0 else None
             axes.plot(before, k, "o", color=_BEFORE, ms=8, label=label)
-        axes.plot(after, k, "o", color=_AFTER, ms=8, label=f"after: {ours}" if k == 0 else None)
+        label = (f"after: {ours}" if theirs else ours) if k == 0 else None
+        axes.plot(after, k, "o", color=_AFTER, ms=8, label=label)
         axes.annotate(f"{after:.2f}", (after, k), (0, 8), textcoords="offset points",
                       ha="center", fontsize=8, color=_AFTER)  # fmt: skip
     axes.margins(x=0.12)

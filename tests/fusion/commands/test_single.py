@@ -232,6 +232,22 @@ def test_a_single_row_of_truth_counts_as_none(stario, recording: Path, tmp_path:
 
 
 @pytest.mark.usefixtures("no_figures")
+def test_run_tells_how_much_of_a_recording_it_tracked(stario, recording: Path) -> None:
+    """The sensors stop after 7 s of 12 and repeat their values."""
+    head, *lines = recording.read_text().splitlines()
+    whole = stario("run", recording)
+    assert "walk: 12.0 s, " in whole.out
+    stopped = lines[700].split(",")[1:7]
+    for k in range(701, len(lines)):
+        cells = lines[k].split(",")
+        lines[k] = ",".join([cells[0], *stopped, *cells[7:]])
+    Path("stopped.csv").write_text("\n".join([head, *lines]) + "\n")
+    done = stario("run", "stopped.csv")
+    assert "stopped: 7.0 of 12.0 s tracked, " in done.out
+    assert "restart the device" in done.out
+
+
+@pytest.mark.usefixtures("no_figures")
 def test_settings_are_read_from_a_file_and_saved(stario, recording: Path, tmp_path: Path) -> None:
     (tmp_path / "slow.toml").write_text("[filter]\nupdate_rate = 2\n")
     assert stario("run", recording, "--config", "slow.toml", "--out", "a").code == 0

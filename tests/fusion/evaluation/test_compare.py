@@ -1,6 +1,7 @@
 """Comparison of tracks, and the files it writes."""
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from stario.fusion.evaluation.compare import (
     compare,
     demonstration,
 )
+from stario.fusion.evaluation.folders import fresh_folder
 from stario.fusion.evaluation.many import distinct_name
 from stario.fusion.evaluation.results import write_comparison, write_run
 from stario.fusion.evaluation.summary import scores_of, summary, summary_table
@@ -196,14 +198,37 @@ def test_a_run_writes_its_files(tmp_path: Path, compared: Comparison, walk: ImuS
     assert health == json.loads(json.dumps(asdict(track.health)))
 
 
-def test_figures_of_an_earlier_run_with_truth_do_not_stay(
+def test_files_of_an_earlier_run_do_not_pass_for_those_of_a_later_one(
     tmp_path: Path, compared: Comparison, walk: ImuSequence
 ) -> None:
-    (tmp_path / "error.png").touch()
+    """The first has truth, a report and the other back end; a file of the user's stays."""
     track = compared.tracks["ekf"]
+    write_run(tmp_path, Comparison(walk, {"graph": track}, {"graph": {}}), CONFIG)
+    (tmp_path / "report.html").touch()
+    (tmp_path / "notes.txt").touch()
+    (tmp_path / "truth.tum").touch()  # no result of a run
     blind = Comparison(walk.without_truth(), {"ekf": track}, {"ekf": {}})
     files = write_run(tmp_path, blind, CONFIG)
-    assert sorted(files) == sorted(tmp_path.iterdir())
+    mine = {tmp_path / "notes.txt", tmp_path / "truth.tum"}
+    assert {*files, *mine} == set(tmp_path.iterdir())
+
+
+def test_a_comparison_leaves_nothing_of_an_earlier_one_but_other_recordings(
+    tmp_path: Path, compared: Comparison, blind: Comparison
+) -> None:
+    write_comparison(tmp_path, [compared, blind], CONFIG)
+    kept = set((tmp_path / "blind").iterdir())
+    (tmp_path / compared.sequence.name / "report.html").touch()
+    sequence = compared.sequence.without_truth()
+    files = write_comparison(tmp_path, [replace(compared, sequence=sequence)], CONFIG)
+    assert {*files, *kept} == {path for path in tmp_path.rglob("*") if path.is_file()}
+
+
+def test_every_file_of_a_comparison_can_be_removed(folder: Path, tmp_path: Path) -> None:
+    written = shutil.copytree(folder, tmp_path / "copy")
+    for inner in (written, *(path for path in written.iterdir() if path.is_dir())):
+        fresh_folder(inner)
+    assert not [path for path in written.rglob("*") if path.is_file()]
 
 
 def test_a_folder_that_cannot_be_created_raises_a_stario_error(

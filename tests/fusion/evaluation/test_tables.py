@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.figures import write_table
+from stario.fusion.evaluation.figures import figures, write_table
+from stario.fusion.evaluation.folders import fresh_folder
 from stario.fusion.evaluation.tables import (
     METRICS,
     PROTOCOLS,
@@ -122,6 +123,14 @@ def test_csv_and_json_hold_the_same_figures(table, tmp_path: Path) -> None:
             assert float(row[metric]) == pytest.approx(entry[metric])
     for path in tmp_path.glob("*.png"):
         assert path.read_bytes().startswith(b"\x89PNG")
+    fresh_folder(tmp_path)  # for a later run
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_panel_of_the_drift_cuts_its_boxes(table) -> None:
+    for axes in figures(table)["pde.png"].axes:
+        assert axes.get_ylim()[0] == 0.0
+        assert axes.dataLim.y1 <= axes.get_ylim()[1]
 
 
 def test_weights_are_found_by_network_name_in_the_runs_folder(tmp_path: Path) -> None:

@@ -13,12 +13,13 @@ from stario.fusion.evaluation.tracks import (
     inertial_track,
     network_track,
     network_track_true_attitude,
+    true_poses,
 )
 from stario.fusion.navigator import Navigator
 from stario.sequences.accuracy.metrics import align, pose_errors
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import WINDOW_SECONDS, clean_samples, headings_at, imu_in_world
@@ -140,3 +141,10 @@ def test_every_track_continues_across_gaps_in_the_imu_data(
         assert np.isfinite(track.trajectory.position_W).all()
         assert (np.diff(track.time) > 0).all()
         assert track.time[-1] > 19.9
+
+
+def test_a_recording_without_poses_is_refused_by_what_it_has() -> None:
+    walk = simulate_imu(generate_walk(0, 5.0), 100.0, PERFECT_IMU, 0)
+    waypoints = PositionTrack(np.array([1.0, 2.0, 3.0]), np.zeros((3, 2)), "waypoints")
+    with pytest.raises(InputError, match="truth: found 3 waypoints, no poses, expected"):
+        true_poses(replace(walk.without_truth(), positions=waypoints))

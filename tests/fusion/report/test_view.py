@@ -17,10 +17,11 @@ def view():
 
 def test_file_holds_every_quantity_over_time(tmp_path, view, walk, still_model):
     from stario.fusion import Navigator
+    from stario.fusion.evaluation.compare import Comparison
 
     reader = pytest.importorskip("rerun.chunk", reason="requires rerun 0.41 or newer").RrdReader
     track = Navigator(still_model).run(walk)
-    path = view.write_view(tmp_path / "track.rrd", walk, track, track.trajectory)
+    path = view.write_view(tmp_path / "track.rrd", Comparison(walk, {"ekf": track}, {"ekf": {}}))
     entities = {str(chunk.entity_path) for chunk in reader(str(path)).stream()}
     for name in ("world/track", "world/truth", "world/device", "NIS", "bias", "force", "yaw"):
         assert any(name in entity for entity in entities), (name, entities)

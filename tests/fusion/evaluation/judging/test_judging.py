@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from recorded import DATA
 
+from stario.fusion.evaluation.folders import fresh_folder
 from stario.fusion.evaluation.judging.bootstrap import Interval, paired_ratio
 from stario.fusion.evaluation.judging.displacement_error import RecordingErrors, recording_errors
 from stario.fusion.evaluation.judging.judge import POOLED, RecordingResult, Row, judge, rows_of
@@ -270,6 +271,8 @@ def test_a_judgement_is_written_as_tables_and_figure(walk: ImuSequence, tmp_path
     content = json.loads((tmp_path / "groups.json").read_text())
     assert content["recordings"][1]["truth"] == "waypoints"
     assert (tmp_path / "groups.png").stat().st_size > 10_000
+    fresh_folder(tmp_path)  # for a later run
+    assert not list(tmp_path.iterdir())
 
 
 def test_two_groups_are_too_few_for_a_verdict() -> None:
