@@ -95,10 +95,11 @@ class Navigator:
             InputError: time is not a number, or every sample is far from the previous one (time not
                 in seconds), or a thousand have the same time (time in 32 bits); gyro or accel does
                 not hold three numbers; the mean force of the first second cannot be gravity in
-                m/s^2, or the rate is not about 50 Hz to 1 kHz; gyro cannot be in rad/s, which shows
-                once the device turns; or the clock was set back by at least five seconds (after
-                less, samples are late until it has caught up). After the last four the stream
-                starts again; after a clock that was set back, without prior and fixes.
+                m/s^2, or the rate is not about 50 Hz to 1 kHz; gyro cannot be in rad/s or one
+                sensor's values never change, which shows once the device turns; or the clock was
+                set back by at least five seconds (after less, samples are late until it has caught
+                up). After the last five the stream starts again; after a clock that was set back,
+                without prior and fixes.
         """
         sample = (seconds(time), *three("gyro", gyro), *three("accel", accel))
         state = None
@@ -287,7 +288,7 @@ class Navigator:
         start = self._front_end.start
         assert start is not None  # set before the first interval
         try:
-            self._front_end.gyro_unit.check(interval)
+            self._front_end.sensors.check(interval)
             if self._estimator is None:
                 check_start(start, self.config.gravity)
         except InputError:

@@ -9,9 +9,8 @@ Six numbers that repeat for a tenth of a second come from sensors that have stop
 device may be at rest. One sensor alone: loggers repeat samples of a slow one, and a coarse one at
 rest measures the same numbers for minutes. So its values must repeat for half a second in which the
 other one shows motion that they rule out, by the rules of `sequences.inspection.stuck`. From then
-on it counts as stopped until its values change. Values that have never changed are left to the
-checks of a stream's first second; they may be simulated without noise. Samples of a stopped sensor
-are dropped, so that they are treated as a gap.
+on it counts as stopped until its values change. Samples of a stopped sensor are dropped, so that
+they are treated as a gap. A sensor whose values have never changed is dead, and the stream refused.
 
 Outliers: a spike is one sample that differs from both its neighbours by more than a carried device
 can cause; it is replaced by their mean. Saturation shows as values of a moving axis that repeat
@@ -20,10 +19,10 @@ at a magnitude soon exceeded, do not count. What the sensor missed is unknown, s
 flagged.
 
 Units of a stream: that of the accelerometer shows in the first second (`intervals.check_start`),
-that of the gyroscope not at rest. A recording is checked as a whole before it runs
-(`sequences.inspection.checks`), a stream piece by piece by the same physics. A single piece may
-fail because the device is thrown or dropped, so several, with no calm one in between, are needed to
-refuse the stream.
+that of the gyroscope, or a dead sensor, not at rest. A recording is checked as a whole before it
+runs (`sequences.inspection.checks`), a stream piece by piece by the same physics. A single piece
+may fail because the device is thrown or dropped, so several, with no calm one in between, are
+needed to refuse the stream.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ from stario.fusion.health import Stopped
 from stario.fusion.imu.intervals import NO_FLAGS, SAME_TIME, Flags, ImuInterval, Sample
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_gyro
-from stario.sequences.inspection.stuck import shaken, tilting
+from stario.sequences.inspection.stuck import check_not_dead, shaken, tilting
 from stario.sequences.sequence import BoolArray, FloatArray
 from stario.sequences.windows import MIN_RATE
 
@@ -283,8 +282,11 @@ _TURNING_RAD_S, _DOUBTFUL_RAD_S = 1.0, 6.0
 even in deg/s; the second by hardly any walk (maximum recorded 4.2), but by all given in deg/s."""
 
 
-class GyroUnitCheck:
-    """Checks a stream's intervals until the unit of the gyroscope is beyond doubt."""
+class SensorCheck:
+    """Checks a stream's intervals until the unit of the gyroscope is beyond doubt.
+
+    A sensor that is dead from the beginning shows before that.
+    """
 
     def __init__(self) -> None:
         self._tables: list[FloatArray] = []  # time, gyro, accel (k, 7) of the piece so far
@@ -294,7 +296,7 @@ class GyroUnitCheck:
         """Add the stream's next interval.
 
         Raises:
-            InputError: the gyroscope cannot be in rad/s.
+            InputError: the gyroscope cannot be in rad/s, or one sensor's values never change.
         """
         if interval.gap:
             self._tables = []
@@ -308,13 +310,16 @@ class GyroUnitCheck:
             self._check_piece(piece[:, 0], piece[:, 1:4], piece[:, 4:7])
 
     def _check_piece(self, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> None:
+        remedy = "is the sensor connected?"
         try:
+            check_not_dead("stream", time, gyro, accel)
+            remedy = "if it is in deg/s, push np.radians(gyro)"
             check_gyro("stream", time, gyro, accel, [slice(0, len(time))])
         except InputError as error:
             self._wrong += 1
             if self._wrong >= _MIN_FAILED_PIECES:
-                remedy = "if it is in deg/s, push np.radians(gyro)"
-                raise InputError("gyro", error.found, error.expected, remedy) from None
+                field = "accel" if error.field.endswith("accelerometer") else "gyro"
+                raise InputError(field, error.found, error.expected, remedy) from None
         else:
             speed = np.percentile(np.linalg.norm(gyro, axis=1), 95)
             if speed < _DOUBTFUL_RAD_S:

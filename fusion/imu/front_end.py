@@ -25,8 +25,8 @@ from stario.fusion.health import SampleCounts
 from stario.fusion.imu.faults import (
     ClockSetBackDetector,
     FrozenSensorDetector,
-    GyroUnitCheck,
     OutlierDetector,
+    SensorCheck,
 )
 from stario.fusion.imu.intervals import (
     FieldBuffer,
@@ -82,7 +82,7 @@ class FrontEnd:
         self._clock = ClockSetBackDetector()
         self._frozen = FrozenSensorDetector(config.gravity)
         self._outliers = OutlierDetector()
-        self.gyro_unit = GyroUnitCheck()  # for streams, which cannot be checked as a whole
+        self.sensors = SensorCheck()  # for streams, which cannot be checked as a whole
         self.counts = SampleCounts()
         self.start: Start | None = None
 

@@ -78,6 +78,19 @@ def test_a_stream_in_degrees_is_refused_once_the_device_turns(
     np.testing.assert_array_equal(states[-1].p_W, expected.state.p_W)
 
 
+@pytest.mark.parametrize("sensor", ["gyro", "accel"])
+def test_a_stream_with_a_sensor_dead_from_the_beginning_is_refused(
+    make_walk: Make, still_model: Any, sensor: str
+) -> None:
+    right = after_a_still_start(make_walk(3, 26.0))
+    dead = replace(right, **{sensor: np.tile(getattr(right, sensor)[0], (len(right), 1))})
+    navigator = Navigator(still_model)
+    with pytest.raises(InputError, match=f"{sensor}: found values that never change"):
+        stream(navigator, dead)
+    assert navigator.state is None
+    assert stream(navigator, right)
+
+
 def test_a_briefly_tumbling_device_is_not_mistaken_for_a_stream_in_degrees(
     make_walk: Make, still_model: Any
 ) -> None:
