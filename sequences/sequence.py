@@ -258,7 +258,7 @@ class ImuSequence:
             return "none"
         words = f"{int(self.positions.valid.sum())} {self.positions.kind}"
         if sigma := self.positions.typical_sigma:
-            words += f" known to {sigma:.2g} m"
+            words += f" (sigma {sigma:.2g} m per axis)"
         waypoints = self.positions.kind == "waypoints"
         return f"{words}, no poses" if waypoints else f"{words} without attitude, no poses"
 

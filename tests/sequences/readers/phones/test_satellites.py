@@ -60,7 +60,7 @@ def test_positions_of_phyphox_are_read_with_their_accuracy(
     np.testing.assert_allclose(found.sigma[found.valid], 3.0)
     np.testing.assert_array_equal(found.valid, TIME != 5.0)
     summary = read_recording(tmp_path / "p").truth_summary()
-    assert summary == "11 positions known to 3 m without attitude, no poses"
+    assert summary == "11 positions (sigma 3 m per axis) without attitude, no poses"
 
 
 def test_sensor_loggers_own_clock_is_used_and_satellites_are_preferred(
