@@ -236,7 +236,7 @@ def test_a_removal_that_fails_can_be_repeated(folder: Path, tmp_path: Path) -> N
     inner, *_ = (path for path in written.iterdir() if path.is_dir())
     (inner / "network.npz").unlink()
     (inner / "network.npz").mkdir()
-    with pytest.raises(StarioError, match="network.npz"):
+    with pytest.raises(StarioError, match=r"network\.npz"):
         fresh_folder(inner)
     (inner / "network.npz").rmdir()
     fresh_folder(inner)
