@@ -51,3 +51,11 @@ def test_the_time_of_a_tap_is_uncertain_wherever_the_waypoint_is(recording: ImuS
     assert speed.max() > 1.0
     np.testing.assert_allclose(surveyed.sigma, np.hypot(0.01, 0.3 * speed[:, None]) * [[1.0, 1.0]])
     assert (by_eye.sigma > surveyed.sigma).all()
+
+
+def test_positions_seconds_apart_make_no_legs(recording: ImuSequence) -> None:
+    """Between them a pedestrian may have turned, however regular they are."""
+    assert recording.truth is not None
+    time = TIME[::4]
+    known = PositionTrack(time, recording.truth.at(time).position_W, "positions")
+    assert leg_streams(replace(recording, truth=None, positions=known)) == []
