@@ -57,6 +57,17 @@ def test_shares_add_up_along_a_displacement_and_vanish_with_the_level() -> None:
     assert u @ (lasting @ lasting.T)[:2, :2] @ u == pytest.approx(0.02 * LASTING)
 
 
+def test_a_second_of_white_errors_is_the_same_at_any_update_rate() -> None:
+    """More windows a second repeat each other's errors instead of averaging them."""
+    d_W, covariance = np.array([1.2, -0.5, 0.0]), np.diag([0.02, 0.02, 0.01])
+    slow, fast = (
+        displacement_errors(d_W, covariance, 1.0, False, FilterConfig(update_rate=rate))
+        for rate in (2, 10)
+    )
+    np.testing.assert_allclose(fast.white / 10.0, slow.white / 2.0)
+    np.testing.assert_allclose(fast.considered, slow.considered)
+
+
 def test_errors_turn_with_the_world() -> None:
     rng = np.random.default_rng(0)
     R = about_z(1.1).as_matrix()
