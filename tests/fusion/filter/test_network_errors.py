@@ -13,6 +13,7 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS, Estimate
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.estimator import Estimator
+from stario.fusion.filter.frame_transform import frame_rotation
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.map_frame import MapFrame
 from stario.fusion.filter.network_errors import (
@@ -280,6 +281,14 @@ def estimate(P: np.ndarray, Q: np.ndarray) -> Estimate:
 def nav_state(covariance: np.ndarray) -> NavState:
     zero = np.zeros(3)
     return NavState(0.0, np.eye(3), zero, zero, zero, zero, covariance)
+
+
+def test_a_graph_in_a_turned_frame_gets_the_filters_covariance_turned() -> None:
+    rng = np.random.default_rng(3)
+    P, Q = (random_covariance(rng) for _ in range(2))
+    A = frame_rotation(about_z(1.1).as_matrix())
+    (state,) = with_actual_covariances([nav_state(A @ P @ A.T)], [estimate(P, Q)], A[None])
+    np.testing.assert_allclose(state.covariance, A @ Q @ A.T, atol=1e-8 * np.abs(Q).max())
 
 
 def test_a_graph_as_certain_as_the_filter_gets_the_filters_covariance() -> None:
