@@ -94,9 +94,10 @@ def test_a_stream_with_a_sensor_dead_from_the_beginning_is_refused(
 def test_a_briefly_tumbling_device_is_not_mistaken_for_a_stream_in_degrees(
     make_walk: Make, still_model: Any
 ) -> None:
-    walk = make_walk(3, 26.0)
+    walk = make_walk(3, 46.0)
     gyro = walk.gyro.copy()
-    gyro[1150:1250] += [0.0, 0.0, 30.0]  # across the end of a piece, faster than anyone turns it
+    for k in (550, 1350, 2150, 2950):  # each within a piece or across its end, between calm ones
+        gyro[k : k + 100] += [0.0, 30.0, 30.0]  # faster than anyone turns it
     assert stream(Navigator(still_model), replace(walk, gyro=gyro))
 
 
