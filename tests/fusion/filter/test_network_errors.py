@@ -58,6 +58,16 @@ def test_shares_add_up_along_a_displacement_and_vanish_with_the_level() -> None:
     assert u @ (lasting @ lasting.T)[:2, :2] @ u == pytest.approx(0.02 * LASTING)
 
 
+def test_the_floors_slope_is_no_error_of_the_network() -> None:
+    """It is part of the height's variance, lasts longer, and does not depend on the level."""
+    d_W, own, slope = np.array([1.2, -0.5, 0.0]), 1e-4, (0.03 * 1.3) ** 2
+    covariance = np.diag([0.02, 0.02, own + slope])
+    for level in (1.0, 0.2):
+        white, considered = displacement_errors(d_W, covariance, level, False, F)
+        height = white[2, 2] + considered[2] @ considered[2]
+        assert height == pytest.approx(slope + level * own * (WHITE + DRIFTING))
+
+
 def test_a_second_of_white_errors_is_the_same_at_any_update_rate() -> None:
     """More windows a second repeat each other's errors instead of averaging them."""
     d_W, covariance = np.array([1.2, -0.5, 0.0]), np.diag([0.02, 0.02, 0.01])
