@@ -61,12 +61,9 @@ def with_conventions(
         accel_unit = turned if accel_unit.startswith("-") else f"-{accel_unit}"
     if unit_named(gyro_unit) == "deg/s":
         _warn_if_in_radians(sequence)
-    if sequence.maybe_apple and not accel_unit.startswith("-"):
-        log.warning(
-            "%s: gravity was logged apart, as Sensor Logger does on iPhones, whose sign is "
-            "inverted: if it is from an iPhone, pass `--accel-sign apple`", sequence.name,
-        )  # fmt: skip
-    sequence = replace(sequence, maybe_apple=False)
+    sequence = replace(
+        sequence, maybe_apple=sequence.maybe_apple and not accel_unit.startswith("-")
+    )
     sequence = with_axes(with_units(sequence, gyro_unit, accel_unit), axes)
     return with_gravity(sequence) if gravity == "removed" else sequence
 

@@ -159,10 +159,9 @@ def _ends_sigma(known: PositionTrack, ends: NDArray[np.int64], speed: FloatArray
     """
     taps = known.kind == "waypoints"
     if known.sigma is None:
-        each = (
-            np.hypot(_TAP_SIGMA, _TAP_TIME * speed) if taps else np.full(len(speed), _TRACK_SIGMA)
-        )
-        return np.stack([each, each], axis=1)
-    stated = known.sigma[known.valid][ends]
-    sigma = stated if taps else np.maximum(_INDEPENDENT * stated, _TRACK_SIGMA)
-    return np.stack([sigma[:-1], sigma[1:]], axis=1)
+        sigma = np.full(len(ends), _TAP_SIGMA if taps else _TRACK_SIGMA)
+    else:
+        stated = known.sigma[known.valid][ends]
+        sigma = stated if taps else np.maximum(_INDEPENDENT * stated, _TRACK_SIGMA)
+    of_legs = np.stack([sigma[:-1], sigma[1:]], axis=1)
+    return np.hypot(of_legs, _TAP_TIME * speed[:, None]) if taps else of_legs

@@ -190,7 +190,7 @@ class ImuSequence:
         source: format or app of the recording, for display.
         axes: the axes x, y, z of all sensors in those of the file, see `with_axes`.
         maybe_apple: whether the accelerometer may have Apple's sign, which nothing in the file
-            tells: `with_conventions` warns of it.
+            tells: `check_units` warns of it.
 
     Raises:
         InputError: the arrays' shapes do not agree, there is no sample, time, gyro or accel holds
@@ -258,7 +258,7 @@ class ImuSequence:
             return "none"
         words = f"{int(self.positions.valid.sum())} {self.positions.kind}"
         if sigma := self.positions.typical_sigma:
-            words += f" known to {sigma:.2g} m"
+            words += f" (sigma {sigma:.2g} m per axis)"
         waypoints = self.positions.kind == "waypoints"
         return f"{words}, no poses" if waypoints else f"{words} without attitude, no poses"
 

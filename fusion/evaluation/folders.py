@@ -69,8 +69,10 @@ def fresh_folder(folder: Path) -> None:
     make_folder(folder)
     for mark, others in RESULTS.items():
         if (folder / mark).exists():
-            for name in (*others, mark):  # the mark last: a removal that fails can be repeated
-                _remove(folder / name)
+            for name in others:
+                if name != mark:  # which goes last: a removal that fails can be repeated
+                    _remove(folder / name)
+            _remove(folder / mark)
 
 
 def _remove(path: Path) -> None:

@@ -63,5 +63,5 @@ def position_error_words(track: Track, known: PositionTrack) -> str:
         return f"{coverage}: too few to compare with"
     words = f"{coverage}: {error:.2f} m rms from them, after a fit of yaw and position"
     if sigma := known.typical_sigma:
-        words += f"; they are known to {sigma:.2g} m per axis"
+        words += f"; their sigma is {sigma:.2g} m per axis"
     return words

@@ -31,7 +31,6 @@ class FrameTransform:
     """The transform p <- R p + shift.
 
     Attributes:
-        time: time of the fix that determined it [s].
         R: (3, 3) rotation about the vertical.
         shift: (3,) translation [m].
         pivot: (3,) point of the new frame that an error of the turn leaves in place [m].
@@ -43,7 +42,6 @@ class FrameTransform:
         position_covariance: (3, 3) covariance of the shift [m^2].
     """
 
-    time: float
     R: FloatArray
     shift: FloatArray
     pivot: FloatArray
@@ -86,9 +84,7 @@ def frame_rotation(R: FloatArray) -> FloatArray:
 def unoriented_stretch(pivot: FloatArray, since: float, until: float) -> FrameTransform:
     """Return a transform that keeps a stretch in place but makes its yaw about a pivot unknown."""
     zero = np.zeros(3)
-    return FrameTransform(
-        math.nan, np.eye(3), zero, pivot, False, since, until, yaw_sigma=UNKNOWN_YAW
-    )
+    return FrameTransform(np.eye(3), zero, pivot, False, since, until, yaw_sigma=UNKNOWN_YAW)
 
 
 @dataclass(frozen=True, eq=False)

@@ -137,7 +137,7 @@ class MapFrame:
 
     def _place(self, fix: Fix) -> FrameTransform:
         now, since = self._ekf.state.nav_state(), self.state.since
-        transform = FrameTransform(fix.time, np.eye(3), fix.value - now.p_W, fix.value, True, since)
+        transform = FrameTransform(np.eye(3), fix.value - now.p_W, fix.value, True, since)
         self._ekf.state = self._ekf.state.transformed(np.eye(3), transform.shift)
         variance = np.trace(fix.covariance) + np.trace(now.position_covariance)
         sigma = min(_INFLATION_RATIO * math.sqrt(variance), _MAX_SIGMA)
@@ -174,15 +174,13 @@ class MapFrame:
                 return None
         R = about_vertical(turn)
         drift = float(now.covariance[2, 2])
-        transform = FrameTransform(fix.time, R, pivot - R @ pivot, pivot, False, since, drift=drift)
+        transform = FrameTransform(R, pivot - R @ pivot, pivot, False, since, drift=drift)
         turned = self._ekf.state.transformed(transform.R, transform.shift)
         self._ekf.state = turned.with_yaw_inflated(pivot, inflation)
-        stretches = (changed(stretch, time=fix.time) for stretch in self.state.unoriented)
-        transforms = (*self.state.transforms, *stretches)
         self.state = changed(
             self.state,
             oriented=True,
-            transforms=transforms,
+            transforms=(*self.state.transforms, *self.state.unoriented),
             alignment=PlanarAlignment(),
             unoriented=(),
         )

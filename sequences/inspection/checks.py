@@ -10,6 +10,7 @@ looks like a device held still.
 
 from __future__ import annotations
 
+import logging
 import math
 
 import numpy as np
@@ -25,6 +26,8 @@ from stario.sequences.truth.part import without_spikes
 from stario.sequences.truth.positions import fit_positions
 from stario.sequences.units import FAST_RAD_S, GYRO_UNITS, TIME_UNITS
 from stario.sequences.windows import MAX_RATE, MIN_RATE, clean_samples, unbroken
+
+log = logging.getLogger(__name__)
 
 MIN_SECONDS = 1.5
 """Shortest recording that holds a window and a margin around it [s]."""
@@ -80,6 +83,8 @@ _MAX_TILT_RAD = math.radians(20.0)
 def check_units(sequence: ImuSequence) -> None:
     """Check that a recording's numbers can be in s, rad/s and m/s^2.
 
+    Warns of an accelerometer that may have Apple's sign, which nothing in the file tells.
+
     Raises:
         InputError: it is too short or holds no number, time is in another unit, a sensor is dead,
             the gyroscope is in deg/s, the accelerometer is in g, lacks gravity or has the opposite
@@ -101,6 +106,11 @@ def check_units(sequence: ImuSequence) -> None:
         force, average = check_gyro(sequence.name, time, gyro, accel, pieces, known)
         _check_force(sequence, force, average)
     _check_direction(sequence, time, accel)
+    if sequence.maybe_apple and sequence.truth is None:
+        log.warning(
+            "%s: gravity was logged apart, as Sensor Logger does on iPhones, whose sign is "
+            "inverted: if it is from an iPhone, pass `--accel-sign apple`", sequence.name,
+        )  # fmt: skip
 
 
 def _check_content(sequence: ImuSequence) -> None:

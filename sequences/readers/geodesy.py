@@ -15,7 +15,8 @@ _EQUATOR_M, _ECCENTRICITY_2 = 6_378_137.0, 6.694_379_990_14e-3
 def east_north(degrees: FloatArray) -> FloatArray:
     """Return metres (N, 2) east and north of the first of N points.
 
-    To first order about that point: off by centimetres within a kilometre.
+    To first order about that point: at a kilometre and a latitude of 60 degrees off by 0.16 m, and
+    by four times as much at twice the distance.
 
     Args:
         degrees: (N, 2) latitude and longitude on WGS 84 [deg].

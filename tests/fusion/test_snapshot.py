@@ -1,9 +1,11 @@
 """A stream that is stopped and continued elsewhere gives the same states as without a stop."""
 
 import io
+import json
 import subprocess
 import sys
 import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -165,6 +167,33 @@ def test_a_snapshot_of_another_version_is_refused(walk: ImuSequence, still_model
     data = pack(unpack(navigator.snapshot()) | {"version": 1})
     with pytest.raises(InputError, match=f"version: found 1, expected {VERSION}"):
         navigator.restore(data)
+
+
+LAYOUTS = {20: "16226231"}
+"""CRC of the classes and attributes in a snapshot, by version."""
+
+
+def test_a_snapshot_with_other_classes_or_attributes_has_another_version(
+    walk: ImuSequence, still_model: Any
+) -> None:
+    """Otherwise an older one would be taken for damaged, or restored in part."""
+    found: set[str] = set()
+
+    def visit(value: Any) -> None:
+        if isinstance(value, dict):
+            if "is" in value:
+                found.add(f"{value['is']}: {', '.join(sorted(value['has']))}")
+            list(map(visit, value.values()))
+        elif isinstance(value, list):
+            list(map(visit, value))
+
+    for backend in ("ekf", "graph"):
+        navigator = Navigator(still_model, CONFIG, backend=backend)
+        push(navigator, walk, 0.0, 3.0)
+        with np.load(io.BytesIO(navigator.snapshot())) as file:
+            visit(json.loads(file["tree"].tobytes()))
+    layout = format(zlib.crc32("\n".join(sorted(found)).encode()), "08x")
+    assert LAYOUTS.get(VERSION) == layout, f"raise VERSION, and note its layout {layout} here"
 
 
 def test_a_snapshot_contains_no_pickles(walk: ImuSequence, still_model: Any) -> None:

@@ -10,7 +10,7 @@ from support import CONFIG, stream, stream_deviation
 
 from stario.fusion import Navigator
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import ImuSequence
+from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.walks import CARRYING_MODES
 
 Make = Callable[..., Any]
@@ -94,10 +94,22 @@ def test_a_stream_with_a_sensor_dead_from_the_beginning_is_refused(
 def test_a_briefly_tumbling_device_is_not_mistaken_for_a_stream_in_degrees(
     make_walk: Make, still_model: Any
 ) -> None:
-    walk = make_walk(3, 26.0)
+    walk = make_walk(3, 46.0)
     gyro = walk.gyro.copy()
-    gyro[1150:1250] += [0.0, 0.0, 30.0]  # across the end of a piece, faster than anyone turns it
+    for k in (550, 1350, 2150, 2950):  # each within a piece or across its end, between calm ones
+        gyro[k : k + 100] += [0.0, 30.0, 30.0]  # faster than anyone turns it
     assert stream(Navigator(still_model), replace(walk, gyro=gyro))
+
+
+def test_a_turn_within_gaps_is_not_taken_for_wrong_units(still_model: Any) -> None:
+    """The device turns while it is measured and rests in every gap: nobody knows what it did."""
+    time = 0.01 * np.arange(2400)
+    measured = time % 4.0 < 2.5
+    turned = np.cumsum(np.where(measured, 0.02, 0.0))  # 2 rad/s about x
+    accel = STANDARD_GRAVITY * np.column_stack([0.0 * time, np.sin(turned), np.cos(turned)])
+    gyro = np.tile([2.0, 0.0, 0.0], (len(time), 1))
+    samples = ImuSequence("turns", time[measured], gyro[measured], accel[measured])
+    assert stream(Navigator(still_model), samples)[-1].time > 22.0
 
 
 def test_the_check_for_degrees_survives_a_snapshot(walk: ImuSequence, still_model: Any) -> None:

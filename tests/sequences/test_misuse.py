@@ -40,6 +40,8 @@ DATES = np.datetime64("2026-01-01") + (1e9 * TIME).astype("timedelta64[ns]")
         (lambda: replace(SEQUENCE, accel=[[1.0], [1.0, 2.0]]), "accel", "an array of numbers"),
         (lambda: PositionTrack(TIME, ROWS, "foo"), "positions' kind", "positions, waypoints"),
         (lambda: PositionTrack(DATES, ROWS, "positions"), "positions' time", "np.timedelta64"),
+        (lambda: PositionTrack(TIME, ROWS, "positions", sigma=TIME), "positions' sigma", "above 0"),
+        (lambda: PositionTrack(TIME, ROWS, "positions", sigma=ROWS), "positions' sigma", "(200,)"),
         (lambda: Magnetometer(TIME, "north"), "magnetic field", "an array of numbers"),
         (lambda: Trajectory(TIME, ROWS, np.zeros((200, 4))), "attitude_WB", "Rotation.from_quat"),
         (lambda: DeviceAttitude(TIME, ROWS), "device attitude's attitude_WB", "Rotation"),

@@ -79,7 +79,7 @@ def assemble_recording(
         return sequence
     positions = reference_points(folder, files.key, stamps[0], stamps[-1])
     if positions is None:
-        positions = satellite_positions(folder, files.gyro, stamps[0], stamps[-1])
+        positions = satellite_positions(files.gyro, files.key, stamps[0], stamps[-1])
     return replace(sequence, positions=positions)
 
 

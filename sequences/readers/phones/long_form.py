@@ -58,13 +58,14 @@ def unpack_long_form(path: Path) -> Iterator[Path]:
     titles = [_cells(line, layout.delimiter) for line in above]
     sensors: dict[str, list[list[str]]] = {}
     for row in (_cells(line, layout.delimiter) for line in below):
-        sensors.setdefault("".join(row[layout.column : layout.column + 1]), []).append(row)
+        name = "".join(row[layout.column : layout.column + 1])
+        stem = re.sub(r"\W+", "_", name) or "unnamed"
+        sensors.setdefault(stem, []).append(row)
     with tempfile.TemporaryDirectory(prefix="stario-") as folder:
-        for name, own in sensors.items():
+        for stem, own in sensors.items():
             kept = ([cell for k, cell in enumerate(row) if k != layout.column]
                     for row in [*titles, *own])  # fmt: skip
             text = "".join((layout.delimiter or " ").join(row) + "\n" for row in kept)
-            stem = re.sub(r"\W+", "_", name) or "unnamed"
             (Path(folder) / f"{stem}.csv").write_text(text, encoding="utf-8")
         yield Path(folder)
 

@@ -7,7 +7,7 @@ position with a probability of 68 % on Android, and about that on iOS.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +15,11 @@ import numpy as np
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.clocks import unit_within
 from stario.sequences.readers.columns import Column
+from stario.sequences.readers.dates import with_seconds
 from stario.sequences.readers.geodesy import east_north
 from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.sensor_layout import clock_of
-from stario.sequences.readers.phones.sensor_words import words_of
+from stario.sequences.readers.phones.sensor_words import sensor_of, words_of
 from stario.sequences.readers.separators import cells_of, first_row, number_of
 from stario.sequences.readers.text import read_table, seconds
 from stario.sequences.sequence import PositionTrack
@@ -29,6 +30,9 @@ _log = logging.getLogger(__name__)
 
 _NAMES = {"location", "locations", "gps", "gnss"}
 """Words of which the name of a file of satellite positions has one."""
+
+_TITLES = {"latitude": {"latitude", "lat"}, "longitude": {"longitude", "lon", "long", "lng"}}
+"""Words of which a column's title has one; next to a sensor's name they are directions."""
 
 _RADIUS_PER_SIGMA = 1.51
 """Radius that holds 68 % of a Gaussian in the plane, in standard deviations per axis."""
@@ -45,7 +49,7 @@ _LARGEST_RADIUS = 30.0
 
 @dataclass(frozen=True)
 class _Header:
-    """Columns of a file of positions, and how to read its rows."""
+    """Columns of a file of positions, and how to read its rows, as in `SensorTable`."""
 
     clock: Column
     latitude: int
@@ -54,23 +58,23 @@ class _Header:
     skip: int
     delimiter: str | None
     decimal: str
+    dated: bool = False
 
 
 def satellite_positions(
-    folder: Path, wide: Path, start_ns: np.int64, stop_ns: np.int64
+    sensors: Path, key: str, start_ns: np.int64, stop_ns: np.int64
 ) -> PositionTrack | None:
     """Return the horizontal positions, x east and y north of the first; None if there are none.
 
+    They are in columns next to those of the sensors, or else in a file of the same folder.
+
     Args:
-        folder: the folder to search.
-        wide: file that may have columns of positions next to those of its sensors.
+        sensors: the gyroscope's file.
+        key: the words that the names of all files of the recording share.
         start_ns: time of the recording's first sample on the sensors' clock [ns].
         stop_ns: time of its last sample [ns].
     """
-    named = [file for file in sorted(folder.iterdir()) if _NAMES & set(words_of(file.stem))]
-    # `LocationGps.csv` holds satellite positions only, `Location.csv` those of all sources.
-    named.sort(key=lambda file: (not {"gps", "gnss"} & set(words_of(file.stem)), len(file.stem)))
-    for file in (*(f for f in named if f.suffix.lower() in (".csv", ".txt")), wide):
+    for file in (sensors, *_named(sensors.parent, set(key.split()))):
         header = _header(file)
         if header is None:
             continue
@@ -84,8 +88,32 @@ def satellite_positions(
     return None
 
 
+def _named(folder: Path, key: set[str]) -> list[Path]:
+    """Return the files whose names say that they hold positions, the best first.
+
+    Not those of another recording: `two_gps.csv` next to `one_gyr.csv`.
+    """
+    found = []
+    for file in sorted(folder.iterdir()):
+        words = set(words_of(file.stem))
+        mine = key <= words or words - _NAMES <= key
+        if file.suffix.lower() in (".csv", ".txt") and _NAMES & words and mine:
+            # `LocationGps.csv` holds satellite positions only, `Location.csv` those of all sources.
+            found.append((not {"gps", "gnss"} & words, len(file.stem), file))
+    return [file for *_, file in sorted(found)]
+
+
 def _header(file: Path) -> _Header | None:
     numbered = [(k, line) for k, line in enumerate(head_lines(file)) if line.strip()]
+    if header := _header_of(numbered):
+        return header
+    lines = with_seconds(line for _, line in numbered)
+    header = _header_of([(k, line) for (k, _), line in zip(numbered, lines, strict=True)])
+    return header and replace(header, clock=replace(header.clock, unit="s"), dated=True)
+
+
+def _header_of(numbered: list[tuple[int, str]]) -> _Header | None:
+    """Return the header in the lines at a file's start, with their numbers; None without one."""
     found = first_row(numbered, least=3)
     if found is None or not found[0]:
         return None
@@ -108,12 +136,12 @@ def _header(file: Path) -> _Header | None:
 
 def _place_of(title: str) -> str:
     """Return what a column holds: "latitude", "longitude", "radius" of accuracy, or nothing."""
-    words = words_of(title)
-    for place in ("latitude", "longitude"):
-        if place in words:
+    words = set(words_of(title))
+    for place, names in _TITLES.items():
+        if names & words and sensor_of(words) is None:
             return place
     others = {"vertical", "speed", "bearing", "course", "heading", "altitude", "time", "magnetic"}
-    return "radius" if "accuracy" in words and not others & set(words) else ""
+    return "radius" if "accuracy" in words and not others & words else ""
 
 
 def _read(
@@ -121,13 +149,15 @@ def _read(
 ) -> PositionTrack | None:
     used = [header.clock.index, header.latitude, header.longitude]
     used += [] if header.radius is None else [header.radius]
-    table = read_table(file, used, header.skip, header.delimiter, header.decimal, killed=True)
+    table = read_table(
+        file, used, header.skip, header.delimiter, header.decimal, killed=True, dated=header.dated
+    )
     place = table.values[:, 1:3]
     known = np.asarray((np.abs(place) <= [90.0, 180.0]).all(axis=1))  # not where NaN
     known &= place.any(axis=1)  # some apps write zeros until there is a position
     known[1:] &= (np.diff(place, axis=0) != 0.0).any(axis=1)  # repeated until there is another
     rows = np.flatnonzero(known)
-    if not len(rows):
+    if len(rows) < 2:
         return None
     unit = TIME_UNITS.get(header.clock.unit)
     if unit is None:
@@ -136,7 +166,8 @@ def _read(
     inside = (time >= 0.0) & (time <= float(stop_ns - start_ns) * 1e-9)
     inside &= increasing_mask(time)
     if inside.sum() < 2:
-        return None
+        found = f"{inside.sum()} of {len(rows)} positions within the recording"
+        raise ReadError(file, "time", found, "two or more, on the sensors' clock")
     rows, time = rows[inside], time[inside]
     radius = table.values[rows, 3] if header.radius is not None else np.full(len(rows), np.nan)
     radius = np.where(np.isfinite(radius), radius, _USUAL_RADIUS)

@@ -231,6 +231,18 @@ def test_every_file_of_a_comparison_can_be_removed(folder: Path, tmp_path: Path)
     assert not [path for path in written.rglob("*") if path.is_file()]
 
 
+def test_a_removal_that_fails_can_be_repeated(folder: Path, tmp_path: Path) -> None:
+    written = shutil.copytree(folder, tmp_path / "copy")
+    inner, *_ = (path for path in written.iterdir() if path.is_dir())
+    (inner / "network.npz").unlink()
+    (inner / "network.npz").mkdir()
+    with pytest.raises(StarioError, match=r"network\.npz"):
+        fresh_folder(inner)
+    (inner / "network.npz").rmdir()
+    fresh_folder(inner)
+    assert not list(inner.iterdir())
+
+
 def test_a_folder_that_cannot_be_created_raises_a_stario_error(
     tmp_path: Path, compared: Comparison
 ) -> None:

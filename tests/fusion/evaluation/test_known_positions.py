@@ -41,6 +41,14 @@ def test_waypoints_outside_the_track_are_excluded():
     assert words.startswith("6 of 6 waypoints lie within the track: 0.00 m rms")
 
 
+def test_the_error_is_given_next_to_the_sigma_of_the_positions_used():
+    valid, sigma = np.arange(6) > 2, np.where(np.arange(6) > 2, 3.0, 50.0)
+    known = PositionTrack(TIME[::40], PATH[::40, :2], "positions", valid, sigma)
+    words = position_error_words(track(PATH), known)
+    assert words.startswith("3 of 3 positions lie within the track: 0.00 m rms")
+    assert words.endswith("; their sigma is 3 m per axis")
+
+
 def test_placed_positions_are_fitted_to_the_track_in_the_frame_of_the_track():
     rotated = Rotation.from_euler("z", 50.0, degrees=True).apply(PATH) + np.array([7.0, -3.0, 1.0])
     shown = placed(track(rotated), waypoints(PATH, delay=0.0))

@@ -168,7 +168,7 @@ def test_a_streams_graph_follows_the_fixes_where_the_filter_does(
 def test_the_moments_of_a_large_turn_agree_with_sampled_turns() -> None:
     arm, sigma = np.array([3.0, -1.0, 0.5]), 1.2
     zero, no_covariance = np.zeros(3), np.zeros((15, 15))
-    turn = FrameTransform(1.0, np.eye(3), zero, zero, False, -np.inf, yaw_sigma=sigma)
+    turn = FrameTransform(np.eye(3), zero, zero, False, -np.inf, yaw_sigma=sigma)
     state = NavState(0.0, np.eye(3), 0.5 * arm, arm, zero, zero, no_covariance)
     angles = np.random.default_rng(0).normal(0.0, sigma, 200_000)
     off = about_z(angles).apply(arm) - arm

@@ -13,6 +13,7 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS, Estimate
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.estimator import Estimator
+from stario.fusion.filter.frame_transform import frame_rotation
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.map_frame import MapFrame
 from stario.fusion.filter.network_errors import (
@@ -55,6 +56,27 @@ def test_shares_add_up_along_a_displacement_and_vanish_with_the_level() -> None:
     assert u @ total[:2, :2] @ u == pytest.approx(0.02 * (WHITE + DRIFTING + LASTING))
     _, lasting = displacement_errors(d_W, covariance, 0.0, False, F)
     assert u @ (lasting @ lasting.T)[:2, :2] @ u == pytest.approx(0.02 * LASTING)
+
+
+def test_the_floors_slope_is_no_error_of_the_network() -> None:
+    """It is part of the height's variance, lasts longer, and does not depend on the level."""
+    d_W, own, slope = np.array([1.2, -0.5, 0.0]), 1e-4, (0.03 * 1.3) ** 2
+    covariance = np.diag([0.02, 0.02, own + slope])
+    for level in (1.0, 0.2):
+        white, considered = displacement_errors(d_W, covariance, level, False, F)
+        height = white[2, 2] + considered[2] @ considered[2]
+        assert height == pytest.approx(slope + level * own * (WHITE + DRIFTING))
+
+
+def test_a_second_of_white_errors_is_the_same_at_any_update_rate() -> None:
+    """More windows a second repeat each other's errors instead of averaging them."""
+    d_W, covariance = np.array([1.2, -0.5, 0.0]), np.diag([0.02, 0.02, 0.01])
+    slow, fast = (
+        displacement_errors(d_W, covariance, 1.0, False, FilterConfig(update_rate=rate))
+        for rate in (2, 10)
+    )
+    np.testing.assert_allclose(fast.white / 10.0, slow.white / 2.0)
+    np.testing.assert_allclose(fast.considered, slow.considered)
 
 
 def test_errors_turn_with_the_world() -> None:
@@ -269,6 +291,14 @@ def estimate(P: np.ndarray, Q: np.ndarray) -> Estimate:
 def nav_state(covariance: np.ndarray) -> NavState:
     zero = np.zeros(3)
     return NavState(0.0, np.eye(3), zero, zero, zero, zero, covariance)
+
+
+def test_a_graph_in_a_turned_frame_gets_the_filters_covariance_turned() -> None:
+    rng = np.random.default_rng(3)
+    P, Q = (random_covariance(rng) for _ in range(2))
+    A = frame_rotation(about_z(1.1).as_matrix())
+    (state,) = with_actual_covariances([nav_state(A @ P @ A.T)], [estimate(P, Q)], A[None])
+    np.testing.assert_allclose(state.covariance, A @ Q @ A.T, atol=1e-8 * np.abs(Q).max())
 
 
 def test_a_graph_as_certain_as_the_filter_gets_the_filters_covariance() -> None:

@@ -96,3 +96,24 @@ def test_a_model_without_memory_is_called_directly(still_model) -> None:
     assert network.memory is None
     with pytest.raises(InputError, match="memory"):
         network.memory = (1, (1,))
+
+
+class Walking:
+    """Predicts 1.5 m ahead for every window, with a sigma of 1 cm per axis."""
+
+    def predict(self, windows):
+        n = len(windows)
+        return np.tile([1.5, 0.0, 0.0], (n, 1)), np.tile(1e-4 * np.eye(3), (n, 1, 1))
+
+
+def test_slopes_and_missing_samples_make_displacements_less_certain(walk, without) -> None:
+    """A floor of unknown slope (0.03) the height, missing samples all axes: sigma is doubled."""
+    holed = without(walk, (walk.time > 6.0) & (walk.time < 6.1))
+    preprocessed = Navigator(Walking(), NavigatorConfig()).observe(holed)
+    pairs = zip(preprocessed.intervals, preprocessed.measurements, strict=True)
+    known = [(i.window_flagged, measured[1]) for i, measured in pairs if measured is not None]
+    assert {flagged for flagged, _ in known} == {True, False}
+    for flagged, covariance in known:
+        own = 4e-4 if flagged else 1e-4
+        expected = np.diag([own, own, own + (0.03 * 1.5) ** 2])
+        np.testing.assert_allclose(covariance, expected, atol=1e-12)

@@ -316,12 +316,13 @@ def test_an_undetermined_accelerometer_sign_is_reported(
     iphone(tmp_path / "s", walk)
     (tmp_path / "s/Metadata.csv").unlink()
     undetermined = read_recording(tmp_path / "s")
-    with_conventions(undetermined)
-    assert "from an iPhone, pass `--accel-sign apple`" in caplog.text
-    caplog.clear()
+    for read in (undetermined, with_conventions(undetermined)):
+        check_units(read)
+        assert "from an iPhone, pass `--accel-sign apple`" in caplog.text
+        caplog.clear()
     turned = with_conventions(undetermined, accel_sign="apple")
     np.testing.assert_allclose(turned.accel, walk.accel, atol=1e-8)
-    with_conventions(turned)
+    check_units(with_conventions(turned))
     assert not caplog.text
     ios_logger(tmp_path / "t", walk)
     for name in ("Motion.txt", "MotMagnFull.txt"):

@@ -63,6 +63,14 @@ def test_times_may_be_those_of_the_day(walk: ImuSequence, tmp_path: Path) -> Non
     assert_same_samples(read_recording(path), walk)
 
 
+def test_a_sensor_spelled_in_two_ways_is_one(walk: ImuSequence, tmp_path: Path) -> None:
+    rows = rows_of(walk, ("gyro (1)", "acc", "mag"))
+    rows[3::6] = [row.replace("gyro (1)", "gyro-1-") for row in rows[3::6]]
+    path = tmp_path / "own.csv"
+    path.write_text("\n".join(["time,sensor,x,y,z", *rows]) + "\n")
+    assert_same_samples(read_recording(path), walk)
+
+
 def test_messages_name_the_file_and_the_sensor(
     walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -257,7 +257,7 @@ def test_waypoints_and_reference_points_are_read_as_positions(
 
 KINDS = {
     "sensor_logger/university_loop": "none", "sensor_logger/shopping_mall_eight": "none",
-    "phyphox": "positions known to", "canlang_logger": "none", "pyojinkim_android": "none",
+    "phyphox": "positions (sigma", "canlang_logger": "none", "pyojinkim_android": "none",
     "senslogs_tyrex_android": "none", "senslogs_tyrex_ios": "none", "ipin21_hcu": "waypoints",
     "imunet_txt/Walk7S9": "poses", "tlio_npy_ridi/dan_body1": "poses", "advio/advio-15": "none",
     "imu_pose_android_recorder/2019-06-18_105450_IMU.txt": "poses",

@@ -60,7 +60,7 @@ def test_positions_of_phyphox_are_read_with_their_accuracy(
     np.testing.assert_allclose(found.sigma[found.valid], 3.0)
     np.testing.assert_array_equal(found.valid, TIME != 5.0)
     summary = read_recording(tmp_path / "p").truth_summary()
-    assert summary == "11 positions known to 3 m without attitude, no poses"
+    assert summary == "11 positions (sigma 3 m per axis) without attitude, no poses"
 
 
 def test_sensor_loggers_own_clock_is_used_and_satellites_are_preferred(
@@ -97,13 +97,45 @@ def test_positions_repeated_in_every_row_are_read_once(walk: ImuSequence, tmp_pa
     np.testing.assert_allclose(found.sigma, 4.0)
 
 
+def test_each_recording_of_a_folder_has_its_own_positions(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
+    for name, speed in (("one", 1.0), ("two", -1.0)):
+        for sensor, values in (("gyr", walk.gyro), ("acc", walk.accel)):
+            save(tmp_path / f"{name}_{sensor}.csv", "time (s),x,y,z", walk.time, values)
+        place = degrees(speed * METRES)
+        save(tmp_path / f"{name}_gps.csv", "time (s),lat,lon", TIME, place)
+    for name, speed in (("one", 1.0), ("two", -1.0)):
+        found = positions_of(tmp_path / f"{name}_gyr.csv")
+        np.testing.assert_allclose(found.position_W, speed * (METRES - METRES[0]), atol=0.02)
+
+
+def test_times_may_be_dates(walk: ImuSequence, tmp_path: Path) -> None:
+    def dates(times: FloatArray) -> list[str]:
+        start = np.datetime64("2024-05-01T12:00:00.000000")
+        return [f"{start + round(t * 1e6)}Z" for t in times.tolist()]
+
+    for name, values in (("Gyroscope", walk.gyro), ("Accelerometer", walk.accel)):
+        save(tmp_path / f"d/{name}.csv", "time,x,y,z", dates(walk.time), values)
+    save(tmp_path / "d/GPS.csv", "time,lat,lon", dates(TIME), degrees(METRES))
+    found = positions_of(tmp_path / "d")
+    np.testing.assert_allclose(found.time, TIME, atol=1e-5)
+
+
+def test_lateral_forces_are_no_positions(walk: ImuSequence, tmp_path: Path) -> None:
+    phyphox(tmp_path / "p", walk)
+    header = "time (s),acc_lat,acc_long,gps speed"
+    save(tmp_path / "p/GPS.csv", header, TIME, METRES, TIME)
+    assert read_recording(tmp_path / "p").positions is None
+
+
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
         ("", None),
         ("1.0,45.0,7.0,0,0,0\n", None),
         ("1.0,45.0,7.0,0,0,0\n2.0,45.0,x,0,0,0\n3.0,45.0,7.0,0,0,0\n", "'x', expected a number"),
-        ("9001.0,45.0,7.0,0,0,0\n9002.0,45.1,7.0,0,0,0\n", None),
+        ("9001.0,45.0,7.0,0,0,0\n9002.0,45.1,7.0,0,0,0\n", "0 of 2 positions within the recording"),
     ],
 )
 def test_positions_that_cannot_be_used_cost_no_recording(

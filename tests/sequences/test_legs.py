@@ -1,0 +1,61 @@
+"""Legs between known positions: how certain their ends are."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stario.sequences import ImuSequence
+from stario.sequences.legs import LegStream, leg_streams
+from stario.sequences.sequence import FloatArray, PositionTrack
+from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
+from stario.sequences.simulation.walks import generate_walk
+
+TIME = np.arange(1.0, 38.0)
+
+
+@pytest.fixture(scope="module")
+def recording() -> ImuSequence:
+    return simulate_imu(generate_walk(3, 40.0), 100.0, PERFECT_IMU, 0, name="walk")
+
+
+def legs_of(recording: ImuSequence, time: FloatArray, kind: str, sigma: object) -> LegStream:
+    assert recording.truth is not None
+    position = recording.truth.at(time).position_W
+    known = PositionTrack(time, position, kind, sigma=sigma)  # type: ignore[arg-type]
+    [legs] = leg_streams(replace(recording, truth=None, positions=known))
+    return legs
+
+
+def test_the_ends_of_a_leg_are_as_certain_as_their_own_positions(recording: ImuSequence) -> None:
+    """Those of satellites share most of their error, which a displacement does not contain."""
+    stated = 3.0 + 0.1 * TIME
+    legs = legs_of(recording, TIME, "positions", stated)
+    ends = np.stack([legs.start, legs.stop], axis=1)
+    relative = legs.sigma / np.interp(ends, TIME, stated)
+    np.testing.assert_allclose(relative, relative[0, 0])
+    assert 0.1 < relative[0, 0] < 0.4
+
+
+def test_precise_positions_are_still_those_of_another_device(recording: ImuSequence) -> None:
+    precise = legs_of(recording, TIME, "positions", np.full(len(TIME), 0.01))
+    unstated = legs_of(recording, TIME, "positions", None)
+    np.testing.assert_allclose(precise.sigma, unstated.sigma)
+
+
+def test_the_time_of_a_tap_is_uncertain_wherever_the_waypoint_is(recording: ImuSequence) -> None:
+    time = TIME[::6]
+    surveyed = legs_of(recording, time, "waypoints", np.full(len(time), 0.01))
+    by_eye = legs_of(recording, time, "waypoints", None)
+    speed = np.linalg.norm(surveyed.displacement, axis=1) / (surveyed.stop - surveyed.start)
+    assert speed.max() > 1.0
+    np.testing.assert_allclose(surveyed.sigma, np.hypot(0.01, 0.3 * speed[:, None]) * [[1.0, 1.0]])
+    assert (by_eye.sigma > surveyed.sigma).all()
+
+
+def test_positions_seconds_apart_make_no_legs(recording: ImuSequence) -> None:
+    """Between them a pedestrian may have turned, however regular they are."""
+    assert recording.truth is not None
+    time = TIME[::4]
+    known = PositionTrack(time, recording.truth.at(time).position_W, "positions")
+    assert leg_streams(replace(recording, truth=None, positions=known)) == []
