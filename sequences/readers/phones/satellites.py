@@ -7,7 +7,7 @@ position with a probability of 68 % on Android, and about that on iOS.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ import numpy as np
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.clocks import unit_within
 from stario.sequences.readers.columns import Column
+from stario.sequences.readers.dates import with_seconds
 from stario.sequences.readers.geodesy import east_north
 from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.sensor_layout import clock_of
@@ -29,6 +30,9 @@ _log = logging.getLogger(__name__)
 
 _NAMES = {"location", "locations", "gps", "gnss"}
 """Words of which the name of a file of satellite positions has one."""
+
+_PLACES = {"latitude": {"latitude", "lat"}, "longitude": {"longitude", "lon", "lng"}}
+"""Words of which the title of a column of latitudes or longitudes has one."""
 
 _RADIUS_PER_SIGMA = 1.51
 """Radius that holds 68 % of a Gaussian in the plane, in standard deviations per axis."""
@@ -54,6 +58,7 @@ class _Header:
     skip: int
     delimiter: str | None
     decimal: str
+    dated: bool = False
 
 
 def satellite_positions(
@@ -85,7 +90,20 @@ def satellite_positions(
 
 
 def _header(file: Path) -> _Header | None:
+    """Return how to read a file's positions; None if it names none or has no clock."""
     numbered = [(k, line) for k, line in enumerate(head_lines(file)) if line.strip()]
+    header = _columns(numbered)
+    if header is not None:
+        return header
+    lines = with_seconds(line for _, line in numbered)
+    header = _columns([(k, line) for (k, _), line in zip(numbered, lines, strict=True)])
+    if header is None:
+        return None
+    return replace(header, dated=True, clock=replace(header.clock, unit="s"))
+
+
+def _columns(numbered: list[tuple[int, str]]) -> _Header | None:
+    """Return the columns of positions, given the lines at a file's start with their numbers."""
     found = first_row(numbered, least=3)
     if found is None or not found[0]:
         return None
@@ -109,8 +127,8 @@ def _header(file: Path) -> _Header | None:
 def _place_of(title: str) -> str:
     """Return what a column holds: "latitude", "longitude", "radius" of accuracy, or nothing."""
     words = words_of(title)
-    for place in ("latitude", "longitude"):
-        if place in words:
+    for place, names in _PLACES.items():
+        if names & set(words):
             return place
     others = {"vertical", "speed", "bearing", "course", "heading", "altitude", "time", "magnetic"}
     return "radius" if "accuracy" in words and not others & set(words) else ""
@@ -121,7 +139,9 @@ def _read(
 ) -> PositionTrack | None:
     used = [header.clock.index, header.latitude, header.longitude]
     used += [] if header.radius is None else [header.radius]
-    table = read_table(file, used, header.skip, header.delimiter, header.decimal, killed=True)
+    table = read_table(
+        file, used, header.skip, header.delimiter, header.decimal, killed=True, dated=header.dated
+    )
     place = table.values[:, 1:3]
     known = np.asarray((np.abs(place) <= [90.0, 180.0]).all(axis=1))  # not where NaN
     known &= place.any(axis=1)  # some apps write zeros until there is a position
@@ -135,6 +155,11 @@ def _read(
     time = seconds(table.stamps_ns(header.clock.index, unit, rows), start_ns)
     inside = (time >= 0.0) & (time <= float(stop_ns - start_ns) * 1e-9)
     inside &= increasing_mask(time)
+    if len(time) > 1 and not inside.any():  # a single one may be the last known before the start
+        found = f"times from {time[0]:.0f} to {time[-1]:.0f} s after the first sample"
+        expected = f"times from 0 to {float(stop_ns - start_ns) * 1e-9:.0f} s"
+        fix = "write both in one clock and time zone"
+        raise ReadError(file, "time", found, expected, fix)
     if inside.sum() < 2:
         return None
     rows, time = rows[inside], time[inside]
@@ -142,8 +167,8 @@ def _read(
     radius = np.where(np.isfinite(radius), radius, _USUAL_RADIUS)
     valid = (radius > 0.0) & (radius <= _LARGEST_RADIUS)  # iOS: negative where there is none
     if valid.sum() < 2:
-        _log.info("%s: no two positions within %g m", file, _LARGEST_RADIUS)
-        return None
+        found = f"{valid.sum()} of {len(valid)} positions known to {_LARGEST_RADIUS:g} m"
+        raise ReadError(file, "accuracy", found, "at least two")
     origin = int(np.argmax(valid))
     degrees = np.vstack([table.values[rows[origin], 1:3], table.values[rows, 1:3]])
     xy = east_north(degrees)[1:]
