@@ -52,8 +52,8 @@ def list_entries(path: Path) -> Iterator[tuple[Path, AttributeFilter] | ReadErro
         raise ReadError(path, "list", "no entry", "names of recordings")
     bases = _bases(path.parent)
     if len(written) > _HEAD_LINES and not any(_names_any(bases, text) for _, text in written):
-        found = f"{len(written)} lines without an existing name, such as {written[0][1]:.60}"
-        raise ReadError(path, "list", found, "a recording, or a list of them")
+        shown = f"{len(written)} lines without an existing name, such as {written[0][1]:.60}"
+        raise ReadError(path, "list", shown, "a recording, or a list of them")
     for number, text in written:
         text, where = _split_filters(text)
         name = _name_in(text)
