@@ -26,6 +26,9 @@ _SHORTEST_LEG, _FASTEST_LEG = 1.5, 2.5
 _FASTEST_STEP, _MAX_STEP = 6.0, 0.25
 """A faster step between two samples [m/s] is a jump of the track; a longer step [s] is a gap."""
 
+_JUMP_SIGMAS = 3.0
+"""Shorter jumps, in standard deviations that the source states, are noise."""
+
 _SLOW_STEP, _SLOWEST_STEP = 2.5, 3.0
 """In a low-rate track, for example from GNSS, a gap is longer than this many median steps or than
 this many seconds, whichever is less: a pedestrian has turned by then."""
@@ -128,6 +131,16 @@ def gaps_and_jumps(time: FloatArray, position: FloatArray) -> BoolArray:
     longest = max(_MAX_STEP, min(_SLOW_STEP * usual, _SLOWEST_STEP))
     speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / step
     return np.asarray((speed > _FASTEST_STEP) | (step > longest))
+
+
+def jumps(known: PositionTrack) -> FloatArray:
+    """Return the lengths [m] of steps that no pedestrian took, far beyond the sigma stated."""
+    if known.sigma is None or known.kind == "waypoints":
+        return np.empty(0)
+    time, position, sigma = (x[known.valid] for x in (known.time, known.position_W, known.sigma))
+    length = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    fast = length > _FASTEST_STEP * np.diff(time)
+    return np.asarray(length[fast & (length > _JUMP_SIGMAS * np.hypot(sigma[1:], sigma[:-1]))])
 
 
 def _legs(known: PositionTrack) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

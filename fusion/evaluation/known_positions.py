@@ -7,6 +7,7 @@ import numpy as np
 from stario.fusion.evaluation.judging.displacement_error import fit_yaw_and_position
 from stario.fusion.state import Track
 from stario.sequences.arrays import interpolated
+from stario.sequences.legs import jumps
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
 
 MIN_POSITIONS = 2
@@ -64,4 +65,6 @@ def position_error_words(track: Track, known: PositionTrack) -> str:
     words = f"{coverage}: {error:.2f} m rms from them, after a fit of yaw and position"
     if sigma := known.typical_sigma:
         words += f"; their sigma is {sigma:.2g} m per axis"
+    if len(found := jumps(known)):
+        words += f", but jump by up to {found.max():.0f} m"
     return words

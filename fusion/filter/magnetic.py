@@ -51,6 +51,9 @@ _GATE = 0.95
 _MIN_HORIZONTAL = 4.0
 """Horizontal field [uT] below which its bearing is meaningless."""
 
+_WEAKEST = 2.0
+"""Field [uT] that only one in another unit falls below: the Earth's has at least 22."""
+
 NORTH_SIGMA = 0.1
 """Sigma of magnetic north's mean direction along a pedestrian's path [rad]."""
 
@@ -296,9 +299,8 @@ def update_bearing(
     horizontal = math.hypot(m_W[0], m_W[1])
     size, dip = math.hypot(horizontal, m_W[2]), math.atan2(-m_W[2], horizontal)
     if horizontal < _MIN_HORIZONTAL:
-        return UpdateResult(math.nan, 1, False, reason="no horizontal field"), changed(
-            reference, time=now
-        )
+        reason = "too weak to be in uT" if measured < _WEAKEST else "no horizontal field"
+        return UpdateResult(math.nan, 1, False, reason=reason), changed(reference, time=now)
     reference = reference.compared(s, m_B)
     if reference.contradicts_gyro:
         reason = "contradicts the gyroscope"

@@ -133,8 +133,7 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
     path = Path(path)
     if format != "auto" and format not in FORMATS:
         raise InputError("format", repr(format), f"auto, {', '.join(FORMATS)}")
-    if not split_name(path)[0].exists():
-        raise ReadError(path, "path", "no such file or folder", "a recording")
+    _check_readable(path, "a recording")
     name = _recognised(path) if format == "auto" else format
     if name is None:
         raise unrecognised(path, sorted(_below(path)), _KNOWN)
@@ -169,8 +168,7 @@ def find_recordings(
             the attributes, or a list entry is invalid.
     """
     path = Path(path)
-    if not split_name(path)[0].exists():
-        raise ReadError(path, "path", "no such file or folder", "a recording or a folder of them")
+    _check_readable(path, "a recording or a folder of them")
     if is_archive(path):
         if members := archive_members(path, where):
             return members
@@ -185,6 +183,21 @@ def find_recordings(
             raise unrecognised(path, [], _KNOWN)
         raise ReadError(path, "folder", "no recording", f"recordings in {_KNOWN}")
     return _with_attributes(found, where)
+
+
+def _check_readable(path: Path, expected: str) -> None:
+    """Check that a path is a file or a folder that may be read.
+
+    Raises:
+        ReadError: it does not exist, is a pipe or a device, or lacks permission.
+    """
+    file = split_name(path)[0]
+    if not file.exists():
+        raise ReadError(path, "path", "no such file or folder", expected)
+    if not (file.is_file() or file.is_dir()):  # readers look at a file several times
+        raise ReadError(path, "path", "a pipe or device", expected, "save its content as a file")
+    if not os.access(file, os.R_OK | (os.X_OK if file.is_dir() else 0)):
+        raise ReadError(path, "path", "no permission to read", expected, "fix its permissions")
 
 
 def _with_attributes(found: list[Path], where: AttributeFilter | None) -> list[Path]:
@@ -253,4 +266,7 @@ def _is_recording(path: Path) -> bool:
 
 def _recognised(path: Path) -> str | None:
     """Return the name of the format that matches a path's content, or None."""
-    return next((name for name, known in FORMATS.items() if known.recognises(path)), None)
+    try:
+        return next((name for name, known in FORMATS.items() if known.recognises(path)), None)
+    except PermissionError:  # of a folder somewhere below: `os.walk` passes it over as well
+        return None

@@ -41,7 +41,7 @@ def list_entries(path: Path) -> Iterator[tuple[Path, AttributeFilter] | ReadErro
     `data1/syn/imu3.csv` (OxIOD).
 
     Raises:
-        ReadError: the list cannot be read or names nothing.
+        ReadError: the list cannot be read or names nothing, or is some other long text.
     """
     lines = read_lines(path)
     while lines and not lines[-1].strip():
@@ -51,9 +51,12 @@ def list_entries(path: Path) -> Iterator[tuple[Path, AttributeFilter] | ReadErro
     if not written:
         raise ReadError(path, "list", "no entry", "names of recordings")
     bases = _bases(path.parent)
+    if len(written) > _HEAD_LINES and not any(_names_any(bases, text) for _, text in written):
+        shown = f"{len(written)} lines without an existing name, such as {written[0][1]:.60}"
+        raise ReadError(path, "list", shown, "a recording, or a list of them")
     for number, text in written:
         text, where = _split_filters(text)
-        name = text.split(",")[0].strip()
+        name = _name_in(text)
         line = f"line {number}"
         if not name:
             fix = "delete the line"
@@ -63,6 +66,17 @@ def list_entries(path: Path) -> Iterator[tuple[Path, AttributeFilter] | ReadErro
             yield ReadError(path, line, f"no {name}", "a recording", fix)
         else:
             yield found, where
+
+
+def _names_any(bases: list[Path], text: str) -> bool:
+    """Return whether a line names a file or folder that exists."""
+    name = _name_in(_split_filters(text)[0])
+    return bool(name) and _located(bases, Path(name)) is not None
+
+
+def _name_in(text: str) -> str:
+    """Return the name in a line without its filters."""
+    return text.split(",")[0].strip()
 
 
 def _split_filters(text: str) -> tuple[str, AttributeFilter]:

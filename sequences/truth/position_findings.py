@@ -1,4 +1,4 @@
-"""Report on how the truth's positions fit the accelerometer: a line, plain values and problems."""
+"""Report on the positions: a line, plain values and problems of their fit; jumps."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.conventions import axes_matrix, axes_named
-from stario.sequences.sequence import FloatArray
+from stario.sequences.legs import jumps
+from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.truth.findings import TruthProblem
 from stario.sequences.truth.positions import PositionFit
 
@@ -101,3 +102,14 @@ def _columns(R: FloatArray) -> str:
     return ",".join(
         ("-" if row.min() < -0.5 else "") + "p" + "xyz"[int(np.abs(row).argmax())] for row in R
     )
+
+
+def jump_problems(sequence: ImuSequence) -> list[str]:
+    """Describe jumps of positions known without attitude, as of satellites next to buildings."""
+    found = () if sequence.positions is None else jumps(sequence.positions)
+    if not len(found):
+        return []
+    return [
+        f"{sequence.name}: positions: found jumps of up to {max(found):.0f} m, "
+        "expected a path at walking speed; satellite positions are poor indoors"
+    ]

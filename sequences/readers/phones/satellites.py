@@ -21,8 +21,8 @@ from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.sensor_layout import clock_of
 from stario.sequences.readers.phones.sensor_words import sensor_of, words_of
 from stario.sequences.readers.separators import cells_of, first_row, number_of
-from stario.sequences.readers.text import read_table, seconds
-from stario.sequences.sequence import PositionTrack
+from stario.sequences.readers.text import IntArray, Table, read_table, seconds
+from stario.sequences.sequence import FloatArray, PositionTrack
 from stario.sequences.time_order import increasing_mask
 from stario.sequences.units import TIME_UNITS
 
@@ -104,6 +104,7 @@ def _named(folder: Path, key: set[str]) -> list[Path]:
 
 
 def _header(file: Path) -> _Header | None:
+    """Return how to read a file's positions; None if it names none or has no clock."""
     numbered = [(k, line) for k, line in enumerate(head_lines(file)) if line.strip()]
     if header := _header_of(numbered):
         return header
@@ -152,30 +153,45 @@ def _read(
     table = read_table(
         file, used, header.skip, header.delimiter, header.decimal, killed=True, dated=header.dated
     )
+    rows, time = _within(table, header, start_ns, stop_ns)
+    if len(rows) < 2:
+        return None
+    radius = table.values[rows, 3] if header.radius is not None else np.full(len(rows), np.nan)
+    radius = np.where(np.isfinite(radius), radius, _USUAL_RADIUS)
+    valid = (radius > 0.0) & (radius <= _LARGEST_RADIUS)  # iOS: negative where there is none
+    if valid.sum() < 2:
+        found = f"{valid.sum()} of {len(valid)} positions known to {_LARGEST_RADIUS:g} m"
+        raise ReadError(file, "accuracy", found, "at least two")
+    origin = int(np.argmax(valid))
+    degrees = np.vstack([table.values[rows[origin], 1:3], table.values[rows, 1:3]])
+    xy = east_north(degrees)[1:]
+    return PositionTrack(time, xy, "positions", valid, radius / _RADIUS_PER_SIGMA)
+
+
+def _within(
+    table: Table, header: _Header, start_ns: np.int64, stop_ns: np.int64
+) -> tuple[IntArray, FloatArray]:
+    """Return the rows (N,) with a new position within the recording, and their times [s].
+
+    Raises:
+        ReadError: all of several positions are at other times.
+    """
     place = table.values[:, 1:3]
     known = np.asarray((np.abs(place) <= [90.0, 180.0]).all(axis=1))  # not where NaN
     known &= place.any(axis=1)  # some apps write zeros until there is a position
     known[1:] &= (np.diff(place, axis=0) != 0.0).any(axis=1)  # repeated until there is another
     rows = np.flatnonzero(known)
-    if len(rows) < 2:
-        return None
+    if len(rows) < 2:  # a single one may be the last known before the start
+        return rows[:0], np.zeros(0)
     unit = TIME_UNITS.get(header.clock.unit)
     if unit is None:
-        unit = unit_within(file, table.values[rows, 0], start_ns, stop_ns)
+        unit = unit_within(table.path, table.values[rows, 0], start_ns, stop_ns)
     time = seconds(table.stamps_ns(header.clock.index, unit, rows), start_ns)
-    inside = (time >= 0.0) & (time <= float(stop_ns - start_ns) * 1e-9)
+    stop = float(stop_ns - start_ns) * 1e-9
+    inside = (time >= 0.0) & (time <= stop)
+    if not inside.any():
+        found = f"times from {time[0]:.0f} to {time[-1]:.0f} s after the first sample"
+        fix = "write both in one clock and time zone"
+        raise ReadError(table.path, "time", found, f"times from 0 to {stop:.0f} s", fix)
     inside &= increasing_mask(time)
-    if inside.sum() < 2:
-        found = f"{inside.sum()} of {len(rows)} positions within the recording"
-        raise ReadError(file, "time", found, "two or more, on the sensors' clock")
-    rows, time = rows[inside], time[inside]
-    radius = table.values[rows, 3] if header.radius is not None else np.full(len(rows), np.nan)
-    radius = np.where(np.isfinite(radius), radius, _USUAL_RADIUS)
-    valid = (radius > 0.0) & (radius <= _LARGEST_RADIUS)  # iOS: negative where there is none
-    if valid.sum() < 2:
-        _log.info("%s: no two positions within %g m", file, _LARGEST_RADIUS)
-        return None
-    origin = int(np.argmax(valid))
-    degrees = np.vstack([table.values[rows[origin], 1:3], table.values[rows, 1:3]])
-    xy = east_north(degrees)[1:]
-    return PositionTrack(time, xy, "positions", valid, radius / _RADIUS_PER_SIGMA)
+    return rows[inside], time[inside]

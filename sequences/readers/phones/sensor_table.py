@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -86,8 +87,14 @@ def sensor_table(file: Path) -> SensorTable | None:
     table = _table(file, dated) if dated != numbered else None
     if table is None:
         return None
-    clocks = {sensor: replace(clock, unit="s") for sensor, clock in table.clocks.items()}
-    return replace(table, dated=True, clock=replace(table.clock, unit="s"), clocks=clocks)
+    row = next(line for k, line in numbered if k >= table.skip)
+
+    def in_seconds(clock: Column) -> Column:
+        was_number = math.isfinite(number_of(row.split(table.delimiter)[clock.index]))
+        return clock if was_number else replace(clock, unit="s")
+
+    clocks = {sensor: in_seconds(clock) for sensor, clock in table.clocks.items()}
+    return replace(table, dated=True, clock=in_seconds(table.clock), clocks=clocks)
 
 
 def _table(file: Path, numbered: list[tuple[int, str]]) -> SensorTable | None:

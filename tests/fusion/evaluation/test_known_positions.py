@@ -62,3 +62,12 @@ def test_positions_in_a_gap_of_the_track_are_excluded():
     gapped = SimpleNamespace(time=TIME[known], trajectory=broken)
     around = PositionTrack(TIME[::20], PATH[::20, :2], "waypoints")
     assert position_error(gapped, around) == (pytest.approx(0.0, abs=1e-9), 6)
+
+
+@pytest.mark.parametrize(("sigma", "jump"), [(8.0, 90.0), (8.0, 12.0), (30.0, 90.0)])
+def test_jumps_far_beyond_the_stated_accuracy_are_named(sigma, jump):
+    path = PATH[::10, :2] + np.outer(TIME[::10] >= 9.0, [jump, 0.0])
+    known = PositionTrack(TIME[::10], path, "positions", sigma=np.full(len(path), sigma))
+    words = position_error_words(track(PATH), known)
+    assert f"their sigma is {sigma:.0f} m per axis" in words
+    assert words.endswith("but jump by up to 91 m") == (jump > 4.3 * sigma)

@@ -239,6 +239,18 @@ def test_repeated_and_invalid_fields_are_dropped_and_counted(still_model: Any) -
     assert navigator._front_end.counts.field_dropped == 2
 
 
+@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e-2])  # T, mT, gauss
+def test_a_field_in_another_unit_is_named_as_such(
+    biased_walk: ImuSequence, make_oracle: Make, scale: float
+) -> None:
+    walk = biased_walk.slice(0.0, 20.0)
+    assert walk.magnetometer is not None
+    field = replace(walk.magnetometer, field=scale * walk.magnetometer.field)
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
+    bearings = Navigator(oracle, CONFIG).run(replace(walk, magnetometer=field)).health.bearings
+    assert set(bearings) == {"too weak to be in uT"}
+
+
 def test_a_disabled_magnetometer_has_no_effect(biased_walk: ImuSequence, make_oracle: Make) -> None:
     short = biased_walk.slice(0.0, 10.0)
     off = replace(CONFIG, filter=replace(CONFIG.filter, magnetometer=False))

@@ -72,6 +72,16 @@ def test_wrong_entries_are_named_and_the_others_kept(tmp_path: Path) -> None:
         find_recordings(path)
 
 
+def test_a_text_of_something_else_is_one_error(tmp_path: Path) -> None:
+    """A log of a serial port, or a list of a hundred recordings next to another data folder."""
+    path = tmp_path / "serial.txt"
+    path.write_text("".join(f"t: {k} ax: 0.1 ay: 0.2 az: 9.8\n" for k in range(100)))
+    errors: list[StarioError] = []
+    with pytest.raises(ReadError, match="found 100 lines without an existing name, such as t: 0 "):
+        find_recordings(path, errors.append)
+    assert errors == []
+
+
 def test_lists_name_recordings_below_a_folder_and_their_groups(tmp_path: Path) -> None:
     for name in ("a.csv", "walks.h5"):
         (tmp_path / name).touch()

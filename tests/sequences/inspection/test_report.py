@@ -14,7 +14,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.files import json_text
 from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.readers import read_recording
-from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
+from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, PositionTrack, Trajectory
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
@@ -55,6 +55,16 @@ def test_axes_are_not_called_right_where_the_device_hardly_tilts(walk: ImuSequen
     assert (
         "axes: no problems found" not in inspect_recording(replace(still, truth=None)).lines()[-1]
     )
+
+
+def test_jumps_of_satellite_positions_are_a_problem(walk: ImuSequence) -> None:
+    time = np.arange(1.0, 29.0)
+    path, sigma = np.outer(time, [1.2, 0.0]), np.full(len(time), 5.0)
+    known = PositionTrack(time, path, "positions", sigma=sigma)
+    outdoors = replace(walk, truth=None, positions=known)
+    assert inspect_recording(outdoors).problems == ()
+    path[10:15] += [0.0, 100.0]
+    assert "positions: found jumps of up to 100 m" in problem(outdoors)
 
 
 def test_a_good_recording_has_no_problems(walk: ImuSequence) -> None:

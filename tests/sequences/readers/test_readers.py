@@ -1,5 +1,6 @@
 import logging
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -307,6 +308,31 @@ def test_unknown_content_is_shown_with_the_known_formats(tmp_path: Path) -> None
         InputError, match=r"format: found 'bags', expected auto, archive, ronin, .*, csv"
     ):
         read_recording(path, format="bags")
+
+
+@pytest.mark.parametrize("read", [read_recording, find_recordings])
+def test_a_pipe_is_refused_before_it_is_read(
+    read: Callable[[Path], object], tmp_path: Path
+) -> None:
+    os.mkfifo(tmp_path / "walk.csv")  # nobody writes to it: opening it would wait forever
+    with pytest.raises(ReadError, match="found a pipe or device, expected a recording"):
+        read(tmp_path / "walk.csv")
+
+
+def test_folders_without_permission_are_passed_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listed = Path.iterdir
+
+    def iterdir(folder: Path) -> Iterator[Path]:
+        if folder.name == "private":
+            raise PermissionError(13, "Permission denied")
+        return listed(folder)
+
+    monkeypatch.setattr(Path, "iterdir", iterdir)
+    (tmp_path / "private").mkdir()
+    (tmp_path / "own.csv").write_text("t,gx,gy,gz,ax,ay,az\n0.0,0.1,0.2,0.3,1.0,2.0,9.0\n")
+    assert find_recordings(tmp_path) == [tmp_path / "own.csv"]
 
 
 def test_find_recordings_searches_folders_in_order(

@@ -135,11 +135,21 @@ def quoted_titles_with_commas(folder: Path, walk: ImuSequence) -> None:
     save(folder / "a.csv", header, walk.time, *columns)
 
 
+def gopro(folder: Path, walk: ImuSequence) -> None:
+    """Milliseconds without a unit, dates next to them, and titles of no axis."""
+    for name, title, values in (
+        ("ACCL", "Accelerometer [m/s2]", walk.accel),
+        ("GYRO", "Gyroscope [rad/s]", walk.gyro),
+    ):
+        columns = 1e3 * walk.time, dates(walk, "%Y-%m-%dT%H:%M:%S.%fZ"), values
+        save(folder / f"GX010001-{name}.csv", f'"cts","date","{title}","1","2"', *columns)
+
+
 LOGGERS: dict[str, Callable[[Path, ImuSequence], None]] = {
     write.__name__: write
     for write in (
         shimmer, units_below_the_titles, matlab_mobile, metawear, polar, witmotion, vectornav,
-        movella, hyperimu, microcontroller, date_and_time, titles_in_a_comment,
+        movella, hyperimu, gopro, microcontroller, date_and_time, titles_in_a_comment,
         quoted_titles_with_commas,
     )
 }  # fmt: skip

@@ -1,5 +1,6 @@
 """Satellite positions next to the sensors of a phone's recording."""
 
+from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
 import numpy as np
@@ -110,23 +111,40 @@ def test_each_recording_of_a_folder_has_its_own_positions(
         np.testing.assert_allclose(found.position_W, speed * (METRES - METRES[0]), atol=0.02)
 
 
-def test_times_may_be_dates(walk: ImuSequence, tmp_path: Path) -> None:
-    def dates(times: FloatArray) -> list[str]:
-        start = np.datetime64("2024-05-01T12:00:00.000000")
-        return [f"{start + round(t * 1e6)}Z" for t in times.tolist()]
-
-    for name, values in (("Gyroscope", walk.gyro), ("Accelerometer", walk.accel)):
-        save(tmp_path / f"d/{name}.csv", "time,x,y,z", dates(walk.time), values)
-    save(tmp_path / "d/GPS.csv", "time,lat,lon", dates(TIME), degrees(METRES))
-    found = positions_of(tmp_path / "d")
-    np.testing.assert_allclose(found.time, TIME, atol=1e-5)
-
-
 def test_lateral_forces_are_no_positions(walk: ImuSequence, tmp_path: Path) -> None:
     phyphox(tmp_path / "p", walk)
     header = "time (s),acc_lat,acc_long,gps speed"
     save(tmp_path / "p/GPS.csv", header, TIME, METRES, TIME)
     assert read_recording(tmp_path / "p").positions is None
+
+
+def test_dates_of_positions_and_samples_may_be_in_different_zones(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
+    for name, values in (("Accelerometer", walk.accel), ("Gyroscope", walk.gyro)):
+        save(tmp_path / f"w/{name}.csv", "time,x,y,z", dates(walk.time, hours=2), values)
+    columns = dates(TIME, hours=-3), degrees(METRES), np.full(len(TIME), 4.53)
+    save(tmp_path / "w/gps.csv", "time,lat,lon,accuracy", *columns)
+    found = positions_of(tmp_path / "w")
+    np.testing.assert_allclose(found.time, TIME, atol=1e-6)
+    np.testing.assert_allclose(found.position_W, METRES - METRES[0], atol=0.02)
+
+
+def dates(time: FloatArray, hours: int) -> list[list[str]]:
+    """Dates at times [s] after one instant, in a zone so many hours ahead of UTC."""
+    zone = timezone(timedelta(hours=hours))
+    start = datetime(2024, 5, 1, 23, 59, 55, tzinfo=UTC).astimezone(zone)
+    return [[(start + timedelta(seconds=t)).isoformat()] for t in time.tolist()]
+
+
+def test_positions_known_no_better_than_a_room_are_skipped_with_a_warning(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    phyphox(tmp_path / "p", walk)
+    radius = np.where(TIME == 5.0, 8.0, 120.0)
+    save(tmp_path / "p/gps.csv", "time,lat,lon,accuracy", TIME, degrees(METRES), radius)
+    assert read_recording(tmp_path / "p").positions is None
+    assert "found 1 of 12 positions known to 30 m, expected at least two" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -135,7 +153,11 @@ def test_lateral_forces_are_no_positions(walk: ImuSequence, tmp_path: Path) -> N
         ("", None),
         ("1.0,45.0,7.0,0,0,0\n", None),
         ("1.0,45.0,7.0,0,0,0\n2.0,45.0,x,0,0,0\n3.0,45.0,7.0,0,0,0\n", "'x', expected a number"),
-        ("9001.0,45.0,7.0,0,0,0\n9002.0,45.1,7.0,0,0,0\n", "0 of 2 positions within the recording"),
+        ("9001.0,45.0,7.0,0,0,0\n", None),
+        (
+            "9001.0,45.0,7.0,0,0,0\n9002.0,45.1,7.0,0,0,0\n",
+            "found times from 9001 to 9002 s after the first sample, expected times from 0 to ",
+        ),
     ],
 )
 def test_positions_that_cannot_be_used_cost_no_recording(
