@@ -165,12 +165,9 @@ def _lost_positions(positions: PositionTrack, beside_poses: bool) -> list[str]:
         return [f"{kind} alongside true poses have no column in CSV"]
     if len(time) < 2:
         return [f"a CSV needs two {kind}: write .h5"]
-    lost = []
     if kind != (read_as := kind_of_positions(time)):
-        lost.append(f"a CSV's reader takes {kind} at such intervals for {read_as}: write .h5")
-    if positions.sigma is not None:
-        lost.append(f"the standard deviations of the {kind} have no column: write .h5")
-    return lost
+        return [f"a CSV's reader takes {kind} at such intervals for {read_as}: write .h5"]
+    return []
 
 
 def _warn_about_losses(sequence: ImuSequence, layout: str) -> None:

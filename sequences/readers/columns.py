@@ -30,6 +30,9 @@ HEADER = "t [s],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2
 TRUTH_HEADER = "px [m],py [m],pz [m],qx,qy,qz,qw"
 """Optional ground truth: poses, or positions without attitude (px and py at least)."""
 
+SIGMA_HEADER = "sp [m]"
+"""Optional standard deviation per axis of positions without attitude."""
+
 MAGNETIC_HEADER = "mx [uT],my [uT],mz [uT]"
 """Optional magnetometer columns."""
 
@@ -40,7 +43,9 @@ Factor = TypeVar("Factor")
 IMU = ("gx", "gy", "gz", "ax", "ay", "az")
 POSITION, QUAT = ("px", "py", "pz"), ("qx", "qy", "qz", "qw")
 TRUTH = POSITION + QUAT
+SIGMA = "sp"
 MAGNETIC = ("mx", "my", "mz")
+QUANTITIES = (*IMU, *MAGNETIC, *TRUTH, SIGMA)
 
 _STEMS = {
     "g": ("gyro", "gyr", "gyroscope", "w", "omega", "angular_velocity", "w_rs_s"),
@@ -49,13 +54,17 @@ _STEMS = {
     "p": ("pos", "position"),
     "q": ("quat", "quaternion", "ori", "orientation"),
 }
-_ALIASES = dict.fromkeys(("t", "time", "times", "timestamp", "datetime"), "t") | {
-    stem + joint + axis: letter + axis
-    for letter, stems in _STEMS.items()
-    for stem in (letter, *stems)
-    for joint in ("", "_")
-    for axis in ("xyzw" if letter == "q" else "xyz")
-}
+_ALIASES = (
+    dict.fromkeys(("t", "time", "times", "timestamp", "datetime"), "t")
+    | {SIGMA: SIGMA}
+    | {
+        stem + joint + axis: letter + axis
+        for letter, stems in _STEMS.items()
+        for stem in (letter, *stems)
+        for joint in ("", "_")
+        for axis in ("xyzw" if letter == "q" else "xyz")
+    }
+)
 _LIKE_TRUTH = re.compile(
     r"gt|truth|pos|quat|(ori|orientation)_?[wxyz]$|[ptq]?_?[xyz]$|q_?[w0-3]$", flags=re.IGNORECASE
 )
@@ -144,6 +153,8 @@ def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
     missing = [name for name in ("t", *IMU) if name not in columns]
     if not set(POSITION) & set(columns):  # attitude alone is not a track
         ignored += [columns.pop(name).title for name in QUAT if name in columns]
+    if not set(POSITION) & set(columns) or set(QUAT) & set(columns):
+        ignored += [columns.pop(SIGMA).title] if SIGMA in columns else []
     truth = [name for name in TRUTH if name in columns]
     if set(QUAT) & set(columns):
         missing += [name for name in TRUTH if name not in columns]
@@ -166,8 +177,8 @@ def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
                 "%s: no ground truth is read from %s: it must have %s",
                 path, ", ".join(truth_like), TRUTH_HEADER,
             )  # fmt: skip
-    for name in truth:
-        unit_factor(path, columns[name], {"m": 1.0, "": 1.0} if name in POSITION else {"": 1.0})
+    for name in (*truth, *([SIGMA] if SIGMA in columns else [])):
+        unit_factor(path, columns[name], {"": 1.0} if name in QUAT else {"m": 1.0, "": 1.0})
     return columns
 
 

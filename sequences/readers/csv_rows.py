@@ -13,7 +13,7 @@ import numpy as np
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.clocks import assumed_unit, refuse_row_numbers, time_unit
-from stario.sequences.readers.columns import IMU, MAGNETIC, TRUTH, Column, Header, unit_factor
+from stario.sequences.readers.columns import IMU, QUANTITIES, Column, Header, unit_factor
 from stario.sequences.readers.dates import with_seconds
 from stario.sequences.readers.lines import decimal_mark, ends_within_a_row, unquoted
 from stario.sequences.readers.rows import NumberedLine, is_missing, parsed_rows, rows_below
@@ -61,7 +61,7 @@ def read_rows(path: Path, lines: list[str], header: Header) -> Rows:
 def _rows_quickly(path: Path, header: Header, decimal: str) -> Rows | None:
     """Return the rows of a large file if every row is complete, else None."""
     columns = header.columns
-    names = ["t", *(name for name in (*IMU, *MAGNETIC, *TRUTH) if name in columns)]
+    names = ["t", *(name for name in QUANTITIES if name in columns)]
     used = [columns[name].index for name in names]
     quick = read_quickly(path, header.lines, header.separator, used, decimal)
     if quick is None:
@@ -93,7 +93,7 @@ def _rows_carefully(path: Path, lines: list[str], header: Header, decimal: str) 
         numbered = [(number, line) for (number, _), line in zip(numbered, lines, strict=True)]
         columns = {**columns, "t": replace(columns["t"], unit="s")}
         header = replace(header, columns=columns)
-    used = [name for name in (*IMU, *MAGNETIC, *TRUTH) if name in columns]
+    used = [name for name in QUANTITIES if name in columns]
     places, titles = [columns[name].index for name in used], [columns[name].title for name in used]
     values = parsed_rows(path, numbered, header.separator, places, titles)
     is_imu = _imu_rows(numbered, header, values[:, : len(IMU)])

@@ -8,7 +8,13 @@ import numpy as np
 
 from stario.sequences.arrays import check_type
 from stario.sequences.files import atomic_write
-from stario.sequences.readers.columns import HEADER, IMU, MAGNETIC_HEADER, TRUTH_HEADER
+from stario.sequences.readers.columns import (
+    HEADER,
+    IMU,
+    MAGNETIC_HEADER,
+    SIGMA_HEADER,
+    TRUTH_HEADER,
+)
 from stario.sequences.sequence import FloatArray, ImuSequence
 
 
@@ -31,7 +37,11 @@ def write_csv(path: Path | str, sequence: ImuSequence) -> None:
     if truth is None and sequence.positions is not None:
         known = sequence.positions
         header += "," + ",".join(TRUTH_HEADER.split(",")[: known.position_W.shape[1]])
-        rows.add(known.time[known.valid], known.position_W[known.valid])
+        values = known.position_W
+        if known.sigma is not None:
+            header += f",{SIGMA_HEADER}"
+            values = np.column_stack([values, known.sigma])
+        rows.add(known.time[known.valid], values[known.valid])
     if truth is not None:
         header += f",{TRUTH_HEADER}"
         poses = np.column_stack([truth.position_W, truth.quat_xyzw])

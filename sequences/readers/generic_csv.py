@@ -15,7 +15,8 @@ separated by commas, semicolons or tabs like the rows below it; comments (`#`) m
 - ground truth: `px,py,pz` [m] in a world with z up and `qx,qy,qz,qw`, body to world. A row may
   leave it blank (truth at a lower rate), or gyroscope and accelerometer (truth at other times).
 - or only `px,py` or `px,py,pz`: waypoints (if their median interval is two seconds or more), or
-  a track of positions, for example from satellites.
+  a track of positions, for example from satellites; `sp` [m] may give their standard deviation
+  per axis, and rows without it then hold no position.
 
 A sample written as `nan` stays NaN; other columns are ignored.
 """
@@ -37,6 +38,7 @@ from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import resample_to_gyro, source_words
 from stario.sequences.readers.columns import (
     IMU,
+    SIGMA,
     TRUTH,
     Header,
     columns_named,
@@ -156,7 +158,7 @@ def kind_of_positions(time: FloatArray) -> Literal["positions", "waypoints"]:
 
 def _ground_truth(path: Path, rows: Rows) -> tuple[Trajectory | None, PositionTrack | None]:
     """Return the poses, or else the positions; None if fewer than two rows hold them."""
-    names = [name for name in TRUTH if name in rows.table]
+    names = [name for name in (*TRUTH, SIGMA) if name in rows.table]
     if not names:
         return None, None
     values = np.stack([rows.table[name] for name in names], axis=1)
@@ -172,7 +174,12 @@ def _ground_truth(path: Path, rows: Rows) -> tuple[Trajectory | None, PositionTr
         return None, None
     time, values = rows.time[kept], values[kept]
     if not has_attitude:
-        return None, PositionTrack(time, values, kind_of_positions(time))
+        sigma = values[:, -1] if SIGMA in names else None
+        if sigma is not None and sigma.min() <= 0.0:
+            where = f"line {rows.line_numbers[kept[np.argmin(sigma)]]}, sp"
+            raise ReadError(path, where, f"{sigma.min():g}", "a standard deviation above 0 m")
+        place = values if sigma is None else values[:, :-1]
+        return None, PositionTrack(time, place, kind_of_positions(time), sigma=sigma)
     norm = np.linalg.norm(values[:, 3:], axis=1)
     bad = np.abs(norm - 1.0) > NORM_TOLERANCE
     if bad.any():

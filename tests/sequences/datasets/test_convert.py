@@ -132,10 +132,6 @@ def test_positions_that_a_csv_would_change_give_a_warning(
     kept = read_recording(tmp_path / "r.csv").positions
     assert bool(message) == (kept is None or kept.kind != kind)
     caplog.clear()
-    stated = replace(known, sigma=np.full(count, 3.0))
-    convert(replace(walk, truth=None, positions=stated), tmp_path / "stated.csv")
-    assert count < 2 or f"standard deviations of the {kind} have no column" in caplog.text
-    caplog.clear()
     convert(replace(walk, positions=known, attributes={"person": "x"}), tmp_path / "both.csv")
     assert "alongside true poses" in caplog.text
     assert "attributes have no place" in caplog.text
