@@ -6,6 +6,13 @@ import pytest
 from published_formats import WRITERS, Written, walk_of
 
 from stario.sequences.sequence import ImuSequence
+from stario.sequences.simulation.imu import simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
+
+
+@pytest.fixture(scope="module")
+def walk() -> ImuSequence:
+    return simulate_imu(generate_walk(4, 10.0, style=WalkStyle()), rate=200.0)
 
 
 @pytest.fixture(scope="session")

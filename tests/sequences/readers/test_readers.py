@@ -1,6 +1,5 @@
 import logging
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers import FORMATS, find_recordings, read_recording, write_csv
-from stario.sequences.readers.lists import is_list
 from stario.sequences.readers.published.euroc import read_euroc
 from stario.sequences.readers.published.oxiod import read_oxiod
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
@@ -310,31 +308,6 @@ def test_unknown_content_is_shown_with_the_known_formats(tmp_path: Path) -> None
         read_recording(path, format="bags")
 
 
-@pytest.mark.parametrize("read", [read_recording, find_recordings])
-def test_a_pipe_is_refused_before_it_is_read(
-    read: Callable[[Path], object], tmp_path: Path
-) -> None:
-    os.mkfifo(tmp_path / "walk.csv")  # nobody writes to it: opening it would wait forever
-    with pytest.raises(ReadError, match="found a pipe or device, expected a recording"):
-        read(tmp_path / "walk.csv")
-
-
-def test_folders_without_permission_are_passed_over(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    listed = Path.iterdir
-
-    def iterdir(folder: Path) -> Iterator[Path]:
-        if folder.name == "private":
-            raise PermissionError(13, "Permission denied")
-        return listed(folder)
-
-    monkeypatch.setattr(Path, "iterdir", iterdir)
-    (tmp_path / "private").mkdir()
-    (tmp_path / "own.csv").write_text("t,gx,gy,gz,ax,ay,az\n0.0,0.1,0.2,0.3,1.0,2.0,9.0\n")
-    assert find_recordings(tmp_path) == [tmp_path / "own.csv"]
-
-
 def test_find_recordings_searches_folders_in_order(
     tmp_path: Path, walk: ImuSequence, phone_walk: ImuSequence
 ) -> None:
@@ -380,33 +353,3 @@ def test_recorded_truth_agrees_with_the_sensors(name: str, least: float, tilt_de
     up = pose.attitude_WB.apply(sequence.accel[inside])[pose.valid].mean(axis=0)
     assert np.degrees(np.arctan2(np.hypot(up[0], up[1]), up[2])) < tilt_deg
     assert np.linalg.norm(up) == pytest.approx(9.8, abs=0.05)
-
-
-@needs_data
-def test_every_recording_is_found() -> None:
-    assert sum(len(find_recordings(DATA / name)) for name in ("oxiod", "tumvi", "euroc")) == 18
-    assert len(find_recordings(DATA / "archives")) == 1149
-
-
-def test_a_text_file_with_rows_of_numbers_is_not_a_list(tmp_path: Path) -> None:
-    """Whatever its header and separator: each row would name a recording that does not exist."""
-    path = tmp_path / "samples.txt"
-    for mark in ",;\t ":
-        rows = [mark.join(["0.0", "1", "2"]), mark.join(["0.1", "1", "2"])]
-        path.write_text("\n".join(["# logger", mark.join(["s", "x", "y"]), *rows]))
-        assert not is_list(path)
-    path.write_text("a000_1\n145820422949970\n")
-    assert is_list(path)
-
-
-@pytest.mark.parametrize("stem", ["walk_{}", "{}", "{}_1"])
-def test_recordings_named_by_letters_are_not_the_sensors_of_one(
-    stem: str, walk: ImuSequence, tmp_path: Path
-) -> None:
-    """Letters a, b, g and m also name the accelerometer, magnetometer and gyroscope."""
-    for number, letter in enumerate("abgm"):
-        shorter = walk.slice(0.0, 10.0 + number)
-        write_csv(tmp_path / f"{stem.format(letter)}.csv", shorter)
-    found = [read_recording(path) for path in find_recordings(tmp_path)]
-    assert [round(one.duration) for one in found] == [10, 11, 12, 13]
-    assert all(one.source == "generic CSV" and one.magnetometer is None for one in found)

@@ -1,0 +1,72 @@
+"""Recordings found below a path: what is one, what is a list of them, and what is passed over."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from recorded import DATA
+
+from stario.sequences.errors import ReadError
+from stario.sequences.readers import find_recordings, read_recording, write_csv
+from stario.sequences.readers.lists import is_list
+from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
+from stario.sequences.simulation.walks import generate_walk
+
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
+
+
+@pytest.mark.parametrize("read", [read_recording, find_recordings])
+def test_a_pipe_is_refused_before_it_is_read(
+    read: Callable[[Path], object], tmp_path: Path
+) -> None:
+    os.mkfifo(tmp_path / "walk.csv")  # nobody writes to it: opening it would wait forever
+    with pytest.raises(ReadError, match="found a pipe or device, expected a recording"):
+        read(tmp_path / "walk.csv")
+
+
+def test_folders_without_permission_are_passed_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listed = Path.iterdir
+
+    def iterdir(folder: Path) -> Iterator[Path]:
+        if folder.name == "private":
+            raise PermissionError(13, "Permission denied")
+        return listed(folder)
+
+    monkeypatch.setattr(Path, "iterdir", iterdir)
+    (tmp_path / "private").mkdir()
+    (tmp_path / "own.csv").write_text("t,gx,gy,gz,ax,ay,az\n0.0,0.1,0.2,0.3,1.0,2.0,9.0\n")
+    assert find_recordings(tmp_path) == [tmp_path / "own.csv"]
+
+
+@needs_data
+def test_every_recording_is_found() -> None:
+    assert sum(len(find_recordings(DATA / name)) for name in ("oxiod", "tumvi", "euroc")) == 18
+    assert len(find_recordings(DATA / "archives")) == 1149
+
+
+def test_a_text_file_with_rows_of_numbers_is_not_a_list(tmp_path: Path) -> None:
+    """Whatever its header and separator: each row would name a recording that does not exist."""
+    path = tmp_path / "samples.txt"
+    for mark in ",;\t ":
+        rows = [mark.join(["0.0", "1", "2"]), mark.join(["0.1", "1", "2"])]
+        path.write_text("\n".join(["# logger", mark.join(["s", "x", "y"]), *rows]))
+        assert not is_list(path)
+    path.write_text("a000_1\n145820422949970\n")
+    assert is_list(path)
+
+
+@pytest.mark.parametrize("stem", ["walk_{}", "{}", "{}_1"])
+def test_recordings_named_by_letters_are_not_the_sensors_of_one(stem: str, tmp_path: Path) -> None:
+    """Letters a, b, g and m also name the accelerometer, magnetometer and gyroscope."""
+    walk = simulate_imu(generate_walk(4, 14.0), rate=200.0, errors=PHONE_IMU)
+    for number, letter in enumerate("abgm"):
+        shorter = walk.slice(0.0, 10.0 + number)
+        write_csv(tmp_path / f"{stem.format(letter)}.csv", shorter)
+    found = [read_recording(path) for path in find_recordings(tmp_path)]
+    assert [round(one.duration) for one in found] == [10, 11, 12, 13]
+    assert all(one.source == "generic CSV" and one.magnetometer is None for one in found)
