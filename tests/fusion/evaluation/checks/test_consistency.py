@@ -50,8 +50,10 @@ def test_nees_of_five_minutes_is_within_its_bounds() -> None:
 
 
 @pytest.mark.slow
-def test_nees_of_half_an_hour_with_a_phone_is_within_its_bounds() -> None:
-    result = consistency(PHONE, seconds=1800.0)
+def test_nees_of_a_quarter_of_an_hour_with_a_phone_is_within_its_bounds() -> None:
+    # Nothing observes yaw, whose sigma is then 1.3 rad. Later, errors near pi leave the chart.
+    result = consistency(PHONE, seconds=900.0)
+    assert 1.0 < result.yaw_sigma < 1.5
     assert 12.7 < result.nees < 17.5
     assert 0.5 < result.yaw < 1.7
 
