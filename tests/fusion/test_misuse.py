@@ -85,7 +85,7 @@ def test_a_recording_preprocessed_for_another_update_rate_is_refused(
 def test_a_recording_may_have_more_fixes_than_may_wait_in_a_stream(
     walk: ImuSequence, still_model: Any
 ) -> None:
-    times = np.linspace(1.0, walk.duration - 0.01, 10_500)
+    times = [*np.linspace(1.0, walk.duration - 0.01, 50), *np.linspace(1e3, 2e3, 10_001)]
     fixes = [position_fix(t, np.zeros(3), 1e4 * np.eye(3)) for t in times]
     counts = Navigator(still_model).run(walk, fixes=fixes).health.fixes
     assert sum(counts.values()) == len(fixes)

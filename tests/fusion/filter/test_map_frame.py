@@ -152,9 +152,9 @@ def test_fixes_that_agree_prevail_over_an_overconfident_track(
 def test_neither_gaps_nor_fixes_make_a_streams_graph_grow(
     make_walk: Make, make_oracle: Make, without: Make
 ) -> None:
-    walk = make_walk(5, 40.0)
+    walk = make_walk(5, 25.0)
     holed = without(walk, (walk.time > 5.0) & (walk.time % 3.0 < 0.3))
-    for recording, fixes in ((holed, []), (walk, fixes_of(walk, np.arange(3.0, 39.0, 0.1), MAP))):
+    for recording, fixes in ((holed, []), (walk, fixes_of(walk, np.arange(3.0, 24.0, 0.1), MAP))):
         oracle = make_oracle(recording, walk.truth, CONFIG)
         navigator = Navigator(oracle, CONFIG, backend="graph")
         stream_with_fixes(navigator, recording, fixes)
