@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from stario.fusion.evaluation.checks.corruption import faults
 from stario.fusion.evaluation.checks.faults import (
+    DummyPredictor,
     FaultResult,
     fault_table,
     matched_walk,
     run_faults,
+    with_true_displacements,
 )
+from stario.fusion.navigator import Navigator
 from stario.sequences.errors import InputError
 
 SECONDS = 20.0
@@ -72,6 +77,22 @@ def test_a_recording_without_truth_is_refused() -> None:
     sequence, config = matched_walk(3.0)
     with pytest.raises(InputError, match="truth"):
         run_faults(sequence.without_truth(), config)
+
+
+def test_true_displacements_have_the_noise_that_the_filter_takes_them_to_have() -> None:
+    """The filter multiplies their covariance by its scale."""
+    sequence, config = matched_walk(SECONDS)
+    config = replace(config, filter=replace(config.filter, covariance_scale=4.0))
+    preprocessed = Navigator(DummyPredictor(), config).observe(sequence)
+    measured = with_true_displacements(preprocessed, sequence.truth, config, 0, noise=0.05)
+    errors = []
+    for interval, measurement in zip(measured.intervals, measured.measurements, strict=True):
+        if measurement is not None:
+            np.testing.assert_allclose(4.0 * measurement[1], 0.05**2 * np.eye(3))
+            ends = sequence.truth.at(np.array([interval.stop - 1.0, interval.stop])).position_W
+            length = np.linalg.norm((ends[1] - ends[0])[:2])
+            errors.append(np.linalg.norm(measurement[0][:2]) - length)
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(0.05, rel=0.35)
 
 
 def test_faults_are_drawn_from_the_seed() -> None:
