@@ -205,6 +205,7 @@ def test_the_command_writes_tables_and_figures(
 ) -> None:
     folder = dataset.training[0].parent
     monkeypatch.setenv("STARIO_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("stario.network.runtime.survey._RUNS", {1: 1, 64: 1})
     (tmp_path / "recipe.json").write_text(json.dumps(RECIPE))
     out = tmp_path / "out"
     arguments = ["--set", f"ronin={folder}", "--out", str(out), "--steps", "1", "--seeds", "1"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -54,11 +55,16 @@ def with_waypoints(walk: ImuSequence, every: float = 8.0) -> ImuSequence:
     return replace(walk, truth=None, positions=PositionTrack(time, xy, "waypoints"))
 
 
+@cache
+def prepared_once(recording: ImuSequence) -> Prepared:
+    return prepare(recording, Path("walk"))
+
+
 class Stub:
     """Predictor of the true displacements of successive windows, scaled and rotated."""
 
     def __init__(self, walk: ImuSequence, scale: float = 1.0, yaw: float = 0.0) -> None:
-        [piece] = prepare(walk, Path("walk")).pieces
+        [piece] = prepared_once(walk).pieces
         known = piece.position_W
         steps = np.exp(-1j * piece.yaw_WN[:-2]) * (known[2:] - known[:-2])
         steps = scale * np.exp(1j * yaw) * steps[: piece.stream.window_count]
@@ -80,7 +86,7 @@ def horizontal_path(walk: ImuSequence) -> float:
 
 
 def errors_of(recording: ImuSequence, stub: Stub | PedestrianDeadReckoning) -> RecordingErrors:
-    prepared = prepare(recording, Path("walk"))
+    prepared = prepared_once(recording)
     return recording_errors(prepared, predictions(stub, prepared))
 
 
@@ -231,6 +237,7 @@ def test_pedestrian_dead_reckoning_is_judged_like_a_network(walk: ImuSequence) -
     assert 0.5 < found.figures["length_ratio"] < 1.6
 
 
+@pytest.fixture(scope="module")
 def judged_pair(walk: ImuSequence) -> list[RecordingResult]:
     prepared = [
         replace(prepare(recording, Path(name)), attributes={"person": person})
@@ -256,8 +263,10 @@ def test_a_recording_with_two_waypoints_is_named_as_not_compared(
     assert [one.errors["ours"].path_m > 0.0 for one in judged] == [False, True]
 
 
-def test_rows_compare_weights_by_group_and_pooled(walk: ImuSequence) -> None:
-    rows = {row.name: row for row in rows_of(judged_pair(walk), "person", "ours", "theirs")}
+def test_rows_compare_weights_by_group_and_pooled(
+    walk: ImuSequence, judged_pair: list[RecordingResult]
+) -> None:
+    rows = {row.name: row for row in rows_of(judged_pair, "person", "ours", "theirs")}
     assert list(rows) == ["a", "b", "all"]
     assert rows["a"].ratios["rms_1s_m"].ratio == pytest.approx(0.25, rel=0.01)
     assert rows["b"].ratios["rms_10s_m"].ratio == pytest.approx(0.5, abs=0.05)
@@ -267,10 +276,11 @@ def test_rows_compare_weights_by_group_and_pooled(walk: ImuSequence) -> None:
     assert rows["a"].medians["theirs"]["length_ratio"] == pytest.approx(0.8, abs=0.02)
 
 
-def test_a_judgement_is_written_as_tables_and_figure(walk: ImuSequence, tmp_path: Path) -> None:
-    judged = judged_pair(walk)
-    rows = rows_of(judged, "set", "ours", "theirs")
-    found = JudgingResult("ours", "theirs", rows, judged)
+def test_a_judgement_is_written_as_tables_and_figure(
+    judged_pair: list[RecordingResult], tmp_path: Path
+) -> None:
+    rows = rows_of(judged_pair, "set", "ours", "theirs")
+    found = JudgingResult("ours", "theirs", rows, judged_pair)
     assert "ratio over 10 s" in judgement_text(found)
     write_judgement(tmp_path, found)
     names = {path.name for path in tmp_path.iterdir()}
@@ -286,10 +296,10 @@ def test_a_judgement_is_written_as_tables_and_figure(walk: ImuSequence, tmp_path
     assert not list(tmp_path.iterdir())
 
 
-def test_a_group_may_be_called_all(walk: ImuSequence) -> None:
+def test_a_group_may_be_called_all(judged_pair: list[RecordingResult]) -> None:
     judged = [
         replace(one, labels=one.labels | {"person": person})
-        for one, person in zip(judged_pair(walk), ("a", POOLED), strict=True)
+        for one, person in zip(judged_pair, ("a", POOLED), strict=True)
     ]
     rows = rows_of(judged, "person", "ours", "theirs")
     assert [(row.name, row.pooled) for row in rows] == [("a", False), ("all", False), ("all", True)]
