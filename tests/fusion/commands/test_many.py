@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from training_runs import narrow
 
+from stario.fusion.commands.options import ReadingOptions
 from stario.fusion.commands.train import _recipe
 from stario.network import load_model
 from stario.network.training.config import FINE_TUNING, training_config
@@ -170,6 +171,13 @@ def test_evaluate_compares_with_other_weights_by_groups(
     assert 0.5 < figures["nis_ekf"] < 6.0  # 3 is expected of a consistent filter
     written = json.loads((tmp_path / "out/groups.json").read_text())["groups"]
     assert {group["name"]: group for group in written} == groups
+
+
+def test_every_option_that_changes_what_is_read_is_part_of_the_key_of_a_cache() -> None:
+    usual = ReadingOptions()
+    for name in (field.name for field in fields(usual)):
+        other = replace(usual, **{name: ["person=dan"] if name == "where" else "other"})
+        assert (other.as_read() == usual.as_read()) == (name == "where")
 
 
 # --- train -------------------------------------------------------------------------------------

@@ -18,12 +18,14 @@ from stario.fusion.evaluation.compare import (
     Comparison,
     compare,
     demonstration,
+    measure,
 )
 from stario.fusion.evaluation.folders import fresh_folder
 from stario.fusion.evaluation.many import distinct_name
 from stario.fusion.evaluation.results import write_comparison, write_run
 from stario.fusion.evaluation.summary import scores_of, summary, summary_table
 from stario.sequences.accuracy.metrics import evaluate_track
+from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.errors import StarioError
 from stario.sequences.files import read_tum
 from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
@@ -103,6 +105,14 @@ def test_a_fit_gives_no_larger_ate_than_the_first_pose(compared: Comparison) -> 
         truth, track = compared.sequence.truth, compared.tracks[name].trajectory
         assert fitted == evaluate_track(track, truth, alignment="yaw").ate_m
         assert figures["known_positions_m"] is None
+
+
+def test_figures_with_fixes_are_those_after_a_fit(compared: Comparison) -> None:
+    sequence, track = compared.sequence, compared.tracks["ekf"]
+    figures = measure(track, sequence, "yaw")
+    assert figures["ate_m"] == figures["ate_fit_m"]
+    fitted = position_nees(track.trajectory, sequence.truth, "yaw").median
+    assert figures["nees_median"] == fitted != compared.metrics["ekf"]["nees_median"]
 
 
 def test_waypoints_replace_poses_in_the_error(compared: Comparison, blind: Comparison) -> None:

@@ -195,6 +195,14 @@ def test_a_cell_can_be_pickled_for_other_machines(dataset: DataSet, reading: Rea
     assert sent[1].digest == cell(dataset).digest
 
 
+def test_results_belong_to_a_network_a_recipe_and_all_recordings_of_their_set(
+    dataset: DataSet,
+) -> None:
+    sets = [replace(dataset, **{part: ()}) for part in ("training", "validation", "test")]
+    others = [*map(cell, sets), cell(dataset, "R-ResNet"), cell(dataset, seed=1)]
+    assert len({cell(dataset).digest, *(other.digest for other in others)}) == 6
+
+
 def test_an_unknown_backend_is_refused() -> None:
     with pytest.raises(ConfigError, match="--backend"):
         backend("mpi")

@@ -233,6 +233,8 @@ def test_prepared_recordings_are_cached(walk: ImuSequence, tmp_path: Path) -> No
 
 
 def test_pedestrian_dead_reckoning_is_judged_like_a_network(walk: ImuSequence) -> None:
+    [predicted] = PedestrianDeadReckoning().predictions(prepared_once(walk))
+    np.testing.assert_allclose(predicted.covariance_N[0], 0.3**2 * np.eye(3))  # its usual error
     found = errors_of(walk, PedestrianDeadReckoning())
     assert 0.5 < found.figures["length_ratio"] < 1.6
 
