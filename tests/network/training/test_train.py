@@ -113,6 +113,29 @@ def test_the_best_epoch_has_the_smallest_finite_error_of_those_that_train_sigma(
     assert History(TINY, reports).best().epoch == best
 
 
+def test_training_stops_after_epochs_without_progress_that_train_sigma() -> None:
+    """The likelihood begins with the third epoch, whatever came before."""
+    config = replace(TINY, epochs=6, likelihood_from=1.0 / 3.0, patience=2)
+    errors = (1.0, 2.0, 3.0, 4.0, 5.0)
+    reports = [EpochReport(epoch, 0.0, error, {}) for epoch, error in enumerate(errors, 1)]
+    stops = [History(config, reports[:count]).should_stop() for count in range(1, 6)]
+    assert stops == [False, False, False, False, True]
+
+
+def test_gradients_are_clipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    norms: list[float] = []
+    average = TrainingRun._average
+
+    def measured(self: TrainingRun) -> None:
+        gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
+        norms.append(float(torch.nn.utils.get_total_norm(gradients)))
+        average(self)
+
+    monkeypatch.setattr(TrainingRun, "_average", measured)
+    run(tmp_path, replace(TINY, epochs=1, epoch_windows=16, clip=0.01))
+    assert norms == [pytest.approx(0.01, rel=1e-3)]
+
+
 def test_weights_of_an_epoch_without_a_finite_error_are_not_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -79,6 +79,15 @@ def test_a_recording_without_truth_is_refused() -> None:
         run_faults(sequence.without_truth(), config)
 
 
+def test_a_block_of_false_displacements_lasts_five_seconds() -> None:
+    [block] = [fault for fault in faults(60.0) if fault.name == "network off by 1 m for 5 s"]
+    mean = np.zeros((600, 3))  # ten a second
+    assert block.modify_predictions is not None
+    block.modify_predictions(mean, np.tile(np.eye(3), (600, 1, 1)), np.random.default_rng(0))
+    assert mean.sum(axis=0).tolist() == [50.0, 0.0, 0.0]
+    assert np.flatnonzero(mean[:, 0])[0] == pytest.approx(300, abs=1)
+
+
 def test_true_displacements_have_the_noise_that_the_filter_takes_them_to_have() -> None:
     """The filter multiplies their covariance by its scale."""
     sequence, config = matched_walk(SECONDS)
