@@ -25,6 +25,11 @@ def interpolated(at: FloatArray, time: FloatArray, values: FloatArray) -> FloatA
     return np.stack([np.interp(at, time, column) for column in values.T], axis=1)
 
 
+def evenly_spaced(count: int, most: int) -> NDArray[np.intp]:
+    """Return up to `most` of `count` indices, evenly spaced from the first to the last."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.intp))
+
+
 def integral(time: FloatArray, values: FloatArray) -> FloatArray:
     """Return the trapezoidal integral (N, k) over time (N,) of values (N, k), starting at 0."""
     steps = 0.5 * np.diff(time)[:, None] * (values[1:] + values[:-1])

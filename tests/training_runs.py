@@ -1,10 +1,12 @@
-"""A tiny training run, on a device on a swing."""
+"""A tiny training run, on a device on a swing, and networks that are trained quickly."""
 
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
+from stario.network.stario import WIDTHS
 from stario.network.training.augment import Augmentation
 from stario.network.training.config import TrainingConfig
 from stario.network.training.train import train
@@ -37,6 +39,18 @@ def swaying(name: str, phase: float, seconds: float = 20.0) -> WorldStream:
 
 STREAMS = [swaying("a", 0.3), swaying("b", 1.2)]
 VALIDATION = [swaying("c", 0.8, 6.0), swaying("d", 2.0, 6.0)]
+
+
+def narrow(patch: pytest.MonkeyPatch) -> None:
+    """Give StarIO a quarter of its channels and half of its blocks."""
+    patch.setattr("stario.network.stario.WIDTHS", tuple(width // 4 for width in WIDTHS))
+    patch.setattr("stario.network.stario.BLOCKS", (1, 1, 1, 1))
+
+
+def shallow(patch: pytest.MonkeyPatch) -> None:
+    """Give RNIN one residual block in place of eight; its memory stays as it is."""
+    one_block = "stario.network.baselines.rnin.residual_groups"
+    patch.setattr(one_block, lambda block: block(64, 512, 8))
 
 
 def run(folder: Path, config: TrainingConfig = TINY, **options: Any) -> Path:

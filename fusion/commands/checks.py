@@ -21,9 +21,11 @@ from stario.fusion.commands.options import (
     BackendOption,
     ByOption,
     ConfigOption,
+    DataOption,
     EstimatorOptions,
     JsonOption,
     OptionalPathsArgument,
+    PathsArgument,
     ReadingOptions,
     backend_named,
     changed,
@@ -43,11 +45,6 @@ if TYPE_CHECKING:
     Judge = Callable[[Predictor, ImuSequence, NavigatorConfig, str], Sequence[Any]]
 
 _WALKS, _SECONDS, _SPLIT = 20, 120.0, "validation"
-
-RecordingsArgument = Annotated[
-    list[Path],
-    typer.Argument(metavar="PATH...", help="Recordings, folders, archives or list files."),
-]
 
 
 def models(
@@ -73,9 +70,7 @@ def backends(
     paths: OptionalPathsArgument = None,
     walks: Annotated[int, typer.Option(min=1, help="Number of simulated walks.")] = _WALKS,
     seconds: Annotated[float, typer.Option(min=5.0, help="Duration of each walk in s.")] = _SECONDS,
-    data: Annotated[
-        Path | None, typer.Option(help="Folder of the development recordings to use instead.")
-    ] = None,
+    data: DataOption = None,
     split: Annotated[str, typer.Option(help="With --data: split to use.")] = _SPLIT,
     as_json: JsonOption = False,
 ) -> None:
@@ -186,7 +181,7 @@ def benchmark(as_json: JsonOption = False) -> None:
 
 @expand_option_groups
 def fusion(
-    paths: RecordingsArgument,
+    paths: PathsArgument,
     reading: ReadingOptions,
     estimating: EstimatorOptions,
     by: ByOption = "set",
@@ -209,7 +204,7 @@ def fusion(
 
 @expand_option_groups
 def fixes(
-    paths: RecordingsArgument,
+    paths: PathsArgument,
     reading: ReadingOptions,
     estimating: EstimatorOptions,
     every: Annotated[float, typer.Option(min=0.1, help="Interval between fixes in s.")] = 5.0,
@@ -234,7 +229,7 @@ def fixes(
 
 @expand_option_groups
 def gaps(
-    paths: RecordingsArgument,
+    paths: PathsArgument,
     reading: ReadingOptions,
     estimating: EstimatorOptions,
     by: ByOption = "set",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +33,7 @@ from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.compare import Comparison
+    from stario.sequences.sequence import ImuSequence
 
 
 @expand_option_groups
@@ -46,7 +48,6 @@ def compare(
     as_json: JsonOption = False,
 ) -> None:
     """Compare tracks: inertial only, network only, EKF, graph. Without PATH: a simulated walk."""
-    from stario.fusion.evaluation.compare import compare as compare_tracks
     from stario.fusion.evaluation.compare import demonstration
     from stario.fusion.evaluation.folders import check_folder
     from stario.fusion.evaluation.many import compare_recordings
@@ -59,25 +60,22 @@ def compare(
         refuse_unused(changed(reading), "without PATH", "use with a recording to read")
     if report:
         optional_package("plotly", "report")
-    settings, network = estimating.settings(), estimating.network()
-    model = network if jobs == 1 else estimating.model  # each process loads the weights once
+    settings, model = estimating.settings(), estimating.network_for(jobs)
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
-    comparisons: list[Comparison] = []
     files, skipped = reading.recordings(paths or [])
+    read: Callable[[Path], ImuSequence] = reading.read
+    if not paths:
+        typer.echo("demonstration: a simulated walk not used in training", err=True)
+        files, read = [Path("demonstration")], lambda path: demonstration()
     if fixes is not None and len(files) > 1:
         raise InputError("--fixes", f"{len(files)} recordings", "one recording")
     folder = out or Path("runs") / "compare"
     check_folder(folder)
-    with progress_bar("compare", 100 * max(len(files), 1)) as progress:
-        if not paths:
-            typer.echo("demonstration: a simulated walk not used in training", err=True)
-            comparisons.append(
-                compare_tracks(network, demonstration(), settings, progress, absolute_fixes)
-            )
+    with progress_bar("compare", 100 * len(files)) as progress:
         outcomes = compare_recordings(
-            files, model, settings, reading.read, jobs, absolute_fixes, progress=progress
+            files, model, settings, read, jobs, absolute_fixes, progress=progress
         )
-        comparisons += collect_results(outcomes, skipped)
+        comparisons = list(collect_results(outcomes, skipped))
     written = write_comparison(folder, comparisons, settings) if comparisons else []
     if report:
         from stario.fusion.report.page import write_report

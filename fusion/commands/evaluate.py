@@ -15,6 +15,7 @@ from stario.fusion.commands.common import (
     progress_bar,
 )
 from stario.fusion.commands.options import (
+    DataOption,
     EstimatorOptions,
     JobsOption,
     JsonOption,
@@ -24,6 +25,7 @@ from stario.fusion.commands.options import (
     RunsOption,
     changed,
     expand_option_groups,
+    names_in,
     refuse_unused,
     refuse_unused_sources,
 )
@@ -45,9 +47,7 @@ def evaluate(
     reading: ReadingOptions,
     estimating: EstimatorOptions,
     paths: OptionalPathsArgument = None,
-    data: Annotated[
-        Path | None, typer.Option(help="Folder of the development recordings, used without PATH.")
-    ] = None,
+    data: DataOption = None,
     split: Annotated[
         str,
         typer.Option(
@@ -101,8 +101,8 @@ def evaluate(
     if by is not None:
         skipped += _groups(listed, reading, by, estimating.model, against, ekf, jobs, out, as_json)
     elif models is not None:
-        names, settings = [name.strip() for name in models.split(",")], estimating.settings()
-        averaging = convention or "rms"
+        settings, averaging = estimating.settings(), convention or "rms"
+        names = names_in(models)
         skipped += _networks(names, runs, files, settings, reading, averaging, jobs, out, as_json)
     else:
         skipped += _tracks(files, reading, estimating, jobs, out, as_json)
@@ -162,8 +162,7 @@ def _tracks(
     from stario.fusion.evaluation.results import write_recording, write_summary
     from stario.fusion.evaluation.summary import Scores, scores_of, summary, summary_table
 
-    settings, network = estimating.settings(), estimating.network()
-    model = network if jobs == 1 else estimating.model  # each process loads the weights once
+    settings, model = estimating.settings(), estimating.network_for(jobs)
     skipped: list[Skipped] = []
     recordings: list[Scores] = []
     with progress_bar("evaluate", 100 * len(files)) as progress:

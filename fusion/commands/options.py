@@ -31,6 +31,9 @@ RunsOption = Annotated[
 CacheOption = Annotated[
     Path | None, typer.Option(help="Folder for cached windows. Default: STARIO_CACHE or ~/.cache.")
 ]
+DataOption = Annotated[
+    Path | None, typer.Option(help="Folder of the development recordings, used without PATH.")
+]
 ConfigOption = Annotated[Path | None, typer.Option(help="TOML or JSON file with settings.")]
 OutOption = Annotated[
     Path | None, typer.Option(help="Folder for the results; replaces those of an earlier run.")
@@ -181,6 +184,11 @@ class EstimatorOptions:
 
         return load_model(self.model)
 
+    def network_for(self, jobs: int) -> DisplacementModel | str:
+        """Return the network, or for several processes its name: each loads the weights once."""
+        network = self.network()  # fails at once if the weights cannot be loaded
+        return network if jobs == 1 else self.model
+
 
 def changed(group: ReadingOptions | EstimatorOptions, *names: str) -> dict[str, bool]:
     """Return by command-line option whether these fields, or all, differ from their defaults."""
@@ -257,9 +265,9 @@ def backend_named(name: str) -> BackendName:
         InputError: there is none.
     """
     from stario.fusion.backends import BACKENDS
+    from stario.sequences.arrays import check_choice
 
-    if name not in BACKENDS:
-        raise InputError("--backend", repr(name), f"one of {', '.join(BACKENDS)}")
+    check_choice("--backend", name, BACKENDS)
     return cast("BackendName", name)
 
 
@@ -279,12 +287,27 @@ def recipe_values(path: Path) -> dict[str, Any]:
     return values
 
 
+def assignment(option: str, word: str, expected: str, example: str) -> tuple[str, str]:
+    """Return what is left and right of the first `=` in the value of an option.
+
+    Raises:
+        InputError: there is no `=`, or nothing on one side of it.
+    """
+    key, _, value = word.partition("=")
+    if not (key and value):
+        raise InputError(option, repr(word), expected, example)
+    return key, value
+
+
+def names_in(text: str) -> list[str]:
+    """Return the names in a comma-separated list."""
+    return [name.strip() for name in text.split(",")]
+
+
 def _attributes(words: Iterable[str]) -> dict[str, list[str]]:
     """Return the patterns by attribute from `key=pattern` words."""
     chosen: dict[str, list[str]] = {}
     for word in words:
-        key, equals, pattern = word.partition("=")
-        if not (key and equals and pattern):
-            raise InputError("--where", repr(word), "attribute=value", "such as person=dan")
+        key, pattern = assignment("--where", word, "attribute=value", "such as person=dan")
         chosen.setdefault(key, []).append(pattern)
     return chosen

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stario.fusion.commands.common import exit_if_skipped
-from stario.fusion.commands.options import CacheOption, ReadingOptions, recipe_values, refuse_unused
+from stario.fusion.commands.options import (
+    CacheOption,
+    ReadingOptions,
+    assignment,
+    names_in,
+    recipe_values,
+    refuse_unused,
+)
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -73,7 +80,7 @@ def table(
     from stario.sequences.datasets.stream_cache import cache_folder
 
     datasets = _data_sets(data, sets, published or [], split_seed, per_group)
-    chosen = None if networks is None else [name.strip() for name in networks.split(",")]
+    chosen = None if networks is None else names_in(networks)
     cells = table_cells(datasets, _recipe(config), steps, chosen, seeds)
     make_folder(out)
     requested = {cell.network for cell in cells}
@@ -86,10 +93,10 @@ def table(
         if jobs is None and backend != "loky":
             jobs = -1
         for done, outcome in enumerate(fill(cells, out, reading, jobs), 1):
+            cell, status = str(outcome), "done"
             if isinstance(outcome, Skipped):
                 skipped.append(outcome)
-            status = "not filled" if isinstance(outcome, Skipped) else "done"
-            cell = outcome.item if isinstance(outcome, Skipped) else outcome
+                cell, status = outcome.item, "not filled"
             typer.echo(f"{done} of {len(cells)}: {cell}: {status}", err=True)
             write_results(cells, out, costs, learned, drawn=False)
     typer.echo(write_results(cells, out, costs, learned), nl=False)
@@ -108,12 +115,10 @@ def _data_sets(
         unused = {"--sets": sets is not None, "--per-group": per_group != _PER_GROUP}
         refuse_unused(unused, "without --data", "use with --data")
     else:
-        names = None if sets is None else [name.strip() for name in sets.split(",")]
+        names = None if sets is None else names_in(sets)
         datasets += development_sets(data, seed, per_group, names)
     for word in published:
-        name, equals, folder = word.partition("=")
-        if not (name and equals and folder):
-            raise InputError("--set", repr(word), "NAME=FOLDER", "such as ronin=/data/RoNIN")
+        name, folder = assignment("--set", word, "NAME=FOLDER", "such as ronin=/data/RoNIN")
         if name in {dataset.name for dataset in datasets}:
             raise InputError("--set", repr(name), "a name of its own", f"or drop {name} by --sets")
         datasets.append(folder_set(name, Path(folder), seed))

@@ -217,15 +217,15 @@ def _recipe(
 
 def _lists(data: Path | None, group: str | None, name: str) -> tuple[list[Path], list[Path]]:
     """Return the training and held-out recordings from the lists in the package."""
-    from stario.network.training.splits import read_packaged_list
+    from stario.network.training.splits import read_packaged_list, without_holdout
+    from stario.sequences.arrays import check_choice
     from stario.sequences.datasets.splits import hold_out_group
 
     if data is None:
         unused = {"--leave-out": group is not None, "--learn-from": name != "all"}
         refuse_unused(unused, "without --data", "use with the development recordings")
         return [], []
-    if name not in ("all", "open", "few"):
-        raise InputError("--learn-from", repr(name), "all, open or few")
+    check_choice("--learn-from", name, ("all", "open", "few"))
     everything = (
         read_packaged_list("training", data) + read_packaged_list("validation", data)
         if name == "few"
@@ -234,9 +234,7 @@ def _lists(data: Path | None, group: str | None, name: str) -> tuple[list[Path],
     if group is not None:
         outside, inside = hold_out_group(everything, group)
     else:
-        held_out = {entry.path for entry in read_packaged_list("holdout", data)}
-        outside = [entry for entry in everything if entry.path not in held_out]
-        inside = [entry for entry in everything if entry.path in held_out]
+        outside, inside = without_holdout(everything, data)
     return [entry.path for entry in outside], [entry.path for entry in inside]
 
 
@@ -272,19 +270,8 @@ def _recorded(
 def _streams_of(
     reading: ReadingOptions, attitude: Attitude, folder: Path, jobs: int, files: list[Path]
 ) -> tuple[list[RecordingStreams], list[Skipped]]:
-    from stario.network.training.data import RecordingStreams
-    from stario.sequences.datasets.batch import Skipped
+    from stario.network.training.data import recording_streams
     from stario.sequences.datasets.stream_cache import recorded
-    from stario.sequences.readers.archive import archive_attributes
 
-    recordings: list[RecordingStreams] = []
-    skipped: list[Skipped] = []
     outcomes = recorded(files, reading.read, reading.as_read(), folder, jobs, attitude)
-    pairs = with_bar("read", zip(files, outcomes, strict=True), len(files))
-    for path, outcome in pairs:
-        if isinstance(outcome, Skipped):
-            skipped.append(outcome)
-        else:
-            licence = str(archive_attributes(path).get("licence", ""))
-            recordings.append(RecordingStreams(path, outcome, licence))
-    return recordings, skipped
+    return recording_streams(with_bar("read", zip(files, outcomes, strict=True), len(files)))

@@ -17,7 +17,7 @@ from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.imu.stateful import Predictor, StatefulInference
 from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.state import Track
-from stario.sequences.arrays import interpolated
+from stario.sequences.arrays import integral, interpolated
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -178,6 +178,4 @@ def _chained(
 ) -> Trajectory:
     """Return the trajectory at `time` from velocities at the windows' middles."""
     at_time = interpolated(time, middle, velocity)
-    steps = 0.5 * np.diff(time)[:, None] * (at_time[1:] + at_time[:-1])
-    position = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    return Trajectory(time, position, attitude, velocity_W=at_time)
+    return Trajectory(time, integral(time, at_time), attitude, velocity_W=at_time)

@@ -14,7 +14,7 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 
 from stario.fusion.live.hub import Hub
-from stario.fusion.live.payload import Batch, joined, json_from, parse_line
+from stario.fusion.live.payload import Batch, joined, object_from, parse_line
 from stario.fusion.live.server import tokens_match
 from stario.sequences.errors import InputError
 
@@ -137,10 +137,9 @@ class LineServer:
 
     def _is_token(self, line: bytes) -> bool:
         try:
-            message = json_from(line)
+            token = object_from("line", line).get("token")
         except InputError:
             return False
-        token = message.get("token") if isinstance(message, dict) else None
         return isinstance(token, str) and tokens_match(token, self._token)
 
 

@@ -89,7 +89,7 @@ def parse_push(body: bytes) -> Batch:
     Raises:
         InputError: the body does not have this form; the error names the field.
     """
-    message = _object("body", json_from(body))
+    message = object_from("body", body)
     payload = message.get("payload")
     if not isinstance(payload, list):
         raise InputError("payload", _describe(payload), "a list of samples")
@@ -123,7 +123,7 @@ def parse_line(line: bytes, sender: str) -> Batch:
     Raises:
         InputError: the line does not have this form; the error names the field.
     """
-    message = _object("line", json_from(line))
+    message = object_from("line", line)
     if "payload" in message:
         return parse_push(line)
     if "t_ns" in message:
@@ -153,18 +153,19 @@ def joined(batches: Iterable[Batch]) -> list[Batch]:
     return merged
 
 
-def json_from(text: bytes) -> Any:
-    """Parse JSON from arbitrary bytes.
+def object_from(where: str, text: bytes) -> Mapping[str, Any]:
+    """Parse a JSON object from arbitrary bytes.
 
     Raises:
-        InputError: the bytes are not valid JSON.
+        InputError: the bytes are not valid JSON, or not an object; the error names `where`.
     """
     try:
-        return json.loads(text)
+        value = json.loads(text)
     except RecursionError:
         raise InputError("JSON", "too many levels", "an object") from None
     except ValueError as error:  # not UTF-8, not JSON, or a number of thousands of digits
         raise InputError("JSON", str(error)[:120], "valid JSON in UTF-8") from None
+    return _object(where, value)
 
 
 def _pushed(where: str, entry: Mapping[str, Any]) -> Reading | None:

@@ -24,7 +24,7 @@ from stario.fusion.live.payload import (
     TOTAL,
     Batch,
     Reading,
-    json_from,
+    object_from,
 )
 from stario.sequences.errors import InputError
 
@@ -116,13 +116,9 @@ class Phyphox:
             readings.append(Reading(sensor, round(1e9 * t), (x, y, z)))
         return readings
 
-    def _get(self, path: str) -> dict[str, Any]:
+    def _get(self, path: str) -> Mapping[str, Any]:
         with urllib.request.urlopen(self._root + path, timeout=_TIMEOUT) as response:
-            body = response.read(_MAX_RESPONSE_BYTES)
-        message = json_from(body)
-        if not isinstance(message, dict):
-            raise InputError("phyphox", "a different response", "a JSON object")
-        return message
+            return object_from("phyphox", response.read(_MAX_RESPONSE_BYTES))
 
 
 def buffers_of(config: Mapping[str, Any]) -> dict[str, tuple[str, str, str, str]]:

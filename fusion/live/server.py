@@ -22,7 +22,7 @@ import hmac
 import importlib.resources
 import json
 import logging
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from functools import cache
 from typing import Any
 
@@ -35,7 +35,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from stario.fusion.live.hub import Hub, Viewer
-from stario.fusion.live.payload import Batch, joined, json_from, parse_line, parse_push
+from stario.fusion.live.payload import Batch, joined, object_from, parse_line, parse_push
 from stario.sequences.errors import InputError, StarioError
 from stario.sequences.units import ACCEL_UNITS, unit_named
 
@@ -189,15 +189,15 @@ async def _command(request: Request) -> Response:
     device, command = request.path_params["device"], request.path_params["command"]
     if command not in COMMANDS:
         raise InputError("command", repr(command[:40]), ", ".join(COMMANDS))
-    values = {} if command != "fix" else _fix_values(json_from(await _body(request)))
+    values = {} if command != "fix" else _fix_values(object_from("body", await _body(request)))
     await hub.command(device, command, **values)
     return JSONResponse({"done": command})
 
 
-def _fix_values(message: Any) -> dict[str, float]:
+def _fix_values(message: Mapping[str, Any]) -> dict[str, float]:
     values = {}
     for name in ("x", "y", "sigma"):
-        value = message.get(name) if isinstance(message, dict) else None
+        value = message.get(name)
         if not isinstance(value, (int, float)) or not abs(value) <= _MAX_COORDINATE:
             raise InputError(name, "nothing, or no number", f"a number up to {_MAX_COORDINATE:g} m")
         values[name] = float(value)

@@ -10,6 +10,7 @@ from plotly.subplots import make_subplots
 
 from stario.fusion.report.panels import FAINT, GRID, INK, TRUTH, Panel, style
 from stario.fusion.report.series import Series, ellipse
+from stario.sequences.arrays import evenly_spaced
 from stario.sequences.sequence import FloatArray, PositionTrack
 
 PANEL_HEIGHT = 190
@@ -131,7 +132,7 @@ def _ellipses(name: str, series: Series, covariance: FloatArray, largest: float)
     Semi-axes beyond `largest` [m] are too large for the map: they appear at the slider's time only.
     """
     valid = np.flatnonzero(np.isfinite(series.position[:, 0]))
-    rows = np.unique(valid[np.linspace(0, len(valid) - 1, _ELLIPSES).round().astype(int)])
+    rows = valid[evenly_spaced(len(valid), _ELLIPSES)]
     outlines = [(k, ellipse(covariance[k])) for k in rows]
     parts = [
         np.vstack([series.position[k, :2] + outline, [[np.nan] * 2]])

@@ -10,7 +10,7 @@ import plotly.graph_objects as go
 
 from stario.fusion.report.series import Series
 from stario.fusion.state import Innovations
-from stario.sequences.arrays import interpolated
+from stario.sequences.arrays import evenly_spaced, interpolated
 from stario.sequences.drawing.figures import TRACK_STYLES, split_at_gaps, unbroken
 from stario.sequences.sequence import BoolArray, FloatArray
 
@@ -88,8 +88,7 @@ def innovation_panels(innovations: Innovations, start: float) -> list[Panel]:
         innovations: innovations of an estimator's updates.
         start: time of the recording's first sample [s].
     """
-    count = len(innovations.time)
-    rows = np.unique(np.linspace(0, count - 1, min(count, _MAX_INNOVATIONS)).round().astype(int))
+    rows = evenly_spaced(len(innovations.time), _MAX_INNOVATIONS)
     rows = np.union1d(rows, np.flatnonzero(innovations.gated))  # draw all of these
     time, gated = innovations.time[rows] - start, innovations.gated[rows]
     panels = []

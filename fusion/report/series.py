@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stario.fusion.state import Track
-from stario.sequences.arrays import interpolated
+from stario.sequences.arrays import evenly_spaced, interpolated
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.drawing.figures import indices_after_gaps
 from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray, Trajectory
@@ -129,8 +129,8 @@ def _rows(
 
     At most `MAX_POINTS` poses are drawn, and in the middle of each gap a row that is not shown.
     """
-    time, count = trajectory.time, len(trajectory.time)
-    rows = np.unique(np.linspace(0, count - 1, min(count, MAX_POINTS)).round().astype(np.intp))
+    time = trajectory.time
+    rows = evenly_spaced(len(time), MAX_POINTS)
     after = np.unique(np.searchsorted(rows, indices_after_gaps(time, MAX_TRUTH_GAP)))
     middle = 0.5 * (time[rows[after - 1]] + time[rows[after]])
     return (

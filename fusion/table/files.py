@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -87,12 +87,11 @@ def _network_table(filled: Filled, samples: list[Sample]) -> NetworkTable:
     """Return the networks' errors on recordings with poses, for the figures."""
     parameters = {name: table_cost(name).parameters for name in ARCHITECTURES if name in filled}
     entries = [
-        Entry(one["recording"], name, f"seed {seed}", protocol, *map(_number, values))
+        Entry(one["recording"], name, f"seed {seed}", protocol, *_numbers(errors, METRICS))
         for name in parameters
         for seed, content in filled[name].items()
         for one in content["recordings"]
         for protocol, errors in one["tracks"].items()
-        for values in ([errors[metric] for metric in METRICS],)
     ]
     return NetworkTable(CONVENTION, parameters, entries, samples)
 
@@ -108,16 +107,16 @@ def _samples(cells: Sequence[Cell], filled: Filled, out: Path) -> list[Sample]:
         for name, shown in read_tracks(cell, out).items():
             track = _level(shown.time, shown.position_W)
             truth = _level(shown.time, shown.truth_W)
-            errors = found[name][TRUE_ATTITUDE]
+            ate_m, rte_m = _numbers(found[name][TRUE_ATTITUDE], ("ate_m", "rte_m"))
             sample = samples.setdefault(name, Sample(name, truth, {}, {}))
             sample.tracks[cell.network] = track
-            sample.errors[cell.network] = _number(errors["ate_m"]), _number(errors["rte_m"])
+            sample.errors[cell.network] = ate_m, rte_m
     return list(samples.values())
 
 
-def _number(value: float | None) -> float:
-    """Return a number; NaN for None, which stands for it in JSON."""
-    return float("nan") if value is None else value
+def _numbers(values: Mapping[str, float | None], names: Iterable[str]) -> list[float]:
+    """Return values by name, with NaN for None, which stands for it in JSON."""
+    return [float(value) for value in np.array([values[name] for name in names], np.float64)]
 
 
 def _level(time: FloatArray, xy: FloatArray) -> Trajectory:

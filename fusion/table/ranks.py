@@ -11,7 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.evaluation.judging.bootstrap import CONFIDENCE, REPLICATES, Interval
+from stario.fusion.evaluation.judging.bootstrap import (
+    BOUNDS,
+    REPLICATES,
+    Interval,
+    interval,
+    means_of_draws,
+)
 from stario.sequences.sequence import FloatArray
 
 Recordings = Sequence[tuple[str, str, FloatArray]]
@@ -53,18 +59,15 @@ def ranks(networks: Mapping[str, Sequence[Recordings]], against: str) -> dict[st
     replicates = np.stack(
         [np.mean([_replicates(run, common) for run in networks[n]], axis=0) for n in names]
     )
-    tail = 50.0 * (1.0 - CONFIDENCE)
     places = replicates.argsort(axis=0).argsort(axis=0) + 1
-    low, high = np.percentile(places, [tail, 100.0 - tail], axis=1, method="nearest")
+    low, high = np.percentile(places, BOUNDS, axis=1, method="nearest")
     rank = scores.argsort().argsort() + 1
     found = {}
     for k, name in enumerate(names):
         ratio = None
         if against in networks and name != against:
-            reference = names.index(against)
-            bounds = np.percentile(replicates[k] - replicates[reference], [tail, 100.0 - tail])
-            values = np.exp([scores[k] - scores[reference], *bounds])
-            ratio = Interval(*(float(value) for value in values))
+            other = names.index(against)
+            ratio = interval(scores[k] - scores[other], replicates[k] - replicates[other])
         found[name] = Rank(int(rank[k]), int(low[k]), int(high[k]), ratio)
     return found
 
@@ -100,9 +103,7 @@ def _replicates(run: Recordings, common: Mapping[str, Sequence[str]]) -> FloatAr
             rng = np.random.default_rng([0, s, k])
             rows = rng.integers(len(value), size=(REPLICATES, len(value)))
             errors.append(_log_error(value[rows].sum(axis=1)))
-        rng = np.random.default_rng([0, s])
-        rows = rng.integers(len(names), size=(len(names), REPLICATES))
-        strata.append(np.take_along_axis(np.stack(errors), rows, axis=0).mean(axis=0))
+        strata.append(means_of_draws(np.stack(errors), np.random.default_rng([0, s])))
     return np.asarray(np.mean(strata, axis=0))
 
 

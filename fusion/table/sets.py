@@ -10,9 +10,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from stario.network.training.splits import read_packaged_list
+from stario.network.training.splits import read_packaged_list, without_holdout
+from stario.sequences.arrays import check_choice, evenly_spaced
 from stario.sequences.datasets.splits import ListEntry, random_split
-from stario.sequences.errors import InputError
 from stario.sequences.readers import find_recordings
 
 ALL = "all"
@@ -77,8 +77,7 @@ def development_sets(
         InputError: a name is unknown, or a recording of the packaged lists is missing.
     """
     for name in chosen or ():
-        if name not in _SETS:
-            raise InputError("--sets", repr(name), f"one of {', '.join(_SETS)}")
+        check_choice("--sets", name, _SETS)
     recordings = read_packaged_list("all", data) + read_packaged_list("test", data)
     return [
         _combined(data, seed, per_group)
@@ -123,9 +122,7 @@ def _walk(entry: ListEntry) -> Path:
 
 def _combined(data: Path, seed: int, per_group: int) -> DataSet:
     """Combine all sets, tested on people, devices and places unseen in training."""
-    held_out = read_packaged_list("holdout", data)
-    held_paths = {entry.path for entry in held_out}
-    outside = [entry for entry in read_packaged_list("all", data) if entry.path not in held_paths]
+    outside, held_out = without_holdout(read_packaged_list("all", data), data)
     rng = np.random.default_rng(seed)
     validation = set()
     for members in _by(outside, _set_of).values():
@@ -164,9 +161,7 @@ def _by(
 
 def _spread(members: Sequence[ListEntry], maximum: int) -> list[ListEntry]:
     """Return up to `maximum` of them, evenly spaced from the first to the last."""
-    count = min(maximum, len(members))
-    indices = np.linspace(0, len(members) - 1, count).round().astype(int)
-    return [members[k] for k in indices]
+    return [members[k] for k in evenly_spaced(len(members), maximum)]
 
 
 def learned_from(data: Path) -> dict[str, frozenset[Path]]:
@@ -175,6 +170,7 @@ def learned_from(data: Path) -> dict[str, frozenset[Path]]:
     Raises:
         InputError: a recording of the packaged lists is missing.
     """
-    everything = frozenset(entry.path for entry in read_packaged_list("all", data))
-    held_out = frozenset(entry.path for entry in read_packaged_list("holdout", data))
-    return {"default": everything, "first-stage": everything - held_out}
+    everything = read_packaged_list("all", data)
+    outside, _ = without_holdout(everything, data)
+    learned = {"default": everything, "first-stage": outside}
+    return {name: frozenset(e.path for e in entries) for name, entries in learned.items()}

@@ -206,8 +206,8 @@ def _row(name: str, seeds: Mapping[int, Content], rank: Rank | None, learned: in
 
 
 def _mean(values: Sequence[float]) -> float:
-    finite = [value for value in values if np.isfinite(value)]
-    return float(np.mean(finite)) if finite else float("nan")
+    found = _over_seeds(values)
+    return float("nan") if found is None else found.value
 
 
 def _over_seeds(values: Sequence[float]) -> Mean | None:

@@ -84,7 +84,7 @@ def _set_text(table: SetTable) -> str:
     titles = ["network", "seeds", *(COLUMNS[key].title for key in keys)]
     titles += ["rank", f"error / {REFERENCE_NETWORK}'s", "training error", "validation error"]
     titles += ["paper: ATE, RTE [m]"] if paper else []
-    lines += _markdown_head(titles)
+    rows = [titles]
     for row in table.rows:
         cells = [_title(row, table.tested), str(len(row.seeds))]
         cells += [_cell(row.figures.get(key)) for key in keys]
@@ -94,7 +94,8 @@ def _set_text(table: SetTable) -> str:
             cells.append(
                 "" if paper_errors is None else f"{paper_errors[0]:.3f}, {paper_errors[1]:.3f}"
             )
-        lines.append(f"| {' | '.join(cells)} |")
+        rows.append(cells)
+    lines += _markdown(rows)
     if table.skipped:
         lines += ["", f"Skipped: {len(table.skipped)} recordings, listed in `table.json`."]
     return "\n".join(lines)
@@ -112,10 +113,8 @@ def _title(row: Row, tested: int) -> str:
 def _rank(rank: Rank | None) -> tuple[str, str]:
     if rank is None:
         return "", ""
-    place = f"{rank.rank} [{rank.low}, {rank.high}]"
-    if rank.ratio is None:
-        return place, ""
-    return place, f"{rank.ratio.ratio:.2f} [{rank.ratio.low:.2f}, {rank.ratio.high:.2f}]"
+    ratio = "" if rank.ratio is None else f"{rank.ratio:.2f}"
+    return f"{rank.rank} [{rank.low}, {rank.high}]", ratio
 
 
 def _cell(mean: Mean | None) -> str:
@@ -127,24 +126,22 @@ def _cell(mean: Mean | None) -> str:
 def _cost_text(costs: Sequence[ModelRow], work: Work) -> str:
     times = [f"ms per window, batch {batch}" for batch in BATCHES]
     titles = ["network", "parameters [10^6] (paper)", "FLOPs [10^6] (paper)", "memory [MB]", *times]
-    lines = ["### Costs", "", *_markdown_head([*titles, "core hours", "training windows / s"])]
+    rows = [[*titles, "core hours", "training windows / s"]]
     for row in costs:
-        published_row = ARCHITECTURES[row.name]
         milliseconds = row.milliseconds["torch"] or {}
         training, testing, speed = work.get(row.name, (0.0, 0.0, float("nan")))
         cells = [
             row.name,
-            f"{row.parameters / 1e6:.3f} ({published_row.parameters:.3f})",
-            f"{row.flops / 1e6:.3f} ({published_row.flops:.3f})",
+            *row.counts(),
             f"{row.peak_memory_mb:.1f}",
             *(f"{milliseconds[str(batch)]:.2f}" for batch in BATCHES),
             f"{(training + testing) / 3600.0:.2f}",
             "" if speed != speed else f"{speed:.0f}",
         ]
-        lines.append(f"| {' | '.join(cells)} |")
+        rows.append(cells)
     totals = [sum(times[k] for times in work.values()) / 3600.0 for k in (0, 1)]
-    lines += [
-        "",
+    lines = [
+        *("### Costs", "", *_markdown(rows), ""),
         f"Total: {sum(totals):.2f} core hours, {totals[0]:.2f} for training and {totals[1]:.2f} "
         "for evaluation. Time per window: on this machine, one thread per core that PyTorch uses; "
         "memory: weights and results of one inference (`stario check models`).",
@@ -152,8 +149,10 @@ def _cost_text(costs: Sequence[ModelRow], work: Work) -> str:
     return "\n".join(lines)
 
 
-def _markdown_head(titles: Sequence[str]) -> list[str]:
-    return [f"| {' | '.join(titles)} |", f"|{'---|' * len(titles)}"]
+def _markdown(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return a table's lines; the first row holds the titles."""
+    head, *body = (f"| {' | '.join(cells)} |" for cells in rows)
+    return [head, f"|{'---|' * len(rows[0])}", *body]
 
 
 def _words() -> str:

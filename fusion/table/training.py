@@ -13,7 +13,12 @@ from time import process_time
 
 from stario.fusion.table.sets import DataSet
 from stario.network.training.config import TrainingConfig, training_config
-from stario.network.training.data import RecordingStreams, cached_walks, mix_sources
+from stario.network.training.data import (
+    RecordingStreams,
+    cached_walks,
+    mix_sources,
+    recording_streams,
+)
 from stario.network.training.train import train
 from stario.sequences.datasets.batch import Skipped
 from stario.sequences.datasets.stream_cache import recorded
@@ -134,13 +139,7 @@ def _streams(
 ) -> tuple[list[RecordingStreams], list[Skipped]]:
     """Return the streams of each recording; later cells of the same set reuse them."""
     outcomes = recorded(files, reading.read, reading.options, reading.cache, 1, attitude)
-    streams, skipped = [], []
-    for path, outcome in zip(files, outcomes, strict=True):
-        if isinstance(outcome, Skipped):
-            skipped.append(outcome)
-        else:
-            streams.append(RecordingStreams(path, outcome))
-    return streams, skipped
+    return recording_streams(zip(files, outcomes, strict=True))
 
 
 def _leg_windows(recipe: TrainingConfig, legs: Sequence[object]) -> int:

@@ -20,8 +20,9 @@ from torch import Tensor, nn
 
 from stario.network.card import dump_card
 from stario.network.displacement import DisplacementNetwork
-from stario.network.runtime.onnx_file import CARD_KEY, onnx_packages
+from stario.network.runtime.onnx_file import CARD_KEY
 from stario.sequences.files import atomic_write
+from stario.sequences.readers.checked import optional_package
 from stario.sequences.windows import WINDOW_SAMPLES
 
 if TYPE_CHECKING:
@@ -45,7 +46,8 @@ def export_onnx(model: DisplacementModel, path: Path) -> None:
         InputError: the extra `onnx` is not installed, the model is itself an exported graph, or
             the folder does not exist.
     """
-    onnx_packages("onnx", "onnxscript")
+    for package in ("onnx", "onnxscript"):
+        optional_package(package, "onnx")
     network = model.training_form
     recurrent, batch = network.is_recurrent, torch.export.Dim("batch")
     inputs = {"windows": torch.zeros(2, 6, WINDOW_SAMPLES)}

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 from pathlib import Path
 from typing import Any
 
 from stario.network.card import Card, parse_card
 from stario.network.runtime.engines import OnnxEngine
-from stario.sequences.errors import InputError, WeightsError
+from stario.sequences.errors import WeightsError
+from stario.sequences.readers.checked import optional_package
 from stario.sequences.windows import WINDOW_SAMPLES
 
 CARD_KEY = "stario_card"
@@ -27,7 +27,7 @@ def load_onnx(path: Path) -> tuple[OnnxEngine, Card]:
         WeightsError: the file is missing, truncated, not written by `export_onnx`, or its graph was
             changed since.
     """
-    runtime = onnx_packages("onnxruntime")
+    runtime = optional_package("onnxruntime", "onnx")
     if not path.is_file():
         raise WeightsError(path, "file", "no such file", "an exported model")
     options = runtime.SessionOptions()
@@ -62,20 +62,3 @@ def _check_graph(session: Any, path: Path) -> None:
                 continue
             found = f"{kind} of shape {[batch, *rest]}"
         raise WeightsError(path, name, found, expected, "export the weights again")
-
-
-def onnx_packages(*names: str) -> Any:
-    """Import packages of the extra `onnx` and return the last.
-
-    Raises:
-        InputError: a package is not installed.
-    """
-    module = None
-    for name in names:
-        try:
-            module = importlib.import_module(name)
-        except ImportError as error:
-            raise InputError(
-                name, "not installed", "the extra `onnx`", "pip install 'stario[onnx]'"
-            ) from error
-    return module

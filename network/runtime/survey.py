@@ -59,6 +59,12 @@ class ModelRow:
         """Return the row as plain values."""
         return dict(vars(self))
 
+    def counts(self) -> list[str]:
+        """Return parameters and FLOPs in millions, with the paper's figures in parentheses."""
+        published = ARCHITECTURES[self.name]
+        pairs = (self.parameters, published.parameters), (self.flops, published.flops)
+        return [f"{count / 1e6:.3f} ({in_paper:.3f})" for count, in_paper in pairs]
+
 
 def measured() -> dict[str, str]:
     """Return a description of how each column is obtained."""
@@ -132,12 +138,7 @@ def survey_table(rows: Sequence[ModelRow]) -> str:
     titles = columns.split(",")
     table = [["", *titles]]
     for row in rows:
-        published = ARCHITECTURES[row.name]
-        cells = [
-            f"{row.parameters / 1e6:.3f} ({published.parameters:.3f})",
-            f"{row.flops / 1e6:.3f} ({published.flops:.3f})",
-            f"{row.numel / 1e6:.3f}",
-        ]
+        cells = [*row.counts(), f"{row.numel / 1e6:.3f}"]
         for engine in ("torch", "onnxruntime"):
             found = row.milliseconds[engine]
             cells += [figure(None if found is None else found[str(b)]) for b in BATCHES]

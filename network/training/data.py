@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -11,10 +11,11 @@ from types import MappingProxyType
 import numpy as np
 
 from stario.network.training.config import SIMULATED
+from stario.sequences.datasets.batch import Skipped
 from stario.sequences.datasets.stream_cache import Stream, cached
 from stario.sequences.errors import ConfigError
 from stario.sequences.legs import LegStream
-from stario.sequences.readers.archive import split_name
+from stario.sequences.readers.archive import archive_attributes, split_name
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
@@ -38,6 +39,25 @@ class RecordingStreams:
     path: Path
     streams: Sequence[Stream]
     licence: str = ""
+
+
+def recording_streams(
+    outcomes: Iterable[tuple[Path, Sequence[Stream] | Skipped]],
+) -> tuple[list[RecordingStreams], list[Skipped]]:
+    """Return the streams of each recording with its licence, and those that were skipped.
+
+    Args:
+        outcomes: paths, each with the outcome of `stario.sequences.datasets.stream_cache.recorded`.
+    """
+    recordings: list[RecordingStreams] = []
+    skipped: list[Skipped] = []
+    for path, outcome in outcomes:
+        if isinstance(outcome, Skipped):
+            skipped.append(outcome)
+        else:
+            licence = str(archive_attributes(path).get("licence", ""))
+            recordings.append(RecordingStreams(path, outcome, licence))
+    return recordings, skipped
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ The running average of the weights is what is evaluated and saved.
 from __future__ import annotations
 
 import copy
-import json
 import logging
 import math
 from collections.abc import Callable
@@ -31,7 +30,7 @@ from stario.network.training.parallel import Workers
 from stario.network.training.validation import ValidationSet
 from stario.network.training.weak_truth import leg_loss
 from stario.sequences.errors import ConfigError, InputError
-from stario.sequences.files import atomic_write
+from stario.sequences.files import write_json
 
 log = logging.getLogger(__name__)
 
@@ -229,8 +228,7 @@ class TrainingRun:
             history = [asdict(r) for r in self.history.reports]
             path, config = self._checkpoint, self.config
             write_checkpoint(path, config, self._material, self.step, history, self._tensors())
-            with atomic_write(self.folder / "log.json") as file:
-                file.write(json.dumps(history, indent=1))
+            write_json(self.folder / "log.json", history)
         return report
 
     def _tensors(self) -> dict[str, Tensor]:

@@ -11,6 +11,7 @@ import pytest
 
 from stario.network.card import Card, dump_card, parse_card
 from stario.network.known_motion import (
+    FEATURES,
     OUTSIDE_VARIANCE,
     KnownMotion,
     features,
@@ -85,6 +86,7 @@ def test_another_gait_lies_outside_and_widens_the_variance(
 def test_weights_that_keep_an_earlier_motion_know_both() -> None:
     slow, fast = walking_stream(1, seconds=80.0), walking_stream(2, 2.6, 3.0, seconds=80.0)
     both = known_motion_of(slow).extended(known_motion_of(fast))
+    assert both.limit == known_motion_of(slow).limit
     for stream in (slow, fast):
         assert both.is_unfamiliar(windows(stream)).mean() < 0.2
     assert known_motion_of(slow).is_unfamiliar(windows(fast)).mean() > 0.8
@@ -100,6 +102,18 @@ def test_novelty_does_not_depend_on_the_yaw_of_windows(known: KnownMotion) -> No
     rotated = np.concatenate([rotation @ original[:, :3], rotation @ original[:, 3:]], axis=1)
     np.testing.assert_allclose(features(rotated), features(original), rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(known.novelty(rotated), known.novelty(original), rtol=1e-3)
+
+
+@pytest.mark.parametrize(("hertz", "fast", "middle"), [(2.0, 0, 0), (6.0, 0, 1), (15.0, 1, 0)])
+def test_shares_of_power_are_those_of_the_frequency_of_a_vibration(
+    hertz: float, fast: int, middle: int
+) -> None:
+    imu = np.zeros((1, 6, 200), np.float32)
+    imu[:, 5] = STANDARD_GRAVITY + np.sin(2.0 * np.pi * hertz * np.arange(200) / 200.0)
+    found = dict(zip(FEATURES, features(imu)[0], strict=True))
+    shares = [found[name] for name in ("fast", "middle", "vertical")]
+    assert shares == pytest.approx([fast, middle, 1.0], abs=0.01)
+    assert found["acceleration"] == pytest.approx(0.5**0.5, rel=0.01)
 
 
 @pytest.mark.parametrize("rate", [1.5, 2.3])

@@ -4,12 +4,13 @@ import hashlib
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import safetensors.torch
 import torch
 
 import stario.network
-from stario.network.card import card_path
+from stario.network.card import MAX_SIGMA, Calibration, card_path
 from stario.network.model import load_model
 from stario.sequences.errors import StarioError, WeightsError
 
@@ -75,6 +76,15 @@ def test_a_calibration_that_gives_no_valid_covariance_is_refused(
     calibration = json.loads(card_path(DEFAULT).read_text(encoding="utf-8"))["calibration"]
     change_card(model, calibration=calibration | {part: [0.5, 0.5, value]})
     assert words in refusal(model)
+
+
+def test_sigma_lies_between_its_floor_and_the_longest_way_of_a_second() -> None:
+    calibration = Calibration((2.0, 2.0, 1.0), (1.5, 1.5, 1.0), (0.02, 0.02, 0.03))
+    certain, usual, lost = calibration.variance(np.log([[1e-9] * 3, [0.25] * 3, [1e3] * 3]))
+    np.testing.assert_allclose(certain, np.square([0.02, 0.02, 0.03]), rtol=1e-6)
+    scaled = np.square([2.0 * 0.25**1.5, 2.0 * 0.25**1.5, 0.25])
+    np.testing.assert_allclose(usual, scaled + certain)
+    np.testing.assert_allclose(lost, MAX_SIGMA**2 + certain)
 
 
 @pytest.mark.parametrize("field", ["format", "outputs", "rate", "samples", "frame", "channels"])

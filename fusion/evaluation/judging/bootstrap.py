@@ -17,6 +17,8 @@ from stario.sequences.sequence import FloatArray
 
 REPLICATES = 1000
 CONFIDENCE = 0.95
+BOUNDS = (50.0 * (1.0 - CONFIDENCE), 50.0 * (1.0 + CONFIDENCE))
+"""Percentiles of the replicates that bound an interval."""
 
 Blocks = tuple[FloatArray, FloatArray]
 """Sums of squared errors of a recording's blocks: evaluated network (B,) and baseline (B,)."""
@@ -33,6 +35,9 @@ class Interval:
     low: float
     high: float
 
+    def __format__(self, form: str) -> str:
+        return f"{self.ratio:{form}} [{self.low:{form}}, {self.high:{form}}]"
+
 
 def paired_ratio(strata: Mapping[str, Groups]) -> Interval | None:
     """Return the mean ratio of errors over equally weighted strata of equally weighted groups.
@@ -44,21 +49,24 @@ def paired_ratio(strata: Mapping[str, Groups]) -> Interval | None:
     rng = np.random.default_rng(0)
     results = [_stratum(groups, rng) for groups in strata.values()]
     means, replicates = zip(*results, strict=True)
-    tail = 50.0 * (1.0 - CONFIDENCE)
-    bounds = np.percentile(np.mean(replicates, axis=0), [tail, 100.0 - tail])
-    return Interval(*(float(np.exp(value)) for value in (np.mean(means), *bounds)))
+    return interval(float(np.mean(means)), np.mean(replicates, axis=0))
+
+
+def interval(log_ratio: float, replicates: FloatArray) -> Interval:
+    """Return the interval of a ratio from its logarithm and that of each replicate (R,)."""
+    return Interval(*np.exp([log_ratio, *np.percentile(replicates, BOUNDS)]).tolist())
 
 
 def _stratum(groups: Groups, rng: np.random.Generator) -> tuple[float, FloatArray]:
     """Return the mean log ratio over groups, and its replicates (R,)."""
     means, replicates = zip(*(_group(part, rng) for part in groups.values()), strict=True)
-    return float(np.mean(means)), _means_of_draws(np.stack(replicates), rng)
+    return float(np.mean(means)), means_of_draws(np.stack(replicates), rng)
 
 
 def _group(recordings: Sequence[Blocks], rng: np.random.Generator) -> tuple[float, FloatArray]:
     ratios = [0.5 * np.log(evaluated.sum() / baseline.sum()) for evaluated, baseline in recordings]
     replicates = np.stack([_recording(*blocks, rng) for blocks in recordings])
-    return float(np.mean(ratios)), _means_of_draws(replicates, rng)
+    return float(np.mean(ratios)), means_of_draws(replicates, rng)
 
 
 def _recording(evaluated: FloatArray, baseline: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -67,7 +75,7 @@ def _recording(evaluated: FloatArray, baseline: FloatArray, rng: np.random.Gener
     return np.asarray(0.5 * np.log(evaluated[rows].sum(axis=1) / baseline[rows].sum(axis=1)))
 
 
-def _means_of_draws(values: FloatArray, rng: np.random.Generator) -> FloatArray:
+def means_of_draws(values: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Return for each replicate the mean of n members drawn from values (n, R) with replacement."""
     rows = rng.integers(len(values), size=values.shape)
     return np.asarray(np.take_along_axis(values, rows, axis=0).mean(axis=0))

@@ -99,15 +99,11 @@ class _Sums:
 
     def add_blocks(self, measure: str, errors: FloatArray) -> None:
         """Add errors (K,) by start tick, NaN where unknown."""
-        if np.isfinite(errors).sum() < _MIN_DISPLACEMENTS:
-            return
-        self.add(measure, errors)
-        per_block = round(BLOCK_SECONDS / TICK_SECONDS)
-        squares = np.nan_to_num(errors**2)
-        starts = np.arange(0, max(len(errors), 1), per_block)
-        counted = np.isfinite(errors).astype(np.float64)
-        sums = np.stack([np.add.reduceat(part, starts) for part in (squares, counted)], axis=1)
-        self.blocks.setdefault(measure, []).append(sums[sums[:, 1] > 0])
+        known = np.flatnonzero(np.isfinite(errors))
+        if len(known) >= _MIN_DISPLACEMENTS:
+            self.add(measure, errors)
+            sums = block_sums(np.asarray(TICK_SECONDS * known), errors[known] ** 2)
+            self.blocks.setdefault(measure, []).append(sums)
 
 
 def recording_errors(prepared: Prepared, found: Sequence[Predictions]) -> RecordingErrors:

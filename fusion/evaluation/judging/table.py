@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stario.fusion.evaluation.folders import fresh_folder
-from stario.fusion.evaluation.judging.bootstrap import CONFIDENCE, REPLICATES, Interval
+from stario.fusion.evaluation.judging.bootstrap import CONFIDENCE, REPLICATES
 from stario.fusion.evaluation.judging.displacement_error import FIGURES
 from stario.fusion.evaluation.judging.judge import RecordingResult, Row
 from stario.sequences.drawing.figures import BLUE, INK, apply_style, new_figure, save_figure
@@ -80,7 +80,7 @@ def judgement_text(found: JudgingResult) -> str:
         lines += body[k * len(labels) : (k + 1) * len(labels)]
         for key, interval in row.ratios.items():
             title = _COLUMNS[key][0].split(" [")[0]
-            lines.append(f"{row.name}: ratio over {title}: {_interval(interval)}")
+            lines.append(f"{row.name}: ratio over {title}: {interval:.3f}")
     if conclusion := verdict(found.rows):
         lines.append(conclusion)
     names = [f"ours: {found.ours}"] + ([f"theirs: {found.theirs}"] if found.theirs else [])
@@ -104,10 +104,8 @@ def verdict(rows: Sequence[Row]) -> str:
     worst = max(ratios, key=lambda name: ratios[name].ratio)
     accepted = pooled.high < 1.0 and ratios[worst].ratio <= _MAX_GROUP_RATIO
     if len(ratios) < _MIN_GROUPS:
-        return (
-            f"not decided, {len(ratios)} groups are too few: pooled {_interval(pooled)} over 10 s"
-        )
-    words = f"pooled {_interval(pooled)} over 10 s, worst {worst} {_interval(ratios[worst])}"
+        return f"not decided, {len(ratios)} groups are too few: pooled {pooled:.3f} over 10 s"
+    words = f"pooled {pooled:.3f} over 10 s, worst {worst} {ratios[worst]:.3f}"
     return f"{'accepted' if accepted else 'not accepted'}: {words}"
 
 
@@ -163,10 +161,6 @@ def _ratios(row: Row) -> dict[str, float]:
         for key, interval in row.ratios.items()
         for part in ("ratio", "low", "high")
     }
-
-
-def _interval(found: Interval) -> str:
-    return f"{found.ratio:.3f} [{found.low:.3f}, {found.high:.3f}]"
 
 
 _BEFORE, _AFTER = "#8C8C8C", BLUE

@@ -8,6 +8,7 @@ weights; `holdout` the people, devices and places used to evaluate weights train
 from __future__ import annotations
 
 import importlib.resources
+from collections.abc import Iterable
 from pathlib import Path
 
 from stario.sequences.datasets.splits import ListEntry, read_list
@@ -32,6 +33,20 @@ def read_packaged_list(name: str, data: Path) -> list[ListEntry]:
         raise InputError("split", repr(name), f"one of {', '.join(NAMES)}, or a list file")
     folder = importlib.resources.files("stario.network.training.splits")
     return read_list(Path(str(folder.joinpath(f"{name}.txt"))), data)
+
+
+def without_holdout(
+    recordings: Iterable[ListEntry], data: Path
+) -> tuple[list[ListEntry], list[ListEntry]]:
+    """Return the recordings outside the list `holdout`, and those on it.
+
+    Raises:
+        InputError: a recording of that list is missing.
+    """
+    known = list(recordings)
+    held_out = {entry.path for entry in read_packaged_list("holdout", data)}
+    outside = [entry for entry in known if entry.path not in held_out]
+    return outside, [entry for entry in known if entry.path in held_out]
 
 
 def split_paths(data: Path, split: str) -> list[Path]:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +21,8 @@ from stario.fusion.config import read_config
 from stario.network.architectures import build_network
 from stario.network.card import Card
 from stario.network.displacement import DisplacementNetwork
-from stario.network.model import load_model, save_model
+from stario.network.model import DisplacementModel, load_model, save_model
+from stario.network.runtime.engines import OnnxEngine
 from stario.sequences.conventions import with_axes
 from stario.sequences.files import read_tum
 from stario.sequences.readers.csv_writer import write_csv
@@ -78,7 +80,7 @@ def test_the_installed_command_has_the_same_exit_codes(tmp_path: Path) -> None:
     def code(*arguments: str) -> int:
         return subprocess.run([command, *arguments], capture_output=True, cwd=tmp_path).returncode
 
-    assert [code("--help"), code("run", "missing.csv"), code("nosuch")] == [0, 1, 2]
+    assert [code("--help"), code("convert", "one.csv"), code("nosuch")] == [0, 1, 2]
 
 
 def test_a_bug_is_not_reported_as_an_error_of_the_user(
@@ -314,12 +316,11 @@ def test_export_accepts_the_name_of_a_network(
 ) -> None:
     """Of its run; without one, StarIO is the default and others require training first."""
     pytest.importorskip("onnx")
-    exported = []
-    with monkeypatch.context() as patch:  # tracing all blocks takes ten seconds
-        patch.setattr(
-            "stario.network.runtime.export.export_onnx", lambda *given: exported.append(given)
-        )
-        done = stario("export", "--model", "StarIO")
+    exported = []  # tracing takes seconds
+    monkeypatch.setattr(
+        "stario.network.runtime.export.export_onnx", lambda *given: exported.append(given)
+    )
+    done = stario("export", "--model", "StarIO")
     assert (done.code, done.out) == (0, "StarIO.onnx\n")
     [(model, path)] = exported
     assert (model.card, path) == (load_model("default").card, Path("StarIO.onnx"))
@@ -331,7 +332,13 @@ def test_export_accepts_the_name_of_a_network(
     save_model(tmp_path / "mine/R-ResNet/model.safetensors", network, Card(architecture="R-ResNet"))
     done = stario("export", "--model", "R-ResNet", "--runs", "mine", "--out", "r.onnx")
     assert done.code == 0, done.err
-    assert (tmp_path / "r.onnx").exists()
+    assert [(model.name, path) for model, path in exported[1:]] == [("R-ResNet", Path("r.onnx"))]
+
+
+def test_an_exported_graph_cannot_be_trained(stario, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = SimpleNamespace(get_inputs=list)
+    exported = DisplacementModel(OnnxEngine(session), Card(architecture="R-ResNet"))
+    monkeypatch.setattr("stario.network.model.load_model", lambda name: exported)
     done = stario("train", "nowhere.csv", "--start-from", "r.onnx")
     done.assert_one_line_error("an exported graph")
     assert "nowhere.csv" not in done.err  # nothing is read first

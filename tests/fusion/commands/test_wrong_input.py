@@ -109,7 +109,6 @@ def test_a_line_that_is_cut_short_is_named(stario, recording: Path, tmp_path: Pa
         (["convert", "RECORDING", "a.csv", "--to", "euroc"], ["a.csv", "euroc"]),
         (["simulate", "a.csv", "--carry", "drone"], ["carry", "drone"]),
         (["simulate", "a.csv", "--imu", "tactical"], ["--imu", "tactical"]),
-        (["train", "--generated", "0"], ["streams"]),
         (["train", "--config", "missing.json"], ["missing.json"]),
         (["train"], ["PATH", "--data"]),
         (["train", "--data", ".", "--where", "person=dan"], ["--where: found use with --data"]),

@@ -18,12 +18,14 @@ from stario.fusion.evaluation.compare import (
     Comparison,
     compare,
     demonstration,
+    measure,
 )
 from stario.fusion.evaluation.folders import fresh_folder
 from stario.fusion.evaluation.many import distinct_name
 from stario.fusion.evaluation.results import write_comparison, write_run
 from stario.fusion.evaluation.summary import scores_of, summary, summary_table
 from stario.sequences.accuracy.metrics import evaluate_track
+from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.errors import StarioError
 from stario.sequences.files import read_tum
 from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
@@ -100,7 +102,17 @@ def test_a_fit_gives_no_larger_ate_than_the_first_pose(compared: Comparison) -> 
         assert first is not None
         assert fitted is not None
         assert fitted <= first, name
+        truth, track = compared.sequence.truth, compared.tracks[name].trajectory
+        assert fitted == evaluate_track(track, truth, alignment="yaw").ate_m
         assert figures["known_positions_m"] is None
+
+
+def test_figures_with_fixes_are_those_after_a_fit(compared: Comparison) -> None:
+    sequence, track = compared.sequence, compared.tracks["ekf"]
+    figures = measure(track, sequence, "yaw")
+    assert figures["ate_m"] == figures["ate_fit_m"]
+    fitted = position_nees(track.trajectory, sequence.truth, "yaw").median
+    assert figures["nees_median"] == fitted != compared.metrics["ekf"]["nees_median"]
 
 
 def test_waypoints_replace_poses_in_the_error(compared: Comparison, blind: Comparison) -> None:
@@ -185,6 +197,14 @@ def test_the_written_configuration_can_be_read_back(folder: Path) -> None:
     assert read_config(folder / "config.json") == CONFIG
 
 
+@pytest.fixture
+def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw figures, but leave their files empty: most of the time goes into rendering."""
+    saved = "stario.fusion.evaluation.results.save_figure"
+    monkeypatch.setattr(saved, lambda figure, path: path.touch())
+
+
+@pytest.mark.usefixtures("blank_figures")
 def test_a_run_writes_its_files(tmp_path: Path, compared: Comparison, walk: ImuSequence) -> None:
     track = compared.tracks["ekf"]
     alone = Comparison(walk, {"ekf": track}, {"ekf": compared.metrics["ekf"]})
@@ -198,6 +218,7 @@ def test_a_run_writes_its_files(tmp_path: Path, compared: Comparison, walk: ImuS
     assert health == json.loads(json.dumps(asdict(track.health)))
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_files_of_an_earlier_run_do_not_pass_for_those_of_a_later_one(
     tmp_path: Path, compared: Comparison, walk: ImuSequence
 ) -> None:
@@ -213,6 +234,7 @@ def test_files_of_an_earlier_run_do_not_pass_for_those_of_a_later_one(
     assert {*files, *mine} == set(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_comparison_leaves_nothing_of_an_earlier_one_but_other_recordings(
     tmp_path: Path, compared: Comparison, blind: Comparison
 ) -> None:

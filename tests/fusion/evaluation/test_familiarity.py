@@ -59,6 +59,14 @@ def test_a_walk_like_the_training_data_is_familiar_and_a_vibrating_one_is_not(
     assert unfamiliar.medians["step_rate"] == pytest.approx(usual.medians["step_rate"], abs=0.2)
 
 
+def test_a_jolt_does_not_change_what_a_walk_is_like(model: DisplacementModel) -> None:
+    walk = simulated()
+    jolt = np.where((walk.time > 10.0) & (walk.time < 11.0), 40.0, 0.0)
+    jolted = replace(walk, accel=walk.accel + np.outer(jolt, [0.0, 0.0, 1.0]))
+    usual, shaken = (familiarity(model, each).medians["acceleration"] for each in (walk, jolted))
+    assert shaken == pytest.approx(usual, rel=0.1)
+
+
 class ReversedModel(DisplacementModel):
     """A model that reverses every displacement."""
 

@@ -122,6 +122,31 @@ def test_gaps_in_the_truth_are_bridged_by_the_gyroscope(make_walk: Make) -> None
     assert turn.magnitude().max() < 2e-3
 
 
+class Counting:
+    """A recurrent network that predicts how many windows of a stretch it has seen [m]."""
+
+    def __init__(self, seen: int = 0) -> None:
+        self.seen = seen
+
+    def stateful_inference(self, updates: int) -> "Counting":
+        return Counting()
+
+    def predict(self, windows: Any) -> Any:
+        seen, self.seen = self.seen, self.seen + len(windows)
+        mean = np.zeros((len(windows), 3))
+        mean[:, 2] = seen + np.arange(len(windows))
+        return mean, np.tile(np.eye(3), (len(windows), 1, 1))
+
+
+def test_the_memory_of_a_network_ends_at_a_gap(walk: ImuSequence, without: Make) -> None:
+    gone = (walk.time > 8.0) & (walk.time < 10.0)
+    longest = [
+        network_track_true_attitude(Counting(), sequence, CONFIG).trajectory.velocity_W[:, 2].max()
+        for sequence in (walk, without(walk, gone))
+    ]
+    assert longest == pytest.approx([190.0, 90.0], abs=2.0)  # ten windows a second
+
+
 def test_tracks_without_a_filter_have_no_covariance(walk: ImuSequence, still_model: Any) -> None:
     preprocessed = Navigator(still_model).observe(walk)
     for track in (inertial_track(preprocessed, CONFIG), network_track(preprocessed)):

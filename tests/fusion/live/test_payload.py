@@ -2,9 +2,11 @@
 
 import json
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from stario.fusion.live.payload import Batch, parse_line, parse_push
 from stario.sequences.errors import InputError
@@ -52,6 +54,16 @@ def test_push_keeps_nanoseconds_and_skips_sensors_that_are_not_used():
     assert (gravity.sensor, gravity.time_ns, gravity.value) == (
         "gravity", 1698501144401773002, (0.0, 0.0, 9.8),
     )  # fmt: skip
+
+
+def test_the_vertical_is_that_of_the_attitude_of_the_phone():
+    attitude = Rotation.from_rotvec([0.4, -0.9, 0.3])
+    values = dict(zip(("qx", "qy", "qz", "qw"), attitude.as_quat().tolist(), strict=True))
+    push = changed(PUSH, ("payload", 2), {"name": "orientation", "time": 5, "values": values})
+    value = (
+        parse_push(push.replace(b'"time": 5', b'"time": 1698501144401773003')).readings[-1].value
+    )
+    np.testing.assert_allclose(value, attitude.inv().apply([0.0, 0.0, 1.0]))
 
 
 def test_line_is_a_sample_of_both_sensors_at_one_time():

@@ -195,6 +195,14 @@ def test_a_cell_can_be_pickled_for_other_machines(dataset: DataSet, reading: Rea
     assert sent[1].digest == cell(dataset).digest
 
 
+def test_results_belong_to_a_network_a_recipe_and_all_recordings_of_their_set(
+    dataset: DataSet,
+) -> None:
+    sets = [replace(dataset, **{part: ()}) for part in ("training", "validation", "test")]
+    others = [*map(cell, sets), cell(dataset, "R-ResNet"), cell(dataset, seed=1)]
+    assert len({cell(dataset).digest, *(other.digest for other in others)}) == 6
+
+
 def test_an_unknown_backend_is_refused() -> None:
     with pytest.raises(ConfigError, match="--backend"):
         backend("mpi")
@@ -205,6 +213,7 @@ def test_the_command_writes_tables_and_figures(
 ) -> None:
     folder = dataset.training[0].parent
     monkeypatch.setenv("STARIO_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("stario.network.runtime.survey._RUNS", {1: 1, 64: 1})
     (tmp_path / "recipe.json").write_text(json.dumps(RECIPE))
     out = tmp_path / "out"
     arguments = ["--set", f"ronin={folder}", "--out", str(out), "--steps", "1", "--seeds", "1"]

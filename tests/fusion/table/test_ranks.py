@@ -45,6 +45,14 @@ def test_seeds_are_averaged_over_common_recordings_only() -> None:
     assert ranks({"a": [errors(1.0)], "b": [[]]}, "a") == {}
 
 
+def test_sets_have_equal_weights_however_many_recordings_they_have() -> None:
+    """Eight times the error on the two recordings of one set, none on the six of the other."""
+    small, large = errors(8.0)[:3:2], errors(1.0)[1::2]
+    found = ranks({"StarIO": [errors(1.0)], "other": [[*small, *large]]}, "StarIO")["other"].ratio
+    assert found is not None
+    assert found.ratio == pytest.approx(np.sqrt(8.0))
+
+
 def test_published_figures_are_found_by_set_and_network() -> None:
     assert published("ridi", "StarIO") == (2.033, 2.274)
     assert published("oxiod", "R-ResNet") == (4.336, 1.595)

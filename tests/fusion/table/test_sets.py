@@ -9,6 +9,7 @@ from recorded import DATA
 
 from stario.fusion.table import sets
 from stario.fusion.table.sets import ALL, FIRST, development_sets, learned_from
+from stario.network.training import splits
 from stario.sequences.datasets.splits import ListEntry
 from stario.sequences.errors import InputError
 
@@ -43,7 +44,8 @@ def test_two_phones_on_one_walk_are_validated_together(monkeypatch: pytest.Monke
     ]
     held = [ListEntry(Path("ridi.h5:dan"), "ridi dan")]
     parts = {"all": [*phones, *held], "test": [], "holdout": held}
-    monkeypatch.setattr(sets, "read_packaged_list", lambda name, data: parts[name])
+    for module in (sets, splits):
+        monkeypatch.setattr(module, "read_packaged_list", lambda name, data: parts[name])
     for seed in range(9):
         [together] = development_sets(Path(), seed, 2, [ALL])
         names = [path.name.removesuffix("S9").removesuffix("S20") for path in together.validation]

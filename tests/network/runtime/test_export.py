@@ -3,6 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from training_runs import shallow
 
 from stario.network.architectures import ARCHITECTURES, build_network
 from stario.network.card import Calibration, Card
@@ -48,10 +49,16 @@ def assert_parity(model: DisplacementModel, path: Path) -> DisplacementModel:
     return exported
 
 
+def shallow_rnin() -> DisplacementModel:
+    with pytest.MonkeyPatch.context() as patch:
+        shallow(patch)
+        return untrained("RNIN")
+
+
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("export") / "rnin.onnx"
-    export_onnx(untrained("RNIN"), path)
+    export_onnx(shallow_rnin(), path)
     return path
 
 
@@ -72,7 +79,7 @@ def test_every_exported_network_gives_the_same_predictions(name: str, tmp_path: 
 
 
 def test_a_recurrent_network_keeps_its_state_in_both_engines(exported: Path) -> None:
-    windows, model = random_windows(6), untrained("RNIN")
+    windows, model = random_windows(6), shallow_rnin()
     for found, expected in zip(
         load_model(exported).stateful_inference(2).predict(windows),
         model.stateful_inference(2).predict(windows),

@@ -4,27 +4,27 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from training_runs import run
+from training_runs import narrow, run
 
 from stario.network.card import card_path
-from stario.network.stario import WIDTHS
 from stario.network.training.history import EpochReport
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _narrow() -> Iterator[None]:
-    """StarIO with a quarter of its channels, which is trained in a fraction of the time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("stario.network.stario.WIDTHS", tuple(width // 4 for width in WIDTHS))
+        narrow(patch)
         yield
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[EpochReport]]:
     """A run without interruption: the model's path and the reports of its epochs."""
     reports: list[EpochReport] = []
     folder = tmp_path_factory.mktemp("finished")
-    return run(folder, on_epoch=reports.append, trained_on=["swings"]), reports
+    with pytest.MonkeyPatch.context() as patch:
+        narrow(patch)
+        return run(folder, on_epoch=reports.append, trained_on=["swings"]), reports
 
 
 @pytest.fixture

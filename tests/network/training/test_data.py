@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
@@ -7,9 +8,19 @@ import numpy as np
 import pytest
 
 from stario.network.training.config import SIMULATED, TrainingConfig
-from stario.network.training.data import RecordingStreams, TrainingData, mix_sources, split_off
+from stario.network.training.data import (
+    RecordingStreams,
+    TrainingData,
+    mix_sources,
+    recording_streams,
+    split_off,
+)
+from stario.sequences.datasets.archive_writer import write_archive
+from stario.sequences.datasets.batch import Skipped
 from stario.sequences.errors import ConfigError
 from stario.sequences.sequence import STANDARD_GRAVITY
+from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
+from stario.sequences.simulation.walks import generate_walk
 from stario.sequences.windows import WorldStream
 
 
@@ -97,6 +108,18 @@ def test_shares_that_leave_nothing_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"shares: found a sum of 1\.2"):
         TrainingConfig(shares={"ridi": 0.6, "kipd": 0.6})
     TrainingConfig(shares={"ridi": 0.7, "kipd": 0.2, "tyrex": 0.1, SIMULATED: 0.5})
+
+
+def test_streams_come_with_the_licence_of_their_archive(tmp_path: Path) -> None:
+    walk = simulate_imu(generate_walk(0, 4.0), 100.0, PERFECT_IMU, 0, name="walk")
+    licensed = replace(walk, attributes={"licence": "CC BY 4.0"})
+    write_archive(tmp_path / "walks.h5", [licensed])
+    paths = [Path(f"{tmp_path / 'walks.h5'}:walk"), Path("other.csv"), Path("bad.csv")]
+    outcomes = [[moving("walk", 1.0)], [moving("other", 1.0)], Skipped("bad.csv", "broken")]
+    found, skipped = recording_streams(zip(paths, outcomes, strict=True))
+    assert [(one.path, one.licence) for one in found] == [(paths[0], "CC BY 4.0"), (paths[1], "")]
+    assert skipped == outcomes[2:]
+    assert mix_sources(found, []).words[-1] == "walks.h5, licence CC BY 4.0: 1 recordings, 10 s"
 
 
 def recordings_of(*recordings: list[WorldStream]) -> list[RecordingStreams]:

@@ -12,7 +12,7 @@ import pytest
 import safetensors.torch
 import torch
 from cut_windows import windows_of
-from training_runs import STREAMS, TINY, VALIDATION, run, swaying
+from training_runs import STREAMS, TINY, VALIDATION, run, shallow, swaying
 
 from stario.network.architectures import build_network
 from stario.network.displacement import DisplacementNetwork
@@ -20,7 +20,8 @@ from stario.network.known_motion import OUTSIDE_VARIANCE
 from stario.network.model import load_model
 from stario.network.training.augment import Augmentation
 from stario.network.training.config import TrainingConfig, training_config
-from stario.network.training.history import EpochReport
+from stario.network.training.history import EpochReport, History
+from stario.network.training.run import TrainingRun
 from stario.network.training.train import train
 from stario.network.training.validation import ValidationSet
 from stario.sequences.errors import InputError
@@ -41,7 +42,7 @@ def test_an_epoch_reports_its_speed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     clock = count()
     monkeypatch.setattr("stario.network.training.run.perf_counter", lambda: float(next(clock)))
     reports: list[EpochReport] = []
-    run(tmp_path, replace(TINY, epochs=1), on_epoch=reports.append)
+    run(tmp_path, replace(TINY, epochs=1, epoch_windows=32), on_epoch=reports.append)
     assert reports[0].windows_per_second == TINY.batch / 2
     assert reports[0].drawing_share == 0.5
 
@@ -99,25 +100,63 @@ def test_only_the_likelihood_trains_sigma(finished: tuple[Path, list[EpochReport
     assert (moment[3:] == 0.0).all()
 
 
-@pytest.mark.parametrize(("without_error", "kept"), [({3}, {4}), ({4}, {3}), ({3, 4}, {1, 2})])
-def test_an_epoch_without_a_finite_error_is_never_the_best(
-    finished: tuple[Path, list[EpochReport]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    without_error: set[int],
-    kept: set[int],
+@pytest.mark.parametrize(
+    ("errors", "best"),
+    [((2.0, 1.0, 4.0, 3.0), 4), ((2.0, 1.0, 3.0, 4.0), 3), ((2.0, 1.0, math.nan, 4.0), 4),
+     ((2.0, 1.0, 3.0, math.nan), 3), ((2.0, 1.0, 3.0, -math.inf), 3), ((2.0, 3.0), 1)],
+)  # fmt: skip
+def test_the_best_epoch_has_the_smallest_finite_error_of_those_that_train_sigma(
+    errors: tuple[float, ...], best: int
 ) -> None:
-    """The likelihood begins with epoch 3; an earlier epoch is kept if it has no finite error."""
-    original, epoch = ValidationSet.errors, count(1)
+    """The likelihood begins with the third of four epochs."""
+    reports = [EpochReport(epoch, 0.0, error, {}) for epoch, error in enumerate(errors, 1)]
+    assert History(TINY, reports).best().epoch == best
+
+
+def test_training_stops_after_epochs_without_progress_that_train_sigma() -> None:
+    """The likelihood begins with the third epoch, whatever came before."""
+    config = replace(TINY, epochs=6, likelihood_from=1.0 / 3.0, patience=2)
+    errors = (1.0, 2.0, 3.0, 4.0, 5.0)
+    reports = [EpochReport(epoch, 0.0, error, {}) for epoch, error in enumerate(errors, 1)]
+    stops = [History(config, reports[:count]).should_stop() for count in range(1, 6)]
+    assert stops == [False, False, False, False, True]
+
+
+def test_gradients_are_clipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    norms: list[float] = []
+    average = TrainingRun._average
+
+    def measured(self: TrainingRun) -> None:
+        gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
+        norms.append(float(torch.nn.utils.get_total_norm(gradients)))
+        average(self)
+
+    monkeypatch.setattr(TrainingRun, "_average", measured)
+    run(tmp_path, replace(TINY, epochs=1, epoch_windows=16, clip=0.01))
+    assert norms == [pytest.approx(0.01, rel=1e-3)]
+
+
+def test_weights_of_an_epoch_without_a_finite_error_are_not_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither epoch that trains sigma has one: the weights of the better earlier one are kept."""
+    original, errors_of = ValidationSet.errors, iter((1.0, 2.0, math.nan, math.nan))
 
     def errors(self: ValidationSet, *arguments: Any) -> dict[str, float]:
-        found = original(self, *arguments)
-        return found | {"c": math.nan} if next(epoch) in without_error else found
+        return original(self, *arguments) | {"c": next(errors_of, 0.0), "d": 0.0}
+
+    kept: list[dict[str, torch.Tensor]] = []
+    original_keep = TrainingRun._keep
+
+    def keep(self: TrainingRun, network: DisplacementNetwork) -> None:
+        original_keep(self, network)
+        kept.append(self.best)
 
     monkeypatch.setattr(ValidationSet, "errors", errors)
-    model = load_model(run(tmp_path))
-    choice = [r.validation_by_recording for r in finished[1] if r.epoch in kept]
-    assert model.card.figures["validation_mse_m2"] in choice
+    monkeypatch.setattr(TrainingRun, "_keep", keep)
+    state = safetensors.torch.load_file(run(tmp_path, replace(TINY, epoch_windows=16)))
+    assert len(kept) == 2  # the initial weights, and those of the first epoch
+    assert all(torch.equal(kept[-1][f"network.{name}"], value) for name, value in state.items())
 
 
 def test_a_short_run_keeps_the_epoch_that_trained_sigma(
@@ -143,14 +182,15 @@ def test_a_loss_that_is_not_finite_stops_before_it_corrupts_anything(tmp_path: P
         for stream in corrupted:
             stream.imu_W[:] = np.nan
 
-    with pytest.raises(InputError, match=r"loss: found nan .* in step 9.*`rate` below 0\.001"):
-        train(TINY, corrupted, [1.0, 1.0], VALIDATION, tmp_path, on_epoch=corrupt)
+    short = replace(TINY, epochs=2, epoch_windows=32)
+    with pytest.raises(InputError, match=r"loss: found nan .* in step 3.*`rate` below 0\.001"):
+        train(short, corrupted, [1.0, 1.0], VALIDATION, tmp_path, on_epoch=corrupt)
     state = safetensors.torch.load_file(tmp_path / "checkpoint.safetensors")
     assert all(value.isfinite().all() for value in state.values() if value.is_floating_point())
     assert not (tmp_path / "model.safetensors").exists()
     reports: list[EpochReport] = []
-    run(tmp_path, on_epoch=reports.append)
-    assert [r.epoch for r in reports] == [2, 3, 4]
+    run(tmp_path, short, on_epoch=reports.append)
+    assert [r.epoch for r in reports] == [2]
 
 
 def test_the_log_holds_every_epoch(finished: tuple[Path, list[EpochReport]]) -> None:
@@ -179,7 +219,10 @@ def build_network_of(config: TrainingConfig) -> torch.nn.Module:
     return build_network(config.architecture)
 
 
-def test_a_recurrent_network_is_trained_on_successive_windows(tmp_path: Path) -> None:
+def test_a_recurrent_network_is_trained_on_successive_windows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shallow(monkeypatch)
     values = {"architecture": "RNIN", "epochs": 1, "epoch_windows": 40, "batch": 20}
     config = training_config({**values, "device": "cpu", "likelihood_from": 0.0})
     assert config.successive == 10

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from training_runs import shallow
 
 from stario.network.displacement import DisplacementNetwork
 from stario.network.training.augment import UNVARIED, Augmentation
@@ -202,11 +203,14 @@ def test_a_recording_without_positions_has_no_legs() -> None:
         leg_streams(WALK)
 
 
-def test_training_with_legs_reduces_the_error_at_positions(tmp_path: Path) -> None:
+def test_training_with_legs_reduces_the_error_at_positions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Legs are trained together with windows of full truth from the same walk."""
     [legs] = leg_streams(with_positions("positions", 0.1))
     assert isinstance(legs, LegStream)
-    streams = world_streams(WALK)
+    streams = [stream.part(0, 4000) for stream in world_streams(WALK)]
+    monkeypatch.setattr("stario.network.training.validation._STRETCHES", 12)
     config = TrainingConfig(
         architecture="DeepILS", epochs=2, epoch_windows=64, batch=16, rate=2e-3, warm_up=0.0,
         likelihood_from=0.0, track_stretches=2, augmentation=PLAIN,
@@ -221,24 +225,27 @@ def test_training_with_legs_reduces_the_error_at_positions(tmp_path: Path) -> No
     assert (tmp_path / "checkpoint.safetensors").exists()
 
 
-def test_a_recurrent_network_is_trained_on_stretches_in_rows(tmp_path: Path) -> None:
+def test_a_recurrent_network_is_trained_on_stretches_in_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its state is kept through a stretch, which must be a whole number of rows."""
+    shallow(monkeypatch)
+    monkeypatch.setattr("stario.network.training.validation._STRETCHES", 5)
     [legs] = leg_streams(with_positions("positions", 0.1))
-    streams = world_streams(WALK)
+    streams = [stream.part(0, 4000) for stream in world_streams(WALK)]
     values = {"architecture": "RNIN", "epochs": 1, "batch": 20, "epoch_windows": 20}
     config = training_config({**values, "track_stretches": 1, "likelihood_from": 0.0})
     weights, shapes = [1.0] * len(streams), []
     run = partial(train, config, streams, weights, streams, legs=[legs], validation_legs=[legs])
-    with pytest.MonkeyPatch.context() as patch:
-        original = DisplacementNetwork.forward
-        patch.setattr(
-            DisplacementNetwork,
-            "forward",
-            lambda self, windows: shapes.append(tuple(windows.shape)) or original(self, windows),
-        )
-        run(tmp_path / "rows")
+    original = DisplacementNetwork.forward
+    monkeypatch.setattr(
+        DisplacementNetwork,
+        "forward",
+        lambda self, windows: shapes.append(tuple(windows.shape)) or original(self, windows),
+    )
+    run(tmp_path / "rows")
     assert shapes[0] == (3, 10, 6, 200)  # two rows with full truth, one stretch of a track
-    assert (48, 10, 6, 200) in shapes
+    assert (5, 10, 6, 200) in shapes
     with pytest.raises(ConfigError, match=r"positions: found 12, expected a multiple.*=10"):
         train(replace(config, track_seconds=12), streams, weights, streams, tmp_path, legs=[legs])
 

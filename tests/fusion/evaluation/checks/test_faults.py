@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from stario.fusion.evaluation.checks.corruption import faults
 from stario.fusion.evaluation.checks.faults import (
+    DummyPredictor,
     FaultResult,
     fault_table,
     matched_walk,
     run_faults,
+    with_true_displacements,
 )
+from stario.fusion.navigator import Navigator
 from stario.sequences.errors import InputError
 
 SECONDS = 20.0
@@ -72,6 +77,31 @@ def test_a_recording_without_truth_is_refused() -> None:
     sequence, config = matched_walk(3.0)
     with pytest.raises(InputError, match="truth"):
         run_faults(sequence.without_truth(), config)
+
+
+def test_a_block_of_false_displacements_lasts_five_seconds() -> None:
+    [block] = [fault for fault in faults(60.0) if fault.name == "network off by 1 m for 5 s"]
+    mean = np.zeros((600, 3))  # ten a second
+    assert block.modify_predictions is not None
+    block.modify_predictions(mean, np.tile(np.eye(3), (600, 1, 1)), np.random.default_rng(0))
+    assert mean.sum(axis=0).tolist() == [50.0, 0.0, 0.0]
+    assert np.flatnonzero(mean[:, 0])[0] == pytest.approx(300, abs=1)
+
+
+def test_true_displacements_have_the_noise_that_the_filter_takes_them_to_have() -> None:
+    """The filter multiplies their covariance by its scale."""
+    sequence, config = matched_walk(SECONDS)
+    config = replace(config, filter=replace(config.filter, covariance_scale=4.0))
+    preprocessed = Navigator(DummyPredictor(), config).observe(sequence)
+    measured = with_true_displacements(preprocessed, sequence.truth, config, 0, noise=0.05)
+    errors = []
+    for interval, measurement in zip(measured.intervals, measured.measurements, strict=True):
+        if measurement is not None:
+            np.testing.assert_allclose(4.0 * measurement[1], 0.05**2 * np.eye(3))
+            ends = sequence.truth.at(np.array([interval.stop - 1.0, interval.stop])).position_W
+            length = np.linalg.norm((ends[1] - ends[0])[:2])
+            errors.append(np.linalg.norm(measurement[0][:2]) - length)
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(0.05, rel=0.35)
 
 
 def test_faults_are_drawn_from_the_seed() -> None:

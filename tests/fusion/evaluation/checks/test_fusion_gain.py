@@ -9,6 +9,8 @@ import pytest
 from support import CONFIG
 
 from stario.fusion.evaluation.checks.fusion_gain import FusionGain, fusion_gain, fusion_gain_table
+from stario.fusion.navigator import Navigator
+from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, PositionTrack
 
@@ -21,6 +23,7 @@ def test_ratios_are_geometric_means_by_group() -> None:
     rows += [FusionGain("c", "y", 2.0, {"ekf": 1.0}, 1.0, float("nan"), float("nan"), 0.1)]
     _, x, y, pooled, *_ = fusion_gain_table(rows).splitlines()
     assert x.split()[:4] == ["x", "2", "1.00", "1.00"]
+    assert x.split()[4:6] == ["1.87", "2.00"]  # 95th percentile on a logarithmic scale, and worst
     assert x.split()[-5:] == ["3.0", "3.0", "26.1", "50%", "50%"]
     assert y.split()[3] == "0.50"
     assert pooled.split()[:2] == ["all", "3"]
@@ -37,6 +40,25 @@ def test_the_error_of_the_fusion_at_waypoints_agrees_with_its_error_at_poses(
     waypoints = fusion_gain(oracle, at_waypoints, CONFIG, "walks", ("ekf",))
     assert poses.fused_m["ekf"] < 0.5
     assert waypoints.fused_m["ekf"] == pytest.approx(poses.fused_m["ekf"], abs=0.2)
+
+
+def test_the_yaw_error_is_that_since_the_start_next_to_the_sigma_of_yaw(
+    walk: ImuSequence, make_oracle: Make
+) -> None:
+    """A world whose axes point elsewhere changes neither."""
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
+    turn, truth = about_z(2.0), walk.truth
+    other = replace(
+        truth, position_W=turn.apply(truth.position_W), attitude_WB=turn * truth.attitude_WB
+    )
+    found, rotated = (
+        fusion_gain(oracle, replace(walk, truth=each), CONFIG, "walks", ("ekf",))
+        for each in (truth, other)
+    )
+    assert rotated.yaw_error == pytest.approx(found.yaw_error, abs=1e-9)
+    assert abs(found.yaw_error) < 0.1
+    covariance = Navigator(oracle, CONFIG).run(walk).covariance
+    assert found.yaw_sigma == pytest.approx(np.sqrt(covariance[-1, 2, 2]))
 
 
 def test_too_little_truth_is_refused(walk: ImuSequence, still_model: Any) -> None:

@@ -22,6 +22,7 @@ def test_gaps_of_a_tenth_of_a_second_and_5_percent_loss_hardly_move_the_end(
     assert len(found) == 7
     assert {one.recording for one in found} == {walk.name}
     *gaps, dropped = found
+    assert [one.fault for one in gaps[::5]] == ["gap at 2 s", "gap at 18 s"]  # of twenty
     # On the short path of a simulated walk of 20 s, a turn at a gap has a large effect.
     assert max(one.metres for one in gaps) < 0.1
     assert max(one.degrees for one in gaps) < 15.0

@@ -33,6 +33,10 @@ def test_the_rotation_of_rotated_displacements_is_found(stream_and_truth, degree
     assert np.angle(rotated_back) == pytest.approx(direction(*stream_and_truth).turn, abs=1e-9)
 
 
+def test_changes_of_velocity_over_three_seconds_count_once_in_that_time(stream_and_truth):
+    assert direction(*stream_and_truth).count == pytest.approx(90.0 / 3.0, abs=1.5)
+
+
 def test_the_direction_of_noise_has_a_large_sigma(stream_and_truth):
     stream, displacement = stream_and_truth
     noise = np.random.default_rng(0).normal(size=displacement.shape)

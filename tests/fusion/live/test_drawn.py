@@ -1,0 +1,51 @@
+"""Points of a drawn track: their values, and how a change of the map frame moves them."""
+
+import numpy as np
+import pytest
+
+from stario.fusion.live import hub as hub_module
+from stario.fusion.live.drawn import DisplayedTrack, point_of
+from stario.fusion.live.hub import Viewer
+from stario.fusion.live.payload import parse_push
+from stario.fusion.state import NavState
+from stario.sequences.attitude.rotations import about_z
+
+
+def state(time=0.0, yaw=0.2, p_W=(1.0, 2.0, 3.0)):
+    covariance = np.diag([0.1, 0.1, 0.04, *[0.1] * 3, 4.0, 1.0, 0.5, *[0.1] * 6])
+    R_WB, zero = about_z(yaw).as_matrix(), np.zeros(3)
+    return NavState(time, R_WB, np.array([0.6, 0.8, 0.0]), np.array(p_W), zero, zero, covariance)
+
+
+def test_a_point_holds_position_speed_yaw_covariance_and_sigma_of_yaw():
+    yaw, sigma = np.degrees([0.2, 0.2])
+    expected = [0.0, 1.0, 2.0, 3.0, 1.0, yaw, 4.0, 0.0, 1.0, sigma]
+    np.testing.assert_allclose(point_of(state()), expected, atol=1e-5)
+
+
+def test_a_new_map_frame_rotates_position_yaw_and_covariance_together():
+    track, turn, shift = DisplayedTrack(), about_z(0.5), np.array([5.0, -3.0, 1.0])
+    track.add(state())
+    before, after = state(1.0, 0.9, (7.0, 7.0, 3.0)), state(1.0, 1.4)
+    after.p_W[:] = turn.apply(before.p_W) + shift
+    track.move(before, after)
+    [point] = track.points
+    np.testing.assert_allclose(point[1:4], turn.apply([1.0, 2.0, 3.0]) + shift, atol=1e-4)
+    assert point[5] == pytest.approx(np.degrees(0.2 + 0.5), abs=1e-3)
+    R = turn.as_matrix()[:2, :2]
+    np.testing.assert_allclose(
+        [[point[6], point[7]], [point[7], point[8]]], R @ np.diag([4.0, 1.0]) @ R.T, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("most", [7, 1000])
+def test_a_new_viewer_gets_no_more_points_than_a_message_may_hold(hub, pushes, monkeypatch, most):
+    session = hub._session("phone")
+    for body in pushes(seconds=4.0):
+        session.take(parse_push(body), 0.0)
+    monkeypatch.setattr(hub_module, "MAX_SENT", most)
+    [device] = Viewer(hub).message()["devices"]
+    points = session.drawn.points
+    assert min(len(points), most) / 2 < len(device["points"]) <= most + 1
+    assert (device["points"][0], device["points"][-1]) == (points[0], points[-1])
+    assert session.status()["rate"] == pytest.approx(100.0, rel=0.02)

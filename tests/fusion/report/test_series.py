@@ -1,0 +1,96 @@
+"""What the report draws of a known track: units, standard deviations, ellipses, turns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+pytest.importorskip("plotly", reason="pip install 'stario[report]'")
+
+from stario.fusion.report.page import _cursors
+from stario.fusion.report.panels import motion_panels
+from stario.fusion.report.series import Series, ellipse, track_series, trajectory_series
+from stario.fusion.state import Track
+from stario.sequences.attitude.rotations import about_z
+from stario.sequences.sequence import Trajectory
+
+TIME = np.arange(0.0, 10.0, 0.1)
+_POSE = (0.01, 0.02, 0.03, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+SIGMA = np.array([*_POSE, 1e-3, 2e-3, 3e-3, 0.07, 0.08, 0.09])
+"""Of rotation, velocity, position and both biases."""
+
+
+def along_y(yaw: float = 0.0) -> Track:
+    """A track at 1.5 m/s along y."""
+    count = len(TIME)
+    covariance = np.tile(np.diag(SIGMA**2), (count, 1, 1))
+    covariance[:, 6, 7] = covariance[:, 7, 6] = 0.05
+    trajectory = Trajectory(
+        TIME,
+        np.outer(TIME, [0.0, 1.5, 0.0]),
+        about_z(np.full(count, yaw)),
+        np.tile([0.0, 1.5, 0.0], (count, 1)),
+        covariance[:, 6:9, 6:9],
+    )
+    b_g, b_a = np.full((count, 3), 0.01), np.full((count, 3), 0.2)
+    return Track(trajectory, b_g=b_g, b_a=b_a, covariance=covariance)
+
+
+def series_of(track: Track) -> Series:
+    return track_series(track, track.trajectory, 0.0)
+
+
+def test_columns_are_in_their_units_with_their_own_sigmas() -> None:
+    series = series_of(along_y(yaw=0.5))
+    assert series.gyro_bias is not None
+    assert series.accel_bias is not None
+    for found, expected in (
+        (series.yaw, np.degrees(0.5)),
+        (series.yaw_sigma, np.degrees(0.03)),
+        (series.speed, 1.5),
+        (series.speed_sigma, 0.2),  # that of the velocity along the path
+        (series.height_sigma, 0.6),
+        (series.gyro_bias[0], np.degrees(0.01)),
+        (series.gyro_bias[1], np.degrees(SIGMA[9:12])),
+        (series.accel_bias[0], 0.2),
+        (series.accel_bias[1], SIGMA[12:]),
+    ):
+        np.testing.assert_allclose(found, np.broadcast_to(expected, np.shape(found)))
+
+
+def test_speed_of_positions_alone_is_their_rate() -> None:
+    positions = Trajectory(TIME, np.outer(TIME, [0.0, 1.5, 0.0]), Rotation.identity(len(TIME)))
+    np.testing.assert_allclose(trajectory_series(positions, 0.0).speed, 1.5)
+
+
+def test_an_ellipse_reaches_three_sigma_along_its_axes() -> None:
+    R = about_z(0.4).as_matrix()[:2, :2]
+    outline = ellipse(R @ np.diag([4.0, 0.25]) @ R.T) @ R  # in the ellipse's own axes
+    np.testing.assert_allclose(np.abs(outline).max(axis=0), [6.0, 1.5], rtol=0.01)
+    np.testing.assert_allclose(outline[0], outline[-1], atol=1e-12)
+
+
+def test_yaws_on_both_sides_of_half_a_turn_are_drawn_next_to_each_other() -> None:
+    shown = {
+        name: trajectory_series(along_y(np.radians(yaw)).trajectory, 0.0)
+        for name, yaw in (("ekf", 179.0), ("graph", -179.0))
+    }
+    yaw = {trace.name: trace.y for trace in motion_panels(shown, None)[2].traces}
+    np.testing.assert_allclose(yaw["factor graph"] - yaw["EKF"], 2.0, atol=1e-3)
+
+
+def test_the_band_of_a_line_is_three_sigma_wide() -> None:
+    height = motion_panels({"ekf": series_of(along_y())}, None)[0]
+    band, line = height.traces
+    assert np.nanmax(band.y) == pytest.approx(3.0 * 0.6)
+    assert np.nanmin(band.y) == pytest.approx(-3.0 * 0.6)
+    assert not line.y.any()
+
+
+def test_the_slider_moves_ellipses_of_the_horizontal_covariance() -> None:
+    series = series_of(along_y())
+    other, main = _cursors({"graph": series, "ekf": series}, "ekf")[::-1]
+    assert (main["name"], other["name"]) == ("ekf", "graph")
+    assert [main[key][5] for key in ("xx", "xy", "yy")] == [0.16, 0.05, 0.25]
+    assert main["y"][10] == pytest.approx(1.5 * TIME[10])
