@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+from stario.sequences.arrays import check_choice
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 
@@ -84,8 +85,7 @@ def with_units(
 
 def _factor(sequence: ImuSequence, sensor: str, unit: str, known: dict[str, float]) -> float:
     field, name = f"{sensor}_unit", unit_named(unit)
-    if name not in known:
-        raise InputError(field, repr(unit), f"one of {', '.join(known)}")
+    check_choice(field, name, known)
     if known[name] != 1.0 and sensor in sequence.converted:
         found = f"{unit!r} for {sequence.name}, whose file names its unit"
         expected = f"{next(iter(known))}, to which it was converted on reading"

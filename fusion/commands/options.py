@@ -257,9 +257,9 @@ def backend_named(name: str) -> BackendName:
         InputError: there is none.
     """
     from stario.fusion.backends import BACKENDS
+    from stario.sequences.arrays import check_choice
 
-    if name not in BACKENDS:
-        raise InputError("--backend", repr(name), f"one of {', '.join(BACKENDS)}")
+    check_choice("--backend", name, BACKENDS)
     return cast("BackendName", name)
 
 

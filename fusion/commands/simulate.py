@@ -32,6 +32,7 @@ def simulate(
     as_json: JsonOption = False,
 ) -> None:
     """Write a simulated walk with its ground truth as a CSV recording."""
+    from stario.sequences.arrays import check_choice
     from stario.sequences.readers.csv_writer import write_csv
     from stario.sequences.simulation.imu import GOOD_IMU, PERFECT_IMU, PHONE_IMU, simulate_imu
     from stario.sequences.simulation.magnetometer import INDOOR_FIELD
@@ -47,11 +48,8 @@ def simulate(
         raise InputError("path", str(path), "a file name ending in .csv", fix)
     check_new("path", path, overwrite)
     sensors = {"phone": PHONE_IMU, "good": GOOD_IMU, "perfect": PERFECT_IMU}
-    if imu not in sensors:
-        raise InputError("--imu", repr(imu), f"one of {', '.join(sensors)}")
-    modes = (*CARRYING_MODES, "random")
-    if carry not in modes:
-        raise InputError("--carry", repr(carry), f"one of {', '.join(modes)}")
+    check_choice("--imu", imu, sensors)
+    check_choice("--carry", carry, (*CARRYING_MODES, "random"))
     check_amount(seconds, rate)
     style = None if carry == "random" else WalkStyle(carry=carry)
     walk = generate_walk(seed, seconds, style=style)

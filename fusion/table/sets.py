@@ -11,8 +11,8 @@ from typing import TypeVar
 import numpy as np
 
 from stario.network.training.splits import read_packaged_list
+from stario.sequences.arrays import check_choice
 from stario.sequences.datasets.splits import ListEntry, random_split
-from stario.sequences.errors import InputError
 from stario.sequences.readers import find_recordings
 
 ALL = "all"
@@ -77,8 +77,7 @@ def development_sets(
         InputError: a name is unknown, or a recording of the packaged lists is missing.
     """
     for name in chosen or ():
-        if name not in _SETS:
-            raise InputError("--sets", repr(name), f"one of {', '.join(_SETS)}")
+        check_choice("--sets", name, _SETS)
     recordings = read_packaged_list("all", data) + read_packaged_list("test", data)
     return [
         _combined(data, seed, per_group)

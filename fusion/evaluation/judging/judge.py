@@ -25,8 +25,8 @@ from stario.fusion.evaluation.judging.network_alone import RecordingPredictor, p
 from stario.fusion.evaluation.judging.prepared import Prepared
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
+from stario.sequences.arrays import check_choice
 from stario.sequences.datasets.batch import Skipped
-from stario.sequences.errors import InputError
 from stario.sequences.readers.archive import split_name
 from stario.sequences.sequence import ImuSequence
 
@@ -86,9 +86,8 @@ def check_by(name: str) -> By:
     Raises:
         InputError: the name is not one of `By`.
     """
-    if name in get_args(By):
-        return cast(By, name)
-    raise InputError("--by", repr(name), f"one of {', '.join(get_args(By))}")
+    check_choice("--by", name, get_args(By))
+    return cast(By, name)
 
 
 def judge(
