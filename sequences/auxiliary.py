@@ -13,7 +13,7 @@ from stario.sequences.arrays import (
     BoolArray,
     FloatArray,
     check_choice,
-    check_type,
+    check_rotations,
     checked_array,
     checked_time,
     checked_valid,
@@ -132,9 +132,5 @@ class DeviceAttitude(Timed):
 
     def __post_init__(self) -> None:
         time = checked_time("device attitude's time", self.time)
-        remedy = "Rotation.from_quat(quat_xyzw)"
-        check_type("device attitude's attitude_WB", self.attitude_WB, Rotation, remedy)
-        if len(self.attitude_WB) != len(time):
-            found = f"{len(self.attitude_WB)} rotations"
-            raise InputError("device attitude", found, f"{len(time)} as time")
+        check_rotations("device attitude's attitude_WB", self.attitude_WB, time)
         object.__setattr__(self, "time", time)

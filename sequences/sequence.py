@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from stario.sequences.arrays import BoolArray as BoolArray
 from stario.sequences.arrays import FloatArray as FloatArray
 from stario.sequences.arrays import (
+    check_rotations,
     check_type,
     checked_array,
     checked_time,
@@ -74,16 +75,13 @@ class Trajectory(Timed):
 
     def __post_init__(self) -> None:
         time = checked_time("time", self.time)
-        n = len(time)
         valid = checked_valid("valid", self.valid, time)
-        check_type("attitude_WB", self.attitude_WB, Rotation, "Rotation.from_quat(quat_xyzw)")
-        if len(self.attitude_WB) != n:
-            raise InputError("attitude_WB", f"{len(self.attitude_WB)} rotations", f"{n} as time")
+        check_rotations("attitude_WB", self.attitude_WB, time)
         arrays: dict[str, Any] = {"time": time, "valid": valid}
         for name, shape in _TRAJECTORY_SHAPES.items():
             value = getattr(self, name)
             if value is not None:
-                arrays[name] = checked_array(name, value, (n, *shape), where=valid)
+                arrays[name] = checked_array(name, value, (len(time), *shape), where=valid)
         for name, value in arrays.items():
             object.__setattr__(self, name, value)
 

@@ -196,7 +196,7 @@ def test_a_cell_can_be_pickled_for_other_machines(dataset: DataSet, reading: Rea
 
 
 def test_an_unknown_backend_is_refused() -> None:
-    with pytest.raises(ConfigError, match="--backend"):
+    with pytest.raises(InputError, match="--backend"):
         backend("mpi")
 
 
