@@ -90,20 +90,19 @@ class Trajectory(Timed):
         """Attitude as unit quaternions (N, 4), x y z w, body to world."""
         return np.asarray(self.attitude_WB.as_quat(), dtype=np.float64)
 
-    def at(self, time: FloatArray, max_gap: float = MAX_TRUTH_GAP) -> Trajectory:
+    def at(self, time: FloatArray) -> Trajectory:
         """Interpolate at other times: linear in position, slerp in attitude.
 
         Never interpolates across a gap: times outside the track, or between valid samples more
-        than `max_gap` apart, are returned with `valid` False.
+        than `MAX_TRUTH_GAP` apart, are returned with `valid` False.
 
         Args:
             time: (M,) [s], strictly increasing.
-            max_gap: longest step between valid neighbours [s].
 
         Raises:
             InputError: fewer than two valid samples to interpolate between.
         """
-        covered = self.covers(time, max_gap)
+        covered = self.covers(time)
         known = np.flatnonzero(self.valid)
         t = self.time[known]
         clipped = np.clip(time, t[0], t[-1])
@@ -123,7 +122,7 @@ class Trajectory(Timed):
             valid=covered,
         )
 
-    def covers(self, time: FloatArray, max_gap: float = MAX_TRUTH_GAP) -> BoolArray:
+    def covers(self, time: FloatArray) -> BoolArray:
         """Return whether the pose is known at each time (M,): `valid` of `at`, but faster.
 
         Raises:
@@ -136,7 +135,7 @@ class Trajectory(Timed):
         right = np.clip(np.searchsorted(t, time), 1, len(t) - 1)
         tolerance = max(1e-9, 4.0 * float(np.spacing(np.abs(t[[0, -1]]).max())))
         inside = (time >= t[0] - tolerance) & (time <= t[-1] + tolerance)
-        bracketed = ~is_gap(t[right] - t[right - 1], max_gap)
+        bracketed = ~is_gap(t[right] - t[right - 1])
         exact = np.minimum(np.abs(time - t[right]), np.abs(time - t[right - 1])) <= tolerance
         return np.asarray(inside & (bracketed | exact))
 

@@ -38,7 +38,7 @@ from stario.fusion.live.hub import Hub, Viewer
 from stario.fusion.live.payload import Batch, joined, json_from, parse_line, parse_push
 from stario.sequences.arrays import check_choice
 from stario.sequences.errors import InputError, StarioError
-from stario.sequences.units import ACCEL_UNITS, unit_named
+from stario.sequences.units import ACCEL_UNITS, known_unit
 
 MAX_BYTES = 4 * 1024 * 1024
 """Maximum size of a push [bytes]."""
@@ -131,7 +131,7 @@ async def _data(request: Request) -> Response:
     try:
         _check_origin(request)
         unit = request.query_params.get("accel_unit", "m/s^2")
-        check_choice("accel_unit", name := unit_named(unit), ACCEL_UNITS)
+        name = known_unit("accel_unit", unit, ACCEL_UNITS)
         body = await _body(request)
         lines = request.headers.get("content-type", "").startswith("application/x-ndjson")
         sender = f"http {request.client.host if request.client else ''}"
