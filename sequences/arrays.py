@@ -158,7 +158,7 @@ def check_rotations(name: str, value: Rotation, time: FloatArray) -> None:
 
 
 def checked_array(
-    name: str, value: FloatArray, shape: tuple[int, ...], where: BoolArray
+    name: str, value: FloatArray, shape: tuple[int, ...], where: BoolArray | bool = True
 ) -> FloatArray:
     """Return `value` as an array, checked for its shape and for finite rows at `where`.
 

@@ -23,7 +23,10 @@ from stario.sequences.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Timed:
-    """Rows at increasing times."""
+    """Rows at increasing times.
+
+    Like `ImuSequence`, subclasses keep checked copies of their arguments: `vars(self).update`.
+    """
 
     time: FloatArray
 
@@ -77,9 +80,8 @@ class PositionTrack(Timed):
             sigma = checked_array("positions' sigma", self.sigma, time.shape, where=valid)
             if sigma[valid].min(initial=math.inf) <= 0.0:
                 raise InputError("positions' sigma", f"{sigma[valid].min():g}", "above 0 m")
-            object.__setattr__(self, "sigma", sigma)
-        for name, value in (("time", time), ("position_W", position_W), ("valid", valid)):
-            object.__setattr__(self, name, value)
+            vars(self).update(sigma=sigma)
+        vars(self).update(time=time, position_W=position_W, valid=valid)
 
     @property
     def typical_sigma(self) -> float | None:
@@ -105,10 +107,8 @@ class Magnetometer(Timed):
 
     def __post_init__(self) -> None:
         time = checked_time("magnetometer's time", self.time)
-        everywhere = np.ones(len(time), dtype=np.bool_)
-        field = checked_array("magnetic field", self.field, (len(time), 3), where=everywhere)
-        object.__setattr__(self, "time", time)
-        object.__setattr__(self, "field", field)
+        field = checked_array("magnetic field", self.field, (len(time), 3))
+        vars(self).update(time=time, field=field)
 
     @property
     def rate(self) -> float:
@@ -133,4 +133,4 @@ class DeviceAttitude(Timed):
     def __post_init__(self) -> None:
         time = checked_time("device attitude's time", self.time)
         check_rotations("device attitude's attitude_WB", self.attitude_WB, time)
-        object.__setattr__(self, "time", time)
+        vars(self).update(time=time)

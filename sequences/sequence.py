@@ -77,13 +77,12 @@ class Trajectory(Timed):
         time = checked_time("time", self.time)
         valid = checked_valid("valid", self.valid, time)
         check_rotations("attitude_WB", self.attitude_WB, time)
-        arrays: dict[str, Any] = {"time": time, "valid": valid}
-        for name, shape in _TRAJECTORY_SHAPES.items():
-            value = getattr(self, name)
-            if value is not None:
-                arrays[name] = checked_array(name, value, (len(time), *shape), where=valid)
-        for name, value in arrays.items():
-            object.__setattr__(self, name, value)
+        arrays = {
+            name: checked_array(name, value, (len(time), *shape), where=valid)
+            for name, shape in _TRAJECTORY_SHAPES.items()
+            if (value := getattr(self, name)) is not None
+        }
+        vars(self).update(arrays, time=time, valid=valid)
 
     @property
     def quat_xyzw(self) -> FloatArray:
@@ -213,14 +212,11 @@ class ImuSequence:
             remedy = f"create one with {kind.__name__}(...)"
             check_type(name, getattr(self, name), kind, remedy, optional=True)
         time = some_times("time", self.time)
-        arrays = {"time": time}
-        for name in ("gyro", "accel"):
-            value = numbers(name, getattr(self, name))
+        vectors = {name: numbers(name, getattr(self, name)) for name in ("gyro", "accel")}
+        for name, value in vectors.items():
             if value.shape != (len(time), 3):
                 raise InputError(name, f"shape {value.shape}", f"({len(time)}, 3) as time")
-            arrays[name] = value
-        for name, value in arrays.items():
-            object.__setattr__(self, name, value)
+        vars(self).update(vectors, time=time)
 
     def __len__(self) -> int:
         return len(self.time)

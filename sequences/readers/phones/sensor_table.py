@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,9 +14,8 @@ import numpy as np
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.clocks import assumed_unit, refuse_row_numbers, time_unit
-from stario.sequences.readers.columns import Column
+from stario.sequences.readers.columns import Column, unit_factor
 from stario.sequences.readers.phones.sensor_layout import Layout, by_header, by_rows
-from stario.sequences.readers.phones.which_imu import Axes
 from stario.sequences.readers.table_head import TableHead, table_heads
 from stario.sequences.readers.text import IntArray, Table
 from stario.sequences.sequence import FloatArray
@@ -102,13 +101,13 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
     time, values = rows.values[kept, 0], rows.values[kept, 1:4]
     if table.biases:
         values = values - rows.values[kept, 4:7]
-    unit, factor = _unit(table.file, places, UNITS[sensor])
-    values = factor * values
+    named = next((place for place in places if place.unit), places[0])
+    values = unit_factor(table.file, named, UNITS[sensor]) * values
     _check_size(table.file, titles, sensor, values)
     per_second = time_unit(table.file, time, clock.unit)
     stamps = rows.stamps_ns(clock.index, per_second, kept)
     assumed = "" if clock.unit else assumed_unit(per_second, float(time[0]))
-    return Samples(stamps, values, unit, assumed)
+    return Samples(stamps, values, named.unit, assumed)
 
 
 def _complete_rows(file: Path, sensor: str, titles: str, values: FloatArray) -> IntArray:
@@ -123,16 +122,6 @@ def _complete_rows(file: Path, sensor: str, titles: str, values: FloatArray) -> 
     if not len(kept):
         raise ReadError(file, titles, "no row with all three", "samples of three axes")
     return kept
-
-
-def _unit(file: Path, places: Axes, known: Mapping[str, float]) -> tuple[str, float]:
-    """Return the unit that the axes' titles name, empty if none, and its factor."""
-    place = next((place for place in places if place.unit), None)
-    if place is None:
-        return "", 1.0
-    if place.unit not in known:
-        raise ReadError(file, f"header, {place.title}", f"unit {place.unit!r}", ", ".join(known))
-    return place.unit, known[place.unit]
 
 
 def _check_size(file: Path, titles: str, sensor: str, values: FloatArray) -> None:
