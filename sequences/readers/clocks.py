@@ -61,7 +61,7 @@ def resample_to_gyro(
         ]
         raise ReadError(path, "time", ", ".join(spans), "overlapping times on one clock")
     right = np.clip(np.searchsorted(accel_ns, gyro_ns), 1, len(accel_ns) - 1)
-    before, after = accel_ns[right - 1], accel_ns[np.minimum(right, len(accel_ns) - 1)]
+    before, after = accel_ns[right - 1], accel_ns[right]
     exact = (gyro_ns == before) | (gyro_ns == after)
     kept &= exact | (after - before <= round(MAX_TRUTH_GAP * 1e9))
     time, t = seconds(gyro_ns[kept], accel_ns[0]), seconds(accel_ns, accel_ns[0])

@@ -22,9 +22,9 @@ from stario.network.card import Card
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import load_model, save_model
 from stario.sequences.conventions import with_axes
-from stario.sequences.files import read_tum
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
+from stario.sequences.readers.tum import read_tum
 from stario.sequences.sequence import Trajectory
 
 COMMANDS = (
