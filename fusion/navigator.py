@@ -28,7 +28,7 @@ from stario.fusion.imu.stateful import Predictor, StatefulInference, displacemen
 from stario.fusion.recording import PreprocessedRecording, Progress, preprocess
 from stario.fusion.snapshot import check_same, pack, unpack
 from stario.fusion.state import ContinuousPose, NavState, SmoothedPose, Track, advanced, copied
-from stario.sequences.arrays import check_type
+from stario.sequences.arrays import check_choice, check_type
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 
@@ -60,8 +60,7 @@ class Navigator:
         prior: PriorPose | None = None,
         backend: BackendName = "ekf",
     ) -> None:
-        if not (isinstance(backend, str) and backend in BACKENDS):
-            raise InputError("backend", repr(backend), f"one of {', '.join(BACKENDS)}")
+        check_choice("backend", backend, BACKENDS)
         if not hasattr(model, "predict") or isinstance(model, type):
             remedy = "load_model(name) returns one"
             raise InputError("model", repr(model), "a model with `predict`", remedy)

@@ -23,7 +23,7 @@ from stario.fusion.imu.stateful import (
 from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
-from stario.sequences.inspection.dead_axes import warn_of_dead_axes
+from stario.sequences.inspection.constant_values import warn_of_dead_axes
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import MAX_IMU_GAP, WINDOW_SECONDS
 

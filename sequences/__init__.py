@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from stario.sequences.errors import ReadError as ReadError
     from stario.sequences.errors import StarioError as StarioError
     from stario.sequences.errors import WeightsError as WeightsError
-    from stario.sequences.files import read_tum as read_tum
-    from stario.sequences.files import write_tum as write_tum
     from stario.sequences.inspection.checks import check_units as check_units
     from stario.sequences.inspection.report import inspect_recording as inspect_recording
     from stario.sequences.legs import LegStream as LegStream
@@ -27,6 +25,8 @@ if TYPE_CHECKING:
     from stario.sequences.readers import find_recordings as find_recordings
     from stario.sequences.readers import read_recording as read_recording
     from stario.sequences.readers.csv_writer import write_csv as write_csv
+    from stario.sequences.readers.tum import read_tum as read_tum
+    from stario.sequences.readers.tum import write_tum as write_tum
     from stario.sequences.sequence import STANDARD_GRAVITY as STANDARD_GRAVITY
     from stario.sequences.sequence import DeviceAttitude as DeviceAttitude
     from stario.sequences.sequence import ImuSequence as ImuSequence
@@ -53,13 +53,13 @@ _NAMES = {
     "conventions": "with_conventions",
     "datasets.batch": "Skipped",
     "errors": "ConfigError InputError ReadError StarioError WeightsError",
-    "files": "read_tum write_tum",
     "inspection.checks": "check_units",
     "inspection.report": "inspect_recording",
     "legs": "LegStream leg_streams",
     "noise": "ImuNoise",
     "readers": "find_recordings read_recording",
     "readers.csv_writer": "write_csv",
+    "readers.tum": "read_tum write_tum",
     "sequence": "DeviceAttitude ImuSequence Magnetometer PositionTrack STANDARD_GRAVITY Trajectory",
     "simulation.imu": "GOOD_IMU ImuErrors PERFECT_IMU PHONE_IMU simulate_imu",
     "simulation.magnetometer": "INDOOR_FIELD MagneticField",

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError
 
@@ -30,9 +31,14 @@ def evenly_spaced(count: int, most: int) -> NDArray[np.intp]:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.intp))
 
 
+def trapezoids(time: FloatArray, values: FloatArray) -> FloatArray:
+    """Return the trapezoidal integrals (N - 1, k) of values (N, k) over the steps of time (N,)."""
+    return np.asarray(0.5 * np.diff(time)[:, None] * (values[1:] + values[:-1]))
+
+
 def integral(time: FloatArray, values: FloatArray) -> FloatArray:
     """Return the trapezoidal integral (N, k) over time (N,) of values (N, k), starting at 0."""
-    steps = 0.5 * np.diff(time)[:, None] * (values[1:] + values[:-1])
+    steps = trapezoids(time, values)
     return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
 
 
@@ -75,8 +81,9 @@ def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
     Raises:
         InputError: it is not; names the argument and the choices.
     """
-    if value not in (known := tuple(choices)):
-        raise InputError(name, repr(value), f"one of {', '.join(known)}")
+    known = tuple(choices)
+    if not (isinstance(value, str) and value in known):
+        raise InputError(name, shown(value), f"one of {', '.join(known)}")
 
 
 def shown(value: object) -> str:
@@ -144,8 +151,19 @@ def checked_valid(name: str, value: BoolArray, time: FloatArray) -> BoolArray:
     return valid
 
 
+def check_rotations(name: str, value: Rotation, time: FloatArray) -> None:
+    """Check that a value holds a rotation for each time (N,).
+
+    Raises:
+        InputError: it has another type, or their number differs.
+    """
+    check_type(name, value, Rotation, "Rotation.from_quat(quat_xyzw)")
+    if len(value) != len(time):
+        raise InputError(name, f"{len(value)} rotations", f"{len(time)} as time")
+
+
 def checked_array(
-    name: str, value: FloatArray, shape: tuple[int, ...], where: BoolArray
+    name: str, value: FloatArray, shape: tuple[int, ...], where: BoolArray | bool = True
 ) -> FloatArray:
     """Return `value` as an array, checked for its shape and for finite rows at `where`.
 

@@ -13,7 +13,7 @@ from stario.sequences.arrays import (
     BoolArray,
     FloatArray,
     check_choice,
-    check_type,
+    check_rotations,
     checked_array,
     checked_time,
     checked_valid,
@@ -23,7 +23,10 @@ from stario.sequences.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Timed:
-    """Rows at increasing times."""
+    """Rows at increasing times.
+
+    Like `ImuSequence`, subclasses keep checked copies of their arguments: `vars(self).update`.
+    """
 
     time: FloatArray
 
@@ -77,9 +80,8 @@ class PositionTrack(Timed):
             sigma = checked_array("positions' sigma", self.sigma, time.shape, where=valid)
             if sigma[valid].min(initial=math.inf) <= 0.0:
                 raise InputError("positions' sigma", f"{sigma[valid].min():g}", "above 0 m")
-            object.__setattr__(self, "sigma", sigma)
-        for name, value in (("time", time), ("position_W", position_W), ("valid", valid)):
-            object.__setattr__(self, name, value)
+            vars(self).update(sigma=sigma)
+        vars(self).update(time=time, position_W=position_W, valid=valid)
 
     @property
     def typical_sigma(self) -> float | None:
@@ -105,10 +107,8 @@ class Magnetometer(Timed):
 
     def __post_init__(self) -> None:
         time = checked_time("magnetometer's time", self.time)
-        everywhere = np.ones(len(time), dtype=np.bool_)
-        field = checked_array("magnetic field", self.field, (len(time), 3), where=everywhere)
-        object.__setattr__(self, "time", time)
-        object.__setattr__(self, "field", field)
+        field = checked_array("magnetic field", self.field, (len(time), 3))
+        vars(self).update(time=time, field=field)
 
     @property
     def rate(self) -> float:
@@ -132,9 +132,5 @@ class DeviceAttitude(Timed):
 
     def __post_init__(self) -> None:
         time = checked_time("device attitude's time", self.time)
-        remedy = "Rotation.from_quat(quat_xyzw)"
-        check_type("device attitude's attitude_WB", self.attitude_WB, Rotation, remedy)
-        if len(self.attitude_WB) != len(time):
-            found = f"{len(self.attitude_WB)} rotations"
-            raise InputError("device attitude", found, f"{len(time)} as time")
-        object.__setattr__(self, "time", time)
+        check_rotations("device attitude's attitude_WB", self.attitude_WB, time)
+        vars(self).update(time=time)

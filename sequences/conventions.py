@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import check_choice
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import (
     STANDARD_GRAVITY,
@@ -52,10 +54,8 @@ def with_conventions(
         InputError: an argument's value is unknown, a unit is given for numbers already converted
             from the one named in their file, or gravity cannot be restored.
     """
-    if gravity not in GRAVITY:
-        raise InputError("gravity", repr(gravity), f"one of {', '.join(GRAVITY)}")
-    if accel_sign not in ACCEL_SIGNS:
-        raise InputError("accel_sign", repr(accel_sign), f"one of {', '.join(ACCEL_SIGNS)}")
+    check_choice("gravity", gravity, GRAVITY)
+    check_choice("accel_sign", accel_sign, ACCEL_SIGNS)
     if accel_sign == "apple":
         turned = accel_unit.removeprefix("-")
         accel_unit = turned if accel_unit.startswith("-") else f"-{accel_unit}"
@@ -132,8 +132,12 @@ def axes_matrix(axes: str) -> FloatArray:
 def axes_named(R: FloatArray) -> str:
     """Return the `axes` text of the right-handed axes nearest to a rotation (3, 3)."""
     group = Rotation.create_group("O").as_matrix()
-    best = group[int(np.argmax((group * R).sum(axis=(1, 2))))]
-    return ",".join(("-" if row.min() < -0.5 else "") + "xyz"[np.abs(row).argmax()] for row in best)
+    return permuted(group[int(np.argmax((group * R).sum(axis=(1, 2))))], "xyz")
+
+
+def permuted(R: FloatArray, names: Sequence[str]) -> str:
+    """Return three names in the order and with the signs of a signed permutation (3, 3)."""
+    return ",".join(("-" if row.min() < -0.5 else "") + names[np.abs(row).argmax()] for row in R)
 
 
 def with_gravity(sequence: ImuSequence) -> ImuSequence:

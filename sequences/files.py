@@ -1,4 +1,4 @@
-"""Atomic writing of results (complete or not at all), and tracks in TUM format."""
+"""Atomic writing of results: complete or not at all."""
 
 from __future__ import annotations
 
@@ -16,14 +16,8 @@ from typing import IO, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import number_in
-from stario.sequences.attitude.rotations import NORM_TOLERANCE
-from stario.sequences.errors import InputError, ReadError
-from stario.sequences.sequence import FloatArray, Trajectory
-
-_TUM_FIELDS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
+from stario.sequences.errors import InputError
 
 
 @contextmanager
@@ -114,48 +108,6 @@ def _temporary(path: Path, kind: str) -> Iterator[Path]:
         raise InputError("path", found, "a writable location", fix) from error
 
 
-def write_tum(path: Path | str, trajectory: Trajectory) -> None:
-    """Write the valid poses as TUM lines `t x y z qx qy qz qw` with 9 decimals, body to world.
-
-    Raises:
-        InputError: there is no valid pose, or the folder does not exist.
-    """
-    valid = trajectory.valid
-    if not valid.any():
-        raise InputError("trajectory", "no valid pose", "at least one")
-    rows = np.column_stack(
-        [trajectory.time[valid], trajectory.position_W[valid], trajectory.quat_xyzw[valid]]
-    )
-    with atomic_write(path) as file:
-        np.savetxt(file, rows, fmt="%.9f", delimiter=" ")
-
-
-def read_tum(path: Path | str) -> Trajectory:
-    """Read a TUM track; lines starting with `#` and empty lines are skipped.
-
-    Raises:
-        ReadError: the file cannot be read, or a line does not hold eight finite numbers with
-            increasing time and a unit quaternion; the error names line and field.
-    """
-    path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ReadError(path, "file", str(error), "a readable TUM text file") from error
-    numbered = [
-        (number, line)
-        for number, line in enumerate(lines, start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if not numbered:
-        raise ReadError(path, "file", "no pose", "lines of " + " ".join(_TUM_FIELDS))
-    rows = np.array([_tum_row(path, number, line) for number, line in numbered])
-    _check_tum(path, [number for number, _ in numbered], rows)
-    return Trajectory(
-        time=rows[:, 0], position_W=rows[:, 1:4], attitude_WB=Rotation.from_quat(rows[:, 4:])
-    )
-
-
 def write_json(path: Path | str, obj: object) -> None:
     """Write JSON, indented by 2, keys in their order; NaN and infinity become null.
 
@@ -198,33 +150,6 @@ def write_npz(path: Path | str, **arrays: ArrayLike) -> None:
             raise InputError(name, f"dtype {value.dtype}", "numbers, bool or text")
     with atomic_write(path, "wb") as file:
         np.savez_compressed(file, **plain)  # type: ignore[arg-type]
-
-
-def _tum_row(path: Path, number: int, line: str) -> list[float]:
-    words = line.split()
-    if len(words) != len(_TUM_FIELDS):
-        expected = f"{len(_TUM_FIELDS)}: " + " ".join(_TUM_FIELDS)
-        raise ReadError(path, f"line {number}", f"{len(words)} values", expected)
-    row = [number_in(word) for word in words]
-    for name, word, value in zip(_TUM_FIELDS, words, row, strict=True):
-        if not math.isfinite(value):
-            raise ReadError(path, f"line {number}, {name}", repr(word), "a finite number")
-    return row
-
-
-def _check_tum(path: Path, numbers: list[int], rows: FloatArray) -> None:
-    not_increasing = np.flatnonzero(np.diff(rows[:, 0]) <= 0)
-    if len(not_increasing):
-        k = int(not_increasing[0])
-        found = f"{rows[k + 1, 0]!s} after {rows[k, 0]!s}"
-        raise ReadError(path, f"line {numbers[k + 1]}, t", found, "strictly increasing seconds")
-    norm = np.linalg.norm(rows[:, 4:], axis=1)
-    bad = np.flatnonzero(np.abs(norm - 1) > NORM_TOLERANCE)
-    if len(bad):
-        k = int(bad[0])
-        raise ReadError(
-            path, f"line {numbers[k]}, qx qy qz qw", f"norm {norm[k]:.4g}", "a unit quaternion"
-        )
 
 
 def _plain(obj: object) -> object:

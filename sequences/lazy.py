@@ -1,4 +1,4 @@
-"""Lazy imports: public names that are imported on first use.
+"""Lazy imports: public names that are imported on first use, and optional packages.
 
 SciPy, torch and gtsam take up to seconds to import; `stario --help` and callers that need a single
 reader should not wait for them.
@@ -10,6 +10,8 @@ import importlib
 import sys
 from collections.abc import Callable, Mapping
 from typing import Any
+
+from stario.sequences.errors import MissingPackageError
 
 
 def lazy_attributes(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
@@ -23,3 +25,18 @@ def lazy_attributes(package: str, modules: Mapping[str, str]) -> Callable[[str],
         return value
 
     return attribute
+
+
+def optional_package(name: str, extra: str) -> Any:
+    """Import and return an optional package.
+
+    Raises:
+        MissingPackageError: the error names the extra that installs the package.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        package = name.split(".")[0]
+        fix = f'pip install "stario[{extra}]"'
+        expected = f"the package {package}"
+        raise MissingPackageError(package, "not installed", expected, fix) from None

@@ -17,6 +17,9 @@ from stario.sequences.levelled_stream import levelled_streams
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, PositionTrack
 from stario.sequences.windows import WINDOW_RATE
 
+_SHORTEST_STRETCH = 12.0
+"""Minimum length of a stretch [s]."""
+
 _TRACK_STEP = 2.0
 """Time between the positions of a track that delimit its legs [s]."""
 
@@ -89,12 +92,8 @@ class LegStream:
         )
 
 
-def leg_streams(sequence: ImuSequence, min_seconds: float = 12.0) -> list[LegStream]:
+def leg_streams(sequence: ImuSequence) -> list[LegStream]:
     """Cut a recording with known positions into unbroken stretches with at least two legs.
-
-    Args:
-        sequence: recording with positions or waypoints.
-        min_seconds: minimum length of a stretch [s].
 
     Raises:
         InputError: the recording has no known positions, or its rate is not accepted.
@@ -103,7 +102,7 @@ def leg_streams(sequence: ImuSequence, min_seconds: float = 12.0) -> list[LegStr
         raise InputError(f"{sequence.name}: positions", "none", "positions or waypoints")
     start, stop, displacement, sigma = _legs(sequence.positions)
     streams = []
-    for stream in levelled_streams(sequence, min_seconds):
+    for stream in levelled_streams(sequence, _SHORTEST_STRETCH):
         legs = LegStream(
             sequence.name,
             sequence.positions.kind,

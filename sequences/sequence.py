@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from stario.sequences.arrays import BoolArray as BoolArray
 from stario.sequences.arrays import FloatArray as FloatArray
 from stario.sequences.arrays import (
+    check_rotations,
     check_type,
     checked_array,
     checked_time,
@@ -74,38 +75,33 @@ class Trajectory(Timed):
 
     def __post_init__(self) -> None:
         time = checked_time("time", self.time)
-        n = len(time)
         valid = checked_valid("valid", self.valid, time)
-        check_type("attitude_WB", self.attitude_WB, Rotation, "Rotation.from_quat(quat_xyzw)")
-        if len(self.attitude_WB) != n:
-            raise InputError("attitude_WB", f"{len(self.attitude_WB)} rotations", f"{n} as time")
-        arrays: dict[str, Any] = {"time": time, "valid": valid}
-        for name, shape in _TRAJECTORY_SHAPES.items():
-            value = getattr(self, name)
-            if value is not None:
-                arrays[name] = checked_array(name, value, (n, *shape), where=valid)
-        for name, value in arrays.items():
-            object.__setattr__(self, name, value)
+        check_rotations("attitude_WB", self.attitude_WB, time)
+        arrays = {
+            name: checked_array(name, value, (len(time), *shape), where=valid)
+            for name, shape in _TRAJECTORY_SHAPES.items()
+            if (value := getattr(self, name)) is not None
+        }
+        vars(self).update(arrays, time=time, valid=valid)
 
     @property
     def quat_xyzw(self) -> FloatArray:
         """Attitude as unit quaternions (N, 4), x y z w, body to world."""
         return np.asarray(self.attitude_WB.as_quat(), dtype=np.float64)
 
-    def at(self, time: FloatArray, max_gap: float = MAX_TRUTH_GAP) -> Trajectory:
+    def at(self, time: FloatArray) -> Trajectory:
         """Interpolate at other times: linear in position, slerp in attitude.
 
         Never interpolates across a gap: times outside the track, or between valid samples more
-        than `max_gap` apart, are returned with `valid` False.
+        than `MAX_TRUTH_GAP` apart, are returned with `valid` False.
 
         Args:
             time: (M,) [s], strictly increasing.
-            max_gap: longest step between valid neighbours [s].
 
         Raises:
             InputError: fewer than two valid samples to interpolate between.
         """
-        covered = self.covers(time, max_gap)
+        covered = self.covers(time)
         known = np.flatnonzero(self.valid)
         t = self.time[known]
         clipped = np.clip(time, t[0], t[-1])
@@ -125,7 +121,7 @@ class Trajectory(Timed):
             valid=covered,
         )
 
-    def covers(self, time: FloatArray, max_gap: float = MAX_TRUTH_GAP) -> BoolArray:
+    def covers(self, time: FloatArray) -> BoolArray:
         """Return whether the pose is known at each time (M,): `valid` of `at`, but faster.
 
         Raises:
@@ -138,7 +134,7 @@ class Trajectory(Timed):
         right = np.clip(np.searchsorted(t, time), 1, len(t) - 1)
         tolerance = max(1e-9, 4.0 * float(np.spacing(np.abs(t[[0, -1]]).max())))
         inside = (time >= t[0] - tolerance) & (time <= t[-1] + tolerance)
-        bracketed = ~is_gap(t[right] - t[right - 1], max_gap)
+        bracketed = ~is_gap(t[right] - t[right - 1])
         exact = np.minimum(np.abs(time - t[right]), np.abs(time - t[right - 1])) <= tolerance
         return np.asarray(inside & (bracketed | exact))
 
@@ -216,14 +212,11 @@ class ImuSequence:
             remedy = f"create one with {kind.__name__}(...)"
             check_type(name, getattr(self, name), kind, remedy, optional=True)
         time = some_times("time", self.time)
-        arrays = {"time": time}
-        for name in ("gyro", "accel"):
-            value = numbers(name, getattr(self, name))
+        vectors = {name: numbers(name, getattr(self, name)) for name in ("gyro", "accel")}
+        for name, value in vectors.items():
             if value.shape != (len(time), 3):
                 raise InputError(name, f"shape {value.shape}", f"({len(time)}, 3) as time")
-            arrays[name] = value
-        for name, value in arrays.items():
-            object.__setattr__(self, name, value)
+        vars(self).update(vectors, time=time)
 
     def __len__(self) -> int:
         return len(self.time)

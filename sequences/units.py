@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 
+from stario.sequences.arrays import shown
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 
@@ -61,6 +63,17 @@ def unit_named(text: str) -> str:
     return _SPELLINGS.get(plain, plain)
 
 
+def known_unit(field: str, text: str, known: Mapping[str, float]) -> str:
+    """Return a unit in the tables' spelling.
+
+    Raises:
+        InputError: it is not one of those known; names the field.
+    """
+    if (name := unit_named(text)) not in known:
+        raise InputError(field, shown(text), f"one of {', '.join(known)}")
+    return name
+
+
 def with_units(
     sequence: ImuSequence, gyro_unit: str = "rad/s", accel_unit: str = "m/s^2"
 ) -> ImuSequence:
@@ -83,9 +96,8 @@ def with_units(
 
 
 def _factor(sequence: ImuSequence, sensor: str, unit: str, known: dict[str, float]) -> float:
-    field, name = f"{sensor}_unit", unit_named(unit)
-    if name not in known:
-        raise InputError(field, repr(unit), f"one of {', '.join(known)}")
+    field = f"{sensor}_unit"
+    name = known_unit(field, unit, known)
     if known[name] != 1.0 and sensor in sequence.converted:
         found = f"{unit!r} for {sequence.name}, whose file names its unit"
         expected = f"{next(iter(known))}, to which it was converted on reading"

@@ -54,7 +54,7 @@ def compare(
     from stario.fusion.evaluation.results import scores_dict, write_comparison
     from stario.fusion.evaluation.summary import scores_of
     from stario.fusion.fix_file import read_fixes
-    from stario.sequences.readers.checked import optional_package
+    from stario.sequences.lazy import optional_package
 
     if not paths:
         refuse_unused(changed(reading), "without PATH", "use with a recording to read")

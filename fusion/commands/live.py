@@ -29,7 +29,7 @@ def live(
     out: Annotated[Path, typer.Option(help="Folder for the recordings.")] = Path("runs/live"),
 ) -> None:
     """Show live tracks on a web page, from Sensor Logger, phyphox or lines of JSON."""
-    from stario.sequences.readers.checked import optional_package
+    from stario.sequences.lazy import optional_package
 
     for package in ("starlette", "uvicorn", "plotly"):
         optional_package(package, "live")

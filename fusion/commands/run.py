@@ -46,7 +46,7 @@ def run(
     """Fuse each recording into a track with attitude, velocity, biases and covariance."""
     from stario.fusion.fix_file import read_fixes
     from stario.fusion.navigator import Navigator
-    from stario.sequences.readers.checked import optional_package
+    from stario.sequences.lazy import optional_package
 
     if report:
         optional_package("plotly", "report")

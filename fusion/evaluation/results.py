@@ -15,7 +15,8 @@ from stario.fusion.state import Track
 from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.plan import plan_view
 from stario.sequences.drawing.plots import error_over_time, innovations
-from stario.sequences.files import write_json, write_npz, write_tum
+from stario.sequences.files import write_json, write_npz
+from stario.sequences.readers.tum import write_tum
 
 
 def write_run(folder: Path, run: Comparison, config: NavigatorConfig) -> list[Path]:

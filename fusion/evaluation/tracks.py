@@ -17,7 +17,7 @@ from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.imu.stateful import Predictor, StatefulInference
 from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.state import Track
-from stario.sequences.arrays import integral, interpolated
+from stario.sequences.arrays import integral, interpolated, trapezoids
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -150,7 +150,7 @@ def _propagated_through_gaps(sequence: ImuSequence, truth: Trajectory) -> Trajec
     time, gyro = time[inside], gyro[inside]
     poses = truth.at(time)
     R_WB = poses.attitude_WB.as_matrix()
-    turns = 0.5 * (gyro[1:] + gyro[:-1]) * np.diff(time)[:, None]
+    turns = trapezoids(time, gyro)
     for start, stop in runs(~truth.covers(time)):
         for k in range(start, stop):
             R_WB[k] = R_WB[k - 1] @ exp_so3(turns[k - 1])

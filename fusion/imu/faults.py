@@ -8,9 +8,10 @@ Stopped sensors: no real sensor repeats its numbers for long, since noise change
 Six numbers that repeat for a tenth of a second come from sensors that have stopped, unless the
 device may be at rest. One sensor alone: loggers repeat samples of a slow one, and a coarse one at
 rest measures the same numbers for minutes. So its values must repeat for half a second in which the
-other one shows motion that they rule out, by the rules of `sequences.inspection.stuck`. From then
-on it counts as stopped until its values change. Samples of a stopped sensor are dropped, so that
-they are treated as a gap. A sensor whose values have never changed is dead, and the stream refused.
+other one shows motion that they rule out, by the rules of `sequences.inspection.constant_values`.
+From then on it counts as stopped until its values change. Samples of a stopped sensor are dropped,
+so that they are treated as a gap. A sensor whose values have never changed is dead, and the stream
+refused.
 
 Outliers: a spike is one sample that differs from both its neighbours by more than a carried device
 can cause; it is replaced by their mean. Saturation shows as values of a moving axis that repeat
@@ -36,7 +37,7 @@ from stario.fusion.health import Stopped
 from stario.fusion.imu.intervals import NO_FLAGS, SAME_TIME, Flags, ImuInterval, Sample
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_gyro
-from stario.sequences.inspection.stuck import check_not_dead, shaken, tilting
+from stario.sequences.inspection.constant_values import check_not_dead, shaken, tilting
 from stario.sequences.sequence import BoolArray, FloatArray
 from stario.sequences.windows import MIN_RATE
 

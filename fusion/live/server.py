@@ -36,8 +36,9 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from stario.fusion.live.hub import Hub, Viewer
 from stario.fusion.live.payload import Batch, joined, object_from, parse_line, parse_push
+from stario.sequences.arrays import check_choice
 from stario.sequences.errors import InputError, StarioError
-from stario.sequences.units import ACCEL_UNITS, unit_named
+from stario.sequences.units import ACCEL_UNITS, known_unit
 
 MAX_BYTES = 4 * 1024 * 1024
 """Maximum size of a push [bytes]."""
@@ -130,8 +131,7 @@ async def _data(request: Request) -> Response:
     try:
         _check_origin(request)
         unit = request.query_params.get("accel_unit", "m/s^2")
-        if (name := unit_named(unit)) not in ACCEL_UNITS:
-            raise InputError("accel_unit", repr(unit[:20]), ", ".join(ACCEL_UNITS))
+        name = known_unit("accel_unit", unit, ACCEL_UNITS)
         body = await _body(request)
         lines = request.headers.get("content-type", "").startswith("application/x-ndjson")
         sender = f"http {request.client.host if request.client else ''}"
@@ -187,8 +187,7 @@ async def _command(request: Request) -> Response:
     hub: Hub = request.app.state.hub
     _check_origin(request)
     device, command = request.path_params["device"], request.path_params["command"]
-    if command not in COMMANDS:
-        raise InputError("command", repr(command[:40]), ", ".join(COMMANDS))
+    check_choice("command", command, COMMANDS)
     values = {} if command != "fix" else _fix_values(object_from("body", await _body(request)))
     await hub.command(device, command, **values)
     return JSONResponse({"done": command})

@@ -18,7 +18,7 @@ from stario.fusion.evaluation.compare import Comparison
 from stario.fusion.state import Track
 from stario.sequences.drawing.figures import split_at_gaps, unbroken
 from stario.sequences.errors import InputError
-from stario.sequences.readers.checked import optional_package
+from stario.sequences.lazy import optional_package
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
 rr: Any = optional_package("rerun", "view")

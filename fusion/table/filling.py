@@ -14,9 +14,10 @@ from stario.fusion.table.cells import LEADING, Cell, fill_cell, reference_rows
 from stario.fusion.table.sets import FIRST, DataSet
 from stario.fusion.table.training import ReaderConfig, cell_recipe
 from stario.network.architectures import ARCHITECTURES, architecture
+from stario.sequences.arrays import check_choice
 from stario.sequences.datasets.batch import Skipped, each
-from stario.sequences.errors import ConfigError, InputError
-from stario.sequences.readers.checked import optional_package
+from stario.sequences.errors import InputError
+from stario.sequences.lazy import optional_package
 
 
 def table_cells(
@@ -74,16 +75,14 @@ def backend(name: str) -> AbstractContextManager[object]:
     at `RAY_ADDRESS`; without these, both start on this machine.
 
     Raises:
-        ConfigError: the name is unknown.
-        InputError: the backend's package is not installed.
+        InputError: the name is unknown, or the backend's package is not installed.
     """
     backends: dict[str, Callable[[], AbstractContextManager[object]]] = {
         "loky": nullcontext,
         "dask": _dask,
         "ray": _ray,
     }
-    if name not in backends:
-        raise ConfigError("--backend", repr(name), f"one of {', '.join(backends)}")
+    check_choice("--backend", name, backends)
     return backends[name]()
 
 

@@ -22,7 +22,7 @@ from stario.network.card import dump_card
 from stario.network.displacement import DisplacementNetwork
 from stario.network.runtime.onnx_file import CARD_KEY
 from stario.sequences.files import atomic_write
-from stario.sequences.readers.checked import optional_package
+from stario.sequences.lazy import optional_package
 from stario.sequences.windows import WINDOW_SAMPLES
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import Any
 from stario.network.card import Card, parse_card
 from stario.network.runtime.engines import OnnxEngine
 from stario.sequences.errors import WeightsError
-from stario.sequences.readers.checked import optional_package
+from stario.sequences.lazy import optional_package
 from stario.sequences.windows import WINDOW_SAMPLES
 
 CARD_KEY = "stario_card"

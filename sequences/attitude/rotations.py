@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import integral, interpolated
+from stario.sequences.arrays import integral, interpolated, trapezoids
 from stario.sequences.sequence import FloatArray
 
 NORM_TOLERANCE = 1e-2
@@ -60,8 +60,8 @@ def integrated_gyro(time: FloatArray, gyro: FloatArray) -> Rotation:
         time: (N,) without gaps [s].
         gyro: (N, 3) [rad/s].
     """
-    steps = 0.5 * np.diff(time)[:, None] * (gyro[1:] + gyro[:-1])
-    return Rotation.from_quat(cumulative_rotations(Rotation.from_rotvec(steps)))
+    turns = Rotation.from_rotvec(trapezoids(time, gyro))
+    return Rotation.from_quat(cumulative_rotations(turns))
 
 
 class GyroIntegral:

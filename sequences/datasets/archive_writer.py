@@ -15,8 +15,8 @@ from typing import Any
 
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_path
+from stario.sequences.lazy import optional_package
 from stario.sequences.readers.archive import SUFFIXES
-from stario.sequences.readers.checked import optional_package
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
 
 _log = logging.getLogger(__name__)

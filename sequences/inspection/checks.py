@@ -18,8 +18,8 @@ import numpy as np
 from stario.sequences.arrays import check_type
 from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.errors import InputError
+from stario.sequences.inspection.constant_values import check_not_dead
 from stario.sequences.inspection.samples import disorder
-from stario.sequences.inspection.stuck import check_not_dead
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 from stario.sequences.truth.fit import TruthFit, fit_truth
 from stario.sequences.truth.part import without_spikes

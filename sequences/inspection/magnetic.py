@@ -152,9 +152,8 @@ def assess_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
         return None
     time, gyro, accel = clean_samples(sequence)
     part = longest_unbroken(time)
-    time, gyro, accel = time[part], gyro[part], accel[part]
-    part = slice(int(np.searchsorted(time, time[0] + _LONGEST_S)))
-    time, gyro, accel = time[part], gyro[part], accel[part]
+    count = int(np.searchsorted(time[part], time[part.start] + _LONGEST_S))
+    time, gyro, accel = (values[part][:count] for values in (time, gyro, accel))
     field = sequence.magnetometer
     inside = slice(*np.searchsorted(field.time, time[[0, -1]]))
     stamps, values = field.time[inside], field.field[inside]

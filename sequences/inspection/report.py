@@ -10,7 +10,7 @@ import numpy as np
 from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
-from stario.sequences.inspection.dead_axes import dead_axis_problems
+from stario.sequences.inspection.constant_values import dead_axis_problems
 from stario.sequences.inspection.gyro_axes import GyroAxes, compare_gyro_axes
 from stario.sequences.inspection.magnetic import (
     MagneticFindings,

@@ -6,7 +6,7 @@ import logging
 
 import numpy as np
 
-from stario.sequences.inspection.stuck import stuck_problems
+from stario.sequences.inspection.constant_values import stuck_problems
 from stario.sequences.sequence import MAX_IMU_GAP, FloatArray, ImuSequence
 from stario.sequences.time_order import ahead_mask, increasing_mask
 from stario.sequences.windows import runs, usable

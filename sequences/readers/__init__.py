@@ -9,11 +9,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from stario.sequences.arrays import check_choice
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.inspection.samples import in_order
 from stario.sequences.readers.archive import (
     AttributeFilter,
     archive_members,
+    filter_words,
     is_archive,
     read_archive,
     split_name,
@@ -131,8 +133,7 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
     if not isinstance(path, str | Path):
         raise InputError("path", f"{path!r:.60}", "the path of a recording")
     path = Path(path)
-    if format != "auto" and format not in FORMATS:
-        raise InputError("format", repr(format), f"auto, {', '.join(FORMATS)}")
+    check_choice("format", format, ("auto", *FORMATS))
     _check_readable(path, "a recording")
     name = _recognised(path) if format == "auto" else format
     if name is None:
@@ -215,9 +216,9 @@ def _with_attributes(found: list[Path], where: AttributeFilter | None) -> list[P
     if errors and not chosen:
         raise errors[0]
     if not chosen:
-        filters = ", ".join(f"{key}={value}" for key, values in where.items() for value in values)
+        field = f"recordings with {filter_words(where)}"
         fix = "only recordings in archives have attributes"
-        raise ReadError(found[0], f"recordings with {filters}", "none", "at least one", fix)
+        raise ReadError(found[0], field, "none", "at least one", fix)
     return chosen
 
 

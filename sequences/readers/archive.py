@@ -16,9 +16,9 @@ from typing import Any, Literal
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import checked, optional_package, rotations
-from stario.sequences.readers.hdf5 import DAMAGED, opened_hdf5
-from stario.sequences.readers.lines import first_bytes
+from stario.sequences.lazy import optional_package
+from stario.sequences.readers.checked import checked, rotations
+from stario.sequences.readers.hdf5 import DAMAGED, is_hdf5, opened_hdf5
 from stario.sequences.sequence import (
     BoolArray,
     DeviceAttitude,
@@ -35,7 +35,6 @@ SUFFIXES = (".h5", ".hdf5")
 AttributeFilter = Mapping[str, Sequence[str]]
 """Filter of recordings: patterns for each attribute, one of which must match."""
 
-_HDF5_MAGIC = b"\x89HDF"
 _RONIN = "data.hdf5"
 _EXPECTED = "an intact HDF5 archive"
 _OPTIONAL = {
@@ -60,7 +59,7 @@ def is_archive(path: Path) -> bool:
     A file that cannot be opened counts as one unless it is named like RoNIN's: reading it then
     raises an error that names the damage.
     """
-    if path.suffix.lower() not in SUFFIXES or first_bytes(path, 4) != _HDF5_MAGIC:
+    if path.suffix.lower() not in SUFFIXES or not is_hdf5(path):
         return False
     h5py = optional_package("h5py", "readers")
     try:
@@ -109,6 +108,11 @@ def _attributes(group: Any) -> dict[str, str | float]:
     return {key: _plain(value) for key, value in group.attrs.items()}
 
 
+def filter_words(where: AttributeFilter) -> str:
+    """Return a filter as it is written in a list."""
+    return ", ".join(f"{key}={value}" for key, values in where.items() for value in values)
+
+
 def _matches(attributes: Mapping[str, str | float], where: AttributeFilter) -> bool:
     return all(
         any(fnmatchcase(_text(attributes.get(key, "")), pattern) for pattern in patterns)
@@ -119,7 +123,6 @@ def _matches(attributes: Mapping[str, str | float], where: AttributeFilter) -> b
 def _none_chosen(
     path: Path, known: list[dict[str, str | float]], where: AttributeFilter
 ) -> ReadError:
-    wanted = ", ".join(f"{key}={value}" for key, values in where.items() for value in values)
     none_match = (
         key
         for key, patterns in where.items()
@@ -129,7 +132,7 @@ def _none_chosen(
     values = sorted({_text(attributes.get(key, "")) for attributes in known} - {""})
     listed = ", ".join(values[:6]) + (f" and {len(values) - 6} more" if len(values) > 6 else "")
     expected = f"{key} to be one of {listed}" if listed else f"another attribute: none has {key}"
-    return ReadError(path, f"recordings with {wanted}", "none", expected)
+    return ReadError(path, f"recordings with {filter_words(where)}", "none", expected)
 
 
 def _text(value: str | float) -> str:

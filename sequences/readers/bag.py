@@ -19,13 +19,8 @@ from typing import Any
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import (
-    checked,
-    magnetometer,
-    optional_package,
-    rotations,
-    trajectory,
-)
+from stario.sequences.lazy import optional_package
+from stario.sequences.readers.checked import checked, magnetometer, rotations, trajectory
 from stario.sequences.readers.lines import first_bytes
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory

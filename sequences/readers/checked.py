@@ -1,16 +1,14 @@
-"""Checks shared by the readers: finite numbers, unit quaternions, optional packages."""
+"""Parts of a recording as files give them, checked: numbers, rotations, poses, magnetic field."""
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
-from stario.sequences.errors import MissingPackageError, ReadError
+from stario.sequences.errors import ReadError
 from stario.sequences.sequence import BoolArray, FloatArray, Magnetometer, Trajectory
 from stario.sequences.time_order import increasing_mask
 
@@ -95,18 +93,3 @@ def trajectory(
         attitude_WB=attitude_WB[keep],
         velocity_W=None if velocity_W is None else velocity_W[keep],
     )
-
-
-def optional_package(name: str, extra: str) -> Any:
-    """Import and return an optional package.
-
-    Raises:
-        MissingPackageError: the error names the extra that installs the package.
-    """
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        package = name.split(".")[0]
-        fix = f'pip install "stario[{extra}]"'
-        expected = f"the package {package}"
-        raise MissingPackageError(package, "not installed", expected, fix) from None

@@ -9,6 +9,7 @@ import numpy as np
 
 from stario.sequences.arrays import interpolated
 from stario.sequences.errors import ReadError
+from stario.sequences.readers.phones.sensor_words import XSENS_CLOCK
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import MAX_TRUTH_GAP, FloatArray
 from stario.sequences.units import TIME_UNITS
@@ -21,7 +22,7 @@ _RATES = (9.0, 1.05 * MAX_RATE)
 the factor between two units, so that only one unit fits."""
 
 
-_CLOCKS = {"sampletimefine": {"ticks of 100 us": 10**4, "us": 10**6}}
+_CLOCKS = {XSENS_CLOCK: {"ticks of 100 us": 10**4, "us": 10**6}}
 """Units of clocks by their title: Xsens counts 10 kHz ticks in MT devices, microseconds in DOTs."""
 
 _MARGIN_S = 60.0
@@ -60,7 +61,7 @@ def resample_to_gyro(
         ]
         raise ReadError(path, "time", ", ".join(spans), "overlapping times on one clock")
     right = np.clip(np.searchsorted(accel_ns, gyro_ns), 1, len(accel_ns) - 1)
-    before, after = accel_ns[right - 1], accel_ns[np.minimum(right, len(accel_ns) - 1)]
+    before, after = accel_ns[right - 1], accel_ns[right]
     exact = (gyro_ns == before) | (gyro_ns == after)
     kept &= exact | (after - before <= round(MAX_TRUTH_GAP * 1e9))
     time, t = seconds(gyro_ns[kept], accel_ns[0]), seconds(accel_ns, accel_ns[0])

@@ -1,4 +1,4 @@
-"""Opening of HDF5 files that may be damaged."""
+"""Recognising HDF5 files, and opening those that may be damaged."""
 
 from __future__ import annotations
 
@@ -8,10 +8,18 @@ from pathlib import Path
 from typing import Any
 
 from stario.sequences.errors import ReadError, StarioError
-from stario.sequences.readers.checked import optional_package
+from stario.sequences.lazy import optional_package
+from stario.sequences.readers.lines import first_bytes
+
+_MAGIC = b"\x89HDF\r\n\x1a\n"
 
 DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, AttributeError)
 """Exceptions of h5py and NumPy for a damaged file, or for one with other content."""
+
+
+def is_hdf5(path: Path) -> bool:
+    """Return whether a file is HDF5, by its first bytes; never raises."""
+    return first_bytes(path, len(_MAGIC)) == _MAGIC
 
 
 @contextmanager

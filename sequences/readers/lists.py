@@ -47,59 +47,46 @@ def list_entries(path: Path) -> Iterator[tuple[Path, AttributeFilter] | ReadErro
     while lines and not lines[-1].strip():
         lines.pop()
     numbered = enumerate(lines, 1)
-    written = [(k, x.split("#")[0]) for k, x in numbered if not x.lstrip().startswith("#")]
-    if not written:
+    entries = [(k, *_parsed(x.split("#")[0])) for k, x in numbered if x.lstrip()[:1] != "#"]
+    if not entries:
         raise ReadError(path, "list", "no entry", "names of recordings")
     bases = _bases(path.parent)
-    if len(written) > _HEAD_LINES and not any(_names_any(bases, text) for _, text in written):
-        shown = f"{len(written)} lines without an existing name, such as {written[0][1]:.60}"
-        raise ReadError(path, "list", shown, "a recording, or a list of them")
-    for number, text in written:
-        text, where = _split_filters(text)
-        name = _name_in(text)
+    if len(entries) > _HEAD_LINES and not any(_located(bases, name) for _, name, _ in entries):
+        found = f"{len(entries)} lines without an existing name, such as {entries[0][1]:.60}"
+        raise ReadError(path, "list", found, "a recording, or a list of them")
+    for number, name, where in entries:
         line = f"line {number}"
         if not name:
             fix = "delete the line"
             yield ReadError(path, line, "an empty entry", "a recording's name", fix)
-        elif (found := _located(bases, Path(name))) is None:
+        elif (located := _located(bases, name)) is None:
             fix = "remove the line or fetch the recording"
             yield ReadError(path, line, f"no {name}", "a recording", fix)
         else:
-            yield found, where
+            yield located, where
 
 
-def _names_any(bases: list[Path], text: str) -> bool:
-    """Return whether a line names a file or folder that exists."""
-    name = _name_in(_split_filters(text)[0])
-    return bool(name) and _located(bases, Path(name)) is not None
-
-
-def _name_in(text: str) -> str:
-    """Return the name in a line without its filters."""
-    return text.split(",")[0].strip()
-
-
-def _split_filters(text: str) -> tuple[str, AttributeFilter]:
-    """Split the `key=value` filters off the end of a line."""
+def _parsed(text: str) -> tuple[str, AttributeFilter]:
+    """Return the name in a line, and the `key=value` filters at its end."""
     where: dict[str, list[str]] = {}
     while match := _FILTER.search(text):
         where.setdefault(match["key"], []).insert(0, match["value"].strip('"'))
         text = text[: match.start()]
-    return text, where
+    return text.split(",")[0].strip(), where
 
 
 def _bases(folder: Path) -> list[Path]:
-    inside = _folders(folder)
-    if inside:
-        return [folder, *inside]
-    return [folder, folder.parent, *_folders(folder.parent)]
+    return [folder, *(_folders(folder) or [folder.parent, *_folders(folder.parent)])]
 
 
 def _folders(folder: Path) -> list[Path]:
     return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
 
 
-def _located(bases: list[Path], name: Path) -> Path | None:
-    forms = [name, *(name.parent / form / name.name for form in _OXIOD_FORMS)]
+def _located(bases: list[Path], name: str) -> Path | None:
+    if not name:
+        return None
+    path = Path(name)
+    forms = [path, *(path.parent / form / path.name for form in _OXIOD_FORMS)]
     candidates = (base / form for base in bases for form in forms)
-    return next((path for path in candidates if split_name(path)[0].exists()), None)
+    return next((found for found in candidates if split_name(found)[0].exists()), None)

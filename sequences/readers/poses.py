@@ -23,10 +23,9 @@ from stario.sequences.attitude.levelling import MIN_GRAVITY_FORCE
 from stario.sequences.attitude.rotations import NORM_TOLERANCE, tilt_aligning
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.clocks import time_unit
-from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.sensor_words import words_of
-from stario.sequences.readers.separators import first_row
-from stario.sequences.readers.text import IntArray, read_table, seconds
+from stario.sequences.readers.table_head import table_heads
+from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.time_order import increasing_mask
 from stario.sequences.truth.accel_axes import accel_axes
@@ -131,16 +130,11 @@ def pose_rows(file: Path) -> list[PoseCandidate]:
     Raises:
         ReadError: a row is malformed.
     """
-    lines = [(k, line) for k, line in enumerate(head_lines(file)) if line.strip()]
-    found = first_row(lines)
-    if found is None:
+    head = next(table_heads(file), None)
+    if head is None or head.rows.shape[1] < 8:
         return []
-    first, delimiter, decimal = found
-    width = len(lines[first][1].split(delimiter))
-    if width < 8:
-        return []
-    columns = 13 if width >= 13 else 8
-    table = read_table(file, columns, lines[first][0], delimiter, decimal, killed=True)
+    columns = 13 if head.rows.shape[1] >= 13 else 8
+    table = head.read(columns)
     stamps = table.stamps_ns(0, time_unit(file, table.values[:, 0]))
     numbers = table.values[:, 1:]
     if columns == 13:

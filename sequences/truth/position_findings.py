@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.conventions import axes_matrix, axes_named
+from stario.sequences.conventions import axes_matrix, axes_named, permuted
 from stario.sequences.legs import jumps
-from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.sequence import ImuSequence
 from stario.sequences.truth.findings import TruthProblem
 from stario.sequences.truth.positions import PositionFit
 
@@ -94,14 +93,8 @@ def _axes_problem(fit: PositionFit) -> TruthProblem:
     nearest = sign * axes_matrix(axes_named(sign * fit.Q_PW))
     if Rotation.from_matrix(nearest.T @ fit.Q_PW).magnitude() > _NEAR_RAD:
         return TruthProblem(found, "give both in the same world, with z up")
-    return TruthProblem(found, f"write {_columns(nearest.T)} as px,py,pz in the file")
-
-
-def _columns(R: FloatArray) -> str:
-    """Return the file's columns that a signed permutation (3, 3) puts in the place of px,py,pz."""
-    return ",".join(
-        ("-" if row.min() < -0.5 else "") + "p" + "xyz"[int(np.abs(row).argmax())] for row in R
-    )
+    columns = permuted(nearest.T, ("px", "py", "pz"))
+    return TruthProblem(found, f"write {columns} as px,py,pz in the file")
 
 
 def jump_problems(sequence: ImuSequence) -> list[str]:

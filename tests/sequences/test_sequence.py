@@ -64,9 +64,6 @@ def test_interpolation_never_crosses_a_gap(missing: bool) -> None:
     read = track.at(time)
     assert read.valid.tolist() == [True, True, False, False, False, True, True]
     assert np.isfinite(read.position_W).all()
-    wider = track.at(time, max_gap=0.5)
-    assert wider.valid.all()
-    assert np.allclose(wider.position_W, screw(time).position_W)
 
 
 def test_short_gaps_are_bridged_by_their_valid_neighbours() -> None:

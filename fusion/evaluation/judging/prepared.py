@@ -26,7 +26,7 @@ from stario.sequences.datasets.stream_cache import recording_key
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_write
 from stario.sequences.inspection.checks import check_units
-from stario.sequences.inspection.dead_axes import warn_of_dead_axes
+from stario.sequences.inspection.constant_values import warn_of_dead_axes
 from stario.sequences.legs import gaps_and_jumps
 from stario.sequences.levelled_stream import LevelledStream, levelled_streams
 from stario.sequences.sequence import (

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import interpolated
+from stario.sequences.arrays import integral, interpolated
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.phones.files import PhoneFiles
@@ -63,12 +63,10 @@ def agreeing_attitude(
     """
     good = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) < NORM_TOLERANCE
     stamps, quaternion = stamps[good], quaternion[good]
-    kept = (
-        increasing_mask(stamps.astype(np.float64)) if len(stamps) else np.empty(0, dtype=np.int64)
-    )
-    if len(kept) < 2:
-        return None
+    kept = increasing_mask(stamps.astype(np.float64))
     stamps, quaternion = stamps[kept], quaternion[kept]
+    if len(stamps) < 2:
+        return None
     orders = _ORDERS[:1] if named else _ORDERS
     variants = [Rotation.from_quat(quaternion[:, order]) for order in orders]
     variants += [variant.inv() for variant in variants]
@@ -84,14 +82,10 @@ def _explained(stamps_ns: IntArray, attitude_WB: Rotation, gyro: Samples) -> flo
     """
     order = np.unique(gyro.stamps_ns, return_index=True)[1]
     clock = seconds(gyro.stamps_ns[order], stamps_ns[0])
-    rate = gyro.values[order]
-    steps = 0.5 * np.diff(clock)[:, None] * (rate[1:] + rate[:-1])
-    angle = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
     time = seconds(stamps_ns, stamps_ns[0])
-    turned = interpolated(time, clock, angle)
+    turned = interpolated(time, clock, integral(clock, gyro.values[order]))
     logged = (attitude_WB[:-1].inv() * attitude_WB[1:]).as_rotvec()
-    inside = (time[:-1] >= clock[0]) & (time[1:] <= clock[-1])
-    inside &= np.diff(time) < _MAX_STEP_S
+    inside = (time[:-1] >= clock[0]) & (time[1:] <= clock[-1]) & (np.diff(time) < _MAX_STEP_S)
     if not inside.any():
         return 0.0
     measured = np.diff(turned, axis=0)[inside]

@@ -8,7 +8,6 @@ It holds the same data as the app's folder of CSV files, so it is converted to s
 from __future__ import annotations
 
 import csv
-import json
 import re
 import tempfile
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from stario.sequences.errors import ReadError
+from stario.sequences.readers.json_file import read_json
 from stario.sequences.readers.lines import head_lines
 
 _FIRST = re.compile(r"\ufeff?\s*\[\s*\{[^{}]*\"sensor\"\s*:")
@@ -56,11 +56,7 @@ def unpack_json(path: Path) -> Iterator[Path]:
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:
-    try:
-        rows = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError, RecursionError) as error:
-        found = " ".join(str(error).split())
-        raise ReadError(path, "file", found, "JSON", "is the download complete?") from None
+    rows = read_json(path)
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise ReadError(path, "file", "other JSON", "an array of objects, one for each sample")
     return rows

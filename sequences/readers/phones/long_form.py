@@ -20,7 +20,7 @@ from stario.sequences.errors import ReadError
 from stario.sequences.readers.lines import head_lines, is_row, read_lines, unquoted
 from stario.sequences.readers.phones.files import SUFFIXES
 from stario.sequences.readers.phones.sensor_words import sensor_of, words_of
-from stario.sequences.readers.separators import first_row
+from stario.sequences.readers.table_head import first_row
 
 _HEAD_ROWS = 50
 _MIN_SHARE = 0.5
@@ -72,7 +72,7 @@ def unpack_long_form(path: Path) -> Iterator[Path]:
 
 def _layout(lines: list[str]) -> _Layout | None:
     """Return how lines without blank ones are written, None if they are not of this form."""
-    found = first_row(list(enumerate(lines[:_HEAD_ROWS])), least=3)  # the time may be a date
+    found = first_row(lines[:_HEAD_ROWS], least=3)  # the time may be a date
     if found is None:
         return None
     first, delimiter, _ = found

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.readers.clocks import unit_within
-from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.sensor_words import words_of
-from stario.sequences.readers.separators import first_row
-from stario.sequences.readers.text import read_table, seconds
+from stario.sequences.readers.table_head import table_heads
+from stario.sequences.readers.text import seconds
 from stario.sequences.sequence import PositionTrack
 from stario.sequences.time_order import increasing_mask
 
@@ -35,12 +34,10 @@ def reference_points(
         words = set(words_of(file.stem))
         if file.suffix.lower() not in (".csv", ".txt") or not _NAMES & words:
             continue
-        lines = [(k, line) for k, line in enumerate(head_lines(file)) if line.strip()]
-        found = first_row(lines, least=3)
-        if found is None or not set(key.split()) <= words:
+        head = next(table_heads(file, least=3), None)
+        if head is None or not set(key.split()) <= words:
             continue
-        first, delimiter, decimal = found
-        table = read_table(file, 3, lines[first][0], delimiter, decimal, killed=True)
+        table = head.read(3)
         unit = unit_within(file, table.values[:, 0], start_ns, stop_ns)
         time = seconds(table.stamps_ns(0, unit), start_ns)
         kept = increasing_mask(time)

@@ -7,7 +7,7 @@ position with a probability of 68 % on Android, and about that on iOS.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +15,11 @@ import numpy as np
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.clocks import unit_within
 from stario.sequences.readers.columns import Column
-from stario.sequences.readers.dates import with_seconds
 from stario.sequences.readers.geodesy import east_north
-from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.sensor_layout import clock_of
 from stario.sequences.readers.phones.sensor_words import sensor_of, words_of
-from stario.sequences.readers.separators import cells_of, first_row, number_of
-from stario.sequences.readers.text import IntArray, Table, read_table, seconds
+from stario.sequences.readers.table_head import TableHead, table_heads
+from stario.sequences.readers.text import IntArray, Table, seconds
 from stario.sequences.sequence import FloatArray, PositionTrack
 from stario.sequences.time_order import increasing_mask
 from stario.sequences.units import TIME_UNITS
@@ -40,25 +38,17 @@ _RADIUS_PER_SIGMA = 1.51
 _USUAL_RADIUS = 10.0
 """Radius [m] where a file states none."""
 
-_HEAD_ROWS = 24
-"""Rows that show which columns are clocks."""
-
 _LARGEST_RADIUS = 30.0
 """Larger radii [m] are of positions from cells of the network or of rooms without reception."""
 
 
 @dataclass(frozen=True)
-class _Header:
-    """Columns of a file of positions, and how to read its rows, as in `SensorTable`."""
+class _Columns:
+    """Columns of a file of positions: clock, latitude, longitude and, if stated, radius."""
 
+    head: TableHead
     clock: Column
-    latitude: int
-    longitude: int
-    radius: int | None
-    skip: int
-    delimiter: str | None
-    decimal: str
-    dated: bool = False
+    used: list[int]
 
 
 def satellite_positions(
@@ -75,11 +65,11 @@ def satellite_positions(
         stop_ns: time of its last sample [ns].
     """
     for file in (sensors, *_named(sensors.parent, set(key.split()))):
-        header = _header(file)
-        if header is None:
+        columns = _positions_in(file)
+        if columns is None:
             continue
         try:
-            track = _read(file, header, start_ns, stop_ns)
+            track = _read(columns, start_ns, stop_ns)
         except ReadError as error:  # positions are optional
             _log.warning("satellite positions skipped: %s", error)
             continue
@@ -103,36 +93,17 @@ def _named(folder: Path, key: set[str]) -> list[Path]:
     return [file for *_, file in sorted(found)]
 
 
-def _header(file: Path) -> _Header | None:
+def _positions_in(file: Path) -> _Columns | None:
     """Return how to read a file's positions; None if it names none or has no clock."""
-    numbered = [(k, line) for k, line in enumerate(head_lines(file)) if line.strip()]
-    if header := _header_of(numbered):
-        return header
-    lines = with_seconds(line for _, line in numbered)
-    header = _header_of([(k, line) for (k, _), line in zip(numbered, lines, strict=True)])
-    return header and replace(header, clock=replace(header.clock, unit="s"), dated=True)
-
-
-def _header_of(numbered: list[tuple[int, str]]) -> _Header | None:
-    """Return the header in the lines at a file's start, with their numbers; None without one."""
-    found = first_row(numbered, least=3)
-    if found is None or not found[0]:
-        return None
-    first, delimiter, decimal = found
-    titles = [title.strip(" #\"'\ufeff") for title in numbered[first - 1][1].split(delimiter)]
-    places = [_place_of(title) for title in titles]
-    if not {"latitude", "longitude"} <= set(places):
-        return None
-    rows = [cells_of(line, delimiter, decimal) for _, line in numbered[first:]]
-    whole = [row for row in rows[:_HEAD_ROWS] if len(row) == len(titles)]
-    head = np.array([[number_of(cell) for cell in row] for row in whole])
-    clock = clock_of(titles, head) if len(whole) > 1 else None
-    if clock is None:
-        return None
-    radius = places.index("radius") if "radius" in places else None
-    latitude, longitude = places.index("latitude"), places.index("longitude")
-    skip = numbered[first][0]
-    return _Header(clock, latitude, longitude, radius, skip, delimiter, decimal)
+    for head in table_heads(file, least=3):
+        places = [_place_of(title) for title in head.titles]
+        if len(head.rows) < 2 or not {"latitude", "longitude"} <= set(places):
+            continue
+        if clock := clock_of(head.titles, head.rows):
+            used = [clock.index, places.index("latitude"), places.index("longitude")]
+            used += [places.index("radius")] if "radius" in places else []
+            return _Columns(head, head.clock(clock), used)
+    return None
 
 
 def _place_of(title: str) -> str:
@@ -145,23 +116,18 @@ def _place_of(title: str) -> str:
     return "radius" if "accuracy" in words and not others & words else ""
 
 
-def _read(
-    file: Path, header: _Header, start_ns: np.int64, stop_ns: np.int64
-) -> PositionTrack | None:
-    used = [header.clock.index, header.latitude, header.longitude]
-    used += [] if header.radius is None else [header.radius]
-    table = read_table(
-        file, used, header.skip, header.delimiter, header.decimal, killed=True, dated=header.dated
-    )
-    rows, time = _within(table, header, start_ns, stop_ns)
+def _read(columns: _Columns, start_ns: np.int64, stop_ns: np.int64) -> PositionTrack | None:
+    table = columns.head.read(columns.used)
+    rows, time = _within(table, columns.clock, start_ns, stop_ns)
     if len(rows) < 2:
         return None
-    radius = table.values[rows, 3] if header.radius is not None else np.full(len(rows), np.nan)
+    stated = len(columns.used) > 3
+    radius = table.values[rows, 3] if stated else np.full(len(rows), np.nan)
     radius = np.where(np.isfinite(radius), radius, _USUAL_RADIUS)
     valid = (radius > 0.0) & (radius <= _LARGEST_RADIUS)  # iOS: negative where there is none
     if valid.sum() < 2:
         found = f"{valid.sum()} of {len(valid)} positions known to {_LARGEST_RADIUS:g} m"
-        raise ReadError(file, "accuracy", found, "at least two")
+        raise ReadError(table.path, "accuracy", found, "at least two")
     origin = int(np.argmax(valid))
     degrees = np.vstack([table.values[rows[origin], 1:3], table.values[rows, 1:3]])
     xy = east_north(degrees)[1:]
@@ -169,7 +135,7 @@ def _read(
 
 
 def _within(
-    table: Table, header: _Header, start_ns: np.int64, stop_ns: np.int64
+    table: Table, clock: Column, start_ns: np.int64, stop_ns: np.int64
 ) -> tuple[IntArray, FloatArray]:
     """Return the rows (N,) with a new position within the recording, and their times [s].
 
@@ -183,10 +149,10 @@ def _within(
     rows = np.flatnonzero(known)
     if len(rows) < 2:  # a single one may be the last known before the start
         return rows[:0], np.zeros(0)
-    unit = TIME_UNITS.get(header.clock.unit)
+    unit = TIME_UNITS.get(clock.unit)
     if unit is None:
         unit = unit_within(table.path, table.values[rows, 0], start_ns, stop_ns)
-    time = seconds(table.stamps_ns(header.clock.index, unit, rows), start_ns)
+    time = seconds(table.stamps_ns(clock.index, unit, rows), start_ns)
     stop = float(stop_ns - start_ns) * 1e-9
     inside = (time >= 0.0) & (time <= stop)
     if not inside.any():

@@ -1,33 +1,28 @@
 """A text file of sensor samples: how its rows are written, and reading them in known units.
 
-`separators` determines how cells are separated, `sensor_layout` what the columns hold.
+`table_head` determines how cells are separated, `sensor_layout` what the columns hold.
 """
 
 from __future__ import annotations
 
 import logging
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.clocks import assumed_unit, refuse_row_numbers, time_unit
-from stario.sequences.readers.columns import Column, with_units_below
-from stario.sequences.readers.dates import with_seconds
-from stario.sequences.readers.lines import head_lines, unquoted
+from stario.sequences.readers.columns import Column, unit_factor
 from stario.sequences.readers.phones.sensor_layout import Layout, by_header, by_rows
-from stario.sequences.readers.phones.which_imu import Axes
-from stario.sequences.readers.separators import cells_of, first_row, number_of
-from stario.sequences.readers.text import IntArray, Table, read_table
+from stario.sequences.readers.table_head import TableHead, table_heads
+from stario.sequences.readers.text import IntArray, Table
 from stario.sequences.sequence import FloatArray
 from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS
 
 _log = logging.getLogger(__name__)
 
-_HEAD_ROWS = 24
 UNITS = {
     "accel": ACCEL_UNITS,
     "linear": ACCEL_UNITS,
@@ -41,21 +36,18 @@ _LIMITS = {"accel": 2e3, "linear": 2e3, "gravity": 2e3, "gyro": 1e4, "mag": 1e5}
 
 @dataclass(frozen=True, kw_only=True)
 class SensorTable(Layout):
-    """How to read a file's rows.
+    """How to read a file's rows, and what its columns hold."""
 
-    Attributes:
-        file: the file.
-        delimiter: separator of the cells; None for blanks.
-        decimal: decimal mark, a point or a comma.
-        skip: number of lines before the first row.
-        dated: whether the times are dates or times of day.
-    """
+    head: TableHead
 
-    file: Path
-    delimiter: str | None = ","
-    decimal: str = "."
-    skip: int = 0
-    dated: bool = False
+    @property
+    def file(self) -> Path:
+        """The file."""
+        return self.head.file
+
+    def read(self, columns: Sequence[Column]) -> Table:
+        """Read columns; arguments and errors as for `TableHead.read`."""
+        return self.head.read([place.index for place in columns])
 
 
 @dataclass(frozen=True)
@@ -77,57 +69,15 @@ class Samples:
 
 def sensor_table(file: Path) -> SensorTable | None:
     """Return how to read a file's rows, or None if that cannot be determined; never raises."""
-    numbered = [(k, line) for k, line in enumerate(head_lines(file)) if line.strip()]
-    numbered = numbered[: 4 * _HEAD_ROWS]
-    table = _table(file, numbered)
-    if table is not None:
-        return table
-    lines = with_seconds(line for _, line in numbered)
-    dated = [(k, line) for (k, _), line in zip(numbered, lines, strict=True)]
-    table = _table(file, dated) if dated != numbered else None
-    if table is None:
-        return None
-    row = next(line for k, line in numbered if k >= table.skip)
-
-    def in_seconds(clock: Column) -> Column:
-        was_number = math.isfinite(number_of(row.split(table.delimiter)[clock.index]))
-        return clock if was_number else replace(clock, unit="s")
-
-    clocks = {sensor: in_seconds(clock) for sensor, clock in table.clocks.items()}
-    return replace(table, dated=True, clock=in_seconds(table.clock), clocks=clocks)
-
-
-def _table(file: Path, numbered: list[tuple[int, str]]) -> SensorTable | None:
-    """Return how to read a file's rows, given the lines at its start with their numbers."""
-    if len(numbered) < 2:
-        return None
-    found = first_row(numbered[:-1])  # the last line may be cut
-    if found is None:
-        return None
-    first, delimiter, decimal = found
-    skip = numbered[first][0]
-    rows = [cells_of(line, delimiter, decimal) for _, line in numbered[first:-1]][:_HEAD_ROWS]
-    width = max(set(map(len, rows)), key=list(map(len, rows)).count)
-    rows = [row for row in rows if len(row) == width]
-    if len(rows) < 2:
-        return None
-    head = np.array([[number_of(cell) for cell in row] for row in rows])
-    layout = None
-    titles = _titles([line for _, line in numbered[:first]], delimiter)
-    if titles and (len(titles) == width or delimiter is not None):
-        layout = by_header(titles[:width], head)
-    layout = layout or by_rows(head)
-    if layout is None:
-        return None
-    return SensorTable(**vars(layout), file=file, delimiter=delimiter, decimal=decimal, skip=skip)
-
-
-def _titles(above: list[str], delimiter: str | None) -> list[str]:
-    """Return the titles in the last line above the rows, or above a line of their units."""
-    lines = [unquoted(line.lstrip("# "), delimiter).split(delimiter) for line in above[-2:]]
-    titles = with_units_below(*lines) if len(lines) == 2 else None
-    titles = titles or (lines[-1] if lines else [])
-    return [title.strip(" #\"'\ufeff") for title in titles]
+    for head in table_heads(file):
+        if len(head.rows) < 2:
+            continue
+        layout = by_header(head.titles, head.rows) or by_rows(head.rows)
+        if layout is not None:
+            clocks = {axes: head.clock(clock) for axes, clock in layout.clocks.items()}
+            clock = head.clock(layout.clock)
+            return SensorTable(**vars(layout) | {"clock": clock, "clocks": clocks}, head=head)
+    return None
 
 
 def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
@@ -144,20 +94,20 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
         raise ReadError(table.file, "header", f"several IMUs ({table.conflict})", "one", fix)
     places, clock = table.axes[axes], table.clocks.get(axes, table.clock)
     titles = ", ".join(p.title or f"column {p.index + 1}" for p in places)
-    rows = _rows(table, [clock, *places, *table.biases])
+    rows = table.read([clock, *places, *table.biases])
     kept = _complete_rows(table.file, sensor, titles, rows.values[:, 1:])
     if not clock.unit:
         refuse_row_numbers(table.file, clock.title or "time", rows.values[:, 0])
     time, values = rows.values[kept, 0], rows.values[kept, 1:4]
     if table.biases:
         values = values - rows.values[kept, 4:7]
-    unit, factor = _unit(table.file, places, UNITS[sensor])
-    values = factor * values
+    named = next((place for place in places if place.unit), places[0])
+    values = unit_factor(table.file, named, UNITS[sensor]) * values
     _check_size(table.file, titles, sensor, values)
     per_second = time_unit(table.file, time, clock.unit)
     stamps = rows.stamps_ns(clock.index, per_second, kept)
     assumed = "" if clock.unit else assumed_unit(per_second, float(time[0]))
-    return Samples(stamps, values, unit, assumed)
+    return Samples(stamps, values, named.unit, assumed)
 
 
 def _complete_rows(file: Path, sensor: str, titles: str, values: FloatArray) -> IntArray:
@@ -172,25 +122,6 @@ def _complete_rows(file: Path, sensor: str, titles: str, values: FloatArray) -> 
     if not len(kept):
         raise ReadError(file, titles, "no row with all three", "samples of three axes")
     return kept
-
-
-def _unit(file: Path, places: Axes, known: Mapping[str, float]) -> tuple[str, float]:
-    """Return the unit that the axes' titles name, empty if none, and its factor."""
-    place = next((place for place in places if place.unit), None)
-    if place is None:
-        return "", 1.0
-    if place.unit not in known:
-        raise ReadError(file, f"header, {place.title}", f"unit {place.unit!r}", ", ".join(known))
-    return place.unit, known[place.unit]
-
-
-def _rows(table: SensorTable, used: Sequence[Column]) -> Table:
-    """Read the given columns, skipping a last row that a killed recorder cut short."""
-    indices = [place.index for place in used]
-    return read_table(
-        table.file, indices, table.skip, table.delimiter, table.decimal,
-        killed=True, dated=table.dated,
-    )  # fmt: skip
 
 
 def _check_size(file: Path, titles: str, sensor: str, values: FloatArray) -> None:
@@ -209,6 +140,6 @@ def read_quaternion(table: SensorTable) -> tuple[IntArray, FloatArray]:
     Raises:
         ReadError: a row is malformed.
     """
-    rows = _rows(table, [table.clock, *table.quaternion])
+    rows = table.read([table.clock, *table.quaternion])
     per_second = time_unit(table.file, rows.values[:, 0], table.clock.unit)
     return rows.stamps_ns(table.clock.index, per_second), rows.values[:, 1:]

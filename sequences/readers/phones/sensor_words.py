@@ -49,7 +49,7 @@ _UNIT_WORDS = {
     **dict.fromkeys(("ms", "milli", "millis", "msec", "milliseconds"), "ms"),
     **dict.fromkeys(("s", "sec", "secs", "seconds"), "s"),
 }
-_XSENS_CLOCK = "sampletimefine"
+XSENS_CLOCK = "sampletimefine"
 """Clock of Xsens, whose unit `clocks.time_unit` determines."""
 
 _BRACKETS = re.compile(r"[\[(]\s*([^\])]*?)\s*[\])]")
@@ -190,8 +190,8 @@ def time_unit_of(name: str) -> str:
 
     Text in brackets is returned as it is, so that an unknown unit can be rejected.
     """
-    if "".join(words_of(name)) == _XSENS_CLOCK:
-        return _XSENS_CLOCK
+    if "".join(words_of(name)) == XSENS_CLOCK:
+        return XSENS_CLOCK
     if (named := _bracketed_unit(name)) and (named in TIME_UNITS or named not in ("", "since")):
         return named
     return next((_UNIT_WORDS[word] for word in reversed(words_of(name)) if word in _UNIT_WORDS), "")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked, magnetometer, rotations
+from stario.sequences.readers.json_file import read_json
 from stario.sequences.readers.lines import first_line, read_lines
 from stario.sequences.readers.text import read_table, seconds
 from stario.sequences.sequence import FloatArray, Magnetometer
@@ -83,14 +83,7 @@ class JsonFields:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        try:
-            self.fields = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise ReadError(path, "file", "no such file", "the recording's JSON file") from None
-        except (OSError, ValueError) as error:
-            found = " ".join(str(error).split())
-            raise ReadError(path, "file", found, "JSON", "is the download complete?") from None
+        self.path, self.fields = path, read_json(path)
         if not isinstance(self.fields, dict):
             raise ReadError(path, "file", type(self.fields).__name__, "a JSON object")
 

@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import binary_dilation, median_filter
 
+from stario.sequences.arrays import samples_in
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.checked import captured_rotations, magnetometer
 from stario.sequences.readers.clocks import resample_to_gyro, time_unit
@@ -170,7 +171,7 @@ def _position_glitches(time: FloatArray, position: FloatArray) -> BoolArray:
     """Return rows next to an impossible step or far from the median around them, dilated by two."""
     if len(time) < 2:
         return np.zeros(len(time), dtype=np.bool_)
-    half = max(1, round(0.25 / float(np.median(np.diff(time)))))
+    half = samples_in(0.25, time)
     median = median_filter(position, size=(2 * half + 1, 1), mode="nearest")
     distance = np.linalg.norm(position - median, axis=1)
     limit = _JUMP_M_S * np.maximum(np.diff(time), 1.0 / RATE)

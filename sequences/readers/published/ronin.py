@@ -30,12 +30,10 @@ from stario.sequences.readers.checked import (
     rotations,
     trajectory,
 )
-from stario.sequences.readers.hdf5 import opened_hdf5
-from stario.sequences.readers.lines import first_bytes
+from stario.sequences.readers.hdf5 import is_hdf5, opened_hdf5
 from stario.sequences.readers.published.by_name import JsonFields
 from stario.sequences.sequence import FloatArray, ImuSequence
 
-_MAGIC = b"\x89HDF\r\n\x1a\n"
 _FIELDS = {
     "synced/time": (),
     "synced/gyro_uncalib": (3,),
@@ -78,7 +76,7 @@ def read_ronin(path: Path) -> ImuSequence:
 
 def is_ronin(path: Path) -> bool:
     """Return whether a path is an HDF5 file or a folder with `data.hdf5`."""
-    return (path / "data.hdf5").is_file() or first_bytes(path, len(_MAGIC)) == _MAGIC
+    return (path / "data.hdf5").is_file() or is_hdf5(path)
 
 
 def _data_file(path: Path) -> Path:

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import interpolated
+from stario.sequences.arrays import interpolated, trapezoids
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import checked, rotations, trajectory
 from stario.sequences.readers.published.by_name import JsonFields
@@ -98,7 +98,7 @@ def _in_body_axes(time: FloatArray, gyro: FloatArray, attitude_WB: Rotation) -> 
     """
     if len(time) < 2:
         return False
-    turned = 0.5 * (gyro[1:] + gyro[:-1]) * np.diff(time)[:, None]
+    turned = trapezoids(time, gyro)
     steps_B = (attitude_WB[:-1].inv() * attitude_WB[1:]).as_rotvec()
     steps_W = attitude_WB[:-1].apply(steps_B)
     return bool(np.abs(turned - steps_B).sum() < np.abs(turned - steps_W).sum())

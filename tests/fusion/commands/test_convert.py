@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from stario.sequences.datasets.archive_writer import write_archive
-from stario.sequences.files import read_tum
 from stario.sequences.readers import find_recordings
 from stario.sequences.readers.generic_csv import read_generic_csv
+from stario.sequences.readers.tum import read_tum
 from stario.sequences.sequence import PositionTrack
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import generate_walk

@@ -14,9 +14,9 @@ from stario.fusion.commands.options import ReadingOptions
 from stario.fusion.commands.train import _recipe
 from stario.network import load_model
 from stario.network.training.config import FINE_TUNING, training_config
-from stario.sequences.files import read_tum
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
+from stario.sequences.readers.tum import read_tum
 
 # --- compare and evaluate ----------------------------------------------------------------------
 

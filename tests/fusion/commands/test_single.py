@@ -24,9 +24,9 @@ from stario.network.displacement import DisplacementNetwork
 from stario.network.model import DisplacementModel, load_model, save_model
 from stario.network.runtime.engines import OnnxEngine
 from stario.sequences.conventions import with_axes
-from stario.sequences.files import read_tum
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
+from stario.sequences.readers.tum import read_tum
 from stario.sequences.sequence import Trajectory
 
 COMMANDS = (

@@ -27,7 +27,7 @@ from stario.fusion.evaluation.summary import scores_of, summary, summary_table
 from stario.sequences.accuracy.metrics import evaluate_track
 from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.errors import StarioError
-from stario.sequences.files import read_tum
+from stario.sequences.readers.tum import read_tum
 from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
 
 CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=10, covariance_scale=1.0))

@@ -204,7 +204,7 @@ def test_results_belong_to_a_network_a_recipe_and_all_recordings_of_their_set(
 
 
 def test_an_unknown_backend_is_refused() -> None:
-    with pytest.raises(ConfigError, match="--backend"):
+    with pytest.raises(InputError, match="--backend"):
         backend("mpi")
 
 

@@ -15,7 +15,6 @@ from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.readers import find_recordings
-from stario.sequences.readers.phones.sensor_table import first_row
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.truth.alignment import align_tracked_body
 from stario.sequences.truth.clock_offset import clock_offset
@@ -136,13 +135,6 @@ def test_reference_points_take_the_time_unit_that_fits_the_recording(
     found = reference_points(tmp_path, "", np.int64(0), np.int64(30 * 10**9))
     assert found is not None
     np.testing.assert_allclose(found.time, [0.0, 2.0, 10.0, 28.0])
-
-
-def test_a_first_row_of_integers_has_the_decimal_mark_of_the_rows_below() -> None:
-    rows = ["Zeit;x;y;z", "0;0;0;0", "0,01;0,5;-0,25;9,8", "0,02;0,5;-0,25;9,8"]
-    assert first_row(list(enumerate(rows))) == (1, ";", ",")
-    points = [row.replace(",", ".") for row in rows]
-    assert first_row(list(enumerate(points))) == (1, ";", ".")
 
 
 @pytest.mark.parametrize(("delay", "sorts"), [(2, True), (60, False)])

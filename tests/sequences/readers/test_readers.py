@@ -303,7 +303,7 @@ def test_unknown_content_is_shown_with_the_known_formats(tmp_path: Path) -> None
     with pytest.raises(ReadError, match=r"found a folder with imu\.csv, expected one of"):
         read_recording(tmp_path)
     with pytest.raises(
-        InputError, match=r"format: found 'bags', expected auto, archive, ronin, .*, csv"
+        InputError, match=r"format: found 'bags', expected one of auto, archive, ronin, .*, csv"
     ):
         read_recording(path, format="bags")
 

@@ -44,7 +44,7 @@ def assert_consistent(path: Path) -> None:
     field = sequence.magnetometer
     assert field is not None
     inside = (field.time >= truth.time[0]) & (field.time <= truth.time[-1])
-    pose = truth.at(field.time[inside], max_gap=1.0)
+    pose = truth.at(field.time[inside])
     field_W = pose.attitude_WB.apply(field.field[inside])[pose.valid]
     assert 10.0 < np.linalg.norm(field_W.mean(axis=0)) < 60.0
     assert np.linalg.norm(field_W.std(axis=0)) < 0.6 * np.linalg.norm(field_W.mean(axis=0))

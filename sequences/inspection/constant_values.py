@@ -1,20 +1,74 @@
-"""Sensors that have stopped: values that repeat exactly while the other sensor shows motion."""
+"""Sensors and axes whose values repeat exactly although the device moves: stopped, or broken.
+
+Data simulated in a plane have constant axes too. So an axis of the gyroscope counts as dead only if
+the rates about both others vary, and one of the accelerometer only if the gyroscope turns gravity
+into it.
+"""
 
 from __future__ import annotations
+
+import logging
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import FloatArray
-from stario.sequences.windows import MIN_RATE, runs
+from stario.sequences.sequence import STANDARD_GRAVITY, BoolArray, FloatArray, ImuSequence
+from stario.sequences.windows import MIN_RATE, runs, usable
+
+_log = logging.getLogger(__name__)
 
 _STUCK_S = 1.0
 """Time [s] for which a stuck sensor's values repeat exactly; those of others repeat for 0.1 s."""
 
 _SHAKEN_M_S2 = 0.5
 _TILTING_RAD_S = 0.1
-"""Scatter of the force, and of the rate perpendicular to it, above which a device moves."""
+"""Scatter of the force, and of the rate that turns it in the device's axes, above which a device
+moves."""
+
+_VARIES_RAD_S = 0.01
+"""Scatter of a rate above which it varies: far above rounding, below any hand or vehicle."""
+
+_REMEDY = "is another column meant, or is the sensor broken?"
+
+
+def dead_axis_problems(sequence: ImuSequence) -> list[str]:
+    """Return one line for each sensor with a dead axis."""
+    given = usable(sequence)
+    gyro, accel = sequence.gyro[given], sequence.accel[given]
+    if len(gyro) < 2:
+        return []
+    found = {"gyroscope": _dead_gyro_axes(gyro), "accelerometer": _dead_accel_axes(gyro, accel)}
+    return [
+        f"{sequence.name}: {sensor}: its {axis} axis never changes, although the device turns: "
+        f"{_REMEDY}"
+        for sensor, dead in found.items()
+        for axis in np.array(["x", "y", "z"])[dead]
+    ]
+
+
+def warn_of_dead_axes(sequence: ImuSequence) -> None:
+    """Log a warning for each sensor with a dead axis: data simulated in a plane may be meant."""
+    for problem in dead_axis_problems(sequence):
+        _log.warning("%s", problem)
+
+
+def _dead_gyro_axes(gyro: FloatArray) -> BoolArray:
+    """Return which axes (3,) of rates (n, 3) are constant while both others vary."""
+    varies = gyro.std(axis=0) > _VARIES_RAD_S
+    return np.asarray(_constant(gyro) & (varies.sum() == 2))
+
+
+def _dead_accel_axes(gyro: FloatArray, accel: FloatArray) -> BoolArray:
+    """Return which axes (3,) of forces (n, 3) are constant while gravity turns into them."""
+    turned = np.cross(accel.mean(axis=0), gyro).std(axis=0)  # the force's rate of change
+    constant = _constant(accel)
+    alone = constant.sum() < 3  # otherwise the whole sensor is dead
+    return np.asarray(constant & alone & (turned > _TILTING_RAD_S * STANDARD_GRAVITY))
+
+
+def _constant(values: FloatArray) -> BoolArray:
+    return np.asarray((values == values[0]).all(axis=0))
 
 
 def stuck_problems(name: str, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> list[str]:
@@ -48,13 +102,12 @@ def check_not_dead(name: str, time: FloatArray, gyro: FloatArray, accel: FloatAr
     Raises:
         InputError: one's are.
     """
-    remedy = "is another column meant, or is the sensor broken?"
     if not np.diff(gyro, axis=0).any() and shaken(time, gyro, accel):
         found = "values that never change while the accelerometer's do"
-        raise InputError(f"{name}: gyroscope", found, "angular rates", remedy)
+        raise InputError(f"{name}: gyroscope", found, "angular rates", _REMEDY)
     if not np.diff(accel, axis=0).any() and tilting(time, gyro, accel):
         found = "values that never change while the gyroscope tilts them"
-        raise InputError(f"{name}: accelerometer", found, "specific forces", remedy)
+        raise InputError(f"{name}: accelerometer", found, "specific forces", _REMEDY)
 
 
 def shaken(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:

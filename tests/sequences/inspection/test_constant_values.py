@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stario.sequences.inspection.dead_axes import dead_axis_problems, warn_of_dead_axes
+from stario.sequences.inspection.constant_values import dead_axis_problems, warn_of_dead_axes
 from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.imu import simulate_imu

@@ -1,0 +1,24 @@
+"""Reading of JSON files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from stario.sequences.errors import ReadError
+
+
+def read_json(path: Path) -> Any:
+    """Return the content of a JSON file.
+
+    Raises:
+        ReadError: the file is missing or not JSON.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise ReadError(path, "file", "no such file", "a JSON file") from None
+    except (OSError, ValueError, RecursionError) as error:
+        found = " ".join(str(error).split())
+        raise ReadError(path, "file", found, "JSON", "is the download complete?") from None

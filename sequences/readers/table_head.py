@@ -1,0 +1,152 @@
+"""Head of a text file's table: separator, decimal mark, titles and first rows.
+
+Cells are separated by commas, semicolons, tabs or blanks; with any of the latter three, numbers may
+have a decimal comma. The first row of numbers determines both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from stario.sequences.arrays import number_in
+from stario.sequences.readers.columns import Column, with_units_below
+from stario.sequences.readers.dates import with_seconds
+from stario.sequences.readers.lines import head_lines, unquoted
+from stario.sequences.readers.text import Table, read_table
+from stario.sequences.sequence import FloatArray
+
+_FORMS: tuple[tuple[str | None, str], ...] = (
+    *((";", "."), (";", ","), ("\t", "."), ("\t", ","), (",", "."), (None, "."), (None, ",")),
+)
+"""Separators (None for blanks) and decimal marks in the order in which they are tried."""
+
+_MARK_ROWS = 5
+"""Number of rows that determine the decimal mark."""
+
+_HEAD_LINES, _HEAD_ROWS = 96, 24
+"""Number of lines within which the rows must begin, and of the rows that show what columns hold."""
+
+
+@dataclass(frozen=True)
+class TableHead:
+    """How to read a file's rows, and the first of them.
+
+    Attributes:
+        file: the file.
+        skip: number of lines before the first row.
+        delimiter: separator of the cells; None for blanks.
+        decimal: decimal mark, a point or a comma.
+        titles: titles of the columns; empty without any.
+        rows: (N, K) first rows, NaN where a cell is not a number.
+        dates: indices of the columns with dates or times of day, which become seconds.
+    """
+
+    file: Path
+    skip: int
+    delimiter: str | None
+    decimal: str
+    titles: list[str]
+    rows: FloatArray
+    dates: frozenset[int] = frozenset()
+
+    def read(self, columns: int | list[int]) -> Table:
+        """Read columns, given their number or indices, without a last row that is cut short.
+
+        Raises:
+            ReadError: a row is malformed.
+        """
+        return read_table(
+            self.file, columns, self.skip, self.delimiter, self.decimal,
+            killed=True, dated=bool(self.dates),
+        )  # fmt: skip
+
+    def clock(self, column: Column) -> Column:
+        """Return a clock's column with its unit, seconds if it holds dates."""
+        return replace(column, unit="s") if column.index in self.dates else column
+
+
+def table_heads(file: Path, least: int = 4) -> Iterator[TableHead]:
+    """Yield the head of a file's table and, if there are dates, that with dates as seconds.
+
+    Yields nothing without a row of `least` numbers; never raises.
+    """
+    lines = head_lines(file)
+    numbers = [k for k, line in enumerate(lines) if line.strip()][:_HEAD_LINES]
+    written = [lines[k] for k in numbers]
+    if head := _head(file, numbers, written, least):
+        yield head
+    in_seconds = with_seconds(written)
+    if in_seconds != written and (head := _head(file, numbers, in_seconds, least)):
+        cells = cells_of(written[numbers.index(head.skip)], head.delimiter, head.decimal)
+        dates = (k for k, cell in enumerate(cells) if math.isnan(number_of(cell)))
+        yield replace(head, dates=frozenset(dates))
+
+
+def _head(file: Path, numbers: list[int], lines: list[str], least: int) -> TableHead | None:
+    """Return the head of a table in lines without blank ones, given their numbers in the file."""
+    found = first_row(lines, least)
+    if found is None:
+        return None
+    first, delimiter, decimal = found
+    rows = [cells_of(line, delimiter, decimal) for line in lines[first:]]
+    rows = (rows[:-1] if len(rows) > 2 else rows)[:_HEAD_ROWS]  # the last line may be cut
+    width = max(set(map(len, rows)), key=list(map(len, rows)).count)
+    titles = _titles(lines[:first], delimiter)
+    if delimiter is None and len(titles) != width:  # words of a comment
+        titles = []
+    values = np.array([[number_of(cell) for cell in row] for row in rows if len(row) == width])
+    return TableHead(file, numbers[first], delimiter, decimal, titles[:width], values)
+
+
+def _titles(above: list[str], delimiter: str | None) -> list[str]:
+    """Return the titles in the last line above the rows, or above a line of their units."""
+    lines = [unquoted(line.lstrip("# "), delimiter).split(delimiter) for line in above[-2:]]
+    titles = with_units_below(*lines) if len(lines) == 2 else None
+    titles = titles or (lines[-1] if lines else [])
+    return [title.strip(" #\"'\ufeff") for title in titles]
+
+
+def first_row(lines: list[str], least: int = 4) -> tuple[int, str | None, str] | None:
+    """Return the index of the first row of `least` numbers, its delimiter and its decimal mark.
+
+    There must be no blank line.
+    """
+    for k, line in enumerate(lines):
+        if line.lstrip().startswith("#"):
+            continue
+        for delimiter, decimal in _FORMS:
+            cells = cells_of(line, delimiter, decimal)
+            numbers = _count_numbers(cells)
+            if numbers >= least and 2 * numbers >= sum(bool(cell.strip()) for cell in cells):
+                return k, delimiter, _decimal_mark(lines[k : k + _MARK_ROWS], delimiter, decimal)
+    return None
+
+
+def cells_of(line: str, delimiter: str | None, decimal: str) -> list[str]:
+    """Return a line's cells, with decimal points."""
+    return (line.replace(",", ".") if decimal == "," else line).split(delimiter)
+
+
+def number_of(cell: str) -> float:
+    """Return the number in a cell, perhaps quoted; NaN if it holds none."""
+    return number_in(cell.strip(" \"'"))
+
+
+def _count_numbers(cells: list[str]) -> int:
+    return sum(math.isfinite(number_of(cell)) for cell in cells)
+
+
+def _decimal_mark(rows: list[str], delimiter: str | None, first: str) -> str:
+    """Return the mark that gives the most numbers: a row of integers (0;0;0;0) fits either."""
+    if delimiter == ",":
+        return first
+
+    def numbers(decimal: str) -> int:
+        return sum(_count_numbers(cells_of(line, delimiter, decimal)) for line in rows)
+
+    return max((first, "." if first == "," else ","), key=numbers)

@@ -1,0 +1,65 @@
+"""Tracks in TUM format: lines `t x y z qx qy qz qw`, body to world."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.sequences.attitude.rotations import NORM_TOLERANCE
+from stario.sequences.errors import InputError, ReadError
+from stario.sequences.files import atomic_write
+from stario.sequences.readers.lines import read_lines
+from stario.sequences.readers.rows import parsed_rows, rows_below
+from stario.sequences.sequence import Trajectory
+
+_FIELDS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
+
+
+def write_tum(path: Path | str, trajectory: Trajectory) -> None:
+    """Write the valid poses with 9 decimals.
+
+    Raises:
+        InputError: there is no valid pose, or the folder does not exist.
+    """
+    valid = trajectory.valid
+    if not valid.any():
+        raise InputError("trajectory", "no valid pose", "at least one")
+    rows = np.column_stack(
+        [trajectory.time[valid], trajectory.position_W[valid], trajectory.quat_xyzw[valid]]
+    )
+    with atomic_write(path) as file:
+        np.savetxt(file, rows, fmt="%.9f", delimiter=" ")
+
+
+def read_tum(path: Path | str) -> Trajectory:
+    """Read a TUM track; lines starting with `#` and empty lines are skipped.
+
+    Raises:
+        ReadError: the file cannot be read, or a line does not hold eight finite numbers with
+            increasing time and a unit quaternion; the error names line and field.
+    """
+    path = Path(path)
+    numbered = rows_below(path, read_lines(path), 0)
+    for number, line in numbered:
+        if (count := len(line.split())) != len(_FIELDS):
+            expected = f"{len(_FIELDS)}: {' '.join(_FIELDS)}"
+            raise ReadError(path, f"line {number}", f"{count} values", expected)
+    rows = parsed_rows(path, numbered, None, range(len(_FIELDS)), _FIELDS)
+
+    def refusal(k: int, field: str, found: str, expected: str) -> ReadError:
+        return ReadError(path, f"line {numbered[k][0]}, {field}", found, expected)
+
+    if not (finite := np.isfinite(rows)).all():
+        k, column = np.argwhere(~finite)[0].tolist()
+        raise refusal(k, _FIELDS[column], repr(numbered[k][1].split()[column]), "a finite number")
+    if not (later := np.diff(rows[:, 0]) > 0.0).all():
+        k = int(np.argmin(later))
+        found = f"{rows[k + 1, 0]!s} after {rows[k, 0]!s}"
+        raise refusal(k + 1, "t", found, "strictly increasing seconds")
+    norm = np.linalg.norm(rows[:, 4:], axis=1)
+    if (off := np.abs(norm - 1.0) > NORM_TOLERANCE).any():
+        k = int(np.argmax(off))
+        raise refusal(k, "qx qy qz qw", f"norm {norm[k]:.4g}", "a unit quaternion")
+    return Trajectory(rows[:, 0], rows[:, 1:4], Rotation.from_quat(rows[:, 4:]))

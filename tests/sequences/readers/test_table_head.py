@@ -1,0 +1,53 @@
+"""The head of a text file's table: separator, decimal mark, titles, dates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stario.sequences.readers.table_head import TableHead, first_row, table_heads
+
+
+def head_of(folder: Path, *lines: str) -> TableHead:
+    file = folder / "table.csv"
+    file.write_text("\n".join(lines))
+    *_, last = table_heads(file)
+    return last
+
+
+def test_a_first_row_of_integers_has_the_decimal_mark_of_the_rows_below() -> None:
+    rows = ["Zeit;x;y;z", "0;0;0;0", "0,01;0,5;-0,25;9,8", "0,02;0,5;-0,25;9,8"]
+    assert first_row(rows) == (1, ";", ",")
+    points = [row.replace(",", ".") for row in rows]
+    assert first_row(points) == (1, ";", ".")
+
+
+def test_titles_are_those_above_a_row_of_their_units(tmp_path: Path) -> None:
+    head = head_of(
+        tmp_path, "# by a logger", "t;x;y;z", "s;rad/s;rad/s;rad/s", "0;1;2;3", "1;1;2;3"
+    )
+    assert head.titles == ["t [s]", "x [rad/s]", "y [rad/s]", "z [rad/s]"]
+    assert (head.skip, head.delimiter) == (3, ";")
+
+
+def test_words_above_rows_with_blanks_are_no_titles(tmp_path: Path) -> None:
+    assert head_of(tmp_path, "made by a logger on a phone", "0 1 2 3", "1 1 2 3").titles == []
+    assert head_of(tmp_path, "t x y z", "0 1 2 3", "1 1 2 3").titles == ["t", "x", "y", "z"]
+
+
+def test_a_last_line_that_may_be_cut_does_not_count(tmp_path: Path) -> None:
+    head = head_of(tmp_path, "t,x,y,z", "10,1,2,3", "20,1,2,3", "3,1,2,3")
+    np.testing.assert_array_equal(head.rows[:, 0], [10.0, 20.0])
+
+
+@pytest.mark.parametrize("form", ["2024-05-01T12:00:00.{:02d}Z", "12:00:00.{:02d}"])
+def test_columns_with_dates_become_seconds(tmp_path: Path, form: str) -> None:
+    rows = [f"{form.format(k)},{k},1,2,3" for k in range(5)]
+    head = head_of(tmp_path, "date,count,x,y,z", *rows)
+    assert head.dates == {0}
+    read = head.read([0, 1])
+    np.testing.assert_allclose(
+        read.values[:, 0] - read.values[0, 0], 0.01 * np.arange(5), atol=1e-6
+    )
