@@ -27,9 +27,10 @@ def shaped(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise InputError(name, repr(value), f"numbers of shape {shape}") from None
+        expected = f"numbers of shape {shape}" if shape else "a number"
+        raise InputError(name, repr(value), expected) from None
     if array.shape != shape:
-        raise InputError(name, f"shape {array.shape}", f"{shape}")
+        raise InputError(name, f"shape {array.shape}", f"{shape}" if shape else "a number")
     return array
 
 

@@ -22,6 +22,7 @@ from stario.fusion.recording import Progress
 from stario.fusion.state import Track
 from stario.sequences.accuracy.metrics import CONVENTIONS, Alignment, align, evaluate_track
 from stario.sequences.accuracy.nees import position_nees
+from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
@@ -149,9 +150,10 @@ def compare(
     """Compute every track of a recording; tracks share predictions, EKF and graph use the fixes.
 
     Raises:
-        InputError: the recording is too short, its units or rate are wrong, or no fix is within
-            its time.
+        InputError: the recording is too short, its units or rate are wrong, no fix is within its
+            time, or an argument has the wrong type.
     """
+    check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
     check_within(fixes, sequence)
     navigator = Navigator(model, config)
     preprocessed = navigator.observe(sequence, progress)

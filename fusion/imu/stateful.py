@@ -40,6 +40,10 @@ SLOPE_SIGMA = 0.03
 the height. With it the median position NEES of KIPD, some of whose walks climb, falls from 12.4 to
 7.2, that of RIDI from 4.6 to 3.8; with 0.05 that of OxIOD would be 1.4 (2.4 expected)."""
 
+_ASYMMETRY = 1e-5
+"""Largest asymmetry of predicted covariances, relative to their largest element: 32-bit rounding
+and no more."""
+
 Displacement = tuple[FloatArray, FloatArray]
 """Displacement (3,) [m] and covariance (3, 3) [m^2] in the window's frame N."""
 
@@ -126,7 +130,8 @@ class Predictor(Protocol):
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Predict displacement (B, 3) [m] and covariance (B, 3, 3) [m^2] of windows (B, 6, 200).
 
-        Windows and predictions are in frame H: z up, the device's heading zero.
+        A window is one second at 200 Hz: angular rate [rad/s], then specific force [m/s^2], gravity
+        included. Windows and predictions are in frame H: z up, the device's heading zero.
         """
         ...
 
@@ -164,8 +169,13 @@ class StatefulInference:
 
         Returns:
             displacement (B, 3) [m] and covariance (B, 3, 3) [m^2] in N.
+
+        Raises:
+            InputError: the model's predictions are not arrays of these shapes, or a covariance is
+                asymmetric.
         """
-        mean_H, covariance_H = self._stretch.predict(rotated_windows(windows_N, -heading))
+        answer = self._stretch.predict(rotated_windows(windows_N, -heading))
+        mean_H, covariance_H = _checked(answer, len(heading))
         R_NH = about_z(heading).as_matrix()
         with np.errstate(invalid="ignore"):  # the estimator refuses values that are not finite
             mean_N: FloatArray = (R_NH @ mean_H[:, :, None])[:, :, 0]
@@ -194,6 +204,23 @@ class StatefulInference:
             )
         if self.is_recurrent:
             self._stretch.memory = memory
+
+
+def _checked(answer: Any, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return a model's predictions as arrays: other shapes would be broadcast, or fail unnamed."""
+    expected = f"displacements ({count}, 3) and covariances ({count}, 3, 3)"
+    try:
+        mean, covariance = (np.asarray(part, dtype=np.float64) for part in answer)
+    except (TypeError, ValueError):
+        found = f"no pair of arrays from its `predict`, but {type(answer).__name__}"
+        raise InputError("model", found, expected) from None
+    if mean.shape != (count, 3) or covariance.shape != (count, 3, 3):
+        found = f"shapes {mean.shape} and {covariance.shape} from its `predict`"
+        raise InputError("model", found, expected)
+    asymmetry = np.abs(covariance - covariance.transpose(0, 2, 1)).max(initial=0.0)
+    if asymmetry > _ASYMMETRY * np.abs(covariance).max(initial=0.0):
+        raise InputError("model", "asymmetric covariances from its `predict`", "symmetric ones")
+    return mean, covariance
 
 
 def displacements_of(

@@ -179,7 +179,8 @@ def _updates(health: Health) -> Iterator[Finding]:
         gated = health.gated / health.updates
         text = f"{gated:.0%} of the network's displacements contradict the IMU."
         advice = (
-            "The motion may differ from the training data (carrying, running, wheels): "
+            "Check that both sensors have the same axes and signs (`stario inspect`). "
+            "If so, the motion may differ from the training data (carrying, running, wheels): "
             "fine-tune the weights on recordings of this kind with `stario train`."
         )
         yield Finding("warning", text, advice)

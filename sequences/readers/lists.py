@@ -61,7 +61,8 @@ def list_entries(path: Path) -> Iterator[tuple[Path, AttributeFilter] | ReadErro
             yield ReadError(path, line, "an empty entry", "a recording's name", fix)
         elif (located := _located(bases, name)) is None:
             fix = "remove the line or fetch the recording"
-            yield ReadError(path, line, f"no {name}", "a recording", fix)
+            found_name = f"{name!r}, which does not exist"
+            yield ReadError(path, line, found_name, "the name of a recording", fix)
         else:
             yield located, where
 

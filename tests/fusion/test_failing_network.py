@@ -1,4 +1,4 @@
-"""A network that raises an error: the caller sees it, and the stream goes on."""
+"""A network that raises an error or predicts other shapes: the caller sees it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from support import stream
 
 from stario.fusion import Navigator
 from stario.fusion.backends import BackendName
+from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 
 
@@ -45,3 +46,43 @@ def test_a_stream_continues_after_its_network_has_failed(
     errors = [np.linalg.norm(s.p_W - expected[s.time]) for s in states if s is not None]
     assert len(errors) == len(expected) - 3
     assert max(errors) < 0.1
+
+
+def zeros(count: int) -> np.ndarray:
+    return np.zeros((count, 3))
+
+
+def variances(count: int) -> np.ndarray:
+    return np.tile(0.01 * np.eye(3), (count, 1, 1))
+
+
+@pytest.mark.parametrize(
+    ("predict", "named"),
+    [
+        (lambda n: None, "NoneType"),
+        (lambda n: zeros(n), "ndarray"),
+        (lambda n: (zeros(n), 0.01 * np.ones((n, 3))), r"covariances \(\d+, 3, 3\)"),
+        (lambda n: (zeros(n)[:, :2], variances(n)), r"displacements \(\d+, 3\)"),
+        (lambda n: (zeros(1), variances(1)), r"shapes \(1, 3\)"),  # would be every window's
+        (lambda n: (zeros(n), variances(n) + np.triu(np.ones((3, 3)), 1)), "asymmetric"),
+    ],
+)
+def test_predictions_of_other_shapes_are_refused(
+    walk: ImuSequence, predict: Callable[[int], Any], named: str
+) -> None:
+    class Custom:
+        def predict(self, windows: Any) -> Any:
+            return predict(len(windows))
+
+    with pytest.raises(InputError, match=f"model.*{named}"):
+        Navigator(Custom()).run(walk)
+
+
+def test_predictions_may_be_lists(walk: ImuSequence) -> None:
+    class Custom:
+        def predict(self, windows: Any) -> Any:
+            return zeros(len(windows)).tolist(), variances(len(windows)).tolist()
+
+    track = Navigator(Custom()).run(walk)
+    assert track.health is not None
+    assert track.health.updates > 0

@@ -14,6 +14,7 @@ from stario.fusion import (
     Navigator,
     NavigatorConfig,
     PriorPose,
+    compare,
     position_fix,
     yaw_fix,
 )
@@ -37,6 +38,9 @@ LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
         (lambda model: Navigator(type(model)), "model"),
         (lambda model: Navigator(model).run("walk.csv"), "sequence"),
         (lambda model: Navigator(model).restore("text"), "snapshot"),
+        (lambda model: Navigator(model).update_yaw("x", 0.0, 0.1), "time.*expected a number"),
+        (lambda model: Navigator(model).update_yaw(1.0, [0, 0], 0.1), "yaw.*expected a number"),
+        (lambda model: compare("walk.csv", model, NavigatorConfig()), "sequence.*read_recording"),
         (lambda model: FilterConfig(gate="0.9"), "gate"),
         (lambda model: FilterConfig(gate=1.0), "gate"),
         (lambda model: FilterConfig(magnetometer="no"), "magnetometer"),

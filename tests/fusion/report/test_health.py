@@ -73,6 +73,11 @@ def warnings_of(health: Health) -> str:
     return " ".join(f.text + f.advice for f in findings(health) if f.level == "warning")
 
 
+def test_displacements_that_contradict_the_imu_ask_for_its_axes_before_any_training() -> None:
+    found = warnings_of(Health(updates=100, gated=20, mean_nis=3.0))
+    assert 0 < found.index("axes and signs") < found.index("stario train")
+
+
 def test_small_innovations_are_not_reported_as_small_errors() -> None:
     (line,) = health_lines(Health(updates=100, mean_nis=0.8))[1:]
     assert "does not mean that the track's sigmas are too large" in line
