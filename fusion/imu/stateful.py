@@ -217,8 +217,9 @@ def _checked(answer: Any, count: int) -> tuple[FloatArray, FloatArray]:
     if mean.shape != (count, 3) or covariance.shape != (count, 3, 3):
         found = f"shapes {mean.shape} and {covariance.shape} from its `predict`"
         raise InputError("model", found, expected)
-    asymmetry = np.abs(covariance - covariance.transpose(0, 2, 1)).max(initial=0.0)
-    if asymmetry > _ASYMMETRY * np.abs(covariance).max(initial=0.0):
+    finite = covariance[np.isfinite(covariance).all(axis=(1, 2))]  # others are refused one by one
+    asymmetry = np.abs(finite - finite.transpose(0, 2, 1)).max(initial=0.0)
+    if asymmetry > _ASYMMETRY * np.abs(finite).max(initial=0.0):
         raise InputError("model", "asymmetric covariances from its `predict`", "symmetric ones")
     return mean, covariance
 
