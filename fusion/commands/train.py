@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import (
-    exit_if_skipped,
-    list_skipped,
-    progress_bar,
-    with_bar,
-)
+from stario.fusion.commands.common import list_skipped, progress_bar
 from stario.fusion.commands.options import (
     CacheOption,
     JobsOption,
@@ -25,14 +19,21 @@ from stario.fusion.commands.options import (
     recipe_values,
     refuse_unused,
 )
+from stario.fusion.commands.training_data import (
+    packaged_lists,
+    recorded_streams,
+    streams_of_files,
+    training_material,
+    validation_material,
+)
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
+    from stario.network.card import Calibration
     from stario.network.model import DisplacementModel
     from stario.network.training.config import TrainingConfig
-    from stario.network.training.data import RecordingStreams
-    from stario.sequences.datasets.batch import Skipped
-    from stario.sequences.windows import Attitude
+    from stario.network.training.data import TrainingData
+    from stario.network.training.history import EpochReport
 
 
 _GENERATED = 150
@@ -113,85 +114,108 @@ def train(
     """
     from stario.fusion.evaluation.folders import make_folder
     from stario.network.model import load_model
-    from stario.network.training.data import cached_walks, mix_sources
     from stario.network.training.parallel import is_leader
-    from stario.network.training.train import train as train_network
     from stario.sequences.datasets.stream_cache import cache_folder
 
-    if recorded_only:
-        refuse_unused({"--generated": bool(generated)}, "with --recorded-only", "one of the two")
-    if data is not None:
-        refuse_unused(changed(reading, "where"), "with --data", "use with PATH: name the archive")
-    elif not paths and not validation:
-        refuse_unused(changed(reading), "without recordings", "use with PATH")
+    walks = _number_of_walks(generated, recorded_only)
     first = load_model(start_from) if start_from else None  # fails before anything slow starts
     if first is not None:
         _ = first.training_form  # an exported graph has none
     recipe = _recipe(config, first, architecture=model, epochs=epochs, seed=seed)
-    if not paths and data is None and generated is None:
-        raise InputError("PATH", "none", "recordings, --data, or --generated for walks only")
-    walks = 0 if recorded_only else _GENERATED if generated is None else generated
+    _check_sources(reading, paths, validation, data, generated)
     folder = cache or cache_folder()
-    streams_of = partial(_streams_of, reading, recipe.attitude, folder, jobs)
-    recorded, held_out, skipped = _recorded(
-        reading, paths or [], validation or [], _lists(data, leave_out, learn_from), streams_of
+    streams_of = partial(streams_of_files, reading, recipe.attitude, folder, jobs)
+    recorded, held_out, skipped = recorded_streams(
+        reading,
+        paths or [],
+        validation or [],
+        packaged_lists(data, leave_out, learn_from),
+        streams_of,
     )
     out = out or Path("runs") / recipe.architecture
     make_folder(out)
-    material = mix_sources(
-        recorded + held_out if last_stage is not None else recorded,
-        cached_walks(walks, recipe.seed, folder, recipe.attitude),
-        recipe.shares,
-        recipe.reach,
-    )
-    if recorded_only and material.legs and not material.streams:
-        raise InputError(
-            "--recorded-only",
-            "only positions or waypoints to learn from",
-            "some recordings with poses",
-            "omit it: the poses of simulated walks will do",
-        )
-    validation_data = mix_sources(held_out, [])
-    if recorded and not (validation_data.streams or validation_data.legs):
-        raise InputError(
-            "recordings",
-            "none whose last fifth has 2 s of poses, or two legs between known positions",
-            "validation data to select and calibrate on",
-            "name recordings with --validation",
-        )
-    calibrated_by = last_stage or (None if validation_data.streams else start_from)
-    # Sigma needs windows with full ground truth; if there are none, use simulated walks.
-    windows = validation_data.streams or cached_walks(10, recipe.seed + 1, folder, recipe.attitude)
+    learned = recorded + held_out if last_stage is not None else recorded
+    material = training_material(learned, walks, recipe, folder)
+    held = validation_material(held_out, required=bool(recorded))
+    calibrated_by = last_stage or (None if held.streams else start_from)
+    calibration = load_model(calibrated_by).card.calibration if calibrated_by else None
     if is_leader():
         list_skipped(skipped)  # before hours of training
         for words in material.words:
             typer.echo(words, err=True)
+    path = _trained(recipe, material, held, out, folder, first, calibration)
+    if is_leader():
+        typer.echo(str(path))
+        if skipped:
+            raise typer.Exit(1)
+
+
+def _number_of_walks(generated: int | None, recorded_only: bool) -> int:
+    if recorded_only:
+        refuse_unused({"--generated": bool(generated)}, "with --recorded-only", "one of the two")
+        return 0
+    return _GENERATED if generated is None else generated
+
+
+def _check_sources(
+    reading: ReadingOptions,
+    paths: list[Path] | None,
+    validation: list[Path] | None,
+    data: Path | None,
+    generated: int | None,
+) -> None:
+    """Refuse options of reading that nothing uses, and a run without anything to learn from."""
+    if data is not None:
+        refuse_unused(changed(reading, "where"), "with --data", "use with PATH: name the archive")
+        return
+    if not paths and not validation:
+        refuse_unused(changed(reading), "without recordings", "use with PATH")
+    if not paths and generated is None:
+        raise InputError("PATH", "none", "recordings, --data, or --generated for walks only")
+
+
+def _trained(
+    recipe: TrainingConfig,
+    material: TrainingData,
+    held: TrainingData,
+    out: Path,
+    folder: Path,
+    first: DisplacementModel | None,
+    calibration: Calibration | None,
+) -> Path:
+    """Train with a progress bar and a line per epoch; return the path of the weights."""
+    from stario.network.training.data import cached_walks
+    from stario.network.training.parallel import is_leader
+    from stario.network.training.train import train as train_network
+
+    # Sigma needs windows with full ground truth; if there are none, use simulated walks.
+    windows = held.streams or cached_walks(10, recipe.seed + 1, folder, recipe.attitude)
     with progress_bar("train", total=recipe.steps, shown=is_leader()) as progress:
-        path = train_network(
+        return train_network(
             recipe,
             material.streams,
             material.weights,
             windows,
             out,
             on_step=lambda step, error: progress(step / recipe.steps),
-            on_epoch=lambda report: typer.echo(
-                f"epoch {report.epoch}: training {report.training_error:.4f} m^2, "
-                f"validation {report.validation_error:.4f} m^2; "
-                f"{report.windows_per_second:.0f} windows/s, {report.drawing_share:.0%} of the "
-                "time spent drawing them",
-                err=True,
-            ),
+            on_epoch=_print_epoch,
             trained_on=material.words,
             start_from=first,
-            calibration=load_model(calibrated_by).card.calibration if calibrated_by else None,
+            calibration=calibration,
             legs=material.legs,
-            validation_legs=validation_data.legs,
-            chosen_by_legs=not validation_data.streams,
+            validation_legs=held.legs,
+            chosen_by_legs=not held.streams,
         )
-    if is_leader():
-        typer.echo(str(path))
-        if skipped:
-            raise typer.Exit(1)
+
+
+def _print_epoch(report: EpochReport) -> None:
+    typer.echo(
+        f"epoch {report.epoch}: training {report.training_error:.4f} m^2, "
+        f"validation {report.validation_error:.4f} m^2; "
+        f"{report.windows_per_second:.0f} windows/s, {report.drawing_share:.0%} of the "
+        "time spent drawing them",
+        err=True,
+    )
 
 
 def _recipe(
@@ -213,65 +237,3 @@ def _recipe(
             "omit --model, or name weights of that network",
         )
     return recipe
-
-
-def _lists(data: Path | None, group: str | None, name: str) -> tuple[list[Path], list[Path]]:
-    """Return the training and held-out recordings from the lists in the package."""
-    from stario.network.training.splits import read_packaged_list, without_holdout
-    from stario.sequences.arrays import check_choice
-    from stario.sequences.datasets.splits import hold_out_group
-
-    if data is None:
-        unused = {"--leave-out": group is not None, "--learn-from": name != "all"}
-        refuse_unused(unused, "without --data", "use with the development recordings")
-        return [], []
-    check_choice("--learn-from", name, ("all", "open", "few"))
-    everything = (
-        read_packaged_list("training", data) + read_packaged_list("validation", data)
-        if name == "few"
-        else read_packaged_list(name, data)
-    )
-    if group is not None:
-        outside, inside = hold_out_group(everything, group)
-    else:
-        outside, inside = without_holdout(everything, data)
-    return [entry.path for entry in outside], [entry.path for entry in inside]
-
-
-def _recorded(
-    reading: ReadingOptions,
-    paths: list[Path],
-    validation: list[Path],
-    lists: tuple[list[Path], list[Path]],
-    streams_of: Callable[[list[Path]], tuple[list[RecordingStreams], list[Skipped]]],
-) -> tuple[list[RecordingStreams], list[RecordingStreams], list[Skipped]]:
-    """Return training, held-out and skipped recordings; exit at once if too few are usable."""
-    from stario.network.training.data import split_off
-
-    files, missing = reading.recordings(paths)
-    held_files, held_missing = reading.recordings(validation)
-    files, held_files = files + lists[0], held_files + lists[1]
-    known = {path.resolve() for path in held_files}
-    if both := [path for path in files if path.resolve() in known]:  # would hide overfitting
-        raise InputError(
-            "--validation", f"{both[0]}, which is also trained on", "other recordings",
-            "remove it; without --validation the last fifth of each recording is held out",
-        )  # fmt: skip
-    recordings, failed = streams_of(files)
-    held_out, held_failed = streams_of(held_files)
-    skipped = missing + failed + held_missing + held_failed
-    if skipped and not (recordings and (held_out or not validation)):
-        exit_if_skipped(skipped)
-    if held_files or not files:
-        return recordings, held_out, skipped
-    return *split_off(recordings), skipped
-
-
-def _streams_of(
-    reading: ReadingOptions, attitude: Attitude, folder: Path, jobs: int, files: list[Path]
-) -> tuple[list[RecordingStreams], list[Skipped]]:
-    from stario.network.training.data import recording_streams
-    from stario.sequences.datasets.stream_cache import recorded
-
-    outcomes = recorded(files, reading.read, reading.as_read(), folder, jobs, attitude)
-    return recording_streams(with_bar("read", zip(files, outcomes, strict=True), len(files)))

@@ -235,4 +235,4 @@ def test_waypoints_alone_cannot_be_all_recorded_data(
     known = PositionTrack(truth.time[legs], truth.position_W[legs], "waypoints")
     write_csv(tmp_path / "legs.csv", replace(sequence, truth=None, positions=known))
     done = stario("train", "legs.csv", "--validation", recording, "--recorded-only", "--out", "o")
-    done.assert_one_line_error("--recorded-only", "omit it")
+    done.assert_one_line_error("omit --recorded-only")
