@@ -7,6 +7,7 @@ unless a network is given.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import get_args
@@ -27,6 +28,7 @@ from stario.fusion.state import Track
 from stario.sequences.accuracy.metrics import align, evaluate_track
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.drawing.text_table import aligned
+from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
@@ -39,7 +41,7 @@ WHITE_NOISE = 0.05
 
 @dataclass(frozen=True)
 class FaultResult:
-    """Cost of a fault.
+    """Cost of a fault; figures are NaN if the recording with it is refused.
 
     Attributes:
         fault: name of the fault.
@@ -49,7 +51,7 @@ class FaultResult:
         end_error: distance from the ground truth at the end [m].
         end_sigma: its standard deviation as reported, root of the covariance's trace [m].
         finite: whether every state, covariance included, is finite.
-        reported: faults counted in the health report, in words.
+        reported: faults counted in the health report, in words, or why the recording is refused.
     """
 
     fault: str
@@ -110,8 +112,14 @@ def run_faults(
         unmodified = _run(Fault(""), sequence, config, model, seed, backend)
         without = evaluate_track(unmodified.trajectory, truth).ate_m
         for fault in faults(sequence.duration) if only is None else only:
-            track = _run(fault, sequence, config, model, seed, backend)
-            results.append(_result(fault, backend, track, truth, without))
+            try:
+                track = _run(fault, sequence, config, model, seed, backend)
+            except InputError as refusal:
+                nothing = (math.nan,) * 3
+                words = f"refused: {refusal}"
+                results.append(FaultResult(fault.name, backend, without, *nothing, True, words))
+            else:
+                results.append(_result(fault, backend, track, truth, without))
     return results
 
 
@@ -120,7 +128,7 @@ def fault_table(results: Sequence[FaultResult]) -> str:
     rows = [["fault", "back end", "ATE without [m]", "with [m]", "end [m]", "sigma [m]"]]
     for r in results:
         figures = (r.error_without, r.error_with, r.end_error, r.end_sigma)
-        rows.append([r.fault, r.backend, *(f"{value:.3f}" for value in figures)])
+        rows.append([r.fault, r.backend, *("-" if v != v else f"{v:.3f}" for v in figures)])
     reports = [("" if r.finite else "NOT FINITE, ") + r.reported for r in results]
     lines = zip(aligned(rows), ["reported", *reports], strict=True)
     return "\n".join(f"{line}   {words}" for line, words in lines)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stario.fusion.evaluation.checks.corruption import faults
+from stario.fusion.evaluation.checks.corruption import Fault, faults
 from stario.fusion.evaluation.checks.faults import (
     DummyPredictor,
     FaultResult,
@@ -30,8 +30,22 @@ def results() -> dict[str, FaultResult]:
 
 def test_every_fault_ends_in_finite_states(results: dict[str, FaultResult]) -> None:
     assert list(results) == [fault.name for fault in faults(SECONDS)]
-    assert all(result.finite for result in results.values())
+    assert all(result.finite and np.isfinite(result.error_with) for result in results.values())
     assert results["none"].error_with == results["none"].error_without
+
+
+def test_a_refused_recording_is_a_row_of_the_table() -> None:
+    in_degrees = Fault("rates in degrees", lambda s, _: replace(s, gyro=np.degrees(s.gyro)))
+    sequence, config = matched_walk(SECONDS, seed=1)
+    refused, unchanged = run_faults(
+        sequence, config, backends=("ekf",), only=[in_degrees, Fault("none")]
+    )
+    assert np.isnan(refused.error_with)
+    assert unchanged.error_with == refused.error_without
+    row = next(row for row in fault_table([refused, unchanged]).splitlines() if "degrees" in row)
+    assert " - " in row
+    assert "refused: " in row
+    assert "deg/s" in row
 
 
 @pytest.mark.parametrize(
