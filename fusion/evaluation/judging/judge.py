@@ -38,7 +38,7 @@ POOLED = "all"
 """Name of the row over all sets, equally weighted; a group may have this name, too."""
 
 _NOT_COMPARED = (
-    "not compared, because its ground truth has neither 2 s of known positions nor three waypoints "
+    "not compared, because the ground truth has neither 2 s of known positions nor three waypoints "
     "within an unbroken stretch of samples"
 )
 
@@ -120,11 +120,20 @@ def judge(
                 name: _errors(model(recording_labels["group"]), prepared, read)
                 for name, model in models.items()
             }
-            if not any(error.path_m > 0.0 for error in errors.values()):
-                log.warning("%s: %s", prepared.path, _NOT_COMPARED)
             judged.append(RecordingResult(prepared.path, recording_labels, errors))
         progress(done)
+    _warn_of_not_compared(judged)
     return judged, skipped
+
+
+def _warn_of_not_compared(judged: Sequence[RecordingResult]) -> None:
+    """Log one warning about all recordings in which nothing could be compared."""
+    paths = [r.path for r in judged if not any(e.path_m > 0.0 for e in r.errors.values())]
+    if len(paths) > 1:
+        message = "%d of %d recordings, the first %s: %s"
+        log.warning(message, len(paths), len(judged), paths[0], _NOT_COMPARED)
+    elif paths:
+        log.warning("%s: %s", paths[0], _NOT_COMPARED)
 
 
 def _errors(

@@ -263,6 +263,10 @@ def test_a_recording_with_two_waypoints_is_named_as_not_compared(
     judged, _ = judge(prepared, {"ours": lambda group: Stub(walk)}, {})
     assert [record.getMessage()[:17] for record in caplog.records] == ["50: not compared,"]
     assert [one.errors["ours"].path_m > 0.0 for one in judged] == [False, True]
+    caplog.clear()
+    judge([prepared[0], *prepared], {"ours": lambda group: Stub(walk)}, {})
+    [record] = caplog.records
+    assert record.getMessage().startswith("2 of 3 recordings, the first 50: not compared,")
 
 
 def test_rows_compare_weights_by_group_and_pooled(
