@@ -66,9 +66,11 @@ class ReadingOptions:
     format: Annotated[str, typer.Option(help="Format of the recording: auto or a format name.")] = (
         "auto"
     )
-    gyro_unit: Annotated[str, typer.Option(help="Unit of the gyroscope: rad/s or deg/s.")] = "rad/s"
+    gyro_unit: Annotated[str, typer.Option(help="Unit of the gyroscope: rad/s, deg/s or mdps.")] = (
+        "rad/s"
+    )
     accel_unit: Annotated[
-        str, typer.Option(help="Unit of the accelerometer: m/s^2, g, -m/s^2 or -g.")
+        str, typer.Option(help="Unit of the accelerometer: m/s^2, g, mg, -m/s^2, -g or -mg.")
     ] = "m/s^2"
     accel_sign: Annotated[
         str, typer.Option(help="Direction of the accelerometer at rest: up, or apple (down).")
