@@ -57,7 +57,7 @@ def motion_panels(tracks: Mapping[str, Series], truth: Series | None) -> list[Pa
             value, sigma = value_of(series), sigma_of(series)
             assert value is not None  # only a sigma may be unknown
             if title.startswith("Yaw"):
-                value = value + _whole_turns(value, next(iter(shown.values())).yaw)
+                value = value + _whole_turns(series, next(iter(shown.values())))
             traces += _curve(name, series.time, value, unit, sigma)
         panels.append(Panel(f"{title}, band: 3 sigma", traces, {"range": _limits(traces)}))
     return panels
@@ -208,10 +208,12 @@ def _limits(traces: Sequence[go.Scatter]) -> list[float]:
     return [float(low - margin), float(high + margin)]
 
 
-def _whole_turns(yaw: FloatArray, reference: FloatArray) -> float:
-    """Return the whole turns [deg] that bring a yaw nearest to a reference."""
-    off = np.nanmedian(yaw) - np.nanmedian(reference)
-    return -360.0 * float(np.round(off / 360.0)) if np.isfinite(off) else 0.0
+def _whole_turns(series: Series, reference: Series) -> float:
+    """Return the whole turns [deg] that bring a yaw nearest to a reference at common times."""
+    expected = np.interp(series.time, reference.time, reference.yaw, np.nan, np.nan)
+    off = series.yaw - expected
+    known = off[np.isfinite(off)]
+    return -360.0 * float(np.round(np.median(known) / 360.0)) if len(known) else 0.0
 
 
 def _rounded(values: FloatArray) -> FloatArray:

@@ -94,3 +94,21 @@ def test_the_slider_moves_ellipses_of_the_horizontal_covariance() -> None:
     assert (main["name"], other["name"]) == ("ekf", "graph")
     assert [main[key][5] for key in ("xx", "xy", "yy")] == [0.16, 0.05, 0.25]
     assert main["y"][10] == pytest.approx(1.5 * TIME[10])
+
+
+def turning(stop: float, offset: float) -> Series:
+    """A device that turns by six degrees a second until `stop` [s], its yaw off by `offset` deg."""
+    time = np.arange(0.0, stop, 0.1)
+    zeros = np.zeros(len(time))
+    return Series(time, np.zeros((len(time), 3)), zeros, 6.0 * time + offset)
+
+
+@pytest.mark.parametrize("stop", [10.0, 120.0])
+@pytest.mark.parametrize("turns", [0, 2])
+def test_yaws_are_drawn_within_half_a_turn_of_the_truth_where_both_exist(
+    stop: float, turns: int
+) -> None:
+    track = turning(stop, 5.0 + 360.0 * turns)
+    panel = motion_panels({"ekf": track}, turning(120.0, 0.0))[-1]
+    drawn = next(trace for trace in panel.traces if trace.legendgroup == "ekf")
+    np.testing.assert_allclose(drawn.y, 6.0 * track.time + 5.0, atol=1e-3)
