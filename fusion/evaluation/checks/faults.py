@@ -128,7 +128,7 @@ def fault_table(results: Sequence[FaultResult]) -> str:
     rows = [["fault", "back end", "ATE without [m]", "with [m]", "end [m]", "sigma [m]"]]
     for r in results:
         figures = (r.error_without, r.error_with, r.end_error, r.end_sigma)
-        rows.append([r.fault, r.backend, *("-" if v != v else f"{v:.3f}" for v in figures)])
+        rows.append([r.fault, r.backend, *("-" if math.isnan(v) else f"{v:.3f}" for v in figures)])
     reports = [("" if r.finite else "NOT FINITE, ") + r.reported for r in results]
     lines = zip(aligned(rows), ["reported", *reports], strict=True)
     return "\n".join(f"{line}   {words}" for line, words in lines)
