@@ -80,9 +80,8 @@ class Navigator:
         """Process one sample of a stream.
 
         Samples that are not finite, repeated or late are dropped and counted (`health`); gaps are
-        detected. The first state comes one second after the first sample. After a gap longer than
-        ten seconds the next one comes a second after its end, and is not marked `in_gap`: see
-        `health.gaps`.
+        detected. The first state comes one second after the first sample, and the next one a second
+        after the end of each gap (`health.gaps`): that second levels the attitude.
 
         Args:
             time: [s].
@@ -240,7 +239,7 @@ class Navigator:
         """Estimate the fused track of a recording; its ground truth is not used.
 
         It has the states of a stream, and those of the first second and of the second after each
-        long gap as well. The stream of `push` is not affected.
+        gap as well. The stream of `push` is not affected.
 
         Args:
             sequence: the recording.

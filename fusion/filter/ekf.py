@@ -13,17 +13,20 @@ import math
 import numpy as np
 
 from stario.fusion.checked import check_covariance, checked, checked_rotation
+from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf_state import EkfState, FieldState
 from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult
 from stario.fusion.filter.jacobians import (
     ACTUAL,
     CLONE,
     CORE,
+    Propagation,
     bearing_jacobian,
     displacement_jacobian,
     mean_velocity_jacobian,
     position_jacobian,
     propagated,
+    propagated_in_gap,
     turn_jacobian,
     velocity_jacobian,
     yaw_jacobian,
@@ -32,6 +35,8 @@ from stario.fusion.filter.network_errors import DisplacementErrors, with_conside
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import about_vertical, exp_times, yaw_twist
 from stario.fusion.state import NavState, changed
+from stario.sequences.attitude.rotations import tilt_aligning
+from stario.sequences.attitude.so3 import log_so3
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 
@@ -104,11 +109,27 @@ class StateCloningEkf(ErrorStateEngine):
         s = self.state
         pose = s.X[0]
         start = pose[:, :3], pose[:, 3], pose[:, 4], s.b_g, s.b_a
-        end = propagated(segment, *start, accel_share)
-        X = s.X.copy()
+        self._move(segment.stop, propagated(segment, *start, accel_share))
+
+    def propagate_in_gap(self, stop: float, turn_variance: float, config: NavigatorConfig) -> None:
+        """Propagate without samples to the end of a gap, or to a fix within it.
+
+        Args:
+            stop: time of the end, or of the fix [s].
+            turn_variance: variance of the device's unobserved turn until then [rad^2].
+            config: noise densities.
+        """
+        s = self.state
+        pose = s.X[0]
+        start = pose[:, :3], pose[:, 3], pose[:, 4]
+        self._move(stop, propagated_in_gap(stop - s.time, turn_variance, *start, config))
+
+    def _move(self, time: float, end: Propagation) -> None:
+        """Set the current pose and its covariances after a propagation to a time [s]."""
+        X = self.state.X.copy()
         X[0, :, :3], X[0, :, 3], X[0, :, 4] = end.R_WB, end.v_W, end.p_W
-        P = self._propagated(s.covariances, end.transition, end.noise)
-        self.state = changed(s, time=segment.stop, X=X, covariances=P)
+        P = self._propagated(self.state.covariances, end.transition, end.noise)
+        self.state = changed(self.state, time=time, X=X, covariances=P)
 
     def clone(self, instead_of: int | None = None) -> int:
         """Copy the current pose into a slot and return its number.
@@ -247,6 +268,15 @@ class StateCloningEkf(ErrorStateEngine):
         predicted = self.state.v_W
         blocks = velocity_jacobian(predicted)
         return self.update_linear(v_W - predicted, blocks, covariance, gate, gains_from=ACTUAL)
+
+    def update_tilt(self, up_B: FloatArray, sigma: float) -> UpdateResult:
+        """Update with the upward direction in B: unit vector (3,), standard deviation [rad].
+
+        The residual is the smallest rotation that takes R up_B to the vertical, theta's first two
+        components.
+        """
+        turn = log_so3(tilt_aligning(self.state.R_WB @ up_B).as_matrix())[:2]
+        return self.update_linear(turn, [(0, np.eye(2))], sigma**2 * np.eye(2))
 
     def update_yaw(self, yaw: float, sigma: float, gate: float | None = None) -> UpdateResult:
         """Update with the current yaw [rad] as defined by `yaw_twist`; rejected if upside down."""

@@ -253,23 +253,19 @@ class EkfState:
         P = 0.5 * (P + P.transpose(0, 2, 1))
         return changed(self, X=X, origin_W=origin_W, covariances=P, field=field)
 
-    def with_yaw_inflated(
-        self, about_W: FloatArray, sigma: float, field_too: bool = True
-    ) -> EkfState:
-        """Return the state with its covariances inflated by a turn of all poses about a vertical.
+    def with_yaw_inflated(self, about_W: FloatArray, sigma: float) -> EkfState:
+        """Return the state with its covariances inflated by a turn of the frame about a vertical.
 
         Args:
             about_W: (3,) a point on the vertical [m].
             sigma: standard deviation of the turn [rad].
-            field_too: whether the magnetic field turns with them: True if the frame turns, False if
-                the device turned during a gap.
         """
         x, y, _ = about_W - self.origin_W
         N = np.zeros((self.covariances.shape[1], 1))
         for first, rho in self._poses():
             N[first + 2, 0] = 1.0
             N[rho, 0], N[rho + 1, 0] = y, -x  # -e3 x p
-        if self.field is not None and field_too:
+        if self.field is not None:
             N[self.first_field, 0] = 1.0
         return changed(self, covariances=self.covariances + sigma**2 * (N @ N.T))
 

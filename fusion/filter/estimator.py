@@ -5,7 +5,6 @@ README.md, "One interval".
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 from stario.fusion.config import NavigatorConfig
@@ -23,15 +22,16 @@ from stario.fusion.filter.estimator_state import (
 )
 from stario.fusion.filter.frame_transform import with_undirected
 from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior
-from stario.fusion.filter.initial import PriorPose, initialise, reinitialise
+from stario.fusion.filter.initial import PriorPose, initialise, reinitialise, tilt_sigma
 from stario.fusion.filter.magnetic import MagneticUpdates, north_fix
 from stario.fusion.filter.map_frame import MapFrame
 from stario.fusion.filter.network_errors import ACCEL_SHARE
 from stario.fusion.filter.zero_velocity import StillnessDetector, ZeroVelocity, ZeroVelocityUpdates
 from stario.fusion.fixes import Accepted, Fix, by_time
 from stario.fusion.health import Health, SampleCounts
+from stario.fusion.imu.gap import yaw_variance
 from stario.fusion.imu.intervals import ImuInterval, Start, split_at_fixes
-from stario.fusion.imu.preintegration import Segment, gap_yaw_variance, segment_of
+from stario.fusion.imu.preintegration import Segment, segment_of
 from stario.fusion.imu.stateful import Displacement
 from stario.fusion.state import NavState, SmoothedPose, changed
 from stario.sequences.windows import WINDOW_SECONDS
@@ -140,45 +140,47 @@ class Estimator:
         self.in_gap = interval.gap
         if interval.gap:
             self._release_clones()
-        if interval.restart is not None:
+        if interval.lost:
             # Fixes within a long gap are useless: nothing links them to the track after it.
             self._counts = self._counts.add("fixes", *["in a long gap"] * len(fixes))
-            reinitialise(self.ekf, interval, interval.restart, self._config)
+            reinitialise(self.ekf, interval, self._config)
             self.frame.lose_yaw()
             return None, []
-        if not fixes:
-            return self._propagate_piece(interval, interval.start), []
+        segment: Segment | None = None
         accepted = []
-        for piece, due in split_at_fixes(interval, fixes):
+        pieces = split_at_fixes(interval, fixes)
+        for piece, due in pieces:
             if piece is not None:
-                self._propagate_piece(piece, interval.start)
+                segment = self._propagate_piece(piece, interval.start)
             accepted += [applied for fix in due if (applied := self._update_fix(fix)) is not None]
-        return None, accepted
+        if interval.levelled is not None:
+            sigma = tilt_sigma(interval.levelled, self._config)
+            self.ekf.update_tilt(interval.levelled.up_B, sigma)
+        return (segment if len(pieces) == 1 else None), accepted
 
-    def _propagate_piece(self, interval: ImuInterval, interval_start: float) -> Segment:
+    def _propagate_piece(self, interval: ImuInterval, interval_start: float) -> Segment | None:
         """Propagate through a piece of the interval that started at `interval_start` [s]."""
 
         def propagate() -> Segment:
             s = self.ekf.state
-            segment = segment_of(interval, s.R_WB, s.b_g, s.b_a, self._config)
+            segment = segment_of(interval, s.b_g, s.b_a, self._config)
             self.ekf.propagate(segment, accel_share)
             return segment
 
-        # The noise of gaps and faulty samples is what it may be.
-        faulty = interval.gap or any(interval.flags)
-        correlated = self._config.filter.correlated_errors
-        accel_share = ACCEL_SHARE if correlated and not faulty else 1.0
-
-        before = self.ekf.state.p_W
-        segment = self._hypotheses.apply_to_both(propagate)
         if interval.gap:
-            sigma = math.sqrt(
-                gap_yaw_variance(interval.stop - interval_start)
-                - gap_yaw_variance(interval.start - interval_start)
-            )
-            self.ekf.state = self.ekf.state.with_yaw_inflated(before, sigma, field_too=False)
-            self.frame.lose_yaw()
-        return segment
+            self._propagate_in_gap(interval, interval_start)
+            return None
+        # The noise of faulty samples is what it may be.
+        correlated = self._config.filter.correlated_errors
+        accel_share = ACCEL_SHARE if correlated and not any(interval.flags) else 1.0
+        return self._hypotheses.apply_to_both(propagate)
+
+    def _propagate_in_gap(self, interval: ImuInterval, gap_start: float) -> None:
+        """Propagate through a piece of the gap that began at `gap_start` [s]."""
+        earlier = yaw_variance(interval.start - gap_start)
+        turn_variance = yaw_variance(interval.stop - gap_start) - earlier
+        self.ekf.propagate_in_gap(interval.stop, turn_variance, self._config)
+        self.frame.lose_yaw()
 
     def _update_fix(self, fix: Fix) -> Accepted | None:
         result = self.frame.update(fix)
@@ -267,7 +269,6 @@ class Estimator:
             self._displacements.error_level,
             self._hypotheses.alternative,
             self._counts,
-            self.in_gap,
             self.released,
             self._history,
         )
@@ -282,7 +283,7 @@ class Estimator:
         self._displacements.accel_noise = s.accel_noise
         self._displacements.error_level = s.error_level
         self._hypotheses.alternative = s.alternative
-        self.in_gap, self.released, self._history = s.in_gap, s.released, s.history
+        self.released, self._history = s.released, s.history
 
     @property
     def time(self) -> float:

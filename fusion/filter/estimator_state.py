@@ -175,7 +175,6 @@ class EstimatorState:
         error_level: estimated level of the network's errors.
         alternative: the alternative hypothesis; None while all displacements fit.
         counts: updates by outcome.
-        in_gap: whether the last interval had no samples.
         released: newest pose that left the window, corrected by the whole window.
         history: steps of the last second of a stream; empty for a recording.
     """
@@ -191,7 +190,6 @@ class EstimatorState:
     error_level: ErrorLevel
     alternative: AlternativeHypothesis | None
     counts: UpdateCounts
-    in_gap: bool
     released: Estimate | None
     history: History = ()
 

@@ -60,12 +60,17 @@ class PriorPose:
             check_number(self, name)
 
 
+def tilt_sigma(start: Start, config: NavigatorConfig) -> float:
+    """Return the standard deviation of an attitude's tilt from gravity [rad]."""
+    return STILL_TILT_SIGMA if start.still else start.liveliness * config.filter.tilt_sigma
+
+
 def initialise(
     ekf: StateCloningEkf, start: Start, prior: PriorPose | None, config: NavigatorConfig
 ) -> None:
     """Set the first state: the prior if given, else levelled by gravity, at rest, at the origin."""
     f = config.filter
-    tilt = STILL_TILT_SIGMA if start.still else f.tilt_sigma
+    tilt = tilt_sigma(start, config)
     zero = np.zeros(3)
     pose = prior or PriorPose(start.R_WB, zero, zero, tilt, f.yaw_sigma, f.velocity_sigma)
     sigma = [pose.tilt_sigma] * 2 + [pose.yaw_sigma]
@@ -76,15 +81,14 @@ def initialise(
     ekf.initialise(state)
 
 
-def reinitialise(
-    ekf: StateCloningEkf, interval: ImuInterval, start: Start, config: NavigatorConfig
-) -> None:
+def reinitialise(ekf: StateCloningEkf, interval: ImuInterval, config: NavigatorConfig) -> None:
     """Reset the state after a long gap: tilt from gravity, velocity and yaw unknown."""
-    f, s = config.filter, ekf.state
+    f, s, start = config.filter, ekf.state, interval.levelled
+    assert start is not None  # no gap is that long without
     covariance, seconds = s.nav_state().covariance, interval.stop - interval.start
     # The position stays correlated with the biases that led there.
     covariance[:6], covariance[:, :6] = 0.0, 0.0
-    tilt = STILL_TILT_SIGMA if start.still else f.tilt_sigma
+    tilt = tilt_sigma(start, config)
     covariance[:3, :3] = np.diag(np.square([tilt, tilt, UNKNOWN_YAW]))
     covariance[3:6, 3:6] = max(f.velocity_sigma, MIN_PRIOR_SIGMA) ** 2 * np.eye(3)
     reach = min(GAP_VELOCITY_SIGMA * seconds, MAX_GAP_DISTANCE)

@@ -15,6 +15,8 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.imu.gap import gap_covariance
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import twist
 from stario.sequences.attitude.so3 import skew
@@ -200,6 +202,33 @@ def propagated(
     transition[:9, 9:12] = by_bias[:, 3:]
     transition[:9, 12:15] = by_bias[:, :3]
     return Propagation(R, v, p, transition, noise)
+
+
+def propagated_in_gap(
+    seconds: float,
+    turn_variance: float,
+    R_WB: FloatArray,
+    v_W: FloatArray,
+    p_W: FloatArray,
+    config: NavigatorConfig,
+) -> Propagation:
+    """Return the state after a gap: attitude and velocity are kept, with a pedestrian's noise.
+
+    No force is measured that a wrong tilt could rotate, so the motion does not depend on gravity:
+    theta' = theta, rho_v' = rho_v, rho_p' = rho_p + t rho_v.
+
+    Args:
+        seconds: length t of the gap [s].
+        turn_variance: as for `gap_covariance` [rad^2].
+        R_WB: (3, 3) attitude.
+        v_W: (3,) velocity [m/s].
+        p_W: (3,) position before it [m].
+        config: noise densities.
+    """
+    p = p_W + seconds * v_W
+    covariance = gap_covariance(seconds, turn_variance, v_W, config)
+    noise = plain_covariance(covariance, -np.array((v_W, p)))
+    return Propagation(R_WB, v_W, p, _nav_transition(seconds, 0.0), np.array((noise, noise)))
 
 
 _IDENTITY = np.eye(CORE)

@@ -9,18 +9,15 @@ import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.engine import fault_of
+from stario.fusion.filter.initial import tilt_sigma
 from stario.fusion.filter.network_errors import TURN_SECONDS, TurnEstimate
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Fix
-from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Velocity, Yaw
+from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Tilt, Velocity, Yaw
 from stario.fusion.graph.keyframes import KeyframeGraph
+from stario.fusion.imu.gap import yaw_variance
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
-from stario.fusion.imu.preintegration import (
-    Segment,
-    gap_yaw_variance,
-    segment_of,
-    segment_of_all,
-)
+from stario.fusion.imu.preintegration import Segment, segment_of, segment_of_all
 from stario.fusion.imu.stateful import Displacement as Measured
 from stario.fusion.lie import about_vertical, yaw_twist
 from stario.fusion.state import NavState
@@ -82,7 +79,7 @@ class GraphBuilder:
         self._pending: list[ImuInterval] = []
         # Keyframes where windows begin and end, by the count of intervals; cleared at a gap.
         self._window_keyframes: dict[int, int] = {count: 0} if count % self._spacing == 0 else {}
-        self._gaps: list[int] = []  # keyframes followed by a gap
+        self._gaps: dict[int, float] = {}  # keyframes followed by a gap, and its end [s]
 
     @property
     def estimates_turn(self) -> bool:
@@ -105,26 +102,25 @@ class GraphBuilder:
             displacement: measured over the window that ends with it; None if there is none.
             fixes: fixes within the interval, in order.
             zero_velocity: measurement at rest; None if the device moved.
-            guess: initial guess of the state at its end; None predicts it from the IMU.
+            guess: initial guess of the state at its end; None predicts it from the IMU, except
+                across a gap.
             segment: its preintegrated samples, if available.
 
         Returns:
             Whether a keyframe was added.
         """
-        before = self.graph.last
         if interval.gap:
-            self.close()
-            self._window_keyframes.clear()
-        if interval.restart is not None and guess is not None:
-            # Continue from the filter's new start after a gap too long to be bridged.
-            self.count = 0
-            k = self.graph.add_disconnected(guess)
-            self.segments[k] = []
-            self._window_keyframes[0] = k
+            assert guess is not None  # a stream's graph begins again after each gap
+            self._cross(interval, guess)
+            if not interval.lost:
+                for fix in fixes:
+                    self.fix(fix)
             return True
-        self.count = 0 if interval.gap else self.count + 1
-        if segment is None or interval.gap:
-            segment = self._segment_of(interval)
+        before = self.graph.last
+        self.count += 1
+        if segment is None:
+            _, _, _, b_g, b_a = self.graph.pose(before)
+            segment = segment_of(interval, b_g, b_a, self._config)
         self.segments[self.graph.last].append(segment)
         self._pending.append(interval.without_window())
         due = self.count % self._spacing == 0
@@ -177,11 +173,13 @@ class GraphBuilder:
         self.graph.marginalise(first)
         self._window_keyframes = {n: k for n, k in self._window_keyframes.items() if k >= first}
         self.segments = {k: pieces for k, pieces in self.segments.items() if k >= first}
-        self._gaps = [k for k in self._gaps if k >= first]
+        self._gaps = {k: stop for k, stop in self._gaps.items() if k >= first}
 
     def dead_reckoned(self, k: int, time: float = math.inf) -> Pose:
-        """Dead-reckon from a keyframe to a time [s], or to the end of its segments if earlier."""
+        """Dead-reckon from a keyframe to a time [s], or to the end of its data if earlier."""
         R, v, p, b_g, b_a = self.graph.pose(k)
+        if k in self._gaps:
+            return R, v, p + (min(time, self._gaps[k]) - self.graph.time(k)) * v
         for segment in self.segments[k]:
             end = segment.predict(R, v, p, b_g, b_a)
             if segment.stop > time:
@@ -190,15 +188,23 @@ class GraphBuilder:
             R, v, p = end
         return R, v, p
 
-    def _segment_of(self, interval: ImuInterval) -> Segment:
-        """Preintegrate; a gap includes a pedestrian's turn, which the filter adds to its state."""
-        last = self.graph.last
-        R, _, _, b_g, b_a = self.graph.pose(last)
-        turned = 0.0
-        if interval.gap:
-            self._gaps.append(last)
-            turned = gap_yaw_variance(interval.stop - interval.start)
-        return segment_of(interval, R, b_g, b_a, self._config, turned)
+    def _cross(self, interval: ImuInterval, guess: NavState) -> None:
+        """Add a keyframe at the end of a gap."""
+        self.close()
+        graph = self.graph
+        if interval.lost:
+            graph.add_disconnected(guess)  # the filter's new start
+        else:
+            self._gaps[graph.last] = interval.stop
+            graph.add_after_gap(guess, self._config)
+            assert interval.levelled is not None  # it comes with the end of every gap
+            variance = tilt_sigma(interval.levelled, self._config) ** 2
+            graph.add(Tilt(graph.last, interval.levelled.up_B, variance * np.eye(3)), gated=False)
+            if self.estimates_turn:
+                graph.add_turn(self._turn_sigma, TURN_SECONDS)
+        self.count = 0
+        self.segments[graph.last] = []
+        self._window_keyframes = {0: graph.last}
 
     def _add_displacement(
         self, i: int, interval: ImuInterval, d_N: FloatArray, covariance_N: FloatArray
@@ -226,7 +232,7 @@ class GraphBuilder:
         dt, f = max(dt, 0.0), self._config.filter
         # Noise of the IMU since the keyframe, or of the motion in a gap.
         accel_noise = f.gap_accel_noise if k in self._gaps else self._config.noise.accel_noise
-        turned = f.gap_gyro_noise**2 * dt + gap_yaw_variance(dt) if k in self._gaps else 0.0
+        turned = f.gap_gyro_noise**2 * dt + yaw_variance(dt) if k in self._gaps else 0.0
         drift = accel_noise**2 * dt * np.eye(3)
         if fix.kind == "position":
             covariance = fix.covariance + dt**2 / 3.0 * drift

@@ -25,6 +25,7 @@ from stario.fusion.graph.covariances import root_information
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.lie import about_vertical, twist, yaw_rotation
 from stario.fusion.state import NavState
+from stario.sequences.attitude.so3 import skew
 from stario.sequences.sequence import FloatArray
 
 _EYE = np.eye(3)
@@ -175,27 +176,6 @@ class Displacement(Between):
 
 
 @dataclass(frozen=True, eq=False)
-class TurnProcess(Between):
-    """Gauss-Markov model of the network's turn: tau_j = correlation tau_i + n.
-
-    Attributes:
-        correlation: correlation of the two turns; 0 for the first turn, where i is j.
-        covariance: (1, 1) covariance of n [rad^2].
-    """
-
-    correlation: float
-    covariance: FloatArray
-
-    def linearise(self, values: Any) -> Linearised:
-        """Linearise about the vertical."""
-        now, before = turn_at(values, self.j), turn_at(values, self.i)
-        blocks = [(T(self.j), np.eye(1))]
-        if self.i != self.j:
-            blocks.append((T(self.i), -self.correlation * np.eye(1)))
-        return np.array([self.correlation * before - now]), blocks
-
-
-@dataclass(frozen=True, eq=False)
 class Position(AtKeyframe):
     """A position some time after a keyframe: p_k + dt v_k + dp_W.
 
@@ -260,6 +240,26 @@ class Yaw(AtKeyframe):
         H = np.zeros((1, 6))
         H[0, :3] = R[2]
         return np.array([residual]), [(X(self.k), H)]
+
+
+@dataclass(frozen=True, eq=False)
+class Tilt(AtKeyframe):
+    """The upward direction at a keyframe: up_B x R^T e3 is zero.
+
+    Attributes:
+        up_B: (3,) unit vector.
+        covariance: (3, 3) [rad^2]; the component along up_B has no information.
+    """
+
+    up_B: FloatArray
+    covariance: FloatArray
+
+    def linearise(self, values: Any) -> Linearised:
+        """Linearise in B."""
+        R, _ = _pose(values, self.k)
+        up, H = skew(self.up_B), np.zeros((3, 6))
+        H[:, :3] = up @ skew(R[2])
+        return -up @ R[2], [(X(self.k), H)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -99,7 +99,7 @@ class FixedLagEstimator:
         """Propagate to the interval's end and apply its measurements; as `Estimator.step`."""
         applied = self._filter.step(interval, displacement, fixes)
         self._narrow_bias_prior()
-        if self._stale or interval.restart is not None or applied.revoked:
+        if self._stale or interval.gap or applied.revoked:
             self._begin(0 if interval.gap else self._builder.count + 1)
             return
         local_fixes = [self._in_graph_frame(accepted) for accepted in applied.fixes]

@@ -20,10 +20,13 @@ import numpy as np
 from gtsam.symbol_shorthand import B, T, V, X
 from scipy.linalg import block_diag
 
+from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.network_errors import TurnEstimate
-from stario.fusion.graph.factors import Prior, Term, TurnProcess, turn_at
+from stario.fusion.graph.factors import Prior, Term, turn_at
 from stario.fusion.graph.keyframe_state import KeyframeState
+from stario.fusion.graph.processes import Coasting, TurnProcess
 from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_factor
+from stario.fusion.imu.gap import gap_covariance, yaw_variance
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.state import NavState
 from stario.sequences.accuracy.chi_square import chi2_quantile
@@ -93,6 +96,15 @@ class KeyframeGraph:
         """Connect a new keyframe to the last one by a segment; return its number."""
         self._segments[self.last] = segment
         self._insert(guess)
+        return self.last
+
+    def add_after_gap(self, guess: NavState, config: NavigatorConfig) -> int:
+        """Connect a new keyframe to the last one across a gap; return its number."""
+        i = self.last
+        self._insert(guess)
+        t = guess.time - self._time[i]
+        covariance = gap_covariance(t, yaw_variance(t), np.zeros(3), config)[2:, 2:]
+        self.add(Coasting(i, self.last, t, covariance), gated=False)
         return self.last
 
     def add_disconnected(self, state: NavState) -> int:

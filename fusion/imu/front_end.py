@@ -5,8 +5,9 @@ the IMU interpolated exactly there (so that nothing is integrated twice or skipp
 holds its samples and, at the times of a network update, the window that ends there, provided that
 the last second of samples is unbroken.
 Samples that jump ahead in time wait until others confirm them, so that one wild timestamp does not
-make all later samples look late (`sequences.time_order`). After a gap longer than `LONG_GAP`
-attitude and speed are unknown, and the attitude is initialised again from gravity.
+make all later samples look late (`sequences.time_order`). After a gap the attitude is levelled
+again by the mean force of a second, as at the start: a phone in a swinging hand turns by 30 degrees
+within a third of a second.
 
 Nothing here depends on the filter, so batch runs can pass all windows to the network at once and
 still reproduce the streamed track.
@@ -37,7 +38,6 @@ from stario.fusion.imu.intervals import (
     interpolated_sample,
 )
 from stario.fusion.imu.stateful import WindowBuffer
-from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
@@ -77,7 +77,7 @@ class FrontEnd:
         self._window = WindowBuffer(rate)
         self._hole = (-math.inf, -math.inf)  # ends of the last hole [s]
         self._unconfirmed: list[Sample] = []  # jumped ahead in time, not confirmed yet
-        self._before_long_gap: Sample | None = None
+        self._before_gap: Sample | None = None  # after which gravity has not been averaged yet
         self._fields = FieldBuffer()
         self._clock = ClockSetBackDetector()
         self._frozen = FrozenSensorDetector(config.gravity)
@@ -167,10 +167,12 @@ class FrontEnd:
         self._samples.append(sample)
         if time < self._next:
             return []
-        return self._begin() if self._attitude is None else self._complete()
+        if self._attitude is None or self._before_gap is not None:
+            return self._begin()
+        return self._complete()
 
     def _begin(self) -> list[ImuInterval]:
-        """Level the first attitude after `START_SECONDS` of samples, then cut the intervals."""
+        """Level the attitude once `START_SECONDS` have been collected, at first or after a gap."""
         first = self._samples[0][0]
         # A single sample here: its time is so large that adding a second is lost in rounding.
         if self._newest < first + START_SECONDS or len(self._samples) == 1:
@@ -179,17 +181,17 @@ class FrontEnd:
         table = np.array(self._samples)
         gravity = start_from_gravity(table[:, 0], table[:, 1:4], table[:, 4:7])
         rate = 1.0 / float(np.median(np.diff(table[:, 0])))
-        start = Start(first, gravity.R_WB, gravity.still, gravity.force, rate)
-        self._attitude = LevelledAttitude(gravity.R_WB)
+        start = Start(**vars(gravity), time=first, rate=rate)
         self._restart_grid(first)
-        intervals = []
-        if self.start is None:
-            self.start = start
-        elif self._before_long_gap is not None:
-            ends = np.array([self._before_long_gap, self._samples[0]])
-            intervals.append(changed(_interval(ends, self._attitude, gap=True), restart=start))
-            self._before_long_gap = None
-        return intervals + self._complete()
+        if self._attitude is None:
+            self.start, self._attitude = start, LevelledAttitude(start)
+            return self._complete()
+        assert self._before_gap is not None
+        self._attitude.level(start)
+        ends = np.array([self._before_gap, self._samples[0]])
+        self._before_gap = None
+        gap = _interval(ends, self._attitude, gap=True, levelled=start)
+        return [gap, *self._complete()]
 
     def _check_time_unit(self) -> None:
         """Refuse a stream in which every sample so far is isolated by gaps."""
@@ -208,27 +210,19 @@ class FrontEnd:
             raise InputError("time", found, "a time that advances", remedy)
 
     def _span_gap(self, sample: Sample) -> list[ImuInterval]:
-        """End the current interval, span the gap with one of its own and restart the grid."""
+        """End the current interval; `_begin` spans the gap with one of its own."""
         before = self._samples
         self._samples = [sample]
         self._check_time_unit()
         self._window.clear()
-        if self._attitude is None:
-            self._next = -math.inf
+        self._next = -math.inf
+        if self._attitude is None or self._before_gap is not None:
             return []
-        intervals = []
-        if len(before) > 1:
-            table = np.array(before)
-            flags = self._flag_outliers(table)
-            intervals.append(_interval(table, self._attitude, flags=flags))
-        if sample[0] - before[-1][0] > LONG_GAP:
-            self._attitude, self._before_long_gap = None, before[-1]
-            self._next = -math.inf
-            return intervals
-        self._attitude.restart()
-        intervals.append(_interval(np.array([before[-1], sample]), self._attitude, gap=True))
-        self._restart_grid(sample[0])
-        return intervals
+        self._before_gap = before[-1]
+        if len(before) == 1:
+            return []
+        table = np.array(before)
+        return [_interval(table, self._attitude, flags=self._flag_outliers(table))]
 
     def _restart_grid(self, origin: float) -> None:
         self._origin, self._index = origin, 1

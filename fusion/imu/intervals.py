@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from stario.fusion.fixes import Fix
 from stario.fusion.state import changed
+from stario.sequences.attitude.levelling import GravityStart
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
+from stario.sequences.time_order import LONG_GAP
 from stario.sequences.windows import MAX_RATE, MIN_RATE
 
 Sample = tuple[float, float, float, float, float, float, float]
@@ -22,21 +24,15 @@ Sample = tuple[float, float, float, float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
-    """Start of the filter, estimated from the first second of samples.
+class Start(GravityStart):
+    """Start of the filter, estimated from the first second of samples, also after a gap.
 
     Attributes:
         time: time of the first sample [s].
-        R_WB: (3, 3) levelled attitude; this and the next two are those of `GravityStart`.
-        still: whether the device was at rest.
-        force: magnitude of the mean specific force [m/s^2].
         rate: sampling rate, from the median step [Hz].
     """
 
     time: float
-    R_WB: FloatArray
-    still: bool
-    force: float
     rate: float
 
 
@@ -92,7 +88,8 @@ class ImuInterval:
         gyro: (n + 1, 3) [rad/s] in B, interpolated at both ends.
         accel: (n + 1, 3) [m/s^2] in B, likewise.
         gap: whether this is a gap too long to be bridged; its samples then carry no information.
-        restart: new start after a long gap, estimated as at the first sample; None elsewhere.
+        levelled: attitude from gravity after a gap, estimated as at the first sample; None
+            elsewhere.
         flags: whether samples of either sensor are saturated, missing, or were spikes.
         window_flagged: whether any of the window's samples are.
         attitudes: (n + 1, 3, 3) levelled attitude R_NB at the samples.
@@ -121,13 +118,18 @@ class ImuInterval:
     levelled_bias_sigma: float = 0.0
     field_B: FloatArray | None = None
     accel_factor: float = 1.0
-    restart: Start | None = None
+    levelled: Start | None = None
     flags: Flags = NO_FLAGS
     window_flagged: bool = False
 
     def without_window(self) -> ImuInterval:
         """Return a copy without the window and attitudes, which an estimator does not need."""
         return changed(self, window=None, attitudes=_NO_ATTITUDES)
+
+    @property
+    def lost(self) -> bool:
+        """Whether this is a gap too long for the motion before it to tell anything about after."""
+        return self.gap and self.stop - self.start > LONG_GAP
 
     @property
     def table(self) -> FloatArray:

@@ -25,7 +25,6 @@ import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.intervals import Flags, ImuInterval
-from stario.fusion.lie import UNKNOWN_YAW
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray
@@ -34,12 +33,6 @@ from stario.sequences.sequence import FloatArray
 # graph and is far below any sensor's.
 _POSITION_NOISE = 1e-5
 _MIN_WALK = 1e-7
-
-_GAP_STEPS = 10
-
-GAP_YAW_RATE = 0.5
-"""Standard deviation of a pedestrian's turn per second of a gap [rad/s]: 0.4 to 1.0 over one second
-and 0.36 to 0.7 per second over three in the training and validation recordings."""
 
 _MISSING_GYRO, _MISSING_ACCEL = 0.1, 1.0
 """Noise densities where up to a fifth of a second is missing and was interpolated [rad/s/sqrt(Hz),
@@ -97,60 +90,20 @@ class Segment:
 
 
 def segment_of(
-    interval: ImuInterval,
-    R_WB: FloatArray,
-    b_g: FloatArray,
-    b_a: FloatArray,
-    config: NavigatorConfig,
-    turned: float = 0.0,
+    interval: ImuInterval, b_g: FloatArray, b_a: FloatArray, config: NavigatorConfig
 ) -> Segment:
-    """Preintegrate an interval, or bridge it if it is a gap.
-
-    A gap is bridged by constant velocity and attitude, with noise wide enough for a pedestrian.
+    """Preintegrate an interval that is no gap.
 
     Args:
-        interval: samples, or a gap.
-        R_WB: (3, 3) attitude at its start; used only for a gap.
+        interval: the samples.
         b_g: (3,) gyroscope bias [rad/s].
         b_a: (3,) accelerometer bias [m/s^2].
         config: noise and gravity.
-        turned: variance of a turn about the vertical within a gap [rad^2]; 0 for the filter, which
-            adds it itself and turns the velocity with it.
     """
-    if interval.gap:
-        up_B = R_WB.T @ [0.0, 0.0, 1.0]
-        return _gap_segment(interval.start, interval.stop, up_B, b_g, b_a, config, turned)
     noise = _widened_noise(config, interval.accel_factor, interval.flags)
     return preintegrate(
         interval.time, interval.gyro, interval.accel, b_g, b_a, noise, config.gravity
     )
-
-
-def gap_yaw_variance(seconds: float) -> float:
-    """Return the variance of a pedestrian's turn, at a constant rate, since a gap began [rad^2]."""
-    return min(GAP_YAW_RATE * seconds, UNKNOWN_YAW) ** 2
-
-
-def _gap_segment(
-    start: float,
-    stop: float,
-    up_B: FloatArray,
-    b_g: FloatArray,
-    b_a: FloatArray,
-    config: NavigatorConfig,
-    turned: float,
-) -> Segment:
-    f, dt = config.filter, (stop - start) / _GAP_STEPS
-    noise = replace(config.noise, gyro_noise=f.gap_gyro_noise, accel_noise=f.gap_accel_noise)
-    params = _new_params(noise, config.gravity)
-    density = turned / (stop - start) * np.outer(up_B, up_B)
-    params.setGyroscopeCovariance(_EYE * noise.gyro_noise**2 + density)
-    pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(b_a, b_g))
-    force_B = config.gravity * up_B + b_a
-    # After a single step, position and velocity errors are dependent: the covariance is singular.
-    for _ in range(_GAP_STEPS):
-        pim.integrateMeasurement(force_B, b_g, dt)
-    return Segment(start, stop, config.gravity, pim)
 
 
 def segment_of_all(

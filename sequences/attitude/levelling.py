@@ -39,7 +39,7 @@ MIN_GRAVITY_FORCE = 1.0
 """Mean specific force [m/s^2] below which it has no direction: free fall, a dead sensor."""
 
 _TILT_SIGMA = 0.05
-"""Sigma of the tilt at the start, and added after a gap [rad]."""
+"""Sigma of the tilt at the start and after a gap [rad]."""
 
 BIAS_SIGMA = 0.01
 """Initial sigma of the gyroscope bias per axis [rad/s]; suits calibrated and raw gyroscopes."""
@@ -60,11 +60,27 @@ class GravityStart:
         R_WB: (3, 3) at the first sample, yaw zero.
         still: whether the device was still enough for the tilt to be trusted.
         force: magnitude of the mean specific force [m/s^2]; gravity, if the units are right.
+        turn_rate: root mean square rate [rad/s].
     """
 
     R_WB: FloatArray
     still: bool
     force: float
+    turn_rate: float
+
+    @property
+    def up_B(self) -> FloatArray:
+        """Upward direction at the first sample (3,)."""
+        return np.asarray(self.R_WB[2])
+
+    @property
+    def liveliness(self) -> float:
+        """Factor on the tilt's sigma of a moving device: 1 up to 1 rad/s, then as the rate.
+
+        On 1,784 seconds of OxIOD, TUM-VI, RIDI, KIPD, rfbr and tyrex the tilt's error per axis is
+        0.02 rad at rates up to 0.6 rad/s, 0.05 at 1.0, 0.07 at 1.5 and 0.14 at 3.4 (running).
+        """
+        return max(1.0, self.turn_rate)
 
 
 def start_from_gravity(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> GravityStart:
@@ -80,14 +96,12 @@ def start_from_gravity(time: FloatArray, gyro: FloatArray, accel: FloatArray) ->
     """
     R_0B = integrate(np.eye(3), time, gyro)
     force_0 = (R_0B @ accel[:, :, None])[:, :, 0]
-    still = bool(
-        np.linalg.norm(force_0.std(axis=0)) < STILL_ACCEL
-        and math.sqrt(float((gyro**2).sum(axis=1).mean())) < STILL_GYRO
-    )
+    turn_rate = math.sqrt(float((gyro**2).sum(axis=1).mean()))
+    still = bool(np.linalg.norm(force_0.std(axis=0)) < STILL_ACCEL and turn_rate < STILL_GYRO)
     up = force_0.mean(axis=0)
     force = float(np.linalg.norm(up))
     R_WB = tilt_aligning(up).as_matrix() if force > MIN_GRAVITY_FORCE else np.eye(3)
-    return GravityStart(R_WB, still, force)
+    return GravityStart(R_WB, still, force, turn_rate)
 
 
 def integrate(R_NB: FloatArray, time: FloatArray, gyro: FloatArray) -> FloatArray:
@@ -114,7 +128,7 @@ def levelled_attitudes(time: FloatArray, gyro: FloatArray, accel: FloatArray) ->
     """
     first = np.searchsorted(time, time[0] + START_SECONDS, side="right")
     start = start_from_gravity(time[:first], gyro[:first], accel[:first])
-    loop = LevelledAttitude(start.R_WB)
+    loop = LevelledAttitude(start)
     grid = np.arange(time[0] + PERIOD, time[-1], PERIOD)
     # Without the last sample, which rounding may place before the grid's last time.
     ends = np.unique([0, *np.searchsorted(time[:-1], grid), len(time) - 1])
@@ -130,17 +144,17 @@ class LevelledAttitude:
     """Attitude R_NB, integrated from the gyroscope and levelled by the accelerometer.
 
     Args:
-        R_NB: (3, 3) at the start.
+        start: attitude at the start.
 
     Attributes:
         R_NB: (3, 3) current attitude.
         b_g: (3,) gyroscope bias [rad/s], as far as it is observable from gravity.
     """
 
-    def __init__(self, R_NB: FloatArray) -> None:
-        self.R_NB = R_NB
+    def __init__(self, start: GravityStart) -> None:
+        self.R_NB = start.R_WB
         self.b_g = np.zeros(3)
-        tilt, bias = _TILT_SIGMA**2, BIAS_SIGMA**2
+        tilt, bias = (start.liveliness * _TILT_SIGMA) ** 2, BIAS_SIGMA**2
         # Covariance of theta about N's axes, R = (I + [theta]x) R^, and of the bias error.
         self._P = np.diag([tilt, tilt, 0.0, bias, bias, bias])
 
@@ -162,9 +176,11 @@ class LevelledAttitude:
         level = self.R_NB[:2]
         return math.sqrt(0.5 * float(np.vdot(level, level @ self._P[3:, 3:])))
 
-    def restart(self) -> None:
-        """Increase the tilt's uncertainty after a gap, so that it is levelled quickly again."""
-        self._P = self._P + np.diag([_TILT_SIGMA**2] * 2 + [0.0] * 4)
+    def level(self, start: GravityStart) -> None:
+        """Set the tilt after a gap, by the smallest rotation; bias and yaw are kept."""
+        self.R_NB = tilt_aligning(self.R_NB @ start.up_B).as_matrix() @ self.R_NB
+        self._P[:3], self._P[:, :3] = 0.0, 0.0
+        self._P[:2, :2] = (start.liveliness * _TILT_SIGMA) ** 2 * np.eye(2)
 
     def _levelled(self, attitudes: FloatArray, time: FloatArray, accel: FloatArray) -> FloatArray:
         dt = float(time[-1] - time[0])

@@ -229,21 +229,27 @@ def test_a_stream_may_start_with_a_wild_timestamp(
     assert navigator.health.samples["future"] == 2
 
 
+def turned_over(walk: ImuSequence, late: np.ndarray) -> ImuSequence:
+    """Return a walk whose device is turned over before its `late` samples."""
+    turn = Rotation.from_rotvec([1.5, 1.0, -0.5])
+    gyro, accel = walk.gyro.copy(), walk.accel.copy()
+    gyro[late], accel[late] = turn.apply(gyro[late]), turn.apply(accel[late])
+    attitude = [*walk.truth.attitude_WB[~late]] + [
+        R * turn.inv() for R in walk.truth.attitude_WB[late]
+    ]
+    truth = replace(walk.truth, attitude_WB=Rotation.concatenate(attitude))
+    return replace(walk, gyro=gyro, accel=accel, truth=truth)
+
+
 @pytest.mark.parametrize("seconds", [60.0, 1e6])
 def test_after_a_long_gap_the_navigator_restarts_where_it_was(
     walk: ImuSequence, make_oracle: Make, seconds: float
 ) -> None:
     """The device is turned over in the gap: the first second after it determines the tilt again."""
     late = walk.time > 10.0
-    turn = Rotation.from_rotvec([1.5, 1.0, -0.5])
-    gyro, accel = walk.gyro.copy(), walk.accel.copy()
-    gyro[late], accel[late] = turn.apply(gyro[late]), turn.apply(accel[late])
-    time = walk.time + seconds * late
-    attitude = [*walk.truth.attitude_WB[~late]] + [
-        R * turn.inv() for R in walk.truth.attitude_WB[late]
-    ]
-    truth = replace(walk.truth, time=time, attitude_WB=Rotation.concatenate(attitude))
-    broken = replace(walk, time=time, gyro=gyro, accel=accel, truth=truth)
+    turned, time = turned_over(walk, late), walk.time + seconds * late
+    truth = replace(turned.truth, time=time)
+    broken = replace(turned, time=time, truth=truth)
     oracle = make_oracle(broken, truth, CONFIG)
     track, navigator = Navigator(oracle, CONFIG).run(broken), Navigator(oracle, CONFIG)
     assert stream_deviation(stream(navigator, broken), track) < 1e-9
@@ -258,6 +264,29 @@ def test_after_a_long_gap_the_navigator_restarts_where_it_was(
     assert sigma[2] > 1.0
     assert sigma[6] > min(seconds, 9e3)
     assert np.isfinite(track.covariance).all()
+
+
+@both_backends
+@pytest.mark.parametrize("seconds", [0.3, 1.0, 5.0])
+def test_a_device_turned_over_in_a_gap_does_not_run_away(
+    walk: ImuSequence, make_oracle: Make, backend: Any, seconds: float
+) -> None:
+    """As in a swinging hand: with its old tilt, gravity would be taken for motion."""
+    gap = (walk.time > 10.0) & (walk.time < 10.0 + seconds)
+    turned, late = turned_over(walk, walk.time > 10.0), walk.time[~gap]
+    holed = replace(turned, time=late, gyro=turned.gyro[~gap], accel=turned.accel[~gap])
+    oracle = make_oracle(holed, turned.truth, CONFIG)
+    track = Navigator(oracle, CONFIG, backend=backend).run(holed)
+    after = (track.time > 10.0 + seconds + 0.1) & (track.time < walk.time[-1])
+    truth = turned.truth.at(track.time[after])
+    speed = np.linalg.norm(track.trajectory.velocity_W[after], axis=1)
+    assert speed.max() < 2.0 + np.linalg.norm(truth.velocity_W, axis=1).max()
+    up, true_up = (
+        t.inv().apply([0.0, 0.0, 1.0])
+        for t in (track.trajectory.attitude_WB[after], truth.attitude_WB)
+    )
+    assert np.degrees(np.linalg.norm(up - true_up, axis=1)).mean() < 4.0
+    assert np.nanmean(track.innovations.nis[track.innovations.time > 10.0]) < 6.0
 
 
 # --- values ----------------------------------------------------------------------------------

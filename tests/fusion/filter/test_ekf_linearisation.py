@@ -6,11 +6,14 @@ from initial_ekf import initialised
 from scipy.spatial.transform import Rotation
 from se23 import exp_se23
 
+from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.jacobians import (
     displacement_jacobian,
     mean_velocity_jacobian,
+    plain_covariance,
     position_jacobian,
+    propagated_in_gap,
     velocity_jacobian,
     yaw_jacobian,
 )
@@ -67,6 +70,55 @@ def test_mean_velocity_jacobian_agrees_with_finite_differences() -> None:
     for first, block in mean_velocity_jacobian(v, force, R_WB, seconds):
         H[:, first : first + block.shape[1]] += block
     np.testing.assert_allclose(H, numeric, atol=1e-6)
+
+
+def test_a_gap_is_propagated_as_its_motion_and_its_turn_are_drawn() -> None:
+    """The mean and covariance of a pedestrian whose motion nothing measures."""
+    seconds, turn_variance, config = 2.0, 0.3**2, NavigatorConfig()
+    R, v, p = exp_so3(np.array([0.4, -0.7, 1.0])), np.array([1.0, -0.5, 0.1]), np.ones(3)
+    after = propagated_in_gap(seconds, turn_variance, R, v, p, config)
+    np.testing.assert_array_equal(after.R_WB, R)
+    np.testing.assert_array_equal(after.v_W, v)
+    np.testing.assert_allclose(after.p_W, p + seconds * v)
+
+    step, numeric = 1e-6, np.empty((9, 9))
+    for k, error in enumerate(step * np.eye(9)):  # of the state before, in the invariant error
+        turn, shift_v, shift_p = exp_se23(error)
+        v_k, p_k = turn @ v + shift_v, turn @ p + shift_p
+        end_v, end_p = v_k - turn @ v, p_k + seconds * v_k - turn @ (p + seconds * v)
+        numeric[:, k] = np.concatenate([error[:3], end_v, end_p]) / step
+    np.testing.assert_allclose(after.transition[:9, :9], numeric, atol=1e-5)
+
+    f, rng, n = config.filter, np.random.default_rng(0), 100_000
+    psi = rng.normal(0.0, np.sqrt(turn_variance), n)
+    sideways = np.cross(YAW, v) * psi[:, None]
+    q = f.gap_accel_noise**2 * np.array(
+        [[seconds, seconds**2 / 2], [seconds**2 / 2, seconds**3 / 3]]
+    )
+    dv, dp = np.moveaxis(rng.multivariate_normal(np.zeros(2), q, (n, 3)), -1, 0)
+    theta = rng.normal(0.0, f.gap_gyro_noise * np.sqrt(seconds), (n, 3)) + psi[:, None] * YAW
+    drawn = np.concatenate([theta, dv + sideways, dp + seconds * sideways], axis=1)
+    plain = plain_covariance(after.noise, np.array((after.v_W, after.p_W)))
+    scale = np.sqrt(np.diag(plain[0])[:9])
+    for which in plain[:, :9, :9]:
+        np.testing.assert_allclose(
+            which / np.outer(scale, scale), np.cov(drawn.T) / np.outer(scale, scale), atol=0.02
+        )
+
+
+def test_a_tilt_is_corrected_by_the_smallest_rotation() -> None:
+    ekf = initialised(0)
+    covariance = ekf.state.nav_state().covariance
+    before, p, v = ekf.state.R_WB, ekf.state.p_W, ekf.state.v_W
+    turned = exp_so3(np.array([0.3, -0.2, 0.0])) @ before  # the true attitude
+    ekf.update_tilt(turned.T @ YAW, 1e-6)
+    np.testing.assert_allclose(ekf.state.R_WB, turned, atol=1e-6)
+    after = ekf.state.nav_state().covariance
+    assert after[0, 0] < 1e-8
+    assert after[2, 2] == pytest.approx(covariance[2, 2])
+    # Neither place nor velocity hang on the tilt: the device was turned, not carried elsewhere.
+    np.testing.assert_allclose(ekf.state.p_W, p, atol=1e-9)
+    np.testing.assert_allclose(ekf.state.v_W, v, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["position", "velocity", "yaw"])

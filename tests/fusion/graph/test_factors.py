@@ -16,11 +16,12 @@ from stario.fusion.graph.factors import (
     Position,
     Prior,
     Term,
-    TurnProcess,
+    Tilt,
     Velocity,
     Yaw,
 )
 from stario.fusion.graph.keyframe_state import KeyframeState
+from stario.fusion.graph.processes import Coasting, TurnProcess
 from stario.sequences.attitude.so3 import exp_so3
 
 EYE = np.eye(3)
@@ -59,10 +60,12 @@ def terms(rng: np.random.Generator, values: Any) -> list[Term]:
         TurnProcess(1, 1, 0.0, np.eye(1)),
         Prior(0, (state,), rng.normal(size=(9, 16)), rng.normal(size=9), ((0, 0.2),)),
         Bearing(0, state.R_WB, rng.normal(size=3), rng.normal(size=6), 0.7, np.eye(1)),
+        Coasting(0, 1, 1.7, np.eye(13)),
+        Tilt(0, np.array([0.6, 0.0, 0.8]), EYE),
     ]
 
 
-@pytest.mark.parametrize("which", range(11))
+@pytest.mark.parametrize("which", range(13))
 def test_jacobians_agree_with_finite_differences(which: int) -> None:
     for seed in range(2):
         rng = np.random.default_rng(seed)
@@ -81,6 +84,46 @@ def test_jacobians_agree_with_finite_differences(which: int) -> None:
                 expected = given[key][:, column] if key in given else np.zeros(len(residual))
                 # The residual is measured minus predicted.
                 np.testing.assert_allclose(-(ahead - behind) / 2e-5, expected, atol=2e-6)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.5])
+def test_in_a_gap_velocity_and_biases_are_constant_and_a_turn_is_any_turn(yaw: float) -> None:
+    values = random_values(np.random.default_rng(5))
+    a, turn = KeyframeState.of(values, 0), exp_so3(np.array([0.0, 0.0, yaw]))
+    v = turn @ a.v_W
+    tilted = exp_so3(np.array([0.5, -1.0, 0.0])) @ a.R_WB
+    values.update(X(1), gtsam.Pose3(gtsam.Rot3(turn @ tilted), a.p_W + 3.0 * v))
+    values.update(V(1), v)
+    values.update(B(1), gtsam.imuBias.ConstantBias(a.b_a, a.b_g))
+    residual, _ = Coasting(0, 1, 3.0, np.eye(13)).linearise(values)
+    np.testing.assert_allclose(residual, [-yaw, *np.zeros(12)], atol=1e-12)
+
+
+def test_motion_in_a_gap_observes_no_turn_but_its_own() -> None:
+    """Not even where the residual is far from zero, as in a first round."""
+    values = random_values(np.random.default_rng(7))
+    a, b = (KeyframeState.of(values, k) for k in (0, 1))
+    _, blocks = Coasting(0, 1, 1.7, np.eye(13)).linearise(values)
+    H, up = dict(blocks), np.array([0.0, 0.0, 1.0])
+
+    def of_turn(k: int, s: KeyframeState, about: np.ndarray) -> np.ndarray:
+        pose = np.concatenate([s.R_WB.T @ up, s.R_WB.T @ np.cross(up, s.p_W - about)])
+        return np.asarray(H[X(k)] @ pose + H[V(k)] @ np.cross(up, s.v_W))
+
+    world = of_turn(0, a, np.zeros(3)) + of_turn(1, b, np.zeros(3))
+    np.testing.assert_allclose(world, 0.0, atol=1e-12)
+    np.testing.assert_allclose(of_turn(1, b, a.p_W), [1.0, *np.zeros(12)], atol=1e-12)
+
+
+def test_a_tilt_is_that_of_the_measured_vertical_at_any_yaw() -> None:
+    values = random_values(np.random.default_rng(6))
+    R = KeyframeState.of(values, 0).R_WB
+    turned = exp_so3(np.array([0.0, 0.0, 1.1])) @ R
+    residual, ((_, H),) = Tilt(0, turned[2], EYE).linearise(values)
+    np.testing.assert_allclose(residual, 0.0, atol=1e-12)
+    np.testing.assert_allclose(H[:, :3] @ R[2], 0.0, atol=1e-12)  # a turn about the vertical
+    off = exp_so3(np.array([0.0, 0.1, 0.0])) @ R
+    assert np.linalg.norm(Tilt(0, off[2], EYE).linearise(values)[0]) == pytest.approx(np.sin(0.1))
 
 
 def in_turned_world(values: Any, yaw: float, shift: np.ndarray) -> Any:

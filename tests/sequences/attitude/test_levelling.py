@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.levelling import (
+    GravityStart,
     LevelledAttitude,
     integrate,
     levelled_attitudes,
@@ -21,6 +22,10 @@ UP = np.array([0.0, 0.0, 1.0])
 def simulated_walk(seed: int, seconds: float, carry: str, errors: ImuErrors) -> ImuSequence:
     style = WalkStyle(carry=carry, mount_rotvec=(0.4, -0.7, 1.1))
     return simulate_imu(generate_walk(seed, seconds, style=style), 200.0, errors, seed)
+
+
+def start_at(R_WB: np.ndarray, turn_rate: float = 0.5) -> GravityStart:
+    return GravityStart(R_WB, False, STANDARD_GRAVITY, turn_rate)
 
 
 def tilt_error(R_NB: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
@@ -97,7 +102,7 @@ def test_levelling_leaves_yaw_unchanged() -> None:
     time = np.arange(11) / 200.0
     accel = np.tile(STANDARD_GRAVITY * UP, (11, 1))
     tilted = exp_so3(np.array([0.08, -0.04, 0.0]))
-    attitude = LevelledAttitude(tilted)
+    attitude = LevelledAttitude(start_at(tilted))
     for _ in range(1200):
         before = attitude.R_NB
         attitude.advance(time, np.zeros((11, 3)), accel)
@@ -109,10 +114,41 @@ def test_levelling_leaves_yaw_unchanged() -> None:
     assert abs(yaw) < 0.01
 
 
+def test_after_a_gap_the_tilt_is_gravitys_and_bias_and_yaw_are_kept() -> None:
+    time = np.arange(21) / 200.0
+    accel = np.tile(STANDARD_GRAVITY * UP, (21, 1))
+    attitude = LevelledAttitude(start_at(np.eye(3)))
+    for _ in range(300):
+        attitude.advance(time, np.tile([0.02, -0.01, 0.0], (21, 1)), accel)
+    learned, before = attitude.b_g.copy(), attitude.R_NB
+    np.testing.assert_allclose(learned, [0.02, -0.01, 0.0], atol=3e-3)
+    turned = exp_so3(np.array([0.9, 0.4, 0.0]))  # with the device, unobserved
+    attitude.level(start_at(turned.T))
+    np.testing.assert_array_equal(attitude.b_g, learned)
+    assert tilt_error(attitude.R_NB @ turned, np.eye(3)) < 1e-9
+    about = Rotation.from_matrix(attitude.R_NB @ before.T).as_rotvec()
+    assert abs(about[2]) < 1e-9
+
+
+def test_a_livelier_start_is_levelled_more_quickly() -> None:
+    """A runner's first second gives a tilt that is off by ten degrees."""
+    time = np.arange(21) / 200.0
+    accel = np.tile(STANDARD_GRAVITY * UP, (21, 1))
+    off = exp_so3(np.array([0.2, 0.0, 0.0]))
+    errors = []
+    for turn_rate in (0.5, 1.0, 3.0):
+        attitude = LevelledAttitude(start_at(off, turn_rate))
+        for _ in range(20):
+            attitude.advance(time, np.zeros((21, 3)), accel)
+        errors.append(tilt_error(attitude.R_NB, np.eye(3)))
+    assert errors[0] == errors[1]
+    assert errors[2] < 0.6 * errors[1]
+
+
 def test_levelling_leaves_a_rotating_level_device_unchanged() -> None:
     time = np.arange(11) / 200.0
     gyro, accel = np.tile([0.0, 0.0, 2.0], (11, 1)), np.tile(STANDARD_GRAVITY * UP, (11, 1))
-    attitude = LevelledAttitude(np.eye(3))
+    attitude = LevelledAttitude(start_at(np.eye(3)))
     for _ in range(100):
         attitude.advance(time, gyro, accel)
     expected = exp_so3(np.array([0.0, 0.0, 2.0 * 100 * 0.05]))
@@ -121,7 +157,7 @@ def test_levelling_leaves_a_rotating_level_device_unchanged() -> None:
 
 def test_free_fall_and_a_dead_accelerometer_leave_the_attitude_finite() -> None:
     time = np.arange(11) / 200.0
-    attitude = LevelledAttitude(np.eye(3))
+    attitude = LevelledAttitude(start_at(np.eye(3)))
     attitude.advance(time, np.full((11, 3), 0.1), np.zeros((11, 3)))
     expected = exp_so3(np.full(3, 0.1 * 0.05))
     np.testing.assert_allclose(attitude.R_NB, expected, atol=1e-9)

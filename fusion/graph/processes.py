@@ -1,0 +1,85 @@
+"""Terms between keyframes that no measurement gives: a gap, and the network's turn."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gtsam.symbol_shorthand import B, T, V, X
+
+from stario.fusion.filter.jacobians import yaw_jacobian
+from stario.fusion.graph.factors import Between, Linearised, turn_at
+from stario.fusion.graph.keyframe_state import KeyframeState
+from stario.fusion.lie import about_vertical, twist
+from stario.sequences.attitude.so3 import skew
+from stario.sequences.sequence import FloatArray
+
+_EYE = np.eye(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Coasting(Between):
+    """Constant velocity and biases across a gap without samples, apart from a turn.
+
+    The velocity turns with the device about the vertical, by psi, the yaw of R_j R_i^T. The tilt
+    may change by any angle; `Tilt` determines the new one. In the axes of body i, so that neither
+    psi nor a turn of the world is observed by being linearised where the residual is not zero:
+
+        psi      R_i^T (R_z(psi)^T v_j - v_i)      R_i^T (R_z(psi)^T (p_j - p_i) - t v_i)
+
+    Attributes:
+        seconds: length t of the gap [s].
+        covariance: (13, 13) of these and of the changes of gyroscope and accelerometer bias.
+    """
+
+    seconds: float
+    covariance: FloatArray
+
+    def linearise(self, values: Any) -> Linearised:
+        """Linearise in the axes of body i; biases in B."""
+        a, b = KeyframeState.of(values, self.i), KeyframeState.of(values, self.j)
+        R, t, to_i = b.R_WB @ a.R_WB.T, self.seconds, a.R_WB.T
+        psi = math.atan2(*twist(R))
+        back = about_vertical(-psi)
+        ends = back @ np.column_stack([b.v_W, b.p_W - a.p_W])
+        changes = to_i @ (ends - np.column_stack([a.v_W, t * a.v_W]))
+        biases = b.b_g - a.b_g, b.b_a - a.b_a
+
+        # A rotation of R_j by w turns R by R_j w; one of R_i turns it by the same, backwards.
+        turned = to_i @ np.stack([ends[1], -ends[0], np.zeros(2)])  # -e3 x
+        by_psi = np.concatenate([[1.0], turned[:, 0], turned[:, 1]])
+        rotated = np.outer(by_psi, yaw_jacobian(R)[0][1] @ b.R_WB)
+        pose_i, pose_j = np.zeros((13, 6)), np.zeros((13, 6))
+        pose_i[:7, :3], pose_j[:7, :3] = -rotated, rotated
+        pose_i[1:7, :3] += skew(changes.T).reshape(6, 3)
+        pose_i[4:7, 3:], pose_j[4:7, 3:] = -to_i @ back @ a.R_WB, to_i @ back @ b.R_WB
+        velocity, bias = np.eye(13, 3, k=-1), np.zeros((13, 6))
+        bias[7:10, 3:], bias[10:, :3] = _EYE, _EYE
+        by_v_i = -(velocity + t * np.eye(13, 3, k=-4)) @ to_i
+        by_v_j = velocity @ to_i @ back
+        before = [(X(self.i), pose_i), (V(self.i), by_v_i), (B(self.i), -bias)]
+        after = [(X(self.j), pose_j), (V(self.j), by_v_j), (B(self.j), bias)]
+        return -np.concatenate([[psi], changes.T.ravel(), *biases]), before + after
+
+
+@dataclass(frozen=True, eq=False)
+class TurnProcess(Between):
+    """Gauss-Markov model of the network's turn: tau_j = correlation tau_i + n.
+
+    Attributes:
+        correlation: correlation of the two turns; 0 for the first turn, where i is j.
+        covariance: (1, 1) covariance of n [rad^2].
+    """
+
+    correlation: float
+    covariance: FloatArray
+
+    def linearise(self, values: Any) -> Linearised:
+        """Linearise about the vertical."""
+        now, before = turn_at(values, self.j), turn_at(values, self.i)
+        blocks = [(T(self.j), np.eye(1))]
+        if self.i != self.j:
+            blocks.append((T(self.i), -self.correlation * np.eye(1)))
+        return np.array([self.correlation * before - now]), blocks
