@@ -56,8 +56,10 @@ class FilterConfig:
             the tracks of devices with a good gyroscope. The filter widens this prior where gravity,
             stillness or the magnetic field show a larger bias.
         accel_bias_sigma: sigma of the initial accelerometer bias [m/s^2].
-        gap_gyro_noise: gyroscope noise density in a gap [rad/s/sqrt(Hz)].
-        gap_accel_noise: accelerometer noise density in a gap [m/s^2/sqrt(Hz)].
+        gap_gyro_noise: noise density of the tilt in a gap, and of a saturated gyroscope
+            [rad/s/sqrt(Hz)].
+        gap_accel_noise: noise density of the velocity in a gap, and of a saturated accelerometer
+            [m/s^2/sqrt(Hz)].
         stillness_noise: factor on a phone's white noise below which a second of samples counts as
             stationary; 0 disables zero-velocity updates.
         adaptive: whether innovations and gravity adapt the accelerometer's density and the prior of

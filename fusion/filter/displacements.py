@@ -42,9 +42,6 @@ _OFFSET_SCALE = 10.0
 _ALTERNATIVE_GATE = 0.95
 """Probability of the chi-square test beyond which a displacement does not fit the alternative."""
 
-_FITS_TO_REPLACE = 2
-"""Displacements that must fit only the alternative before it replaces the filter's state."""
-
 _FITS_TO_DROP = 4
 """Consecutive displacements that fit both before the alternative is dropped: outliers were few."""
 
@@ -66,8 +63,6 @@ class AlternativeHypothesis:
         start_time: time of the first outlier [s].
         offset_W: (3,) the steady error, from the residuals of the outliers [m].
         outliers: times of the displacements that do not fit as they are [s].
-        exclusive_fits: number of displacements that fitted only the alternative since the last one
-            that fitted only the filter.
         shared_fits: number of latest displacements in a row that fitted both.
     """
 
@@ -75,7 +70,6 @@ class AlternativeHypothesis:
     start_time: float
     offset_W: FloatArray
     outliers: tuple[float, ...] = ()
-    exclusive_fits: int = 0
     shared_fits: int = 0
 
 
@@ -111,7 +105,7 @@ class HypothesisPair:
         return result
 
     def judge(self, fits: bool, fits_filter: bool) -> tuple[float, ...]:
-        """Count a displacement that both have applied; adopt or drop the alternative.
+        """Adopt the alternative if only it fits a displacement; drop it once both fit several.
 
         Args:
             fits: whether it fitted the alternative as it is.
@@ -124,14 +118,11 @@ class HypothesisPair:
         alternative = self.alternative
         if alternative is None:
             return ()
-        exclusive = alternative.exclusive_fits + (fits and not fits_filter)
-        if fits_filter and not fits:
-            exclusive = 0
-        shared = alternative.shared_fits + 1 if fits_filter and fits else 0
-        if exclusive >= _FITS_TO_REPLACE:
+        if fits and not fits_filter:
             self.ekf.state, self.alternative = alternative.ekf, None
             return alternative.outliers
-        self.alternative = changed(alternative, exclusive_fits=exclusive, shared_fits=shared)
+        shared = alternative.shared_fits + 1 if fits else 0
+        self.alternative = changed(alternative, shared_fits=shared)
         if shared >= _FITS_TO_DROP or alternative.ekf.time - alternative.start_time > _MAX_SECONDS:
             self.alternative = None
         return ()

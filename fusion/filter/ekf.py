@@ -111,17 +111,20 @@ class StateCloningEkf(ErrorStateEngine):
         start = pose[:, :3], pose[:, 3], pose[:, 4], s.b_g, s.b_a
         self._move(segment.stop, propagated(segment, *start, accel_share))
 
-    def propagate_in_gap(self, stop: float, turn_variance: float, config: NavigatorConfig) -> None:
+    def propagate_in_gap(
+        self, stop: float, rotation: FloatArray, turn_variance: float, config: NavigatorConfig
+    ) -> None:
         """Propagate without samples to the end of a gap, or to a fix within it.
 
         Args:
             stop: time of the end, or of the fix [s].
+            rotation: (3, 3) from the body then to the body now (`gap_rotation`).
             turn_variance: variance of the device's unobserved turn until then [rad^2].
             config: noise densities.
         """
         s = self.state
         pose = s.X[0]
-        start = pose[:, :3], pose[:, 3], pose[:, 4]
+        start = pose[:, :3] @ rotation, pose[:, 3], pose[:, 4]
         self._move(stop, propagated_in_gap(stop - s.time, turn_variance, *start, config))
 
     def _move(self, time: float, end: Propagation) -> None:

@@ -29,7 +29,7 @@ from stario.fusion.filter.network_errors import ACCEL_SHARE
 from stario.fusion.filter.zero_velocity import StillnessDetector, ZeroVelocity, ZeroVelocityUpdates
 from stario.fusion.fixes import Accepted, Fix, by_time
 from stario.fusion.health import Health, SampleCounts
-from stario.fusion.imu.gap import yaw_variance
+from stario.fusion.imu.gap import gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import ImuInterval, Start, split_at_fixes
 from stario.fusion.imu.preintegration import Segment, segment_of
 from stario.fusion.imu.stateful import Displacement
@@ -151,35 +151,37 @@ class Estimator:
         pieces = split_at_fixes(interval, fixes)
         for piece, due in pieces:
             if piece is not None:
-                segment = self._propagate_piece(piece, interval.start)
+                segment = self._propagate_piece(piece, interval)
             accepted += [applied for fix in due if (applied := self._update_fix(fix)) is not None]
         if interval.levelled is not None:
             sigma = tilt_sigma(interval.levelled, self._config)
             self.ekf.update_tilt(interval.levelled.up_B, sigma)
         return (segment if len(pieces) == 1 else None), accepted
 
-    def _propagate_piece(self, interval: ImuInterval, interval_start: float) -> Segment | None:
-        """Propagate through a piece of the interval that started at `interval_start` [s]."""
+    def _propagate_piece(self, piece: ImuInterval, interval: ImuInterval) -> Segment | None:
+        """Propagate through a piece of an interval."""
 
         def propagate() -> Segment:
             s = self.ekf.state
-            segment = segment_of(interval, s.b_g, s.b_a, self._config)
+            segment = segment_of(piece, s.b_g, s.b_a, self._config)
             self.ekf.propagate(segment, accel_share)
             return segment
 
         if interval.gap:
-            self._propagate_in_gap(interval, interval_start)
+            self._propagate_in_gap(piece, interval)
             return None
         # The noise of faulty samples is what it may be.
         correlated = self._config.filter.correlated_errors
         accel_share = ACCEL_SHARE if correlated and not any(interval.flags) else 1.0
         return self._hypotheses.apply_to_both(propagate)
 
-    def _propagate_in_gap(self, interval: ImuInterval, gap_start: float) -> None:
-        """Propagate through a piece of the gap that began at `gap_start` [s]."""
-        earlier = yaw_variance(interval.start - gap_start)
-        turn_variance = yaw_variance(interval.stop - gap_start) - earlier
-        self.ekf.propagate_in_gap(interval.stop, turn_variance, self._config)
+    def _propagate_in_gap(self, piece: ImuInterval, gap: ImuInterval) -> None:
+        """Propagate through a piece of a gap."""
+        before, after = (
+            yaw_variance(time - gap.start, gap.duration) for time in (piece.start, piece.stop)
+        )
+        rotation = gap_rotation(piece.table, gap.duration, self.ekf.state.b_g)
+        self.ekf.propagate_in_gap(piece.stop, rotation, after - before, self._config)
         self.frame.lose_yaw()
 
     def _update_fix(self, fix: Fix) -> Accepted | None:

@@ -85,7 +85,7 @@ def reinitialise(ekf: StateCloningEkf, interval: ImuInterval, config: NavigatorC
     """Reset the state after a long gap: tilt from gravity, velocity and yaw unknown."""
     f, s, start = config.filter, ekf.state, interval.levelled
     assert start is not None  # no gap is that long without
-    covariance, seconds = s.nav_state().covariance, interval.stop - interval.start
+    covariance, seconds = s.nav_state().covariance, interval.duration
     # The position stays correlated with the biases that led there.
     covariance[:6], covariance[:, :6] = 0.0, 0.0
     tilt = tilt_sigma(start, config)

@@ -212,7 +212,7 @@ def propagated_in_gap(
     p_W: FloatArray,
     config: NavigatorConfig,
 ) -> Propagation:
-    """Return the state after a gap: attitude and velocity are kept, with a pedestrian's noise.
+    """Return the state after a gap: the velocity is kept, with a pedestrian's noise.
 
     No force is measured that a wrong tilt could rotate, so the motion does not depend on gravity:
     theta' = theta, rho_v' = rho_v, rho_p' = rho_p + t rho_v.
@@ -220,7 +220,7 @@ def propagated_in_gap(
     Args:
         seconds: length t of the gap [s].
         turn_variance: as for `gap_covariance` [rad^2].
-        R_WB: (3, 3) attitude.
+        R_WB: (3, 3) attitude after it.
         v_W: (3,) velocity [m/s].
         p_W: (3,) position before it [m].
         config: noise densities.

@@ -15,8 +15,8 @@ from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Fix
 from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Tilt, Velocity, Yaw
 from stario.fusion.graph.keyframes import KeyframeGraph
-from stario.fusion.imu.gap import yaw_variance
-from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
+from stario.fusion.imu.gap import gap_rotation, yaw_variance
+from stario.fusion.imu.intervals import SAME_TIME, ImuInterval, split_at
 from stario.fusion.imu.preintegration import Segment, segment_of, segment_of_all
 from stario.fusion.imu.stateful import Displacement as Measured
 from stario.fusion.lie import about_vertical, yaw_twist
@@ -79,7 +79,7 @@ class GraphBuilder:
         self._pending: list[ImuInterval] = []
         # Keyframes where windows begin and end, by the count of intervals; cleared at a gap.
         self._window_keyframes: dict[int, int] = {count: 0} if count % self._spacing == 0 else {}
-        self._gaps: dict[int, float] = {}  # keyframes followed by a gap, and its end [s]
+        self._gaps: dict[int, ImuInterval] = {}  # by the keyframe before them
 
     @property
     def estimates_turn(self) -> bool:
@@ -173,13 +173,18 @@ class GraphBuilder:
         self.graph.marginalise(first)
         self._window_keyframes = {n: k for n, k in self._window_keyframes.items() if k >= first}
         self.segments = {k: pieces for k, pieces in self.segments.items() if k >= first}
-        self._gaps = {k: stop for k, stop in self._gaps.items() if k >= first}
+        self._gaps = {k: gap for k, gap in self._gaps.items() if k >= first}
 
     def dead_reckoned(self, k: int, time: float = math.inf) -> Pose:
         """Dead-reckon from a keyframe to a time [s], or to the end of its data if earlier."""
         R, v, p, b_g, b_a = self.graph.pose(k)
         if k in self._gaps:
-            return R, v, p + (min(time, self._gaps[k]) - self.graph.time(k)) * v
+            gap = self._gaps[k]
+            until = min(time, gap.stop)
+            if until < gap.stop:
+                gap, _ = split_at(gap, until)
+            turn = gap_rotation(gap.table, self._gaps[k].duration, b_g)
+            return R @ turn, v, p + gap.duration * v
         for segment in self.segments[k]:
             end = segment.predict(R, v, p, b_g, b_a)
             if segment.stop > time:
@@ -195,8 +200,8 @@ class GraphBuilder:
         if interval.lost:
             graph.add_disconnected(guess)  # the filter's new start
         else:
-            self._gaps[graph.last] = interval.stop
-            graph.add_after_gap(guess, self._config)
+            self._gaps[graph.last] = interval
+            graph.add_after_gap(interval, guess, self._config)
             assert interval.levelled is not None  # it comes with the end of every gap
             variance = tilt_sigma(interval.levelled, self._config) ** 2
             graph.add(Tilt(graph.last, interval.levelled.up_B, variance * np.eye(3)), gated=False)
@@ -232,7 +237,7 @@ class GraphBuilder:
         dt, f = max(dt, 0.0), self._config.filter
         # Noise of the IMU since the keyframe, or of the motion in a gap.
         accel_noise = f.gap_accel_noise if k in self._gaps else self._config.noise.accel_noise
-        turned = f.gap_gyro_noise**2 * dt + yaw_variance(dt) if k in self._gaps else 0.0
+        turned = yaw_variance(dt, self._gaps[k].duration) if k in self._gaps else 0.0
         drift = accel_noise**2 * dt * np.eye(3)
         if fix.kind == "position":
             covariance = fix.covariance + dt**2 / 3.0 * drift

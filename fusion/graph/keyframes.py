@@ -26,7 +26,8 @@ from stario.fusion.graph.factors import Prior, Term, turn_at
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.processes import Coasting, TurnProcess
 from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_factor
-from stario.fusion.imu.gap import gap_covariance, yaw_variance
+from stario.fusion.imu.gap import gap_covariance, gap_rotation, yaw_variance
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.state import NavState
 from stario.sequences.accuracy.chi_square import chi2_quantile
@@ -98,13 +99,13 @@ class KeyframeGraph:
         self._insert(guess)
         return self.last
 
-    def add_after_gap(self, guess: NavState, config: NavigatorConfig) -> int:
+    def add_after_gap(self, gap: ImuInterval, guess: NavState, config: NavigatorConfig) -> int:
         """Connect a new keyframe to the last one across a gap; return its number."""
-        i = self.last
+        i, t = self.last, gap.duration
         self._insert(guess)
-        t = guess.time - self._time[i]
-        covariance = gap_covariance(t, yaw_variance(t), np.zeros(3), config)[2:, 2:]
-        self.add(Coasting(i, self.last, t, covariance), gated=False)
+        covariance = gap_covariance(t, yaw_variance(t, t), np.zeros(3), config)[2:, 2:]
+        rotation = gap_rotation(gap.table, t, self._states[i].b_g)
+        self.add(Coasting(i, self.last, t, rotation, covariance), gated=False)
         return self.last
 
     def add_disconnected(self, state: NavState) -> int:

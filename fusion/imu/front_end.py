@@ -29,6 +29,7 @@ from stario.fusion.imu.faults import (
     OutlierDetector,
     SensorCheck,
 )
+from stario.fusion.imu.gap import gap_rotation
 from stario.fusion.imu.intervals import (
     FieldBuffer,
     Flags,
@@ -187,8 +188,9 @@ class FrontEnd:
             self.start, self._attitude = start, LevelledAttitude(start)
             return self._complete()
         assert self._before_gap is not None
-        self._attitude.level(start)
         ends = np.array([self._before_gap, self._samples[0]])
+        turn = gap_rotation(ends, first - ends[0, 0], self._attitude.b_g)
+        self._attitude.level(turn, start)
         self._before_gap = None
         gap = _interval(ends, self._attitude, gap=True, levelled=start)
         return [gap, *self._complete()]

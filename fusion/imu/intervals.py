@@ -129,7 +129,7 @@ class ImuInterval:
     @property
     def lost(self) -> bool:
         """Whether this is a gap too long for the motion before it to tell anything about after."""
-        return self.gap and self.stop - self.start > LONG_GAP
+        return self.gap and self.duration > LONG_GAP
 
     @property
     def table(self) -> FloatArray:
@@ -145,6 +145,11 @@ class ImuInterval:
     def stop(self) -> float:
         """Time of the last sample [s]."""
         return float(self.time[-1])
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last sample [s]."""
+        return self.stop - self.start
 
 
 _NO_ATTITUDES = np.empty((0, 3, 3))

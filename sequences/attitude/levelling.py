@@ -176,9 +176,15 @@ class LevelledAttitude:
         level = self.R_NB[:2]
         return math.sqrt(0.5 * float(np.vdot(level, level @ self._P[3:, 3:])))
 
-    def level(self, start: GravityStart) -> None:
-        """Set the tilt after a gap, by the smallest rotation; bias and yaw are kept."""
-        self.R_NB = tilt_aligning(self.R_NB @ start.up_B).as_matrix() @ self.R_NB
+    def level(self, turn: FloatArray, start: GravityStart) -> None:
+        """Set the attitude after a gap: turned as expected, then levelled by the smallest rotation.
+
+        Args:
+            turn: (3, 3) rotation from the body after it to that before.
+            start: attitude from gravity after it.
+        """
+        R_NB = self.R_NB @ turn
+        self.R_NB = tilt_aligning(R_NB @ start.up_B).as_matrix() @ R_NB
         self._P[:3], self._P[:, :3] = 0.0, 0.0
         self._P[:2, :2] = (start.liveliness * _TILT_SIGMA) ** 2 * np.eye(2)
 

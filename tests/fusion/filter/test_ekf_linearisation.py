@@ -96,7 +96,8 @@ def test_a_gap_is_propagated_as_its_motion_and_its_turn_are_drawn() -> None:
         [[seconds, seconds**2 / 2], [seconds**2 / 2, seconds**3 / 3]]
     )
     dv, dp = np.moveaxis(rng.multivariate_normal(np.zeros(2), q, (n, 3)), -1, 0)
-    theta = rng.normal(0.0, f.gap_gyro_noise * np.sqrt(seconds), (n, 3)) + psi[:, None] * YAW
+    tilt = rng.normal(0.0, f.gap_gyro_noise * np.sqrt(seconds), (n, 3)) * (1.0 - YAW)
+    theta = tilt + psi[:, None] * YAW
     drawn = np.concatenate([theta, dv + sideways, dp + seconds * sideways], axis=1)
     plain = plain_covariance(after.noise, np.array((after.v_W, after.p_W)))
     scale = np.sqrt(np.diag(plain[0])[:9])

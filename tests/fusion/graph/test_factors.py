@@ -60,7 +60,7 @@ def terms(rng: np.random.Generator, values: Any) -> list[Term]:
         TurnProcess(1, 1, 0.0, np.eye(1)),
         Prior(0, (state,), rng.normal(size=(9, 16)), rng.normal(size=9), ((0, 0.2),)),
         Bearing(0, state.R_WB, rng.normal(size=3), rng.normal(size=6), 0.7, np.eye(1)),
-        Coasting(0, 1, 1.7, np.eye(13)),
+        Coasting(0, 1, 1.7, exp_so3(rng.normal(0.0, 0.3, 3)), np.eye(13)),
         Tilt(0, np.array([0.6, 0.0, 0.8]), EYE),
     ]
 
@@ -91,11 +91,12 @@ def test_in_a_gap_velocity_and_biases_are_constant_and_a_turn_is_any_turn(yaw: f
     values = random_values(np.random.default_rng(5))
     a, turn = KeyframeState.of(values, 0), exp_so3(np.array([0.0, 0.0, yaw]))
     v = turn @ a.v_W
-    tilted = exp_so3(np.array([0.5, -1.0, 0.0])) @ a.R_WB
+    R_ij = exp_so3(np.array([0.1, 0.3, -0.2]))  # of the device, known and no turn of the walker
+    tilted = exp_so3(np.array([0.5, -1.0, 0.0])) @ a.R_WB @ R_ij
     values.update(X(1), gtsam.Pose3(gtsam.Rot3(turn @ tilted), a.p_W + 3.0 * v))
     values.update(V(1), v)
     values.update(B(1), gtsam.imuBias.ConstantBias(a.b_a, a.b_g))
-    residual, _ = Coasting(0, 1, 3.0, np.eye(13)).linearise(values)
+    residual, _ = Coasting(0, 1, 3.0, R_ij, np.eye(13)).linearise(values)
     np.testing.assert_allclose(residual, [-yaw, *np.zeros(12)], atol=1e-12)
 
 
@@ -103,7 +104,7 @@ def test_motion_in_a_gap_observes_no_turn_but_its_own() -> None:
     """Not even where the residual is far from zero, as in a first round."""
     values = random_values(np.random.default_rng(7))
     a, b = (KeyframeState.of(values, k) for k in (0, 1))
-    _, blocks = Coasting(0, 1, 1.7, np.eye(13)).linearise(values)
+    _, blocks = Coasting(0, 1, 1.7, EYE, np.eye(13)).linearise(values)
     H, up = dict(blocks), np.array([0.0, 0.0, 1.0])
 
     def of_turn(k: int, s: KeyframeState, about: np.ndarray) -> np.ndarray:

@@ -123,7 +123,7 @@ def test_after_a_gap_the_tilt_is_gravitys_and_bias_and_yaw_are_kept() -> None:
     learned, before = attitude.b_g.copy(), attitude.R_NB
     np.testing.assert_allclose(learned, [0.02, -0.01, 0.0], atol=3e-3)
     turned = exp_so3(np.array([0.9, 0.4, 0.0]))  # with the device, unobserved
-    attitude.level(start_at(turned.T))
+    attitude.level(np.eye(3), start_at(turned.T))
     np.testing.assert_array_equal(attitude.b_g, learned)
     assert tilt_error(attitude.R_NB @ turned, np.eye(3)) < 1e-9
     about = Rotation.from_matrix(attitude.R_NB @ before.T).as_rotvec()

@@ -1,0 +1,76 @@
+"""How a device turns in a gap without samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support import GRAPH
+
+from stario.fusion import Navigator
+from stario.fusion.imu.gap import INTERPOLATED, gap_rotation, yaw_variance
+from stario.sequences.attitude.rotations import about_z, yaw_of
+from stario.sequences.sequence import ImuSequence
+
+RATE, BIAS = np.array([0.3, -0.2, 2.0]), np.array([0.01, 0.02, -0.03])
+
+
+def ends(seconds: float, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    return np.array([[5.0, *before, 0.0, 0.0, 0.0], [5.0 + seconds, *after, 0.0, 0.0, 0.0]])
+
+
+def test_a_short_gap_is_turned_through_at_the_rates_of_its_ends() -> None:
+    table = ends(0.4, RATE + BIAS, RATE + BIAS)
+    expected = Rotation.from_rotvec(0.4 * RATE).as_matrix()
+    np.testing.assert_allclose(gap_rotation(table, 0.4, BIAS), expected, atol=1e-9)
+    about = ends(0.4, np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 3.0]))
+    turned = Rotation.from_matrix(gap_rotation(about, 0.4, np.zeros(3))).as_rotvec()
+    np.testing.assert_allclose(turned, [0.0, 0.0, 0.8], atol=1e-9)
+
+
+def test_a_long_gap_keeps_the_attitude() -> None:
+    length = INTERPOLATED + 0.1
+    np.testing.assert_array_equal(gap_rotation(ends(length, RATE, RATE), length, BIAS), np.eye(3))
+
+
+@pytest.mark.parametrize("length", [0.3, 0.9, 3.0])
+def test_the_yaw_is_ever_less_certain_until_it_is_unknown(length: float) -> None:
+    sigma = np.sqrt([yaw_variance(s, length) for s in np.linspace(0.0, length, 20)])
+    assert sigma[0] == 0.0
+    assert (np.diff(sigma) > 0.0).all()
+    assert yaw_variance(100.0, 100.0) == yaw_variance(1000.0, 1000.0) < np.pi**2
+
+
+@pytest.mark.parametrize("backend", ["ekf", "graph"])
+def test_the_yaw_is_kept_through_gaps_while_the_device_turns(
+    make_walk: Callable[..., Any], make_oracle: Any, without: Any, backend: Any
+) -> None:
+    """A kept attitude would lose 20 degrees in each of these four gaps, and know as much."""
+    walk = swivelled(make_walk(3, 32.0), 1.0)
+    gone = (walk.time > 10.0) & (walk.time < 28.0) & (walk.time % 5.0 < 0.35)
+    holed = without(walk, gone)
+    track = Navigator(make_oracle(holed, walk.truth, GRAPH), GRAPH, backend=backend).run(holed)
+    rows = [0, int(np.searchsorted(track.time, 29.5))]
+    errors = yaw_of(track.trajectory.attitude_WB[rows])
+    errors -= yaw_of(walk.truth.at(track.time[rows]).attitude_WB)
+    off = abs(np.angle(np.exp(1j * (errors[1] - errors[0]))))
+    sigma = np.sqrt(track.covariance[rows[1], 2, 2])
+    assert off < np.radians(20.0)
+    assert off < 3.0 * sigma
+    assert 0.15 < sigma < 0.35
+
+
+def swivelled(walk: ImuSequence, rate: float) -> ImuSequence:
+    """Return a walk whose device also turns about the vertical, at a rate [rad/s]."""
+    assert walk.truth is not None
+    before = walk.truth.at(walk.time).attitude_WB
+    after = about_z(rate * walk.time) * before
+    gyro = walk.gyro + before.inv().apply([0.0, 0.0, rate])
+    attitude_WB = about_z(rate * walk.truth.time) * walk.truth.attitude_WB
+    truth = replace(walk.truth, attitude_WB=attitude_WB)
+    accel = after.inv().apply(before.apply(walk.accel))
+    return replace(walk, gyro=gyro, accel=accel, truth=truth)
