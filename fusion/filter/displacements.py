@@ -185,14 +185,20 @@ class DisplacementUpdates:
     def _update_alternative(self, update: Callable[..., UpdateResult]) -> bool:
         """Update the alternative with a displacement: as it is if it fits, else less the offset.
 
+        An alternative that is uncertain after some seconds would take any displacement for right,
+        so one nearer to the offset than to zero does not fit.
+
         Return whether it fits.
         """
-        result = self.hypotheses.apply_to_alternative(partial(update, _ALTERNATIVE_GATE, "reject"))
         alternative = self.hypotheses.alternative
-        if result is None or alternative is None or result.accepted or result.residual is None:
+        result = self.hypotheses.apply_to_alternative(partial(update, _ALTERNATIVE_GATE, "reject"))
+        if result is None or alternative is None or result.residual is None:
             return True
-        offset_W = alternative.offset_W
-        offset_W = offset_W + _OFFSET_GAIN * (result.residual - offset_W)
+        offset_W, residual = alternative.offset_W, result.residual
+        nearer_offset = residual @ offset_W > 0.5 * offset_W @ offset_W
+        if result.accepted and not nearer_offset:
+            return True
+        offset_W = offset_W + _OFFSET_GAIN * (residual - offset_W)
         outliers = (*alternative.outliers, alternative.ekf.time)
         self.hypotheses.alternative = changed(alternative, offset_W=offset_W, outliers=outliers)
         self.hypotheses.apply_to_alternative(partial(update, None, offset_W=offset_W))

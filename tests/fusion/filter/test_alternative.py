@@ -24,6 +24,8 @@ from stario.fusion.filter.network_errors import TURN_SECONDS, with_turn
 from stario.fusion.state import NavState
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence
+from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
+from stario.sequences.simulation.walks import generate_walk
 
 SECONDS = 120.0
 
@@ -50,6 +52,15 @@ def test_five_false_seconds_leave_no_lasting_error_with_the_default_noise(
     sequence, _ = matched_walk(SECONDS, seed)
     [result] = run_faults(sequence, NavigatorConfig(), seed=seed, backends=(backend,), only=[block])
     assert result.error_with < result.error_without + limit
+
+
+def test_the_last_false_displacement_does_not_spoil_the_alternative() -> None:
+    """In this walk it fits the alternative, by then uncertain; both back ends were 3 m off."""
+    [block] = [fault for fault in faults(SECONDS) if fault.name == "network off by 1 m for 5 s"]
+    walk = generate_walk(4, SECONDS)
+    sequence = simulate_imu(walk, 200.0, PHONE_IMU, 4)
+    [result] = run_faults(sequence, NavigatorConfig(), backends=("graph",), only=[block])
+    assert result.error_with < result.error_without + 0.35
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
@@ -166,3 +177,28 @@ def test_a_false_displacement_lets_the_networks_turn_decay_once() -> None:
     assert len(alternative.outliers) == 1
     for state in (ekf.state, alternative.ekf):
         assert state.network_turn == pytest.approx(0.1 * np.exp(-0.5 / TURN_SECONDS), rel=1e-9)
+
+
+@pytest.mark.parametrize(("error", "fits"), [(1.0, False), (0.0, True)])
+def test_an_uncertain_alternative_does_not_take_the_steady_error_for_right(
+    error: float, fits: bool
+) -> None:
+    ekf, zero = StateCloningEkf(slots=1), np.zeros(3)
+    uncertain = np.diag(np.repeat([1e-2, 1.0, 1.0, 1e-4, 1e-4], 3))
+    ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, 1e-4 * np.eye(15)))
+    slot = ekf.clone()
+    updates = DisplacementUpdates(ekf, FilterConfig(update_rate=2))
+    other = StateCloningEkf(slots=1)
+    other.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, 1e-4 * np.eye(15)))
+    other.clone()
+    P = other.state.covariances.copy()
+    P[:, :15, :15] += uncertain
+    other.state = replace(other.state, covariances=P)
+    offset_W = np.array([1.0, 0.0, 0.0])
+    updates.hypotheses.alternative = AlternativeHypothesis(other.state, 0.0, offset_W)
+    updates.update(slot, np.eye(3), error * offset_W, 1e-2 * np.eye(3))
+    alternative = updates.hypotheses.alternative
+    assert alternative is not None
+    assert (alternative.outliers == ()) == fits
+    # Less the offset, both displacements are zero.
+    np.testing.assert_allclose(alternative.ekf.p_W, 0.0, atol=0.05)
