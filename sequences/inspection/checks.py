@@ -146,6 +146,14 @@ def _check_time(sequence: ImuSequence) -> None:
             "a time for each sample",
             "a logger or spreadsheet rounded the times: export them with fractions of a second",
         )  # fmt: skip
+    mean = (len(times) - 1) / float(times[-1] - times[0])
+    if rate > MAX_RATE and MIN_RATE <= mean <= MAX_RATE:
+        raise InputError(
+            f"{sequence.name}: time",
+            f"batches: {mean:.3g} samples/s, most {1.0 / rate:.2g} s apart",
+            "a time for each sample",
+            "these are the times at which batches arrived: space their samples evenly",
+        )  # fmt: skip
     fix = "set the app to 50 Hz or more" if 1.0 <= rate < MIN_RATE else ""
     for unit, per_second in TIME_UNITS.items():
         if rate and unit != "s" and MIN_RATE <= rate * per_second <= MAX_RATE:

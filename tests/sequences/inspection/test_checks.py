@@ -149,6 +149,15 @@ def test_a_sampling_rate_out_of_range_is_refused(walk: ImuSequence) -> None:
     assert "found 10 samples/s, expected 50 to 1000" in refusal(slow)
 
 
+def test_times_of_batches_are_not_taken_for_a_fast_sensor(walk: ImuSequence) -> None:
+    """As of a sensor whose samples arrive by radio, four at a time."""
+    count = 4 * (len(walk.time) // 4)
+    arrived = walk.time[3:count:4].repeat(4) + np.tile(1e-4 * np.arange(4), count // 4)
+    text = refusal(replace(walk.slice(0.0, walk.time[count - 1]), time=arrived))
+    assert "batches: 200 samples/s, most 0.0001 s apart" in text
+    assert "space their samples evenly" in text
+
+
 @pytest.mark.parametrize(("step", "shared"), [(1.0, "194"), (0.1, "19.9")])
 def test_rounded_times_are_not_taken_for_a_slow_sensor_or_another_unit(
     walk: ImuSequence, step: float, shared: str
