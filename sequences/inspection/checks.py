@@ -19,13 +19,13 @@ from stario.sequences.arrays import check_type
 from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.constant_values import check_not_dead
-from stario.sequences.inspection.samples import disorder
+from stario.sequences.inspection.times import check_time
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 from stario.sequences.truth.fit import TruthFit, fit_truth
 from stario.sequences.truth.part import without_spikes
 from stario.sequences.truth.positions import fit_positions
-from stario.sequences.units import FAST_RAD_S, GYRO_UNITS, TIME_UNITS
-from stario.sequences.windows import MAX_RATE, MIN_RATE, clean_samples, unbroken
+from stario.sequences.units import FAST_RAD_S, GYRO_UNITS
+from stario.sequences.windows import clean_samples, unbroken
 
 log = logging.getLogger(__name__)
 
@@ -40,9 +40,6 @@ recording: the cost does not grow with its length."""
 
 _NO_SENSOR = 1e4
 """Largest median magnitude that a sensor can have, in deg/s, m/s^2 or any unit in between."""
-
-_ROUNDED_TIMES = 1.5
-"""Least number of samples that share a time on average if times are rounded too coarsely."""
 
 _OFF_GRAVITY = 0.1
 """Relative error of the average force above any calibration error; recordings reach 0.008."""
@@ -93,7 +90,7 @@ def check_units(sequence: ImuSequence) -> None:
     """
     check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
     _check_content(sequence)
-    _check_time(sequence)
+    check_time(sequence)
     time, gyro, accel = clean_samples(sequence)
     if time[-1] - time[0] < MIN_SECONDS:
         raise InputError(
@@ -128,39 +125,6 @@ def _check_content(sequence: ImuSequence) -> None:
                 f"{sequence.name}: {field}", f"{size:.3g} on average", "a plausible sensor value",
                 "is another column meant, or is one of them a clock?",
             )  # fmt: skip
-
-
-def _check_time(sequence: ImuSequence) -> None:
-    if found := disorder(sequence.time):
-        raise InputError(
-            f"{sequence.name}: time", found, "increasing times", "sort the rows by time"
-        )
-    rate = sequence.rate
-    if MIN_RATE <= rate <= MAX_RATE:
-        return
-    times = sequence.time[np.isfinite(sequence.time)]
-    shared = len(times) / len(np.unique(times))
-    if shared >= _ROUNDED_TIMES:
-        raise InputError(
-            f"{sequence.name}: time", f"{shared:.3g} samples on average at each time",
-            "a time for each sample",
-            "a logger or spreadsheet rounded the times: export them with fractions of a second",
-        )  # fmt: skip
-    mean = (len(times) - 1) / float(times[-1] - times[0])
-    if rate > MAX_RATE and MIN_RATE <= mean <= MAX_RATE:
-        raise InputError(
-            f"{sequence.name}: time",
-            f"batches: {mean:.3g} samples/s, most {1.0 / rate:.2g} s apart",
-            "a time for each sample",
-            "these are the times at which batches arrived: space their samples evenly",
-        )  # fmt: skip
-    fix = "set the app to 50 Hz or more" if 1.0 <= rate < MIN_RATE else ""
-    for unit, per_second in TIME_UNITS.items():
-        if rate and unit != "s" and MIN_RATE <= rate * per_second <= MAX_RATE:
-            fix = f"time seems to be in {unit}: write `t [{unit}]` in the CSV's header"
-        if rate and unit != "s" and MIN_RATE <= rate / per_second <= MAX_RATE:
-            fix = "time seems to be in seconds already: write `t [s]` in the CSV's header"
-    raise InputError(f"{sequence.name}: time", f"{rate:.4g} samples/s", "50 to 1000", fix)
 
 
 def check_gyro(

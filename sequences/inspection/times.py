@@ -1,0 +1,52 @@
+"""Detection of times that are out of order, rounded, in another unit, or those of batches."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stario.sequences.errors import InputError
+from stario.sequences.inspection.samples import disorder
+from stario.sequences.sequence import ImuSequence
+from stario.sequences.units import TIME_UNITS
+from stario.sequences.windows import MAX_RATE, MIN_RATE
+
+_ROUNDED_TIMES = 1.5
+"""Least number of samples that share a time on average if times are rounded too coarsely."""
+
+
+def check_time(sequence: ImuSequence) -> None:
+    """Check order, rate and unit of a recording's times.
+
+    Raises:
+        InputError: they are out of order, or there are not 50 to 1000 different ones a second.
+    """
+    if found := disorder(sequence.time):
+        raise InputError(
+            f"{sequence.name}: time", found, "increasing times", "sort the rows by time"
+        )
+    rate = sequence.rate
+    if MIN_RATE <= rate <= MAX_RATE:
+        return
+    times = sequence.time[np.isfinite(sequence.time)]
+    shared = len(times) / len(np.unique(times))
+    if shared >= _ROUNDED_TIMES:
+        raise InputError(
+            f"{sequence.name}: time", f"{shared:.3g} samples on average at each time",
+            "a time for each sample",
+            "a logger or spreadsheet rounded the times: export them with fractions of a second",
+        )  # fmt: skip
+    mean = (len(times) - 1) / float(times[-1] - times[0])
+    if rate > MAX_RATE and MIN_RATE <= mean <= MAX_RATE:
+        raise InputError(
+            f"{sequence.name}: time",
+            f"batches: {mean:.3g} samples/s, most {1.0 / rate:.2g} s apart",
+            "a time for each sample",
+            "these are the times at which batches arrived: space their samples evenly",
+        )  # fmt: skip
+    fix = "set the app to 50 Hz or more" if 1.0 <= rate < MIN_RATE else ""
+    for unit, per_second in TIME_UNITS.items():
+        if rate and unit != "s" and MIN_RATE <= rate * per_second <= MAX_RATE:
+            fix = f"time seems to be in {unit}: write `t [{unit}]` in the CSV's header"
+        if rate and unit != "s" and MIN_RATE <= rate / per_second <= MAX_RATE:
+            fix = "time seems to be in seconds already: write `t [s]` in the CSV's header"
+    raise InputError(f"{sequence.name}: time", f"{rate:.4g} samples/s", "50 to 1000", fix)
