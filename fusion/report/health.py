@@ -9,9 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 from stario.fusion.health import Health
+from stario.sequences.attitude.levelling import START_SECONDS
 
 Level = Literal["good", "note", "warning"]
 """Severity: nothing to do, good to know, or worth acting on."""
@@ -164,14 +166,19 @@ def _gaps(health: Health) -> Iterator[Finding]:
         return
     amount = f"{health.gap_count} gaps" if health.gap_count > 1 else "1 gap"
     text = f"{amount} in the samples (longest: {health.longest_gap:.2f} s)."
-    if health.longest_gap < LONG_GAP:
-        yield Finding("note", text)
+    logger = "Keep the logger in the foreground and exempt it from battery saving"
+    if health.longest_gap >= LONG_GAP:
+        restore = "a yaw fix or position fixes after the gap restore the heading"
+        yield Finding("warning", text, f"{logger}; {restore}.")
     else:
-        advice = (
-            "Keep the logger in the foreground and exempt it from battery saving; "
-            "a yaw fix or position fixes after the gap restore the heading."
+        yield Finding("note", text)
+    between = [b - (a + length) for (a, length), (b, _) in pairwise(health.gaps)]
+    if short := sum(seconds < START_SECONDS for seconds in between):
+        text = (
+            f"{short} of the stretches between gaps are shorter than a second, which does not "
+            "suffice to level the attitude: the track leaves them out."
         )
-        yield Finding("warning", text, advice)
+        yield Finding("warning", text, f"{logger}; over Bluetooth, lower the rate.")
 
 
 def _updates(health: Health) -> Iterator[Finding]:

@@ -130,3 +130,12 @@ def test_a_board_shaken_beyond_its_range_is_distrusted_and_one_turned_by_hand_is
 
 def test_the_factor_by_which_sigmas_are_too_small_is_the_root_of_the_ratio() -> None:
     assert "a factor of about 2.0" in warnings_of(Health(updates=100, mean_nis=12.0))
+
+
+def test_stretches_too_short_to_level_the_attitude_are_named() -> None:
+    health = Health(updates=100, mean_nis=3.0, gap_count=3, longest_gap=0.3)
+    health.gaps = [(5.0, 0.25), (6.0, 0.25), (9.0, 0.3)]
+    (short,) = [each for each in findings(health) if each.level == "warning"]
+    assert short.text.startswith("1 of the stretches between gaps")
+    health.gaps = [(5.0, 0.25), (7.0, 0.25)]
+    assert all(each.level != "warning" for each in findings(health))
