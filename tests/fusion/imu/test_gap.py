@@ -13,6 +13,7 @@ from support import GRAPH
 
 from stario.fusion import Navigator
 from stario.fusion.imu.gap import INTERPOLATED, gap_rotation, yaw_variance
+from stario.fusion.recording import cut_recording
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence
 
@@ -62,6 +63,18 @@ def test_the_yaw_is_kept_through_gaps_while_the_device_turns(
     assert off < np.radians(20.0)
     assert off < 3.0 * sigma
     assert 0.15 < sigma < 0.35
+
+
+def test_the_network_sees_the_same_turn(make_walk: Callable[..., Any], without: Any) -> None:
+    """The levelled frame, along which a network's displacements are chained, keeps its yaw."""
+    walk = swivelled(make_walk(3, 20.0), 1.0)
+    holed = without(walk, (walk.time > 10.0) & (walk.time < 10.4))
+    intervals, _ = cut_recording(holed, GRAPH)
+    (k,) = [k for k, each in enumerate(intervals) if each.gap]
+    ends = np.array([intervals[k - 1].stop, intervals[k].stop])
+    R_NB = Rotation.from_matrix([intervals[k - 1].R_NB, intervals[k].R_NB])
+    turn = np.diff(yaw_of(R_NB)) - np.diff(yaw_of(walk.truth.at(ends).attitude_WB))
+    assert np.abs(np.angle(np.exp(1j * turn)))[0] < np.radians(8.0)
 
 
 def swivelled(walk: ImuSequence, rate: float) -> ImuSequence:
