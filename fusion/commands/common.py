@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
+_NAMED = 3
+"""Number of skipped recordings with the same reason that are listed one by one."""
+
 
 def collect_results(
     outcomes: Iterable[Result | Skipped], skipped: list[Skipped]
@@ -102,10 +105,27 @@ def check_new(field: str, path: Path, overwrite: bool) -> None:
 
 
 def list_skipped(skipped: Sequence[Skipped]) -> None:
-    """List what was skipped on stderr."""
+    """List what was skipped on stderr; many recordings with one reason take one line."""
+    by_reason: dict[str, list[str]] = {}
     for failure in skipped:
-        where = "" if failure.item in failure.reason else f"{failure.item}: "
-        typer.echo(f"stario: skipped: {where}{failure.reason}", err=True)
+        by_reason.setdefault(_bare_reason(failure), []).append(failure.item)
+    for reason, items in by_reason.items():
+        named = items
+        if len(items) > _NAMED:
+            named = [f"{len(items)} recordings, the first {items[0]}"]
+        for words in named:
+            where = "" if words in reason else f"{words}: "
+            typer.echo(f"stario: skipped: {where}{reason}", err=True)
+
+
+def _bare_reason(failure: Skipped) -> str:
+    """Return the reason without the recording's name, by which messages begin."""
+    from stario.sequences.readers.archive import split_name
+
+    path = Path(failure.item)
+    member = split_name(path)[1]
+    reason = failure.reason.removeprefix(f"{failure.item}: ")
+    return reason.removeprefix(f"{member or path.stem}: ")
 
 
 def exit_if_skipped(skipped: Sequence[Skipped]) -> None:

@@ -110,6 +110,19 @@ def test_a_bad_recording_in_the_list_is_named_and_the_rest_compared(
         assert not (tmp_path / "none").exists()
 
 
+def test_many_recordings_skipped_for_one_reason_take_one_line(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    blind = read_generic_csv(recording).without_truth()
+    for k in range(5):
+        write_csv(tmp_path / f"blind-{k}.csv", blind)
+    done = stario("evaluate", recording, tmp_path)
+    assert done.code == 1
+    (line,) = done.err.splitlines()
+    assert "5 recordings, the first " in line
+    assert "blind-0.csv: truth: found none" in line
+
+
 def test_evaluate_prints_medians_and_needs_truth(stario, recording: Path, tmp_path: Path) -> None:
     done = stario("evaluate", recording)
     assert done.code == 0
@@ -231,7 +244,7 @@ def test_training_continues_after_failures_and_caches_its_windows(
     lines = [line for line in done.err.splitlines() if line.startswith("stario: skipped")]
     assert len(lines) == 2
     assert "nosuch.csv" in lines[0]
-    assert "blind: truth" in lines[1]
+    assert "blind.csv: truth" in lines[1]
     assert done.err.index(lines[1]) < done.err.index("epoch 1:")
     kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "kept").iterdir()}
     assert len(kept) == 2  # the recording's and the generated walk's
