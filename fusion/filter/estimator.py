@@ -29,7 +29,7 @@ from stario.fusion.filter.network_errors import ACCEL_SHARE
 from stario.fusion.filter.zero_velocity import StillnessDetector, ZeroVelocity, ZeroVelocityUpdates
 from stario.fusion.fixes import Accepted, Fix, by_time
 from stario.fusion.health import Health, SampleCounts
-from stario.fusion.imu.gap import gap_rotation, yaw_variance
+from stario.fusion.imu.gap import INTERPOLATED, gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import ImuInterval, Start, split_at_fixes
 from stario.fusion.imu.preintegration import Segment, segment_of
 from stario.fusion.imu.stateful import Displacement
@@ -140,9 +140,11 @@ class Estimator:
         self.in_gap = interval.gap
         if interval.gap:
             self._release_clones()
+            if interval.duration > INTERPOLATED:
+                # Nothing links them to the track after it, which they would seem to place.
+                self._counts = self._counts.add("fixes", *["in a long gap"] * len(fixes))
+                fixes = ()
         if interval.lost:
-            # Fixes within a long gap are useless: nothing links them to the track after it.
-            self._counts = self._counts.add("fixes", *["in a long gap"] * len(fixes))
             reinitialise(self.ekf, interval, self._config)
             self.frame.lose_yaw()
             return None, []

@@ -86,7 +86,8 @@ class MapFrame:
 
     def update(self, fix: Fix) -> UpdateResult:
         """Apply a fix at the filter's time."""
-        if fix.kind == "position" and self._needs_placing(fix):
+        places = fix.kind == "position" and self._needs_placing(fix)
+        if places:
             transform: FrameTransform | None = self._place(fix)
         elif self.state.oriented:
             return self._update(fix)
@@ -97,6 +98,8 @@ class MapFrame:
             reason = "too coarse" if fix.kind == "yaw" else "yaw not known"
             return UpdateResult(math.nan, len(fix.value), False, reason=reason)
         result = self._update(fix)
+        if places:
+            self._begin_alignment(fix)
         completed = self._with_uncertainty(transform, self._ekf.state.nav_state())
         self.state = changed(self.state, transforms=(*self.state.transforms, completed))
         return result
@@ -143,11 +146,10 @@ class MapFrame:
         sigma = min(_INFLATION_RATIO * math.sqrt(variance), _MAX_SIGMA)
         self._ekf.state = self._ekf.state.with_position_inflated(sigma)
         self.state = changed(self.state, placed=True)
-        self._begin_alignment(fix)
         return transform
 
     def _begin_alignment(self, fix: Fix) -> None:
-        """Take a position as the pivot about which later fixes turn the track."""
+        """Take the position just applied as the pivot about which later fixes turn the track."""
         self.state = changed(
             self.state,
             pivot=fix.value,

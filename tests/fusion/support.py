@@ -10,6 +10,7 @@ import numpy as np
 from stario.fusion import Navigator, NavState, Track
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.sequences.accuracy.metrics import Alignment, evaluate_track
+from stario.sequences.attitude.rotations import about_z
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence
 
@@ -58,3 +59,15 @@ class Broken:
                 mean[k, 0] += self.mean
                 covariance[k, 0, 0] = self.variance
         return mean, covariance
+
+
+def swivelled(walk: ImuSequence, rate: float) -> ImuSequence:
+    """Return a walk whose device also turns about the vertical, at a rate [rad/s]."""
+    assert walk.truth is not None
+    before = walk.truth.at(walk.time).attitude_WB
+    after = about_z(rate * walk.time) * before
+    gyro = walk.gyro + before.inv().apply([0.0, 0.0, rate])
+    attitude_WB = about_z(rate * walk.truth.time) * walk.truth.attitude_WB
+    truth = replace(walk.truth, attitude_WB=attitude_WB)
+    accel = after.inv().apply(before.apply(walk.accel))
+    return replace(walk, gyro=gyro, accel=accel, truth=truth)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support import CONFIG, ate, stream, stream_deviation
+from support import CONFIG, ate, stream, stream_deviation, swivelled
 
 from stario.fusion import Navigator, PriorPose, Track
 from stario.fusion.config import FilterConfig, NavigatorConfig
@@ -190,3 +190,14 @@ def test_another_mount_only_turns_the_track_about_the_vertical(
     assert np.ptp(np.unwrap(yaw_of(turn))) < 1e-6
     back = about_z(float(yaw_of(turn)[0])).apply(ours.position_W, inverse=True)
     assert np.abs(back - theirs.position_W).max() < 1e-5
+
+
+def test_the_first_tilt_is_less_certain_the_faster_the_device_turns(
+    make_walk: Make, still_model: Any
+) -> None:
+    walk = make_walk(3, 3.0)
+    slow, fast = (
+        np.sqrt(Navigator(still_model).run(each).covariance[0, 0, 0])
+        for each in (walk, swivelled(walk, 3.0))
+    )
+    assert fast > 2.0 * slow

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from support import GRAPH as CONFIG
-from support import stream
+from support import stream, swivelled
 
 from stario.fusion import Navigator, PriorPose, Track
 from stario.fusion.evaluation.checks.with_fixes import true_fixes
@@ -55,6 +56,24 @@ def test_a_position_before_a_gap_does_not_turn_the_track_after_it(
     assert abs(turn) < 3.0 * np.sqrt(track.covariance[early, 2, 2])
     # A graph's marginals are of first order: a turn's covariance lies across the arm only.
     assert backend == "graph" or position_nees(track, walk, early) < 20.0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(("seed", "gap", "turn"), [(2, 6.0, 2.5), (2, 6.0, -2.5), (18, 10.0, 1.8)])
+def test_fixes_find_the_direction_again_after_a_gap_with_fixes_in_it(
+    make_walk: Make, make_oracle: Make, without: Make,
+    backend: Any, seed: int, gap: float, turn: float,
+) -> None:  # fmt: skip
+    walk = turned(make_walk(seed, 60.0), 20.0 + 0.5 * gap, turn)
+    holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
+    oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    fixes = true_fixes(walk.truth, 3.0, 0.3, 0)
+    track = Navigator(oracle, CONFIG, backend=backend).run(holed, fixes=fixes)
+    late = (track.time > 20.5 + gap) & (track.time < walk.time[-1])
+    sigma = np.sqrt(track.covariance[late, 2, 2])
+    assert (np.abs(yaw_error(track, walk, late)) < 4.0 * sigma).all()
+    assert sigma[-1] < 0.1
+    assert track.health.fixes["in a long gap"] == sum(20.0 < f.time <= 20.0 + gap for f in fixes)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -148,6 +167,21 @@ def test_a_fix_within_a_gap_gives_little_information_about_the_track_before_it(
     assert np.mean(nees) < 7.8  # 95 % of a chi-square with three degrees of freedom
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_yaw_within_a_short_gap_of_a_turning_device_is_that_of_its_time(
+    make_walk: Make, make_oracle: Make, without: Make, backend: Any
+) -> None:
+    walk = swivelled(make_walk(1, 24.0), 2.0)
+    holed = without(walk, (walk.time > 10.0) & (walk.time < 10.8))
+    oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    fix = yaw_fix(10.5, yaw_of(walk.truth.at(np.array([10.5])).attitude_WB)[0], 0.02)
+    track = Navigator(oracle, CONFIG, backend=backend).run(holed, fixes=[fix])
+    for time in (9.5, 11.5):
+        k = int(np.searchsorted(track.time, time))
+        error = yaw_error(track, walk, slice(k, k + 1))[0]
+        assert abs(error) < 3.0 * np.sqrt(track.covariance[k, 2, 2]) < 1.5
+
+
 @pytest.mark.parametrize("jump", [(0.0, 0.0, 8.0), (20.0, 0.0, 0.0)])
 def test_a_streams_graph_follows_the_fixes_where_the_filter_does(
     make_walk: Make, make_oracle: Make, jump: tuple[float, float, float]
@@ -199,3 +233,17 @@ def test_a_rotation_rounded_to_four_digits_is_accepted(still_model: Any, make_wa
 def true_start(walk: ImuSequence) -> PriorPose:
     truth = walk.truth
     return PriorPose(truth.attitude_WB[0].as_matrix(), truth.velocity_W[0], truth.position_W[0])
+
+
+def turned(walk: ImuSequence, at: float, angle: float) -> ImuSequence:
+    """Return a walk that turns at once by an angle [rad], which its samples do not show."""
+    truth = walk.truth
+    pivot = truth.at(np.array([at])).position_W[0]
+    turn = about_z(np.where(truth.time > at, angle, 0.0))
+    after = replace(
+        truth,
+        attitude_WB=turn * truth.attitude_WB,
+        position_W=pivot + turn.apply(truth.position_W - pivot),
+        velocity_W=turn.apply(truth.velocity_W),
+    )
+    return replace(walk, truth=after)

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support import GRAPH
+from support import GRAPH, swivelled
 
 from stario.fusion import Navigator
 from stario.fusion.imu.gap import INTERPOLATED, gap_rotation, yaw_variance
 from stario.fusion.recording import cut_recording
-from stario.sequences.attitude.rotations import about_z, yaw_of
-from stario.sequences.sequence import ImuSequence
+from stario.sequences.attitude.rotations import yaw_of
 
 RATE, BIAS = np.array([0.3, -0.2, 2.0]), np.array([0.01, 0.02, -0.03])
 
@@ -77,13 +75,17 @@ def test_the_network_sees_the_same_turn(make_walk: Callable[..., Any], without: 
     assert np.abs(np.angle(np.exp(1j * turn)))[0] < np.radians(8.0)
 
 
-def swivelled(walk: ImuSequence, rate: float) -> ImuSequence:
-    """Return a walk whose device also turns about the vertical, at a rate [rad/s]."""
-    assert walk.truth is not None
-    before = walk.truth.at(walk.time).attitude_WB
-    after = about_z(rate * walk.time) * before
-    gyro = walk.gyro + before.inv().apply([0.0, 0.0, rate])
-    attitude_WB = about_z(rate * walk.truth.time) * walk.truth.attitude_WB
-    truth = replace(walk.truth, attitude_WB=attitude_WB)
-    accel = after.inv().apply(before.apply(walk.accel))
-    return replace(walk, gyro=gyro, accel=accel, truth=truth)
+def test_gravity_determines_the_tilt_even_if_the_recording_ends_soon_after_a_gap(
+    make_walk: Callable[..., Any], make_oracle: Any, without: Any
+) -> None:
+    walk = make_walk(1, 19.2)
+    holed = without(walk, (walk.time > 15.0) & (walk.time < 18.0))
+    oracle = make_oracle(holed, walk.truth, GRAPH)
+    for backend in ("ekf", "graph"):
+        track = Navigator(oracle, GRAPH, backend=backend).run(holed)
+        row = int(np.searchsorted(track.time, 18.05))
+        true_WB = walk.truth.at(track.time[row : row + 1]).attitude_WB
+        off = (track.trajectory.attitude_WB[row] * true_WB.inv()).apply([0.0, 0.0, 1.0])
+        sigma = np.sqrt(np.diag(track.covariance[row])[:2])
+        assert np.linalg.norm(off[:, :2]) < 3.0 * np.linalg.norm(sigma)
+        assert (sigma < 0.06).all()
