@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.filter.jacobians import CORE
-from stario.fusion.filter.planar_alignment import PlanarAlignment
+from stario.fusion.filter.planar_alignment import POSITION, PlanarAlignment, without_yaw
 from stario.fusion.lie import UNKNOWN_YAW
 from stario.fusion.state import NavState, SmoothedPose, changed
 from stario.sequences.sequence import FloatArray, Trajectory
@@ -39,6 +39,8 @@ class FrameTransform:
         until: states from this time [s] on are not transformed either.
         yaw_sigma: standard deviation of the turn [rad].
         drift: variance of the track's own yaw at the time of a turn [rad^2].
+        position_drift: (3, 3) covariance of the track's own position at the time of a shift, apart
+            from its yaw's part [m^2].
         position_covariance: (3, 3) covariance of the shift [m^2].
     """
 
@@ -50,6 +52,7 @@ class FrameTransform:
     until: float = math.inf
     yaw_sigma: float = 0.0
     drift: float = 0.0
+    position_drift: FloatArray | None = None
     position_covariance: FloatArray | None = None
 
     def state(self, state: NavState) -> NavState:
@@ -63,6 +66,9 @@ class FrameTransform:
         covariance += _turn_covariance(turn_variance, v_W, p_W - self.pivot)
         if self.position_covariance is not None:
             covariance[6:9, 6:9] += self.position_covariance
+        if self.position_drift is not None:
+            since_then = self.position_drift - without_yaw(state.covariance, POSITION)
+            covariance[6:9, 6:9] += _positive_part(since_then)
         return changed(
             state,
             R_WB=self.R @ state.R_WB,
@@ -71,6 +77,12 @@ class FrameTransform:
             covariance=covariance,
             map_frame=state.map_frame + 1,
         )
+
+
+def _positive_part(P: FloatArray) -> FloatArray:
+    """Return a symmetric matrix without its negative eigenvalues."""
+    values, vectors = np.linalg.eigh(P)
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
 
 def frame_rotation(R: FloatArray) -> FloatArray:

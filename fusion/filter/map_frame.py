@@ -20,6 +20,7 @@ from stario.fusion.filter.frame_transform import FrameTransform, MapFrameState, 
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.network_errors import with_turn
 from stario.fusion.filter.planar_alignment import (
+    POSITION,
     PlanarAlignment,
     plane_sigma,
     turn_from_fix,
@@ -140,7 +141,10 @@ class MapFrame:
 
     def _place(self, fix: Fix) -> FrameTransform:
         now, since = self._ekf.state.nav_state(), self.state.since
-        transform = FrameTransform(np.eye(3), fix.value - now.p_W, fix.value, True, since)
+        drift = without_yaw(now.covariance, POSITION)
+        transform = FrameTransform(
+            np.eye(3), fix.value - now.p_W, fix.value, True, since, position_drift=drift
+        )
         self._ekf.state = self._ekf.state.transformed(np.eye(3), transform.shift)
         variance = np.trace(fix.covariance) + np.trace(now.position_covariance)
         sigma = min(_INFLATION_RATIO * math.sqrt(variance), _MAX_SIGMA)
@@ -193,18 +197,15 @@ class MapFrame:
         now, pivot = self._ekf.state.nav_state(), self.state.pivot
         track, measured = (now.p_W - pivot)[:2], (fix.value - pivot)[:2]
         variance = 0.5 * float(np.trace(fix.covariance[:2, :2]))
-        drift = 0.5 * float(np.trace(without_yaw(now.covariance, 6)))
+        drift = 0.5 * float(np.trace(without_yaw(now.covariance, POSITION)[:2, :2]))
         alignment = self.state.alignment.with_position(track, measured, variance, drift)
         self.state = changed(self.state, alignment=alignment)
 
     def _with_uncertainty(self, transform: FrameTransform, state: NavState) -> FrameTransform:
         """Return a transform with its uncertainty, taken from the state after the fix."""
-        P, oriented = state.covariance, self.state.oriented
-        return changed(
-            transform,
-            yaw_sigma=math.sqrt(P[2, 2]) if oriented else 0.0,
-            position_covariance=np.zeros((3, 3)) if oriented else P[6:9, 6:9],
-        )
+        if transform.placed:
+            return changed(transform, position_covariance=state.position_covariance)
+        return changed(transform, yaw_sigma=math.sqrt(state.covariance[2, 2]))
 
     def _update(self, fix: Fix) -> UpdateResult:
         if self.state.oriented:

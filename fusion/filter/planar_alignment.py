@@ -16,6 +16,9 @@ from stario.fusion.lie import yaw_twist
 from stario.fusion.state import NavState
 from stario.sequences.sequence import FloatArray
 
+POSITION = slice(6, 9)
+"""Rows of the position in the covariance of a `NavState`."""
+
 
 @dataclass(frozen=True, eq=False)
 class PlanarAlignment:
@@ -76,11 +79,11 @@ def turn_from_fix(state: NavState, pivot: FloatArray, fix: Fix) -> tuple[float, 
 
 def plane_sigma(state: NavState, first: int, fix: Fix) -> float:
     """Return the largest horizontal sigma of a fix minus two rows of the state, without yaw."""
-    P = without_yaw(state.covariance, first) + fix.covariance[:2, :2]
+    P = without_yaw(state.covariance, slice(first, first + 2)) + fix.covariance[:2, :2]
     return math.sqrt(float(np.linalg.eigvalsh(P)[-1]))
 
 
-def without_yaw(P: FloatArray, first: int) -> FloatArray:
-    """Return the covariance (2, 2) of two rows without yaw's part, which the fixes determine."""
-    by_yaw = P[first : first + 2, 2]
-    return np.asarray(P[first : first + 2, first : first + 2] - np.outer(by_yaw, by_yaw) / P[2, 2])
+def without_yaw(P: FloatArray, rows: slice) -> FloatArray:
+    """Return the covariance of some rows without yaw's part, which the fixes determine."""
+    by_yaw = P[rows, 2]
+    return np.asarray(P[rows, rows] - np.outer(by_yaw, by_yaw) / P[2, 2])

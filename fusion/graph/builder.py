@@ -205,8 +205,6 @@ class GraphBuilder:
             assert interval.levelled is not None  # it comes with the end of every gap
             variance = tilt_sigma(interval.levelled, self._config) ** 2
             graph.add(Tilt(graph.last, interval.levelled.up_B, variance * np.eye(3)), gated=False)
-            if self.estimates_turn:
-                graph.add_turn(self._turn_sigma, TURN_SECONDS)
         self.count = 0
         self.segments[graph.last] = []
         self._window_keyframes = {0: graph.last}

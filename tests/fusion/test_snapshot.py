@@ -169,7 +169,7 @@ def test_a_snapshot_of_another_version_is_refused(walk: ImuSequence, still_model
         navigator.restore(data)
 
 
-LAYOUTS = {21: "baceaa91"}
+LAYOUTS = {22: "baceaa91"}
 """CRC of the classes and attributes in a snapshot, by version."""
 
 

@@ -76,6 +76,25 @@ def test_fixes_find_the_direction_again_after_a_gap_with_fixes_in_it(
     assert track.health.fixes["in a long gap"] == sum(20.0 < f.time <= 20.0 + gap for f in fixes)
 
 
+@pytest.mark.parametrize(
+    ("seed", "gap", "yaw_first"), [(2, 7.3, False), (2, 7.3, True), (7, 0.9, True)]
+)
+def test_states_before_the_first_position_are_as_uncertain_as_the_motion_until_it(
+    make_walk: Make, make_oracle: Make, without: Make, seed: int, gap: float, yaw_first: bool
+) -> None:
+    walk = make_walk(seed, 45.0)
+    holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
+    oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    fixes = [f for f in true_fixes(walk.truth, 2.0, 0.2, 0) if f.time > 32.0]
+    if yaw_first:
+        fixes.insert(0, yaw_fix(31.0, yaw_of(walk.truth.at(np.array([31.0])).attitude_WB)[0], 0.1))
+    track = Navigator(oracle, CONFIG).run(holed, fixes=fixes)
+    early = np.flatnonzero((track.time > 1.0) & (track.time < 19.0))[::20]
+    assert max(position_nees(track, walk, row) for row in early) < 16.0
+    off = track.trajectory.position_W - walk.truth.at(track.time).position_W
+    assert (np.abs(off[early, 2]) < 3.0 * np.sqrt(track.covariance[early, 8, 8])).all()
+
+
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_short_gaps_after_a_long_one_do_not_lose_the_position(
     make_walk: Make, make_oracle: Make, without: Make, seed: int
