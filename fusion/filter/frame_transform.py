@@ -38,9 +38,9 @@ class FrameTransform:
         since: states before this time [s] are not transformed: they are in the map already.
         until: states from this time [s] on are not transformed either.
         yaw_sigma: standard deviation of the turn [rad].
-        drift: variance of the track's own yaw at the time of a turn [rad^2].
-        position_drift: (3, 3) covariance of the track's own position at the time of a shift, apart
-            from its yaw's part [m^2].
+        drift: variance of the track's own yaw at that time [rad^2].
+        by_yaw: (3,) part of the position's error at the time of a shift, per yaw error [m].
+        position_drift: (3, 3) covariance of the rest of that error [m^2].
         position_covariance: (3, 3) covariance of the shift [m^2].
     """
 
@@ -52,8 +52,9 @@ class FrameTransform:
     until: float = math.inf
     yaw_sigma: float = 0.0
     drift: float = 0.0
-    position_drift: FloatArray | None = None
-    position_covariance: FloatArray | None = None
+    by_yaw: FloatArray = field(default_factory=lambda: np.zeros(3))
+    position_drift: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    position_covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
 
     def state(self, state: NavState) -> NavState:
         """Return a state of the frame before, in the new one."""
@@ -61,14 +62,17 @@ class FrameTransform:
             return changed(state, map_frame=state.map_frame + 1)
         v_W, p_W = self.R @ state.v_W, self.R @ state.p_W + self.shift
         A = frame_rotation(self.R)
+        # A shift takes the error at its own time out of the positions: that of the common yaw, too.
+        A[6:9, 2] = -self.by_yaw
         covariance = A @ state.covariance @ A.T
-        turn_variance = self.yaw_sigma**2 + max(0.0, self.drift - state.covariance[2, 2])
-        covariance += _turn_covariance(turn_variance, v_W, p_W - self.pivot)
-        if self.position_covariance is not None:
-            covariance[6:9, 6:9] += self.position_covariance
-        if self.position_drift is not None:
-            since_then = self.position_drift - without_yaw(state.covariance, POSITION)
-            covariance[6:9, 6:9] += _positive_part(since_then)
+        yaw_since = max(0.0, self.drift - state.covariance[2, 2])
+        if self.placed:
+            drift = self.position_drift - without_yaw(state.covariance, POSITION)
+            covariance[6:9, 6:9] += self.position_covariance + _positive_part(drift)
+            covariance[6:9, 6:9] += yaw_since * np.outer(self.by_yaw, self.by_yaw)
+        else:
+            variance = self.yaw_sigma**2 + yaw_since
+            covariance += _turn_covariance(variance, v_W, p_W - self.pivot)
         return changed(
             state,
             R_WB=self.R @ state.R_WB,

@@ -141,9 +141,16 @@ class MapFrame:
 
     def _place(self, fix: Fix) -> FrameTransform:
         now, since = self._ekf.state.nav_state(), self.state.since
-        drift = without_yaw(now.covariance, POSITION)
+        P = now.covariance
         transform = FrameTransform(
-            np.eye(3), fix.value - now.p_W, fix.value, True, since, position_drift=drift
+            np.eye(3),
+            fix.value - now.p_W,
+            fix.value,
+            placed=True,
+            since=since,
+            drift=float(P[2, 2]),
+            by_yaw=P[POSITION, 2] / P[2, 2],
+            position_drift=without_yaw(P, POSITION),
         )
         self._ekf.state = self._ekf.state.transformed(np.eye(3), transform.shift)
         variance = np.trace(fix.covariance) + np.trace(now.position_covariance)

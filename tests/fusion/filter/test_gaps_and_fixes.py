@@ -95,6 +95,19 @@ def test_states_before_the_first_position_are_as_uncertain_as_the_motion_until_i
     assert (np.abs(off[early, 2]) < 3.0 * np.sqrt(track.covariance[early, 8, 8])).all()
 
 
+@pytest.mark.parametrize("seed", [3, 7])
+def test_a_first_yaw_that_was_off_is_off_about_the_position_that_places_the_track(
+    make_walk: Make, make_oracle: Make, seed: int
+) -> None:
+    walk = make_walk(seed, 45.0)
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    yaw = yaw_of(walk.truth.at(np.array([5.0])).attitude_WB)[0] + 0.3
+    fixes = [f for f in true_fixes(walk.truth, 2.0, 0.2, 0) if f.time > 30.0]
+    track = Navigator(oracle, CONFIG).run(walk, fixes=[yaw_fix(5.0, yaw, 0.4), *fixes])
+    early = np.flatnonzero((track.time > 1.0) & (track.time < 29.0))[::20]
+    assert max(position_nees(track, walk, row) for row in early) < 12.0
+
+
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_short_gaps_after_a_long_one_do_not_lose_the_position(
     make_walk: Make, make_oracle: Make, without: Make, seed: int
