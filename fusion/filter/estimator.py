@@ -179,9 +179,7 @@ class Estimator:
 
     def _propagate_in_gap(self, piece: ImuInterval, gap: ImuInterval) -> None:
         """Propagate through a piece of a gap."""
-        before, after = (
-            yaw_variance(time - gap.start, gap.duration) for time in (piece.start, piece.stop)
-        )
+        before, after = (yaw_variance(time - gap.start, gap) for time in (piece.start, piece.stop))
         rotation = gap_rotation(piece.table, gap.duration, self.ekf.state.b_g)
         self.ekf.propagate_in_gap(piece.stop, rotation, after - before, self._config)
         self.frame.lose_yaw()

@@ -235,7 +235,7 @@ class GraphBuilder:
         dt, f = max(dt, 0.0), self._config.filter
         # Noise of the IMU since the keyframe, or of the motion in a gap.
         accel_noise = f.gap_accel_noise if k in self._gaps else self._config.noise.accel_noise
-        turned = yaw_variance(dt, self._gaps[k].duration) if k in self._gaps else 0.0
+        turned = yaw_variance(dt, self._gaps[k]) if k in self._gaps else 0.0
         drift = accel_noise**2 * dt * np.eye(3)
         if fix.kind == "position":
             covariance = fix.covariance + dt**2 / 3.0 * drift

@@ -103,7 +103,7 @@ class KeyframeGraph:
         """Connect a new keyframe to the last one across a gap; return its number."""
         i, t = self.last, gap.duration
         self._insert(guess)
-        covariance = gap_covariance(t, yaw_variance(t, t), np.zeros(3), config)[2:, 2:]
+        covariance = gap_covariance(t, yaw_variance(t, gap), np.zeros(3), config)[2:, 2:]
         rotation = gap_rotation(gap.table, t, self._states[i].b_g)
         self.add(Coasting(i, self.last, t, rotation, covariance), gated=False)
         return self.last

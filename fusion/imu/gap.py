@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.lie import UNKNOWN_YAW
 from stario.sequences.attitude.levelling import integrate
 from stario.sequences.sequence import FloatArray
@@ -19,9 +20,11 @@ rates in between leave a yaw error of 3, 5, 12 and 22 degrees (root mean square)
 and 0.8 s on OxIOD, TUM-VI, RIDI, KIPD and tyrex, a constant attitude 9, 13, 20 and 30."""
 
 YAW_RATE, YAW_GROWTH = 0.5, 1.0
-"""Standard deviation of the yaw's error per second of a gap [rad/s]: a pedestrian's turn is 0.4 to
-1.0 over one second and 0.36 to 0.7 per second over three in the training and validation recordings;
-and with interpolated rates, per second squared [rad/s^2], while that is less."""
+"""Standard deviation of the yaw's error per second of a gap [rad/s], and with interpolated rates,
+per second squared [rad/s^2] while that is less; both of a device that turns at up to 1 rad/s in the
+second after the gap, and in proportion to that rate beyond. On OxIOD, TUM-VI, RIDI, KIPD and tyrex
+the errors after 0.3, 0.8 and 2.0 s are 0.05, 0.25 and 1.0 rad (root mean square) at rates from 0.5
+to 1 rad/s, 0.11, 0.53 and 1.3 from 1.5 to 2.5, and 0.22, 1.3 and 2.1 from 2.5 to 4 (running)."""
 
 _MIN_WALK = 1e-7
 """Least random walk of a bias: a graph inverts the covariance."""
@@ -47,15 +50,18 @@ def gap_rotation(table: FloatArray, length: float, b_g: FloatArray) -> FloatArra
     return np.asarray(integrate(_EYE, time, gyro - b_g)[-1])
 
 
-def yaw_variance(seconds: float, length: float) -> float:
+def yaw_variance(seconds: float, gap: ImuInterval) -> float:
     """Return the variance of the yaw's error since a gap began [rad^2].
 
     Args:
         seconds: time since then [s].
-        length: length of the gap [s].
+        gap: the whole gap.
     """
-    sigma = min(YAW_RATE * seconds, UNKNOWN_YAW)
-    return (sigma if length > INTERPOLATED else min(sigma, YAW_GROWTH * seconds**2)) ** 2
+    assert gap.levelled is not None  # it comes with the end of every gap
+    rate = YAW_RATE
+    if gap.duration <= INTERPOLATED:
+        rate = min(rate, YAW_GROWTH * seconds)
+    return min(gap.levelled.liveliness * rate * seconds, UNKNOWN_YAW) ** 2
 
 
 def gap_covariance(

@@ -12,6 +12,7 @@ from support import GRAPH, swivelled
 
 from stario.fusion import Navigator
 from stario.fusion.imu.gap import INTERPOLATED, gap_rotation, yaw_variance
+from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.recording import cut_recording
 from stario.sequences.attitude.rotations import yaw_of
 
@@ -36,12 +37,23 @@ def test_a_long_gap_keeps_the_attitude() -> None:
     np.testing.assert_array_equal(gap_rotation(ends(length, RATE, RATE), length, BIAS), np.eye(3))
 
 
+def gap_of(length: float, turn_rate: float) -> ImuInterval:
+    """Return a gap before a second in which the device turns at a rate [rad/s]."""
+    zeros = np.zeros((2, 3))
+    after = Start(np.eye(3), False, 9.81, turn_rate, time=length, rate=100.0)
+    eyes = np.tile(np.eye(3), (2, 1, 1))
+    return ImuInterval(np.array([0.0, length]), zeros, zeros, True, eyes, np.eye(3), levelled=after)
+
+
 @pytest.mark.parametrize("length", [0.3, 0.9, 3.0])
 def test_the_yaw_is_ever_less_certain_until_it_is_unknown(length: float) -> None:
-    sigma = np.sqrt([yaw_variance(s, length) for s in np.linspace(0.0, length, 20)])
+    gap = gap_of(length, 0.5)
+    sigma = np.sqrt([yaw_variance(s, gap) for s in np.linspace(0.0, length, 20)])
     assert sigma[0] == 0.0
     assert (np.diff(sigma) > 0.0).all()
-    assert yaw_variance(100.0, 100.0) == yaw_variance(1000.0, 1000.0) < np.pi**2
+    assert yaw_variance(length, gap_of(length, 3.0)) > 1.4 * sigma[-1] ** 2
+    unknown = yaw_variance(9.0, gap_of(9.0, 0.5))
+    assert unknown == yaw_variance(9.0, gap_of(9.0, 3.0)) < np.pi**2
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
