@@ -137,7 +137,10 @@ class Estimator:
     def _propagate(
         self, interval: ImuInterval, fixes: Sequence[Fix]
     ) -> tuple[Segment | None, list[Accepted]]:
-        """Propagate through the fixes; return the segment (None if split) and the fixes applied."""
+        """Propagate through the fixes and, after a gap, level the attitude.
+
+        Return the segment (None for a gap, and if fixes split it) and the fixes applied.
+        """
         self.in_gap = interval.gap
         if interval.gap:
             self._release_clones()

@@ -49,7 +49,7 @@ class IntervalMeasurements(NamedTuple):
     fixes: list[Accepted]
     """Fixes applied, in order."""
     segment: Segment | None
-    """The preintegrated samples; None if fixes split them."""
+    """The preintegrated samples; None for a gap, and if fixes split them."""
 
     @property
     def displacement(self) -> Displacement | None:

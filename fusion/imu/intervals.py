@@ -88,10 +88,6 @@ class ImuInterval:
         gyro: (n + 1, 3) [rad/s] in B, interpolated at both ends.
         accel: (n + 1, 3) [m/s^2] in B, likewise.
         gap: whether this is a gap too long to be bridged; its samples then carry no information.
-        levelled: attitude from gravity after a gap, estimated as at the first sample; None
-            elsewhere.
-        flags: whether samples of either sensor are saturated, missing, or were spikes.
-        window_flagged: whether any of the window's samples are.
         attitudes: (n + 1, 3, 3) levelled attitude R_NB at the samples.
         R_NB: (3, 3) levelled attitude at the end, after its correction by gravity.
         update: whether windows begin and end at this interval's end.
@@ -102,6 +98,10 @@ class ImuInterval:
         levelled_bias_sigma: its standard deviation per level axis [rad/s].
         field_B: (3,) magnetic field at its end [uT]; None if none was measured.
         accel_factor: factor on the accelerometer's noise density, estimated by the filter.
+        levelled: attitude from gravity after a gap, estimated as at the first sample; None
+            elsewhere.
+        flags: whether samples of either sensor are saturated, missing, or were spikes.
+        window_flagged: whether any of the window's samples are.
     """
 
     time: FloatArray
