@@ -16,7 +16,6 @@ from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import GravityStart
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
-from stario.sequences.time_order import LONG_GAP
 from stario.sequences.windows import MAX_RATE, MIN_RATE
 
 Sample = tuple[float, float, float, float, float, float, float]
@@ -55,6 +54,10 @@ def check_start(start: Start, gravity: float) -> None:
             f"about {gravity:.2f} m/s^2",
             "give specific force in m/s^2 with gravity left in, and rates in rad/s",
         )
+
+
+_LOST_SECONDS = 10.0
+"""Length of a gap [s] beyond which the motion before it tells nothing about that after it."""
 
 
 class Flags(NamedTuple):
@@ -129,7 +132,7 @@ class ImuInterval:
     @property
     def lost(self) -> bool:
         """Whether this is a gap too long for the motion before it to tell anything about after."""
-        return self.gap and self.duration > LONG_GAP
+        return self.gap and self.duration > _LOST_SECONDS
 
     @property
     def table(self) -> FloatArray:
