@@ -147,7 +147,8 @@ class NavigatorConfig:
     Attributes:
         noise: IMU noise densities assumed by the filter, 30 to 100 times those of a stationary
             phone: errors of scale and alignment act like noise in motion, and with smaller
-            densities the biases would absorb the network's slow errors.
+            densities the biases would absorb the network's slow errors. To change some of them, use
+            `replace(config.noise, ...)`: `ImuNoise(...)` has a sensor's own for all the others.
         filter: settings of the EKF.
         graph: settings of the factor graph.
         gravity: magnitude [m/s^2].

@@ -176,8 +176,8 @@ class Innovations:
 
     Attributes:
         time: (M,) end of the window [s].
-        residual_W: (M, 3) innovation [m] (or [m/s] if mean velocities are measured).
-        sigma: (M, 3) predicted standard deviations.
+        residual_W: (M, 3) innovation [m].
+        sigma: (M, 3) predicted standard deviations [m].
         nis: (M,) normalised innovation squared, before any inflation.
         gated: (M,) whether the covariance was inflated.
     """

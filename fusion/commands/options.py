@@ -34,7 +34,10 @@ CacheOption = Annotated[
 DataOption = Annotated[
     Path | None, typer.Option(help="Folder of the development recordings, used without PATH.")
 ]
-ConfigOption = Annotated[Path | None, typer.Option(help="TOML or JSON file with settings.")]
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option(help="TOML or JSON file with settings: gravity, tables noise, filter, graph."),
+]
 OutOption = Annotated[
     Path | None, typer.Option(help="Folder for the results; replaces those of an earlier run.")
 ]

@@ -1,21 +1,18 @@
-"""Updates with the network's displacements, and the alternative hypothesis that outliers open.
+"""Updates with the network's displacements; what outliers mean, and what innovations tell.
 
-Under the alternative, recent outliers share a steady error. README.md, "Gates".
+README.md, "Displacement measurement" and "Gates".
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 
 from stario.fusion.config import FilterConfig
-from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.engine import GateMode, UpdateResult
+from stario.fusion.filter.hypotheses import AlternativeHypothesis, HypothesisPair
 from stario.fusion.filter.network_errors import (
     AccelNoiseScale,
     ErrorLevel,
@@ -42,109 +39,22 @@ _OFFSET_SCALE = 10.0
 _ALTERNATIVE_GATE = 0.95
 """Probability of the chi-square test beyond which a displacement does not fit the alternative."""
 
-_FITS_TO_DROP = 4
-"""Consecutive displacements that fit both before the alternative is dropped: outliers were few."""
-
-_MAX_SECONDS = 6.0
-"""Maximum age of the alternative [s]: an error that lasts longer is not taken for false."""
-
-Result = TypeVar("Result")
-
-
-@dataclass(frozen=True, eq=False)
-class AlternativeHypothesis:
-    """State of the filter if the displacements since an outlier contained one steady error.
-
-    Less this error they still measure how the velocity changes. Without that, tilt and bias of the
-    accelerometer would soon explain any displacement.
-
-    Attributes:
-        ekf: state of the filter under this hypothesis.
-        start_time: time of the first outlier [s].
-        offset_W: (3,) the steady error, from the residuals of the outliers [m].
-        outliers: times of the displacements that do not fit as they are [s].
-        shared_fits: number of latest displacements in a row that fitted both.
-    """
-
-    ekf: EkfState
-    start_time: float
-    offset_W: FloatArray
-    outliers: tuple[float, ...] = ()
-    shared_fits: int = 0
-
-
-class HypothesisPair:
-    """A filter and its alternative hypothesis, if there is one.
-
-    Args:
-        ekf: the filter; its state is set aside while the alternative is updated.
-
-    Attributes:
-        ekf: the filter.
-        alternative: the alternative hypothesis; None while all displacements fit.
-    """
-
-    def __init__(self, ekf: StateCloningEkf) -> None:
-        self.ekf = ekf
-        self.alternative: AlternativeHypothesis | None = None
-
-    def apply_to_both(self, work: Callable[[], Result]) -> Result:
-        """Apply `work` to the filter and then to the alternative; return the filter's result."""
-        result = work()
-        self.apply_to_alternative(work)
-        return result
-
-    def apply_to_alternative(self, work: Callable[[], Result]) -> Result | None:
-        """Apply `work` to the alternative, if there is one; return its result."""
-        if self.alternative is None:
-            return None
-        filter_state, self.ekf.state = self.ekf.state, self.alternative.ekf
-        result = work()
-        self.alternative = changed(self.alternative, ekf=self.ekf.state)
-        self.ekf.state = filter_state
-        return result
-
-    def judge(self, fits: bool, fits_filter: bool) -> tuple[float, ...]:
-        """Adopt the alternative if only it fits a displacement; drop it once both fit several.
-
-        Args:
-            fits: whether it fitted the alternative as it is.
-            fits_filter: whether it fitted the filter.
-
-        Returns:
-            Times of the displacements [s] that were false after all, since the alternative without
-            them is adopted; empty otherwise.
-        """
-        alternative = self.alternative
-        if alternative is None:
-            return ()
-        if fits and not fits_filter:
-            self.ekf.state, self.alternative = alternative.ekf, None
-            return alternative.outliers
-        shared = alternative.shared_fits + 1 if fits else 0
-        self.alternative = changed(alternative, shared_fits=shared)
-        if shared >= _FITS_TO_DROP or alternative.ekf.time - alternative.start_time > _MAX_SECONDS:
-            self.alternative = None
-        return ()
-
 
 class DisplacementUpdates:
     """Displacement updates, and what is estimated from their innovations.
 
     Args:
-        ekf: the filter.
+        hypotheses: the filter and its alternative, which an outlier opens.
         config: settings of the filter.
 
     Attributes:
-        hypotheses: the filter, and the alternative to it.
         outlier_share: fraction of outliers among recent displacements.
         accel_noise: estimated scale of the accelerometer's noise.
         error_level: estimated level of the network's errors.
     """
 
-    def __init__(self, ekf: StateCloningEkf, config: FilterConfig) -> None:
-        self._ekf, self._config = ekf, config
-        self.hypotheses = HypothesisPair(ekf)
+    def __init__(self, hypotheses: HypothesisPair, config: FilterConfig) -> None:
+        self._hypotheses, self._ekf, self._config = hypotheses, hypotheses.ekf, config
         self.outlier_share = 0.5  # outliers are assumed common at first
         self.accel_noise = AccelNoiseScale()
         self.error_level = ErrorLevel()
@@ -163,7 +73,7 @@ class DisplacementUpdates:
             covariance_N: (3, 3) covariance of the displacement [m^2].
         """
         f, before = self._config, self._ekf.state
-        self.hypotheses.apply_to_both(self._propagate_turn)
+        self._hypotheses.apply_to_both(self._propagate_turn)
         rare = self.outlier_share < _RARE_SHARE
         update = partial(self._update, slot, R_NB, d_N, covariance_N)
         result = update(f.gate, power=_RARE_POWER if rare else 1.0)
@@ -173,13 +83,13 @@ class DisplacementUpdates:
             self.accel_noise = self.accel_noise.updated(result)
             if f.correlated_errors:
                 self.error_level = self.error_level.updated(result)
-        if self.hypotheses.alternative is None and rare and result.gated:
+        if self._hypotheses.alternative is None and rare and result.gated:
             assert result.residual is not None  # it has been compared with the gate
             first = AlternativeHypothesis(before, before.time, result.residual, (before.time,))
-            self.hypotheses.alternative = first
+            self._hypotheses.alternative = first
         elif result.accepted:
             fits = self._update_alternative(update)
-            return result, self.hypotheses.judge(fits, not result.gated)
+            return result, self._hypotheses.judge(fits, not result.gated)
         return result, ()
 
     def _update_alternative(self, update: Callable[..., UpdateResult]) -> bool:
@@ -190,8 +100,8 @@ class DisplacementUpdates:
 
         Return whether it fits.
         """
-        alternative = self.hypotheses.alternative
-        result = self.hypotheses.apply_to_alternative(partial(update, _ALTERNATIVE_GATE, "reject"))
+        alternative = self._hypotheses.alternative
+        result = self._hypotheses.apply_to_alternative(partial(update, _ALTERNATIVE_GATE, "reject"))
         if result is None or alternative is None or result.residual is None:
             return True
         offset_W, residual = alternative.offset_W, result.residual
@@ -200,8 +110,8 @@ class DisplacementUpdates:
             return True
         offset_W = offset_W + _OFFSET_GAIN * (residual - offset_W)
         outliers = (*alternative.outliers, alternative.ekf.time)
-        self.hypotheses.alternative = changed(alternative, offset_W=offset_W, outliers=outliers)
-        self.hypotheses.apply_to_alternative(partial(update, None, offset_W=offset_W))
+        self._hypotheses.alternative = changed(alternative, offset_W=offset_W, outliers=outliers)
+        self._hypotheses.apply_to_alternative(partial(update, None, offset_W=offset_W))
         return False
 
     def _update(

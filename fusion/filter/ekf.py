@@ -189,9 +189,9 @@ class StateCloningEkf(ErrorStateEngine):
     ) -> UpdateResult:
         """Update with the displacement from clone i to clone j, in the estimated world.
 
-        The network's input was rotated by the estimated attitude, so the displacement contains the
-        yaw error of clone i, p_j - p_i = (I + theta_iz [e3]x) d + n, and the network's own (turn).
-        Those of its errors that last are considered.
+        The caller has rotated the network's displacement from N to W by the estimated yaw of clone
+        i, so that it contains the error of this yaw, p_j - p_i = (I + theta_iz [e3]x) d + n, and
+        the network's own (turn). Those of its errors that last are considered.
 
         Args:
             slot_i: slot of the window's first pose.

@@ -2,8 +2,9 @@
 
 filterpy multiplies full-size matrices. Here only the blocks that a step touches are computed
 (core rows against the clones, a symmetric update of the measurement's rank), with the same result;
-`speed.DenseEkf` runs filterpy's own algebra for comparison. `P` is replaced, never modified in
-place, so a reference to an earlier one can be restored. README.md, "Gates".
+`evaluation.checks.speed.DenseEkf` runs filterpy's own algebra for comparison. `P` is replaced,
+never modified in place, so a reference to an earlier one can be restored. README.md, "Correlated
+errors" and "Gates".
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ class UpdateResult(NamedTuple):
         residual: (m,) measured minus predicted; None if the measurement was invalid.
         sigma: (m,) standard deviations of the residual under the covariance of the error; None
             likewise.
-        gate_nis: the same NIS under the covariance that the gains assume, which is what gates.
+        gate_nis: the same NIS under the covariance that determined the gain (`gains_from`), which
+            is what gates.
     """
 
     nis: float

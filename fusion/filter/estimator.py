@@ -22,6 +22,7 @@ from stario.fusion.filter.estimator_state import (
 )
 from stario.fusion.filter.frame_transform import with_undirected
 from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior
+from stario.fusion.filter.hypotheses import HypothesisPair
 from stario.fusion.filter.initial import PriorPose, initialise, reinitialise, tilt_sigma
 from stario.fusion.filter.magnetic import MagneticUpdates, north_fix
 from stario.fusion.filter.map_frame import MapFrame
@@ -66,8 +67,8 @@ class Estimator:
         self._config, self._start, self._streaming = config, start.time, streaming
         self.ekf = StateCloningEkf(f.window_updates, config.gravity)
         self.frame = MapFrame(self.ekf, prior, f.gate, f.network_turn_sigma)
-        self._displacements = DisplacementUpdates(self.ekf, f)
-        self._hypotheses = self._displacements.hypotheses
+        self._hypotheses = HypothesisPair(self.ekf)
+        self._displacements = DisplacementUpdates(self._hypotheses, f)
         self.bias = AdaptiveBiasPrior(self._hypotheses, config, start.time)
         detector = StillnessDetector(round(f.output_rate * WINDOW_SECONDS), f.stillness_noise)
         self._rest = ZeroVelocityUpdates(self._hypotheses, self.bias, detector, f.gate)
@@ -136,7 +137,10 @@ class Estimator:
     def _propagate(
         self, interval: ImuInterval, fixes: Sequence[Fix]
     ) -> tuple[Segment | None, list[Accepted]]:
-        """Propagate through the fixes; return the segment (None if split) and the fixes applied."""
+        """Propagate through the fixes and, after a gap, level the attitude.
+
+        Return the segment (None for a gap, and if fixes split it) and the fixes applied.
+        """
         self.in_gap = interval.gap
         if interval.gap:
             self._release_clones()

@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stario.fusion.filter.displacements import AlternativeHypothesis
 from stario.fusion.filter.ekf_state import EkfState, Estimate
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.frame_transform import MapFrameState
 from stario.fusion.filter.gyro_bias import GyroBiasPrior
+from stario.fusion.filter.hypotheses import AlternativeHypothesis
 from stario.fusion.filter.magnetic import MagneticReference
 from stario.fusion.filter.network_errors import AccelNoiseScale, ErrorLevel
 from stario.fusion.filter.zero_velocity import ZeroVelocity
@@ -49,7 +49,7 @@ class IntervalMeasurements(NamedTuple):
     fixes: list[Accepted]
     """Fixes applied, in order."""
     segment: Segment | None
-    """The preintegrated samples; None if fixes split them."""
+    """The preintegrated samples; None for a gap, and if fixes split them."""
 
     @property
     def displacement(self) -> Displacement | None:

@@ -19,10 +19,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.filter.displacements import HypothesisPair
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, FieldState
 from stario.fusion.filter.engine import UpdateResult, gauss_markov
+from stario.fusion.filter.hypotheses import HypothesisPair
 from stario.fusion.fixes import Fix, yaw_fix
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
 from stario.fusion.lie import yaw_twist

@@ -17,10 +17,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stario.fusion.filter.displacements import HypothesisPair
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior
+from stario.fusion.filter.hypotheses import HypothesisPair
 from stario.fusion.imu.intervals import ImuInterval
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.inspection.stillness import looks_still, scatter_bound

@@ -55,6 +55,7 @@ def smooth(
     builder = GraphBuilder(config, first, turn_sigma=turn_sigma)
     revoked = {time for m in measurements for time in m.revoked}
     for m, state in zip(measurements, local[1:], strict=True):
+        # Neither is inflated as by the filter: the graph weights outliers by the whole track.
         fixes = [accepted.fix.shifted(-origin) for accepted in m.fixes]
         offered = None if m.interval.stop in revoked else m.offered
         builder.step(m.interval, offered, fixes, m.zero_velocity, state, m.segment)

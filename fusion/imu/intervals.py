@@ -16,7 +16,6 @@ from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import GravityStart
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
-from stario.sequences.time_order import LONG_GAP
 from stario.sequences.windows import MAX_RATE, MIN_RATE
 
 Sample = tuple[float, float, float, float, float, float, float]
@@ -57,6 +56,10 @@ def check_start(start: Start, gravity: float) -> None:
         )
 
 
+_LOST_SECONDS = 10.0
+"""Length of a gap [s] beyond which the motion before it tells nothing about that after it."""
+
+
 class Flags(NamedTuple):
     """Faults in a stretch of samples.
 
@@ -88,10 +91,6 @@ class ImuInterval:
         gyro: (n + 1, 3) [rad/s] in B, interpolated at both ends.
         accel: (n + 1, 3) [m/s^2] in B, likewise.
         gap: whether this is a gap too long to be bridged; its samples then carry no information.
-        levelled: attitude from gravity after a gap, estimated as at the first sample; None
-            elsewhere.
-        flags: whether samples of either sensor are saturated, missing, or were spikes.
-        window_flagged: whether any of the window's samples are.
         attitudes: (n + 1, 3, 3) levelled attitude R_NB at the samples.
         R_NB: (3, 3) levelled attitude at the end, after its correction by gravity.
         update: whether windows begin and end at this interval's end.
@@ -102,6 +101,10 @@ class ImuInterval:
         levelled_bias_sigma: its standard deviation per level axis [rad/s].
         field_B: (3,) magnetic field at its end [uT]; None if none was measured.
         accel_factor: factor on the accelerometer's noise density, estimated by the filter.
+        levelled: attitude from gravity after a gap, estimated as at the first sample; None
+            elsewhere.
+        flags: whether samples of either sensor are saturated, missing, or were spikes.
+        window_flagged: whether any of the window's samples are.
     """
 
     time: FloatArray
@@ -129,7 +132,7 @@ class ImuInterval:
     @property
     def lost(self) -> bool:
         """Whether this is a gap too long for the motion before it to tell anything about after."""
-        return self.gap and self.duration > LONG_GAP
+        return self.gap and self.duration > _LOST_SECONDS
 
     @property
     def table(self) -> FloatArray:

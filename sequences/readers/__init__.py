@@ -107,7 +107,7 @@ FORMATS: dict[str, Format] = {
     "long": Format(is_long_form, _read_long_form, "phone"),
 }
 """Known formats by name, tried in this order, more specific ones first; `euroc` also covers TUM-VI,
-`ridi` also IMUNet's processed recordings."""
+`ridi` also IMUNet's processed recordings. Files are found below a folder by `_SUFFIXES`."""
 
 _KNOWN = f"one of the formats {', '.join(FORMATS)}"
 

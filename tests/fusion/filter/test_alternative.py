@@ -14,12 +14,9 @@ from stario.fusion import Navigator
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.checks.corruption import faults
 from stario.fusion.evaluation.checks.faults import matched_walk, run_faults
-from stario.fusion.filter.displacements import (
-    AlternativeHypothesis,
-    DisplacementUpdates,
-    HypothesisPair,
-)
+from stario.fusion.filter.displacements import DisplacementUpdates
 from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.hypotheses import AlternativeHypothesis, HypothesisPair
 from stario.fusion.filter.network_errors import TURN_SECONDS, with_turn
 from stario.fusion.state import NavState
 from stario.sequences.noise import ImuNoise
@@ -168,10 +165,11 @@ def test_a_false_displacement_lets_the_networks_turn_decay_once() -> None:
     ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, 1e-4 * np.eye(15)))
     slot = ekf.clone()
     ekf.state = replace(with_turn(ekf.state, 0.05), network_turn=0.1)
-    updates = DisplacementUpdates(ekf, FilterConfig(update_rate=2))
-    updates.hypotheses.alternative = AlternativeHypothesis(ekf.state, 0.0, zero)
+    pair = HypothesisPair(ekf)
+    updates = DisplacementUpdates(pair, FilterConfig(update_rate=2))
+    pair.alternative = AlternativeHypothesis(ekf.state, 0.0, zero)
     result, _ = updates.update(slot, np.eye(3), np.array([5.0, 0.0, 0.0]), 1e-4 * np.eye(3))
-    alternative = updates.hypotheses.alternative
+    alternative = pair.alternative
     assert result.gated
     assert alternative is not None
     assert len(alternative.outliers) == 1
@@ -187,7 +185,8 @@ def test_an_uncertain_alternative_does_not_take_the_steady_error_for_right(
     uncertain = np.diag(np.repeat([1e-2, 1.0, 1.0, 1e-4, 1e-4], 3))
     ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, 1e-4 * np.eye(15)))
     slot = ekf.clone()
-    updates = DisplacementUpdates(ekf, FilterConfig(update_rate=2))
+    pair = HypothesisPair(ekf)
+    updates = DisplacementUpdates(pair, FilterConfig(update_rate=2))
     other = StateCloningEkf(slots=1)
     other.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, 1e-4 * np.eye(15)))
     other.clone()
@@ -195,9 +194,9 @@ def test_an_uncertain_alternative_does_not_take_the_steady_error_for_right(
     P[:, :15, :15] += uncertain
     other.state = replace(other.state, covariances=P)
     offset_W = np.array([1.0, 0.0, 0.0])
-    updates.hypotheses.alternative = AlternativeHypothesis(other.state, 0.0, offset_W)
+    pair.alternative = AlternativeHypothesis(other.state, 0.0, offset_W)
     updates.update(slot, np.eye(3), error * offset_W, 1e-2 * np.eye(3))
-    alternative = updates.hypotheses.alternative
+    alternative = pair.alternative
     assert alternative is not None
     assert (alternative.outliers == ()) == fits
     # Less the offset, both displacements are zero.

@@ -283,6 +283,15 @@ def test_a_precise_displacement_sets_the_vector_between_the_poses() -> None:
     )
 
 
+def test_a_mean_velocity_is_compared_with_the_current_one_less_the_gain_since(
+    driven: StateCloningEkf,
+) -> None:
+    gain, v = np.array([0.4, -0.3, 0.1]), driven.state.v_W
+    result = driven.update_mean_velocity(v - gain, 0.01 * np.eye(3), gain_W=gain, seconds=1.0)
+    assert result.accepted
+    np.testing.assert_allclose(result.residual, 0.0, atol=1e-12)
+
+
 # --- gate and refusals ---------------------------------------------------------------------------
 
 
