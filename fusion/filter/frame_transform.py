@@ -147,7 +147,8 @@ class MapFrameState:
         """Yaw uncertainty in the map of stretches that were placed and not yet oriented."""
         if self.oriented:
             return ()
-        if not (self.placed and self.arbitrary_yaw):
+        # A track that fixes have never moved keeps its own frame, in which its first yaw is zero.
+        if not (self.arbitrary_yaw and (self.placed or self.transforms)):
             return self.unoriented
         return (*self.unoriented, unoriented_stretch(self.pivot, self.since, math.inf))
 

@@ -116,7 +116,15 @@ class MapFrame:
         if not s.oriented:
             unoriented = (*unoriented, unoriented_stretch(s.pivot, s.since, now.time))
         self.state = MapFrameState(
-            False, False, s.transforms, now.p_W, since, unoriented=unoriented, jumps=s.jumps
+            placed=False,
+            oriented=False,
+            transforms=s.transforms,
+            pivot=now.p_W,
+            since=since,
+            unoriented=unoriented,
+            jumps=s.jumps,
+            # The magnetic field may tell the turn in the gap, but not a yaw never known before.
+            arbitrary_yaw=s.arbitrary_yaw and not s.oriented,
         )
 
     def _needs_placing(self, fix: Fix) -> bool:

@@ -16,6 +16,7 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import bearing_jacobian
 from stario.fusion.filter.magnetic import MagneticReference, first_field, update_bearing
+from stario.fusion.fixes import position_fix
 from stario.fusion.navigator import Navigator as Stream
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.attitude.so3 import exp_so3
@@ -280,6 +281,17 @@ def test_a_declination_turns_the_track_to_true_north(
     assert track.health.bearings["north"] == 1
     before = Navigator(oracle, GRAPH, backend=backend).run(walk)
     assert abs(yaw_of(before.trajectory.attitude_WB)[0]) < 0.02  # first yaw without a declination
+
+
+def test_the_field_does_not_tell_after_a_gap_a_yaw_that_was_unknown_before(
+    biased_walk: ImuSequence, make_oracle: Make, without: Make
+) -> None:
+    whole = biased_walk.slice(0.0, 40.0)
+    walk = without(whole, (whole.time > 20.0) & (whole.time < 24.0))
+    oracle = make_oracle(walk, biased_walk.truth, GRAPH)
+    fix = position_fix(5.0, walk.truth.at(np.array([5.0])).position_W[0], np.eye(3))
+    track = Navigator(oracle, GRAPH).run(walk, fixes=[fix])
+    assert np.sqrt(track.covariance[track.time > 6.0, 2, 2]).min() > 1.5
 
 
 def test_north_is_not_applied_if_the_direction_is_known(
