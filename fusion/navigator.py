@@ -25,16 +25,12 @@ from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
 from stario.fusion.imu.intervals import ImuInterval, check_start
 from stario.fusion.imu.stateful import Predictor, StatefulInference, displacements_of
-from stario.fusion.recording import PreprocessedRecording, Progress, preprocess
+from stario.fusion.recording import PreprocessedRecording, Progress, preprocess, silent
 from stario.fusion.snapshot import check_same, pack, unpack
 from stario.fusion.state import ContinuousPose, NavState, SmoothedPose, Track, advanced, copied
 from stario.sequences.arrays import check_choice, check_type
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
-
-
-def _silent(share: float) -> None:
-    """Ignore progress."""
 
 
 class Navigator:
@@ -234,7 +230,7 @@ class Navigator:
         self._continuous = tree["continuous"]
 
     def run(
-        self, sequence: ImuSequence, progress: Progress = _silent, fixes: Iterable[Fix] = ()
+        self, sequence: ImuSequence, progress: Progress = silent, fixes: Iterable[Fix] = ()
     ) -> Track:
         """Estimate the fused track of a recording; its ground truth is not used.
 
@@ -252,7 +248,7 @@ class Navigator:
         """
         return self.track(self.observe(sequence, progress), progress, fixes)
 
-    def observe(self, sequence: ImuSequence, progress: Progress = _silent) -> PreprocessedRecording:
+    def observe(self, sequence: ImuSequence, progress: Progress = silent) -> PreprocessedRecording:
         """Preprocess a recording and predict the displacements of its windows.
 
         Raises:
@@ -263,7 +259,7 @@ class Navigator:
     def track(
         self,
         preprocessed: PreprocessedRecording,
-        progress: Progress = _silent,
+        progress: Progress = silent,
         fixes: Iterable[Fix] = (),
     ) -> Track:
         """Estimate the track of a preprocessed recording; fixes as for `run`.

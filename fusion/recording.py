@@ -34,6 +34,10 @@ Progress = Callable[[float], None]
 """Callback that receives the fraction of the work done, 0 to 1."""
 
 
+def silent(share: float) -> None:
+    """Ignore progress."""
+
+
 @dataclass(frozen=True, eq=False)
 class PreprocessedRecording:
     """A recording after front end and network.

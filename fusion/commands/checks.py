@@ -84,7 +84,7 @@ def backends(
         score_walk,
         summary,
     )
-    from stario.network.training.splits import split_paths
+    from stario.network.training.splits import read_packaged_list
 
     refuse_unused_sources(reading, paths, data, split != _SPLIT)
     simulated = {"--walks": walks != _WALKS, "--seconds": seconds != _SECONDS}
@@ -100,7 +100,7 @@ def backends(
         scores, skipped = map_recordings(
             "backends",
             reading,
-            paths or split_paths(data or Path(), split),
+            paths or [entry.path for entry in read_packaged_list(split, data or Path())],
             lambda path, sequence: score_recording(network, sequence, settings),
         )
     else:

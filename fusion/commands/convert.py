@@ -35,8 +35,9 @@ def convert(
     overwrite: OverwriteOption = False,
 ) -> None:
     """Convert recordings to a CSV, the EuRoC layout or an archive; warn about what they lose."""
+    from stario.sequences.datasets.archive_writer import write_archive
     from stario.sequences.datasets.convert import convert as convert_sequence
-    from stario.sequences.datasets.convert import convert_all, layout_of
+    from stario.sequences.datasets.convert import layout_of
 
     if len(paths) < 2:
         raise InputError("convert", str(paths[0]), "IN... OUT", "also name the output")
@@ -53,7 +54,7 @@ def convert(
     read: list[str] = []
     sequences = _read(reading, files, skipped, read)
     try:
-        names = convert_all(sequences, target)
+        names = write_archive(target, sequences)
     except InputError:
         if not read:  # then nothing was written because each of them was skipped
             exit_if_skipped(skipped)
@@ -95,9 +96,7 @@ def _read(
     from stario.sequences.datasets.convert import check_content
 
     def checked(file: Path) -> ImuSequence:
-        sequence = reading.read(file)
-        check_content(sequence)
-        return sequence
+        return check_content(reading.read(file))
 
     for sequence in collect_results(each(checked, files, jobs=1), skipped):
         typer.echo(sequence.summary())

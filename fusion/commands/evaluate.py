@@ -173,7 +173,7 @@ def _tracks(
             if out is not None:
                 if not recordings:
                     fresh_folder(out)
-                write_recording(out, comparison, settings)
+                write_recording(out, comparison)
             recordings.append(scores_of(comparison))
     if recordings:
         if out is not None:

@@ -18,7 +18,7 @@ from stario.fusion.fix_file import check_within
 from stario.fusion.fixes import Fix
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
-from stario.fusion.recording import Progress
+from stario.fusion.recording import Progress, silent
 from stario.fusion.state import Track
 from stario.sequences.accuracy.metrics import CONVENTIONS, Alignment, align, evaluate_track
 from stario.sequences.accuracy.nees import position_nees
@@ -144,7 +144,7 @@ def compare(
     model: Predictor,
     sequence: ImuSequence,
     config: NavigatorConfig,
-    progress: Progress = lambda share: None,
+    progress: Progress = silent,
     fixes: Sequence[Fix] = (),
 ) -> Comparison:
     """Compute every track of a recording; tracks share predictions, EKF and graph use the fixes.

@@ -13,7 +13,7 @@ from stario.fusion.evaluation.compare import Comparison, compare
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.fixes import Fix
 from stario.fusion.imu.stateful import Predictor
-from stario.fusion.recording import Progress
+from stario.fusion.recording import Progress, silent
 from stario.network.model import load_model
 from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.readers import read_recording
@@ -28,7 +28,7 @@ def compare_recordings(
     jobs: int | None = None,
     fixes: Sequence[Fix] = (),
     truth_needed: bool = False,
-    progress: Progress = lambda share: None,
+    progress: Progress = silent,
 ) -> Iterator[Comparison | Skipped]:
     """Compare the tracks of each recording, in the order of the paths.
 
@@ -59,7 +59,7 @@ def compare_recordings(
         read=read,
         fixes=fixes,
         truth_needed=truth_needed,
-        progress=report_share if jobs == 1 else _ignore_progress,
+        progress=report_share if jobs == 1 else silent,
     )
     names: set[str] = set()
     for outcome in each(work, paths, jobs):
@@ -100,7 +100,3 @@ def _compare(
 
 
 _loaded = cache(load_model)
-
-
-def _ignore_progress(share: float) -> None:
-    """Ignore progress within a recording in another process."""

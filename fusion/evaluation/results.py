@@ -57,7 +57,7 @@ def write_comparison(
     fresh_folder(folder)
     written = write_summary(folder, [scores_of(c) for c in comparisons], config)
     for comparison in comparisons:
-        written += write_recording(folder, comparison, config)
+        written += write_recording(folder, comparison)
     return written
 
 
@@ -70,7 +70,7 @@ def write_summary(
     return [folder / "metrics.json", folder / "config.json"]
 
 
-def write_recording(folder: Path, comparison: Comparison, config: NavigatorConfig) -> list[Path]:
+def write_recording(folder: Path, comparison: Comparison) -> list[Path]:
     """Write tracks and figures of one recording into a sub-folder named after it.
 
     Raises:

@@ -20,6 +20,7 @@ from stario.fusion.evaluation.many import distinct_name
 from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude, true_poses
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
+from stario.fusion.recording import Progress, silent
 from stario.network.model import DisplacementModel
 from stario.network.runtime.cost import table_cost
 from stario.sequences.accuracy.metrics import CONVENTIONS, Convention, align, evaluate_track
@@ -130,7 +131,7 @@ def compare_networks(
     read: Callable[[Path], ImuSequence],
     convention: Convention = "rms",
     jobs: int | None = None,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Progress = silent,
 ) -> tuple[NetworkTable, list[Skipped]]:
     """Compute the tracks of networks, given with distinct names, on recordings with true poses.
 

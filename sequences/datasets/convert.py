@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -64,15 +63,6 @@ def convert(sequence: ImuSequence, path: Path, layout: str | None = None) -> lis
     else:
         write_csv(path, sequence)
     return [path]
-
-
-def convert_all(sequences: Iterable[ImuSequence], path: Path) -> list[str]:
-    """Write recordings into one archive, atomically, and return their names in it.
-
-    Raises:
-        InputError: as for `convert` and `write_archive`.
-    """
-    return write_archive(path, map(check_content, sequences))
 
 
 def layout_of(path: Path, layout: str | None = None) -> str:

@@ -10,7 +10,6 @@ freedom, divided by N.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,7 +24,7 @@ from stario.fusion.filter.network_errors import ACCEL_SHARE, displacement_errors
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.stateful import Displacement, slope_variance
 from stario.fusion.lie import log_se23, yaw_rotation
-from stario.fusion.recording import cut_recording
+from stario.fusion.recording import Progress, cut_recording, silent
 from stario.sequences.accuracy.nees import nees_bounds
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
@@ -91,7 +90,7 @@ def consistency(
     runs: int = 20,
     seconds: float = 300.0,
     seed: int = 0,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Progress = silent,
 ) -> Consistency:
     """Run the filter on simulated walks with errors drawn from its configured standard deviations.
 

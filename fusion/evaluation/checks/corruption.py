@@ -79,20 +79,14 @@ def gap(start: float, seconds: float) -> ModifySamples:
 
     def modify_samples(sequence: ImuSequence, rng: Rng) -> ImuSequence:
         since = sequence.time - sequence.time[0] - start
-        return _selected(sequence, (since <= 0.0) | (since >= seconds))
+        return sequence.select((since <= 0.0) | (since >= seconds))
 
     return modify_samples
 
 
 def drops(share: float) -> ModifySamples:
     """Remove a share of the samples at random."""
-    return lambda sequence, rng: _selected(sequence, rng.random(len(sequence)) >= share)
-
-
-def _selected(sequence: ImuSequence, rows: np.ndarray) -> ImuSequence:
-    return replace(
-        sequence, time=sequence.time[rows], gyro=sequence.gyro[rows], accel=sequence.accel[rows]
-    )
+    return lambda sequence, rng: sequence.select(rng.random(len(sequence)) >= share)
 
 
 def _resampled(sequence: ImuSequence, rng: Rng, rate: float) -> ImuSequence:
@@ -118,7 +112,7 @@ def _reordered(sequence: ImuSequence, rng: Rng) -> ImuSequence:
     order = np.arange(len(sequence))
     for k in np.flatnonzero(rng.random(len(order) - 1) < 0.01):
         order[[k, k + 1]] = order[[k + 1, k]]
-    return _selected(sequence, np.repeat(order, 1 + (rng.random(len(order)) < 0.01)))
+    return sequence.select(np.repeat(order, 1 + (rng.random(len(order)) < 0.01)))
 
 
 def _wild_times(sequence: ImuSequence, rng: Rng) -> ImuSequence:

@@ -47,8 +47,3 @@ def without_holdout(
     held_out = {entry.path for entry in read_packaged_list("holdout", data)}
     outside = [entry for entry in known if entry.path not in held_out]
     return outside, [entry for entry in known if entry.path in held_out]
-
-
-def split_paths(data: Path, split: str) -> list[Path]:
-    """Return the paths of a list's recordings; arguments and errors as `read_packaged_list`."""
-    return [entry.path for entry in read_packaged_list(split, data)]
