@@ -59,7 +59,7 @@ def test_a_position_before_a_gap_does_not_turn_the_track_after_it(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize(("seed", "gap", "turn"), [(2, 6.0, 2.5), (2, 6.0, -2.5), (18, 10.0, 1.8)])
+@pytest.mark.parametrize(("seed", "gap", "turn"), [(2, 6.0, 2.5), (18, 10.0, 1.8)])
 def test_fixes_find_the_direction_again_after_a_gap_with_fixes_in_it(
     make_walk: Make, make_oracle: Make, without: Make,
     backend: Any, seed: int, gap: float, turn: float,
