@@ -1,27 +1,5 @@
 """Neural networks: architectures, training and inference."""
 
-from typing import TYPE_CHECKING
+from stario.sequences.lazy import public_names
 
-from stario.sequences.lazy import lazy_attributes
-
-if TYPE_CHECKING:
-    from stario.network.card import Calibration as Calibration
-    from stario.network.card import Card as Card
-    from stario.network.model import DisplacementModel as DisplacementModel
-    from stario.network.model import load_model as load_model
-    from stario.network.training.augment import Augmentation as Augmentation
-    from stario.network.training.config import TrainingConfig as TrainingConfig
-    from stario.network.training.train import train as train
-
-_MODULES = {
-    "Augmentation": "training.augment",
-    "Calibration": "card",
-    "Card": "card",
-    "DisplacementModel": "model",
-    "TrainingConfig": "training.config",
-    "load_model": "model",
-    "train": "training.train",
-}
-
-__all__ = [*_MODULES]
-__getattr__ = lazy_attributes("stario.network", _MODULES)
+__all__, __getattr__ = public_names("stario.network")

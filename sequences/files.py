@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import math
 import os
 import secrets
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
@@ -106,6 +107,12 @@ def _temporary(path: Path, kind: str) -> Iterator[Path]:
         found = f"{path}: {error.strerror or error}"
         fix = "choose another folder, fix its permissions or free disk space"
         raise InputError("path", found, "a writable location", fix) from error
+
+
+def unused_name(name: str, taken: Container[str]) -> str:
+    """Return the name, or the first of name-2, name-3, ... that is not taken."""
+    names = (f"{name}-{k}" if k > 1 else name for k in itertools.count(1))
+    return next(candidate for candidate in names if candidate not in taken)
 
 
 def write_json(path: Path | str, obj: object) -> None:

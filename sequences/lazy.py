@@ -6,25 +6,34 @@ reader should not wait for them.
 
 from __future__ import annotations
 
+import ast
 import importlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from stario.sequences.errors import MissingPackageError
 
 
-def lazy_attributes(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return a module's `__getattr__` (PEP 562) that imports names from the given modules."""
+def public_names(package: str) -> tuple[list[str], Callable[[str], Any]]:
+    """Return a package's `__all__` and its `__getattr__` (PEP 562), which imports on first use.
+
+    The names are those that the package's stub, `__init__.pyi`, imports for type checkers.
+    """
+    module = sys.modules[package]
+    stub = Path(str(module.__file__)).with_suffix(".pyi").read_text(encoding="utf-8")
+    imports = (line for line in ast.parse(stub).body if isinstance(line, ast.ImportFrom))
+    sources = {alias.name: str(line.module) for line in imports for alias in line.names}
 
     def attribute(name: str) -> Any:
-        if name not in modules:
+        if name not in sources:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(importlib.import_module(f"{package}.{modules[name]}"), name)
-        setattr(sys.modules[package], name, value)
+        value = getattr(importlib.import_module(sources[name]), name)
+        setattr(module, name, value)
         return value
 
-    return attribute
+    return sorted(sources), attribute
 
 
 def optional_package(name: str, extra: str) -> Any:

@@ -14,6 +14,21 @@ def assert_same_samples(read: ImuSequence, walk: ImuSequence) -> None:
     np.testing.assert_allclose(read.accel, walk.accel, atol=1e-8)
 
 
+def assert_same_poses(
+    truth: Trajectory, walk: ImuSequence, tolerance_deg: float, tolerance_m: float
+) -> None:
+    """Assert that the truth is the walk's, except for a turn of the world that levelling allows."""
+    assert walk.truth is not None
+    given, pose = walk.truth, truth.at(walk.time)
+    error = (given.attitude_WB * pose.attitude_WB.inv())[pose.valid]
+    world = error.mean()
+    assert np.hypot(*world.as_rotvec()[:2]) < np.radians(0.5)
+    assert abs(world.as_rotvec()[2]) < np.radians(0.5)
+    assert np.degrees((world.inv() * error).magnitude()).max() < tolerance_deg
+    distance = np.linalg.norm(world.apply(pose.position_W) - given.position_W, axis=1)
+    assert distance[pose.valid].max() < tolerance_m
+
+
 def turned_and_measured(
     sequence: ImuSequence, truth: Trajectory, stride: int
 ) -> tuple[FloatArray, FloatArray]:

@@ -76,7 +76,7 @@ def stamps_ns(time: FloatArray, start: int = START_NS) -> list[int]:
     return [start + round(t * 1e9) for t in time.tolist()]
 
 
-def text(*columns: list[int] | FloatArray, sep: str = ",") -> list[str]:
+def text(*columns: list[int] | list[str] | FloatArray, sep: str = ",") -> list[str]:
     """Rows with all digits of a float64."""
     parts = [
         [str(x) for x in column]

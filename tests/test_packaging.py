@@ -34,17 +34,6 @@ def test_readme_names_every_public_name_and_each_can_be_imported(package):
         assert re.search(rf"`{name}\b", text), name
 
 
-@pytest.mark.parametrize("package", FOLDERS)
-def test_public_names_are_those_that_the_type_checker_sees(package):
-    tree = ast.parse((ROOT / package / "__init__.py").read_text())
-    (block,) = (node for node in tree.body if isinstance(node, ast.If))
-    seen = {alias.name: line.module for line in block.body for alias in line.names}
-    module = importlib.import_module(f"stario.{package}")
-    assert sorted(module.__all__) == sorted(seen)
-    for name, source in seen.items():
-        assert getattr(module, name) is getattr(importlib.import_module(source), name)
-
-
 def test_examples_import_only_from_public_packages():
     for path in (ROOT / "examples").glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):

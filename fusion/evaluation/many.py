@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache, partial
@@ -16,6 +15,7 @@ from stario.fusion.imu.stateful import Predictor
 from stario.fusion.recording import Progress, silent
 from stario.network.model import load_model
 from stario.sequences.datasets.batch import Skipped, each
+from stario.sequences.files import unused_name
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import ImuSequence
 
@@ -76,9 +76,7 @@ def distinct_name(name: str, taken: set[str]) -> str:
 
     It is also the name of a folder: an archive's `..` would be the one above.
     """
-    name = name if name.strip(".") else "recording"
-    names = (f"{name}-{k}" if k > 1 else name for k in itertools.count(1))
-    found = next(name for name in names if name not in taken)
+    found = unused_name(name if name.strip(".") else "recording", taken)
     taken.add(found)
     return found
 

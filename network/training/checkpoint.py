@@ -64,8 +64,7 @@ def read_checkpoint(
     if not metadata or "config" not in metadata:
         raise ReadError(path, "checkpoint", "no recipe in it", "a checkpoint of a training run")
     _check_same(path, json.loads(metadata["config"]), config)
-    # Older checkpoints have no such entry.
-    if metadata.get("material", material) != material:
+    if metadata.get("material") != material:
         raise ConfigError(
             str(path),
             "a run with other recordings or other initial weights",
@@ -77,8 +76,6 @@ def read_checkpoint(
 
 def _check_same(path: Path, found: dict[str, Any], config: TrainingConfig) -> None:
     expected = json.loads(json.dumps(asdict(config)))
-    # Checkpoints older than these settings come from runs without them.
-    found = {"successive": 1, "attitude": "true", "learned": 1.0, **found}
     for name in expected:
         if found.get(name) != expected[name]:
             raise ConfigError(

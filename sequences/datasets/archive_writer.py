@@ -7,14 +7,13 @@ digit of their quaternions).
 
 from __future__ import annotations
 
-import itertools
 import logging
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from stario.sequences.errors import InputError
-from stario.sequences.files import atomic_path
+from stario.sequences.files import atomic_path, unused_name
 from stario.sequences.lazy import optional_package
 from stario.sequences.readers.archive import SUFFIXES
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
@@ -47,17 +46,12 @@ def write_archive(path: Path | str, sequences: Iterable[ImuSequence]) -> list[st
     with atomic_path(path) as temporary:
         with h5py.File(temporary, "x") as file:
             for sequence in sequences:
-                names.append(_free_name(sequence.name, file))
+                name = sequence.name.replace("/", "-") or "recording"
+                names.append(unused_name(name, file))
                 _write(file.create_group(names[-1]), sequence)
         if not names:
             raise InputError(str(path), "no recording", "at least one recording")
     return names
-
-
-def _free_name(name: str, taken: Any) -> str:
-    name = name.replace("/", "-") or "recording"
-    candidates = (f"{name}-{k}" if k > 1 else name for k in itertools.count(1))
-    return next(candidate for candidate in candidates if candidate not in taken)
 
 
 def _write(group: Any, sequence: ImuSequence) -> None:

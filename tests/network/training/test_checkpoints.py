@@ -1,6 +1,5 @@
 """Training runs that are killed, resumed, or already finished."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -96,20 +95,3 @@ def test_a_truncated_checkpoint_is_named(
     (tmp_path / "checkpoint.safetensors").write_bytes(whole[:length])
     with pytest.raises(ReadError, match=r"checkpoint.safetensors: checkpoint: found .*complete"):
         run(tmp_path)
-
-
-def test_a_checkpoint_without_the_setting_successive_is_resumed(
-    finished: tuple[Path, list[EpochReport]], tmp_path: Path
-) -> None:
-    path = finished[0].parent / "checkpoint.safetensors"
-    with safetensors.safe_open(path, framework="pt") as file:
-        metadata = file.metadata()
-    config = json.loads(metadata["config"])
-    del config["successive"]
-    content = safetensors.torch.load_file(path)
-    safetensors.torch.save_file(
-        content,
-        tmp_path / path.name,
-        metadata={**metadata, "config": json.dumps(config)},
-    )
-    assert run(tmp_path, trained_on=["swings"]).read_bytes() == finished[0].read_bytes()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from csv_lines import write_lines
 
 from stario.sequences import ReadError, check_units, read_recording
 from stario.sequences.errors import InputError
@@ -24,8 +25,7 @@ def written(path: Path, header: str, form: str, start: datetime, count: int = 20
     separator = max(",;", key=header.count)
     times = [(start + timedelta(milliseconds=10 * k)).strftime(form) for k in range(count)]
     rows = [separator.join([time, "0.1", "0.2", "0.3", "1", "2", "9.5"]) for time in times]
-    path.write_text("\n".join([header, *rows]) + "\n")
-    return path
+    return write_lines(path, header, *rows)
 
 
 @pytest.mark.parametrize("header", [GENERIC, WIDE])
@@ -80,8 +80,7 @@ def test_a_comma_after_the_seconds_separates_cells() -> None:
 
 def test_a_date_beside_the_time_leaves_the_unit_of_the_time(tmp_path: Path) -> None:
     rows = [f"2024-05-01 12:00:00,{10 * k},0.1,0.2,0.3,1,2,9" for k in range(200)]
-    path = tmp_path / "own.csv"
-    path.write_text("\n".join(["date,t [ms],gx,gy,gz,ax,ay,az", *rows]) + "\n")
+    path = write_lines(tmp_path / "own.csv", "date,t [ms],gx,gy,gz,ax,ay,az", *rows)
     assert read_recording(path).rate == pytest.approx(100.0)
 
 

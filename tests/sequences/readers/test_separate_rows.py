@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from csv_lines import write_lines
 
 from stario.sequences import ReadError, read_recording
 from stario.sequences.readers.columns import HEADER
@@ -37,8 +38,7 @@ def expected(times: FloatArray, start: float) -> tuple[FloatArray, FloatArray]:
 def test_blank_cells_of_the_other_sensor_are_interpolated(tmp_path: Path, header: str) -> None:
     rows = [(t, f"{t:.3f},{text(rate(t))},,,") for t in GYRO_TIMES.tolist()]
     rows += [(t, f"{t:.3f},,,,{text(force(t))}") for t in ACCEL_TIMES.tolist()]
-    path = tmp_path / "own.csv"
-    path.write_text("\n".join([header, *(row for _, row in sorted(rows))]) + "\n")
+    path = write_lines(tmp_path / "own.csv", header, *(row for _, row in sorted(rows)))
     read = read_recording(path)
     assert read.rate == pytest.approx(100.0)
     assert len(read) == 298  # between the first and the last accelerometer sample
@@ -50,8 +50,7 @@ def test_blank_cells_of_the_other_sensor_are_interpolated(tmp_path: Path, header
 def test_a_slower_accelerometer_is_interpolated(tmp_path: Path) -> None:
     cells = [text(force(t)) if k % 3 == 0 else ",," for k, t in enumerate(GYRO_TIMES.tolist())]
     rows = [f"{t},{text(rate(t))},{cells[k]}" for k, t in enumerate(GYRO_TIMES.tolist())]
-    path = tmp_path / "own.csv"
-    path.write_text("\n".join([HEADER, *rows]) + "\n")
+    path = write_lines(tmp_path / "own.csv", HEADER, *rows)
     read = read_recording(path)
     assert len(read) == 298
     np.testing.assert_allclose(read.accel, expected(read.time, 0.0)[1], atol=1e-9)
@@ -60,8 +59,7 @@ def test_a_slower_accelerometer_is_interpolated(tmp_path: Path) -> None:
 def test_an_accelerometer_that_fails_halfway_leaves_its_rows_to_be_counted(tmp_path: Path) -> None:
     cells = [text(force(t)) if t < 1.0 else "nan,nan,nan" for t in GYRO_TIMES.tolist()]
     rows = [f"{t},{text(rate(t))},{cells[k]}" for k, t in enumerate(GYRO_TIMES.tolist())]
-    path = tmp_path / "own.csv"
-    path.write_text("\n".join([HEADER, *rows]) + "\n")
+    path = write_lines(tmp_path / "own.csv", HEADER, *rows)
     read = read_recording(path)
     assert len(read) == 300
     assert np.isnan(read.accel).all(axis=1).sum() == 200
@@ -72,8 +70,7 @@ def test_ground_truth_in_rows_of_its_own_stays_on_the_samples_clock(tmp_path: Pa
     rows = [(t, f"{t:.3f},{text(rate(t))},,,,,,,,,,") for t in GYRO_TIMES.tolist()]
     rows += [(t, f"{t:.3f},,,,{text(force(t))},,,,,,,") for t in ACCEL_TIMES.tolist()]
     rows += [(t, f"{t:.3f},,,,,,,{t},0,0,0,0,0,1") for t in (GYRO_TIMES[::5] + 0.001).tolist()]
-    path = tmp_path / "own.csv"
-    path.write_text("\n".join([header, *(row for _, row in sorted(rows))]) + "\n")
+    path = write_lines(tmp_path / "own.csv", header, *(row for _, row in sorted(rows)))
     read = read_recording(path)
     assert read.truth is not None
     np.testing.assert_allclose(read.truth.position_W[:, 0], read.truth.time + 0.01, atol=1e-9)
@@ -84,8 +81,7 @@ def test_ground_truth_in_rows_of_its_own_stays_on_the_samples_clock(tmp_path: Pa
 def test_gravity_in_columns_of_its_own_is_added(tmp_path: Path, accel: str) -> None:
     names = [f"{name}{axis}" for name in ("g", accel, "gravity_") for axis in "xyz"]
     rows = [f"{t},{text(rate(t))},{t},{-t},0.5,1,2,8.5" for t in GYRO_TIMES.tolist()]
-    path = tmp_path / "own.csv"
-    path.write_text("\n".join([",".join(["t", *names]), *rows]) + "\n")
+    path = write_lines(tmp_path / "own.csv", ",".join(["t", *names]), *rows)
     np.testing.assert_allclose(read_recording(path).accel, expected(GYRO_TIMES, 0.0)[1], atol=1e-9)
 
 
@@ -94,8 +90,7 @@ def test_units_in_a_second_row_are_converted(tmp_path: Path, header: str) -> Non
     titles = [title.split(" [")[0] for title in header.split(",")]
     units = "ms,deg/s,deg/s,deg/s,g,g,g"
     rows = [f"{10 * k},90,0,-90,0,0,1" for k in range(200)]
-    path = tmp_path / "own.csv"
-    path.write_text("\n".join([",".join(titles), units, *rows]) + "\n")
+    path = write_lines(tmp_path / "own.csv", ",".join(titles), units, *rows)
     read = read_recording(path)
     assert read.rate == pytest.approx(100.0)
     np.testing.assert_allclose(read.gyro[0], np.radians([90.0, 0.0, -90.0]))

@@ -9,8 +9,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import phone_exports
 import pytest
 from alike import assert_same_samples
+from csv_lines import write_lines
 from phone_files import ZYX, field, gravity, ns, save, zyx
 from scipy.spatial.transform import Rotation
 
@@ -215,9 +217,8 @@ def two_clocks_and_no_header(folder: Path, walk: ImuSequence) -> None:
 
 def senslogs_ios(folder: Path, walk: ImuSequence) -> None:
     """Without its attitude; the description file indicates the operating system."""
-    t = 55_687.0 + walk.time
-    save(folder / "accelerometer.txt", "", t, -walk.accel / STANDARD_GRAVITY, sep=" ")
-    save(folder / "gyroscope.txt", "", t, walk.gyro, sep=" ")
+    phone_exports.senslogs_ios(folder, walk)
+    (folder / "attitude.txt").unlink()
     (folder / "description.txt").write_text("[Time]\nBootTime = 55687.0793")
 
 
@@ -351,7 +352,7 @@ def test_the_rotation_vector_of_a_trace_is_the_devices_attitude(
             clock = [f"{t + 5:.3f}", f"{t:.4f}"]
             lines += [";".join([name, *clock, *map(str, xyz), "3"]) for _, name, xyz in rows]
             lines.append(";".join(["AHRS", *clock, "1", "2", "3", *map(str, vector[k]), "3"]))
-    (tmp_path / "trace.txt").write_text("\n".join(lines) + "\n")
+    write_lines(tmp_path / "trace.txt", *lines)
     attitude = read_recording(tmp_path / "trace.txt").device_attitude
     assert attitude is not None
     difference = attitude.attitude_WB * walk.truth.attitude_WB.inv()
@@ -371,7 +372,7 @@ def test_the_clock_of_xsens_is_in_ticks_or_microseconds(tmp_path: Path, per_seco
         "\t".join(["PacketCounter", "SampleTimeFine", *names]),
         *rows,
     ]
-    path.write_text("\n".join(lines) + "\n")
+    write_lines(path, *lines)
     read = read_recording(path)
     assert read.rate == pytest.approx(100.0)
     assert read.duration == pytest.approx(1.99)
@@ -387,8 +388,7 @@ def test_a_file_in_g_is_named_by_its_own_name_and_read_without_advice_on_options
         for axis in "xyz"
     ]
     rows = [f"{0.01 * k:.2f},0,0,-1,0,0,0,0,0,{0.01 * (k % 3)}" for k in range(200)]
-    path = tmp_path / "walk.csv"
-    path.write_text("\n".join([",".join(["timestamp", *names]), *rows]) + "\n")
+    path = write_lines(tmp_path / "walk.csv", ",".join(["timestamp", *names]), *rows)
     with caplog.at_level("INFO"):
         read_recording(path)
     assert "walk.csv: added gravity" in caplog.text

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from alike import assert_same_samples
+from csv_lines import write_lines
 from phone_files import field
 
 from stario.sequences import ImuSequence, ReadError, find_recordings, read_recording
@@ -37,7 +38,7 @@ def test_rows_are_sorted_by_their_sensor(
 ) -> None:
     rows = rows_of(walk, names, ";" if ";" in header else ",")
     path = tmp_path / "own.csv"
-    path.write_text("\n".join([header, *rows] if header else rows) + "\n")
+    write_lines(path, *([header, *rows] if header else rows))
     assert find_recordings(tmp_path) == [path]
     read = read_recording(path)
     assert read.name == "own"
@@ -50,8 +51,7 @@ def test_rows_are_sorted_by_their_sensor(
 def test_one_sensor_after_the_other_is_read_too(walk: ImuSequence, tmp_path: Path) -> None:
     rows = rows_of(walk, NAMES["codes"])
     ordered = [row for code in ("ACC", "GYR") for row in rows if code in row]
-    path = tmp_path / "own.csv"
-    path.write_text("\n".join(["time,sensor,x,y,z", *ordered]) + "\n")
+    path = write_lines(tmp_path / "own.csv", "time,sensor,x,y,z", *ordered)
     assert_same_samples(read_recording(path), walk)
 
 
@@ -59,15 +59,14 @@ def test_times_may_be_those_of_the_day(walk: ImuSequence, tmp_path: Path) -> Non
     rows = [row.split(",", 1) for row in rows_of(walk, NAMES["words"])]
     path = tmp_path / "own.csv"
     lines = [f"12:00:{float(t):07.4f},{rest}" for t, rest in rows]
-    path.write_text("\n".join(["Clock time,sensor,x,y,z", *lines]) + "\n")
+    write_lines(path, "Clock time,sensor,x,y,z", *lines)
     assert_same_samples(read_recording(path), walk)
 
 
 def test_a_sensor_spelled_in_two_ways_is_one(walk: ImuSequence, tmp_path: Path) -> None:
     rows = rows_of(walk, ("gyro (1)", "acc", "mag"))
     rows[3::6] = [row.replace("gyro (1)", "gyro-1-") for row in rows[3::6]]
-    path = tmp_path / "own.csv"
-    path.write_text("\n".join(["time,sensor,x,y,z", *rows]) + "\n")
+    path = write_lines(tmp_path / "own.csv", "time,sensor,x,y,z", *rows)
     assert_same_samples(read_recording(path), walk)
 
 
@@ -76,11 +75,11 @@ def test_messages_name_the_file_and_the_sensor(
 ) -> None:
     path = tmp_path / "own.csv"
     rows = rows_of(walk, NAMES["codes"])
-    path.write_text("\n".join(["time,sensor,x,y,z", *rows]) + "\n")
+    write_lines(path, "time,sensor,x,y,z", *rows)
     with caplog.at_level(logging.INFO):
         read_recording(path)
     assert f"{path}/GYR.csv: its times name no unit" in caplog.text
     assert "stario-" not in caplog.text
-    path.write_text("\n".join(["time,sensor,x,y,z", *(row for row in rows if "ACC" in row)]) + "\n")
+    write_lines(path, "time,sensor,x,y,z", *(row for row in rows if "ACC" in row))
     with pytest.raises(ReadError, match=r"own\.csv: sensors: found only accel"):
         read_recording(path)

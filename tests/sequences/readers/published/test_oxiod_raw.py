@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import published_formats as formats
 import pytest
+from alike import assert_same_poses
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
@@ -55,14 +56,8 @@ def assert_matches(path: Path, walk: ImuSequence, tolerance_deg: float = 1.0) ->
     assert np.abs(read.gyro - walk.gyro).max() < 1e-9
     assert np.abs(read.accel - walk.accel).max() < 1e-8
     inside = (walk.time > 3.2) & (walk.time < walk.time[-1] - 2.2)
-    pose = read.truth.at(walk.time[inside])
-    assert pose.valid.mean() > 0.95
-    given = walk.truth.attitude_WB[inside]
-    error = (given * pose.attitude_WB.inv())[pose.valid]
-    assert np.degrees((error.mean().inv() * error).magnitude()).max() < tolerance_deg
-    assert np.hypot(*error.mean().as_rotvec()[:2]) < np.radians(0.5)
-    difference = error.mean().apply(pose.position_W) - walk.truth.position_W[inside]
-    assert np.linalg.norm(difference[pose.valid], axis=1).max() < 0.05
+    assert read.truth.at(walk.time[inside]).valid.mean() > 0.95
+    assert_same_poses(read.truth, walk, tolerance_deg, 0.05)
 
 
 @pytest.mark.parametrize("ahead", [0.02, -1.65, 5000.0])
