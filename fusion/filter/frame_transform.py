@@ -63,13 +63,13 @@ class FrameTransform:
         v_W, p_W = self.R @ state.v_W, self.R @ state.p_W + self.shift
         A = frame_rotation(self.R)
         # A shift takes the error at its own time out of the positions: that of the common yaw, too.
-        A[6:9, 2] = -self.by_yaw
+        A[POSITION, 2] = -self.by_yaw
         covariance = A @ state.covariance @ A.T
         yaw_since = max(0.0, self.drift - state.covariance[2, 2])
         if self.placed:
             drift = self.position_drift - without_yaw(state.covariance, POSITION)
-            covariance[6:9, 6:9] += self.position_covariance + _positive_part(drift)
-            covariance[6:9, 6:9] += yaw_since * np.outer(self.by_yaw, self.by_yaw)
+            covariance[POSITION, POSITION] += self.position_covariance + _positive_part(drift)
+            covariance[POSITION, POSITION] += yaw_since * np.outer(self.by_yaw, self.by_yaw)
         else:
             variance = self.yaw_sigma**2 + yaw_since
             covariance += _turn_covariance(variance, v_W, p_W - self.pivot)
