@@ -1,12 +1,9 @@
-"""The fixed-lag graph of a stream: against filter and batch, with fixes and faults, its memory."""
+"""The fixed-lag graph of a stream: against filter and batch, with fixes and faults."""
 
 from __future__ import annotations
 
-import gc
-import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -300,34 +297,6 @@ def test_if_the_graph_fails_the_stream_continues_from_the_filter(
         "fell back to the filter 1 times, last because velocity at 8.0 s is undetermined"
         in navigator.health.notes[0]
     )
-
-
-def memory_growth(walk: ImuSequence, model: Any, warm_up: float, seconds: float) -> int:
-    """Growth [bytes], from the half with less of it: caches fill once, leaks grow in both."""
-    navigator = lagged(model)
-    rows = list(zip(walk.gyro.tolist(), walk.accel.tolist(), strict=True))
-    held = []
-    tracemalloc.start()
-    try:
-        for start, stop in pairwise([0.0, warm_up, warm_up + 0.5 * seconds, warm_up + seconds]):
-            for k in range(round(start * walk.rate), round(stop * walk.rate)):
-                navigator.push(k / walk.rate, *rows[k % len(rows)])
-            gc.collect()  # free lists are no growth
-            held.append(tracemalloc.get_traced_memory()[0])
-        assert len(navigator._estimator._builder.graph.keyframes) < 12
-        return 2 * min(after - before for before, after in pairwise(held))
-    finally:
-        tracemalloc.stop()
-
-
-def test_the_memory_of_a_stream_does_not_grow(make_walk: Make, still_model: Any) -> None:
-    assert memory_growth(make_walk(1, 30.0, 50.0), still_model, 20.0, 30.0) < 40_000
-
-
-@pytest.mark.slow
-def test_the_memory_of_an_hours_stream_does_not_grow(make_walk: Make, still_model: Any) -> None:
-    # Half of what storing one number per keyframe would take.
-    assert memory_growth(make_walk(1, 30.0, 50.0), still_model, 120.0, 3600.0) < 16 * 2 * 3600
 
 
 @pytest.mark.parametrize("stop", [3.0, 11.37])
