@@ -14,8 +14,7 @@ from stario.fusion.config import FilterConfig
 from stario.fusion.filter.engine import GateMode, UpdateResult
 from stario.fusion.filter.hypotheses import AlternativeHypothesis, HypothesisPair
 from stario.fusion.filter.network_errors import (
-    AccelNoiseScale,
-    ErrorLevel,
+    InnovationStatistics,
     displacement_errors,
     propagated_turn,
 )
@@ -24,10 +23,10 @@ from stario.fusion.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 
-_RARE_SHARE, _RARE_POWER, _SHARE_SECONDS = 0.35, 4.0, 20.0
-"""While less than this share of the last seconds' displacements were outliers, they are attributed
-to the network and inflated by this power of NIS / gate; a filter that gates more of them may itself
-be wrong. This bridges about five seconds of false displacements."""
+_RARE_SHARE, _RARE_POWER = 0.35, 4.0
+"""While less than this share of recent displacements were outliers, they are attributed to the
+network and inflated by this power of NIS / gate; a filter that gates more of them may itself be
+wrong. This bridges about five seconds of false displacements."""
 
 _OFFSET_GAIN = 0.5
 """Share of the latest outlier's residual in the alternative's offset, which may turn with the
@@ -48,16 +47,12 @@ class DisplacementUpdates:
         config: settings of the filter.
 
     Attributes:
-        outlier_share: fraction of outliers among recent displacements.
-        accel_noise: estimated scale of the accelerometer's noise.
-        error_level: estimated level of the network's errors.
+        statistics: what the innovations so far tell.
     """
 
     def __init__(self, hypotheses: HypothesisPair, config: FilterConfig) -> None:
         self._hypotheses, self._ekf, self._config = hypotheses, hypotheses.ekf, config
-        self.outlier_share = 0.5  # outliers are assumed common at first
-        self.accel_noise = AccelNoiseScale()
-        self.error_level = ErrorLevel()
+        self.statistics = InnovationStatistics()
 
     def update(
         self, slot: int, R_NB: FloatArray, d_N: FloatArray, covariance_N: FloatArray
@@ -74,18 +69,13 @@ class DisplacementUpdates:
         """
         f, before = self._config, self._ekf.state
         self._hypotheses.apply_to_both(self._propagate_turn)
-        rare = self.outlier_share < _RARE_SHARE
+        rare = self.statistics.outlier_share < _RARE_SHARE
         update = partial(self._update, slot, R_NB, d_N, covariance_N)
         result = update(f.gate, power=_RARE_POWER if rare else 1.0)
-        gain = 1.0 / (f.update_rate * _SHARE_SECONDS)
-        self.outlier_share += gain * (result.gated - self.outlier_share)
-        if f.adaptive:
-            self.accel_noise = self.accel_noise.updated(result)
-            if f.correlated_errors:
-                self.error_level = self.error_level.updated(result)
+        self.statistics = self.statistics.updated(result, f)
         if self._hypotheses.alternative is None and rare and result.gated:
             assert result.residual is not None  # it has been compared with the gate
-            first = AlternativeHypothesis(before, before.time, result.residual, (before.time,))
+            first = AlternativeHypothesis(before, result.residual, (before.time,))
             self._hypotheses.alternative = first
         elif result.accepted:
             fits = self._update_alternative(update)
@@ -135,7 +125,7 @@ class DisplacementUpdates:
                 d_W, covariance_W = d_W - offset_W, _OFFSET_SCALE * covariance_W
             errors = None
             if f.correlated_errors and np.isfinite(covariance_W).all():
-                level, has_turn = self.error_level.level, self._ekf.state.has_turn
+                level, has_turn = self.statistics.error_level, self._ekf.state.has_turn
                 errors = displacement_errors(d_W, covariance_W, level, has_turn, f)
             limit = None if gate is None else chi2_quantile(gate, 3)
             covariance_W = f.overlap_scale * covariance_W

@@ -286,7 +286,7 @@ class StateCloningEkf(ErrorStateEngine):
         R = self.state.R_WB
         residual = np.array([math.remainder(yaw - yaw_twist(R), 2.0 * math.pi)])
         if not math.isfinite(residual[0]):
-            return UpdateResult(math.nan, 1, False, reason="yaw not defined upside down")
+            return UpdateResult("yaw not defined upside down")
         covariance = np.array([[sigma * sigma]])
         return self.update_linear(residual, yaw_jacobian(R), covariance, gate, gains_from=ACTUAL)
 

@@ -30,12 +30,10 @@ class UpdateResult(NamedTuple):
     """Outcome of one measurement.
 
     Attributes:
-        nis: normalised innovation squared under the covariance of the error, before any
-            inflation; NaN if it could not be computed.
-        dof: dimension of the measurement, the expectation of `nis`.
-        accepted: False if the state was left unchanged.
-        scale: factor by which the measurement covariance was inflated (1: not gated).
         reason: why the measurement was rejected; empty if it was accepted.
+        nis: normalised innovation squared under the covariance of the error, before any
+            inflation; its expectation is m. NaN if it could not be computed.
+        scale: factor by which the measurement covariance was inflated (1: not gated).
         residual: (m,) measured minus predicted; None if the measurement was invalid.
         sigma: (m,) standard deviations of the residual under the covariance of the error; None
             likewise.
@@ -43,14 +41,17 @@ class UpdateResult(NamedTuple):
             is what gates.
     """
 
-    nis: float
-    dof: int
-    accepted: bool
-    scale: float = 1.0
     reason: str = ""
+    nis: float = math.nan
+    scale: float = 1.0
     residual: FloatArray | None = None
     sigma: FloatArray | None = None
     gate_nis: float = math.nan
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the state was updated; a rejected measurement leaves it unchanged."""
+        return not self.reason
 
     @property
     def gated(self) -> bool:
@@ -133,9 +134,8 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
             The outcome. Values that are not finite and covariances that are not positive definite
             are rejected with a reason; the state is then unchanged.
         """
-        m = len(residual)
         if reason := fault_of(residual, covariance):
-            return UpdateResult(math.nan, m, False, reason=reason)
+            return UpdateResult(reason)
         HP = _sum([H @ self.covariances[:, first : first + H.shape[1]] for first, H in blocks])
         HPH = _sum([HP[:, :, first : first + H.shape[1]] @ H.T for first, H in blocks])
         R = np.array((covariance, covariance if noise is None else noise))
@@ -146,17 +146,17 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         scale = 1.0
         if gate is not None and gate_nis > gate:
             if gate_mode == "reject":
-                return UpdateResult(nis, m, False, 1.0, "gated", residual, sigma, gate_nis)
+                return UpdateResult("gated", nis, 1.0, residual, sigma, gate_nis)
             scale = (gate_nis / gate) ** power
             R = R * scale
             S = HPH + R
             whitener = _whitener(S[gains_from])
         if not math.isfinite(gate_nis):
-            return UpdateResult(math.nan, m, False, reason="innovation covariance not invertible")
+            return UpdateResult("innovation covariance not invertible")
         self.R, self.S = R[gains_from], S[gains_from]
         self._set_gain(residual, HP[gains_from], whitener)
         self.inject(self._with_gain(blocks, R, HP, S))
-        return UpdateResult(nis, m, True, scale, "", residual, sigma, gate_nis)
+        return UpdateResult("", nis, scale, residual, sigma, gate_nis)
 
     def inject(self, covariances: FloatArray) -> None:
         """Move the error's mean `x` into the state and set it to zero, with new covariances."""

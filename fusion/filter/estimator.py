@@ -94,7 +94,7 @@ class Estimator:
             displacement: predicted displacement; None if no window ends or none is available.
             fixes: fixes up to the interval's end that were not given before, in order of time.
         """
-        factor = self._displacements.accel_noise.factor
+        factor = self._displacements.statistics.accel_factor
         if factor != interval.accel_factor:
             interval = changed(interval, accel_factor=factor)
         if self._streaming:
@@ -269,10 +269,8 @@ class Estimator:
             self.frame.state,
             self._rest.detector.window,
             self._magnetic.reference,
-            self._displacements.outlier_share,
+            self._displacements.statistics,
             self.bias.prior,
-            self._displacements.accel_noise,
-            self._displacements.error_level,
             self._hypotheses.alternative,
             self._counts,
             self.released,
@@ -285,9 +283,7 @@ class Estimator:
         self.frame.state, self._rest.detector.window = s.map_frame, s.stillness
         self._magnetic.reference, self.bias.prior = s.magnetic, s.bias_prior
         self._counts = s.counts
-        self._displacements.outlier_share = s.outlier_share
-        self._displacements.accel_noise = s.accel_noise
-        self._displacements.error_level = s.error_level
+        self._displacements.statistics = s.statistics
         self._hypotheses.alternative = s.alternative
         self.released, self._history = s.released, s.history
 
@@ -317,8 +313,8 @@ class Estimator:
     def health(self, counts: SampleCounts, state: NavState | None = None) -> Health:
         """Return the health report so far, with the sigmas of `state` if given."""
         health = self._counts.health(counts, state or self.nav_state())
-        health.accel_noise_factor = self._displacements.accel_noise.factor
-        health.network_error_level = self._displacements.error_level.level
+        health.accel_noise_factor = self._displacements.statistics.accel_factor
+        health.network_error_level = self._displacements.statistics.error_level
         if self._config.filter.declination is not None and not self.frame.state.oriented:
             health.notes.append("north could not be determined: the track starts with yaw zero")
         return health

@@ -19,7 +19,7 @@ from stario.fusion.filter.frame_transform import MapFrameState
 from stario.fusion.filter.gyro_bias import GyroBiasPrior
 from stario.fusion.filter.hypotheses import AlternativeHypothesis
 from stario.fusion.filter.magnetic import MagneticReference
-from stario.fusion.filter.network_errors import AccelNoiseScale, ErrorLevel
+from stario.fusion.filter.network_errors import InnovationStatistics
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.health import Health, SampleCounts
@@ -169,10 +169,8 @@ class EstimatorState:
         map_frame: what is known about the map frame.
         stillness: sums over the last second (`StillnessDetector`).
         magnetic: usual size, dip and spread of the magnetic field.
-        outlier_share: fraction of outliers among recent displacements.
+        statistics: what the innovations of displacements tell.
         bias_prior: prior of the gyroscope's bias, as currently applied in the filter.
-        accel_noise: estimated scale of the accelerometer's noise.
-        error_level: estimated level of the network's errors.
         alternative: the alternative hypothesis; None while all displacements fit.
         counts: updates by outcome.
         released: newest pose that left the window, corrected by the whole window.
@@ -184,10 +182,8 @@ class EstimatorState:
     map_frame: MapFrameState
     stillness: tuple[FloatArray | None, ...]
     magnetic: MagneticReference
-    outlier_share: float
+    statistics: InnovationStatistics
     bias_prior: GyroBiasPrior
-    accel_noise: AccelNoiseScale
-    error_level: ErrorLevel
     alternative: AlternativeHypothesis | None
     counts: UpdateCounts
     released: Estimate | None

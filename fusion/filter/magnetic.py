@@ -300,11 +300,10 @@ def update_bearing(
     size, dip = math.hypot(horizontal, m_W[2]), math.atan2(-m_W[2], horizontal)
     if horizontal < _MIN_HORIZONTAL:
         reason = "too weak to be in uT" if measured < _WEAKEST else "no horizontal field"
-        return UpdateResult(math.nan, 1, False, reason=reason), changed(reference, time=now)
+        return UpdateResult(reason), changed(reference, time=now)
     reference = reference.compared(s, m_B)
     if reference.contradicts_gyro:
-        reason = "contradicts the gyroscope"
-        return UpdateResult(math.nan, 1, False, reason=reason), changed(reference, time=now)
+        return UpdateResult("contradicts the gyroscope"), changed(reference, time=now)
     extrapolated = abs(measured - reference.measured) < HELD_CHANGE * measured
     new_place = not extrapolated and math.hypot(s.v_W[0], s.v_W[1]) > _MIN_SPEED
     reference = changed(reference.updated(now, size, dip, new_place), measured=measured)

@@ -96,8 +96,7 @@ class MapFrame:
             doubtful = fix.kind == "position" and self.state.distance_mismatches > 0
             transform = None if doubtful else self._orient(fix)
         if transform is None:
-            reason = "too coarse" if fix.kind == "yaw" else "yaw not known"
-            return UpdateResult(math.nan, len(fix.value), False, reason=reason)
+            return UpdateResult("too coarse" if fix.kind == "yaw" else "yaw not known")
         result = self._update(fix)
         if places:
             self._begin_alignment(fix)

@@ -22,7 +22,7 @@ from stario.fusion.filter.network_errors import (
     MAX_LEVEL,
     MIN_LEVEL,
     WHITE,
-    ErrorLevel,
+    InnovationStatistics,
     displacement_errors,
 )
 from stario.fusion.fixes import position_fix
@@ -100,25 +100,24 @@ def test_a_turn_that_is_a_state_is_not_counted_again() -> None:
 
 @pytest.mark.parametrize(("nis", "bound"), [(0.0, MIN_LEVEL), (1e6, MAX_LEVEL)])
 def test_the_level_stays_within_its_bounds(nis: float, bound: float) -> None:
-    level = ErrorLevel()
+    statistics = InnovationStatistics()
     for _ in range(1000):
-        level = level.updated(UpdateResult(nis, 3, True))
-    assert level.level == pytest.approx(bound)
+        statistics = statistics.updated(UpdateResult(nis=nis, gate_nis=nis), F)
+    assert statistics.error_level == pytest.approx(bound)
 
 
 def test_the_level_makes_the_mean_nis_three() -> None:
     """Innovations twice as large as predicted: their variance, and so the level, is four times."""
-    rng, level, nis = np.random.default_rng(0), ErrorLevel(), []
+    rng, statistics, nis = np.random.default_rng(0), InnovationStatistics(), []
     for _ in range(2000):
-        nis.append(4.0 / level.level * rng.chisquare(3))
-        level = level.updated(UpdateResult(nis[-1], 3, True))
+        nis.append(4.0 / statistics.error_level * rng.chisquare(3))
+        statistics = statistics.updated(UpdateResult(nis=nis[-1], gate_nis=nis[-1]), F)
     assert np.mean(nis[200:]) == pytest.approx(3.0, rel=0.1)
 
 
 def test_one_displacement_changes_the_level_by_a_fifth_at_most() -> None:
-    level = ErrorLevel(gain=0.05)
-    assert level.updated(UpdateResult(1e6, 3, True)).level == pytest.approx(np.exp(0.2))
-    assert level.updated(UpdateResult(float("nan"), 3, False)) == level
+    after = InnovationStatistics(gain=0.05).updated(UpdateResult(nis=1e6, gate_nis=1e6), F)
+    assert after.error_level == pytest.approx(np.exp(0.2))
 
 
 # --- the covariance ------------------------------------------------------------------------------
