@@ -95,10 +95,10 @@ def _graph_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solut
     covariance = states[0].covariance.copy()
     covariance[9:12, 9:12] = estimator.bias.prior.variance * np.eye(3)  # the filter's last prior
     first = replace(states[0], covariance=covariance)
-    sigma = config.filter.network_turn_sigma if estimator.ekf.state.has_turn else 0.0
     final = to_final_frame(states, frame.transforms)
+    has_turn = estimator.ekf.state.has_turn
     solved, note = smooth(
-        final, first, filtered.measurements, frame.transforms, config, bias, sigma
+        final, first, filtered.measurements, frame.transforms, config, bias, has_turn
     )
     turns = [
         frame_rotation(after.R_WB @ before.R_WB.T)

@@ -176,8 +176,7 @@ class TurnEstimate(NamedTuple):
     turn: float
     """The turn [rad]."""
     covariance: FloatArray
-    """(16,) covariance with the plain errors of the state (order of `NavState.covariance`), then
-    the turn's variance."""
+    """(16, 16) of the plain errors of the state (order of `NavState.covariance`) and the turn."""
 
 
 def turn_estimate(s: EkfState) -> TurnEstimate | None:
@@ -186,7 +185,7 @@ def turn_estimate(s: EkfState) -> TurnEstimate | None:
         return None
     rows = [*range(CORE), s.turn_row]
     P = plain_covariance(s.P[rows][:, rows], s.X[0, :, 3:].T)
-    return TurnEstimate(s.network_turn, P[CORE])
+    return TurnEstimate(s.network_turn, P)
 
 
 def with_turn(s: EkfState, sigma: float) -> EkfState:

@@ -19,10 +19,10 @@ from typing import Any, Protocol
 import numpy as np
 from gtsam.symbol_shorthand import B, T, V, X
 
-from stario.fusion.filter.jacobians import CORE, plain_covariance
+from stario.fusion.filter.jacobians import plain_covariance
 from stario.fusion.filter.network_errors import TurnEstimate
 from stario.fusion.graph.covariances import root_information
-from stario.fusion.graph.keyframe_state import KeyframeState
+from stario.fusion.graph.keyframe_state import KeyframeState, turn_at
 from stario.fusion.lie import about_vertical, twist, yaw_rotation
 from stario.fusion.state import NavState
 from stario.sequences.attitude.so3 import skew
@@ -86,29 +86,23 @@ class Prior:
     Attributes:
         k: number of the first keyframe.
         reference: n states, of keyframe k and its successors, from which the error is measured.
-        root: (m, 15 n + t) square-root information; columns of the keyframes, then of the turns.
+        root: (m, ...) square-root information, with the columns of one keyframe after the other.
         offset: (m,) right-hand side.
-        turns: t keyframes with a network's turn, and the turn [rad] at which its error is zero.
     """
 
     k: int
     reference: tuple[KeyframeState, ...]
     root: FloatArray
     offset: FloatArray
-    turns: tuple[tuple[int, float], ...] = ()
 
     @classmethod
     def of(cls, k: int, state: NavState, turn: TurnEstimate | None = None) -> Prior:
         """Return the prior of keyframe k from a state and the network's turn, if estimated."""
-        reference = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
-        covariance: FloatArray = state.covariance
-        turns: tuple[tuple[int, float], ...] = ()
+        reference, covariance = KeyframeState.from_nav(state), state.covariance
         if turn is not None:
-            cross = turn.covariance[:CORE, None]
-            covariance = np.block([[covariance, cross], [cross.T, turn.covariance[CORE:, None]]])
-            turns = ((k, turn.turn),)
+            reference, covariance = reference._replace(turn=turn.turn), turn.covariance
         root = root_information(plain_covariance(covariance, -np.stack([state.v_W, state.p_W])))
-        return cls(k, (reference,), root, np.zeros(len(root)), turns)
+        return cls(k, (reference,), root, np.zeros(len(root)))
 
     @property
     def keyframes(self) -> tuple[int, ...]:
@@ -122,16 +116,13 @@ class Prior:
 
     def linearise(self, values: Any) -> Linearised:
         """Linearise in the rows of the root."""
-        residual, blocks = self.offset, []
-        for n, (k, reference) in enumerate(zip(self.keyframes, self.reference, strict=True)):
-            root = self.root[:, CORE * n : CORE * (n + 1)]
+        residual, blocks, rest = self.offset, [], self.root
+        for k, reference in zip(self.keyframes, self.reference, strict=True):
             state = KeyframeState.of(values, k)
-            residual = residual - root @ state.error_from(reference)
-            H = root @ state.invariant_from_local()
-            blocks += [(X(k), H[:, :6]), (V(k), H[:, 6:9]), (B(k), H[:, 9:])]
-        for n, (k, turn) in enumerate(self.turns, CORE * len(self.reference)):
-            residual = residual - self.root[:, n] * (turn_at(values, k) - turn)
-            blocks.append((T(k), self.root[:, n : n + 1]))
+            error = state.error_from(reference)
+            root, rest = rest[:, : len(error)], rest[:, len(error) :]
+            residual = residual - root @ error
+            blocks += state.blocks(k, root @ state.invariant_from_local())
         return residual, blocks
 
 
@@ -278,11 +269,6 @@ class GyroBias(AtKeyframe):
         """Linearise in B."""
         residual = self.b_g - values.atConstantBias(B(self.k)).gyroscope()
         return residual, [(B(self.k), np.eye(3, 6, k=3))]
-
-
-def turn_at(values: Any, k: int) -> float:
-    """Return the network's turn at a keyframe [rad]."""
-    return float(values.atVector(T(k))[0])
 
 
 def _pose(values: Any, k: int) -> tuple[FloatArray, FloatArray]:

@@ -211,8 +211,9 @@ class FixedLagEstimator:
         self._bias_prior = self._filter.bias.prior.variance
         first = first.shifted(-self._origin_W)
         turn = turn_estimate(self._filter.ekf.state)
-        sigma = 0.0 if turn is None else self._config.filter.network_turn_sigma
-        self._builder = GraphBuilder(self._config, first, count, sigma, turn, streaming=True)
+        self._builder = GraphBuilder(
+            self._config, first, count, turn is not None, turn, streaming=True
+        )
         self._ahead.initialise(first)
 
     def _solve(self) -> None:
