@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.ekf_state import Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.ekf_state import Estimate, nav_states
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import IntervalMeasurements, innovations_of
 from stario.fusion.filter.frame_transform import (
@@ -80,9 +80,7 @@ def _filter_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solu
     """Return the filter's states."""
     frame = filtered.estimator.frame.state
     states = to_final_frame(nav_states(filtered.estimates), frame.transforms)
-    smoothed = smoothed_track(
-        smoothed_poses(filtered.clones), (*frame.transforms, *frame.undirected)
-    )
+    smoothed = smoothed_track(nav_states(filtered.clones), (*frame.transforms, *frame.undirected))
     return Solution(with_undirected(states, frame.undirected), smoothed)
 
 

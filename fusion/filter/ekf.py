@@ -19,6 +19,7 @@ from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult
 from stario.fusion.filter.jacobians import (
     ACTUAL,
     CLONE,
+    CLONED,
     CORE,
     Propagation,
     bearing_jacobian,
@@ -41,9 +42,6 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 
 _NO_GAIN = np.zeros(3)
-
-_CLONED = [0, 1, 2, 6, 7, 8]
-"""Rows of theta and rho_p, which a clone copies."""
 
 
 class StateCloningEkf(ErrorStateEngine):
@@ -154,8 +152,8 @@ class StateCloningEkf(ErrorStateEngine):
         X[1 + slot, :, 3] = 0.0
         first, P = CORE + CLONE * slot, s.covariances.copy()
         clone = slice(first, first + CLONE)
-        P[:, clone] = P[:, _CLONED]
-        P[:, :, clone] = P[:, :, _CLONED]
+        P[:, clone] = P[:, CLONED]
+        P[:, :, clone] = P[:, :, CLONED]
         times = (*s.clone_times[:slot], s.time, *s.clone_times[slot + 1 :])
         self.state = changed(s, X=X, covariances=P, clone_times=times)
         return slot

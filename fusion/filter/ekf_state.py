@@ -13,14 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CLONE, CORE, plain_covariance
-from stario.fusion.state import NavState, SmoothedPose, changed
+from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CLONE, CLONED, CORE, plain_covariance
+from stario.fusion.state import NavState, changed
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
-
-_CLONE_COLUMNS = [0, 1, 2, 4]
-"""Columns R and p of a pose: a clone has no velocity."""
 
 GYRO_BIAS = slice(9, 12)
 """Rows of the gyroscope's bias in the error state."""
@@ -57,17 +54,16 @@ class FieldState:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A filter's estimate of its newest state, or of a clone.
+    """A filter's estimate of its newest state; or of a clone, which has no velocity and biases.
 
     Attributes:
         time: [s].
-        X: (3, 5) R_WB, v_W, p_W; for a clone (3, 4) R_WB, p_W. The position is relative to
-            `origin_W`.
+        X: (3, 5) R_WB, v_W, p_W, the position relative to `origin_W`.
         origin_W: (3,) [m].
         b_g: (3,) gyroscope bias [rad/s].
         b_a: (3,) accelerometer bias [m/s^2].
-        covariances: (2, 15, 15) of theta, rho_v, rho_p, d_bg, d_ba, or for a clone (2, 6, 6) of
-            theta, rho_p: as assumed for the gains, and as it is (see `EkfState`).
+        covariances: (2, 15, 15) of theta, rho_v, rho_p, d_bg, d_ba, as assumed for the gains and
+            as it is (see `EkfState`); zero for what a clone does not have.
         in_gap: as in `NavState`.
         map_frame: as in `NavState`.
     """
@@ -217,13 +213,12 @@ class EkfState:
         Raises:
             InputError: the slot holds no clone.
         """
-        time, first = self.time_of_clone(slot), CORE + CLONE * slot
+        time, first, zero = self.time_of_clone(slot), CORE + CLONE * slot, np.zeros(3)
         rows = slice(first, first + CLONE)
-        X = self.X[1 + slot][:, _CLONE_COLUMNS].copy()
-        covariances = self.covariances[:, rows, rows].copy()
-        return Estimate(
-            time, X, self.origin_W, self.b_g, self.b_a, covariances, map_frame=map_frame
-        )
+        covariances = np.zeros((2, CORE, CORE))
+        covariances[:, CLONED[:, None], CLONED] = self.covariances[:, rows, rows]
+        X = self.X[1 + slot].copy()
+        return Estimate(time, X, self.origin_W, zero, zero, covariances, map_frame=map_frame)
 
     def transformed(self, R: FloatArray, shift: FloatArray) -> EkfState:
         """Return the state in another frame: p <- R p + shift, R applied to attitude and velocity.
@@ -286,7 +281,7 @@ def plain_covariances(estimates: Sequence[Estimate], which: int = ACTUAL) -> Flo
     """Return covariances (N, n, n) of plain errors in W's axes, each true minus estimate.
 
     Args:
-        estimates: N estimates of newest states, or of clones.
+        estimates: N estimates.
         which: `ACTUAL` or `ASSUMED`.
     """
     P = np.array([e.covariances[which] for e in estimates])
@@ -295,7 +290,7 @@ def plain_covariances(estimates: Sequence[Estimate], which: int = ACTUAL) -> Flo
 
 
 def nav_states(estimates: Sequence[Estimate], which: int = ACTUAL) -> list[NavState]:
-    """Convert estimates of newest states to `NavState`; arguments as `plain_covariances`."""
+    """Convert estimates to `NavState`; arguments as `plain_covariances`."""
     states = []
     for k in range(0, len(estimates), _CHUNK):
         part = estimates[k : k + _CHUNK]
@@ -304,13 +299,3 @@ def nav_states(estimates: Sequence[Estimate], which: int = ACTUAL) -> list[NavSt
             biases = e.b_g.copy(), e.b_a.copy()  # those of `e` are the filter's own
             states.append(NavState(e.time, *pose, *biases, covariance, e.in_gap, e.map_frame))
     return states
-
-
-def smoothed_poses(clones: Sequence[Estimate]) -> list[SmoothedPose]:
-    """Convert estimates of clones to `SmoothedPose`."""
-    if not clones:
-        return []
-    return [
-        SmoothedPose(e.time, e.X[:, :3], e.X[:, 3] + e.origin_W, covariance, e.map_frame)
-        for e, covariance in zip(clones, plain_covariances(clones), strict=True)
-    ]

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.displacements import DisplacementUpdates
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import EkfState, Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.ekf_state import EkfState, Estimate, nav_states
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.estimator_state import (
     EstimatorState,
@@ -24,6 +26,7 @@ from stario.fusion.filter.frame_transform import with_undirected
 from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior
 from stario.fusion.filter.hypotheses import HypothesisPair
 from stario.fusion.filter.initial import PriorPose, initialise, reinitialise, tilt_sigma
+from stario.fusion.filter.jacobians import CLONED
 from stario.fusion.filter.magnetic import MagneticUpdates, north_fix
 from stario.fusion.filter.map_frame import MapFrame
 from stario.fusion.filter.network_errors import ACCEL_SHARE
@@ -300,7 +303,11 @@ class Estimator:
     @property
     def smoothed(self) -> SmoothedPose | None:
         """`released` as a `SmoothedPose`; None at first."""
-        return smoothed_poses([self.released])[0] if self.released else None
+        if self.released is None:
+            return None
+        (s,) = nav_states([self.released])
+        covariance = s.covariance[np.ix_(CLONED, CLONED)]
+        return SmoothedPose(s.time, s.R_WB, s.p_W, covariance, s.map_frame)
 
     def estimate(self) -> Estimate:
         """Return the estimate of the filter's newest state."""

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from stario.fusion.filter.jacobians import CORE
 from stario.fusion.filter.planar_alignment import POSITION, PlanarAlignment, without_yaw
 from stario.fusion.lie import UNKNOWN_YAW
-from stario.fusion.state import NavState, SmoothedPose, changed
+from stario.fusion.state import NavState, changed
 from stario.sequences.sequence import FloatArray, Trajectory
 
 _E3_CROSS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
@@ -202,24 +202,15 @@ def with_undirected(states: list[NavState], undirected: Sequence[FrameTransform]
 
 
 def smoothed_track(
-    poses: list[SmoothedPose], transforms: Sequence[FrameTransform]
+    poses: list[NavState], transforms: Sequence[FrameTransform]
 ) -> Trajectory | None:
     """Return smoothed poses as a track in its final frame; None if there are none."""
     if not poses:
         return None
-    states = to_final_frame(map(_as_state, poses), transforms)
+    states = to_final_frame(poses, transforms)
     return Trajectory(
         time=np.array([s.time for s in states]),
         position_W=np.array([s.p_W for s in states]),
         attitude_WB=Rotation.from_matrix(np.array([s.R_WB for s in states])),
         position_covariance_W=np.array([s.position_covariance for s in states]),
-    )
-
-
-def _as_state(pose: SmoothedPose) -> NavState:
-    """Return a pose as a state at rest without biases."""
-    rows, zero, covariance = [0, 1, 2, 6, 7, 8], np.zeros(3), np.zeros((CORE, CORE))
-    covariance[np.ix_(rows, rows)] = pose.covariance
-    return NavState(
-        pose.time, pose.R_WB, zero, pose.p_W, zero, zero, covariance, map_frame=pose.map_frame
     )

@@ -28,6 +28,9 @@ CORE = 15
 CLONE = 6
 """Size of the error state of one cloned pose."""
 
+CLONED = np.array([0, 1, 2, 6, 7, 8])
+"""Rows of theta and rho_p, which a clone copies."""
+
 ASSUMED, ACTUAL = 0, 1
 """Indices of the covariances: as assumed for the gains, and of the error that these gains leave."""
 

@@ -134,7 +134,7 @@ def test_covariance_stays_positive_over_half_an_hour() -> None:
 
 def clone_position_covariance(ekf: StateCloningEkf, slot: int) -> np.ndarray:
     """Covariance (3, 3) of a clone's position [m^2]."""
-    return plain_covariances([ekf.state.clone_estimate(slot)])[0, 3:, 3:]
+    return plain_covariances([ekf.state.clone_estimate(slot)])[0, 6:9, 6:9]
 
 
 def test_a_precise_fix_of_an_unknown_position_keeps_the_covariance_valid(
