@@ -294,7 +294,7 @@ class StateCloningEkf(ErrorStateEngine):
         """Update with the bearing of a magnetic field, which measures the state's azimuth.
 
         Args:
-            m_B: (3,) measured field [uT]; the state must have a field (`magnetic.first_field`).
+            m_B: (3,) measured field [uT]; the state must have a field (`magnetic.with_field`).
             variance: variance of its bearing [rad^2].
             gate: as for the other updates; outliers are inflated.
         """
@@ -303,7 +303,7 @@ class StateCloningEkf(ErrorStateEngine):
         m_W = s.R_WB @ (m_B - s.field.hard_iron_B)
         bearing = math.atan2(m_W[1], m_W[0])
         residual = math.remainder(bearing - s.field.azimuth - s.field.wander, 2.0 * math.pi)
-        blocks = bearing_jacobian(s.R_WB, m_W, s.first_field)
+        blocks = bearing_jacobian(s.R_WB, m_W, s.field_row)
         return self.update_linear(np.array([residual]), blocks, np.array([[variance]]), gate)
 
     def inject(self, covariances: FloatArray) -> None:
@@ -316,8 +316,8 @@ class StateCloningEkf(ErrorStateEngine):
         b_g, b_a = s.b_g + dx[9:12], s.b_a + dx[12:15]
         field = s.field
         if field is not None:
-            azimuth, wander, *_ = dx[s.first_field :].tolist()
-            hard_iron_B = field.hard_iron_B + dx[s.first_field + 2 :]
+            azimuth, wander, *_ = dx[s.field_row :].tolist()
+            hard_iron_B = field.hard_iron_B + dx[s.field_row + 2 :]
             field = FieldState(field.azimuth + azimuth, field.wander + wander, hard_iron_B)
         turn = s.network_turn + float(dx[s.turn_row])
         values = {"X": X, "b_g": b_g, "b_a": b_a, "network_turn": turn, "field": field}

@@ -170,10 +170,10 @@ class EkfState:
     @property
     def considered_rows(self) -> slice:
         """Rows of the network's errors that are considered and never estimated."""
-        return slice(self.turn_row + 1, self.first_field)
+        return slice(self.turn_row + 1, self.field_row)
 
     @property
-    def first_field(self) -> int:
+    def field_row(self) -> int:
         """First row of the magnetic field's error: azimuth, wander, hard iron (3)."""
         return self.turn_row + 1 + len(CONSIDERED_SECONDS)
 
@@ -261,7 +261,7 @@ class EkfState:
             N[first + 2, 0] = 1.0
             N[rho, 0], N[rho + 1, 0] = y, -x  # -e3 x p
         if self.field is not None:
-            N[self.first_field, 0] = 1.0
+            N[self.field_row, 0] = 1.0
         return changed(self, covariances=self.covariances + sigma**2 * (N @ N.T))
 
     def with_position_inflated(self, sigma: float) -> EkfState:

@@ -112,7 +112,7 @@ def yaw_jacobian(R_WB: FloatArray) -> list[Block]:
     return [(0, np.array([[(s * r21 - c * r20) / n, -(c * r21 + s * r20) / n, 1.0]]))]
 
 
-def bearing_jacobian(R_WB: FloatArray, m_W: FloatArray, first_field: int) -> list[Block]:
+def bearing_jacobian(R_WB: FloatArray, m_W: FloatArray, field_row: int) -> list[Block]:
     """Return the Jacobian of the bearing's residual, measured minus azimuth.
 
     The true bearing is that of (I + [theta]x) (m - R d_h): it moves by theta_z
@@ -122,13 +122,13 @@ def bearing_jacobian(R_WB: FloatArray, m_W: FloatArray, first_field: int) -> lis
     Args:
         R_WB: (3, 3) attitude.
         m_W: (3,) field in the estimated world, hard iron removed [uT].
-        first_field: row of the azimuth's error.
+        field_row: row of the azimuth's error.
     """
     x, y, z = m_W
     n = x * x + y * y
     by_theta = np.array([[z * x / n, z * y / n, -1.0]])
     by_hard_iron = (x * R_WB[1] - y * R_WB[0]) / n
-    return [(0, by_theta), (first_field, np.concatenate([[1.0, 1.0], by_hard_iron])[None])]
+    return [(0, by_theta), (field_row, np.concatenate([[1.0, 1.0], by_hard_iron])[None])]
 
 
 def plain_covariance(P: FloatArray, vectors_W: FloatArray) -> FloatArray:
