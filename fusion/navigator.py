@@ -23,8 +23,9 @@ from stario.fusion.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_f
 from stario.fusion.health import Health
 from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
-from stario.fusion.imu.intervals import ImuInterval, check_start
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.stateful import Predictor, StatefulInference, displacements_of
+from stario.fusion.imu.units import check_start
 from stario.fusion.recording import PreprocessedRecording, Progress, preprocess, silent
 from stario.fusion.snapshot import check_same, pack, unpack
 from stario.fusion.state import ContinuousPose, NavState, SmoothedPose, Track, advanced, copied

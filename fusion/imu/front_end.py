@@ -27,7 +27,6 @@ from stario.fusion.imu.faults import (
     ClockSetBackDetector,
     FrozenSensorDetector,
     OutlierDetector,
-    SensorCheck,
 )
 from stario.fusion.imu.gap import gap_rotation
 from stario.fusion.imu.intervals import (
@@ -39,6 +38,7 @@ from stario.fusion.imu.intervals import (
     interpolated_sample,
 )
 from stario.fusion.imu.stateful import WindowBuffer
+from stario.fusion.imu.units import SensorCheck
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray

@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from stario.fusion.fixes import Fix
 from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import GravityStart
-from stario.sequences.errors import InputError
 from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
-from stario.sequences.windows import MAX_RATE, MIN_RATE
 
 Sample = tuple[float, float, float, float, float, float, float]
 """Time [s], gyroscope xyz [rad/s], specific force xyz [m/s^2]."""
@@ -33,27 +31,6 @@ class Start(GravityStart):
 
     time: float
     rate: float
-
-
-_START_FORCE = (5.0, 15.0)
-"""Accepted mean force of the first second [m/s^2]: allows for a jump, excludes units of g."""
-
-
-def check_start(start: Start, gravity: float) -> None:
-    """Check the first second of a stream, which cannot be checked as a whole.
-
-    Raises:
-        InputError: the rate is not about 50 Hz to 1 kHz, or the mean force cannot be gravity.
-    """
-    if not MIN_RATE <= start.rate <= MAX_RATE:
-        raise InputError("time", f"{start.rate:.3g} samples a second", "50 to 1000")
-    if not _START_FORCE[0] <= start.force <= _START_FORCE[1]:
-        raise InputError(
-            "accel",
-            f"an average of {start.force:.3g} over the first second",
-            f"about {gravity:.2f} m/s^2",
-            "give specific force in m/s^2 with gravity left in, and rates in rad/s",
-        )
 
 
 _LOST_SECONDS = 10.0
