@@ -89,7 +89,7 @@ class StateCloningEkf(ErrorStateEngine):
         v, p, b_g, b_a = (
             checked(name, getattr(state, name), (3,)) for name in ("v_W", "p_W", "b_g", "b_a")
         )
-        R = checked_rotation("R_WB", state.R_WB)
+        R = checked_rotation(state.R_WB)
         covariance = checked("covariance", state.covariance, (CORE, CORE))
         check_covariance(covariance)
         now = checked("time", state.time, ()).item()
@@ -105,9 +105,7 @@ class StateCloningEkf(ErrorStateEngine):
                 segment, which the gains assume.
         """
         s = self.state
-        pose = s.X[0]
-        start = pose[:, :3], pose[:, 3], pose[:, 4], s.b_g, s.b_a
-        self._move(segment.stop, propagated(segment, *start, accel_share))
+        self._move(segment.stop, propagated(segment, *s.pose, s.b_g, s.b_a, accel_share))
 
     def propagate_in_gap(
         self, stop: float, rotation: FloatArray, turn_variance: float, config: NavigatorConfig
@@ -120,10 +118,9 @@ class StateCloningEkf(ErrorStateEngine):
             turn_variance: variance of the device's unobserved turn until then [rad^2].
             config: noise densities.
         """
-        s = self.state
-        pose = s.X[0]
-        start = pose[:, :3] @ rotation, pose[:, 3], pose[:, 4]
-        self._move(stop, propagated_in_gap(stop - s.time, turn_variance, *start, config))
+        seconds, (R, v, p) = stop - self.state.time, self.state.pose
+        end = propagated_in_gap(seconds, turn_variance, R @ rotation, v, p, config)
+        self._move(stop, end)
 
     def _move(self, time: float, end: Propagation) -> None:
         """Set the current pose and its covariances after a propagation to a time [s]."""
@@ -228,7 +225,6 @@ class StateCloningEkf(ErrorStateEngine):
         v_mean_W: FloatArray,
         covariance: FloatArray,
         gate: float | None = None,
-        gate_mode: GateMode = "inflate",
         gain_W: FloatArray = _NO_GAIN,
         seconds: float = 0.0,
     ) -> UpdateResult:
@@ -242,8 +238,7 @@ class StateCloningEkf(ErrorStateEngine):
         Args:
             v_mean_W: (3,) mean velocity in the estimated world [m/s].
             covariance: (3, 3) covariance of the mean velocity [m^2/s^2].
-            gate: NIS above which the measurement counts as an outlier; None for no gate.
-            gate_mode: what happens to outliers; see `update_linear`.
+            gate: NIS above which the measurement is an outlier and inflated; None for no gate.
             gain_W: (3,) current velocity minus its mean over the window [m/s], from the IMU alone.
             seconds: length of the window [s]; 0 for a current velocity.
         """
@@ -251,7 +246,7 @@ class StateCloningEkf(ErrorStateEngine):
         force_W = gain_W + np.array([0.0, 0.0, 0.5 * seconds * self.gravity])
         blocks = mean_velocity_jacobian(s.v_W, force_W, s.R_WB, seconds)
         residual = v_mean_W + gain_W - s.v_W
-        return self.update_linear(residual, blocks, covariance, gate, gate_mode)
+        return self.update_linear(residual, blocks, covariance, gate)
 
     def update_position_W(
         self, p_W: FloatArray, covariance: FloatArray, gate: float | None = None

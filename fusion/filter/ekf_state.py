@@ -139,6 +139,12 @@ class EkfState:
         return P
 
     @property
+    def pose(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """R_WB (3, 3), v_W (3,) [m/s] and, relative to `origin_W`, p_W (3,) [m]."""
+        X = self.X[0]
+        return X[:, :3], X[:, 3], X[:, 4]
+
+    @property
     def R_WB(self) -> FloatArray:
         """Attitude (3, 3), body to world."""
         return self.X[0, :, :3]
@@ -177,6 +183,12 @@ class EkfState:
         """First row of the magnetic field's error: azimuth, wander, hard iron (3)."""
         return self.turn_row + 1 + len(CONSIDERED_SECONDS)
 
+    @property
+    def clone_slots(self) -> list[int]:
+        """Slots that hold a clone, oldest first."""
+        taken = [(time, k) for k, time in enumerate(self.clone_times) if time is not None]
+        return [slot for _, slot in sorted(taken)]
+
     def time_of_clone(self, slot: int) -> float:
         """Return the time at which a clone was taken [s].
 
@@ -185,8 +197,7 @@ class EkfState:
         """
         time = self.clone_times[slot] if 0 <= slot < len(self.clone_times) else None
         if time is None:
-            occupied = [k for k, t in enumerate(self.clone_times) if t is not None]
-            raise InputError("slot", repr(slot), f"a slot that holds a clone: {occupied}")
+            raise InputError("slot", repr(slot), f"a slot that holds a clone: {self.clone_slots}")
         return time
 
     def clone_pose(self, slot: int) -> tuple[FloatArray, FloatArray]:
@@ -273,7 +284,7 @@ class EkfState:
 
     def _poses(self) -> list[tuple[int, int]]:
         """Return the first rows of theta and rho_p of the current pose and of every clone."""
-        rows = (CORE + CLONE * k for k, time in enumerate(self.clone_times) if time is not None)
+        rows = (CORE + CLONE * slot for slot in self.clone_slots)
         return [(0, 6), *((first, first + 3) for first in rows)]
 
 

@@ -76,7 +76,6 @@ class Estimator:
         detector = StillnessDetector(round(f.output_rate * WINDOW_SECONDS), f.stillness_noise)
         self._rest = ZeroVelocityUpdates(self._hypotheses, self.bias, detector, f.gate)
         self._magnetic = MagneticUpdates(self._hypotheses)
-        self._clones: tuple[int, ...] = ()
         self._counts = UpdateCounts()
         self.in_gap = False
         self._history: History = ()
@@ -168,20 +167,20 @@ class Estimator:
         return (segment if len(pieces) == 1 else None), accepted
 
     def _propagate_piece(self, piece: ImuInterval, interval: ImuInterval) -> Segment | None:
-        """Propagate through a piece of an interval."""
-
-        def propagate() -> Segment:
-            s = self.ekf.state
-            segment = segment_of(piece, s.b_g, s.b_a, self._config)
-            self.ekf.propagate(segment, accel_share)
-            return segment
-
+        """Propagate through a piece of an interval; return its segment, None in a gap."""
         if interval.gap:
             self._propagate_in_gap(piece, interval)
             return None
         # The noise of faulty samples is what it may be.
         correlated = self._config.filter.correlated_errors
         accel_share = ACCEL_SHARE if correlated and not any(interval.flags) else 1.0
+
+        def propagate() -> Segment:
+            s = self.ekf.state
+            segment = segment_of([piece], s.b_g, s.b_a, self._config)
+            self.ekf.propagate(segment, accel_share)
+            return segment
+
         return self._hypotheses.apply_to_both(propagate)
 
     def _propagate_in_gap(self, piece: ImuInterval, gap: ImuInterval) -> None:
@@ -215,7 +214,7 @@ class Estimator:
             return None, ()
         assert interval.R_NB_window is not None  # a window comes with its initial attitude
         result, revoked = self._displacements.update(
-            self._clones[0], interval.R_NB_window, *displacement
+            self.ekf.state.clone_slots[0], interval.R_NB_window, *displacement
         )
         self._counts = self._counts.add_displacement(result)
         return result, revoked
@@ -245,21 +244,16 @@ class Estimator:
         return (before, self.ekf.state) if self._streaming else None
 
     def _clone(self) -> None:
-        if len(self._clones) < self.ekf.slots:
-            self._clones = (*self._clones, self._hypotheses.apply_to_both(self.ekf.clone))
-            return
-        slot, *later = self._clones
-        self.released = self.ekf.state.clone_estimate(slot, len(self.frame.state.transforms))
-        self._clones = (
-            *later,
-            self._hypotheses.apply_to_both(lambda: self.ekf.clone(instead_of=slot)),
-        )
+        slots, oldest = self.ekf.state.clone_slots, None
+        if len(slots) == self.ekf.slots:
+            oldest = slots[0]
+            self.released = self.ekf.state.clone_estimate(oldest, len(self.frame.state.transforms))
+        self._hypotheses.apply_to_both(lambda: self.ekf.clone(instead_of=oldest))
 
     def _release_clones(self) -> None:
         """Release the clones: no displacement spans a gap."""
-        for slot in self._clones:
+        for slot in self.ekf.state.clone_slots:
             self.ekf.release(slot)
-        self._clones = ()
 
     # --- state and results -----------------------------------------------------------------------
 
@@ -268,7 +262,6 @@ class Estimator:
         """All that varies; assign an earlier one to restore it."""
         return EstimatorState(
             self.ekf.state,
-            self._clones,
             self.frame.state,
             self._rest.detector.window,
             self._magnetic.reference,
@@ -282,8 +275,8 @@ class Estimator:
 
     @state.setter
     def state(self, s: EstimatorState) -> None:
-        self.ekf.state, self._clones = s.ekf, s.clones
-        self.frame.state, self._rest.detector.window = s.map_frame, s.stillness
+        self.ekf.state, self.frame.state = s.ekf, s.map_frame
+        self._rest.detector.window = s.stillness
         self._magnetic.reference, self.bias.prior = s.magnetic, s.bias_prior
         self._counts = s.counts
         self._displacements.statistics = s.statistics

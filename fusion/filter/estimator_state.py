@@ -165,7 +165,6 @@ class EstimatorState:
 
     Attributes:
         ekf: pose, biases, clones and their covariance.
-        clones: slots of the clones, oldest first.
         map_frame: what is known about the map frame.
         stillness: sums over the last second (`StillnessDetector`).
         magnetic: usual size, dip and spread of the magnetic field.
@@ -178,7 +177,6 @@ class EstimatorState:
     """
 
     ekf: EkfState
-    clones: tuple[int, ...]
     map_frame: MapFrameState
     stillness: tuple[FloatArray | None, ...]
     magnetic: MagneticReference

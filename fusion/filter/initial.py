@@ -54,7 +54,7 @@ class PriorPose:
     def __post_init__(self) -> None:
         for name in ("v_W", "p_W"):
             object.__setattr__(self, name, checked(name, getattr(self, name), (3,)))
-        object.__setattr__(self, "R_WB", checked_rotation("R_WB", self.R_WB))
+        object.__setattr__(self, "R_WB", checked_rotation(self.R_WB))
         for name in ("tilt_sigma", "yaw_sigma", "velocity_sigma", "position_sigma"):
             object.__setattr__(self, name, float(checked(name, getattr(self, name), ())))
             check_number(self, name)

@@ -18,7 +18,7 @@ from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.imu.gap import gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval, split_at
-from stario.fusion.imu.preintegration import Segment, segment_of, segment_of_all
+from stario.fusion.imu.preintegration import Segment, segment_of
 from stario.fusion.imu.stateful import Displacement as Measured
 from stario.fusion.lie import about_vertical, yaw_twist
 from stario.fusion.state import NavState
@@ -118,7 +118,7 @@ class GraphBuilder:
         self.count += 1
         if segment is None:
             start = self.graph.pose(before)
-            segment = segment_of(interval, start.b_g, start.b_a, self._config)
+            segment = segment_of([interval], start.b_g, start.b_a, self._config)
         self.segments[self.graph.last].append(segment)
         self._pending.append(interval.without_window())
         due = self.count % self._spacing == 0
@@ -144,7 +144,7 @@ class GraphBuilder:
         pieces = self.segments[graph.last]
         segment, start = pieces[0], graph.pose(graph.last)
         if len(pieces) > 1:
-            segment = segment_of_all(self._pending, start.b_g, start.b_a, self._config)
+            segment = segment_of(self._pending, start.b_g, start.b_a, self._config)
         if guess is None:
             state = KeyframeState(*self.dead_reckoned(graph.last), start.b_g, start.b_a)
         else:

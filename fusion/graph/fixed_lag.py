@@ -87,10 +87,6 @@ class FixedLagEstimator:
         self._filter = Estimator(config, start, prior, streaming=True)
         self._fallbacks = (0, "")
         self._ahead = StateCloningEkf(slots=0, gravity=config.gravity)
-        self._origin_W = np.zeros(3)
-        self._map_frame, self._jumps = 0, 0
-        self._bias_prior = 0.0
-        self._builder: GraphBuilder
         self._begin(0)
 
     def step(
