@@ -130,7 +130,7 @@ class DisplacementUpdates:
             limit = None if gate is None else chi2_quantile(gate, 3)
             covariance_W = f.overlap_scale * covariance_W
             return self._ekf.update_displacement(
-                slot, None, d_W, covariance_W, limit, gate_mode, power, errors
+                slot, d_W, covariance_W, limit, gate_mode, power, errors
             )
 
     def _propagate_turn(self) -> None:

@@ -33,6 +33,8 @@ from stario.fusion.filter.jacobians import (
     yaw_jacobian,
 )
 from stario.fusion.filter.network_errors import DisplacementErrors, with_considered_propagated
+from stario.fusion.imu.gap import gap_rotation, yaw_variance
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import about_vertical, exp_times, yaw_twist
 from stario.fusion.state import NavState, changed
@@ -108,19 +110,14 @@ class StateCloningEkf(ErrorStateEngine):
         self._move(segment.stop, propagated(segment, *s.pose, s.b_g, s.b_a, accel_share))
 
     def propagate_in_gap(
-        self, stop: float, rotation: FloatArray, turn_variance: float, config: NavigatorConfig
+        self, piece: ImuInterval, gap: ImuInterval, config: NavigatorConfig
     ) -> None:
-        """Propagate without samples to the end of a gap, or to a fix within it.
-
-        Args:
-            stop: time of the end, or of the fix [s].
-            rotation: (3, 3) from the body then to the body now (`gap_rotation`).
-            turn_variance: variance of the device's unobserved turn until then [rad^2].
-            config: noise densities.
-        """
-        seconds, (R, v, p) = stop - self.state.time, self.state.pose
-        end = propagated_in_gap(seconds, turn_variance, R @ rotation, v, p, config)
-        self._move(stop, end)
+        """Propagate without samples through a gap, or through a piece of it between fixes."""
+        R, v, p = self.state.pose
+        rotation = gap_rotation(piece.table, gap.duration, self.state.b_g)
+        before, after = (yaw_variance(time - gap.start, gap) for time in (piece.start, piece.stop))
+        pose = R @ rotation, v, p
+        self._move(piece.stop, propagated_in_gap(piece.duration, after - before, *pose, config))
 
     def _move(self, time: float, end: Propagation) -> None:
         """Set the current pose and its covariances after a propagation to a time [s]."""
@@ -173,8 +170,7 @@ class StateCloningEkf(ErrorStateEngine):
 
     def update_displacement(
         self,
-        slot_i: int,
-        slot_j: int | None,
+        slot: int,
         d_W: FloatArray,
         covariance: FloatArray,
         gate: float | None = None,
@@ -182,15 +178,14 @@ class StateCloningEkf(ErrorStateEngine):
         power: float = 1.0,
         errors: DisplacementErrors | None = None,
     ) -> UpdateResult:
-        """Update with the displacement from clone i to clone j, in the estimated world.
+        """Update with the displacement from clone i to the current pose j, in the estimated world.
 
         The caller has rotated the network's displacement from N to W by the estimated yaw of clone
         i, so that it contains the error of this yaw, p_j - p_i = (I + theta_iz [e3]x) d + n, and
         the network's own (turn). Those of its errors that last are considered.
 
         Args:
-            slot_i: slot of the window's first pose.
-            slot_j: slot of its last pose; None for the current pose.
+            slot: slot of the clone where the window began.
             d_W: (3,) displacement [m].
             covariance: (3, 3) covariance in the same axes [m^2]; overlapping windows contain the
                 same motion, so the caller scales it by update rate x window length.
@@ -201,14 +196,12 @@ class StateCloningEkf(ErrorStateEngine):
             errors: its errors as they are; None if they are white with that covariance.
 
         Raises:
-            InputError: a slot holds no clone.
+            InputError: the slot holds no clone.
         """
-        s, X = self.state, self.state.X
-        s.time_of_clone(slot_i)
-        if slot_j is not None:
-            s.time_of_clone(slot_j)
-        p_i, p_j = X[1 + slot_i, :, 4], X[0 if slot_j is None else 1 + slot_j, :, 4]
-        blocks = displacement_jacobian(p_i, p_j, slot_i, slot_j)
+        s = self.state
+        s.time_of_clone(slot)
+        p_i, p_j = s.X[1 + slot, :, 4], s.X[0, :, 4]
+        blocks = displacement_jacobian(p_i, p_j, slot)
         if s.has_turn:
             d_W = about_vertical(-s.network_turn) @ d_W
             blocks.append(turn_jacobian(p_j - p_i, s.turn_row))

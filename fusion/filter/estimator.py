@@ -30,15 +30,14 @@ from stario.fusion.filter.jacobians import CLONED
 from stario.fusion.filter.magnetic import MagneticUpdates, north_fix
 from stario.fusion.filter.map_frame import MapFrame
 from stario.fusion.filter.network_errors import ACCEL_SHARE
-from stario.fusion.filter.zero_velocity import StillnessDetector, ZeroVelocity, ZeroVelocityUpdates
+from stario.fusion.filter.zero_velocity import ZeroVelocity, ZeroVelocityUpdates
 from stario.fusion.fixes import Accepted, Fix, by_time
 from stario.fusion.health import Health, SampleCounts
-from stario.fusion.imu.gap import INTERPOLATED, gap_rotation, yaw_variance
+from stario.fusion.imu.gap import INTERPOLATED
 from stario.fusion.imu.intervals import ImuInterval, Start, split_at_fixes
 from stario.fusion.imu.preintegration import Segment, segment_of
 from stario.fusion.imu.stateful import Displacement
 from stario.fusion.state import NavState, SmoothedPose, changed
-from stario.sequences.windows import WINDOW_SECONDS
 
 
 class Estimator:
@@ -67,14 +66,13 @@ class Estimator:
         streaming: bool = False,
     ) -> None:
         f = config.filter
-        self._config, self._start, self._streaming = config, start.time, streaming
+        self._config, self._streaming = config, streaming
         self.ekf = StateCloningEkf(f.window_updates, config.gravity)
-        self.frame = MapFrame(self.ekf, prior, f.gate, f.network_turn_sigma)
+        self.frame = MapFrame(self.ekf, prior, f)
         self._hypotheses = HypothesisPair(self.ekf)
         self._displacements = DisplacementUpdates(self._hypotheses, f)
         self.bias = AdaptiveBiasPrior(self._hypotheses, config, start.time)
-        detector = StillnessDetector(round(f.output_rate * WINDOW_SECONDS), f.stillness_noise)
-        self._rest = ZeroVelocityUpdates(self._hypotheses, self.bias, detector, f.gate)
+        self._rest = ZeroVelocityUpdates(self._hypotheses, self.bias, f)
         self._magnetic = MagneticUpdates(self._hypotheses)
         self._counts = UpdateCounts()
         self.in_gap = False
@@ -126,7 +124,7 @@ class Estimator:
         Returns:
             All fixes applied since then, in order.
         """
-        found = rewound(self.state, self._start, fix.time)
+        found = rewound(self.state, fix.time)
         if found is None:
             return None
         self.state, steps = found
@@ -169,7 +167,8 @@ class Estimator:
     def _propagate_piece(self, piece: ImuInterval, interval: ImuInterval) -> Segment | None:
         """Propagate through a piece of an interval; return its segment, None in a gap."""
         if interval.gap:
-            self._propagate_in_gap(piece, interval)
+            self.ekf.propagate_in_gap(piece, interval, self._config)
+            self.frame.lose_yaw()
             return None
         # The noise of faulty samples is what it may be.
         correlated = self._config.filter.correlated_errors
@@ -182,13 +181,6 @@ class Estimator:
             return segment
 
         return self._hypotheses.apply_to_both(propagate)
-
-    def _propagate_in_gap(self, piece: ImuInterval, gap: ImuInterval) -> None:
-        """Propagate through a piece of a gap."""
-        before, after = (yaw_variance(time - gap.start, gap) for time in (piece.start, piece.stop))
-        rotation = gap_rotation(piece.table, gap.duration, self.ekf.state.b_g)
-        self.ekf.propagate_in_gap(piece.stop, rotation, after - before, self._config)
-        self.frame.lose_yaw()
 
     def _update_fix(self, fix: Fix) -> Accepted | None:
         result = self.frame.update(fix)

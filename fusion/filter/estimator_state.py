@@ -211,21 +211,18 @@ def with_step(
     return (*(s for s in state.history if s.interval.stop >= oldest), step)
 
 
-def rewound(
-    state: EstimatorState, start: float, time: float
-) -> tuple[EstimatorState, History] | None:
+def rewound(state: EstimatorState, time: float) -> tuple[EstimatorState, History] | None:
     """Return the state before the step that contains a time, and the steps to be repeated.
 
     Args:
         state: the newest state, with its history.
-        start: start of the stream [s].
         time: time of a late fix [s].
 
     Returns:
         None if the time is more than a window ago, or before the stream began.
     """
     steps = state.history
-    oldest = max(start, state.ekf.time - WINDOW_SECONDS - SAME_TIME)
+    oldest = state.ekf.time - WINDOW_SECONDS - SAME_TIME
     if time < oldest or not steps or time < steps[0].interval.start:
         return None
     k = int(np.searchsorted([step.interval.stop for step in steps[:-1]], time))

@@ -44,9 +44,7 @@ _LAST_MINUS_EYE = -_LAST_EYE
 _LAST_EYE_CORE = np.eye(3, 9, k=6)
 
 
-def displacement_jacobian(
-    p_i_W: FloatArray, p_j_W: FloatArray, slot_i: int, slot_j: int | None
-) -> list[Block]:
+def displacement_jacobian(p_i_W: FloatArray, p_j_W: FloatArray, slot: int) -> list[Block]:
     """Return the Jacobian of the residual of `StateCloningEkf.update_displacement`.
 
     theta_i: [p_i]x - (e3 x (p_j - p_i)) e3^T, rho_pi: -I, theta_j: -[p_j]x, rho_pj: I. The third
@@ -55,10 +53,9 @@ def displacement_jacobian(
     P_i, P_j = skew(np.array((p_i_W, p_j_W)))
     H_i = _LAST_MINUS_EYE.copy()
     H_i[:, :2], H_i[:, 2] = P_i[:, :2], P_j[:, 2]
-    H_j = (_LAST_EYE_CORE if slot_j is None else _LAST_EYE).copy()
+    H_j = _LAST_EYE_CORE.copy()
     H_j[:, :3] -= P_j
-    first_j = 0 if slot_j is None else CORE + CLONE * slot_j
-    return [(CORE + CLONE * slot_i, H_i), (first_j, H_j)]
+    return [(CORE + CLONE * slot, H_i), (0, H_j)]
 
 
 def turn_jacobian(d_W: FloatArray, turn_row: int) -> Block:

@@ -14,6 +14,7 @@ import math
 import numpy as np
 from numpy.linalg import norm
 
+from stario.fusion.config import FilterConfig
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.frame_transform import FrameTransform, MapFrameState, unoriented_stretch
@@ -68,22 +69,19 @@ class MapFrame:
     Args:
         ekf: the filter.
         prior: prior on the first pose; None if the track starts without one.
-        gate: probability of the chi-square test.
-        turn_sigma: sigma of the network's yaw error, `FilterConfig.network_turn_sigma` [rad].
+        config: settings of the filter.
 
     Attributes:
         state: state of the map frame.
     """
 
-    def __init__(
-        self, ekf: StateCloningEkf, prior: PriorPose | None, gate: float, turn_sigma: float
-    ) -> None:
+    def __init__(self, ekf: StateCloningEkf, prior: PriorPose | None, config: FilterConfig) -> None:
         self.state = MapFrameState(placed=False, oriented=False, arbitrary_yaw=True)
         if prior is not None:
             oriented = prior.yaw_sigma <= MAX_PRIOR_YAW_SIGMA
             variance = 2.0 * prior.position_sigma**2
             self.state = MapFrameState(True, oriented, pivot=prior.p_W, pivot_variance=variance)
-        self._ekf, self._gate, self._turn_sigma = ekf, gate, turn_sigma
+        self._ekf, self._config = ekf, config
 
     def update(self, fix: Fix) -> UpdateResult:
         """Apply a fix at the filter's time."""
@@ -223,8 +221,8 @@ class MapFrame:
 
     def _update(self, fix: Fix) -> UpdateResult:
         if self.state.oriented:
-            self._ekf.state = with_turn(self._ekf.state, self._turn_sigma)
-        gate = chi2_quantile(self._gate, len(fix.value))
+            self._ekf.state = with_turn(self._ekf.state, self._config.network_turn_sigma)
+        gate = chi2_quantile(self._config.gate, len(fix.value))
         if fix.kind == "position":
             return self._update_position(fix, gate)
         if fix.kind == "velocity":

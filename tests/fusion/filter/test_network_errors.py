@@ -148,7 +148,7 @@ def straight_walk(
         model = displacement_errors(d_W, covariance, 1.0, False, F)
         d_W = d_W + model.considered @ errors
         d_W = d_W + np.linalg.cholesky(model.white) @ rng.normal(size=3)
-        result = ekf.update_displacement(slot, None, d_W, covariance, errors=model)
+        result = ekf.update_displacement(slot, d_W, covariance, errors=model)
         nis.append(result.nis)
         slot = ekf.clone(instead_of=slot)
     return ekf, seconds * speed, float(np.mean(nis[3:]))
@@ -224,7 +224,7 @@ def test_the_first_fix_after_a_straight_walk_is_believed() -> None:
     time = np.arange(0.0, 1.0 + 1e-9, 0.1)
     accel = np.tile([0.0, 0.0, STANDARD_GRAVITY], (len(time), 1))
     noise = ImuNoise(gyro_noise=1e-3, accel_noise=0.1)
-    frame = MapFrame(ekf, PriorPose(np.eye(3), zero, zero), 0.997, 0.0)
+    frame = MapFrame(ekf, PriorPose(np.eye(3), zero, zero), FilterConfig(network_turn_sigma=0.0))
     slot = ekf.clone()
     for second in range(200):
         samples = float(second) + time, np.zeros_like(accel), accel
@@ -232,7 +232,7 @@ def test_the_first_fix_after_a_straight_walk_is_believed() -> None:
         d_W, covariance = np.array([scale * length, 0.0, 0.0]), 0.1**2 * np.eye(3)
         d_W = d_W + rng.normal(0.0, 0.05, 3)
         errors = displacement_errors(d_W, covariance, 1.0, False, F)
-        ekf.update_displacement(slot, None, d_W, covariance, gate=14.0, errors=errors)
+        ekf.update_displacement(slot, d_W, covariance, gate=14.0, errors=errors)
         slot = ekf.clone(instead_of=slot)
     truth = np.array([200.0 * length, 0.0, 0.0])
     assert ekf.state.p_W[0] - truth[0] > 3.0 * np.sqrt(ekf.P[6, 6])
