@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.ekf_state import Estimate, nav_states
+from stario.fusion.filter.estimates import Estimate, nav_states
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import IntervalMeasurements, innovations_of
 from stario.fusion.filter.frame_transform import (

@@ -14,7 +14,7 @@ import numpy as np
 
 from stario.fusion.checked import check_covariance, checked, checked_rotation
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.ekf_state import EkfState, FieldState
+from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult
 from stario.fusion.filter.jacobians import (
     ACTUAL,
@@ -36,7 +36,7 @@ from stario.fusion.filter.network_errors import DisplacementErrors, with_conside
 from stario.fusion.imu.gap import gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.lie import about_vertical, exp_times, yaw_twist
+from stario.fusion.lie import about_vertical, yaw_twist
 from stario.fusion.state import NavState, changed
 from stario.sequences.attitude.rotations import tilt_aligning
 from stario.sequences.attitude.so3 import log_so3
@@ -65,10 +65,9 @@ class StateCloningEkf(ErrorStateEngine):
             raise InputError("slots", repr(slots), "a number of clones >= 0")
         zero = np.zeros(3)
         undefined = NavState(math.nan, np.eye(3), zero, zero, zero, zero, np.zeros((CORE, CORE)))
-        self.state = EkfState.initial(undefined, slots)
-        covariances = self.state.covariances
-        super().__init__(len(self.state.P), self.state.considered_rows)
-        self.covariances = covariances
+        state = self.state = EkfState.initial(undefined, slots)
+        super().__init__(len(state.P), state.considered_rows)
+        self.state = state  # filterpy has set its own P
         self.gravity = gravity
         self.slots = slots
 
@@ -296,18 +295,5 @@ class StateCloningEkf(ErrorStateEngine):
 
     def inject(self, covariances: FloatArray) -> None:
         """Move the error's mean into the state, X <- exp(x) X, and set it to zero."""
-        s, dx = self.state, self.x[:, 0]
-        xi = np.zeros((self.slots + 1, 3, 3))  # rows theta, rho_v, rho_p of each pose
-        xi[0] = dx[:9].reshape(3, 3)
-        xi[1:, ::2] = dx[CORE : s.turn_row].reshape(self.slots, 2, 3)
-        X = exp_times(xi[:, 0], xi[:, 1:].transpose(0, 2, 1), s.X)
-        b_g, b_a = s.b_g + dx[9:12], s.b_a + dx[12:15]
-        field = s.field
-        if field is not None:
-            azimuth, wander, *_ = dx[s.field_row :].tolist()
-            hard_iron_B = field.hard_iron_B + dx[s.field_row + 2 :]
-            field = FieldState(field.azimuth + azimuth, field.wander + wander, hard_iron_B)
-        turn = s.network_turn + float(dx[s.turn_row])
-        values = {"X": X, "b_g": b_g, "b_a": b_a, "network_turn": turn, "field": field}
-        self.state = changed(s, covariances=covariances, **values)
-        self.x = np.zeros((len(dx), 1))
+        self.state = changed(self.state.plus(self.x[:, 0]), covariances=covariances)
+        self.x = np.zeros_like(self.x)

@@ -1,19 +1,19 @@
 """State of the filter at one time, as a value that is never modified in place.
 
 Error state, its order and meaning: README.md, "Error state". The poses lie on SE_2(3) (clones:
-SE(3)); the covariance is that of their right-invariant error. Callers get plain errors; all
-estimates of a recording are converted to them at its end.
+SE(3)); the covariance is that of their right-invariant error.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from stario.fusion.filter.estimates import Estimate, nav_states
 from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CLONE, CLONED, CORE, plain_covariance
+from stario.fusion.lie import exp_times
 from stario.fusion.state import NavState, changed
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.errors import InputError
@@ -32,9 +32,6 @@ _MAX_ORIGIN_DISTANCE = 1e3
 right-invariant error they multiply the attitude error, which leaves no digits for centimetres when
 they are map coordinates."""
 
-_CHUNK = 2000
-"""Number of estimates converted at a time: all of an hour would take hundreds of megabytes."""
-
 
 @dataclass(frozen=True, eq=False)
 class FieldState:
@@ -50,32 +47,6 @@ class FieldState:
     azimuth: float
     wander: float
     hard_iron_B: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """A filter's estimate of its newest state; or of a clone, which has no velocity and biases.
-
-    Attributes:
-        time: [s].
-        X: (3, 5) R_WB, v_W, p_W, the position relative to `origin_W`.
-        origin_W: (3,) [m].
-        b_g: (3,) gyroscope bias [rad/s].
-        b_a: (3,) accelerometer bias [m/s^2].
-        covariances: (2, 15, 15) of theta, rho_v, rho_p, d_bg, d_ba, as assumed for the gains and
-            as it is (see `EkfState`); zero for what a clone does not have.
-        in_gap: as in `NavState`.
-        map_frame: as in `NavState`.
-    """
-
-    time: float
-    X: FloatArray
-    origin_W: FloatArray
-    b_g: FloatArray
-    b_a: FloatArray
-    covariances: FloatArray
-    in_gap: bool = False
-    map_frame: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,6 +202,25 @@ class EkfState:
         X = self.X[1 + slot].copy()
         return Estimate(time, X, self.origin_W, zero, zero, covariances, map_frame=map_frame)
 
+    def plus(self, error: FloatArray) -> EkfState:
+        """Return the state moved by an error (n,), X <- exp(error) X, with its covariances."""
+        xi = np.zeros((len(self.X), 3, 3))  # rows theta, rho_v, rho_p of each pose
+        xi[0] = error[:9].reshape(3, 3)
+        xi[1:, ::2] = error[CORE : self.turn_row].reshape(-1, 2, 3)
+        field = self.field
+        if field is not None:
+            azimuth, wander, *_ = error[self.field_row :].tolist()
+            hard_iron_B = field.hard_iron_B + error[self.field_row + 2 :]
+            field = FieldState(field.azimuth + azimuth, field.wander + wander, hard_iron_B)
+        return changed(
+            self,
+            X=exp_times(xi[:, 0], xi[:, 1:].transpose(0, 2, 1), self.X),
+            b_g=self.b_g + error[9:12],
+            b_a=self.b_a + error[12:15],
+            network_turn=self.network_turn + float(error[self.turn_row]),
+            field=field,
+        )
+
     def transformed(self, R: FloatArray, shift: FloatArray) -> EkfState:
         """Return the state in another frame: p <- R p + shift, R applied to attitude and velocity.
 
@@ -286,27 +276,3 @@ class EkfState:
         """Return the first rows of theta and rho_p of the current pose and of every clone."""
         rows = (CORE + CLONE * slot for slot in self.clone_slots)
         return [(0, 6), *((first, first + 3) for first in rows)]
-
-
-def plain_covariances(estimates: Sequence[Estimate], which: int = ACTUAL) -> FloatArray:
-    """Return covariances (N, n, n) of plain errors in W's axes, each true minus estimate.
-
-    Args:
-        estimates: N estimates.
-        which: `ACTUAL` or `ASSUMED`.
-    """
-    P = np.array([e.covariances[which] for e in estimates])
-    X = np.array([e.X for e in estimates])
-    return plain_covariance(P, X[:, :, 3:].transpose(0, 2, 1))
-
-
-def nav_states(estimates: Sequence[Estimate], which: int = ACTUAL) -> list[NavState]:
-    """Convert estimates to `NavState`; arguments as `plain_covariances`."""
-    states = []
-    for k in range(0, len(estimates), _CHUNK):
-        part = estimates[k : k + _CHUNK]
-        for e, covariance in zip(part, plain_covariances(part, which), strict=True):
-            pose = e.X[:, :3], e.X[:, 3], e.X[:, 4] + e.origin_W
-            biases = e.b_g.copy(), e.b_a.copy()  # those of `e` are the filter's own
-            states.append(NavState(e.time, *pose, *biases, covariance, e.in_gap, e.map_frame))
-    return states

@@ -91,7 +91,6 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
     def __init__(self, dim: int, considered: slice) -> None:
         self._considered = considered
         super().__init__(dim_x=dim, dim_z=3)
-        self.covariances = np.zeros((2, dim, dim))
         self.Q = np.zeros((dim, dim))
 
     @property

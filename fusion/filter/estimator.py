@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.displacements import DisplacementUpdates
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import EkfState, Estimate, nav_states
+from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.engine import UpdateResult
+from stario.fusion.filter.estimates import Estimate, nav_states, smoothed_pose
 from stario.fusion.filter.estimator_state import (
     EstimatorState,
     History,
@@ -26,7 +25,6 @@ from stario.fusion.filter.frame_transform import with_undirected
 from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior
 from stario.fusion.filter.hypotheses import HypothesisPair
 from stario.fusion.filter.initial import PriorPose, initialise, reinitialise, tilt_sigma
-from stario.fusion.filter.jacobians import CLONED
 from stario.fusion.filter.magnetic import MagneticUpdates, north_fix
 from stario.fusion.filter.map_frame import MapFrame
 from stario.fusion.filter.network_errors import ACCEL_SHARE
@@ -143,7 +141,8 @@ class Estimator:
         """
         self.in_gap = interval.gap
         if interval.gap:
-            self._release_clones()
+            for slot in self.ekf.state.clone_slots:  # no displacement spans a gap
+                self.ekf.release(slot)
             if interval.duration > INTERPOLATED:
                 # Nothing links them to the track after it, which they would seem to place.
                 self._counts = self._counts.add("fixes", *["in a long gap"] * len(fixes))
@@ -242,11 +241,6 @@ class Estimator:
             self.released = self.ekf.state.clone_estimate(oldest, len(self.frame.state.transforms))
         self._hypotheses.apply_to_both(lambda: self.ekf.clone(instead_of=oldest))
 
-    def _release_clones(self) -> None:
-        """Release the clones: no displacement spans a gap."""
-        for slot in self.ekf.state.clone_slots:
-            self.ekf.release(slot)
-
     # --- state and results -----------------------------------------------------------------------
 
     @property
@@ -288,11 +282,7 @@ class Estimator:
     @property
     def smoothed(self) -> SmoothedPose | None:
         """`released` as a `SmoothedPose`; None at first."""
-        if self.released is None:
-            return None
-        (s,) = nav_states([self.released])
-        covariance = s.covariance[np.ix_(CLONED, CLONED)]
-        return SmoothedPose(s.time, s.R_WB, s.p_W, covariance, s.map_frame)
+        return None if self.released is None else smoothed_pose(self.released)
 
     def estimate(self) -> Estimate:
         """Return the estimate of the filter's newest state."""

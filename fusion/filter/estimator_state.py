@@ -13,8 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stario.fusion.filter.ekf_state import EkfState, Estimate
+from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.engine import UpdateResult
+from stario.fusion.filter.estimates import Estimate
 from stario.fusion.filter.frame_transform import MapFrameState
 from stario.fusion.filter.gyro_bias import GyroBiasPrior
 from stario.fusion.filter.hypotheses import AlternativeHypothesis

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stario.fusion.filter.ekf_state import Estimate, plain_covariances
+from stario.fusion.filter.estimates import Estimate, plain_covariances
 from stario.fusion.filter.jacobians import ACTUAL, ASSUMED
 from stario.fusion.state import NavState, changed
 from stario.sequences.sequence import FloatArray

@@ -15,7 +15,8 @@ import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import EkfState, nav_states
+from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.filter.estimates import nav_states
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import EstimatorState
 from stario.fusion.filter.frame_transform import with_undirected

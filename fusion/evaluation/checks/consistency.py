@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS, Estimate
+from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
+from stario.fusion.filter.estimates import Estimate
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import innovations_of
 from stario.fusion.filter.initial import PriorPose

@@ -4,7 +4,7 @@ from initial_ekf import initialised
 
 from stario.fusion.evaluation.checks.speed import DenseEkf
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import plain_covariances
+from stario.fusion.filter.estimates import plain_covariances
 from stario.fusion.filter.jacobians import displacement_jacobian, mean_velocity_jacobian
 from stario.fusion.imu.preintegration import Segment, preintegrate
 from stario.fusion.state import NavState

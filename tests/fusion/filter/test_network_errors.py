@@ -10,8 +10,9 @@ import pytest
 from stario.fusion import Navigator, NavigatorConfig
 from stario.fusion.config import FilterConfig
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS, Estimate
+from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
 from stario.fusion.filter.engine import UpdateResult
+from stario.fusion.filter.estimates import Estimate
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.frame_transform import frame_rotation
 from stario.fusion.filter.initial import PriorPose
