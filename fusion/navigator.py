@@ -301,7 +301,7 @@ class Navigator:
         try:
             if interval.window is not None:
                 counts = self._front_end.counts
-                (displacement,) = displacements_of(self._network, [interval], counts)
+                (displacement,) = displacements_of(self._network, [interval.window], counts)
         finally:  # if the network fails, the IMU's motion must not be lost
             self._estimator.step(interval, displacement, self._fixes.due(interval.stop))
         state = self._estimator.nav_state()

@@ -18,6 +18,7 @@ from stario.fusion.filter.network_errors import (
     displacement_errors,
     propagated_turn,
 )
+from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.lie import yaw_rotation
 from stario.fusion.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
@@ -55,7 +56,7 @@ class DisplacementUpdates:
         self.statistics = InnovationStatistics()
 
     def update(
-        self, slot: int, R_NB: FloatArray, d_N: FloatArray, covariance_N: FloatArray
+        self, slot: int, displacement: WindowDisplacement
     ) -> tuple[UpdateResult, tuple[float, ...]]:
         """Update with the displacement of the window that ends now.
 
@@ -63,14 +64,12 @@ class DisplacementUpdates:
 
         Args:
             slot: slot of the clone at the window's start.
-            R_NB: (3, 3) levelled attitude there, with which the window was prepared.
-            d_N: (3,) displacement [m].
-            covariance_N: (3, 3) covariance of the displacement [m^2].
+            displacement: the displacement.
         """
         f, before = self._config, self._ekf.state
         self._hypotheses.apply_to_both(self._propagate_turn)
         rare = self.statistics.outlier_share < _RARE_SHARE
-        update = partial(self._update, slot, R_NB, d_N, covariance_N)
+        update = partial(self._update, slot, displacement)
         result = update(f.gate, power=_RARE_POWER if rare else 1.0)
         self.statistics = self.statistics.updated(result, f)
         if self._hypotheses.alternative is None and rare and result.gated:
@@ -107,16 +106,14 @@ class DisplacementUpdates:
     def _update(
         self,
         slot: int,
-        R_NB: FloatArray,
-        d_N: FloatArray,
-        covariance_N: FloatArray,
+        displacement: WindowDisplacement,
         gate: float | None,
         gate_mode: GateMode = "inflate",
         power: float = 1.0,
         offset_W: FloatArray | None = None,
     ) -> UpdateResult:
         """Update the filter's current state, with the displacement less an offset (3,) [m]."""
-        f = self._config
+        f, (d_N, covariance_N, R_NB) = self._config, displacement
         R_WN = yaw_rotation(self._ekf.state.clone_pose(slot)[0] @ R_NB.T)
         # Values that are not finite are rejected and counted by the filter.
         with np.errstate(invalid="ignore"):

@@ -34,7 +34,7 @@ from stario.fusion.health import Health, SampleCounts
 from stario.fusion.imu.gap import INTERPOLATED
 from stario.fusion.imu.intervals import ImuInterval, Start, split_at_fixes
 from stario.fusion.imu.preintegration import Segment, segment_of
-from stario.fusion.imu.stateful import Displacement
+from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.state import NavState, SmoothedPose, changed
 
 
@@ -83,7 +83,10 @@ class Estimator:
     # --- one interval ----------------------------------------------------------------------------
 
     def step(
-        self, interval: ImuInterval, displacement: Displacement | None, fixes: Sequence[Fix] = ()
+        self,
+        interval: ImuInterval,
+        displacement: WindowDisplacement | None,
+        fixes: Sequence[Fix] = (),
     ) -> IntervalMeasurements:
         """Move to the interval's end and apply the displacement of the window that ends there.
 
@@ -103,7 +106,7 @@ class Estimator:
         zupt = self._update_zero_velocity(interval)
         # Zero velocity is more accurate than a network trained on walks, off by 1 cm/s at rest.
         offered = displacement if zupt is None else None
-        outcome, revoked = self._update_displacement(interval, offered)
+        outcome, revoked = self._update_displacement(offered)
         bearing = self._update_bearing(interval)
         accepted += self._update_north()
         self.bias.update(interval)
@@ -195,7 +198,7 @@ class Estimator:
         return measured if result.accepted else None
 
     def _update_displacement(
-        self, interval: ImuInterval, displacement: Displacement | None
+        self, displacement: WindowDisplacement | None
     ) -> tuple[UpdateResult | None, tuple[float, ...]]:
         """Update with a displacement from the oldest clone.
 
@@ -203,10 +206,8 @@ class Estimator:
         """
         if displacement is None:
             return None, ()
-        assert interval.R_NB_window is not None  # a window comes with its initial attitude
-        result, revoked = self._displacements.update(
-            self.ekf.state.clone_slots[0], interval.R_NB_window, *displacement
-        )
+        oldest = self.ekf.state.clone_slots[0]
+        result, revoked = self._displacements.update(oldest, displacement)
         self._counts = self._counts.add_displacement(result)
         return result, revoked
 

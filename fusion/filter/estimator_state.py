@@ -26,7 +26,7 @@ from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.health import Health, SampleCounts
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.imu.stateful import Displacement
+from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.state import Innovations, NavState, changed
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
@@ -36,7 +36,7 @@ class IntervalMeasurements(NamedTuple):
     """An IMU interval and the measurements applied in it."""
 
     interval: ImuInterval
-    offered: Displacement | None
+    offered: WindowDisplacement | None
     """Predicted displacement of the window ending here; None if no window ends, or at rest."""
     outcome: UpdateResult | None
     """Outcome of the update with it; None without one."""
@@ -53,12 +53,12 @@ class IntervalMeasurements(NamedTuple):
     """The preintegrated samples; None for a gap, and if fixes split them."""
 
     @property
-    def displacement(self) -> Displacement | None:
+    def displacement(self) -> WindowDisplacement | None:
         """The displacement with its inflated covariance; None if there is none or it is refused."""
         if self.offered is None or self.outcome is None or not self.outcome.accepted:
             return None
-        d_N, covariance_N = self.offered
-        return d_N, self.outcome.scale * covariance_N
+        covariance_N = self.outcome.scale * self.offered.covariance_N
+        return self.offered._replace(covariance_N=covariance_N)
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ class Step:
 
     before: EstimatorState
     interval: ImuInterval
-    displacement: Displacement | None
+    displacement: WindowDisplacement | None
     fixes: Sequence[Fix]
 
 
@@ -196,7 +196,7 @@ History = tuple[Step, ...]
 def with_step(
     state: EstimatorState,
     interval: ImuInterval,
-    displacement: Displacement | None,
+    displacement: WindowDisplacement | None,
     fixes: Sequence[Fix],
 ) -> History:
     """Return the history with the step that is about to begin, without those too old for a fix.

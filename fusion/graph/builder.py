@@ -19,7 +19,7 @@ from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.imu.gap import gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval, split_at
 from stario.fusion.imu.preintegration import Segment, segment_of
-from stario.fusion.imu.stateful import Displacement as Measured
+from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.lie import about_vertical, yaw_twist
 from stario.fusion.state import NavState
 from stario.sequences.attitude.so3 import exp_so3, log_so3
@@ -87,7 +87,7 @@ class GraphBuilder:
     def step(
         self,
         interval: ImuInterval,
-        displacement: Measured | None,
+        displacement: WindowDisplacement | None,
         fixes: Sequence[Fix] = (),
         zero_velocity: ZeroVelocity | None = None,
         guess: NavState | None = None,
@@ -128,7 +128,7 @@ class GraphBuilder:
                 self.graph.add_turn(self._config.filter.network_turn_sigma, TURN_SECONDS)
             window_start = self._window_keyframes.get(self.count - self._window)
             if displacement is not None and window_start is not None:
-                self._add_displacement(window_start, interval, *displacement)
+                self._add_displacement(window_start, displacement)
             self._window_keyframes[self.count] = self.graph.last
             if zero_velocity is not None:
                 self._add_zero_velocity(zero_velocity)
@@ -207,15 +207,12 @@ class GraphBuilder:
         self.segments[graph.last] = []
         self._window_keyframes = {0: graph.last}
 
-    def _add_displacement(
-        self, i: int, interval: ImuInterval, d_N: FloatArray, covariance_N: FloatArray
-    ) -> None:
+    def _add_displacement(self, i: int, displacement: WindowDisplacement) -> None:
+        d_N, covariance_N, R_NB = displacement
         covariance = covariance_N * (self._overlap * self._config.filter.covariance_scale)
         if fault_of(d_N, covariance):
             return
-        assert interval.R_NB_window is not None  # a window always comes with its first attitude
-        j, R_NB = self.graph.last, interval.R_NB_window
-        term = Displacement(i, j, d_N, R_NB, covariance, self.estimates_turn)
+        term = Displacement(i, self.graph.last, d_N, R_NB, covariance, self.estimates_turn)
         self.graph.add(term, gated=not self._gated_by_filter)
 
     def _add_zero_velocity(self, zero_velocity: ZeroVelocity) -> None:

@@ -31,7 +31,7 @@ from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.health import Health, SampleCounts
 from stario.fusion.imu.intervals import ImuInterval, Start
-from stario.fusion.imu.stateful import Displacement
+from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.state import NavState
 from stario.sequences.sequence import FloatArray
 
@@ -91,7 +91,10 @@ class FixedLagEstimator:
         self._begin(0)
 
     def step(
-        self, interval: ImuInterval, displacement: Displacement | None, fixes: Sequence[Fix] = ()
+        self,
+        interval: ImuInterval,
+        displacement: WindowDisplacement | None,
+        fixes: Sequence[Fix] = (),
     ) -> None:
         """Propagate to the interval's end and apply its measurements; as `Estimator.step`."""
         applied = self._filter.step(interval, displacement, fixes)

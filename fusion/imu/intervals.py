@@ -59,6 +59,22 @@ NO_FLAGS = Flags()
 """No faults."""
 
 
+class Window(NamedTuple):
+    """The network's input: a second of unbroken samples in a levelled frame N.
+
+    Attributes:
+        imu_N: (6, 200) gyroscope [rad/s] and specific force [m/s^2].
+        R_NB: (3, 3) levelled attitude at its start.
+        heading: heading of the device in N, averaged over it [rad].
+        flagged: whether any of its samples are saturated, missing, or were spikes.
+    """
+
+    imu_N: NDArray[np.float32]
+    R_NB: FloatArray
+    heading: float
+    flagged: bool
+
+
 @dataclass(frozen=True, eq=False)
 class ImuInterval:
     """IMU samples between two times of the grid.
@@ -71,9 +87,7 @@ class ImuInterval:
         attitudes: (n + 1, 3, 3) levelled attitude R_NB at the samples.
         R_NB: (3, 3) levelled attitude at the end, after its correction by gravity.
         update: whether windows begin and end at this interval's end.
-        window: (6, 200) network input that ends here; None if there is none.
-        R_NB_window: (3, 3) levelled attitude at the window's start.
-        heading: heading of the device in N, averaged over the window [rad].
+        window: the window that ends here; None if there is none.
         levelled_bias: magnitude of the gyroscope's bias as estimated from gravity [rad/s].
         levelled_bias_sigma: its standard deviation per level axis [rad/s].
         field_B: (3,) magnetic field at its end [uT]; None if none was measured.
@@ -81,7 +95,6 @@ class ImuInterval:
         levelled: attitude from gravity after a gap, estimated as at the first sample; None
             elsewhere.
         flags: whether samples of either sensor are saturated, missing, or were spikes.
-        window_flagged: whether any of the window's samples are.
     """
 
     time: FloatArray
@@ -91,16 +104,13 @@ class ImuInterval:
     attitudes: FloatArray
     R_NB: FloatArray
     update: bool = False
-    window: NDArray[np.float32] | None = None
-    R_NB_window: FloatArray | None = None
-    heading: float = 0.0
+    window: Window | None = None
     levelled_bias: float = 0.0
     levelled_bias_sigma: float = 0.0
     field_B: FloatArray | None = None
     accel_factor: float = 1.0
     levelled: Start | None = None
     flags: Flags = NO_FLAGS
-    window_flagged: bool = False
 
     def without_window(self) -> ImuInterval:
         """Return a copy without the window and attitudes, which an estimator does not need."""
@@ -173,7 +183,7 @@ def split_at(interval: ImuInterval, time: float) -> tuple[ImuInterval, ImuInterv
     later = table[k:] if table[k, 0] - time >= 1e-9 else table[k + 1 :]
     first = _with_samples(interval, np.vstack([table[:k], boundary]))
     second = _with_samples(interval, np.vstack([boundary, later]))
-    return changed(first, update=False, window=None, R_NB_window=None), second
+    return changed(first, update=False, window=None), second
 
 
 def _with_samples(interval: ImuInterval, table: FloatArray) -> ImuInterval:

@@ -27,7 +27,7 @@ def final_factor(
     for k, (interval, measured) in enumerate(pairs):
         shaken = replace(interval, accel=interval.accel + rng.normal(0.0, shake, 3))
         if measured is not None and k in false:
-            measured = (measured[0] + [1.0, 0.0, 0.0], measured[1])
+            measured = measured._replace(d_N=measured.d_N + np.eye(3)[0])
         estimator.step(shaken, measured)
     return estimator.state.statistics.accel_factor
 

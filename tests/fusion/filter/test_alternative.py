@@ -18,6 +18,7 @@ from stario.fusion.filter.displacements import DisplacementUpdates
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.hypotheses import AlternativeHypothesis, HypothesisPair
 from stario.fusion.filter.network_errors import TURN_SECONDS, with_turn
+from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.state import NavState
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence
@@ -160,6 +161,10 @@ def test_the_alternative_is_dropped_when_both_fit_or_when_it_is_too_old() -> Non
     assert aged.ekf.state.b_a[0] == 0.0
 
 
+def displacement(d_N: np.ndarray, sigma: float) -> WindowDisplacement:
+    return WindowDisplacement(d_N, sigma**2 * np.eye(3), np.eye(3))
+
+
 def test_a_false_displacement_lets_the_networks_turn_decay_once() -> None:
     ekf, zero = StateCloningEkf(slots=1), np.zeros(3)
     ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, 1e-4 * np.eye(15)))
@@ -168,7 +173,7 @@ def test_a_false_displacement_lets_the_networks_turn_decay_once() -> None:
     pair = HypothesisPair(ekf)
     updates = DisplacementUpdates(pair, FilterConfig(update_rate=2))
     pair.alternative = AlternativeHypothesis(ekf.state, zero, (0.0,))
-    result, _ = updates.update(slot, np.eye(3), np.array([5.0, 0.0, 0.0]), 1e-4 * np.eye(3))
+    result, _ = updates.update(slot, displacement(np.array([5.0, 0.0, 0.0]), 1e-2))
     alternative = pair.alternative
     assert result.gated
     assert alternative is not None
@@ -195,7 +200,7 @@ def test_an_uncertain_alternative_does_not_take_the_steady_error_for_right(
     other.state = replace(other.state, covariances=P)
     offset_W = np.array([1.0, 0.0, 0.0])
     pair.alternative = AlternativeHypothesis(other.state, offset_W, (0.0,))
-    updates.update(slot, np.eye(3), error * offset_W, 1e-2 * np.eye(3))
+    updates.update(slot, displacement(error * offset_W, 0.1))
     alternative = pair.alternative
     assert alternative is not None
     assert (alternative.outliers == (0.0,)) == fits

@@ -92,7 +92,7 @@ def track_with_outliers(
     for k in range(intervals.stop + 3 * config.filter.output_rate):
         measurement = preprocessed.measurements[k]
         if measurement is not None and k in intervals:
-            measurement = (measurement[0] + [metres, 0.0, 0.0], measurement[1])
+            measurement = measurement._replace(d_N=measurement.d_N + metres * np.eye(3)[0])
         estimator.step(preprocessed.intervals[k], measurement)
         positions.append(estimator.nav_state().p_W)
     return np.array(positions), estimator.health(preprocessed.front_end.counts).gated
