@@ -12,7 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.fusion.filter.estimates import Estimate, nav_states
-from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CLONE, CLONED, CORE, plain_covariance
+from stario.fusion.filter.jacobians import (
+    ACTUAL,
+    ASSUMED,
+    CLONE,
+    CLONED,
+    CORE,
+    plain_covariance,
+    symmetric,
+)
 from stario.fusion.lie import exp_times
 from stario.fusion.state import NavState, changed
 from stario.sequences.attitude.so3 import skew
@@ -242,11 +250,10 @@ class EkfState:
             A[rho : rho + 3, rho : rho + 3] = R
             A[rho : rho + 3, first : first + 3] = skew(shift) @ R
         A[3:6, 3:6] = R
-        P = A @ self.covariances @ A.T
+        P = symmetric(A @ self.covariances @ A.T)
         field = self.field
         if field is not None:
             field = changed(field, azimuth=field.azimuth + math.atan2(R[1, 0], R[0, 0]))
-        P = 0.5 * (P + P.transpose(0, 2, 1))
         return changed(self, X=X, origin_W=origin_W, covariances=P, field=field)
 
     def with_yaw_inflated(self, about_W: FloatArray, sigma: float) -> EkfState:

@@ -17,7 +17,7 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from scipy.linalg.lapack import dpotrf, dtrtri
 
-from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CORE, Block
+from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CORE, Block, symmetric
 from stario.sequences.sequence import FloatArray
 
 GateMode = Literal["inflate", "reject"]
@@ -178,8 +178,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         P = covariances.copy()
         P[:, :CORE] = transition @ P[:, :CORE]
         P[:, CORE:, :CORE] = P[:, :CORE, CORE:].transpose(0, 2, 1)
-        core = P[:, :CORE, :CORE] @ transition.T + noise
-        P[:, :CORE, :CORE] = 0.5 * (core + core.transpose(0, 2, 1))
+        P[:, :CORE, :CORE] = symmetric(P[:, :CORE, :CORE] @ transition.T + noise)
         return P
 
     def _set_gain(self, residual: FloatArray, HP: FloatArray, whitener: FloatArray) -> None:
@@ -204,7 +203,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         for first, H in blocks:
             A[:, first : first + H.shape[1]] -= K @ H
         P = A @ P @ A.T + K @ R @ K.T
-        return np.asarray(0.5 * (P + P.transpose(0, 2, 1)))
+        return symmetric(P)
 
 
 def fault_of(value: FloatArray, covariance: FloatArray) -> str:

@@ -18,11 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.filter.jacobians import CORE
 from stario.fusion.filter.planar_alignment import POSITION, PlanarAlignment, without_yaw
-from stario.fusion.lie import UNKNOWN_YAW
+from stario.fusion.lie import UNKNOWN_YAW, e3_cross
 from stario.fusion.state import NavState, changed
 from stario.sequences.sequence import FloatArray, Trajectory
 
-_E3_CROSS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 _HORIZONTAL = np.diag([1.0, 1.0, 0.0])
 
 
@@ -168,7 +167,7 @@ def _turn_covariance(variance: float, v_W: FloatArray, arm: FloatArray) -> Float
     """Return the covariance (15, 15) of a state due to a turn; the arm (3,) is from the pivot."""
     across, along, with_angle = _turn_moments(variance)
     columns = np.zeros((15, 2))  # columns: across and along
-    columns[3:6, 0], columns[6:9, 0] = _E3_CROSS @ v_W, _E3_CROSS @ arm
+    columns[3:6, 0], columns[6:9, 0] = e3_cross(v_W), e3_cross(arm)
     columns[3:6, 1], columns[6:9, 1] = _HORIZONTAL @ v_W, _HORIZONTAL @ arm
     covariance = columns @ np.diag([across, along]) @ columns.T
     covariance[2, 2] = variance

@@ -12,13 +12,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import gtsam
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.gap import gap_covariance
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.lie import twist
+from stario.fusion.lie import e3_cross, twist
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.sequence import FloatArray
 
@@ -60,7 +59,7 @@ def displacement_jacobian(p_i_W: FloatArray, p_j_W: FloatArray, slot: int) -> li
 
 def turn_jacobian(d_W: FloatArray, turn_row: int) -> Block:
     """Return the block for the network's turn in that Jacobian: e3 x d, d (3,) displacement [m]."""
-    return turn_row, np.array([[-d_W[1]], [d_W[0]], [0.0]])
+    return turn_row, e3_cross(d_W)[:, None]
 
 
 def mean_velocity_jacobian(
@@ -141,7 +140,12 @@ def plain_covariance(P: FloatArray, vectors_W: FloatArray) -> FloatArray:
     plain[..., 3:stop, :] -= A @ P[..., :3, :]
     plain[..., 3:stop] -= plain[..., :3] @ A.swapaxes(-1, -2)
     # Far from the origin, rounding in the products would make it asymmetric.
-    return np.asarray(0.5 * (plain + plain.swapaxes(-1, -2)))
+    return symmetric(plain)
+
+
+def symmetric(P: FloatArray) -> FloatArray:
+    """Return covariances (..., n, n) without the asymmetry of rounding."""
+    return np.asarray(0.5 * (P + P.swapaxes(-1, -2)))
 
 
 def invariant_from_local(R_WB: FloatArray, v_W: FloatArray, p_W: FloatArray) -> FloatArray:
@@ -183,12 +187,8 @@ def propagated(
     accel_share: float = 1.0,
 ) -> Propagation:
     """Return `Segment.predict` with the transition and noise of the right-invariant error."""
-    start = gtsam.NavState(gtsam.Rot3(R_WB), p_W, v_W)
     bias_jacobian = np.empty((9, 6), order="F")
-    bias = gtsam.imuBias.ConstantBias(b_a, b_g)
-    end = segment.pim.predict(start, bias, None, bias_jacobian)
-    R, v, p = end.attitude().matrix(), end.velocity(), end.position()
-
+    R, v, p = segment.predict(R_WB, v_W, p_W, b_g, b_a, bias_jacobian)
     adjoint = invariant_from_local(R, v, p)
     local = segment.pim.residualCovariance()
     noise = np.empty((2, CORE, CORE))

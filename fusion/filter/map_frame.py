@@ -29,7 +29,7 @@ from stario.fusion.filter.planar_alignment import (
 )
 from stario.fusion.fixes import Fix
 from stario.fusion.lie import UNKNOWN_YAW, about_vertical
-from stario.fusion.state import NavState, changed
+from stario.fusion.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 
 MAX_PRIOR_YAW_SIGMA = 0.5
@@ -98,7 +98,11 @@ class MapFrame:
         result = self._update(fix)
         if places:
             self._begin_alignment(fix)
-        completed = self._with_uncertainty(transform, self._ekf.state.nav_state())
+        now = self._ekf.state.nav_state()
+        if places:
+            completed = changed(transform, position_covariance=now.position_covariance)
+        else:
+            completed = changed(transform, yaw_sigma=math.sqrt(now.covariance[2, 2]))
         self.state = changed(self.state, transforms=(*self.state.transforms, completed))
         return result
 
@@ -212,12 +216,6 @@ class MapFrame:
         drift = 0.5 * float(np.trace(without_yaw(now.covariance, POSITION)[:2, :2]))
         alignment = self.state.alignment.with_position(track, measured, variance, drift)
         self.state = changed(self.state, alignment=alignment)
-
-    def _with_uncertainty(self, transform: FrameTransform, state: NavState) -> FrameTransform:
-        """Return a transform with its uncertainty, taken from the state after the fix."""
-        if transform.placed:
-            return changed(transform, position_covariance=state.position_covariance)
-        return changed(transform, yaw_sigma=math.sqrt(state.covariance[2, 2]))
 
     def _update(self, fix: Fix) -> UpdateResult:
         if self.state.oriented:

@@ -10,7 +10,7 @@ import numpy as np
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.engine import fault_of
 from stario.fusion.filter.initial import tilt_sigma
-from stario.fusion.filter.network_errors import TURN_SECONDS, TurnEstimate
+from stario.fusion.filter.network_errors import TurnEstimate
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Fix
 from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Tilt, Velocity, Yaw
@@ -125,7 +125,7 @@ class GraphBuilder:
         if due:
             self.close(guess)
             if self.estimates_turn:
-                self.graph.add_turn(self._config.filter.network_turn_sigma, TURN_SECONDS)
+                self.graph.add_turn(self._config.filter.network_turn_sigma)
             window_start = self._window_keyframes.get(self.count - self._window)
             if displacement is not None and window_start is not None:
                 self._add_displacement(window_start, displacement)

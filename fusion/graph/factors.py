@@ -23,7 +23,7 @@ from stario.fusion.filter.jacobians import plain_covariance
 from stario.fusion.filter.network_errors import TurnEstimate
 from stario.fusion.graph.covariances import root_information
 from stario.fusion.graph.keyframe_state import KeyframeState, turn_at
-from stario.fusion.lie import about_vertical, twist, yaw_rotation
+from stario.fusion.lie import about_vertical, e3_cross, twist, yaw_rotation
 from stario.fusion.state import NavState
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.sequence import FloatArray
@@ -156,13 +156,12 @@ class Displacement(Between):
             R_NW = about_vertical(turn_at(values, self.j)) @ R_NW
         d_W = p_j - p_i
         H_i, H_j = np.zeros((3, 6)), np.zeros((3, 6))
-        sideways = np.array([-d_W[1], d_W[0], 0.0])  # e3 x (p_j - p_i)
-        H_i[:, :3] = -np.outer(R_NW @ sideways, R_i[2])
+        H_i[:, :3] = -np.outer(R_NW @ e3_cross(d_W), R_i[2])
         H_i[:, 3:] = -R_NW @ R_i
         H_j[:, 3:] = R_NW @ R_j
         predicted, blocks = R_NW @ d_W, [(X(self.i), H_i), (X(self.j), H_j)]
         if self.turned:
-            blocks.append((T(self.j), np.array([[-predicted[1]], [predicted[0]], [0.0]])))
+            blocks.append((T(self.j), e3_cross(predicted)[:, None]))
         return self.d_N - predicted, blocks
 
 

@@ -22,7 +22,7 @@ from gtsam.symbol_shorthand import B, V, X
 from scipy.linalg import block_diag
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.network_errors import TurnEstimate
+from stario.fusion.filter.network_errors import TURN_SECONDS, TurnEstimate
 from stario.fusion.graph.factors import Prior, Term
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.processes import Coasting, TurnProcess
@@ -118,17 +118,12 @@ class KeyframeGraph:
         self._terms.append(Whitened.of(term, limit))
         self._tree = None
 
-    def add_turn(self, sigma: float, memory: float) -> None:
-        """Make the network's turn at the newest keyframe a state.
-
-        Args:
-            sigma: its stationary standard deviation [rad].
-            memory: its correlation time [s].
-        """
+    def add_turn(self, sigma: float) -> None:
+        """Make the network's turn at the newest keyframe a state with a stationary sigma [rad]."""
         j = self.last
         turns = {k: state.turn for k, state in self._states.items() if state.turn is not None}
         i = max(turns, default=j)
-        correlation = math.exp((self._time[i] - self._time[j]) / memory) if i != j else 0.0
+        correlation = math.exp((self._time[i] - self._time[j]) / TURN_SECONDS) if i != j else 0.0
         turn = correlation * turns.get(i, 0.0)
         self._states[j] = self._states[j]._replace(turn=turn)
         covariance = np.array([[(1.0 - correlation**2) * sigma**2]])

@@ -10,7 +10,7 @@ import numpy as np
 
 from stario.fusion.config import MIN_WALK, NavigatorConfig
 from stario.fusion.imu.intervals import ImuInterval
-from stario.fusion.lie import UNKNOWN_YAW
+from stario.fusion.lie import UNKNOWN_YAW, e3_cross
 from stario.sequences.attitude.levelling import integrate
 from stario.sequences.sequence import FloatArray
 
@@ -76,7 +76,7 @@ def gap_covariance(
         config: noise densities.
     """
     f, t = config.filter, seconds
-    sideways = np.array([-v_W[1], v_W[0], 0.0])  # e3 x v
+    sideways = e3_cross(v_W)
     turn = np.concatenate([[0.0, 0.0, 1.0], sideways, t * sideways, np.zeros(6)])
     covariance: FloatArray = turn_variance * np.outer(turn, turn)
     covariance[:2, :2] += t * f.gap_gyro_noise**2 * np.eye(2)

@@ -69,7 +69,13 @@ class Segment:
         vars(self).update(state | {"pim": pim})
 
     def predict(
-        self, R_WB: FloatArray, v_W: FloatArray, p_W: FloatArray, b_g: FloatArray, b_a: FloatArray
+        self,
+        R_WB: FloatArray,
+        v_W: FloatArray,
+        p_W: FloatArray,
+        b_g: FloatArray,
+        b_a: FloatArray,
+        bias_jacobian: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Dead-reckon across the segment.
 
@@ -79,12 +85,15 @@ class Segment:
             p_W: (3,) position [m].
             b_g: (3,) gyroscope bias [rad/s].
             b_a: (3,) accelerometer bias [m/s^2].
+            bias_jacobian: (9, 6) in Fortran order, is set to the derivative with respect to b_a and
+                b_g, in gtsam's tangent of the end.
 
         Returns:
             R_WB, v_W, p_W at the end.
         """
         start = gtsam.NavState(gtsam.Rot3(R_WB), p_W, v_W)
-        end = self.pim.predict(start, gtsam.imuBias.ConstantBias(b_a, b_g))
+        bias = gtsam.imuBias.ConstantBias(b_a, b_g)
+        end = self.pim.predict(start, bias, None, bias_jacobian)
         return end.attitude().matrix(), end.velocity(), end.position()
 
 
