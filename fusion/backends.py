@@ -26,7 +26,7 @@ from stario.fusion.filter.frame_transform import (
     with_undirected,
 )
 from stario.fusion.filter.initial import PriorPose
-from stario.fusion.filter.jacobians import ASSUMED
+from stario.fusion.filter.jacobians import ASSUMED, GYRO_BIAS
 from stario.fusion.fixes import Fix, FixQueue
 from stario.fusion.graph.batch import smooth
 from stario.fusion.graph.covariances import with_actual_covariances
@@ -89,9 +89,10 @@ def _graph_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solut
     estimator = filtered.estimator
     frame, states = estimator.frame.state, nav_states(filtered.estimates, ASSUMED)
     end, has_field = states[-1], estimator.ekf.state.field is not None
-    bias = (end.b_g, end.covariance[9:12, 9:12]) if has_field else None
+    bias = (end.b_g, end.covariance[GYRO_BIAS, GYRO_BIAS]) if has_field else None
     covariance = states[0].covariance.copy()
-    covariance[9:12, 9:12] = estimator.bias.prior.variance * np.eye(3)  # the filter's last prior
+    # The filter's last prior.
+    covariance[GYRO_BIAS, GYRO_BIAS] = estimator.bias.prior.variance * np.eye(3)
     first = replace(states[0], covariance=covariance)
     final = to_final_frame(states, frame.transforms)
     has_turn = estimator.ekf.state.has_turn

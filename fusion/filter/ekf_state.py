@@ -27,9 +27,6 @@ from stario.sequences.attitude.so3 import skew
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 
-GYRO_BIAS = slice(9, 12)
-"""Rows of the gyroscope's bias in the error state."""
-
 CONSIDERED_SECONDS = np.array([1.2, 1.2, 1.2, math.inf, math.inf, 10.0])
 """Correlation times [s] of the network's errors that are considered and never estimated: those that
 drift, along W's axes; those that last, along and across the displacement; the floor's slope

@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.filter.jacobians import CORE
-from stario.fusion.filter.planar_alignment import POSITION, PlanarAlignment, without_yaw
+from stario.fusion.filter.jacobians import CORE, POSITION
+from stario.fusion.filter.planar_alignment import PlanarAlignment, without_yaw
 from stario.fusion.lie import UNKNOWN_YAW, e3_cross
 from stario.fusion.state import NavState, changed
 from stario.sequences.sequence import FloatArray, Trajectory

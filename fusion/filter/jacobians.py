@@ -24,6 +24,9 @@ from stario.sequences.sequence import FloatArray
 CORE = 15
 """Size of the error state of one navigation state."""
 
+POSITION, GYRO_BIAS = slice(6, 9), slice(9, 12)
+"""Rows of position and gyroscope bias in the error state and in the covariance of a `NavState`."""
+
 CLONE = 6
 """Size of the error state of one cloned pose."""
 

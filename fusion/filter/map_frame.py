@@ -19,9 +19,9 @@ from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.frame_transform import FrameTransform, MapFrameState, unoriented_stretch
 from stario.fusion.filter.initial import PriorPose
+from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.filter.network_errors import with_turn
 from stario.fusion.filter.planar_alignment import (
-    POSITION,
     PlanarAlignment,
     plane_sigma,
     turn_from_fix,

@@ -10,6 +10,7 @@ import numpy as np
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.estimator_state import IntervalMeasurements
 from stario.fusion.filter.frame_transform import FrameTransform, frame_rotation
+from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.keyframes import KeyframeGraph
@@ -89,7 +90,7 @@ def _inflated(first: NavState, prior: NavState, transforms: Sequence[FrameTransf
     to_last = frame_rotation(first.R_WB @ prior.R_WB.T)
     covariance = to_last @ prior.covariance @ to_last.T
     if any(transform.placed for transform in transforms):
-        covariance[6:9, 6:9] += _UNKNOWN_POSITION**2 * np.eye(3)
+        covariance[POSITION, POSITION] += _UNKNOWN_POSITION**2 * np.eye(3)
     if not all(transform.placed for transform in transforms):
         covariance[2, 2] += UNKNOWN_YAW**2
     return replace(first, covariance=covariance)

@@ -117,7 +117,7 @@ class GraphBuilder:
         before = self.graph.last
         self.count += 1
         if segment is None:
-            start = self.graph.pose(before)
+            start = self.graph.keyframe(before)
             segment = segment_of([interval], start.b_g, start.b_a, self._config)
         self.segments[self.graph.last].append(segment)
         self._pending.append(interval.without_window())
@@ -142,7 +142,7 @@ class GraphBuilder:
             return
         graph = self.graph
         pieces = self.segments[graph.last]
-        segment, start = pieces[0], graph.pose(graph.last)
+        segment, start = pieces[0], graph.keyframe(graph.last)
         if len(pieces) > 1:
             segment = segment_of(self._pending, start.b_g, start.b_a, self._config)
         if guess is None:
@@ -175,7 +175,7 @@ class GraphBuilder:
 
     def dead_reckoned(self, k: int, time: float = math.inf) -> Pose:
         """Dead-reckon from a keyframe to a time [s], or to the end of its data if earlier."""
-        R, v, p, b_g, b_a, _ = self.graph.pose(k)
+        R, v, p, b_g, b_a, _ = self.graph.keyframe(k)
         if k in self._gaps:
             gap = self._gaps[k]
             until = min(time, gap.stop)
@@ -225,7 +225,7 @@ class GraphBuilder:
     def _fix_term(self, fix: Fix, k: int) -> Term:
         graph = self.graph
         dt = fix.time - graph.time(k)
-        R_k, v_k, p_k, *_ = graph.pose(k)
+        R_k, v_k, p_k, *_ = graph.keyframe(k)
         R, v, p = (R_k, v_k, p_k) if dt <= SAME_TIME else self.dead_reckoned(k, fix.time)
         dt, f = max(dt, 0.0), self._config.filter
         # Noise of the IMU since the keyframe, or of the motion in a gap.

@@ -194,7 +194,7 @@ class FixedLagEstimator:
         graph = self._builder.graph
         k = graph.last
         R, _, _ = self._builder.dead_reckoned(k)
-        R_k = after.R_WB @ R.T @ graph.pose(k).R_WB
+        R_k = after.R_WB @ R.T @ graph.keyframe(k).R_WB
         weights, value, variance = gained
         term = Bearing(k, R_k, after.b_g, weights, value, np.array([[variance]]))
         graph.add(term, gated=False)

@@ -153,13 +153,13 @@ class KeyframeGraph:
             raise IndeterminateError(self._undetermined_state(str(error))) from error
         return Solution(rounds, down_weighted)
 
-    def pose(self, k: int) -> KeyframeState:
+    def keyframe(self, k: int) -> KeyframeState:
         """Return a keyframe without its covariance."""
         return self._states[k]
 
     def state(self, k: int) -> NavState:
         """Return a keyframe with its marginal covariance; call after `solve`."""
-        R, v, p, b_g, b_a, _ = self.pose(k)
+        R, v, p, b_g, b_a, _ = self.keyframe(k)
         joint = self._tree.jointMarginalCovariance([X(k), V(k), B(k)]).fullMatrix()
         to_world = KeyframeState(R, np.zeros(3), np.zeros(3), b_g, b_a).invariant_from_local()
         return NavState(self._time[k], R, v, p, b_g, b_a, to_world @ joint @ to_world.T)
@@ -209,7 +209,7 @@ class KeyframeGraph:
 
     def _marginal(self, keyframes: range, remaining: Any) -> Prior:
         """Return the prior that elimination left on the keyframes that it reached."""
-        reference = tuple(self.pose(k) for k in keyframes)
+        reference = tuple(self.keyframe(k) for k in keyframes)
         to_local = [np.linalg.inv(state.invariant_from_local()) for state in reference]
         for k, state in zip(keyframes, reference, strict=True):
             # A window may reach only a pose: add the other columns, without information.

@@ -39,10 +39,11 @@ from stario.fusion.imu.intervals import (
 )
 from stario.fusion.imu.stateful import WindowBuffer
 from stario.fusion.imu.units import SensorCheck
+from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
-from stario.sequences.time_order import CONFIRMED, CONFIRMED_FAR, LONG_GAP
+from stario.sequences.time_order import CONFIRMED, CONFIRMED_FAR, FAR_AHEAD
 from stario.sequences.windows import MAX_IMU_GAP
 
 BRIDGED = 0.2
@@ -81,7 +82,7 @@ class FrontEnd:
         self._origin, self._index = 0.0, 0
         self._next = -math.inf
         self.newest = -math.inf
-        self._window = WindowBuffer(rate)
+        self._windows = WindowBuffer(rate)
         self._hole = (-math.inf, -math.inf)  # ends of the last hole [s]
         self._unconfirmed: list[Sample] = []  # jumped ahead in time, not confirmed yet
         self._before_gap: Sample | None = None  # after which gravity has not been averaged yet
@@ -149,7 +150,7 @@ class FrontEnd:
         """Queue a sample that jumps ahead in time or follows one; accept all once confirmed."""
         ahead = self._unconfirmed
         ahead.append(sample)
-        far = ahead[0][0] - self.newest > LONG_GAP
+        far = ahead[0][0] - self.newest > FAR_AHEAD
         if len(ahead) < (CONFIRMED_FAR if far else CONFIRMED):
             return []
         self._unconfirmed = []
@@ -217,7 +218,7 @@ class FrontEnd:
         before = self._samples
         self._samples = [sample]
         self._check_time_unit()
-        self._window.clear()
+        self._windows.clear()
         self._next = -math.inf
         if self._attitude is None or self._before_gap is not None:
             return []
@@ -267,8 +268,8 @@ class FrontEnd:
         update = (self._index - 1) % self._config.filter.intervals_per_update == 0
         field_B = self._fields.at(table[-1, 0])
         interval = _interval(table, self._attitude, update=update, flags=flags, field_B=field_B)
-        self._window.add(interval)
-        return self._window.with_window(interval) if update else interval
+        self._windows.add(interval)
+        return changed(interval, window=self._windows.window()) if update else interval
 
 
 def _interval(

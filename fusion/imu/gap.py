@@ -27,6 +27,7 @@ the errors after 0.3, 0.8 and 2.0 s are 0.05, 0.25 and 1.0 rad (root mean square
 to 1 rad/s, 0.11, 0.53 and 1.3 from 1.5 to 2.5, and 0.22, 1.3 and 2.1 from 2.5 to 4 (running)."""
 
 _STEPS = 10
+"""Number of samples at which the rates in a gap are interpolated."""
 
 _EYE = np.eye(3)
 

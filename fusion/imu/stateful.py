@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from stario.fusion.checked import floored
 from stario.fusion.health import SampleCounts
 from stario.fusion.imu.intervals import ImuInterval, Window
-from stario.fusion.state import changed
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
@@ -117,18 +116,17 @@ class WindowBuffer:
         flagged = flags.gyro or flags.accel or flags.missing
         self._blocks.append(Block(imu_N.astype(np.float32).T, R_NB, facing(R_NB), flagged))
 
-    def with_window(self, interval: ImuInterval) -> ImuInterval:
-        """Return the newest interval with the second that ends there, once that is complete."""
+    def window(self) -> Window | None:
+        """Return the second that ends with the newest interval, once it is complete."""
         blocks = self._blocks
         if len(blocks) < (blocks.maxlen or 0):
-            return interval
-        window = Window(
+            return None
+        return Window(
             imu_N=np.concatenate([block.imu_N for block in blocks], axis=1),
             R_NB=blocks[0].R_NB,
             heading=float(mean_heading(np.array([block.facing_N for block in blocks]))),
             flagged=any(block.flagged for block in blocks),
         )
-        return changed(interval, window=window)
 
 
 class Predictor(Protocol):

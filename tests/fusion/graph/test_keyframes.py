@@ -140,7 +140,7 @@ def test_an_undetermined_state_is_named(first: int, name: str) -> None:
     graph.add_keyframe(segment, KeyframeState.from_nav(first_state(np.eye(15))))
     with pytest.raises(IndeterminateError, match=rf"{name} at 1[23]\.3 s"):
         graph.solve()
-    np.testing.assert_array_equal(graph.pose(1).p_W, np.zeros(3))
+    np.testing.assert_array_equal(graph.keyframe(1).p_W, np.zeros(3))
 
 
 def test_if_the_graph_fails_the_track_is_the_filters_and_a_note_says_why(
