@@ -212,7 +212,7 @@ class GraphBuilder:
         covariance = covariance_N * (self._overlap * self._config.filter.covariance_scale)
         if fault_of(d_N, covariance):
             return
-        term = Displacement(i, self.graph.last, d_N, R_NB, covariance, self.estimates_turn)
+        term = Displacement(i, self.graph.last, d_N, R_NB, covariance)
         self.graph.add(term, gated=not self._gated_by_filter)
 
     def _add_zero_velocity(self, zero_velocity: ZeroVelocity) -> None:

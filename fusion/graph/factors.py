@@ -133,26 +133,26 @@ class Displacement(Between):
     The network is given the window in a levelled frame N, whose yaw psi relative to W is that of
     R_WB R_NB^T at the window's start: p_j - p_i = R_z(psi) (d_N + n). It turns with the yaw of
     pose i alone, as in the filter's `update_displacement`; a `BetweenFactorPose3` would also infer
-    tilt from it, which on some recordings doubles the error.
+    tilt from it, which on some recordings doubles the error. Where the network's turn tau at
+    keyframe j is estimated, d_N = R_z(tau) R_z(psi)^T (p_j - p_i) - n, as in the filter (README.md,
+    "Fixes").
 
     Attributes:
         d_N: (3,) displacement [m].
         R_NB: (3, 3) levelled attitude at the window's start.
         covariance: (3, 3) [m^2] in N.
-        turned: whether the network's turn tau at keyframe j is a state; then
-            d_N = R_z(tau) R_z(psi)^T (p_j - p_i) - n, as in the filter (README.md, "Fixes").
     """
 
     d_N: FloatArray
     R_NB: FloatArray
     covariance: FloatArray
-    turned: bool = False
 
     def linearise(self, values: Any) -> Linearised:
         """Linearise in the axes of N."""
         (R_i, p_i), (R_j, p_j) = _pose(values, self.i), _pose(values, self.j)
         R_NW = yaw_rotation(R_i @ self.R_NB.T).T
-        if self.turned:
+        turned = values.exists(T(self.j))
+        if turned:
             R_NW = about_vertical(turn_at(values, self.j)) @ R_NW
         d_W = p_j - p_i
         H_i, H_j = np.zeros((3, 6)), np.zeros((3, 6))
@@ -160,7 +160,7 @@ class Displacement(Between):
         H_i[:, 3:] = -R_NW @ R_i
         H_j[:, 3:] = R_NW @ R_j
         predicted, blocks = R_NW @ d_W, [(X(self.i), H_i), (X(self.j), H_j)]
-        if self.turned:
+        if turned:
             blocks.append((T(self.j), e3_cross(predicted)[:, None]))
         return self.d_N - predicted, blocks
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,6 +44,23 @@ _MAX_ROUNDS = 3
 """Maximum rounds of each optimisation; the next keyframe's continues from there."""
 
 
+class GraphStart(NamedTuple):
+    """What the filter's state was when the graph began.
+
+    Attributes:
+        origin_W: (3,) its position, which is the origin of the graph's [m]; see `EkfState`.
+        map_frame: number of frame transforms.
+        jumps: number of jumps of its track.
+        bias_variance: variance of the gyroscope bias's prior, narrowed since as in the filter
+            [rad^2/s^2].
+    """
+
+    origin_W: FloatArray
+    map_frame: int
+    jumps: int
+    bias_variance: float
+
+
 @dataclass(frozen=True, eq=False)
 class FixedLagState:
     """Complete state of a `FixedLagEstimator` between two intervals.
@@ -51,20 +69,14 @@ class FixedLagState:
         estimator: state of the filter alongside.
         builder: the graph.
         ahead: newest state, propagated by the IMU from the last keyframe.
-        origin_W: (3,) origin of the graph's positions [m]; see `EkfState`.
-        map_frame: number of frame transforms before the graph began.
-        jumps: number of jumps of the filter's track before that.
-        bias_prior: variance of the gyroscope bias's prior in the graph [rad^2/s^2].
+        start: what the graph began from.
         fallbacks: how often the graph fell back to the filter, and the latest reason.
     """
 
     estimator: EstimatorState
     builder: GraphBuilder
     ahead: EkfState
-    origin_W: FloatArray
-    map_frame: int
-    jumps: int
-    bias_prior: float
+    start: GraphStart
     fallbacks: tuple[int, str]
 
 
@@ -134,18 +146,14 @@ class FixedLagEstimator:
             self._filter.state,
             self._builder,
             self._ahead.state,
-            self._origin_W,
-            self._map_frame,
-            self._jumps,
-            self._bias_prior,
+            self._start,
             self._fallbacks,
         )
 
     @state.setter
     def state(self, s: FixedLagState) -> None:
         self._filter.state, self._builder, self._ahead.state = s.estimator, s.builder, s.ahead
-        self._origin_W, self._map_frame, self._fallbacks = s.origin_W, s.map_frame, s.fallbacks
-        self._bias_prior, self._jumps = s.bias_prior, s.jumps
+        self._start, self._fallbacks = s.start, s.fallbacks
 
     @property
     def time(self) -> float:
@@ -154,8 +162,8 @@ class FixedLagEstimator:
 
     def nav_state(self) -> NavState:
         """Return the newest state."""
-        ahead = self._ahead.state.estimate(self._filter.in_gap, self._map_frame)
-        state = nav_states([ahead])[0].shifted(self._origin_W)
+        ahead = self._ahead.state.estimate(self._filter.in_gap, self._start.map_frame)
+        state = nav_states([ahead])[0].shifted(self._start.origin_W)
         states = with_actual_covariances([state], [self._filter.estimate()])
         return with_undirected(states, self._filter.frame.state.undirected)[0]
 
@@ -171,20 +179,20 @@ class FixedLagEstimator:
     @property
     def _stale(self) -> bool:
         """Whether the filter has since changed the state from which the graph began."""
-        wider = self._filter.bias.prior.variance > _WIDER * self._bias_prior
+        start, frame = self._start, self._filter.frame.state
+        wider = self._filter.bias.prior.variance > _WIDER * start.bias_variance
         turned = self._filter.ekf.state.has_turn and not self._builder.estimates_turn
-        frame = self._filter.frame.state
-        jumped = frame.jumps != self._jumps
-        return wider or turned or jumped or len(frame.transforms) != self._map_frame
+        moved = (len(frame.transforms), frame.jumps) != (start.map_frame, start.jumps)
+        return wider or turned or moved
 
     def _narrow_bias_prior(self) -> None:
         """Narrow the prior as the filter did: add its information as a measurement of zero."""
-        variance = self._filter.bias.prior.variance
-        if variance < _NARROWER * self._bias_prior:
-            pseudo_variance = 1.0 / (1.0 / variance - 1.0 / self._bias_prior)
+        old, variance = self._start.bias_variance, self._filter.bias.prior.variance
+        if variance < _NARROWER * old:
+            pseudo_variance = 1.0 / (1.0 / variance - 1.0 / old)
             graph = self._builder.graph
             graph.add(GyroBias(graph.last, np.zeros(3), pseudo_variance * np.eye(3)), gated=False)
-            self._bias_prior = variance
+            self._start = self._start._replace(bias_variance=variance)
 
     def _add_bearing(self, before: EkfState, after: EkfState) -> None:
         """Add what a magnetic bearing has just told the filter about attitude and bias."""
@@ -201,15 +209,14 @@ class FixedLagEstimator:
 
     def _in_graph_frame(self, accepted: Accepted) -> Fix:
         """Return a fix as inflated by the filter, relative to the graph's origin."""
-        return accepted.inflated.shifted(-self._origin_W)
+        return accepted.inflated.shifted(-self._start.origin_W)
 
     def _begin(self, count: int) -> None:
         """Begin a new graph from the filter's state."""
         first = nav_states([self._filter.estimate()], ASSUMED)[0]
-        self._map_frame, self._origin_W = first.map_frame, first.p_W
-        self._jumps = self._filter.frame.state.jumps
-        self._bias_prior = self._filter.bias.prior.variance
-        first = first.shifted(-self._origin_W)
+        jumps, variance = self._filter.frame.state.jumps, self._filter.bias.prior.variance
+        self._start = GraphStart(first.p_W, first.map_frame, jumps, variance)
+        first = first.shifted(-first.p_W)
         turn = turn_estimate(self._filter.ekf.state)
         self._builder = GraphBuilder(
             self._config, first, count, turn is not None, turn, streaming=True
