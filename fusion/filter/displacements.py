@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from stario.fusion.config import FilterConfig
-from stario.fusion.filter.engine import GateMode, UpdateResult
+from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.hypotheses import AlternativeHypothesis, HypothesisPair
 from stario.fusion.filter.network_errors import (
     InnovationStatistics,
@@ -70,7 +70,7 @@ class DisplacementUpdates:
         self._hypotheses.apply_to_both(self._propagate_turn)
         rare = self.statistics.outlier_share < _RARE_SHARE
         update = partial(self._update, slot, displacement)
-        result = update(f.gate, power=_RARE_POWER if rare else 1.0)
+        result = update(f.gate, _RARE_POWER if rare else 1.0)
         self.statistics = self.statistics.updated(result, f)
         if self._hypotheses.alternative is None and rare and result.gated:
             assert result.residual is not None  # it has been compared with the gate
@@ -90,7 +90,7 @@ class DisplacementUpdates:
         Return whether it fits.
         """
         alternative = self._hypotheses.alternative
-        result = self._hypotheses.apply_to_alternative(partial(update, _ALTERNATIVE_GATE, "reject"))
+        result = self._hypotheses.apply_to_alternative(partial(update, _ALTERNATIVE_GATE, None))
         if result is None or alternative is None or result.residual is None:
             return True
         offset_W, residual = alternative.offset_W, result.residual
@@ -108,8 +108,7 @@ class DisplacementUpdates:
         slot: int,
         displacement: WindowDisplacement,
         gate: float | None,
-        gate_mode: GateMode = "inflate",
-        power: float = 1.0,
+        inflation: float | None = 1.0,
         offset_W: FloatArray | None = None,
     ) -> UpdateResult:
         """Update the filter's current state, with the displacement less an offset (3,) [m]."""
@@ -126,9 +125,7 @@ class DisplacementUpdates:
                 errors = displacement_errors(d_W, covariance_W, level, has_turn, f)
             limit = None if gate is None else chi2_quantile(gate, 3)
             covariance_W = f.overlap_scale * covariance_W
-            return self._ekf.update_displacement(
-                slot, d_W, covariance_W, limit, gate_mode, power, errors
-            )
+            return self._ekf.update_displacement(slot, d_W, covariance_W, limit, inflation, errors)
 
     def _propagate_turn(self) -> None:
         f = self._config

@@ -15,7 +15,7 @@ import numpy as np
 from stario.fusion.checked import check_covariance, checked, checked_rotation
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult
+from stario.fusion.filter.engine import ErrorStateEngine, UpdateResult
 from stario.fusion.filter.jacobians import (
     ACTUAL,
     CLONE,
@@ -173,8 +173,7 @@ class StateCloningEkf(ErrorStateEngine):
         d_W: FloatArray,
         covariance: FloatArray,
         gate: float | None = None,
-        gate_mode: GateMode = "inflate",
-        power: float = 1.0,
+        inflation: float | None = 1.0,
         errors: DisplacementErrors | None = None,
     ) -> UpdateResult:
         """Update with the displacement from clone i to the current pose j, in the estimated world.
@@ -190,8 +189,7 @@ class StateCloningEkf(ErrorStateEngine):
                 same motion, so the caller scales it by update rate x window length.
             gate: NIS above which the measurement counts as an outlier (a quantile of chi-square
                 with 3 degrees of freedom); None for no gate.
-            gate_mode: what happens to outliers; see `update_linear`.
-            power: how strongly outliers are inflated; see `update_linear`.
+            inflation: what happens to outliers; see `update_linear`.
             errors: its errors as they are; None if they are white with that covariance.
 
         Raises:
@@ -210,7 +208,7 @@ class StateCloningEkf(ErrorStateEngine):
             self.state = s = with_considered_propagated(s)
             blocks.append((s.considered_rows.start, errors.considered))
         residual = d_W - (p_j - p_i)
-        return self.update_linear(residual, blocks, covariance, gate, gate_mode, power, noise)
+        return self.update_linear(residual, blocks, covariance, gate, inflation, noise)
 
     def update_mean_velocity(
         self,

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
@@ -19,8 +19,6 @@ from scipy.linalg.lapack import dpotrf, dtrtri
 
 from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CORE, Block, symmetric
 from stario.sequences.sequence import FloatArray
-
-GateMode = Literal["inflate", "reject"]
 
 _JOSEPH_RATIO = 1e9
 """Ratio of innovation to measurement variance above which differences of P lose their digits."""
@@ -109,8 +107,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         blocks: Sequence[Block],
         covariance: FloatArray,
         gate: float | None = None,
-        gate_mode: GateMode = "inflate",
-        power: float = 1.0,
+        inflation: float | None = 1.0,
         noise: FloatArray | None = None,
         gains_from: int = ASSUMED,
     ) -> UpdateResult:
@@ -122,9 +119,8 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
                 blocks (first column, (m, width)); columns in no block are zero.
             covariance: (m, m) covariance of the measurement.
             gate: NIS above which the measurement counts as an outlier; None for no gate.
-            gate_mode: "inflate" multiplies an outlier's covariance by a power of NIS / gate, so
-                that a run of outliers can still correct a wrong filter; "reject" drops it.
-            power: exponent of NIS / gate in that factor.
+            inflation: an outlier's covariance is multiplied by this power of NIS / gate, so that a
+                run of outliers can still correct a wrong filter; None rejects outliers.
             noise: (m, m) covariance of the measurement's white noise if it is not `covariance`,
                 which then also stands for considered errors.
             gains_from: which covariance determines the gains: `ASSUMED` or `ACTUAL`.
@@ -144,9 +140,9 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         gate_nis = _square(whitener @ residual)
         scale = 1.0
         if gate is not None and gate_nis > gate:
-            if gate_mode == "reject":
+            if inflation is None:
                 return UpdateResult("gated", nis, 1.0, residual, sigma, gate_nis)
-            scale = (gate_nis / gate) ** power
+            scale = (gate_nis / gate) ** inflation
             R = R * scale
             S = HPH + R
             whitener = _whitener(S[gains_from])

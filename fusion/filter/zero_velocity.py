@@ -118,7 +118,7 @@ def update_zero_velocity(ekf: StateCloningEkf, measured: ZeroVelocity, gate: flo
     s = ekf.state
     residual = np.concatenate([-s.v_W, measured.b_g - s.b_g])
     blocks = [(3, _H_VELOCITY), (9, _H_BIAS)]
-    return ekf.update_linear(residual, blocks, measured.covariance, gate, "reject")
+    return ekf.update_linear(residual, blocks, measured.covariance, gate, None)
 
 
 class ZeroVelocityUpdates:

@@ -307,7 +307,7 @@ def test_outliers_are_inflated_by_their_nis(driven: StateCloningEkf) -> None:
 def test_outliers_can_be_rejected(driven: StateCloningEkf) -> None:
     P, p = driven.P.copy(), driven.state.p_W
     result = driven.update_displacement(
-        0, np.array([50.0, 0, 0]), 0.01 * np.eye(3), gate=7.8, gate_mode="reject"
+        0, np.array([50.0, 0, 0]), 0.01 * np.eye(3), gate=7.8, inflation=None
     )
     assert not result.accepted
     assert result.reason == "gated"
