@@ -109,7 +109,7 @@ def test_a_stream_gates_displacements_as_its_filter_does(
     assert clean_gated == 0
     # Both false ones, and the correct one after them, since the second has changed the velocity.
     assert corrupted_gated == 3
-    # The accelerometer has slightly less weight after them (`AccelNoiseScale`).
+    # The accelerometer has slightly less weight after them (`InnovationStatistics`).
     assert np.linalg.norm(corrupted[-1] - clean[-1]) < 0.12
 
 
