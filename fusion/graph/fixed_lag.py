@@ -91,7 +91,7 @@ class FixedLagEstimator:
         prior: prior on the first pose; None starts levelled, at rest, at the origin.
     """
 
-    smoothed = None
+    smoothed = None  # the filter alone has poses one window late
 
     def __init__(
         self, config: NavigatorConfig, start: Start, prior: PriorPose | None = None
