@@ -16,7 +16,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.ekf_state import Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.estimates import Estimate, nav_states
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import IntervalMeasurements, innovations_of
 from stario.fusion.filter.frame_transform import (
@@ -26,7 +26,7 @@ from stario.fusion.filter.frame_transform import (
     with_undirected,
 )
 from stario.fusion.filter.initial import PriorPose
-from stario.fusion.filter.jacobians import ASSUMED
+from stario.fusion.filter.jacobians import ASSUMED, GYRO_BIAS
 from stario.fusion.fixes import Fix, FixQueue
 from stario.fusion.graph.batch import smooth
 from stario.fusion.graph.covariances import with_actual_covariances
@@ -80,9 +80,7 @@ def _filter_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solu
     """Return the filter's states."""
     frame = filtered.estimator.frame.state
     states = to_final_frame(nav_states(filtered.estimates), frame.transforms)
-    smoothed = smoothed_track(
-        smoothed_poses(filtered.clones), (*frame.transforms, *frame.undirected)
-    )
+    smoothed = smoothed_track(nav_states(filtered.clones), (*frame.transforms, *frame.undirected))
     return Solution(with_undirected(states, frame.undirected), smoothed)
 
 
@@ -91,14 +89,15 @@ def _graph_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solut
     estimator = filtered.estimator
     frame, states = estimator.frame.state, nav_states(filtered.estimates, ASSUMED)
     end, has_field = states[-1], estimator.ekf.state.field is not None
-    bias = (end.b_g, end.covariance[9:12, 9:12]) if has_field else None
+    bias = (end.b_g, end.covariance[GYRO_BIAS, GYRO_BIAS]) if has_field else None
     covariance = states[0].covariance.copy()
-    covariance[9:12, 9:12] = estimator.bias.prior.variance * np.eye(3)  # the filter's last prior
+    # The filter's last prior.
+    covariance[GYRO_BIAS, GYRO_BIAS] = estimator.bias.prior.variance * np.eye(3)
     first = replace(states[0], covariance=covariance)
-    sigma = config.filter.network_turn_sigma if estimator.ekf.state.has_turn else 0.0
     final = to_final_frame(states, frame.transforms)
+    has_turn = estimator.ekf.state.has_turn
     solved, note = smooth(
-        final, first, filtered.measurements, frame.transforms, config, bias, sigma
+        final, first, filtered.measurements, frame.transforms, config, bias, has_turn
     )
     turns = [
         frame_rotation(after.R_WB @ before.R_WB.T)

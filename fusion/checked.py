@@ -63,16 +63,16 @@ def checked(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
     return array
 
 
-def checked_rotation(name: str, value: Any) -> FloatArray:
+def checked_rotation(R_WB: Any) -> FloatArray:
     """Return a rotation matrix (3, 3); the nearest one if the numbers are rounded.
 
     Raises:
         InputError: as for `checked`, or the matrix is not a rotation.
     """
-    R = checked(name, value, (3, 3))
+    R = checked("R_WB", R_WB, (3, 3))
     error = np.abs(R @ R.T - np.eye(3)).max()
     if error > _ROTATION_ERROR or np.linalg.det(R) < 0.0:
-        raise InputError(name, "a matrix that is not a rotation", "R R^T = I with det R = 1")
+        raise InputError("R_WB", "a matrix that is not a rotation", "R R^T = I with det R = 1")
     if error <= _ROUNDING_ERROR:
         return R
     left, _, right = np.linalg.svd(R)

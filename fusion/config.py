@@ -27,6 +27,9 @@ UPDATE_RATES = (1, 2, 5, 10, 20)
 MIN_PRIOR_SIGMA = 1e-6
 """Smallest standard deviation of a prior, which keeps the covariance positive definite."""
 
+MIN_WALK = 1e-7
+"""Smallest random walk of a bias, whose covariance the graph inverts; units as in `ImuNoise`."""
+
 MIN_OUTPUT_RATE = 10
 """States per second if there are fewer network updates [Hz]."""
 

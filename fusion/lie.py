@@ -75,6 +75,11 @@ def yaw_rotation(R: FloatArray) -> FloatArray:
     return about_vertical(math.atan2(s, c))
 
 
+def e3_cross(vector: FloatArray) -> FloatArray:
+    """Return e3 x vector (3,): how it changes per angle about the vertical."""
+    return np.array([-vector[1], vector[0], 0.0])
+
+
 def about_vertical(angle: float) -> FloatArray:
     """Return the rotation (3, 3) about the vertical by an angle [rad]."""
     s, c = math.sin(angle), math.cos(angle)

@@ -23,8 +23,9 @@ from stario.fusion.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_f
 from stario.fusion.health import Health
 from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
-from stario.fusion.imu.intervals import ImuInterval, check_start
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.stateful import Predictor, StatefulInference, displacements_of
+from stario.fusion.imu.units import check_start
 from stario.fusion.recording import PreprocessedRecording, Progress, preprocess, silent
 from stario.fusion.snapshot import check_same, pack, unpack
 from stario.fusion.state import ContinuousPose, NavState, SmoothedPose, Track, advanced, copied
@@ -300,7 +301,7 @@ class Navigator:
         try:
             if interval.window is not None:
                 counts = self._front_end.counts
-                (displacement,) = displacements_of(self._network, [interval], counts)
+                (displacement,) = displacements_of(self._network, [interval.window], counts)
         finally:  # if the network fails, the IMU's motion must not be lost
             self._estimator.step(interval, displacement, self._fixes.due(interval.stop))
         state = self._estimator.nav_state()

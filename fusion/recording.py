@@ -15,9 +15,9 @@ from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.stateful import (
-    Displacement,
     Predictor,
     StatefulInference,
+    WindowDisplacement,
     displacements_of,
 )
 from stario.sequences.arrays import check_type
@@ -54,7 +54,7 @@ class PreprocessedRecording:
 
     intervals: list[ImuInterval]
     update_rate: int
-    measurements: list[Displacement | None]
+    measurements: list[WindowDisplacement | None]
     front_end: FrontEnd
     seconds_front_end: float
     seconds_network: float
@@ -129,15 +129,15 @@ def _displacements(
     network: StatefulInference,
     counts: SampleCounts,
     progress: Progress,
-) -> list[Displacement | None]:
-    measurements: list[Displacement | None] = [None] * len(intervals)
+) -> list[WindowDisplacement | None]:
+    measurements: list[WindowDisplacement | None] = [None] * len(intervals)
     for batch in _batches(intervals, unbroken=network.is_recurrent):
         if network.is_recurrent and intervals[batch[0]].gap:
             network.restart()
-        with_window = [k for k in batch if intervals[k].window is not None]
-        if with_window:
-            displacements = displacements_of(network, [intervals[k] for k in with_window], counts)
-            for k, displacement in zip(with_window, displacements, strict=True):
+        windows = {k: window for k in batch if (window := intervals[k].window) is not None}
+        if windows:
+            displacements = displacements_of(network, list(windows.values()), counts)
+            for k, displacement in zip(windows, displacements, strict=True):
                 measurements[k] = displacement
         progress(0.1 + 0.5 * (batch[-1] + 1) / len(intervals))
     return measurements

@@ -36,7 +36,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 22
+FORMAT, VERSION = "stario snapshot", 23
 
 
 _PACKAGES = ("fusion.filter", "fusion.graph", "fusion.imu")

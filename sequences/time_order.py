@@ -15,7 +15,7 @@ from stario.sequences.arrays import BoolArray, FloatArray
 MAX_IMU_GAP = 0.1
 """Longest step [s] between IMU samples that is bridged by interpolation."""
 
-LONG_GAP = 10.0
+FAR_AHEAD = 10.0
 """A jump ahead by more than this [s] is far, and needs more samples to be confirmed."""
 
 CONFIRMED, CONFIRMED_FAR = 2, 20
@@ -62,7 +62,7 @@ def _first_refuted(time: FloatArray, parts: list[tuple[int, int]], following: Fl
             break
         before = time[parts[k - 1][1] - 1] if k else -np.inf
         jump = time[start] - before
-        few = samples < (CONFIRMED_FAR if jump > LONG_GAP else CONFIRMED)
+        few = samples < (CONFIRMED_FAR if jump > FAR_AHEAD else CONFIRMED)
         if few and jump > MAX_IMU_GAP:
             later = following[np.searchsorted(following, before, side="right") :]
             if len(later) and later[0] < time[start]:

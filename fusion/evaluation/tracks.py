@@ -77,9 +77,9 @@ def network_track(preprocessed: PreprocessedRecording) -> Track:
     time = np.array([start.time, *(e.stop for e in preprocessed.intervals)])
     attitude = np.stack([start.R_WB, *(e.R_NB for e in preprocessed.intervals)])
     windows = [
-        (e, m[0])
+        (e, m.d_N)
         for e, m in zip(preprocessed.intervals, preprocessed.measurements, strict=True)
-        if m
+        if m is not None
     ]
     middle = np.array([e.stop - 0.5 * WINDOW_SECONDS for e, _ in windows])
     velocity = np.array([d for _, d in windows]) / WINDOW_SECONDS

@@ -11,23 +11,23 @@ from functools import partial
 import numpy as np
 
 from stario.fusion.config import FilterConfig
-from stario.fusion.filter.engine import GateMode, UpdateResult
+from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.hypotheses import AlternativeHypothesis, HypothesisPair
 from stario.fusion.filter.network_errors import (
-    AccelNoiseScale,
-    ErrorLevel,
+    InnovationStatistics,
     displacement_errors,
     propagated_turn,
 )
+from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.lie import yaw_rotation
 from stario.fusion.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 
-_RARE_SHARE, _RARE_POWER, _SHARE_SECONDS = 0.35, 4.0, 20.0
-"""While less than this share of the last seconds' displacements were outliers, they are attributed
-to the network and inflated by this power of NIS / gate; a filter that gates more of them may itself
-be wrong. This bridges about five seconds of false displacements."""
+_RARE_SHARE, _RARE_POWER = 0.35, 4.0
+"""While less than this share of recent displacements were outliers, they are attributed to the
+network and inflated by this power of NIS / gate; a filter that gates more of them may itself be
+wrong. This bridges about five seconds of false displacements."""
 
 _OFFSET_GAIN = 0.5
 """Share of the latest outlier's residual in the alternative's offset, which may turn with the
@@ -48,19 +48,15 @@ class DisplacementUpdates:
         config: settings of the filter.
 
     Attributes:
-        outlier_share: fraction of outliers among recent displacements.
-        accel_noise: estimated scale of the accelerometer's noise.
-        error_level: estimated level of the network's errors.
+        statistics: what the innovations so far tell.
     """
 
     def __init__(self, hypotheses: HypothesisPair, config: FilterConfig) -> None:
         self._hypotheses, self._ekf, self._config = hypotheses, hypotheses.ekf, config
-        self.outlier_share = 0.5  # outliers are assumed common at first
-        self.accel_noise = AccelNoiseScale()
-        self.error_level = ErrorLevel()
+        self.statistics = InnovationStatistics()
 
     def update(
-        self, slot: int, R_NB: FloatArray, d_N: FloatArray, covariance_N: FloatArray
+        self, slot: int, displacement: WindowDisplacement
     ) -> tuple[UpdateResult, tuple[float, ...]]:
         """Update with the displacement of the window that ends now.
 
@@ -68,24 +64,17 @@ class DisplacementUpdates:
 
         Args:
             slot: slot of the clone at the window's start.
-            R_NB: (3, 3) levelled attitude there, with which the window was prepared.
-            d_N: (3,) displacement [m].
-            covariance_N: (3, 3) covariance of the displacement [m^2].
+            displacement: the displacement.
         """
         f, before = self._config, self._ekf.state
         self._hypotheses.apply_to_both(self._propagate_turn)
-        rare = self.outlier_share < _RARE_SHARE
-        update = partial(self._update, slot, R_NB, d_N, covariance_N)
-        result = update(f.gate, power=_RARE_POWER if rare else 1.0)
-        gain = 1.0 / (f.update_rate * _SHARE_SECONDS)
-        self.outlier_share += gain * (result.gated - self.outlier_share)
-        if f.adaptive:
-            self.accel_noise = self.accel_noise.updated(result)
-            if f.correlated_errors:
-                self.error_level = self.error_level.updated(result)
+        rare = self.statistics.outlier_share < _RARE_SHARE
+        update = partial(self._update, slot, displacement)
+        result = update(f.gate, _RARE_POWER if rare else 1.0)
+        self.statistics = self.statistics.updated(result, f)
         if self._hypotheses.alternative is None and rare and result.gated:
             assert result.residual is not None  # it has been compared with the gate
-            first = AlternativeHypothesis(before, before.time, result.residual, (before.time,))
+            first = AlternativeHypothesis(before, result.residual, (before.time,))
             self._hypotheses.alternative = first
         elif result.accepted:
             fits = self._update_alternative(update)
@@ -101,7 +90,7 @@ class DisplacementUpdates:
         Return whether it fits.
         """
         alternative = self._hypotheses.alternative
-        result = self._hypotheses.apply_to_alternative(partial(update, _ALTERNATIVE_GATE, "reject"))
+        result = self._hypotheses.apply_to_alternative(partial(update, _ALTERNATIVE_GATE, None))
         if result is None or alternative is None or result.residual is None:
             return True
         offset_W, residual = alternative.offset_W, result.residual
@@ -117,16 +106,13 @@ class DisplacementUpdates:
     def _update(
         self,
         slot: int,
-        R_NB: FloatArray,
-        d_N: FloatArray,
-        covariance_N: FloatArray,
+        displacement: WindowDisplacement,
         gate: float | None,
-        gate_mode: GateMode = "inflate",
-        power: float = 1.0,
+        inflation: float | None = 1.0,
         offset_W: FloatArray | None = None,
     ) -> UpdateResult:
         """Update the filter's current state, with the displacement less an offset (3,) [m]."""
-        f = self._config
+        f, (d_N, covariance_N, R_NB) = self._config, displacement
         R_WN = yaw_rotation(self._ekf.state.clone_pose(slot)[0] @ R_NB.T)
         # Values that are not finite are rejected and counted by the filter.
         with np.errstate(invalid="ignore"):
@@ -135,13 +121,11 @@ class DisplacementUpdates:
                 d_W, covariance_W = d_W - offset_W, _OFFSET_SCALE * covariance_W
             errors = None
             if f.correlated_errors and np.isfinite(covariance_W).all():
-                level, has_turn = self.error_level.level, self._ekf.state.has_turn
+                level, has_turn = self.statistics.error_level, self._ekf.state.has_turn
                 errors = displacement_errors(d_W, covariance_W, level, has_turn, f)
             limit = None if gate is None else chi2_quantile(gate, 3)
             covariance_W = f.overlap_scale * covariance_W
-            return self._ekf.update_displacement(
-                slot, None, d_W, covariance_W, limit, gate_mode, power, errors
-            )
+            return self._ekf.update_displacement(slot, d_W, covariance_W, limit, inflation, errors)
 
     def _propagate_turn(self) -> None:
         f = self._config

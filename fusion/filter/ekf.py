@@ -14,11 +14,12 @@ import numpy as np
 
 from stario.fusion.checked import check_covariance, checked, checked_rotation
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.ekf_state import EkfState, FieldState
-from stario.fusion.filter.engine import ErrorStateEngine, GateMode, UpdateResult
+from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.filter.engine import ErrorStateEngine, UpdateResult
 from stario.fusion.filter.jacobians import (
     ACTUAL,
     CLONE,
+    CLONED,
     CORE,
     Propagation,
     bearing_jacobian,
@@ -32,8 +33,10 @@ from stario.fusion.filter.jacobians import (
     yaw_jacobian,
 )
 from stario.fusion.filter.network_errors import DisplacementErrors, with_considered_propagated
+from stario.fusion.imu.gap import gap_rotation, yaw_variance
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.lie import about_vertical, exp_times, yaw_twist
+from stario.fusion.lie import about_vertical, yaw_twist
 from stario.fusion.state import NavState, changed
 from stario.sequences.attitude.rotations import tilt_aligning
 from stario.sequences.attitude.so3 import log_so3
@@ -41,9 +44,6 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 
 _NO_GAIN = np.zeros(3)
-
-_CLONED = [0, 1, 2, 6, 7, 8]
-"""Rows of theta and rho_p, which a clone copies."""
 
 
 class StateCloningEkf(ErrorStateEngine):
@@ -65,10 +65,9 @@ class StateCloningEkf(ErrorStateEngine):
             raise InputError("slots", repr(slots), "a number of clones >= 0")
         zero = np.zeros(3)
         undefined = NavState(math.nan, np.eye(3), zero, zero, zero, zero, np.zeros((CORE, CORE)))
-        self.state = EkfState.initial(undefined, slots)
-        covariances = self.state.covariances
-        super().__init__(len(self.state.P), self.state.considered_rows)
-        self.covariances = covariances
+        state = self.state = EkfState.initial(undefined, slots)
+        super().__init__(len(state.P), state.considered_rows)
+        self.state = state  # filterpy has set its own P
         self.gravity = gravity
         self.slots = slots
 
@@ -91,7 +90,7 @@ class StateCloningEkf(ErrorStateEngine):
         v, p, b_g, b_a = (
             checked(name, getattr(state, name), (3,)) for name in ("v_W", "p_W", "b_g", "b_a")
         )
-        R = checked_rotation("R_WB", state.R_WB)
+        R = checked_rotation(state.R_WB)
         covariance = checked("covariance", state.covariance, (CORE, CORE))
         check_covariance(covariance)
         now = checked("time", state.time, ()).item()
@@ -107,25 +106,17 @@ class StateCloningEkf(ErrorStateEngine):
                 segment, which the gains assume.
         """
         s = self.state
-        pose = s.X[0]
-        start = pose[:, :3], pose[:, 3], pose[:, 4], s.b_g, s.b_a
-        self._move(segment.stop, propagated(segment, *start, accel_share))
+        self._move(segment.stop, propagated(segment, *s.pose, s.b_g, s.b_a, accel_share))
 
     def propagate_in_gap(
-        self, stop: float, rotation: FloatArray, turn_variance: float, config: NavigatorConfig
+        self, piece: ImuInterval, gap: ImuInterval, config: NavigatorConfig
     ) -> None:
-        """Propagate without samples to the end of a gap, or to a fix within it.
-
-        Args:
-            stop: time of the end, or of the fix [s].
-            rotation: (3, 3) from the body then to the body now (`gap_rotation`).
-            turn_variance: variance of the device's unobserved turn until then [rad^2].
-            config: noise densities.
-        """
-        s = self.state
-        pose = s.X[0]
-        start = pose[:, :3] @ rotation, pose[:, 3], pose[:, 4]
-        self._move(stop, propagated_in_gap(stop - s.time, turn_variance, *start, config))
+        """Propagate without samples through a gap, or through a piece of it between fixes."""
+        R, v, p = self.state.pose
+        rotation = gap_rotation(piece.table, gap.duration, self.state.b_g)
+        before, after = (yaw_variance(time - gap.start, gap) for time in (piece.start, piece.stop))
+        pose = R @ rotation, v, p
+        self._move(piece.stop, propagated_in_gap(piece.duration, after - before, *pose, config))
 
     def _move(self, time: float, end: Propagation) -> None:
         """Set the current pose and its covariances after a propagation to a time [s]."""
@@ -154,8 +145,8 @@ class StateCloningEkf(ErrorStateEngine):
         X[1 + slot, :, 3] = 0.0
         first, P = CORE + CLONE * slot, s.covariances.copy()
         clone = slice(first, first + CLONE)
-        P[:, clone] = P[:, _CLONED]
-        P[:, :, clone] = P[:, :, _CLONED]
+        P[:, clone] = P[:, CLONED]
+        P[:, :, clone] = P[:, :, CLONED]
         times = (*s.clone_times[:slot], s.time, *s.clone_times[slot + 1 :])
         self.state = changed(s, X=X, covariances=P, clone_times=times)
         return slot
@@ -178,42 +169,36 @@ class StateCloningEkf(ErrorStateEngine):
 
     def update_displacement(
         self,
-        slot_i: int,
-        slot_j: int | None,
+        slot: int,
         d_W: FloatArray,
         covariance: FloatArray,
         gate: float | None = None,
-        gate_mode: GateMode = "inflate",
-        power: float = 1.0,
+        inflation: float | None = 1.0,
         errors: DisplacementErrors | None = None,
     ) -> UpdateResult:
-        """Update with the displacement from clone i to clone j, in the estimated world.
+        """Update with the displacement from clone i to the current pose j, in the estimated world.
 
         The caller has rotated the network's displacement from N to W by the estimated yaw of clone
         i, so that it contains the error of this yaw, p_j - p_i = (I + theta_iz [e3]x) d + n, and
         the network's own (turn). Those of its errors that last are considered.
 
         Args:
-            slot_i: slot of the window's first pose.
-            slot_j: slot of its last pose; None for the current pose.
+            slot: slot of the clone where the window began.
             d_W: (3,) displacement [m].
             covariance: (3, 3) covariance in the same axes [m^2]; overlapping windows contain the
                 same motion, so the caller scales it by update rate x window length.
             gate: NIS above which the measurement counts as an outlier (a quantile of chi-square
                 with 3 degrees of freedom); None for no gate.
-            gate_mode: what happens to outliers; see `update_linear`.
-            power: how strongly outliers are inflated; see `update_linear`.
+            inflation: what happens to outliers; see `update_linear`.
             errors: its errors as they are; None if they are white with that covariance.
 
         Raises:
-            InputError: a slot holds no clone.
+            InputError: the slot holds no clone.
         """
-        s, X = self.state, self.state.X
-        s.time_of_clone(slot_i)
-        if slot_j is not None:
-            s.time_of_clone(slot_j)
-        p_i, p_j = X[1 + slot_i, :, 4], X[0 if slot_j is None else 1 + slot_j, :, 4]
-        blocks = displacement_jacobian(p_i, p_j, slot_i, slot_j)
+        s = self.state
+        s.time_of_clone(slot)
+        p_i, p_j = s.X[1 + slot, :, 4], s.X[0, :, 4]
+        blocks = displacement_jacobian(p_i, p_j, slot)
         if s.has_turn:
             d_W = about_vertical(-s.network_turn) @ d_W
             blocks.append(turn_jacobian(p_j - p_i, s.turn_row))
@@ -223,14 +208,13 @@ class StateCloningEkf(ErrorStateEngine):
             self.state = s = with_considered_propagated(s)
             blocks.append((s.considered_rows.start, errors.considered))
         residual = d_W - (p_j - p_i)
-        return self.update_linear(residual, blocks, covariance, gate, gate_mode, power, noise)
+        return self.update_linear(residual, blocks, covariance, gate, inflation, noise)
 
     def update_mean_velocity(
         self,
         v_mean_W: FloatArray,
         covariance: FloatArray,
         gate: float | None = None,
-        gate_mode: GateMode = "inflate",
         gain_W: FloatArray = _NO_GAIN,
         seconds: float = 0.0,
     ) -> UpdateResult:
@@ -244,8 +228,7 @@ class StateCloningEkf(ErrorStateEngine):
         Args:
             v_mean_W: (3,) mean velocity in the estimated world [m/s].
             covariance: (3, 3) covariance of the mean velocity [m^2/s^2].
-            gate: NIS above which the measurement counts as an outlier; None for no gate.
-            gate_mode: what happens to outliers; see `update_linear`.
+            gate: NIS above which the measurement is an outlier and inflated; None for no gate.
             gain_W: (3,) current velocity minus its mean over the window [m/s], from the IMU alone.
             seconds: length of the window [s]; 0 for a current velocity.
         """
@@ -253,7 +236,7 @@ class StateCloningEkf(ErrorStateEngine):
         force_W = gain_W + np.array([0.0, 0.0, 0.5 * seconds * self.gravity])
         blocks = mean_velocity_jacobian(s.v_W, force_W, s.R_WB, seconds)
         residual = v_mean_W + gain_W - s.v_W
-        return self.update_linear(residual, blocks, covariance, gate, gate_mode)
+        return self.update_linear(residual, blocks, covariance, gate)
 
     def update_position_W(
         self, p_W: FloatArray, covariance: FloatArray, gate: float | None = None
@@ -286,7 +269,7 @@ class StateCloningEkf(ErrorStateEngine):
         R = self.state.R_WB
         residual = np.array([math.remainder(yaw - yaw_twist(R), 2.0 * math.pi)])
         if not math.isfinite(residual[0]):
-            return UpdateResult(math.nan, 1, False, reason="yaw not defined upside down")
+            return UpdateResult("yaw not defined upside down")
         covariance = np.array([[sigma * sigma]])
         return self.update_linear(residual, yaw_jacobian(R), covariance, gate, gains_from=ACTUAL)
 
@@ -296,7 +279,7 @@ class StateCloningEkf(ErrorStateEngine):
         """Update with the bearing of a magnetic field, which measures the state's azimuth.
 
         Args:
-            m_B: (3,) measured field [uT]; the state must have a field (`magnetic.first_field`).
+            m_B: (3,) measured field [uT]; the state must have a field (`magnetic.with_field`).
             variance: variance of its bearing [rad^2].
             gate: as for the other updates; outliers are inflated.
         """
@@ -305,23 +288,10 @@ class StateCloningEkf(ErrorStateEngine):
         m_W = s.R_WB @ (m_B - s.field.hard_iron_B)
         bearing = math.atan2(m_W[1], m_W[0])
         residual = math.remainder(bearing - s.field.azimuth - s.field.wander, 2.0 * math.pi)
-        blocks = bearing_jacobian(s.R_WB, m_W, s.first_field)
+        blocks = bearing_jacobian(s.R_WB, m_W, s.field_row)
         return self.update_linear(np.array([residual]), blocks, np.array([[variance]]), gate)
 
     def inject(self, covariances: FloatArray) -> None:
         """Move the error's mean into the state, X <- exp(x) X, and set it to zero."""
-        s, dx = self.state, self.x[:, 0]
-        xi = np.zeros((self.slots + 1, 3, 3))  # rows theta, rho_v, rho_p of each pose
-        xi[0] = dx[:9].reshape(3, 3)
-        xi[1:, ::2] = dx[CORE : s.turn_row].reshape(self.slots, 2, 3)
-        X = exp_times(xi[:, 0], xi[:, 1:].transpose(0, 2, 1), s.X)
-        b_g, b_a = s.b_g + dx[9:12], s.b_a + dx[12:15]
-        field = s.field
-        if field is not None:
-            azimuth, wander, *_ = dx[s.first_field :].tolist()
-            hard_iron_B = field.hard_iron_B + dx[s.first_field + 2 :]
-            field = FieldState(field.azimuth + azimuth, field.wander + wander, hard_iron_B)
-        turn = s.network_turn + float(dx[s.turn_row])
-        values = {"X": X, "b_g": b_g, "b_a": b_a, "network_turn": turn, "field": field}
-        self.state = changed(s, covariances=covariances, **values)
-        self.x = np.zeros((len(dx), 1))
+        self.state = changed(self.state.plus(self.x[:, 0]), covariances=covariances)
+        self.x = np.zeros_like(self.x)

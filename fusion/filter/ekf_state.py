@@ -1,29 +1,31 @@
 """State of the filter at one time, as a value that is never modified in place.
 
 Error state, its order and meaning: README.md, "Error state". The poses lie on SE_2(3) (clones:
-SE(3)); the covariance is that of their right-invariant error. Callers get plain errors; all
-estimates of a recording are converted to them at its end.
+SE(3)); the covariance is that of their right-invariant error.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CLONE, CORE, plain_covariance
-from stario.fusion.state import NavState, SmoothedPose, changed
+from stario.fusion.filter.estimates import Estimate, nav_states
+from stario.fusion.filter.jacobians import (
+    ACTUAL,
+    ASSUMED,
+    CLONE,
+    CLONED,
+    CORE,
+    plain_covariance,
+    symmetric,
+)
+from stario.fusion.lie import exp_times
+from stario.fusion.state import NavState, changed
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
-
-_CLONE_COLUMNS = [0, 1, 2, 4]
-"""Columns R and p of a pose: a clone has no velocity."""
-
-GYRO_BIAS = slice(9, 12)
-"""Rows of the gyroscope's bias in the error state."""
 
 CONSIDERED_SECONDS = np.array([1.2, 1.2, 1.2, math.inf, math.inf, 10.0])
 """Correlation times [s] of the network's errors that are considered and never estimated: those that
@@ -34,9 +36,6 @@ _MAX_ORIGIN_DISTANCE = 1e3
 """Positions farther than this from the origin [m] are expressed relative to a nearby point: in the
 right-invariant error they multiply the attitude error, which leaves no digits for centimetres when
 they are map coordinates."""
-
-_CHUNK = 2000
-"""Number of estimates converted at a time: all of an hour would take hundreds of megabytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,33 +52,6 @@ class FieldState:
     azimuth: float
     wander: float
     hard_iron_B: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """A filter's estimate of its newest state, or of a clone.
-
-    Attributes:
-        time: [s].
-        X: (3, 5) R_WB, v_W, p_W; for a clone (3, 4) R_WB, p_W. The position is relative to
-            `origin_W`.
-        origin_W: (3,) [m].
-        b_g: (3,) gyroscope bias [rad/s].
-        b_a: (3,) accelerometer bias [m/s^2].
-        covariances: (2, 15, 15) of theta, rho_v, rho_p, d_bg, d_ba, or for a clone (2, 6, 6) of
-            theta, rho_p: as assumed for the gains, and as it is (see `EkfState`).
-        in_gap: as in `NavState`.
-        map_frame: as in `NavState`.
-    """
-
-    time: float
-    X: FloatArray
-    origin_W: FloatArray
-    b_g: FloatArray
-    b_a: FloatArray
-    covariances: FloatArray
-    in_gap: bool = False
-    map_frame: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,6 +115,12 @@ class EkfState:
         return P
 
     @property
+    def pose(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """R_WB (3, 3), v_W (3,) [m/s] and, relative to `origin_W`, p_W (3,) [m]."""
+        X = self.X[0]
+        return X[:, :3], X[:, 3], X[:, 4]
+
+    @property
     def R_WB(self) -> FloatArray:
         """Attitude (3, 3), body to world."""
         return self.X[0, :, :3]
@@ -174,12 +152,18 @@ class EkfState:
     @property
     def considered_rows(self) -> slice:
         """Rows of the network's errors that are considered and never estimated."""
-        return slice(self.turn_row + 1, self.first_field)
+        return slice(self.turn_row + 1, self.field_row)
 
     @property
-    def first_field(self) -> int:
+    def field_row(self) -> int:
         """First row of the magnetic field's error: azimuth, wander, hard iron (3)."""
         return self.turn_row + 1 + len(CONSIDERED_SECONDS)
+
+    @property
+    def clone_slots(self) -> list[int]:
+        """Slots that hold a clone, oldest first."""
+        taken = [(time, k) for k, time in enumerate(self.clone_times) if time is not None]
+        return [slot for _, slot in sorted(taken)]
 
     def time_of_clone(self, slot: int) -> float:
         """Return the time at which a clone was taken [s].
@@ -189,8 +173,7 @@ class EkfState:
         """
         time = self.clone_times[slot] if 0 <= slot < len(self.clone_times) else None
         if time is None:
-            occupied = [k for k, t in enumerate(self.clone_times) if t is not None]
-            raise InputError("slot", repr(slot), f"a slot that holds a clone: {occupied}")
+            raise InputError("slot", repr(slot), f"a slot that holds a clone: {self.clone_slots}")
         return time
 
     def clone_pose(self, slot: int) -> tuple[FloatArray, FloatArray]:
@@ -217,12 +200,30 @@ class EkfState:
         Raises:
             InputError: the slot holds no clone.
         """
-        time, first = self.time_of_clone(slot), CORE + CLONE * slot
+        time, first, zero = self.time_of_clone(slot), CORE + CLONE * slot, np.zeros(3)
         rows = slice(first, first + CLONE)
-        X = self.X[1 + slot][:, _CLONE_COLUMNS].copy()
-        covariances = self.covariances[:, rows, rows].copy()
-        return Estimate(
-            time, X, self.origin_W, self.b_g, self.b_a, covariances, map_frame=map_frame
+        covariances = np.zeros((2, CORE, CORE))
+        covariances[:, CLONED[:, None], CLONED] = self.covariances[:, rows, rows]
+        X = self.X[1 + slot].copy()
+        return Estimate(time, X, self.origin_W, zero, zero, covariances, map_frame=map_frame)
+
+    def plus(self, error: FloatArray) -> EkfState:
+        """Return the state moved by an error (n,), X <- exp(error) X, with its covariances."""
+        xi = np.zeros((len(self.X), 3, 3))  # rows theta, rho_v, rho_p of each pose
+        xi[0] = error[:9].reshape(3, 3)
+        xi[1:, ::2] = error[CORE : self.turn_row].reshape(-1, 2, 3)
+        field = self.field
+        if field is not None:
+            azimuth, wander, *_ = error[self.field_row :].tolist()
+            hard_iron_B = field.hard_iron_B + error[self.field_row + 2 :]
+            field = FieldState(field.azimuth + azimuth, field.wander + wander, hard_iron_B)
+        return changed(
+            self,
+            X=exp_times(xi[:, 0], xi[:, 1:].transpose(0, 2, 1), self.X),
+            b_g=self.b_g + error[9:12],
+            b_a=self.b_a + error[12:15],
+            network_turn=self.network_turn + float(error[self.turn_row]),
+            field=field,
         )
 
     def transformed(self, R: FloatArray, shift: FloatArray) -> EkfState:
@@ -246,11 +247,10 @@ class EkfState:
             A[rho : rho + 3, rho : rho + 3] = R
             A[rho : rho + 3, first : first + 3] = skew(shift) @ R
         A[3:6, 3:6] = R
-        P = A @ self.covariances @ A.T
+        P = symmetric(A @ self.covariances @ A.T)
         field = self.field
         if field is not None:
             field = changed(field, azimuth=field.azimuth + math.atan2(R[1, 0], R[0, 0]))
-        P = 0.5 * (P + P.transpose(0, 2, 1))
         return changed(self, X=X, origin_W=origin_W, covariances=P, field=field)
 
     def with_yaw_inflated(self, about_W: FloatArray, sigma: float) -> EkfState:
@@ -266,7 +266,7 @@ class EkfState:
             N[first + 2, 0] = 1.0
             N[rho, 0], N[rho + 1, 0] = y, -x  # -e3 x p
         if self.field is not None:
-            N[self.first_field, 0] = 1.0
+            N[self.field_row, 0] = 1.0
         return changed(self, covariances=self.covariances + sigma**2 * (N @ N.T))
 
     def with_position_inflated(self, sigma: float) -> EkfState:
@@ -278,39 +278,5 @@ class EkfState:
 
     def _poses(self) -> list[tuple[int, int]]:
         """Return the first rows of theta and rho_p of the current pose and of every clone."""
-        rows = (CORE + CLONE * k for k, time in enumerate(self.clone_times) if time is not None)
+        rows = (CORE + CLONE * slot for slot in self.clone_slots)
         return [(0, 6), *((first, first + 3) for first in rows)]
-
-
-def plain_covariances(estimates: Sequence[Estimate], which: int = ACTUAL) -> FloatArray:
-    """Return covariances (N, n, n) of plain errors in W's axes, each true minus estimate.
-
-    Args:
-        estimates: N estimates of newest states, or of clones.
-        which: `ACTUAL` or `ASSUMED`.
-    """
-    P = np.array([e.covariances[which] for e in estimates])
-    X = np.array([e.X for e in estimates])
-    return plain_covariance(P, X[:, :, 3:].transpose(0, 2, 1))
-
-
-def nav_states(estimates: Sequence[Estimate], which: int = ACTUAL) -> list[NavState]:
-    """Convert estimates of newest states to `NavState`; arguments as `plain_covariances`."""
-    states = []
-    for k in range(0, len(estimates), _CHUNK):
-        part = estimates[k : k + _CHUNK]
-        for e, covariance in zip(part, plain_covariances(part, which), strict=True):
-            pose = e.X[:, :3], e.X[:, 3], e.X[:, 4] + e.origin_W
-            biases = e.b_g.copy(), e.b_a.copy()  # those of `e` are the filter's own
-            states.append(NavState(e.time, *pose, *biases, covariance, e.in_gap, e.map_frame))
-    return states
-
-
-def smoothed_poses(clones: Sequence[Estimate]) -> list[SmoothedPose]:
-    """Convert estimates of clones to `SmoothedPose`."""
-    if not clones:
-        return []
-    return [
-        SmoothedPose(e.time, e.X[:, :3], e.X[:, 3] + e.origin_W, covariance, e.map_frame)
-        for e, covariance in zip(clones, plain_covariances(clones), strict=True)
-    ]

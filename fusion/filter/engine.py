@@ -11,16 +11,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from scipy.linalg.lapack import dpotrf, dtrtri
 
-from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CORE, Block
+from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CORE, Block, symmetric
 from stario.sequences.sequence import FloatArray
-
-GateMode = Literal["inflate", "reject"]
 
 _JOSEPH_RATIO = 1e9
 """Ratio of innovation to measurement variance above which differences of P lose their digits."""
@@ -30,12 +28,10 @@ class UpdateResult(NamedTuple):
     """Outcome of one measurement.
 
     Attributes:
-        nis: normalised innovation squared under the covariance of the error, before any
-            inflation; NaN if it could not be computed.
-        dof: dimension of the measurement, the expectation of `nis`.
-        accepted: False if the state was left unchanged.
-        scale: factor by which the measurement covariance was inflated (1: not gated).
         reason: why the measurement was rejected; empty if it was accepted.
+        nis: normalised innovation squared under the covariance of the error, before any
+            inflation; its expectation is m. NaN if it could not be computed.
+        scale: factor by which the measurement covariance was inflated (1: not gated).
         residual: (m,) measured minus predicted; None if the measurement was invalid.
         sigma: (m,) standard deviations of the residual under the covariance of the error; None
             likewise.
@@ -43,14 +39,17 @@ class UpdateResult(NamedTuple):
             is what gates.
     """
 
-    nis: float
-    dof: int
-    accepted: bool
-    scale: float = 1.0
     reason: str = ""
+    nis: float = math.nan
+    scale: float = 1.0
     residual: FloatArray | None = None
     sigma: FloatArray | None = None
     gate_nis: float = math.nan
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the state was updated; a rejected measurement leaves it unchanged."""
+        return not self.reason
 
     @property
     def gated(self) -> bool:
@@ -90,7 +89,6 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
     def __init__(self, dim: int, considered: slice) -> None:
         self._considered = considered
         super().__init__(dim_x=dim, dim_z=3)
-        self.covariances = np.zeros((2, dim, dim))
         self.Q = np.zeros((dim, dim))
 
     @property
@@ -109,8 +107,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         blocks: Sequence[Block],
         covariance: FloatArray,
         gate: float | None = None,
-        gate_mode: GateMode = "inflate",
-        power: float = 1.0,
+        inflation: float | None = 1.0,
         noise: FloatArray | None = None,
         gains_from: int = ASSUMED,
     ) -> UpdateResult:
@@ -122,9 +119,8 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
                 blocks (first column, (m, width)); columns in no block are zero.
             covariance: (m, m) covariance of the measurement.
             gate: NIS above which the measurement counts as an outlier; None for no gate.
-            gate_mode: "inflate" multiplies an outlier's covariance by a power of NIS / gate, so
-                that a run of outliers can still correct a wrong filter; "reject" drops it.
-            power: exponent of NIS / gate in that factor.
+            inflation: an outlier's covariance is multiplied by this power of NIS / gate, so that a
+                run of outliers can still correct a wrong filter; None rejects outliers.
             noise: (m, m) covariance of the measurement's white noise if it is not `covariance`,
                 which then also stands for considered errors.
             gains_from: which covariance determines the gains: `ASSUMED` or `ACTUAL`.
@@ -133,9 +129,8 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
             The outcome. Values that are not finite and covariances that are not positive definite
             are rejected with a reason; the state is then unchanged.
         """
-        m = len(residual)
         if reason := fault_of(residual, covariance):
-            return UpdateResult(math.nan, m, False, reason=reason)
+            return UpdateResult(reason)
         HP = _sum([H @ self.covariances[:, first : first + H.shape[1]] for first, H in blocks])
         HPH = _sum([HP[:, :, first : first + H.shape[1]] @ H.T for first, H in blocks])
         R = np.array((covariance, covariance if noise is None else noise))
@@ -145,18 +140,18 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         gate_nis = _square(whitener @ residual)
         scale = 1.0
         if gate is not None and gate_nis > gate:
-            if gate_mode == "reject":
-                return UpdateResult(nis, m, False, 1.0, "gated", residual, sigma, gate_nis)
-            scale = (gate_nis / gate) ** power
+            if inflation is None:
+                return UpdateResult("gated", nis, 1.0, residual, sigma, gate_nis)
+            scale = (gate_nis / gate) ** inflation
             R = R * scale
             S = HPH + R
             whitener = _whitener(S[gains_from])
         if not math.isfinite(gate_nis):
-            return UpdateResult(math.nan, m, False, reason="innovation covariance not invertible")
+            return UpdateResult("innovation covariance not invertible")
         self.R, self.S = R[gains_from], S[gains_from]
         self._set_gain(residual, HP[gains_from], whitener)
         self.inject(self._with_gain(blocks, R, HP, S))
-        return UpdateResult(nis, m, True, scale, "", residual, sigma, gate_nis)
+        return UpdateResult("", nis, scale, residual, sigma, gate_nis)
 
     def inject(self, covariances: FloatArray) -> None:
         """Move the error's mean `x` into the state and set it to zero, with new covariances."""
@@ -179,8 +174,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         P = covariances.copy()
         P[:, :CORE] = transition @ P[:, :CORE]
         P[:, CORE:, :CORE] = P[:, :CORE, CORE:].transpose(0, 2, 1)
-        core = P[:, :CORE, :CORE] @ transition.T + noise
-        P[:, :CORE, :CORE] = 0.5 * (core + core.transpose(0, 2, 1))
+        P[:, :CORE, :CORE] = symmetric(P[:, :CORE, :CORE] @ transition.T + noise)
         return P
 
     def _set_gain(self, residual: FloatArray, HP: FloatArray, whitener: FloatArray) -> None:
@@ -205,7 +199,7 @@ class ErrorStateEngine(ExtendedKalmanFilter):  # type: ignore[misc]  # filterpy 
         for first, H in blocks:
             A[:, first : first + H.shape[1]] -= K @ H
         P = A @ P @ A.T + K @ R @ K.T
-        return np.asarray(0.5 * (P + P.transpose(0, 2, 1)))
+        return symmetric(P)
 
 
 def fault_of(value: FloatArray, covariance: FloatArray) -> str:

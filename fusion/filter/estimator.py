@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.displacements import DisplacementUpdates
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import EkfState, Estimate, nav_states, smoothed_poses
+from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.engine import UpdateResult
+from stario.fusion.filter.estimates import Estimate, nav_states, smoothed_pose
 from stario.fusion.filter.estimator_state import (
     EstimatorState,
     History,
@@ -27,15 +28,14 @@ from stario.fusion.filter.initial import PriorPose, initialise, reinitialise, ti
 from stario.fusion.filter.magnetic import MagneticUpdates, north_fix
 from stario.fusion.filter.map_frame import MapFrame
 from stario.fusion.filter.network_errors import ACCEL_SHARE
-from stario.fusion.filter.zero_velocity import StillnessDetector, ZeroVelocity, ZeroVelocityUpdates
+from stario.fusion.filter.zero_velocity import ZeroVelocity, ZeroVelocityUpdates
 from stario.fusion.fixes import Accepted, Fix, by_time
 from stario.fusion.health import Health, SampleCounts
-from stario.fusion.imu.gap import INTERPOLATED, gap_rotation, yaw_variance
+from stario.fusion.imu.gap import INTERPOLATED
 from stario.fusion.imu.intervals import ImuInterval, Start, split_at_fixes
 from stario.fusion.imu.preintegration import Segment, segment_of
-from stario.fusion.imu.stateful import Displacement
+from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.state import NavState, SmoothedPose, changed
-from stario.sequences.windows import WINDOW_SECONDS
 
 
 class Estimator:
@@ -64,16 +64,14 @@ class Estimator:
         streaming: bool = False,
     ) -> None:
         f = config.filter
-        self._config, self._start, self._streaming = config, start.time, streaming
+        self._config, self._streaming = config, streaming
         self.ekf = StateCloningEkf(f.window_updates, config.gravity)
-        self.frame = MapFrame(self.ekf, prior, f.gate, f.network_turn_sigma)
+        self.frame = MapFrame(self.ekf, prior, f)
         self._hypotheses = HypothesisPair(self.ekf)
         self._displacements = DisplacementUpdates(self._hypotheses, f)
         self.bias = AdaptiveBiasPrior(self._hypotheses, config, start.time)
-        detector = StillnessDetector(round(f.output_rate * WINDOW_SECONDS), f.stillness_noise)
-        self._rest = ZeroVelocityUpdates(self._hypotheses, self.bias, detector, f.gate)
+        self._rest = ZeroVelocityUpdates(self._hypotheses, self.bias, f)
         self._magnetic = MagneticUpdates(self._hypotheses)
-        self._clones: tuple[int, ...] = ()
         self._counts = UpdateCounts()
         self.in_gap = False
         self._history: History = ()
@@ -85,7 +83,10 @@ class Estimator:
     # --- one interval ----------------------------------------------------------------------------
 
     def step(
-        self, interval: ImuInterval, displacement: Displacement | None, fixes: Sequence[Fix] = ()
+        self,
+        interval: ImuInterval,
+        displacement: WindowDisplacement | None,
+        fixes: Sequence[Fix] = (),
     ) -> IntervalMeasurements:
         """Move to the interval's end and apply the displacement of the window that ends there.
 
@@ -94,7 +95,7 @@ class Estimator:
             displacement: predicted displacement; None if no window ends or none is available.
             fixes: fixes up to the interval's end that were not given before, in order of time.
         """
-        factor = self._displacements.accel_noise.factor
+        factor = self._displacements.statistics.accel_factor
         if factor != interval.accel_factor:
             interval = changed(interval, accel_factor=factor)
         if self._streaming:
@@ -105,7 +106,7 @@ class Estimator:
         zupt = self._update_zero_velocity(interval)
         # Zero velocity is more accurate than a network trained on walks, off by 1 cm/s at rest.
         offered = displacement if zupt is None else None
-        outcome, revoked = self._update_displacement(interval, offered)
+        outcome, revoked = self._update_displacement(offered)
         bearing = self._update_bearing(interval)
         accepted += self._update_north()
         self.bias.update(interval)
@@ -124,7 +125,7 @@ class Estimator:
         Returns:
             All fixes applied since then, in order.
         """
-        found = rewound(self.state, self._start, fix.time)
+        found = rewound(self.state, fix.time)
         if found is None:
             return None
         self.state, steps = found
@@ -143,7 +144,8 @@ class Estimator:
         """
         self.in_gap = interval.gap
         if interval.gap:
-            self._release_clones()
+            for slot in self.ekf.state.clone_slots:  # no displacement spans a gap
+                self.ekf.release(slot)
             if interval.duration > INTERPOLATED:
                 # Nothing links them to the track after it, which they would seem to place.
                 self._counts = self._counts.add("fixes", *["in a long gap"] * len(fixes))
@@ -165,28 +167,22 @@ class Estimator:
         return (segment if len(pieces) == 1 else None), accepted
 
     def _propagate_piece(self, piece: ImuInterval, interval: ImuInterval) -> Segment | None:
-        """Propagate through a piece of an interval."""
-
-        def propagate() -> Segment:
-            s = self.ekf.state
-            segment = segment_of(piece, s.b_g, s.b_a, self._config)
-            self.ekf.propagate(segment, accel_share)
-            return segment
-
+        """Propagate through a piece of an interval; return its segment, None in a gap."""
         if interval.gap:
-            self._propagate_in_gap(piece, interval)
+            self.ekf.propagate_in_gap(piece, interval, self._config)
+            self.frame.lose_yaw()
             return None
         # The noise of faulty samples is what it may be.
         correlated = self._config.filter.correlated_errors
         accel_share = ACCEL_SHARE if correlated and not any(interval.flags) else 1.0
-        return self._hypotheses.apply_to_both(propagate)
 
-    def _propagate_in_gap(self, piece: ImuInterval, gap: ImuInterval) -> None:
-        """Propagate through a piece of a gap."""
-        before, after = (yaw_variance(time - gap.start, gap) for time in (piece.start, piece.stop))
-        rotation = gap_rotation(piece.table, gap.duration, self.ekf.state.b_g)
-        self.ekf.propagate_in_gap(piece.stop, rotation, after - before, self._config)
-        self.frame.lose_yaw()
+        def propagate() -> Segment:
+            s = self.ekf.state
+            segment = segment_of([piece], s.b_g, s.b_a, self._config)
+            self.ekf.propagate(segment, accel_share)
+            return segment
+
+        return self._hypotheses.apply_to_both(propagate)
 
     def _update_fix(self, fix: Fix) -> Accepted | None:
         result = self.frame.update(fix)
@@ -202,7 +198,7 @@ class Estimator:
         return measured if result.accepted else None
 
     def _update_displacement(
-        self, interval: ImuInterval, displacement: Displacement | None
+        self, displacement: WindowDisplacement | None
     ) -> tuple[UpdateResult | None, tuple[float, ...]]:
         """Update with a displacement from the oldest clone.
 
@@ -210,10 +206,8 @@ class Estimator:
         """
         if displacement is None:
             return None, ()
-        assert interval.R_NB_window is not None  # a window comes with its initial attitude
-        result, revoked = self._displacements.update(
-            self._clones[0], interval.R_NB_window, *displacement
-        )
+        oldest = self.ekf.state.clone_slots[0]
+        result, revoked = self._displacements.update(oldest, displacement)
         self._counts = self._counts.add_displacement(result)
         return result, revoked
 
@@ -242,21 +236,11 @@ class Estimator:
         return (before, self.ekf.state) if self._streaming else None
 
     def _clone(self) -> None:
-        if len(self._clones) < self.ekf.slots:
-            self._clones = (*self._clones, self._hypotheses.apply_to_both(self.ekf.clone))
-            return
-        slot, *later = self._clones
-        self.released = self.ekf.state.clone_estimate(slot, len(self.frame.state.transforms))
-        self._clones = (
-            *later,
-            self._hypotheses.apply_to_both(lambda: self.ekf.clone(instead_of=slot)),
-        )
-
-    def _release_clones(self) -> None:
-        """Release the clones: no displacement spans a gap."""
-        for slot in self._clones:
-            self.ekf.release(slot)
-        self._clones = ()
+        slots, oldest = self.ekf.state.clone_slots, None
+        if len(slots) == self.ekf.slots:
+            oldest = slots[0]
+            self.released = self.ekf.state.clone_estimate(oldest, len(self.frame.state.transforms))
+        self._hypotheses.apply_to_both(lambda: self.ekf.clone(instead_of=oldest))
 
     # --- state and results -----------------------------------------------------------------------
 
@@ -265,14 +249,11 @@ class Estimator:
         """All that varies; assign an earlier one to restore it."""
         return EstimatorState(
             self.ekf.state,
-            self._clones,
             self.frame.state,
             self._rest.detector.window,
             self._magnetic.reference,
-            self._displacements.outlier_share,
+            self._displacements.statistics,
             self.bias.prior,
-            self._displacements.accel_noise,
-            self._displacements.error_level,
             self._hypotheses.alternative,
             self._counts,
             self.released,
@@ -281,13 +262,11 @@ class Estimator:
 
     @state.setter
     def state(self, s: EstimatorState) -> None:
-        self.ekf.state, self._clones = s.ekf, s.clones
-        self.frame.state, self._rest.detector.window = s.map_frame, s.stillness
+        self.ekf.state, self.frame.state = s.ekf, s.map_frame
+        self._rest.detector.window = s.stillness
         self._magnetic.reference, self.bias.prior = s.magnetic, s.bias_prior
         self._counts = s.counts
-        self._displacements.outlier_share = s.outlier_share
-        self._displacements.accel_noise = s.accel_noise
-        self._displacements.error_level = s.error_level
+        self._displacements.statistics = s.statistics
         self._hypotheses.alternative = s.alternative
         self.released, self._history = s.released, s.history
 
@@ -304,7 +283,7 @@ class Estimator:
     @property
     def smoothed(self) -> SmoothedPose | None:
         """`released` as a `SmoothedPose`; None at first."""
-        return smoothed_poses([self.released])[0] if self.released else None
+        return None if self.released is None else smoothed_pose(self.released)
 
     def estimate(self) -> Estimate:
         """Return the estimate of the filter's newest state."""
@@ -317,8 +296,8 @@ class Estimator:
     def health(self, counts: SampleCounts, state: NavState | None = None) -> Health:
         """Return the health report so far, with the sigmas of `state` if given."""
         health = self._counts.health(counts, state or self.nav_state())
-        health.accel_noise_factor = self._displacements.accel_noise.factor
-        health.network_error_level = self._displacements.error_level.level
+        health.accel_noise_factor = self._displacements.statistics.accel_factor
+        health.network_error_level = self._displacements.statistics.error_level
         if self._config.filter.declination is not None and not self.frame.state.oriented:
             health.notes.append("north could not be determined: the track starts with yaw zero")
         return health

@@ -13,19 +13,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stario.fusion.filter.ekf_state import EkfState, Estimate
+from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.engine import UpdateResult
+from stario.fusion.filter.estimates import Estimate
 from stario.fusion.filter.frame_transform import MapFrameState
 from stario.fusion.filter.gyro_bias import GyroBiasPrior
 from stario.fusion.filter.hypotheses import AlternativeHypothesis
 from stario.fusion.filter.magnetic import MagneticReference
-from stario.fusion.filter.network_errors import AccelNoiseScale, ErrorLevel
+from stario.fusion.filter.network_errors import InnovationStatistics
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.health import Health, SampleCounts
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.imu.stateful import Displacement
+from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.state import Innovations, NavState, changed
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS
@@ -35,7 +36,7 @@ class IntervalMeasurements(NamedTuple):
     """An IMU interval and the measurements applied in it."""
 
     interval: ImuInterval
-    offered: Displacement | None
+    offered: WindowDisplacement | None
     """Predicted displacement of the window ending here; None if no window ends, or at rest."""
     outcome: UpdateResult | None
     """Outcome of the update with it; None without one."""
@@ -52,12 +53,12 @@ class IntervalMeasurements(NamedTuple):
     """The preintegrated samples; None for a gap, and if fixes split them."""
 
     @property
-    def displacement(self) -> Displacement | None:
+    def displacement(self) -> WindowDisplacement | None:
         """The displacement with its inflated covariance; None if there is none or it is refused."""
         if self.offered is None or self.outcome is None or not self.outcome.accepted:
             return None
-        d_N, covariance_N = self.offered
-        return d_N, self.outcome.scale * covariance_N
+        covariance_N = self.outcome.scale * self.offered.covariance_N
+        return self.offered._replace(covariance_N=covariance_N)
 
 
 @dataclass(frozen=True)
@@ -155,7 +156,7 @@ class Step:
 
     before: EstimatorState
     interval: ImuInterval
-    displacement: Displacement | None
+    displacement: WindowDisplacement | None
     fixes: Sequence[Fix]
 
 
@@ -165,14 +166,11 @@ class EstimatorState:
 
     Attributes:
         ekf: pose, biases, clones and their covariance.
-        clones: slots of the clones, oldest first.
         map_frame: what is known about the map frame.
         stillness: sums over the last second (`StillnessDetector`).
         magnetic: usual size, dip and spread of the magnetic field.
-        outlier_share: fraction of outliers among recent displacements.
+        statistics: what the innovations of displacements tell.
         bias_prior: prior of the gyroscope's bias, as currently applied in the filter.
-        accel_noise: estimated scale of the accelerometer's noise.
-        error_level: estimated level of the network's errors.
         alternative: the alternative hypothesis; None while all displacements fit.
         counts: updates by outcome.
         released: newest pose that left the window, corrected by the whole window.
@@ -180,14 +178,11 @@ class EstimatorState:
     """
 
     ekf: EkfState
-    clones: tuple[int, ...]
     map_frame: MapFrameState
     stillness: tuple[FloatArray | None, ...]
     magnetic: MagneticReference
-    outlier_share: float
+    statistics: InnovationStatistics
     bias_prior: GyroBiasPrior
-    accel_noise: AccelNoiseScale
-    error_level: ErrorLevel
     alternative: AlternativeHypothesis | None
     counts: UpdateCounts
     released: Estimate | None
@@ -201,7 +196,7 @@ History = tuple[Step, ...]
 def with_step(
     state: EstimatorState,
     interval: ImuInterval,
-    displacement: Displacement | None,
+    displacement: WindowDisplacement | None,
     fixes: Sequence[Fix],
 ) -> History:
     """Return the history with the step that is about to begin, without those too old for a fix.
@@ -217,21 +212,18 @@ def with_step(
     return (*(s for s in state.history if s.interval.stop >= oldest), step)
 
 
-def rewound(
-    state: EstimatorState, start: float, time: float
-) -> tuple[EstimatorState, History] | None:
+def rewound(state: EstimatorState, time: float) -> tuple[EstimatorState, History] | None:
     """Return the state before the step that contains a time, and the steps to be repeated.
 
     Args:
         state: the newest state, with its history.
-        start: start of the stream [s].
         time: time of a late fix [s].
 
     Returns:
         None if the time is more than a window ago, or before the stream began.
     """
     steps = state.history
-    oldest = max(start, state.ekf.time - WINDOW_SECONDS - SAME_TIME)
+    oldest = state.ekf.time - WINDOW_SECONDS - SAME_TIME
     if time < oldest or not steps or time < steps[0].interval.start:
         return None
     k = int(np.searchsorted([step.interval.stop for step in steps[:-1]], time))

@@ -16,13 +16,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.filter.jacobians import CORE
-from stario.fusion.filter.planar_alignment import POSITION, PlanarAlignment, without_yaw
-from stario.fusion.lie import UNKNOWN_YAW
-from stario.fusion.state import NavState, SmoothedPose, changed
+from stario.fusion.filter.jacobians import CORE, POSITION
+from stario.fusion.filter.planar_alignment import PlanarAlignment, without_yaw
+from stario.fusion.lie import UNKNOWN_YAW, e3_cross
+from stario.fusion.state import NavState, changed
 from stario.sequences.sequence import FloatArray, Trajectory
 
-_E3_CROSS = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 _HORIZONTAL = np.diag([1.0, 1.0, 0.0])
 
 
@@ -168,7 +167,7 @@ def _turn_covariance(variance: float, v_W: FloatArray, arm: FloatArray) -> Float
     """Return the covariance (15, 15) of a state due to a turn; the arm (3,) is from the pivot."""
     across, along, with_angle = _turn_moments(variance)
     columns = np.zeros((15, 2))  # columns: across and along
-    columns[3:6, 0], columns[6:9, 0] = _E3_CROSS @ v_W, _E3_CROSS @ arm
+    columns[3:6, 0], columns[6:9, 0] = e3_cross(v_W), e3_cross(arm)
     columns[3:6, 1], columns[6:9, 1] = _HORIZONTAL @ v_W, _HORIZONTAL @ arm
     covariance = columns @ np.diag([across, along]) @ columns.T
     covariance[2, 2] = variance
@@ -202,24 +201,15 @@ def with_undirected(states: list[NavState], undirected: Sequence[FrameTransform]
 
 
 def smoothed_track(
-    poses: list[SmoothedPose], transforms: Sequence[FrameTransform]
+    poses: list[NavState], transforms: Sequence[FrameTransform]
 ) -> Trajectory | None:
     """Return smoothed poses as a track in its final frame; None if there are none."""
     if not poses:
         return None
-    states = to_final_frame(map(_as_state, poses), transforms)
+    states = to_final_frame(poses, transforms)
     return Trajectory(
         time=np.array([s.time for s in states]),
         position_W=np.array([s.p_W for s in states]),
         attitude_WB=Rotation.from_matrix(np.array([s.R_WB for s in states])),
         position_covariance_W=np.array([s.position_covariance for s in states]),
-    )
-
-
-def _as_state(pose: SmoothedPose) -> NavState:
-    """Return a pose as a state at rest without biases."""
-    rows, zero, covariance = [0, 1, 2, 6, 7, 8], np.zeros(3), np.zeros((CORE, CORE))
-    covariance[np.ix_(rows, rows)] = pose.covariance
-    return NavState(
-        pose.time, pose.R_WB, zero, pose.p_W, zero, zero, covariance, map_frame=pose.map_frame
     )

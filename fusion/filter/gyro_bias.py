@@ -15,10 +15,9 @@ import numpy as np
 
 from stario.fusion.config import MIN_PRIOR_SIGMA, NavigatorConfig
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import GYRO_BIAS
 from stario.fusion.filter.engine import with_gain
 from stario.fusion.filter.hypotheses import HypothesisPair
-from stario.fusion.filter.jacobians import ACTUAL, ASSUMED
+from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, GYRO_BIAS
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
 from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import BIAS_SIGMA

@@ -32,16 +32,14 @@ class AlternativeHypothesis:
 
     Attributes:
         ekf: state of the filter under this hypothesis.
-        start_time: time of the first outlier [s].
         offset_W: (3,) the steady error, from the residuals of the outliers [m].
-        outliers: times of the displacements that do not fit as they are [s].
+        outliers: times of the displacements that do not fit as they are [s]; the first opened it.
         shared_fits: number of latest displacements in a row that fitted both.
     """
 
     ekf: EkfState
-    start_time: float
     offset_W: FloatArray
-    outliers: tuple[float, ...] = ()
+    outliers: tuple[float, ...]
     shared_fits: int = 0
 
 
@@ -95,6 +93,6 @@ class HypothesisPair:
             return alternative.outliers
         shared = alternative.shared_fits + 1 if fits else 0
         self.alternative = changed(alternative, shared_fits=shared)
-        if shared >= _FITS_TO_DROP or alternative.ekf.time - alternative.start_time > _MAX_SECONDS:
+        if shared >= _FITS_TO_DROP or alternative.ekf.time - alternative.outliers[0] > _MAX_SECONDS:
             self.alternative = None
         return ()

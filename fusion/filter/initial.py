@@ -9,6 +9,7 @@ import numpy as np
 from stario.fusion.checked import checked, checked_rotation
 from stario.fusion.config import MIN_PRIOR_SIGMA, NavigatorConfig
 from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.lie import UNKNOWN_YAW, yaw_rotation
 from stario.fusion.state import NavState
@@ -54,7 +55,7 @@ class PriorPose:
     def __post_init__(self) -> None:
         for name in ("v_W", "p_W"):
             object.__setattr__(self, name, checked(name, getattr(self, name), (3,)))
-        object.__setattr__(self, "R_WB", checked_rotation("R_WB", self.R_WB))
+        object.__setattr__(self, "R_WB", checked_rotation(self.R_WB))
         for name in ("tilt_sigma", "yaw_sigma", "velocity_sigma", "position_sigma"):
             object.__setattr__(self, name, float(checked(name, getattr(self, name), ())))
             check_number(self, name)
@@ -92,7 +93,7 @@ def reinitialise(ekf: StateCloningEkf, interval: ImuInterval, config: NavigatorC
     covariance[:3, :3] = np.diag(np.square([tilt, tilt, UNKNOWN_YAW]))
     covariance[3:6, 3:6] = max(f.velocity_sigma, MIN_PRIOR_SIGMA) ** 2 * np.eye(3)
     reach = min(GAP_VELOCITY_SIGMA * seconds, MAX_GAP_DISTANCE)
-    covariance[6:9, 6:9] += reach**2 * np.eye(3)
+    covariance[POSITION, POSITION] += reach**2 * np.eye(3)
     walks = np.repeat([config.noise.gyro_walk, config.noise.accel_walk], 3)
     turn_on_sigma = np.repeat([f.gyro_bias_sigma, f.accel_bias_sigma], 3)  # limits the walk
     drift = np.minimum(seconds * np.square(walks), np.square(turn_on_sigma))

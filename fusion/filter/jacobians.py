@@ -12,21 +12,26 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import gtsam
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.gap import gap_covariance
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.lie import twist
+from stario.fusion.lie import e3_cross, twist
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.sequence import FloatArray
 
 CORE = 15
 """Size of the error state of one navigation state."""
 
+POSITION, GYRO_BIAS = slice(6, 9), slice(9, 12)
+"""Rows of position and gyroscope bias in the error state and in the covariance of a `NavState`."""
+
 CLONE = 6
 """Size of the error state of one cloned pose."""
+
+CLONED = np.array([0, 1, 2, 6, 7, 8])
+"""Rows of theta and rho_p, which a clone copies."""
 
 ASSUMED, ACTUAL = 0, 1
 """Indices of the covariances: as assumed for the gains, and of the error that these gains leave."""
@@ -41,9 +46,7 @@ _LAST_MINUS_EYE = -_LAST_EYE
 _LAST_EYE_CORE = np.eye(3, 9, k=6)
 
 
-def displacement_jacobian(
-    p_i_W: FloatArray, p_j_W: FloatArray, slot_i: int, slot_j: int | None
-) -> list[Block]:
+def displacement_jacobian(p_i_W: FloatArray, p_j_W: FloatArray, slot: int) -> list[Block]:
     """Return the Jacobian of the residual of `StateCloningEkf.update_displacement`.
 
     theta_i: [p_i]x - (e3 x (p_j - p_i)) e3^T, rho_pi: -I, theta_j: -[p_j]x, rho_pj: I. The third
@@ -52,15 +55,14 @@ def displacement_jacobian(
     P_i, P_j = skew(np.array((p_i_W, p_j_W)))
     H_i = _LAST_MINUS_EYE.copy()
     H_i[:, :2], H_i[:, 2] = P_i[:, :2], P_j[:, 2]
-    H_j = (_LAST_EYE_CORE if slot_j is None else _LAST_EYE).copy()
+    H_j = _LAST_EYE_CORE.copy()
     H_j[:, :3] -= P_j
-    first_j = 0 if slot_j is None else CORE + CLONE * slot_j
-    return [(CORE + CLONE * slot_i, H_i), (first_j, H_j)]
+    return [(CORE + CLONE * slot, H_i), (0, H_j)]
 
 
 def turn_jacobian(d_W: FloatArray, turn_row: int) -> Block:
     """Return the block for the network's turn in that Jacobian: e3 x d, d (3,) displacement [m]."""
-    return turn_row, np.array([[-d_W[1]], [d_W[0]], [0.0]])
+    return turn_row, e3_cross(d_W)[:, None]
 
 
 def mean_velocity_jacobian(
@@ -109,7 +111,7 @@ def yaw_jacobian(R_WB: FloatArray) -> list[Block]:
     return [(0, np.array([[(s * r21 - c * r20) / n, -(c * r21 + s * r20) / n, 1.0]]))]
 
 
-def bearing_jacobian(R_WB: FloatArray, m_W: FloatArray, first_field: int) -> list[Block]:
+def bearing_jacobian(R_WB: FloatArray, m_W: FloatArray, field_row: int) -> list[Block]:
     """Return the Jacobian of the bearing's residual, measured minus azimuth.
 
     The true bearing is that of (I + [theta]x) (m - R d_h): it moves by theta_z
@@ -119,13 +121,13 @@ def bearing_jacobian(R_WB: FloatArray, m_W: FloatArray, first_field: int) -> lis
     Args:
         R_WB: (3, 3) attitude.
         m_W: (3,) field in the estimated world, hard iron removed [uT].
-        first_field: row of the azimuth's error.
+        field_row: row of the azimuth's error.
     """
     x, y, z = m_W
     n = x * x + y * y
     by_theta = np.array([[z * x / n, z * y / n, -1.0]])
     by_hard_iron = (x * R_WB[1] - y * R_WB[0]) / n
-    return [(0, by_theta), (first_field, np.concatenate([[1.0, 1.0], by_hard_iron])[None])]
+    return [(0, by_theta), (field_row, np.concatenate([[1.0, 1.0], by_hard_iron])[None])]
 
 
 def plain_covariance(P: FloatArray, vectors_W: FloatArray) -> FloatArray:
@@ -141,7 +143,12 @@ def plain_covariance(P: FloatArray, vectors_W: FloatArray) -> FloatArray:
     plain[..., 3:stop, :] -= A @ P[..., :3, :]
     plain[..., 3:stop] -= plain[..., :3] @ A.swapaxes(-1, -2)
     # Far from the origin, rounding in the products would make it asymmetric.
-    return np.asarray(0.5 * (plain + plain.swapaxes(-1, -2)))
+    return symmetric(plain)
+
+
+def symmetric(P: FloatArray) -> FloatArray:
+    """Return covariances (..., n, n) without the asymmetry of rounding."""
+    return np.asarray(0.5 * (P + P.swapaxes(-1, -2)))
 
 
 def invariant_from_local(R_WB: FloatArray, v_W: FloatArray, p_W: FloatArray) -> FloatArray:
@@ -183,12 +190,8 @@ def propagated(
     accel_share: float = 1.0,
 ) -> Propagation:
     """Return `Segment.predict` with the transition and noise of the right-invariant error."""
-    start = gtsam.NavState(gtsam.Rot3(R_WB), p_W, v_W)
     bias_jacobian = np.empty((9, 6), order="F")
-    bias = gtsam.imuBias.ConstantBias(b_a, b_g)
-    end = segment.pim.predict(start, bias, None, bias_jacobian)
-    R, v, p = end.attitude().matrix(), end.velocity(), end.position()
-
+    R, v, p = segment.predict(R_WB, v_W, p_W, b_g, b_a, bias_jacobian)
     adjoint = invariant_from_local(R, v, p)
     local = segment.pim.residualCovariance()
     noise = np.empty((2, CORE, CORE))

@@ -15,13 +15,14 @@ the path tells how much the azimuth does.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState, FieldState
 from stario.fusion.filter.engine import UpdateResult, gauss_markov
+from stario.fusion.filter.field_rotation import FieldRotation
 from stario.fusion.filter.hypotheses import HypothesisPair
 from stario.fusion.fixes import Fix, yaw_fix
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
@@ -88,19 +89,6 @@ _AVERAGING_COUNT = 120
 _FIRST_SPREAD, _FIRST_COUNT = 0.2, 20
 """Initial spread, as in a building, and the number of bearings it counts as."""
 
-_MIN_ROTATION, _MAX_STEP = 0.2, 1.1
-"""Two bearings are compared with the gyroscope if the device has rotated by at least the first
-[rad] in at most the second [s]."""
-
-_MAX_UNEXPLAINED = 1.1
-"""Change of the field in W beyond which it contradicts the gyroscope, as a fraction of the change
-in B that rotation alone causes (sums of squares). Swapped or mirrored axes are at 1 to 5; without
-magnets the medians of OxIOD, RIDI, KIPD and tyrex are 0.02 to 0.6, except for two phones that
-hardly rotate on the body."""
-
-_ROTATION_MEMORY, _MIN_ROTATIONS = 0.9, 5
-"""Weight of earlier rotations relative to the next one, and their number before a verdict."""
-
 
 @dataclass(frozen=True, eq=False)
 class MagneticReference:
@@ -114,10 +102,7 @@ class MagneticReference:
         spread: mean deviation of size (fraction) and dip [rad] from their usual values in motion.
         moving_count: number of bearings averaged in `spread`.
         measured: size of the last measured field, including hard iron [uT].
-        before: (3,) last field in B [uT] and (3, 3) attitude R_WB there; None at first.
-        rotations: number of rotations between bearings that were compared with the gyroscope.
-        unexplained: weighted sum of the field's squared changes in W over them [uT^2].
-        explained: likewise of the changes in B that rotation alone would cause [uT^2].
+        rotation: how the field has changed while the device rotated.
     """
 
     time: float = -math.inf
@@ -127,44 +112,7 @@ class MagneticReference:
     spread: float = _FIRST_SPREAD
     moving_count: int = 0
     measured: float = 0.0
-    before: tuple[FloatArray, FloatArray] | None = None
-    rotations: int = 0
-    unexplained: float = 0.0
-    explained: float = 0.0
-
-    @property
-    def contradicts_gyro(self) -> bool:
-        """Whether the field does not rotate against the device as the gyroscope does."""
-        return (
-            self.rotations >= _MIN_ROTATIONS
-            and self.unexplained > _MAX_UNEXPLAINED * self.explained
-        )
-
-    def compared(self, s: EkfState, m_B: FloatArray) -> MagneticReference:
-        """Return the reference after comparing the change of a field (3,) with the rotation.
-
-        Call it before `updated`, which notes the time.
-
-        Args:
-            s: the filter's state at the field's time.
-            m_B: (3,) field [uT].
-        """
-        reference = changed(self, before=(m_B, s.R_WB))
-        if self.before is None or s.time - self.time > _MAX_STEP or s.field is None:
-            return reference
-        (earlier_B, earlier_R), iron = self.before, s.field.hard_iron_B
-        rotation = s.R_WB.T @ earlier_R
-        if np.trace(rotation) > 1.0 + 2.0 * math.cos(_MIN_ROTATION):
-            return reference
-        earlier = earlier_B - iron
-        by_rotation = rotation @ earlier - earlier
-        other = m_B - iron - rotation @ earlier
-        return changed(
-            reference,
-            rotations=self.rotations + 1,
-            unexplained=_ROTATION_MEMORY * self.unexplained + float(other @ other),
-            explained=_ROTATION_MEMORY * self.explained + float(by_rotation @ by_rotation),
-        )
+    rotation: FieldRotation = field(default_factory=FieldRotation)
 
     @property
     def wander_sigma(self) -> float:
@@ -247,18 +195,18 @@ def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> 
     yaw = yaw_twist(s.R_WB)
     if s.field is None or reference.count < _MIN_NORTH_COUNT or not math.isfinite(yaw):
         return None
-    c, P = s.first_field, s.P_actual
+    c, P = s.field_row, s.P_actual
     variance = P[2, 2] + P[c, c] - 2.0 * P[2, c]
     turn = math.pi / 2.0 - declination - s.field.azimuth
     sigma = math.sqrt(max(variance, 0.0) + NORTH_SIGMA**2)
     return yaw_fix(s.time, math.remainder(yaw + turn, 2.0 * math.pi), sigma)
 
 
-def first_field(s: EkfState, m_B: FloatArray) -> EkfState:
+def with_field(s: EkfState, m_B: FloatArray) -> EkfState:
     """Return the state with an unknown azimuth, initialised by the first field (3,) [uT]."""
     x, y, _ = s.R_WB @ m_B
     variances = [_FIRST_AZIMUTH_SIGMA**2, WANDER_SIGMA**2, *[HARD_IRON_SIGMA**2] * 3]
-    n = s.first_field
+    n = s.field_row
     P = np.zeros((2, n + len(variances), n + len(variances)))
     P[:, :n, :n], P[:, n:, n:] = s.covariances, np.diag(variances)
     return changed(s, covariances=P, field=FieldState(math.atan2(y, x), 0.0, np.zeros(3)))
@@ -272,9 +220,9 @@ def propagated_field(s: EkfState, seconds: float, sigma: float) -> EkfState:
         seconds: duration [s].
         sigma: standard deviation of the azimuth about its mean [rad].
     """
-    assert s.field is not None  # set by `first_field`
+    assert s.field is not None  # set by `with_field`
     metres = seconds * math.hypot(s.v_W[0], s.v_W[1])
-    row = s.first_field + 1
+    row = s.field_row + 1
     correlation = math.exp(-metres / WANDER_METRES - seconds / WANDER_SECONDS)
     P = gauss_markov(s.covariances, slice(row, row + 1), np.array([correlation]), sigma)
     return changed(s, covariances=P, field=changed(s.field, wander=correlation * s.field.wander))
@@ -290,7 +238,7 @@ def update_bearing(
     """
     now, measured = ekf.state.time, float(np.linalg.norm(m_B))
     if ekf.state.field is None:
-        ekf.state = first_field(ekf.state, m_B)
+        ekf.state = with_field(ekf.state, m_B)
     elif math.isfinite(reference.time):
         ekf.state = propagated_field(ekf.state, now - reference.time, reference.wander_sigma)
     s = ekf.state
@@ -300,11 +248,11 @@ def update_bearing(
     size, dip = math.hypot(horizontal, m_W[2]), math.atan2(-m_W[2], horizontal)
     if horizontal < _MIN_HORIZONTAL:
         reason = "too weak to be in uT" if measured < _WEAKEST else "no horizontal field"
-        return UpdateResult(math.nan, 1, False, reason=reason), changed(reference, time=now)
-    reference = reference.compared(s, m_B)
-    if reference.contradicts_gyro:
-        reason = "contradicts the gyroscope"
-        return UpdateResult(math.nan, 1, False, reason=reason), changed(reference, time=now)
+        return UpdateResult(reason), changed(reference, time=now)
+    rotation = reference.rotation.updated(s, m_B, now - reference.time)
+    reference = changed(reference, rotation=rotation)
+    if rotation.contradicts_gyro:
+        return UpdateResult("contradicts the gyroscope"), changed(reference, time=now)
     extrapolated = abs(measured - reference.measured) < HELD_CHANGE * measured
     new_place = not extrapolated and math.hypot(s.v_W[0], s.v_W[1]) > _MIN_SPEED
     reference = changed(reference.updated(now, size, dip, new_place), measured=measured)

@@ -14,13 +14,14 @@ import math
 import numpy as np
 from numpy.linalg import norm
 
+from stario.fusion.config import FilterConfig
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.frame_transform import FrameTransform, MapFrameState, unoriented_stretch
 from stario.fusion.filter.initial import PriorPose
+from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.filter.network_errors import with_turn
 from stario.fusion.filter.planar_alignment import (
-    POSITION,
     PlanarAlignment,
     plane_sigma,
     turn_from_fix,
@@ -28,7 +29,7 @@ from stario.fusion.filter.planar_alignment import (
 )
 from stario.fusion.fixes import Fix
 from stario.fusion.lie import UNKNOWN_YAW, about_vertical
-from stario.fusion.state import NavState, changed
+from stario.fusion.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 
 MAX_PRIOR_YAW_SIGMA = 0.5
@@ -68,22 +69,19 @@ class MapFrame:
     Args:
         ekf: the filter.
         prior: prior on the first pose; None if the track starts without one.
-        gate: probability of the chi-square test.
-        turn_sigma: sigma of the network's yaw error, `FilterConfig.network_turn_sigma` [rad].
+        config: settings of the filter.
 
     Attributes:
         state: state of the map frame.
     """
 
-    def __init__(
-        self, ekf: StateCloningEkf, prior: PriorPose | None, gate: float, turn_sigma: float
-    ) -> None:
+    def __init__(self, ekf: StateCloningEkf, prior: PriorPose | None, config: FilterConfig) -> None:
         self.state = MapFrameState(placed=False, oriented=False, arbitrary_yaw=True)
         if prior is not None:
             oriented = prior.yaw_sigma <= MAX_PRIOR_YAW_SIGMA
             variance = 2.0 * prior.position_sigma**2
             self.state = MapFrameState(True, oriented, pivot=prior.p_W, pivot_variance=variance)
-        self._ekf, self._gate, self._turn_sigma = ekf, gate, turn_sigma
+        self._ekf, self._config = ekf, config
 
     def update(self, fix: Fix) -> UpdateResult:
         """Apply a fix at the filter's time."""
@@ -96,12 +94,15 @@ class MapFrame:
             doubtful = fix.kind == "position" and self.state.distance_mismatches > 0
             transform = None if doubtful else self._orient(fix)
         if transform is None:
-            reason = "too coarse" if fix.kind == "yaw" else "yaw not known"
-            return UpdateResult(math.nan, len(fix.value), False, reason=reason)
+            return UpdateResult("too coarse" if fix.kind == "yaw" else "yaw not known")
         result = self._update(fix)
         if places:
             self._begin_alignment(fix)
-        completed = self._with_uncertainty(transform, self._ekf.state.nav_state())
+        now = self._ekf.state.nav_state()
+        if places:
+            completed = changed(transform, position_covariance=now.position_covariance)
+        else:
+            completed = changed(transform, yaw_sigma=math.sqrt(now.covariance[2, 2]))
         self.state = changed(self.state, transforms=(*self.state.transforms, completed))
         return result
 
@@ -216,16 +217,10 @@ class MapFrame:
         alignment = self.state.alignment.with_position(track, measured, variance, drift)
         self.state = changed(self.state, alignment=alignment)
 
-    def _with_uncertainty(self, transform: FrameTransform, state: NavState) -> FrameTransform:
-        """Return a transform with its uncertainty, taken from the state after the fix."""
-        if transform.placed:
-            return changed(transform, position_covariance=state.position_covariance)
-        return changed(transform, yaw_sigma=math.sqrt(state.covariance[2, 2]))
-
     def _update(self, fix: Fix) -> UpdateResult:
         if self.state.oriented:
-            self._ekf.state = with_turn(self._ekf.state, self._turn_sigma)
-        gate = chi2_quantile(self._gate, len(fix.value))
+            self._ekf.state = with_turn(self._ekf.state, self._config.network_turn_sigma)
+        gate = chi2_quantile(self._config.gate, len(fix.value))
         if fix.kind == "position":
             return self._update_position(fix, gate)
         if fix.kind == "velocity":

@@ -58,6 +58,9 @@ MAX_FACTOR = 15.0
 _STEPS = 4
 """Number of noise factors per doubling, so that few different noise models are created."""
 
+_SHARE_SECONDS = 20.0
+"""Time over which the share of outliers is averaged [s]."""
+
 TURN_SECONDS = 60.0
 """Correlation time of the network's turn [s]."""
 
@@ -75,65 +78,47 @@ class DisplacementErrors(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ErrorLevel:
-    """Variance of the errors that change within seconds, relative to what the network predicts.
+class InnovationStatistics:
+    """What the innovations of the displacements so far tell.
 
     Attributes:
-        log_level: its natural logarithm.
-        gain: step size for the next displacement.
+        outlier_share: fraction of outliers among recent ones, which are assumed common at first.
+        log_accel_factor: natural logarithm of the factor on the accelerometer's noise density.
+        log_error_level: that of `error_level`.
+        gain: step of both logarithms for the next displacement.
     """
 
-    log_level: float = 0.0
+    outlier_share: float = 0.5
+    log_accel_factor: float = 0.0
+    log_error_level: float = 0.0
     gain: float = FIRST_GAIN
 
     @property
-    def level(self) -> float:
-        """The variance's factor."""
-        return math.exp(self.log_level)
-
-    def updated(self, result: UpdateResult) -> ErrorLevel:
-        """Return the level after one displacement; unchanged if it has no innovation."""
-        if not math.isfinite(result.nis):
-            return self
-        excess = min(result.nis / result.dof - 1.0, _MAX_EXCESS)
-        return ErrorLevel(*_stepped(self.log_level, self.gain, excess, MIN_LEVEL, MAX_LEVEL))
-
-
-@dataclass(frozen=True)
-class AccelNoiseScale:
-    """Factor by which the accelerometer is noisier than configured.
-
-    Attributes:
-        log_factor: natural logarithm of the factor on its noise density.
-        gain: step size for the next displacement.
-    """
-
-    log_factor: float = 0.0
-    gain: float = FIRST_GAIN
+    def accel_factor(self) -> float:
+        """Factor by which the accelerometer is noisier than configured, in steps."""
+        return float(2.0 ** (round(_STEPS * self.log_accel_factor / math.log(2.0)) / _STEPS))
 
     @property
-    def factor(self) -> float:
-        """Factor on the noise density, in steps."""
-        return float(2.0 ** (round(_STEPS * self.log_factor / math.log(2.0)) / _STEPS))
+    def error_level(self) -> float:
+        """Variance of the errors that change within seconds, relative to the predicted one."""
+        return math.exp(self.log_error_level)
 
-    def updated(self, result: UpdateResult) -> AccelNoiseScale:
-        """Return the scale after one displacement; unchanged if it has no innovation."""
-        if not math.isfinite(result.gate_nis):
-            return self
-        ratio = (result.gate_nis / (TARGET_NIS * result.dof)) ** 2
-        excess = 1.0 - 2.0 / (ratio + 1.0)
-        return AccelNoiseScale(*_stepped(self.log_factor, self.gain, excess, 1.0, MAX_FACTOR))
-
-
-def _stepped(
-    log: float, gain: float, excess: float, low: float, high: float
-) -> tuple[float, float]:
-    """Return a logarithm after one step, between those of two bounds, and its next gain.
-
-    The gains are 1/5, 1/6, 1/7, ... down to `GAIN` (Robbins and Monro 1951).
-    """
-    log = min(max(log + gain * excess, math.log(low)), math.log(high))
-    return log, max(1.0 / (1.0 / gain + 1.0), GAIN)
+    def updated(self, result: UpdateResult, f: FilterConfig) -> InnovationStatistics:
+        """Return the statistics after one displacement, which may have no innovation."""
+        change = (result.gated - self.outlier_share) / (f.update_rate * _SHARE_SECONDS)
+        counted = changed(self, outlier_share=self.outlier_share + change)
+        if not (f.adaptive and math.isfinite(result.nis + result.gate_nis)):
+            return counted
+        ratio = (result.gate_nis / (3.0 * TARGET_NIS)) ** 2
+        step = self.gain * (1.0 - 2.0 / (ratio + 1.0))
+        factor = min(max(self.log_accel_factor + step, 0.0), math.log(MAX_FACTOR))
+        level = self.log_error_level
+        if f.correlated_errors:
+            level += self.gain * min(result.nis / 3.0 - 1.0, _MAX_EXCESS)
+            level = min(max(level, math.log(MIN_LEVEL)), math.log(MAX_LEVEL))
+        # The gains are 1/5, 1/6, 1/7, ... down to `GAIN` (Robbins and Monro 1951).
+        gain = max(1.0 / (1.0 / self.gain + 1.0), GAIN)
+        return changed(counted, log_accel_factor=factor, log_error_level=level, gain=gain)
 
 
 def displacement_errors(
@@ -191,8 +176,7 @@ class TurnEstimate(NamedTuple):
     turn: float
     """The turn [rad]."""
     covariance: FloatArray
-    """(16,) covariance with the plain errors of the state (order of `NavState.covariance`), then
-    the turn's variance."""
+    """(16, 16) of the plain errors of the state (order of `NavState.covariance`) and the turn."""
 
 
 def turn_estimate(s: EkfState) -> TurnEstimate | None:
@@ -201,7 +185,7 @@ def turn_estimate(s: EkfState) -> TurnEstimate | None:
         return None
     rows = [*range(CORE), s.turn_row]
     P = plain_covariance(s.P[rows][:, rows], s.X[0, :, 3:].T)
-    return TurnEstimate(s.network_turn, P[CORE])
+    return TurnEstimate(s.network_turn, P)
 
 
 def with_turn(s: EkfState, sigma: float) -> EkfState:

@@ -16,9 +16,6 @@ from stario.fusion.lie import yaw_twist
 from stario.fusion.state import NavState
 from stario.sequences.sequence import FloatArray
 
-POSITION = slice(6, 9)
-"""Rows of the position in the covariance of a `NavState`."""
-
 
 @dataclass(frozen=True, eq=False)
 class PlanarAlignment:

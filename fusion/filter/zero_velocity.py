@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stario.fusion.config import FilterConfig
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior
@@ -117,7 +118,7 @@ def update_zero_velocity(ekf: StateCloningEkf, measured: ZeroVelocity, gate: flo
     s = ekf.state
     residual = np.concatenate([-s.v_W, measured.b_g - s.b_g])
     blocks = [(3, _H_VELOCITY), (9, _H_BIAS)]
-    return ekf.update_linear(residual, blocks, measured.covariance, gate, "reject")
+    return ekf.update_linear(residual, blocks, measured.covariance, gate, None)
 
 
 class ZeroVelocityUpdates:
@@ -126,22 +127,18 @@ class ZeroVelocityUpdates:
     Args:
         hypotheses: the filter and its alternative, which ends where rest is measured.
         bias: the prior of the gyroscope's bias, which is widened before rest measures the bias.
-        detector: detects rest.
-        gate: probability of the chi-square test.
+        config: settings of the filter.
 
     Attributes:
-        detector: the detector.
+        detector: detects rest.
     """
 
     def __init__(
-        self,
-        hypotheses: HypothesisPair,
-        bias: AdaptiveBiasPrior,
-        detector: StillnessDetector,
-        gate: float,
+        self, hypotheses: HypothesisPair, bias: AdaptiveBiasPrior, config: FilterConfig
     ) -> None:
-        self._hypotheses, self._bias, self._gate = hypotheses, bias, chi2_quantile(gate, 6)
-        self.detector = detector
+        self._hypotheses, self._bias, self._gate = hypotheses, bias, chi2_quantile(config.gate, 6)
+        intervals = round(config.output_rate * WINDOW_SECONDS)
+        self.detector = StillnessDetector(intervals, config.stillness_noise)
 
     def update(self, interval: ImuInterval) -> tuple[UpdateResult, ZeroVelocity] | None:
         """Update if the second that ends with an interval was still; None if the device moved."""

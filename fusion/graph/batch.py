@@ -10,6 +10,7 @@ import numpy as np
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.estimator_state import IntervalMeasurements
 from stario.fusion.filter.frame_transform import FrameTransform, frame_rotation
+from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.keyframes import KeyframeGraph
@@ -31,7 +32,7 @@ def smooth(
     transforms: Sequence[FrameTransform],
     config: NavigatorConfig,
     gyro_bias: tuple[FloatArray, FloatArray] | None = None,
-    turn_sigma: float = 0.0,
+    estimates_turn: bool = False,
 ) -> tuple[list[NavState], str]:
     """Optimise a filtered track as a whole.
 
@@ -43,7 +44,7 @@ def smooth(
         config: noise, filter and graph settings.
         gyro_bias: (3,) [rad/s] and covariance (3, 3) at the end, as estimated by the filter with
             the magnetic field, which the graph does not use; None without a field.
-        turn_sigma: standard deviation of the network's turn [rad]; 0 if the filter estimates none.
+        estimates_turn: whether the network's turn is a state, as it is for the filter with fixes.
 
     Returns:
         The graph's states, one for each filtered one, with their marginal covariances; the filtered
@@ -52,7 +53,7 @@ def smooth(
     origin = filtered[0].p_W  # near the track; see `EkfState`
     local = [state.shifted(-origin) for state in filtered]
     first = _inflated(local[0], prior, transforms)
-    builder = GraphBuilder(config, first, turn_sigma=turn_sigma)
+    builder = GraphBuilder(config, first, estimates_turn=estimates_turn)
     revoked = {time for m in measurements for time in m.revoked}
     for m, state in zip(measurements, local[1:], strict=True):
         # Neither is inflated as by the filter: the graph weights outliers by the whole track.
@@ -89,7 +90,7 @@ def _inflated(first: NavState, prior: NavState, transforms: Sequence[FrameTransf
     to_last = frame_rotation(first.R_WB @ prior.R_WB.T)
     covariance = to_last @ prior.covariance @ to_last.T
     if any(transform.placed for transform in transforms):
-        covariance[6:9, 6:9] += _UNKNOWN_POSITION**2 * np.eye(3)
+        covariance[POSITION, POSITION] += _UNKNOWN_POSITION**2 * np.eye(3)
     if not all(transform.placed for transform in transforms):
         covariance[2, 2] += UNKNOWN_YAW**2
     return replace(first, covariance=covariance)

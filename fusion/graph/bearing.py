@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from gtsam.symbol_shorthand import B, X
 
-from stario.fusion.filter.ekf_state import GYRO_BIAS, EkfState
+from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.filter.jacobians import GYRO_BIAS
 from stario.fusion.graph.factors import AtKeyframe, Linearised
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.sequences.attitude.so3 import log_so3

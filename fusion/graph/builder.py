@@ -10,15 +10,16 @@ import numpy as np
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.engine import fault_of
 from stario.fusion.filter.initial import tilt_sigma
-from stario.fusion.filter.network_errors import TURN_SECONDS, TurnEstimate
+from stario.fusion.filter.network_errors import TurnEstimate
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Fix
 from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Tilt, Velocity, Yaw
+from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.imu.gap import gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval, split_at
-from stario.fusion.imu.preintegration import Segment, segment_of, segment_of_all
-from stario.fusion.imu.stateful import Displacement as Measured
+from stario.fusion.imu.preintegration import Segment, segment_of
+from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.lie import about_vertical, yaw_twist
 from stario.fusion.state import NavState
 from stario.sequences.attitude.so3 import exp_so3, log_so3
@@ -42,8 +43,8 @@ class GraphBuilder:
         config: noise, filter and graph settings.
         first: the first state; its covariance is the prior.
         count: number of intervals since the start or the last gap, for a graph that begins later.
-        turn_sigma: standard deviation of the network's turn [rad], where fixes distinguish it from
-            the yaw; 0 for no turn.
+        estimates_turn: whether the network's turn is a state: where fixes distinguish it from the
+            yaw.
         turn: estimate of the turn at the first state; None if it is new.
         streaming: rely on the filter's gating of fixes, and of displacements if it weights them
             equally. A robust loss in the graph starts from the IMU's prediction: while the speed
@@ -54,6 +55,7 @@ class GraphBuilder:
         graph: the graph so far.
         segments: for each keyframe, the intervals' segments up to the next keyframe or now.
         count: number of intervals since the start or the last gap.
+        estimates_turn: whether the network's turn is a state.
     """
 
     def __init__(
@@ -61,14 +63,15 @@ class GraphBuilder:
         config: NavigatorConfig,
         first: NavState,
         count: int = 0,
-        turn_sigma: float = 0.0,
+        estimates_turn: bool = False,
         turn: TurnEstimate | None = None,
         streaming: bool = False,
     ) -> None:
-        self._config, self._turn_sigma = config, turn_sigma
+        self._config = config
         self.graph = KeyframeGraph(first, config.filter.gate, turn)
         self.segments: dict[int, list[Segment]] = {0: []}
         self.count = count
+        self.estimates_turn = estimates_turn
         f = config.filter
         self._streaming = streaming
         self._overlap = 2 if f.update_rate % 2 == 0 else 1
@@ -81,15 +84,10 @@ class GraphBuilder:
         self._window_keyframes: dict[int, int] = {count: 0} if count % self._spacing == 0 else {}
         self._gaps: dict[int, ImuInterval] = {}  # by the keyframe before them
 
-    @property
-    def estimates_turn(self) -> bool:
-        """Whether the network's turn is a state."""
-        return self._turn_sigma > 0.0
-
     def step(
         self,
         interval: ImuInterval,
-        displacement: Measured | None,
+        displacement: WindowDisplacement | None,
         fixes: Sequence[Fix] = (),
         zero_velocity: ZeroVelocity | None = None,
         guess: NavState | None = None,
@@ -119,18 +117,18 @@ class GraphBuilder:
         before = self.graph.last
         self.count += 1
         if segment is None:
-            _, _, _, b_g, b_a = self.graph.pose(before)
-            segment = segment_of(interval, b_g, b_a, self._config)
+            start = self.graph.keyframe(before)
+            segment = segment_of([interval], start.b_g, start.b_a, self._config)
         self.segments[self.graph.last].append(segment)
         self._pending.append(interval.without_window())
         due = self.count % self._spacing == 0
         if due:
             self.close(guess)
             if self.estimates_turn:
-                self.graph.add_turn(self._turn_sigma, TURN_SECONDS)
+                self.graph.add_turn(self._config.filter.network_turn_sigma)
             window_start = self._window_keyframes.get(self.count - self._window)
             if displacement is not None and window_start is not None:
-                self._add_displacement(window_start, interval, *displacement)
+                self._add_displacement(window_start, displacement)
             self._window_keyframes[self.count] = self.graph.last
             if zero_velocity is not None:
                 self._add_zero_velocity(zero_velocity)
@@ -144,15 +142,15 @@ class GraphBuilder:
             return
         graph = self.graph
         pieces = self.segments[graph.last]
-        segment = pieces[0]
+        segment, start = pieces[0], graph.keyframe(graph.last)
         if len(pieces) > 1:
-            _, _, _, b_g, b_a = graph.pose(graph.last)
-            segment = segment_of_all(self._pending, b_g, b_a, self._config)
+            segment = segment_of(self._pending, start.b_g, start.b_a, self._config)
         if guess is None:
-            _, _, _, b_g, b_a = graph.pose(graph.last)
-            guess = NavState(segment.stop, *self.dead_reckoned(graph.last), b_g, b_a, np.empty(0))
+            state = KeyframeState(*self.dead_reckoned(graph.last), start.b_g, start.b_a)
+        else:
+            state = KeyframeState.from_nav(guess)
         self._pending = []
-        self.segments[graph.add_keyframe(segment, guess)] = []
+        self.segments[graph.add_keyframe(segment, state)] = []
 
     def fix(self, fix: Fix) -> bool:
         """Add a fix up to now to the keyframe before it; return False if there is none."""
@@ -177,7 +175,7 @@ class GraphBuilder:
 
     def dead_reckoned(self, k: int, time: float = math.inf) -> Pose:
         """Dead-reckon from a keyframe to a time [s], or to the end of its data if earlier."""
-        R, v, p, b_g, b_a = self.graph.pose(k)
+        R, v, p, b_g, b_a, _ = self.graph.keyframe(k)
         if k in self._gaps:
             gap = self._gaps[k]
             until = min(time, gap.stop)
@@ -209,15 +207,12 @@ class GraphBuilder:
         self.segments[graph.last] = []
         self._window_keyframes = {0: graph.last}
 
-    def _add_displacement(
-        self, i: int, interval: ImuInterval, d_N: FloatArray, covariance_N: FloatArray
-    ) -> None:
+    def _add_displacement(self, i: int, displacement: WindowDisplacement) -> None:
+        d_N, covariance_N, R_NB = displacement
         covariance = covariance_N * (self._overlap * self._config.filter.covariance_scale)
         if fault_of(d_N, covariance):
             return
-        assert interval.R_NB_window is not None  # a window always comes with its first attitude
-        j, R_NB = self.graph.last, interval.R_NB_window
-        term = Displacement(i, j, d_N, R_NB, covariance, self.estimates_turn)
+        term = Displacement(i, self.graph.last, d_N, R_NB, covariance)
         self.graph.add(term, gated=not self._gated_by_filter)
 
     def _add_zero_velocity(self, zero_velocity: ZeroVelocity) -> None:
@@ -230,7 +225,7 @@ class GraphBuilder:
     def _fix_term(self, fix: Fix, k: int) -> Term:
         graph = self.graph
         dt = fix.time - graph.time(k)
-        R_k, v_k, p_k, _, _ = graph.pose(k)
+        R_k, v_k, p_k, *_ = graph.keyframe(k)
         R, v, p = (R_k, v_k, p_k) if dt <= SAME_TIME else self.dead_reckoned(k, fix.time)
         dt, f = max(dt, 0.0), self._config.filter
         # Noise of the IMU since the keyframe, or of the motion in a gap.

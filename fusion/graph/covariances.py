@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stario.fusion.filter.ekf_state import Estimate, plain_covariances
-from stario.fusion.filter.jacobians import ACTUAL, ASSUMED
+from stario.fusion.filter.estimates import Estimate, plain_covariances
+from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, symmetric
 from stario.fusion.state import NavState, changed
 from stario.sequences.sequence import FloatArray
 
@@ -48,8 +48,7 @@ def with_actual_covariances(
     if turns is not None:
         T = turns @ T @ np.swapaxes(turns, 1, 2)
     covariance = np.array([state.covariance for state in states])
-    covariance = T @ covariance @ T.transpose(0, 2, 1)
-    covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
+    covariance = symmetric(T @ covariance @ T.transpose(0, 2, 1))
     return [changed(s, covariance=c) for s, c in zip(states, covariance, strict=True)]
 
 

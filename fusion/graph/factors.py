@@ -19,11 +19,11 @@ from typing import Any, Protocol
 import numpy as np
 from gtsam.symbol_shorthand import B, T, V, X
 
-from stario.fusion.filter.jacobians import CORE, plain_covariance
+from stario.fusion.filter.jacobians import plain_covariance
 from stario.fusion.filter.network_errors import TurnEstimate
 from stario.fusion.graph.covariances import root_information
-from stario.fusion.graph.keyframe_state import KeyframeState
-from stario.fusion.lie import about_vertical, twist, yaw_rotation
+from stario.fusion.graph.keyframe_state import KeyframeState, turn_at
+from stario.fusion.lie import about_vertical, e3_cross, twist, yaw_rotation
 from stario.fusion.state import NavState
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.sequence import FloatArray
@@ -86,29 +86,23 @@ class Prior:
     Attributes:
         k: number of the first keyframe.
         reference: n states, of keyframe k and its successors, from which the error is measured.
-        root: (m, 15 n + t) square-root information; columns of the keyframes, then of the turns.
+        root: (m, ...) square-root information, with the columns of one keyframe after the other.
         offset: (m,) right-hand side.
-        turns: t keyframes with a network's turn, and the turn [rad] at which its error is zero.
     """
 
     k: int
     reference: tuple[KeyframeState, ...]
     root: FloatArray
     offset: FloatArray
-    turns: tuple[tuple[int, float], ...] = ()
 
     @classmethod
     def of(cls, k: int, state: NavState, turn: TurnEstimate | None = None) -> Prior:
         """Return the prior of keyframe k from a state and the network's turn, if estimated."""
-        reference = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
-        covariance: FloatArray = state.covariance
-        turns: tuple[tuple[int, float], ...] = ()
+        reference, covariance = KeyframeState.from_nav(state), state.covariance
         if turn is not None:
-            cross = turn.covariance[:CORE, None]
-            covariance = np.block([[covariance, cross], [cross.T, turn.covariance[CORE:, None]]])
-            turns = ((k, turn.turn),)
+            reference, covariance = reference._replace(turn=turn.turn), turn.covariance
         root = root_information(plain_covariance(covariance, -np.stack([state.v_W, state.p_W])))
-        return cls(k, (reference,), root, np.zeros(len(root)), turns)
+        return cls(k, (reference,), root, np.zeros(len(root)))
 
     @property
     def keyframes(self) -> tuple[int, ...]:
@@ -122,16 +116,13 @@ class Prior:
 
     def linearise(self, values: Any) -> Linearised:
         """Linearise in the rows of the root."""
-        residual, blocks = self.offset, []
-        for n, (k, reference) in enumerate(zip(self.keyframes, self.reference, strict=True)):
-            root = self.root[:, CORE * n : CORE * (n + 1)]
+        residual, blocks, rest = self.offset, [], self.root
+        for k, reference in zip(self.keyframes, self.reference, strict=True):
             state = KeyframeState.of(values, k)
-            residual = residual - root @ state.error_from(reference)
-            H = root @ state.invariant_from_local()
-            blocks += [(X(k), H[:, :6]), (V(k), H[:, 6:9]), (B(k), H[:, 9:])]
-        for n, (k, turn) in enumerate(self.turns, CORE * len(self.reference)):
-            residual = residual - self.root[:, n] * (turn_at(values, k) - turn)
-            blocks.append((T(k), self.root[:, n : n + 1]))
+            error = state.error_from(reference)
+            root, rest = rest[:, : len(error)], rest[:, len(error) :]
+            residual = residual - root @ error
+            blocks += state.blocks(k, root @ state.invariant_from_local())
         return residual, blocks
 
 
@@ -142,36 +133,35 @@ class Displacement(Between):
     The network is given the window in a levelled frame N, whose yaw psi relative to W is that of
     R_WB R_NB^T at the window's start: p_j - p_i = R_z(psi) (d_N + n). It turns with the yaw of
     pose i alone, as in the filter's `update_displacement`; a `BetweenFactorPose3` would also infer
-    tilt from it, which on some recordings doubles the error.
+    tilt from it, which on some recordings doubles the error. Where the network's turn tau at
+    keyframe j is estimated, d_N = R_z(tau) R_z(psi)^T (p_j - p_i) - n, as in the filter (README.md,
+    "Fixes").
 
     Attributes:
         d_N: (3,) displacement [m].
         R_NB: (3, 3) levelled attitude at the window's start.
         covariance: (3, 3) [m^2] in N.
-        turned: whether the network's turn tau at keyframe j is a state; then
-            d_N = R_z(tau) R_z(psi)^T (p_j - p_i) - n, as in the filter (README.md, "Fixes").
     """
 
     d_N: FloatArray
     R_NB: FloatArray
     covariance: FloatArray
-    turned: bool = False
 
     def linearise(self, values: Any) -> Linearised:
         """Linearise in the axes of N."""
         (R_i, p_i), (R_j, p_j) = _pose(values, self.i), _pose(values, self.j)
         R_NW = yaw_rotation(R_i @ self.R_NB.T).T
-        if self.turned:
+        turned = values.exists(T(self.j))
+        if turned:
             R_NW = about_vertical(turn_at(values, self.j)) @ R_NW
         d_W = p_j - p_i
         H_i, H_j = np.zeros((3, 6)), np.zeros((3, 6))
-        sideways = np.array([-d_W[1], d_W[0], 0.0])  # e3 x (p_j - p_i)
-        H_i[:, :3] = -np.outer(R_NW @ sideways, R_i[2])
+        H_i[:, :3] = -np.outer(R_NW @ e3_cross(d_W), R_i[2])
         H_i[:, 3:] = -R_NW @ R_i
         H_j[:, 3:] = R_NW @ R_j
         predicted, blocks = R_NW @ d_W, [(X(self.i), H_i), (X(self.j), H_j)]
-        if self.turned:
-            blocks.append((T(self.j), np.array([[-predicted[1]], [predicted[0]], [0.0]])))
+        if turned:
+            blocks.append((T(self.j), e3_cross(predicted)[:, None]))
         return self.d_N - predicted, blocks
 
 
@@ -278,11 +268,6 @@ class GyroBias(AtKeyframe):
         """Linearise in B."""
         residual = self.b_g - values.atConstantBias(B(self.k)).gyroscope()
         return residual, [(B(self.k), np.eye(3, 6, k=3))]
-
-
-def turn_at(values: Any, k: int) -> float:
-    """Return the network's turn at a keyframe [rad]."""
-    return float(values.atVector(T(k))[0])
 
 
 def _pose(values: Any, k: int) -> tuple[FloatArray, FloatArray]:

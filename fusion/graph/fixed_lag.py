@@ -10,12 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import EkfState, nav_states
+from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.filter.estimates import nav_states
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import EstimatorState
 from stario.fusion.filter.frame_transform import with_undirected
@@ -30,7 +32,7 @@ from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.health import Health, SampleCounts
 from stario.fusion.imu.intervals import ImuInterval, Start
-from stario.fusion.imu.stateful import Displacement
+from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.state import NavState
 from stario.sequences.sequence import FloatArray
 
@@ -42,6 +44,23 @@ _MAX_ROUNDS = 3
 """Maximum rounds of each optimisation; the next keyframe's continues from there."""
 
 
+class GraphStart(NamedTuple):
+    """What the filter's state was when the graph began.
+
+    Attributes:
+        origin_W: (3,) its position, which is the origin of the graph's [m]; see `EkfState`.
+        map_frame: number of frame transforms.
+        jumps: number of jumps of its track.
+        bias_variance: variance of the gyroscope bias's prior, narrowed since as in the filter
+            [rad^2/s^2].
+    """
+
+    origin_W: FloatArray
+    map_frame: int
+    jumps: int
+    bias_variance: float
+
+
 @dataclass(frozen=True, eq=False)
 class FixedLagState:
     """Complete state of a `FixedLagEstimator` between two intervals.
@@ -50,20 +69,14 @@ class FixedLagState:
         estimator: state of the filter alongside.
         builder: the graph.
         ahead: newest state, propagated by the IMU from the last keyframe.
-        origin_W: (3,) origin of the graph's positions [m]; see `EkfState`.
-        map_frame: number of frame transforms before the graph began.
-        jumps: number of jumps of the filter's track before that.
-        bias_prior: variance of the gyroscope bias's prior in the graph [rad^2/s^2].
+        start: what the graph began from.
         fallbacks: how often the graph fell back to the filter, and the latest reason.
     """
 
     estimator: EstimatorState
     builder: GraphBuilder
     ahead: EkfState
-    origin_W: FloatArray
-    map_frame: int
-    jumps: int
-    bias_prior: float
+    start: GraphStart
     fallbacks: tuple[int, str]
 
 
@@ -78,7 +91,7 @@ class FixedLagEstimator:
         prior: prior on the first pose; None starts levelled, at rest, at the origin.
     """
 
-    smoothed = None
+    smoothed = None  # the filter alone has poses one window late
 
     def __init__(
         self, config: NavigatorConfig, start: Start, prior: PriorPose | None = None
@@ -87,14 +100,13 @@ class FixedLagEstimator:
         self._filter = Estimator(config, start, prior, streaming=True)
         self._fallbacks = (0, "")
         self._ahead = StateCloningEkf(slots=0, gravity=config.gravity)
-        self._origin_W = np.zeros(3)
-        self._map_frame, self._jumps = 0, 0
-        self._bias_prior = 0.0
-        self._builder: GraphBuilder
         self._begin(0)
 
     def step(
-        self, interval: ImuInterval, displacement: Displacement | None, fixes: Sequence[Fix] = ()
+        self,
+        interval: ImuInterval,
+        displacement: WindowDisplacement | None,
+        fixes: Sequence[Fix] = (),
     ) -> None:
         """Propagate to the interval's end and apply its measurements; as `Estimator.step`."""
         applied = self._filter.step(interval, displacement, fixes)
@@ -134,18 +146,14 @@ class FixedLagEstimator:
             self._filter.state,
             self._builder,
             self._ahead.state,
-            self._origin_W,
-            self._map_frame,
-            self._jumps,
-            self._bias_prior,
+            self._start,
             self._fallbacks,
         )
 
     @state.setter
     def state(self, s: FixedLagState) -> None:
         self._filter.state, self._builder, self._ahead.state = s.estimator, s.builder, s.ahead
-        self._origin_W, self._map_frame, self._fallbacks = s.origin_W, s.map_frame, s.fallbacks
-        self._bias_prior, self._jumps = s.bias_prior, s.jumps
+        self._start, self._fallbacks = s.start, s.fallbacks
 
     @property
     def time(self) -> float:
@@ -154,8 +162,8 @@ class FixedLagEstimator:
 
     def nav_state(self) -> NavState:
         """Return the newest state."""
-        ahead = self._ahead.state.estimate(self._filter.in_gap, self._map_frame)
-        state = nav_states([ahead])[0].shifted(self._origin_W)
+        ahead = self._ahead.state.estimate(self._filter.in_gap, self._start.map_frame)
+        state = nav_states([ahead])[0].shifted(self._start.origin_W)
         states = with_actual_covariances([state], [self._filter.estimate()])
         return with_undirected(states, self._filter.frame.state.undirected)[0]
 
@@ -171,20 +179,20 @@ class FixedLagEstimator:
     @property
     def _stale(self) -> bool:
         """Whether the filter has since changed the state from which the graph began."""
-        wider = self._filter.bias.prior.variance > _WIDER * self._bias_prior
+        start, frame = self._start, self._filter.frame.state
+        wider = self._filter.bias.prior.variance > _WIDER * start.bias_variance
         turned = self._filter.ekf.state.has_turn and not self._builder.estimates_turn
-        frame = self._filter.frame.state
-        jumped = frame.jumps != self._jumps
-        return wider or turned or jumped or len(frame.transforms) != self._map_frame
+        moved = (len(frame.transforms), frame.jumps) != (start.map_frame, start.jumps)
+        return wider or turned or moved
 
     def _narrow_bias_prior(self) -> None:
         """Narrow the prior as the filter did: add its information as a measurement of zero."""
-        variance = self._filter.bias.prior.variance
-        if variance < _NARROWER * self._bias_prior:
-            pseudo_variance = 1.0 / (1.0 / variance - 1.0 / self._bias_prior)
+        old, variance = self._start.bias_variance, self._filter.bias.prior.variance
+        if variance < _NARROWER * old:
+            pseudo_variance = 1.0 / (1.0 / variance - 1.0 / old)
             graph = self._builder.graph
             graph.add(GyroBias(graph.last, np.zeros(3), pseudo_variance * np.eye(3)), gated=False)
-            self._bias_prior = variance
+            self._start = self._start._replace(bias_variance=variance)
 
     def _add_bearing(self, before: EkfState, after: EkfState) -> None:
         """Add what a magnetic bearing has just told the filter about attitude and bias."""
@@ -194,25 +202,25 @@ class FixedLagEstimator:
         graph = self._builder.graph
         k = graph.last
         R, _, _ = self._builder.dead_reckoned(k)
-        R_k = after.R_WB @ R.T @ graph.pose(k).R_WB
+        R_k = after.R_WB @ R.T @ graph.keyframe(k).R_WB
         weights, value, variance = gained
         term = Bearing(k, R_k, after.b_g, weights, value, np.array([[variance]]))
         graph.add(term, gated=False)
 
     def _in_graph_frame(self, accepted: Accepted) -> Fix:
         """Return a fix as inflated by the filter, relative to the graph's origin."""
-        return accepted.inflated.shifted(-self._origin_W)
+        return accepted.inflated.shifted(-self._start.origin_W)
 
     def _begin(self, count: int) -> None:
         """Begin a new graph from the filter's state."""
         first = nav_states([self._filter.estimate()], ASSUMED)[0]
-        self._map_frame, self._origin_W = first.map_frame, first.p_W
-        self._jumps = self._filter.frame.state.jumps
-        self._bias_prior = self._filter.bias.prior.variance
-        first = first.shifted(-self._origin_W)
+        jumps, variance = self._filter.frame.state.jumps, self._filter.bias.prior.variance
+        self._start = GraphStart(first.p_W, first.map_frame, jumps, variance)
+        first = first.shifted(-first.p_W)
         turn = turn_estimate(self._filter.ekf.state)
-        sigma = 0.0 if turn is None else self._config.filter.network_turn_sigma
-        self._builder = GraphBuilder(self._config, first, count, sigma, turn, streaming=True)
+        self._builder = GraphBuilder(
+            self._config, first, count, turn is not None, turn, streaming=True
+        )
         self._ahead.initialise(first)
 
     def _solve(self) -> None:

@@ -12,17 +12,18 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, T, V, X
+from gtsam.symbol_shorthand import B, V, X
 from scipy.linalg import block_diag
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.network_errors import TurnEstimate
-from stario.fusion.graph.factors import Prior, Term, turn_at
+from stario.fusion.filter.network_errors import TURN_SECONDS, TurnEstimate
+from stario.fusion.graph.factors import Prior, Term
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.processes import Coasting, TurnProcess
 from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_factor
@@ -72,13 +73,9 @@ class KeyframeGraph:
         self._time: dict[int, float] = {}
         self._segments: dict[int, Segment] = {}  # by the keyframe at which each begins
         self._terms: list[Whitened] = []
-        self._turns: dict[int, float] = {}  # of the network, by keyframe
         self._tree: Any = None  # of the last solution
         self.last = -1
-        self._insert(first)
-        if turn is not None:
-            self._turns[0] = turn.turn
-        self.add(Prior.of(0, first, turn), gated=False)
+        self.add_disconnected(first, turn)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return all but the solution: after restoring, call `solve` before `state`."""
@@ -93,25 +90,26 @@ class KeyframeGraph:
         """Return the time of a keyframe [s]."""
         return self._time[k]
 
-    def add_keyframe(self, segment: Segment, guess: NavState) -> int:
+    def add_keyframe(self, segment: Segment, guess: KeyframeState) -> int:
         """Connect a new keyframe to the last one by a segment; return its number."""
         self._segments[self.last] = segment
-        self._insert(guess)
+        self._insert(segment.stop, guess)
         return self.last
 
     def add_after_gap(self, gap: ImuInterval, guess: NavState, config: NavigatorConfig) -> int:
         """Connect a new keyframe to the last one across a gap; return its number."""
         i, t = self.last, gap.duration
-        self._insert(guess)
+        self._insert(gap.stop, KeyframeState.from_nav(guess))
         covariance = gap_covariance(t, yaw_variance(t, gap), np.zeros(3), config)[2:, 2:]
         rotation = gap_rotation(gap.table, t, self._states[i].b_g)
         self.add(Coasting(i, self.last, t, rotation, covariance), gated=False)
         return self.last
 
-    def add_disconnected(self, state: NavState) -> int:
+    def add_disconnected(self, state: NavState, turn: TurnEstimate | None = None) -> int:
         """Add a disconnected keyframe with its covariance as prior; return its number."""
-        self._insert(state)
-        self.add(Prior.of(self.last, state), gated=False)
+        prior = Prior.of(self.last + 1, state, turn)
+        self._insert(state.time, prior.reference[0])
+        self.add(prior, gated=False)
         return self.last
 
     def add(self, term: Term, gated: bool = True) -> None:
@@ -120,19 +118,14 @@ class KeyframeGraph:
         self._terms.append(Whitened.of(term, limit))
         self._tree = None
 
-    def add_turn(self, sigma: float, memory: float) -> None:
-        """Make the network's turn at the last keyframe a state, unless it already is.
-
-        Args:
-            sigma: its stationary standard deviation [rad].
-            memory: its correlation time [s].
-        """
+    def add_turn(self, sigma: float) -> None:
+        """Make the network's turn at the newest keyframe a state with a stationary sigma [rad]."""
         j = self.last
-        if j in self._turns:
-            return
-        i = max(self._turns, default=j)
-        correlation = math.exp((self._time[i] - self._time[j]) / memory) if i != j else 0.0
-        self._turns[j] = correlation * self._turns.get(i, 0.0)
+        turns = {k: state.turn for k, state in self._states.items() if state.turn is not None}
+        i = max(turns, default=j)
+        correlation = math.exp((self._time[i] - self._time[j]) / TURN_SECONDS) if i != j else 0.0
+        turn = correlation * turns.get(i, 0.0)
+        self._states[j] = self._states[j]._replace(turn=turn)
         covariance = np.array([[(1.0 - correlation**2) * sigma**2]])
         self.add(TurnProcess(i, j, correlation, covariance), gated=False)
 
@@ -146,28 +139,27 @@ class KeyframeGraph:
             IndeterminateError: a state is not determined, or the optimisation diverged; the
                 keyframes are then unchanged.
         """
-        start = self._states, self._turns
+        start = self._states
         try:
             rounds, values = self._optimise(max_rounds)
             self._states = {k: KeyframeState.of(values, k) for k in self._time}
-            self._turns = {k: turn_at(values, k) for k in self._turns}
             self._check_determined()
             down_weighted = sum(term.weighted(values)[2] < 1.0 for term in self._terms)
         except (RuntimeError, IndeterminateError) as error:
-            (self._states, self._turns), self._tree = start, None
+            self._states, self._tree = start, None
             if isinstance(error, IndeterminateError):
                 raise
             # gtsam's way to report it
             raise IndeterminateError(self._undetermined_state(str(error))) from error
         return Solution(rounds, down_weighted)
 
-    def pose(self, k: int) -> KeyframeState:
+    def keyframe(self, k: int) -> KeyframeState:
         """Return a keyframe without its covariance."""
         return self._states[k]
 
     def state(self, k: int) -> NavState:
         """Return a keyframe with its marginal covariance; call after `solve`."""
-        R, v, p, b_g, b_a = self.pose(k)
+        R, v, p, b_g, b_a, _ = self.keyframe(k)
         joint = self._tree.jointMarginalCovariance([X(k), V(k), B(k)]).fullMatrix()
         to_world = KeyframeState(R, np.zeros(3), np.zeros(3), b_g, b_a).invariant_from_local()
         return NavState(self._time[k], R, v, p, b_g, b_a, to_world @ joint @ to_world.T)
@@ -188,9 +180,9 @@ class KeyframeGraph:
             if term.first < before:
                 linear.push_back(term.factor(values))
                 connected += [k for k in term.term.keyframes if k > before]
-        keys = [key for k in old for key in self._keys(k)]
+        ordering = self._ordering(old)
         try:
-            _, remaining = linear.eliminatePartialMultifrontal(_ordering(keys), gtsam.EliminateQR)
+            _, remaining = linear.eliminatePartialMultifrontal(ordering, gtsam.EliminateQR)
         except RuntimeError as error:  # gtsam's way to report it
             raise IndeterminateError(self._undetermined_state(str(error))) from error
         self._terms = [term for term in self._terms if term.first >= before]
@@ -198,15 +190,12 @@ class KeyframeGraph:
         for k in old:
             del self._time[k], self._states[k]
             self._segments.pop(k, None)
-            self._turns.pop(k, None)
         self._tree = None
 
     def _values(self) -> Any:
         values = gtsam.Values()
         for k, state in self._states.items():
             state.insert_into(values, k)
-        for k, turn in self._turns.items():
-            values.insert(T(k), np.array([turn]))
         return values
 
     def _imu_factors(self, before: float = math.inf) -> Any:
@@ -220,25 +209,19 @@ class KeyframeGraph:
 
     def _marginal(self, keyframes: range, remaining: Any) -> Prior:
         """Return the prior that elimination left on the keyframes that it reached."""
-        turns = tuple((k, self._turns[k]) for k in keyframes if k in self._turns)
-        for k in keyframes:  # a window may reach only a pose; add the other columns
-            remaining.push_back(_uninformative_factor(k, k in self._turns))
-        keys = [key(k) for k in keyframes for key in (X, V, B)]
-        A, b = remaining.jacobian(_ordering([*keys, *(T(k) for k, _ in turns)]))
+        reference = tuple(self.keyframe(k) for k in keyframes)
+        to_local = [np.linalg.inv(state.invariant_from_local()) for state in reference]
+        for k, state in zip(keyframes, reference, strict=True):
+            # A window may reach only a pose: add the other columns, without information.
+            nothing = state.blocks(k, np.zeros((1, 16)))
+            remaining.push_back(linear_factor(nothing, np.zeros(1)))
+        A, b = remaining.jacobian(self._ordering(keyframes))
         table = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))[: A.shape[1]]
-        reference = tuple(self.pose(k) for k in keyframes)
-        to_local = block_diag(
-            *(np.linalg.inv(state.invariant_from_local()) for state in reference),
-            np.eye(len(turns)),
-        )
-        return Prior(keyframes[0], reference, table[:, :-1] @ to_local, table[:, -1], turns)
+        return Prior(keyframes[0], reference, table[:, :-1] @ block_diag(*to_local), table[:, -1])
 
-    def _insert(self, state: NavState) -> None:
+    def _insert(self, time: float, state: KeyframeState) -> None:
         self.last += 1
-        k = self.last
-        self._time[k] = state.time
-        self._states[k] = KeyframeState(state.R_WB, state.v_W, state.p_W, state.b_g, state.b_a)
-        self._tree = None
+        self._time[self.last], self._states[self.last], self._tree = time, state, None
 
     def _optimise(self, max_rounds: int) -> tuple[int, Any]:
         """Take full Gauss-Newton steps, which follow the IMU's stiff factors as a filter does.
@@ -246,7 +229,7 @@ class KeyframeGraph:
         From a poor start, a correct step may increase their error by its second-order terms.
         Levenberg-Marquardt's damping is then slow, and a stream would output unconverged states.
         """
-        factors, values, ordering = self._imu_factors(), self._values(), self._ordering()
+        factors, values, ordering = self._imu_factors(), self._values(), self._ordering(self._time)
         for _round in range(max_rounds):
             linear = factors.linearize(values)
             for term in self._terms:
@@ -264,13 +247,13 @@ class KeyframeGraph:
     def _positions(self, values: Any) -> FloatArray:
         return np.array([values.atPose3(X(k)).translation() for k in self._time])
 
-    def _ordering(self) -> Any:
-        """Return the order of time: the graph is a chain whose longest link is a window."""
-        return _ordering([key for k in self._time for key in self._keys(k)])
-
-    def _keys(self, k: int) -> list[int]:
-        turn = [T(k)] if k in self._turns else []
-        return [*turn, X(k), V(k), B(k)]
+    def _ordering(self, keyframes: Iterable[int]) -> Any:
+        """Return the keys in order of time: the graph's longest link is a window."""
+        ordering = gtsam.Ordering()
+        for k in keyframes:
+            for key in self._states[k].keys(k):
+                ordering.push_back(key)
+        return ordering
 
     def _check_determined(self) -> None:
         for k in (next(iter(self._time)), self.last):
@@ -287,18 +270,3 @@ class KeyframeGraph:
         if match is None:
             return message.strip().splitlines()[0]
         return f"{_NAMES[match[1]]} at {self._time[int(match[2])]:.1f} s is undetermined"
-
-
-def _uninformative_factor(k: int, has_turn: bool) -> Any:
-    """Return a factor without information on a keyframe and, if present, the turn there."""
-    blocks = [(X(k), np.zeros((1, 6))), (V(k), np.zeros((1, 3))), (B(k), np.zeros((1, 6)))]
-    if has_turn:
-        blocks.append((T(k), np.zeros((1, 1))))
-    return linear_factor(blocks, np.zeros(1))
-
-
-def _ordering(keys: list[int]) -> Any:
-    ordering = gtsam.Ordering()
-    for key in keys:
-        ordering.push_back(key)
-    return ordering

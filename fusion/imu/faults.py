@@ -1,4 +1,4 @@
-"""Faults of a stream: a clock set back, stopped sensors, spikes and saturation, a rate in deg/s.
+"""Faults of samples: a clock set back, stopped sensors, spikes and saturation.
 
 Clock: single late samples are dropped, and so is a burst in the wrong order. Late samples that
 advance among themselves for seconds come from another clock, and how much time has passed between
@@ -10,20 +10,13 @@ device may be at rest. One sensor alone: loggers repeat samples of a slow one, a
 rest measures the same numbers for minutes. So its values must repeat for half a second in which the
 other one shows motion that they rule out, by the rules of `sequences.inspection.constant_values`.
 From then on it counts as stopped until its values change. Samples of a stopped sensor are dropped,
-so that they are treated as a gap. A sensor whose values have never changed is dead, and the stream
-refused.
+so that they are treated as a gap. A sensor whose values have never changed is dead (`units`).
 
 Outliers: a spike is one sample that differs from both its neighbours by more than a carried device
 can cause; it is replaced by their mean. Saturation shows as values of a moving axis that repeat
 exactly and more than once at the largest magnitude measured so far; two that are equal by chance,
 at a magnitude soon exceeded, do not count. What the sensor missed is unknown, so these are only
 flagged.
-
-Units of a stream: that of the accelerometer shows in the first second (`intervals.check_start`),
-that of the gyroscope, or a dead sensor, not at rest. A recording is checked as a whole before it
-runs (`sequences.inspection.checks`), a stream piece by piece by the same physics. A single piece
-may fail because the device is thrown or dropped, so several, with no calm one in between, are
-needed to refuse the stream.
 """
 
 from __future__ import annotations
@@ -34,10 +27,9 @@ from collections.abc import Callable
 import numpy as np
 
 from stario.fusion.health import Stopped
-from stario.fusion.imu.intervals import NO_FLAGS, SAME_TIME, Flags, ImuInterval, Sample
+from stario.fusion.imu.intervals import NO_FLAGS, Flags, Sample
 from stario.sequences.errors import InputError
-from stario.sequences.inspection.checks import check_gyro
-from stario.sequences.inspection.constant_values import check_not_dead, shaken, tilting
+from stario.sequences.inspection.constant_values import shaken, tilting
 from stario.sequences.sequence import BoolArray, FloatArray
 from stario.sequences.windows import MIN_RATE
 
@@ -266,63 +258,3 @@ class OutlierDetector:
         count = repeated.sum(axis=0)
         self._repeats = self._repeats + count
         return np.asarray(np.where(self._repeats >= _MIN_REPEATS, count, 0.0))
-
-
-_PIECE_SECONDS = 4.0
-"""Length of a piece [s], as in the check of recordings."""
-
-_MIN_FAILED_PIECES = 3
-"""Number of failed pieces, with no calm one in between, that refuse a stream: a single fall may
-cause two, and no recording has failed any."""
-
-_MIN_TURNING_PIECES = 12
-"""Number of pieces with turns after which later failures are not attributed to the unit."""
-
-_TURNING_RAD_S, _DOUBTFUL_RAD_S = 1.0, 6.0
-"""Rates exceeded for a twentieth of a piece: the first by walks, but not by noise and bias at rest,
-even in deg/s; the second by hardly any walk (maximum recorded 4.2), but by all given in deg/s."""
-
-
-class SensorCheck:
-    """Checks a stream's intervals until the unit of the gyroscope is beyond doubt.
-
-    A sensor that is dead from the beginning shows before that.
-    """
-
-    def __init__(self) -> None:
-        self._tables: list[FloatArray] = []  # time, gyro, accel (k, 7) of the piece so far
-        self._wrong = self._turned = 0
-
-    def check(self, interval: ImuInterval) -> None:
-        """Add the stream's next interval.
-
-        Raises:
-            InputError: the gyroscope cannot be in rad/s, or one sensor's values never change.
-        """
-        if interval.gap:
-            self._tables = []
-            return
-        if self._turned >= _MIN_TURNING_PIECES:
-            return
-        table = interval.table
-        self._tables.append(table[1:] if self._tables else table)
-        if interval.stop - self._tables[0][0, 0] > _PIECE_SECONDS - SAME_TIME:
-            piece, self._tables = np.vstack(self._tables), []
-            self._check_piece(piece[:, 0], piece[:, 1:4], piece[:, 4:7])
-
-    def _check_piece(self, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> None:
-        remedy = "is the sensor connected?"
-        try:
-            check_not_dead("stream", time, gyro, accel)
-            remedy = "if it is in deg/s, push np.radians(gyro)"
-            check_gyro("stream", time, gyro, accel, [slice(0, len(time))])
-        except InputError as error:
-            self._wrong += 1
-            if self._wrong >= _MIN_FAILED_PIECES:
-                field = "accel" if error.field.endswith("accelerometer") else "gyro"
-                raise InputError(field, error.found, error.expected, remedy) from None
-        else:
-            speed = np.percentile(np.linalg.norm(gyro, axis=1), 95)
-            if speed < _DOUBTFUL_RAD_S:
-                self._wrong = 0
-                self._turned += int(speed > _TURNING_RAD_S)

@@ -27,7 +27,6 @@ from stario.fusion.imu.faults import (
     ClockSetBackDetector,
     FrozenSensorDetector,
     OutlierDetector,
-    SensorCheck,
 )
 from stario.fusion.imu.gap import gap_rotation
 from stario.fusion.imu.intervals import (
@@ -39,10 +38,12 @@ from stario.fusion.imu.intervals import (
     interpolated_sample,
 )
 from stario.fusion.imu.stateful import WindowBuffer
+from stario.fusion.imu.units import SensorCheck
+from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
-from stario.sequences.time_order import CONFIRMED, CONFIRMED_FAR, LONG_GAP
+from stario.sequences.time_order import CONFIRMED, CONFIRMED_FAR, FAR_AHEAD
 from stario.sequences.windows import MAX_IMU_GAP
 
 BRIDGED = 0.2
@@ -64,6 +65,12 @@ class FrontEnd:
 
     Args:
         config: update rate, gravity, and whether the magnetometer is used.
+
+    Attributes:
+        newest: time of the newest accepted sample [s]; minus infinity before the first.
+        sensors: check of units for streams, which cannot be checked as a whole.
+        counts: samples used and dropped.
+        start: time and levelled attitude of the first sample; None during the first second.
     """
 
     def __init__(self, config: NavigatorConfig) -> None:
@@ -74,8 +81,8 @@ class FrontEnd:
         self._attitude: LevelledAttitude | None = None
         self._origin, self._index = 0.0, 0
         self._next = -math.inf
-        self._newest = -math.inf
-        self._window = WindowBuffer(rate)
+        self.newest = -math.inf
+        self._windows = WindowBuffer(rate)
         self._hole = (-math.inf, -math.inf)  # ends of the last hole [s]
         self._unconfirmed: list[Sample] = []  # jumped ahead in time, not confirmed yet
         self._before_gap: Sample | None = None  # after which gravity has not been averaged yet
@@ -83,7 +90,7 @@ class FrontEnd:
         self._clock = ClockSetBackDetector()
         self._frozen = FrozenSensorDetector(config.gravity)
         self._outliers = OutlierDetector()
-        self.sensors = SensorCheck()  # for streams, which cannot be checked as a whole
+        self.sensors = SensorCheck()
         self.counts = SampleCounts()
         self.start: Start | None = None
 
@@ -101,9 +108,9 @@ class FrontEnd:
         if stopped := self._frozen.stopped(sample):
             self.counts.add_frozen(stopped)
             return []
-        if self._unconfirmed and time > self._newest:
+        if self._unconfirmed and time > self.newest:
             self._drop_ahead(time)
-        newest = self._newest
+        newest = self.newest
         if self._unconfirmed and time > newest:
             newest = self._unconfirmed[-1][0]
         if time == newest:
@@ -121,13 +128,8 @@ class FrontEnd:
 
     def push_field(self, time: float, field_B: FloatArray) -> None:
         """Add a magnetic field (3,) [uT] in B, before any later sample is pushed."""
-        if self._config.filter.magnetometer and not self._fields.add(time, field_B, self._newest):
+        if self._config.filter.magnetometer and not self._fields.add(time, field_B, self.newest):
             self.counts.field_dropped += 1
-
-    @property
-    def newest(self) -> float:
-        """Time of the newest accepted sample [s]; minus infinity before the first."""
-        return self._newest
 
     def finish(self) -> None:
         """End the stream: drop the samples that still wait for others to confirm their times."""
@@ -148,7 +150,7 @@ class FrontEnd:
         """Queue a sample that jumps ahead in time or follows one; accept all once confirmed."""
         ahead = self._unconfirmed
         ahead.append(sample)
-        far = ahead[0][0] - self._newest > LONG_GAP
+        far = ahead[0][0] - self.newest > FAR_AHEAD
         if len(ahead) < (CONFIRMED_FAR if far else CONFIRMED):
             return []
         self._unconfirmed = []
@@ -157,7 +159,7 @@ class FrontEnd:
     def _accept(self, sample: Sample) -> list[ImuInterval]:
         time = sample[0]
         self._clock.on_time()
-        before, self._newest = self._newest, time
+        before, self.newest = self.newest, time
         self.counts.used += 1
         if self._samples and time - before > _HOLE_SECONDS:
             self._hole = before, time
@@ -176,14 +178,14 @@ class FrontEnd:
         """Level the attitude once `START_SECONDS` have been collected, at first or after a gap."""
         first = self._samples[0][0]
         # A single sample here: its time is so large that adding a second is lost in rounding.
-        if self._newest < first + START_SECONDS or len(self._samples) == 1:
+        if self.newest < first + START_SECONDS or len(self._samples) == 1:
             self._next = first + START_SECONDS
             return []
         table = np.array(self._samples)
         gravity = start_from_gravity(table[:, 0], table[:, 1:4], table[:, 4:7])
         rate = 1.0 / float(np.median(np.diff(table[:, 0])))
         start = Start(**vars(gravity), time=first, rate=rate)
-        self._restart_grid(first)
+        self._origin, self._index, self._next = first, 1, first + self._period
         if self._attitude is None:
             self.start, self._attitude = start, LevelledAttitude(start)
             return self._complete()
@@ -216,7 +218,7 @@ class FrontEnd:
         before = self._samples
         self._samples = [sample]
         self._check_time_unit()
-        self._window.clear()
+        self._windows.clear()
         self._next = -math.inf
         if self._attitude is None or self._before_gap is not None:
             return []
@@ -226,13 +228,9 @@ class FrontEnd:
         table = np.array(before)
         return [_interval(table, self._attitude, flags=self._flag_outliers(table))]
 
-    def _restart_grid(self, origin: float) -> None:
-        self._origin, self._index = origin, 1
-        self._next = origin + self._period
-
     def _complete(self) -> list[ImuInterval]:
         intervals = []
-        while self._newest >= self._next:
+        while self.newest >= self._next:
             intervals.append(self._with_window(*self._cut()))
         return intervals
 
@@ -270,8 +268,8 @@ class FrontEnd:
         update = (self._index - 1) % self._config.filter.intervals_per_update == 0
         field_B = self._fields.at(table[-1, 0])
         interval = _interval(table, self._attitude, update=update, flags=flags, field_B=field_B)
-        self._window.add(interval)
-        return self._window.with_window(interval) if update else interval
+        self._windows.add(interval)
+        return changed(interval, window=self._windows.window()) if update else interval
 
 
 def _interval(

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from stario.fusion.config import NavigatorConfig
+from stario.fusion.config import MIN_WALK, NavigatorConfig
 from stario.fusion.imu.intervals import ImuInterval
-from stario.fusion.lie import UNKNOWN_YAW
+from stario.fusion.lie import UNKNOWN_YAW, e3_cross
 from stario.sequences.attitude.levelling import integrate
 from stario.sequences.sequence import FloatArray
 
@@ -26,10 +26,8 @@ second after the gap, and in proportion to that rate beyond. On OxIOD, TUM-VI, R
 the errors after 0.3, 0.8 and 2.0 s are 0.05, 0.25 and 1.0 rad (root mean square) at rates from 0.5
 to 1 rad/s, 0.11, 0.53 and 1.3 from 1.5 to 2.5, and 0.22, 1.3 and 2.1 from 2.5 to 4 (running)."""
 
-_MIN_WALK = 1e-7
-"""Least random walk of a bias: a graph inverts the covariance."""
-
 _STEPS = 10
+"""Number of samples at which the rates in a gap are interpolated."""
 
 _EYE = np.eye(3)
 
@@ -79,12 +77,12 @@ def gap_covariance(
         config: noise densities.
     """
     f, t = config.filter, seconds
-    sideways = np.array([-v_W[1], v_W[0], 0.0])  # e3 x v
+    sideways = e3_cross(v_W)
     turn = np.concatenate([[0.0, 0.0, 1.0], sideways, t * sideways, np.zeros(6)])
     covariance: FloatArray = turn_variance * np.outer(turn, turn)
     covariance[:2, :2] += t * f.gap_gyro_noise**2 * np.eye(2)
     white = f.gap_accel_noise**2 * np.array([[t, t**2 / 2.0], [t**2 / 2.0, t**3 / 3.0]])
     covariance[3:9, 3:9] += np.kron(white, _EYE)
-    walks = np.maximum([config.noise.gyro_walk, config.noise.accel_walk], _MIN_WALK)
+    walks = np.maximum([config.noise.gyro_walk, config.noise.accel_walk], MIN_WALK)
     covariance[9:, 9:] += np.diag(t * np.repeat(walks, 3) ** 2)
     return covariance

@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from stario.fusion.fixes import Fix
 from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import GravityStart
-from stario.sequences.errors import InputError
 from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
-from stario.sequences.windows import MAX_RATE, MIN_RATE
 
 Sample = tuple[float, float, float, float, float, float, float]
 """Time [s], gyroscope xyz [rad/s], specific force xyz [m/s^2]."""
@@ -33,27 +31,6 @@ class Start(GravityStart):
 
     time: float
     rate: float
-
-
-_START_FORCE = (5.0, 15.0)
-"""Accepted mean force of the first second [m/s^2]: allows for a jump, excludes units of g."""
-
-
-def check_start(start: Start, gravity: float) -> None:
-    """Check the first second of a stream, which cannot be checked as a whole.
-
-    Raises:
-        InputError: the rate is not about 50 Hz to 1 kHz, or the mean force cannot be gravity.
-    """
-    if not MIN_RATE <= start.rate <= MAX_RATE:
-        raise InputError("time", f"{start.rate:.3g} samples a second", "50 to 1000")
-    if not _START_FORCE[0] <= start.force <= _START_FORCE[1]:
-        raise InputError(
-            "accel",
-            f"an average of {start.force:.3g} over the first second",
-            f"about {gravity:.2f} m/s^2",
-            "give specific force in m/s^2 with gravity left in, and rates in rad/s",
-        )
 
 
 _LOST_SECONDS = 10.0
@@ -82,6 +59,22 @@ NO_FLAGS = Flags()
 """No faults."""
 
 
+class Window(NamedTuple):
+    """The network's input: a second of unbroken samples in a levelled frame N.
+
+    Attributes:
+        imu_N: (6, 200) gyroscope [rad/s] and specific force [m/s^2].
+        R_NB: (3, 3) levelled attitude at its start.
+        heading: heading of the device in N, averaged over it [rad].
+        flagged: whether any of its samples are saturated, missing, or were spikes.
+    """
+
+    imu_N: NDArray[np.float32]
+    R_NB: FloatArray
+    heading: float
+    flagged: bool
+
+
 @dataclass(frozen=True, eq=False)
 class ImuInterval:
     """IMU samples between two times of the grid.
@@ -94,9 +87,7 @@ class ImuInterval:
         attitudes: (n + 1, 3, 3) levelled attitude R_NB at the samples.
         R_NB: (3, 3) levelled attitude at the end, after its correction by gravity.
         update: whether windows begin and end at this interval's end.
-        window: (6, 200) network input that ends here; None if there is none.
-        R_NB_window: (3, 3) levelled attitude at the window's start.
-        heading: heading of the device in N, averaged over the window [rad].
+        window: the window that ends here; None if there is none.
         levelled_bias: magnitude of the gyroscope's bias as estimated from gravity [rad/s].
         levelled_bias_sigma: its standard deviation per level axis [rad/s].
         field_B: (3,) magnetic field at its end [uT]; None if none was measured.
@@ -104,7 +95,6 @@ class ImuInterval:
         levelled: attitude from gravity after a gap, estimated as at the first sample; None
             elsewhere.
         flags: whether samples of either sensor are saturated, missing, or were spikes.
-        window_flagged: whether any of the window's samples are.
     """
 
     time: FloatArray
@@ -114,16 +104,13 @@ class ImuInterval:
     attitudes: FloatArray
     R_NB: FloatArray
     update: bool = False
-    window: NDArray[np.float32] | None = None
-    R_NB_window: FloatArray | None = None
-    heading: float = 0.0
+    window: Window | None = None
     levelled_bias: float = 0.0
     levelled_bias_sigma: float = 0.0
     field_B: FloatArray | None = None
     accel_factor: float = 1.0
     levelled: Start | None = None
     flags: Flags = NO_FLAGS
-    window_flagged: bool = False
 
     def without_window(self) -> ImuInterval:
         """Return a copy without the window and attitudes, which an estimator does not need."""
@@ -196,7 +183,7 @@ def split_at(interval: ImuInterval, time: float) -> tuple[ImuInterval, ImuInterv
     later = table[k:] if table[k, 0] - time >= 1e-9 else table[k + 1 :]
     first = _with_samples(interval, np.vstack([table[:k], boundary]))
     second = _with_samples(interval, np.vstack([boundary, later]))
-    return changed(first, update=False, window=None, R_NB_window=None), second
+    return changed(first, update=False, window=None), second
 
 
 def _with_samples(interval: ImuInterval, table: FloatArray) -> ImuInterval:

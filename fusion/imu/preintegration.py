@@ -23,16 +23,15 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from stario.fusion.config import NavigatorConfig
+from stario.fusion.config import MIN_WALK, NavigatorConfig
 from stario.fusion.imu.intervals import Flags, ImuInterval
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray
 
-# gtsam adds this to the position noise [m/sqrt(s)]; it keeps one-sample segments invertible for the
-# graph and is far below any sensor's.
 _POSITION_NOISE = 1e-5
-_MIN_WALK = 1e-7
+"""Noise of the position that gtsam adds [m/sqrt(s)]: it keeps one-sample segments invertible for
+the graph and is far below any sensor's."""
 
 _MISSING_GYRO, _MISSING_ACCEL = 0.1, 1.0
 """Noise densities where up to a fifth of a second is missing and was interpolated [rad/s/sqrt(Hz),
@@ -70,7 +69,13 @@ class Segment:
         vars(self).update(state | {"pim": pim})
 
     def predict(
-        self, R_WB: FloatArray, v_W: FloatArray, p_W: FloatArray, b_g: FloatArray, b_a: FloatArray
+        self,
+        R_WB: FloatArray,
+        v_W: FloatArray,
+        p_W: FloatArray,
+        b_g: FloatArray,
+        b_a: FloatArray,
+        bias_jacobian: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Dead-reckon across the segment.
 
@@ -80,39 +85,31 @@ class Segment:
             p_W: (3,) position [m].
             b_g: (3,) gyroscope bias [rad/s].
             b_a: (3,) accelerometer bias [m/s^2].
+            bias_jacobian: (9, 6) in Fortran order, is set to the derivative with respect to b_a and
+                b_g, in gtsam's tangent of the end.
 
         Returns:
             R_WB, v_W, p_W at the end.
         """
         start = gtsam.NavState(gtsam.Rot3(R_WB), p_W, v_W)
-        end = self.pim.predict(start, gtsam.imuBias.ConstantBias(b_a, b_g))
+        bias = gtsam.imuBias.ConstantBias(b_a, b_g)
+        end = self.pim.predict(start, bias, None, bias_jacobian)
         return end.attitude().matrix(), end.velocity(), end.position()
 
 
 def segment_of(
-    interval: ImuInterval, b_g: FloatArray, b_a: FloatArray, config: NavigatorConfig
-) -> Segment:
-    """Preintegrate an interval that is no gap.
-
-    Args:
-        interval: the samples.
-        b_g: (3,) gyroscope bias [rad/s].
-        b_a: (3,) accelerometer bias [m/s^2].
-        config: noise and gravity.
-    """
-    noise = _widened_noise(config, interval.accel_factor, interval.flags)
-    return preintegrate(
-        interval.time, interval.gyro, interval.accel, b_g, b_a, noise, config.gravity
-    )
-
-
-def segment_of_all(
     intervals: Sequence[ImuInterval], b_g: FloatArray, b_a: FloatArray, config: NavigatorConfig
 ) -> Segment:
     """Preintegrate consecutive intervals, none of them a gap, each with its own noise.
 
     Their mean noise would spread the effect of a heel strike from a tenth of a second over half a
     second, and correlate position and velocity at the end wrongly.
+
+    Args:
+        intervals: the samples.
+        b_g: (3,) gyroscope bias [rad/s].
+        b_a: (3,) accelerometer bias [m/s^2].
+        config: noise and gravity.
     """
     first, *rest = intervals
     table = np.vstack([first.table, *(e.table[1:] for e in rest)])  # without the shared samples
@@ -166,7 +163,9 @@ def preintegrate(
     if seconds * math.sqrt(3.0) * float(np.abs(rate).max()) > _MAX_TURN:
         rate, densities = _within_a_turn(rate, dt, densities)
     current = densities[0]
-    params = _params(current, gravity) if current is noise else _new_params(current, gravity)
+    uniform = all(density is current for density in densities)
+    # Those of the cache must not be changed.
+    params = _params(current, gravity) if uniform else _new_params(current, gravity)
     pim = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(b_a, b_g))
     integrate = pim.integrateMeasurement
     # gtsam subtracts the bias itself, so it is added back here.
@@ -246,9 +245,8 @@ def _new_params(noise: ImuNoise, gravity: float) -> Any:
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
     _set_white_noise(params, noise)
     params.setIntegrationCovariance(_EYE * _POSITION_NOISE**2)
-    # gtsam's graph factors invert these covariances: none may be zero.
-    params.setBiasOmegaCovariance(_EYE * max(noise.gyro_walk, _MIN_WALK) ** 2)
-    params.setBiasAccCovariance(_EYE * max(noise.accel_walk, _MIN_WALK) ** 2)
+    params.setBiasOmegaCovariance(_EYE * max(noise.gyro_walk, MIN_WALK) ** 2)
+    params.setBiasAccCovariance(_EYE * max(noise.accel_walk, MIN_WALK) ** 2)
     return params
 
 

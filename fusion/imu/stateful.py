@@ -8,15 +8,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stario.fusion.checked import floored
 from stario.fusion.health import SampleCounts
-from stario.fusion.imu.intervals import ImuInterval
-from stario.fusion.state import changed
+from stario.fusion.imu.intervals import ImuInterval, Window
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
@@ -44,8 +43,19 @@ _ASYMMETRY = 1e-5
 """Largest asymmetry of predicted covariances, relative to their largest element: 32-bit rounding
 and no more."""
 
-Displacement = tuple[FloatArray, FloatArray]
-"""Displacement (3,) [m] and covariance (3, 3) [m^2] in the window's frame N."""
+
+class WindowDisplacement(NamedTuple):
+    """Displacement over a window, in its levelled frame N.
+
+    Attributes:
+        d_N: (3,) [m].
+        covariance_N: (3, 3) [m^2].
+        R_NB: (3, 3) levelled attitude at the window's start.
+    """
+
+    d_N: FloatArray
+    covariance_N: FloatArray
+    R_NB: FloatArray
 
 
 def slope_variance(d: FloatArray) -> FloatArray:
@@ -106,17 +116,16 @@ class WindowBuffer:
         flagged = flags.gyro or flags.accel or flags.missing
         self._blocks.append(Block(imu_N.astype(np.float32).T, R_NB, facing(R_NB), flagged))
 
-    def with_window(self, interval: ImuInterval) -> ImuInterval:
-        """Return the newest interval with the second that ends there, once that is complete."""
+    def window(self) -> Window | None:
+        """Return the second that ends with the newest interval, once it is complete."""
         blocks = self._blocks
         if len(blocks) < (blocks.maxlen or 0):
-            return interval
-        return changed(
-            interval,
-            window=np.concatenate([block.imu_N for block in blocks], axis=1),
-            R_NB_window=blocks[0].R_NB,
+            return None
+        return Window(
+            imu_N=np.concatenate([block.imu_N for block in blocks], axis=1),
+            R_NB=blocks[0].R_NB,
             heading=float(mean_heading(np.array([block.facing_N for block in blocks]))),
-            window_flagged=any(block.flagged for block in blocks),
+            flagged=any(block.flagged for block in blocks),
         )
 
 
@@ -225,23 +234,22 @@ def _checked(answer: Any, count: int) -> tuple[FloatArray, FloatArray]:
 
 
 def displacements_of(
-    network: StatefulInference, intervals: Sequence[ImuInterval], counts: SampleCounts
-) -> list[Displacement]:
-    """Predict the displacements of the intervals' windows, with inflated and floored covariances.
+    network: StatefulInference, windows: Sequence[Window], counts: SampleCounts
+) -> list[WindowDisplacement]:
+    """Predict the displacements of windows, with inflated and floored covariances.
 
     Also count the windows, and those that move unlike anything the weights were trained on.
     """
-    # Callers pass only intervals with a window.
-    windows_N = np.stack([i.window for i in intervals if i.window is not None])
+    windows_N = np.stack([window.imu_N for window in windows])
     counts.windows += len(windows_N)
     counts.unfamiliar += network.unfamiliar(windows_N)
-    heading = np.array([interval.heading for interval in intervals])
+    heading = np.array([window.heading for window in windows])
     mean_N, covariance_N = network.predict(windows_N, heading)
-    flagged = np.array([interval.window_flagged for interval in intervals])
+    flagged = np.array([window.flagged for window in windows])
     covariance_N = np.where(flagged[:, None, None], FLAGGED_SCALE, 1.0) * covariance_N
     with np.errstate(invalid="ignore", over="ignore"):  # the estimator refuses such values
         covariance_N[:, 2, 2] += slope_variance(mean_N)
     return [
-        (d_N, floored(C, MIN_DISPLACEMENT_SIGMA))
-        for d_N, C in zip(mean_N, covariance_N, strict=True)
+        WindowDisplacement(d_N, floored(C, MIN_DISPLACEMENT_SIGMA), window.R_NB)
+        for d_N, C, window in zip(mean_N, covariance_N, windows, strict=True)
     ]

@@ -40,13 +40,13 @@ class Oracle:
         complete = [e for e in intervals if e.window is not None]
         stop = np.array([e.stop for e in complete])
         first, last = truth.at(stop - WINDOW_SECONDS), truth.at(stop)
-        R_NB = Rotation.from_matrix(np.stack([e.R_NB_window for e in complete]))
+        R_NB = Rotation.from_matrix(np.stack([e.window.R_NB for e in complete]))
         turn = about_z(yaw_of(R_NB * first.attitude_WB.inv()))
         displacement = turn.apply(last.position_W - first.position_W)
         displacement += noise * rng.standard_normal(displacement.shape)
-        heading = np.array([e.heading for e in complete])
+        heading = np.array([e.window.heading for e in complete])
         displacement = about_z(-heading).apply(displacement)
-        windows = rotated_windows(np.stack([e.window for e in complete]), -heading)
+        windows = rotated_windows(np.stack([e.window.imu_N for e in complete]), -heading)
         keys = [window.tobytes() for window in windows]
         self._displacements = dict(zip(keys, displacement, strict=True))
         self._covariance = sigma**2 * np.eye(3)

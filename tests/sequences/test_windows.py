@@ -184,9 +184,11 @@ def test_levelled_windows_equal_the_navigators_except_for_heading() -> None:
             continue
         first = round((epoch.stop - 1.0) * 200)
         theirs = stream.imu_W[first : first + 200].T
-        levelled_NB = Rotation.from_matrix(epoch.R_NB_window)
+        levelled_NB = Rotation.from_matrix(epoch.window.R_NB)
         turn = about_z(yaw_of(true_WB[first] * levelled_NB.inv()))
-        ours = np.concatenate([turn.apply(epoch.window[k : k + 3].T) for k in (0, 3)], axis=1).T
+        ours = np.concatenate(
+            [turn.apply(epoch.window.imu_N[k : k + 3].T) for k in (0, 3)], axis=1
+        ).T
         assert np.abs(ours - theirs).mean() < 0.1
         compared += 1
     assert compared > 25

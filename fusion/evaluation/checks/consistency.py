@@ -15,14 +15,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS, Estimate
+from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
+from stario.fusion.filter.estimates import Estimate
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import innovations_of
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import ACTUAL, CORE
 from stario.fusion.filter.network_errors import ACCEL_SHARE, displacement_errors
 from stario.fusion.imu.intervals import ImuInterval
-from stario.fusion.imu.stateful import Displacement, slope_variance
+from stario.fusion.imu.stateful import WindowDisplacement, slope_variance
 from stario.fusion.lie import log_se23, yaw_rotation
 from stario.fusion.recording import Progress, cut_recording, silent
 from stario.sequences.accuracy.nees import nees_bounds
@@ -257,9 +258,9 @@ class _DrawnNetwork:
         self._lasting = rng.normal(size=len(CONSIDERED_SECONDS))
         self._time = 0.0
 
-    def displacement(self, interval: ImuInterval) -> Displacement | None:
+    def displacement(self, interval: ImuInterval) -> WindowDisplacement | None:
         """Return the displacement of the window that ends with an interval, in its frame N."""
-        if interval.R_NB_window is None:
+        if interval.window is None:
             return None
         walk, f, rng = self._walk, self._config.filter, self._rng
         kept = np.exp((self._time - interval.stop) / CONSIDERED_SECONDS)
@@ -278,8 +279,8 @@ class _DrawnNetwork:
         else:  # overlapping windows count as less certain than each one is
             white = f.overlap_scale * covariance
         d_W = d_W + np.linalg.cholesky(white) @ rng.normal(size=3)
-        R_WN = yaw_rotation(walk.R_WB[start] @ interval.R_NB_window.T)
-        return R_WN.T @ d_W, covariance
+        R_WN = yaw_rotation(walk.R_WB[start] @ interval.window.R_NB.T)
+        return WindowDisplacement(R_WN.T @ d_W, covariance, interval.window.R_NB)
 
 
 def _errors(

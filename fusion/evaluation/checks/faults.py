@@ -21,7 +21,7 @@ from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.checks.corruption import Fault, ModifyPredictions, faults
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.health import Health
-from stario.fusion.imu.stateful import Predictor
+from stario.fusion.imu.stateful import Predictor, WindowDisplacement
 from stario.fusion.navigator import Navigator
 from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.state import Track
@@ -188,18 +188,20 @@ def with_true_displacements(
     covariance = noise**2 / config.filter.covariance_scale * np.eye(3)
     measurements = list(preprocessed.measurements)
     with_window = {
-        k: (interval.stop, interval.R_NB_window)
+        k: (interval.stop, interval.window.R_NB)
         for k, interval in enumerate(preprocessed.intervals)
-        if interval.R_NB_window is not None
+        if interval.window is not None
     }
     stop, attitudes = (np.array(values) for values in zip(*with_window.values(), strict=True))
     ends = np.clip([stop - WINDOW_SECONDS, stop], truth.time[0], truth.time[-1])
     first, last = truth.at(ends[0]), truth.at(ends[1])
     turn = about_z(yaw_of(Rotation.from_matrix(attitudes) * first.attitude_WB.inv()))
     displacement_N = turn.apply(last.position_W - first.position_W)
-    for k, d_N, time in zip(with_window, displacement_N, stop - truth.time[0], strict=True):
+    times = stop - truth.time[0]
+    for k, d_N, R_NB, time in zip(with_window, displacement_N, attitudes, times, strict=True):
         rng = np.random.default_rng([seed, max(0, round(time * config.filter.output_rate))])
-        measurements[k] = (d_N + noise * rng.standard_normal(3), covariance)
+        noisy_N = d_N + noise * rng.standard_normal(3)
+        measurements[k] = WindowDisplacement(noisy_N, covariance, R_NB)
     return replace(preprocessed, measurements=measurements)
 
 
@@ -208,11 +210,11 @@ def _corrupted(
 ) -> PreprocessedRecording:
     """Apply a fault to all measurements at once."""
     measurements = list(preprocessed.measurements)
-    measured = {k: pair for k, pair in enumerate(measurements) if pair is not None}
-    mean, covariance = (np.stack(values) for values in zip(*measured.values(), strict=True))
+    measured = {k: each for k, each in enumerate(measurements) if each is not None}
+    mean, covariance, _ = (np.stack(values) for values in zip(*measured.values(), strict=True))
     modify(mean, covariance, rng)
-    for k, d_N, cov_N in zip(measured, mean, covariance, strict=True):
-        measurements[k] = (d_N, cov_N)
+    for (k, each), d_N, C in zip(measured.items(), mean, covariance, strict=True):
+        measurements[k] = each._replace(d_N=d_N, covariance_N=C)
     return replace(preprocessed, measurements=measurements)
 
 

@@ -86,7 +86,7 @@ def engine_speed() -> tuple[float, float]:
             ekf.propagate(preintegrate(*samples, state.b_g, state.b_a, noise, STANDARD_GRAVITY))
             clones.append(ekf.clone())
             if len(clones) > per_window:
-                ekf.update_displacement(clones[0], clones[-1], displacement, covariance, gate=16.3)
+                ekf.update_displacement(clones[0], displacement, covariance, gate=16.3)
                 ekf.release(clones.pop(0))
 
     engines = [kind(per_window + 1) for kind in (StateCloningEkf, DenseEkf)]

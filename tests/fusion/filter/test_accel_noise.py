@@ -10,7 +10,7 @@ import pytest
 from stario.fusion import Navigator, NavigatorConfig
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.estimator import Estimator
-from stario.fusion.filter.network_errors import AccelNoiseScale
+from stario.fusion.filter.network_errors import InnovationStatistics
 from stario.sequences.sequence import ImuSequence
 
 
@@ -27,9 +27,9 @@ def final_factor(
     for k, (interval, measured) in enumerate(pairs):
         shaken = replace(interval, accel=interval.accel + rng.normal(0.0, shake, 3))
         if measured is not None and k in false:
-            measured = (measured[0] + [1.0, 0.0, 0.0], measured[1])
+            measured = measured._replace(d_N=measured.d_N + np.eye(3)[0])
         estimator.step(shaken, measured)
-    return estimator.state.accel_noise.factor
+    return estimator.state.statistics.accel_factor
 
 
 def test_the_factor_rises_for_a_bad_accelerometer_but_not_for_a_good_one(
@@ -49,11 +49,13 @@ def test_five_seconds_of_outliers_hardly_raise_the_factor(make_walk, make_oracle
 
 @pytest.mark.parametrize(("nis", "sign"), [(1e9, 1), (0.0, -1)])
 def test_one_displacement_moves_the_log_factor_by_the_gain_at_most(nis: float, sign: int) -> None:
-    before = AccelNoiseScale(log_factor=1.0, gain=0.05)
-    after = before.updated(UpdateResult(nis, 3, True, gate_nis=nis))
-    assert after.log_factor - before.log_factor == pytest.approx(sign * 0.05, abs=1e-6)
+    before = InnovationStatistics(log_accel_factor=1.0, gain=0.05)
+    after = before.updated(UpdateResult(nis=nis, gate_nis=nis), NavigatorConfig().filter)
+    change = after.log_accel_factor - before.log_accel_factor
+    assert change == pytest.approx(sign * 0.05, abs=1e-6)
 
 
-def test_an_update_without_innovation_leaves_the_factor_unchanged() -> None:
-    before = AccelNoiseScale(log_factor=1.0)
-    assert before.updated(UpdateResult(float("nan"), 3, False)) == before
+def test_an_update_without_innovation_leaves_the_noise_unchanged() -> None:
+    before = InnovationStatistics(log_accel_factor=1.0, log_error_level=1.0)
+    after = before.updated(UpdateResult("value that is not finite"), NavigatorConfig().filter)
+    assert replace(after, outlier_share=before.outlier_share) == before

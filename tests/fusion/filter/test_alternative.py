@@ -18,6 +18,7 @@ from stario.fusion.filter.displacements import DisplacementUpdates
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.hypotheses import AlternativeHypothesis, HypothesisPair
 from stario.fusion.filter.network_errors import TURN_SECONDS, with_turn
+from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.state import NavState
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence
@@ -129,7 +130,7 @@ def hypotheses() -> HypothesisPair:
     filter_.state = replace(filter_.state, time=10.0)
     pair = HypothesisPair(filter_)
     other = replace(filter_.state, b_a=np.ones(3))
-    pair.alternative = AlternativeHypothesis(other, 10.0, np.zeros(3), (10.0, 10.5))
+    pair.alternative = AlternativeHypothesis(other, np.zeros(3), (10.0, 10.5))
     return pair
 
 
@@ -160,6 +161,10 @@ def test_the_alternative_is_dropped_when_both_fit_or_when_it_is_too_old() -> Non
     assert aged.ekf.state.b_a[0] == 0.0
 
 
+def displacement(d_N: np.ndarray, sigma: float) -> WindowDisplacement:
+    return WindowDisplacement(d_N, sigma**2 * np.eye(3), np.eye(3))
+
+
 def test_a_false_displacement_lets_the_networks_turn_decay_once() -> None:
     ekf, zero = StateCloningEkf(slots=1), np.zeros(3)
     ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, 1e-4 * np.eye(15)))
@@ -167,12 +172,12 @@ def test_a_false_displacement_lets_the_networks_turn_decay_once() -> None:
     ekf.state = replace(with_turn(ekf.state, 0.05), network_turn=0.1)
     pair = HypothesisPair(ekf)
     updates = DisplacementUpdates(pair, FilterConfig(update_rate=2))
-    pair.alternative = AlternativeHypothesis(ekf.state, 0.0, zero)
-    result, _ = updates.update(slot, np.eye(3), np.array([5.0, 0.0, 0.0]), 1e-4 * np.eye(3))
+    pair.alternative = AlternativeHypothesis(ekf.state, zero, (0.0,))
+    result, _ = updates.update(slot, displacement(np.array([5.0, 0.0, 0.0]), 1e-2))
     alternative = pair.alternative
     assert result.gated
     assert alternative is not None
-    assert len(alternative.outliers) == 1
+    assert len(alternative.outliers) == 2
     for state in (ekf.state, alternative.ekf):
         assert state.network_turn == pytest.approx(0.1 * np.exp(-0.5 / TURN_SECONDS), rel=1e-9)
 
@@ -194,10 +199,10 @@ def test_an_uncertain_alternative_does_not_take_the_steady_error_for_right(
     P[:, :15, :15] += uncertain
     other.state = replace(other.state, covariances=P)
     offset_W = np.array([1.0, 0.0, 0.0])
-    pair.alternative = AlternativeHypothesis(other.state, 0.0, offset_W)
-    updates.update(slot, np.eye(3), error * offset_W, 1e-2 * np.eye(3))
+    pair.alternative = AlternativeHypothesis(other.state, offset_W, (0.0,))
+    updates.update(slot, displacement(error * offset_W, 0.1))
     alternative = pair.alternative
     assert alternative is not None
-    assert (alternative.outliers == ()) == fits
+    assert (alternative.outliers == (0.0,)) == fits
     # Less the offset, both displacements are zero.
     np.testing.assert_allclose(alternative.ekf.p_W, 0.0, atol=0.05)

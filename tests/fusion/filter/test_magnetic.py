@@ -15,7 +15,7 @@ from stario.fusion.config import FilterConfig
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import bearing_jacobian
-from stario.fusion.filter.magnetic import MagneticReference, first_field, update_bearing
+from stario.fusion.filter.magnetic import MagneticReference, update_bearing, with_field
 from stario.fusion.fixes import position_fix
 from stario.fusion.navigator import Navigator as Stream
 from stario.sequences.attitude.rotations import yaw_of
@@ -54,7 +54,7 @@ def state() -> EkfState:
     R_WB = exp_so3(np.array([0.3, -0.5, 1.2]))
     p_W = np.array([3.0, 1.0, 0.0])
     ekf.initialise(NavState(0.0, R_WB, zero, p_W, zero, zero, 0.01 * np.eye(15)))
-    return first_field(ekf.state, R_WB.T @ FIELD_W)
+    return with_field(ekf.state, R_WB.T @ FIELD_W)
 
 
 def test_bearing_jacobian_agrees_with_finite_differences() -> None:

@@ -10,8 +10,9 @@ import pytest
 from stario.fusion import Navigator, NavigatorConfig
 from stario.fusion.config import FilterConfig
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS, Estimate
+from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
 from stario.fusion.filter.engine import UpdateResult
+from stario.fusion.filter.estimates import Estimate
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.frame_transform import frame_rotation
 from stario.fusion.filter.initial import PriorPose
@@ -22,7 +23,7 @@ from stario.fusion.filter.network_errors import (
     MAX_LEVEL,
     MIN_LEVEL,
     WHITE,
-    ErrorLevel,
+    InnovationStatistics,
     displacement_errors,
 )
 from stario.fusion.fixes import position_fix
@@ -100,25 +101,24 @@ def test_a_turn_that_is_a_state_is_not_counted_again() -> None:
 
 @pytest.mark.parametrize(("nis", "bound"), [(0.0, MIN_LEVEL), (1e6, MAX_LEVEL)])
 def test_the_level_stays_within_its_bounds(nis: float, bound: float) -> None:
-    level = ErrorLevel()
+    statistics = InnovationStatistics()
     for _ in range(1000):
-        level = level.updated(UpdateResult(nis, 3, True))
-    assert level.level == pytest.approx(bound)
+        statistics = statistics.updated(UpdateResult(nis=nis, gate_nis=nis), F)
+    assert statistics.error_level == pytest.approx(bound)
 
 
 def test_the_level_makes_the_mean_nis_three() -> None:
     """Innovations twice as large as predicted: their variance, and so the level, is four times."""
-    rng, level, nis = np.random.default_rng(0), ErrorLevel(), []
+    rng, statistics, nis = np.random.default_rng(0), InnovationStatistics(), []
     for _ in range(2000):
-        nis.append(4.0 / level.level * rng.chisquare(3))
-        level = level.updated(UpdateResult(nis[-1], 3, True))
+        nis.append(4.0 / statistics.error_level * rng.chisquare(3))
+        statistics = statistics.updated(UpdateResult(nis=nis[-1], gate_nis=nis[-1]), F)
     assert np.mean(nis[200:]) == pytest.approx(3.0, rel=0.1)
 
 
 def test_one_displacement_changes_the_level_by_a_fifth_at_most() -> None:
-    level = ErrorLevel(gain=0.05)
-    assert level.updated(UpdateResult(1e6, 3, True)).level == pytest.approx(np.exp(0.2))
-    assert level.updated(UpdateResult(float("nan"), 3, False)) == level
+    after = InnovationStatistics(gain=0.05).updated(UpdateResult(nis=1e6, gate_nis=1e6), F)
+    assert after.error_level == pytest.approx(np.exp(0.2))
 
 
 # --- the covariance ------------------------------------------------------------------------------
@@ -149,7 +149,7 @@ def straight_walk(
         model = displacement_errors(d_W, covariance, 1.0, False, F)
         d_W = d_W + model.considered @ errors
         d_W = d_W + np.linalg.cholesky(model.white) @ rng.normal(size=3)
-        result = ekf.update_displacement(slot, None, d_W, covariance, errors=model)
+        result = ekf.update_displacement(slot, d_W, covariance, errors=model)
         nis.append(result.nis)
         slot = ekf.clone(instead_of=slot)
     return ekf, seconds * speed, float(np.mean(nis[3:]))
@@ -225,7 +225,7 @@ def test_the_first_fix_after_a_straight_walk_is_believed() -> None:
     time = np.arange(0.0, 1.0 + 1e-9, 0.1)
     accel = np.tile([0.0, 0.0, STANDARD_GRAVITY], (len(time), 1))
     noise = ImuNoise(gyro_noise=1e-3, accel_noise=0.1)
-    frame = MapFrame(ekf, PriorPose(np.eye(3), zero, zero), 0.997, 0.0)
+    frame = MapFrame(ekf, PriorPose(np.eye(3), zero, zero), FilterConfig(network_turn_sigma=0.0))
     slot = ekf.clone()
     for second in range(200):
         samples = float(second) + time, np.zeros_like(accel), accel
@@ -233,7 +233,7 @@ def test_the_first_fix_after_a_straight_walk_is_believed() -> None:
         d_W, covariance = np.array([scale * length, 0.0, 0.0]), 0.1**2 * np.eye(3)
         d_W = d_W + rng.normal(0.0, 0.05, 3)
         errors = displacement_errors(d_W, covariance, 1.0, False, F)
-        ekf.update_displacement(slot, None, d_W, covariance, gate=14.0, errors=errors)
+        ekf.update_displacement(slot, d_W, covariance, gate=14.0, errors=errors)
         slot = ekf.clone(instead_of=slot)
     truth = np.array([200.0 * length, 0.0, 0.0])
     assert ekf.state.p_W[0] - truth[0] > 3.0 * np.sqrt(ekf.P[6, 6])

@@ -11,7 +11,7 @@ from support import GRAPH as CONFIG
 
 from stario.fusion import Navigator, NavState
 from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.magnetic import first_field
+from stario.fusion.filter.magnetic import with_field
 from stario.fusion.graph.bearing import gained_information
 from stario.sequences.attitude.so3 import log_so3
 from stario.sequences.sequence import ImuSequence
@@ -30,7 +30,7 @@ def ekf_with_field() -> StateCloningEkf:
     P[9:12, 9:12] = 1e-5 * np.eye(3)
     zero = np.zeros(3)
     ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, P))
-    ekf.state = first_field(ekf.state, FIELD_B)
+    ekf.state = with_field(ekf.state, FIELD_B)
     P = ekf.P.copy()
     P[-5:, -5:] = np.diag([0.04**2, 0.05**2, 1.0, 1.0, 1.0])  # a field known from before
     ekf.P = P

@@ -89,7 +89,7 @@ def track_with_outliers(
     for k in range(intervals.stop + 3 * config.filter.output_rate):
         measurement = preprocessed.measurements[k]
         if measurement is not None and k in intervals:
-            measurement = (measurement[0] + [metres, 0.0, 0.0], measurement[1])
+            measurement = measurement._replace(d_N=measurement.d_N + metres * np.eye(3)[0])
         estimator.step(preprocessed.intervals[k], measurement)
         positions.append(estimator.nav_state().p_W)
     return np.array(positions), estimator.health(preprocessed.front_end.counts).gated
@@ -106,7 +106,7 @@ def test_a_stream_gates_displacements_as_its_filter_does(
     assert clean_gated == 0
     # Both false ones, and the correct one after them, since the second has changed the velocity.
     assert corrupted_gated == 3
-    # The accelerometer has slightly less weight after them (`AccelNoiseScale`).
+    # The accelerometer has slightly less weight after them (`InnovationStatistics`).
     assert np.linalg.norm(corrupted[-1] - clean[-1]) < 0.12
 
 

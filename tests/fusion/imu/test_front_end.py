@@ -109,7 +109,7 @@ def test_windows_equal_those_of_training_for_the_same_attitude(
     truth = Trajectory(np.array(time), np.zeros((len(time), 3)), Rotation.from_matrix(np.stack(R)))
     (stream,) = world_streams(replace(walk, truth=truth), attitude="true")
     theirs, _ = windows_of(stream, 20)
-    ours = np.stack([e.window for e in intervals if e.window is not None])
+    ours = np.stack([e.window.imu_N for e in intervals if e.window is not None])
     n = min(len(ours), len(theirs))
     assert n > 40
     off = np.abs(ours[:n] - theirs[:n])
@@ -127,9 +127,9 @@ def test_windows_start_with_their_stated_attitude(walk: ImuSequence) -> None:
         before = by_stop.get(round(interval.stop - WINDOW_SECONDS, 6))
         if interval.window is None or before is None:
             continue
-        np.testing.assert_array_equal(interval.R_NB_window, before.R_NB)
+        np.testing.assert_array_equal(interval.window.R_NB, before.R_NB)
         first = before.R_NB @ before.accel[-1]
-        np.testing.assert_allclose(interval.window[3:, 0], first, atol=1e-5)
+        np.testing.assert_allclose(interval.window.imu_N[3:, 0], first, atol=1e-5)
         checked += 1
     assert checked > 100
 
@@ -191,7 +191,7 @@ def test_a_hole_is_bridged_and_intervals_and_windows_across_it_are_flagged(
     for e in intervals:
         if e.window is not None:
             touches = e.stop - WINDOW_SECONDS < missing[-1].stop - 1e-9
-            assert e.window_flagged == (touches and e.stop > missing[0].start + 1e-9)
+            assert e.window.flagged == (touches and e.stop > missing[0].start + 1e-9)
 
 
 def test_a_hole_of_a_tenth_of_a_second_is_bridged(
@@ -246,7 +246,7 @@ def test_the_newest_gaps_are_listed_and_all_are_counted(
 def test_times_since_1970_give_the_same_windows(walk: ImuSequence) -> None:
     late = replace(walk, time=walk.time + 1.7e9)
     ours, theirs = (
-        [e.window for e in cut_recording(s, CONFIG)[0] if e.window is not None]
+        [e.window.imu_N for e in cut_recording(s, CONFIG)[0] if e.window is not None]
         for s in (late, walk)
     )
     assert len(ours) == len(theirs)

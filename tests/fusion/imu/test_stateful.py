@@ -58,7 +58,7 @@ def test_memory_is_kept_between_gaps_separately_for_each_series(walk, without, r
         if interval.gap:
             stretches.append([])
         if measurement is not None:
-            stretches[-1].append(measurement[0][2])
+            stretches[-1].append(measurement.d_N[2])
     assert len(stretches) == 2
     for stretch in stretches:
         assert stretch == pytest.approx([k // rate for k in range(len(stretch))])
@@ -111,7 +111,9 @@ def test_slopes_and_missing_samples_make_displacements_less_certain(walk, withou
     holed = without(walk, (walk.time > 6.0) & (walk.time < 6.1))
     preprocessed = Navigator(Walking(), NavigatorConfig()).observe(holed)
     pairs = zip(preprocessed.intervals, preprocessed.measurements, strict=True)
-    known = [(i.window_flagged, measured[1]) for i, measured in pairs if measured is not None]
+    known = [
+        (i.window.flagged, measured.covariance_N) for i, measured in pairs if measured is not None
+    ]
     assert {flagged for flagged, _ in known} == {True, False}
     for flagged, covariance in known:
         own = 4e-4 if flagged else 1e-4

@@ -111,10 +111,10 @@ def test_true_displacements_have_the_noise_that_the_filter_takes_them_to_have() 
     errors = []
     for interval, measurement in zip(measured.intervals, measured.measurements, strict=True):
         if measurement is not None:
-            np.testing.assert_allclose(4.0 * measurement[1], 0.05**2 * np.eye(3))
+            np.testing.assert_allclose(4.0 * measurement.covariance_N, 0.05**2 * np.eye(3))
             ends = sequence.truth.at(np.array([interval.stop - 1.0, interval.stop])).position_W
             length = np.linalg.norm((ends[1] - ends[0])[:2])
-            errors.append(np.linalg.norm(measurement[0][:2]) - length)
+            errors.append(np.linalg.norm(measurement.d_N[:2]) - length)
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(0.05, rel=0.35)
 
 

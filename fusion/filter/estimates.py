@@ -1,0 +1,75 @@
+"""Estimates that the filter gives out, and their conversion to plain errors.
+
+All estimates of a recording are converted at its end, many at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stario.fusion.filter.jacobians import ACTUAL, CLONED, plain_covariance
+from stario.fusion.state import NavState, SmoothedPose
+from stario.sequences.sequence import FloatArray
+
+_CHUNK = 2000
+"""Number of estimates converted at a time: all of an hour would take hundreds of megabytes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """A filter's estimate of its newest state; or of a clone, which has no velocity and biases.
+
+    Attributes:
+        time: [s].
+        X: (3, 5) R_WB, v_W, p_W, the position relative to `origin_W`.
+        origin_W: (3,) [m].
+        b_g: (3,) gyroscope bias [rad/s].
+        b_a: (3,) accelerometer bias [m/s^2].
+        covariances: (2, 15, 15) of theta, rho_v, rho_p, d_bg, d_ba, as assumed for the gains and
+            as it is (see `EkfState`); zero for what a clone does not have.
+        in_gap: as in `NavState`.
+        map_frame: as in `NavState`.
+    """
+
+    time: float
+    X: FloatArray
+    origin_W: FloatArray
+    b_g: FloatArray
+    b_a: FloatArray
+    covariances: FloatArray
+    in_gap: bool = False
+    map_frame: int = 0
+
+
+def plain_covariances(estimates: Sequence[Estimate], which: int = ACTUAL) -> FloatArray:
+    """Return covariances (N, n, n) of plain errors in W's axes, each true minus estimate.
+
+    Args:
+        estimates: N estimates.
+        which: `ACTUAL` or `ASSUMED`.
+    """
+    P = np.array([e.covariances[which] for e in estimates])
+    X = np.array([e.X for e in estimates])
+    return plain_covariance(P, X[:, :, 3:].transpose(0, 2, 1))
+
+
+def nav_states(estimates: Sequence[Estimate], which: int = ACTUAL) -> list[NavState]:
+    """Convert estimates to `NavState`; arguments as `plain_covariances`."""
+    states = []
+    for k in range(0, len(estimates), _CHUNK):
+        part = estimates[k : k + _CHUNK]
+        for e, covariance in zip(part, plain_covariances(part, which), strict=True):
+            pose = e.X[:, :3], e.X[:, 3], e.X[:, 4] + e.origin_W
+            biases = e.b_g.copy(), e.b_a.copy()  # those of `e` are the filter's own
+            states.append(NavState(e.time, *pose, *biases, covariance, e.in_gap, e.map_frame))
+    return states
+
+
+def smoothed_pose(clone: Estimate) -> SmoothedPose:
+    """Convert the estimate of a clone to a `SmoothedPose`."""
+    (s,) = nav_states([clone])
+    covariance = s.covariance[np.ix_(CLONED, CLONED)]
+    return SmoothedPose(s.time, s.R_WB, s.p_W, covariance, s.map_frame)
