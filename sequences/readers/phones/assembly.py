@@ -56,6 +56,8 @@ def assemble_recording(
         ReadError: a file is malformed or the sensors do not overlap in time.
     """
     folder = files.gyro.parent
+    for file in files.unread:
+        _log.warning("%s: not read: it has no rows with a time that grows and three values", file)
     gyro = _read(files.tables["gyro"][0], "gyro")
     attitude = logged_attitude(files, gyro)
     accel = _force(files, attitude, core_motion)

@@ -77,3 +77,18 @@ def test_a_malformed_json_export_is_refused_in_one_line(
         read_recording(tmp_path / "x.json")
     assert "\n" not in str(error.value)
     assert "stario-" not in str(error.value)
+
+
+def test_a_sensors_file_without_samples_is_named(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    zyx(tmp_path, walk, Gyroscope=walk.gyro, GyroscopeUncalibrated=walk.gyro)
+    (tmp_path / "TotalAcceleration.csv").write_text("time,seconds_elapsed,z,y,x\n")
+    lacking = "has no rows with a time that grows and three values"
+    message = rf"found only gyro, expected .*; TotalAcceleration\.csv {lacking}$"
+    with pytest.raises(ReadError, match=message):
+        read_recording(tmp_path)
+    zyx(tmp_path, walk, TotalAcceleration=walk.accel)
+    (tmp_path / "Gyroscope.csv").write_text("")
+    read_recording(tmp_path)
+    assert "Gyroscope.csv: not read: it has no rows" in caplog.text

@@ -162,3 +162,17 @@ def test_a_loggers_export_is_read_as_the_walk(
     LOGGERS[logger](tmp_path / "s", walk)
     (found,) = find_recordings(tmp_path / "s")
     assert_same_samples(read_recording(found), walk)
+
+
+@pytest.mark.parametrize("second_clock", [False, True])
+def test_swapped_rows_at_the_start_of_a_file_without_titles(
+    second_clock: bool, walk: ImuSequence, tmp_path: Path
+) -> None:
+    order = np.arange(len(walk))
+    order[[4, 5, 12, 13]] = [5, 4, 13, 12]
+    clocks = [[stamp, stamp] if second_clock else [stamp] for stamp in ns(walk)]
+    for name, values in (("gyro", walk.gyro), ("acce", walk.accel), ("gyro_uncalib", walk.accel)):
+        rows = np.asarray(clocks)[order]
+        save(tmp_path / f"s/{name}.txt", "", rows, values[order], sep=" ")
+    sequence = read_recording(tmp_path / "s")
+    assert_same_samples(sequence.select(np.argsort(sequence.time)), walk)
