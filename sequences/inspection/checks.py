@@ -240,8 +240,8 @@ def _downward(sequence: ImuSequence, fit: TruthFit | None) -> InputError:
     decide: rotated by the attitude, the accelerometer then measures their acceleration or its
     opposite.
     """
-    sign = "pass `--accel-unit=-m/s^2` (or -g) or write `ax [-m/s^2]` in the CSV's header"
-    sign = _UNIT_NAMED if "accel" in sequence.converted else sign
+    sign = "pass `--accel-sign apple` or write `ax [-m/s^2]` (or `[-g]`) in the CSV's header"
+    sign = _UNIT_NAMED if "sign" in sequence.converted else sign
     fix = f"{sign}; or if the truth's world has z down, {_TO_Z_UP}"
     positions = fit_positions(sequence, fit.time_offset) if fit and fit.consistent else None
     if positions is not None and positions.correlation > _SAME_MOTION:

@@ -64,7 +64,7 @@ def assemble_recording(
     stamps, rate, force = resample_to_gyro(
         folder, gyro.stamps_ns, gyro.values, accel.samples.stamps_ns, accel.samples.values
     )
-    converted = {"gyro": gyro.unit not in ("", "rad/s"), "accel": accel.converted}
+    converted = {"gyro": gyro.unit not in ("", "rad/s"), **accel.converted}
     sequence = ImuSequence(
         name=name,
         time=seconds(stamps, stamps[0]),
@@ -95,10 +95,10 @@ def _read(table: SensorTable, sensor: Sensor) -> Samples:
 
 @dataclass(frozen=True)
 class _Force:
-    """Specific force, whether its unit or sign was converted, and whether Apple's sign is left."""
+    """Specific force, whether its unit and sign were converted, and whether Apple's sign is left."""
 
     samples: Samples
-    converted: bool
+    converted: dict[str, bool]
     maybe_apple: bool
 
 
@@ -126,7 +126,10 @@ def _force(
     factor *= STANDARD_GRAVITY if in_g and inverted else 1.0
     return _Force(
         samples=replace(accel, values=factor * accel.values),
-        converted=inverted or accel.unit not in ("", "m/s^2"),
+        converted={
+            "accel": inverted or accel.unit.removeprefix("-") not in ("", "m/s^2"),
+            "sign": inverted or accel.unit.startswith("-"),
+        },
         maybe_apple=sign is None and in_two_parts and not in_g,
     )
 

@@ -145,12 +145,20 @@ def gopro(folder: Path, walk: ImuSequence) -> None:
         save(folder / f"GX010001-{name}.csv", f'"cts","date","{title}","1","2"', *columns)
 
 
+def sensor_log(folder: Path, walk: ImuSequence) -> None:
+    """An app for iPhones without the attitude: columns as Core Motion names them tell the sign."""
+    titles = by_axis("accelerometerAcceleration#(G)", "gyroRotation#(rad/s)")
+    columns = -walk.accel / STANDARD_GRAVITY, walk.gyro
+    texts = dates(walk, "%Y-%m-%d %H:%M:%S.%f +0200")
+    save(folder / "a.csv", ",".join(["loggingTime(txt)", *titles]), texts, *columns)
+
+
 LOGGERS: dict[str, Callable[[Path, ImuSequence], None]] = {
     write.__name__: write
     for write in (
         shimmer, units_below_the_titles, matlab_mobile, metawear, polar, witmotion, vectornav,
         movella, hyperimu, gopro, microcontroller, date_and_time, titles_in_a_comment,
-        quoted_titles_with_commas,
+        quoted_titles_with_commas, sensor_log,
     )
 }  # fmt: skip
 
