@@ -104,5 +104,6 @@ def _factor(sequence: ImuSequence, sensor: str, unit: str, known: dict[str, floa
         raise InputError(field, found, expected, "omit the option or fix the file's header")
     if known[name] < 0.0 and "sign" in sequence.converted:
         found = f"{unit!r} for {sequence.name}, whose sign was already turned on reading"
-        raise InputError(field, found, "a unit without a minus", "omit it, and `--accel-sign apple`")
+        fix = "omit the minus and `--accel-sign apple`"
+        raise InputError(field, found, "a unit without a minus", fix)
     return known[name]

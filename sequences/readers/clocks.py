@@ -48,7 +48,7 @@ def resample_to_gyro(
         Time stamps (K,) [ns], gyroscope (K, 3) and accelerometer (K, 3).
 
     Raises:
-        ReadError: the two sensors do not overlap in time.
+        ReadError: the two sensors do not overlap in time, or the accelerometer's rate is too low.
     """
     order = np.unique(accel_ns, return_index=True)[1]
     accel_ns, accel = accel_ns[order], accel[order]
@@ -64,6 +64,10 @@ def resample_to_gyro(
     before, after = accel_ns[right - 1], accel_ns[right]
     exact = (gyro_ns == before) | (gyro_ns == after)
     kept &= exact | (after - before <= round(MAX_TRUTH_GAP * 1e9))
+    if not kept.any():
+        step = float(np.median(np.diff(accel_ns))) * 1e-9
+        found, fix = f"samples {step:.3g} s apart", "is its unit the one that the header names?"
+        raise ReadError(path, "time of the accelerometer", found, f"at most {MAX_TRUTH_GAP} s", fix)
     time, t = seconds(gyro_ns[kept], accel_ns[0]), seconds(accel_ns, accel_ns[0])
     return gyro_ns[kept], gyro[kept], interpolated(time, t, accel)
 

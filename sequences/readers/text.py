@@ -78,7 +78,8 @@ class Table:
             return np.array(stamps, dtype=np.int64)
         except OverflowError:
             found = f"a time of {max(map(abs, stamps)):.3g} ns"
-            raise ReadError(self.path, "time", found, "at most 9.2e18 ns") from None
+            fix = "is its unit the one that the header names?"
+            raise ReadError(self.path, "time", found, "at most 9.2e18 ns", fix) from None
 
     def _stamp(self, row: int, cell: str, unit_ns: int) -> int:
         try:

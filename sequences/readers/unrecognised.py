@@ -39,7 +39,7 @@ def unrecognised(path: Path, inside: list[Path], known: str) -> ReadError:
     elif sensors := incomplete_sensors(path):
         found, expected = f"only {' and '.join(sensors)}", "a gyroscope and an accelerometer"
         unread = [file.name for file in unread_files(path)] if path.is_dir() else []
-        no_rows = f"{' and '.join(unread)} has no rows with a time that grows and three values"
+        no_rows = f"{' and '.join(unread)}: no rows with a time that grows and three values"
         return ReadError(path, "sensors", found, expected, no_rows if unread else "log both")
     elif names_both_sensors(path):
         found, fix = "no column of times that grow", "name one `t [s]`; a count of samples is none"

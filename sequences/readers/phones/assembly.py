@@ -95,7 +95,7 @@ def _read(table: SensorTable, sensor: Sensor) -> Samples:
 
 @dataclass(frozen=True)
 class _Force:
-    """Specific force, whether its unit and sign were converted, and whether Apple's sign is left."""
+    """Specific force, which of unit and sign were converted, and whether Apple's sign is left."""
 
     samples: Samples
     converted: dict[str, bool]

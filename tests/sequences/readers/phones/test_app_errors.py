@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from phone_files import save, zyx
+from phone_files import ns, save, zyx
 
 from stario.sequences import ImuSequence, ReadError, read_recording
+from stario.sequences.windows import clean_samples
 
 
 @pytest.mark.parametrize(
@@ -84,11 +85,33 @@ def test_a_sensors_file_without_samples_is_named(
 ) -> None:
     zyx(tmp_path, walk, Gyroscope=walk.gyro, GyroscopeUncalibrated=walk.gyro)
     (tmp_path / "TotalAcceleration.csv").write_text("time,seconds_elapsed,z,y,x\n")
-    lacking = "has no rows with a time that grows and three values"
-    message = rf"found only gyro, expected .*; TotalAcceleration\.csv {lacking}$"
+    lacking = "no rows with a time that grows and three values"
+    message = rf"found only gyro, expected .*; TotalAcceleration\.csv: {lacking}$"
     with pytest.raises(ReadError, match=message):
         read_recording(tmp_path)
     zyx(tmp_path, walk, TotalAcceleration=walk.accel)
     (tmp_path / "Gyroscope.csv").write_text("")
     read_recording(tmp_path)
     assert "Gyroscope.csv: not read: it has no rows" in caplog.text
+
+
+def test_single_wild_samples_are_no_reason_to_refuse_a_file(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
+    gyro, accel = walk.gyro.copy(), walk.accel.copy()
+    gyro[500, 1], accel[700, 2], accel[900, 0] = 1e30, np.inf, -1e15
+    zyx(tmp_path, walk, Gyroscope=gyro, TotalAcceleration=accel)
+    time, kept, _ = clean_samples(read_recording(tmp_path))
+    assert len(time) == len(walk) - 3
+    assert np.abs(kept).max() < 10.0
+
+
+def test_a_clock_in_another_unit_than_its_title_says(walk: ImuSequence, tmp_path: Path) -> None:
+    for name, values in (("Gyroscope", walk.gyro), ("TotalAcceleration", walk.accel)):
+        save(tmp_path / f"{name}.csv", "t [s],x,y,z", ns(walk), values)
+    with pytest.raises(ReadError, match=r"time: found .*; is its unit the one that the header"):
+        read_recording(tmp_path)
+    for name, values, late in (("Gyroscope", walk.gyro, 5), ("TotalAcceleration", walk.accel, 0)):
+        save(tmp_path / f"{name}.csv", "t [s],x,y,z", 1e3 * walk.time + late, values)
+    with pytest.raises(ReadError, match=r"found samples 10 s apart, .*; is its unit"):
+        read_recording(tmp_path)
