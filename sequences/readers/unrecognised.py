@@ -10,6 +10,7 @@ from stario.sequences.readers.lines import first_bytes, first_line
 from stario.sequences.readers.phones.files import (
     incomplete_sensors,
     names_both_sensors,
+    recording_with,
     unread_files,
 )
 from stario.sequences.readers.poses import pose_files
@@ -41,6 +42,9 @@ def unrecognised(path: Path, inside: list[Path], known: str) -> ReadError:
         unread = [file.name for file in unread_files(path)] if path.is_dir() else []
         no_rows = f"{' and '.join(unread)}: no rows with a time that grows and three values"
         return ReadError(path, "sensors", found, expected, no_rows if unread else "log both")
+    elif part_of := recording_with(path):
+        found, fix = "one sensor of a recording", f"name its gyroscope: {part_of.gyro}"
+        return ReadError(path, "content", found, "a recording", fix)
     elif names_both_sensors(path):
         found, fix = "no column of times that grow", "name one `t [s]`; a count of samples is none"
         return ReadError(path, "time", found, "one next to the sensors'", fix)

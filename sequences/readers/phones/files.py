@@ -70,8 +70,12 @@ class PhoneFiles:
     @property
     def shown(self) -> Path:
         """The recording's path in messages: the only file, or else the folder."""
-        files = {table.file for tables in self.tables.values() for table in tables}
-        return self.gyro if len(files) == 1 else self.gyro.parent
+        return self.gyro if len(self.files) == 1 else self.gyro.parent
+
+    @property
+    def files(self) -> set[Path]:
+        """The files of all sensors."""
+        return {table.file for tables in self.tables.values() for table in tables}
 
     def first(self, sensor: Sensor) -> SensorTable | None:
         """Return the preferred file of a sensor, or None."""
@@ -86,6 +90,13 @@ def phone_recordings(folder: Path) -> list[PhoneFiles]:
         return complete
     merged = _merged_groups(groups)
     return [merged] if is_complete(merged.tables) else []
+
+
+def recording_with(file: Path) -> PhoneFiles | None:
+    """Return the recording in a file's folder that the file is a part of; never raises."""
+    if not file.is_file():
+        return None
+    return next((one for one in phone_recordings(file.parent) if file in one.files), None)
 
 
 def unread_files(folder: Path) -> list[Path]:

@@ -95,6 +95,16 @@ def test_a_sensors_file_without_samples_is_named(
     assert "Gyroscope.csv: not read: it has no rows" in caplog.text
 
 
+def test_a_file_of_one_sensor_names_that_of_the_gyroscope(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
+    zyx(tmp_path, walk, Gyroscope=walk.gyro, TotalAcceleration=walk.accel)
+    message = r"found one sensor of a recording, .*; name its gyroscope: .*/Gyroscope\.csv$"
+    with pytest.raises(ReadError, match=message):
+        read_recording(tmp_path / "TotalAcceleration.csv")
+    assert len(read_recording(tmp_path / "Gyroscope.csv")) == len(walk)
+
+
 def test_single_wild_samples_are_no_reason_to_refuse_a_file(
     walk: ImuSequence, tmp_path: Path
 ) -> None:
