@@ -84,6 +84,14 @@ def test_two_wrong_units_are_named_one_after_the_other(walk: ImuSequence) -> Non
     check_units(with_units(gyro_fixed, accel_unit="g"))
 
 
+def test_thousandths_of_a_unit_are_named_as_such(walk: ImuSequence) -> None:
+    gyro, accel = 1e3 * np.degrees(walk.gyro), 1e3 * walk.accel / STANDARD_GRAVITY
+    assert "--gyro-unit mdps" in refusal(replace(walk, gyro=gyro))
+    assert "`--gyro-unit" not in refusal(replace(walk, gyro=0.1 * gyro))
+    assert "--accel-unit mg" in refusal(replace(walk, accel=accel))
+    check_units(with_units(replace(walk, gyro=gyro, accel=accel), "mdps", "mg"))
+
+
 def test_specific_force_in_an_unknown_unit_is_refused(walk: ImuSequence) -> None:
     for factor in (1000.0 / STANDARD_GRAVITY, 100.0, 0.5, STANDARD_GRAVITY):
         assert "accelerometer" in refusal(replace(walk, accel=factor * walk.accel))
