@@ -25,6 +25,11 @@ def test_a_file_of_fixes_is_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(yaw.covariance, [[0.0025]])
 
 
+def test_a_folder_is_no_file_of_fixes(tmp_path: Path) -> None:
+    with pytest.raises(ReadError, match="file: found is a directory, expected a readable file"):
+        read_fixes(tmp_path)
+
+
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
 def test_a_spreadsheets_blank_cells_and_encoding_are_read(tmp_path: Path, encoding: str) -> None:
     path = tmp_path / "fixes.csv"
