@@ -31,6 +31,9 @@ _MARGIN_S = 60.0
 _SINCE_1970_S = 1e8
 """Times beyond this [s] are counted from 1970 rather than from a start."""
 
+_FEW_LOST = 0.05
+"""Share of samples before the start or after the end of another sensor that need no mention."""
+
 _FEW_ROWS = 10
 """Number of rows below which a count may be a coincidence."""
 
@@ -67,7 +70,12 @@ def resample_to_gyro(
     if not kept.any():
         step = float(np.median(np.diff(accel_ns))) * 1e-9
         found, fix = f"samples {step:.3g} s apart", "is its unit the one that the header names?"
-        raise ReadError(path, "time of the accelerometer", found, f"at most {MAX_TRUTH_GAP} s", fix)
+        raise ReadError(path, "time", found, f"at most {MAX_TRUTH_GAP} s", fix)
+    if (lost := int((~kept).sum())) > _FEW_LOST * len(kept):
+        _log.warning(
+            "%s: dropped %d of %d samples at whose times only one of two sensors was recorded",
+            path, lost, len(kept),
+        )  # fmt: skip
     time, t = seconds(gyro_ns[kept], accel_ns[0]), seconds(accel_ns, accel_ns[0])
     return gyro_ns[kept], gyro[kept], interpolated(time, t, accel)
 

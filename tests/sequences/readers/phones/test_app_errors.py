@@ -95,6 +95,19 @@ def test_a_sensors_file_without_samples_is_named(
     assert "Gyroscope.csv: not read: it has no rows" in caplog.text
 
 
+def test_samples_without_an_accelerometer_are_counted(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It stopped halfway, say; that it starts a little late needs no mention."""
+    for part, dropped in ((slice(10, None), False), (slice(0, 751), True)):
+        zyx(tmp_path, walk, Gyroscope=walk.gyro)
+        zyx(tmp_path, walk.select(np.arange(len(walk))[part]), TotalAcceleration=walk.accel[part])
+        caplog.clear()
+        read_recording(tmp_path)
+        assert ("dropped 750 of 1501 samples at whose times only" in caplog.text) == dropped
+        assert ("dropped" in caplog.text) == dropped
+
+
 def test_a_file_of_one_sensor_names_that_of_the_gyroscope(
     walk: ImuSequence, tmp_path: Path
 ) -> None:
