@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from phone_exports import pose
 from phone_files import ns, save, zyx
 
 from stario.sequences import ImuSequence, ReadError, read_recording
@@ -121,12 +122,17 @@ def test_a_file_of_one_sensor_names_that_of_the_gyroscope(
 def test_single_wild_samples_are_no_reason_to_refuse_a_file(
     walk: ImuSequence, tmp_path: Path
 ) -> None:
-    gyro, accel = walk.gyro.copy(), walk.accel.copy()
-    gyro[500, 1], accel[700, 2], accel[900, 0] = 1e30, np.inf, -1e15
+    """They would spoil the comparison with the phone's attitude, which tells Apple's sign."""
+    gyro, accel = walk.gyro.copy(), -walk.accel
+    gyro[500, 1], gyro[600, 0], accel[700, 2], accel[900, 0] = 1e30, 1e5, np.inf, -1e15
     zyx(tmp_path, walk, Gyroscope=gyro, TotalAcceleration=accel)
-    time, kept, _ = clean_samples(read_recording(tmp_path))
-    assert len(time) == len(walk) - 3
-    assert np.abs(kept).max() < 10.0
+    header = "time,seconds_elapsed,qz,qy,qx,qw"
+    quat_xyzw = pose(walk).quat_xyzw[:, [2, 1, 0, 3]]
+    save(tmp_path / "Orientation.csv", header, ns(walk), walk.time, quat_xyzw)
+    time, rate, force = clean_samples(read_recording(tmp_path))
+    assert len(time) == len(walk) - 2
+    np.testing.assert_allclose(rate, np.delete(walk.gyro, [500, 600], axis=0))
+    assert np.abs(force - np.delete(walk.accel, [500, 600], axis=0)).max() < 2.0
 
 
 def test_a_clock_in_another_unit_than_its_title_says(walk: ImuSequence, tmp_path: Path) -> None:
