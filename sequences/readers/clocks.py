@@ -119,7 +119,10 @@ def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.in
     }
     unit = max(fitting, key=lambda unit: fitting[unit])
     if not fitting[unit]:
-        raise ReadError(file, "time", "other times", "times of the recording")
+        found = f"times from {time.min():.12g} to {time.max():.12g}"
+        whole = f"{float(start_ns) * 1e-9:.3f} to {float(stop_ns) * 1e-9:.3f} s"
+        expected = f"some within the recording's, {whole}, in any unit"
+        raise ReadError(file, "time", found, expected, "write both in one clock")
     return unit
 
 
