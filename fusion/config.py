@@ -182,8 +182,8 @@ def read_config(path: Path | str) -> NavigatorConfig:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
-        values = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+        text = path.read_text(encoding="utf-8-sig")
+        values = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
     except FileNotFoundError:
         raise ConfigError(str(path), "no such file", "a TOML or JSON file") from None
     except OSError as error:

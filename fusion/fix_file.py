@@ -23,7 +23,7 @@ import numpy as np
 from stario.fusion.fixes import KINDS, MAX_YAW, Fix, make_fix
 from stario.fusion.lie import UNKNOWN_YAW
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers.lines import decimal_mark
+from stario.sequences.readers.lines import decimal_mark, read_lines
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.time_order import increasing_mask
 
@@ -45,16 +45,14 @@ def read_fixes(path: Path | str) -> list[Fix]:
             names line and column.
     """
     path = Path(path)
+    lines = read_lines(path)
+    separator = max(",;\t", key=lines[0].count)
+    decimal = decimal_mark(lines[1:], separator)
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-        separator = max(",;\t", key=lines[0].count) if lines else ","
-        decimal = decimal_mark(lines[1:], separator)
-        rows = list(csv.reader(lines, delimiter=separator))
-    except FileNotFoundError:
-        raise ReadError(path, "file", "no such file", "a CSV of fixes") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        rows = [_trimmed(row) for row in csv.reader(lines, delimiter=separator)]
+    except csv.Error as error:
         raise ReadError(path, "file", str(error), "a readable CSV of fixes") from error
-    header = [_without_unit(word).lower() for word in rows[0]] if rows else []
+    header = [_without_unit(word).lower() for word in rows[0]]
     for number, row in enumerate(rows, start=1):
         if row and row[0].lstrip().startswith("#"):
             expected = "only the header and fixes"
@@ -63,12 +61,18 @@ def read_fixes(path: Path | str) -> list[Fix]:
         raise ReadError(path, "line 1", found, f"the header {','.join(_COLUMNS)}")
     fixes = []
     for number, row in enumerate(rows[1:], start=2):
-        if any(word.strip() for word in row):
+        if row:
             cells = [word.strip().replace(decimal, ".") for word in row]
             fixes.append(_read_row(path, f"line {number}", header, cells))
     if not fixes:
         raise ReadError(path, "file", "a header only", "at least one fix")
     return fixes
+
+
+def _trimmed(row: list[str]) -> list[str]:
+    """Return a row without the blank cells at its end, which spreadsheets write."""
+    width = max((k for k, cell in enumerate(row, 1) if cell.strip()), default=0)
+    return row[:width]
 
 
 def _wrong_column(header: Sequence[str]) -> str:
@@ -125,7 +129,8 @@ def _read_row(path: Path, where: str, header: Sequence[str], row: Sequence[str])
     if unit == "deg]":
         value, sigma = np.radians(value), np.radians(sigma)
     if kind == "yaw" and (abs(value[0]) > MAX_YAW or sigma[0] > UNKNOWN_YAW):
-        found, remedy = f"{cells['x']} +- {cells['sx']}", "for degrees, use the kind `yaw [deg]`"
+        found = f"{cells['x']} +- {cells['sx']}"
+        remedy = "" if unit == "deg]" else "for degrees, use the kind `yaw [deg]`"
         raise ReadError(path, f"{where}, yaw", found, "radians", remedy)
     (time,) = _numbers(path, where, cells, ["t"])
     return make_fix(time, kind, value, np.diag(np.square(sigma)))  # type: ignore[arg-type]

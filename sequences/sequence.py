@@ -178,7 +178,7 @@ class ImuSequence:
         accel: (N, 3) specific force in B [m/s^2]; at rest about 9.81, pointing up.
         truth: ground truth (the true trajectory), or None.
         converted: which of "gyro" and "accel" the reader has converted from a unit named in the
-            file, so that they are not converted again.
+            file, and "sign" if it has turned Apple's, so that they are not converted again.
         magnetometer: magnetic field measured alongside the IMU, or None.
         positions: known positions if there are no poses (`truth`): a track or waypoints, or None.
         attributes: other metadata of the recording (person, device, place, carry, ...).

@@ -86,7 +86,7 @@ def with_units(
 
     Raises:
         InputError: a unit is unknown, or given for numbers already converted from the unit named
-            in their file.
+            in their file; or so is a minus.
     """
     return replace(
         sequence,
@@ -98,8 +98,12 @@ def with_units(
 def _factor(sequence: ImuSequence, sensor: str, unit: str, known: dict[str, float]) -> float:
     field = f"{sensor}_unit"
     name = known_unit(field, unit, known)
-    if known[name] != 1.0 and sensor in sequence.converted:
+    if abs(known[name]) != 1.0 and sensor in sequence.converted:
         found = f"{unit!r} for {sequence.name}, whose file names its unit"
         expected = f"{next(iter(known))}, to which it was converted on reading"
         raise InputError(field, found, expected, "omit the option or fix the file's header")
+    if known[name] < 0.0 and "sign" in sequence.converted:
+        found = f"{unit!r} for {sequence.name}, whose sign was already turned on reading"
+        fix = "omit the minus and `--accel-sign apple`"
+        raise InputError(field, found, "a unit without a minus", fix)
     return known[name]

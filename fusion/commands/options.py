@@ -283,7 +283,7 @@ def recipe_values(path: Path) -> dict[str, Any]:
         ConfigError: the file cannot be read, or is not a table of settings.
     """
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError) as error:
         found = "no such file" if isinstance(error, FileNotFoundError) else str(error)
         raise ConfigError(str(path), found, "a JSON file with settings") from error

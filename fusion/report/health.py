@@ -145,6 +145,8 @@ def _samples(health: Health) -> Iterator[Finding]:
                 "The sensors repeat their values: log them at their own rate; if they stopped for "
                 "good, restart the device and record again."
             )
+        elif dropped.get("out_of_order", 0) > 0.5 * count:
+            advice = "`stario inspect` says when: sort the rows, or split the recording there."
         yield Finding("warning", text, advice)
     elif dropped:
         yield Finding("note", text)

@@ -121,10 +121,10 @@ def _check_content(sequence: ImuSequence) -> None:
         with np.errstate(over="ignore"):  # single values may be huge: the median ignores them
             size = float(np.nanmedian(np.linalg.norm(values, axis=1)))
         if size > _NO_SENSOR:
-            raise InputError(
-                f"{sequence.name}: {field}", f"{size:.3g} on average", "a plausible sensor value",
-                "is another column meant, or is one of them a clock?",
-            )  # fmt: skip
+            fix = "is another column meant, or is one of them a clock?"
+            fix += " If it is in mdps, pass `--gyro-unit mdps`" if field == "gyro" else ""
+            found = f"{size:.3g} on average"
+            raise InputError(f"{sequence.name}: {field}", found, "a plausible sensor value", fix)
 
 
 def check_gyro(
@@ -169,6 +169,8 @@ def check_gyro(
         fix = "are its axes and signs the accelerometer's? If the device lay still, is it in deg/s?"
     elif unit_known:
         fix = _UNIT_NAMED
+    elif speed * GYRO_UNITS["deg/s"] > FAST_RAD_S:
+        fix = "these are neither rad/s nor deg/s: convert a sensor's counts to one of the two"
     raise InputError(f"{name}: gyroscope", found, "rad/s", fix)
 
 
@@ -185,10 +187,11 @@ def _check_force(sequence: ImuSequence, force: float, average: float) -> None:
         if sequence.truth is not None:
             fix = "pass `--gravity removed`"
         fix = f"if it is linear or user acceleration, {fix}"
-    elif _G_RANGE[0] <= average <= _G_RANGE[1]:
+    elif any(_G_RANGE[0] <= average / size <= _G_RANGE[1] for size in (1.0, 1e3)):
+        unit = "g" if average <= _G_RANGE[1] else "mg"
         fix = (
-            "if it is in g, pass `--accel-unit g` (and `--accel-sign apple` if it is from "
-            "an iPhone) or write `ax [g]` in the CSV's header"
+            f"if it is in {unit}, pass `--accel-unit {unit}` (and `--accel-sign apple` if it is "
+            f"from an iPhone) or write `ax [{unit}]` in the CSV's header"
         )
         if "accel" in sequence.converted:
             fix = _UNIT_NAMED
@@ -240,8 +243,8 @@ def _downward(sequence: ImuSequence, fit: TruthFit | None) -> InputError:
     decide: rotated by the attitude, the accelerometer then measures their acceleration or its
     opposite.
     """
-    sign = "pass `--accel-unit=-m/s^2` (or -g) or write `ax [-m/s^2]` in the CSV's header"
-    sign = _UNIT_NAMED if "accel" in sequence.converted else sign
+    sign = "pass `--accel-sign apple` or write `ax [-m/s^2]` (or `[-g]`) in the CSV's header"
+    sign = _UNIT_NAMED if "sign" in sequence.converted else sign
     fix = f"{sign}; or if the truth's world has z down, {_TO_Z_UP}"
     positions = fit_positions(sequence, fit.time_offset) if fit and fit.consistent else None
     if positions is not None and positions.correlation > _SAME_MOTION:

@@ -170,7 +170,7 @@ def _sequence(path: Path, name: str, group: Any) -> ImuSequence:
         gyro=_column(path, group, "imu/gyro", finite=False),
         accel=_column(path, group, "imu/accel", finite=False),
         truth=truth,
-        converted=frozenset({"gyro", "accel"}),
+        converted=frozenset({"gyro", "accel", "sign"}),
         magnetometer=_magnetometer(path, group),
         positions=positions,
         device_attitude=_device_attitude(path, group),

@@ -31,6 +31,9 @@ _MARGIN_S = 60.0
 _SINCE_1970_S = 1e8
 """Times beyond this [s] are counted from 1970 rather than from a start."""
 
+_FEW_LOST = 0.05
+"""Share of samples before the start or after the end of another sensor that need no mention."""
+
 _FEW_ROWS = 10
 """Number of rows below which a count may be a coincidence."""
 
@@ -48,7 +51,7 @@ def resample_to_gyro(
         Time stamps (K,) [ns], gyroscope (K, 3) and accelerometer (K, 3).
 
     Raises:
-        ReadError: the two sensors do not overlap in time.
+        ReadError: the two sensors do not overlap in time, or the accelerometer's rate is too low.
     """
     order = np.unique(accel_ns, return_index=True)[1]
     accel_ns, accel = accel_ns[order], accel[order]
@@ -64,6 +67,15 @@ def resample_to_gyro(
     before, after = accel_ns[right - 1], accel_ns[right]
     exact = (gyro_ns == before) | (gyro_ns == after)
     kept &= exact | (after - before <= round(MAX_TRUTH_GAP * 1e9))
+    if not kept.any():
+        step = float(np.median(np.diff(accel_ns))) * 1e-9
+        found, fix = f"samples {step:.3g} s apart", "is its unit the one that the header names?"
+        raise ReadError(path, "time", found, f"at most {MAX_TRUTH_GAP} s", fix)
+    if (lost := int((~kept).sum())) > _FEW_LOST * len(kept):
+        _log.warning(
+            "%s: dropped %d of %d samples at whose times only one of two sensors was recorded",
+            path, lost, len(kept),
+        )  # fmt: skip
     time, t = seconds(gyro_ns[kept], accel_ns[0]), seconds(accel_ns, accel_ns[0])
     return gyro_ns[kept], gyro[kept], interpolated(time, t, accel)
 
@@ -107,7 +119,10 @@ def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.in
     }
     unit = max(fitting, key=lambda unit: fitting[unit])
     if not fitting[unit]:
-        raise ReadError(file, "time", "other times", "times of the recording")
+        found = f"times from {time.min():.12g} to {time.max():.12g}"
+        whole = f"{float(start_ns) * 1e-9:.3f} to {float(stop_ns) * 1e-9:.3f} s"
+        expected = f"some within the recording's, {whole}, in any unit"
+        raise ReadError(file, "time", found, expected, "write both in one clock")
     return unit
 
 

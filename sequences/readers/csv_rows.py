@@ -15,7 +15,7 @@ from stario.sequences.errors import ReadError
 from stario.sequences.readers.clocks import assumed_unit, refuse_row_numbers, time_unit
 from stario.sequences.readers.columns import IMU, QUANTITIES, Column, Header, unit_factor
 from stario.sequences.readers.dates import with_seconds
-from stario.sequences.readers.lines import decimal_mark, ends_within_a_row, unquoted
+from stario.sequences.readers.lines import decimal_mark, ends_within_a_row, is_row, unquoted
 from stario.sequences.readers.rows import NumberedLine, is_missing, parsed_rows, rows_below
 from stario.sequences.readers.text import read_quickly
 from stario.sequences.sequence import BoolArray, FloatArray
@@ -50,12 +50,25 @@ def read_rows(path: Path, lines: list[str], header: Header) -> Rows:
         ReadError: there is none, or one is malformed; names its line and column.
     """
     decimal = decimal_mark(lines[header.lines :], header.separator)
+    _check_width(path, lines, header, decimal)
     if len(lines) > header.lines + 1 and ends_within_a_row(path, header.separator):
         # The recorder was killed while it wrote: all earlier rows are complete.
         _log.warning("%s: skipped the last line, %d, which is cut short", path, len(lines))
         return _rows_carefully(path, lines[:-1], header, decimal)
     rows = _rows_quickly(path, header, decimal)
     return rows or _rows_carefully(path, lines, header, decimal)
+
+
+def _check_width(path: Path, lines: list[str], header: Header, decimal: str) -> None:
+    """Check that the first row has no more cells than there are titles: which ones lack a title?"""
+    numbered = enumerate(lines[header.lines :], header.lines + 1)
+    number, first = next(((k, line) for k, line in numbered if is_row(line)), (0, ""))
+    cells = unquoted(first, header.separator, decimal).rstrip(f"{header.separator} ")
+    count = cells.count(header.separator) + 1
+    if count > header.titles:
+        found, expected = f"{count} values", f"{header.titles} as in the header"
+        fix = "name every column, and write decimal points"
+        raise ReadError(path, f"line {number}", found, expected, fix)
 
 
 def _rows_quickly(path: Path, header: Header, decimal: str) -> Rows | None:

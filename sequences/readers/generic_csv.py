@@ -78,15 +78,19 @@ def read_generic_csv(path: Path) -> ImuSequence:
     lines = read_lines(path)
     header = read_header(path, lines)
     rows = read_rows(path, lines, header)
-    gyro, gyro_converted = _vectors(path, header, rows, "g", GYRO_UNITS)
-    accel, accel_converted = _vectors(path, header, rows, "a", ACCEL_UNITS)
+    gyro, gyro_factors = _vectors(path, header, rows, "g", GYRO_UNITS)
+    accel, accel_factors = _vectors(path, header, rows, "a", ACCEL_UNITS)
     rows, time, gyro, accel = _samples(path, rows, gyro, accel)
     truth, positions = _ground_truth(path, rows)
     field = None
     if "mx" in rows.table:
         vectors, _ = _vectors(path, header, rows, "m", MAGNETIC_UNITS)
         field = magnetometer(rows.time, vectors, held=False)
-    converted = {"gyro": gyro_converted, "accel": accel_converted}
+    converted = {
+        "gyro": gyro_factors != 1.0,
+        "accel": np.abs(accel_factors) != 1.0,
+        "sign": accel_factors < 0.0,
+    }
     return ImuSequence(
         name=path.stem,
         time=time,
@@ -96,7 +100,7 @@ def read_generic_csv(path: Path) -> ImuSequence:
         positions=positions,
         magnetometer=field,
         source=source_words("generic CSV", rows.assumed_unit),
-        converted=frozenset(sensor for sensor, done in converted.items() if done),
+        converted=frozenset(sensor for sensor, done in converted.items() if done.any()),
     )
 
 
@@ -142,12 +146,12 @@ def _in_separate_rows(shared: BoolArray) -> bool:
 
 def _vectors(
     path: Path, header: Header, rows: Rows, letter: str, known: Mapping[str, float]
-) -> tuple[FloatArray, bool]:
-    """Return three columns (N, 3) in the first unit of `known`, and whether they were converted."""
+) -> tuple[FloatArray, FloatArray]:
+    """Return three columns (N, 3) in the first unit of `known`, and the factors (3,) to it."""
     names = [letter + axis for axis in "xyz"]
     factors = np.array([unit_factor(path, header.columns[name], known) for name in names])
     values = np.stack([rows.table[name] for name in names], axis=1)
-    return values * factors, bool((factors != 1.0).any())
+    return values * factors, factors
 
 
 def kind_of_positions(time: FloatArray) -> Literal["positions", "waypoints"]:

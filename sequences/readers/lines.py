@@ -34,7 +34,8 @@ def read_lines(path: Path) -> list[str]:
     except FileNotFoundError:
         raise ReadError(path, "file", "no such file", "a readable file") from None
     except OSError as error:
-        raise ReadError(path, "file", type(error).__name__, "a readable file") from None
+        found = (error.strerror or "an error").lower()
+        raise ReadError(path, "file", found, "a readable file") from None
     if not content.startswith(_UTF_16):
         content = _without_padding(path, content)
     lines = _decoded(content).splitlines()

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.archive import AttributeFilter, split_name
-from stario.sequences.readers.lines import first_line, first_lines, numbers_in, read_lines
+from stario.sequences.readers.lines import first_line, first_lines, is_row, numbers_in, read_lines
 
 _SUFFIXES = (".txt", ".list", ".lst")
 _HEAD_LINES = 20
@@ -43,11 +43,8 @@ def list_entries(path: Path) -> Iterator[tuple[Path, AttributeFilter] | ReadErro
     Raises:
         ReadError: the list cannot be read or names nothing, or is some other long text.
     """
-    lines = read_lines(path)
-    while lines and not lines[-1].strip():
-        lines.pop()
-    numbered = enumerate(lines, 1)
-    entries = [(k, *_parsed(x.split("#")[0])) for k, x in numbered if x.lstrip()[:1] != "#"]
+    numbered = enumerate(read_lines(path), 1)
+    entries = [(k, *_parsed(x.split("#")[0])) for k, x in numbered if is_row(x)]
     if not entries:
         raise ReadError(path, "list", "no entry", "names of recordings")
     bases = _bases(path.parent)

@@ -241,7 +241,7 @@ def _posed(sequence: ImuSequence, fit: _Fit) -> ImuSequence:
         return replace(sequence, truth=None)
     if min(up[1:]) < -_DOWN * np.linalg.norm(up):  # worlds have y or z up
         _log.warning("%s: inverted the accelerometer, which has Apple's sign", sequence.name)
-        converted = sequence.converted | {"accel"}
+        converted = sequence.converted | {"accel", "sign"}
         sequence, up = replace(sequence, accel=-sequence.accel, converted=converted), -up
     R_WP = tilt_aligning(up)
     try:

@@ -50,11 +50,11 @@ def parsed_rows(
     """
     rows = [line for _, line in numbered]
     with suppress(ValueError, IndexError):
-        return np.loadtxt(rows, delimiter=delimiter, ndmin=2, usecols=columns)
+        return np.loadtxt(rows, comments=None, delimiter=delimiter, ndmin=2, usecols=columns)
     if delimiter is not None:
         filled = _blank(delimiter).sub("nan", "\n".join(rows)).split("\n")
         with suppress(ValueError, IndexError):
-            return np.loadtxt(filled, delimiter=delimiter, ndmin=2, usecols=columns)
+            return np.loadtxt(filled, comments=None, delimiter=delimiter, ndmin=2, usecols=columns)
     titles = titles or [f"column {k + 1}" for k in columns]
     return np.array([_row(path, row, delimiter, columns, titles) for row in numbered])
 

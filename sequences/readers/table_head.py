@@ -21,9 +21,11 @@ from stario.sequences.readers.text import Table, read_table
 from stario.sequences.sequence import FloatArray
 
 _FORMS: tuple[tuple[str | None, str], ...] = (
-    *((";", "."), (";", ","), ("\t", "."), ("\t", ","), (",", "."), (None, "."), (None, ",")),
+    *((";", "."), (";", ","), ("\t", "."), ("\t", ","), (",", "."), (",", ",")),
+    *((None, "."), (None, ",")),
 )
-"""Separators (None for blanks) and decimal marks in the order in which they are tried."""
+"""Separators (None for blanks) and decimal marks in the order in which they are tried; commas may
+be both if cells are quoted."""
 
 _MARK_ROWS = 5
 """Number of rows that determine the decimal mark."""
@@ -96,15 +98,24 @@ def _head(file: Path, numbers: list[int], lines: list[str], least: int) -> Table
     rows = [cells_of(line, delimiter, decimal) for line in lines[first:]]
     rows = (rows[:-1] if len(rows) > 2 else rows)[:_HEAD_ROWS]  # the last line may be cut
     width = max(set(map(len, rows)), key=list(map(len, rows)).count)
-    titles = _titles(lines[:first], delimiter)
-    if delimiter is None and len(titles) != width:  # words of a comment
-        titles = []
+    titles = _titles(lines[:first], delimiter, width)
     values = np.array([[number_of(cell) for cell in row] for row in rows if len(row) == width])
     return TableHead(file, numbers[first], delimiter, decimal, titles[:width], values)
 
 
-def _titles(above: list[str], delimiter: str | None) -> list[str]:
-    """Return the titles in the last line above the rows, or above a line of their units."""
+def _titles(above: list[str], delimiter: str | None, width: int) -> list[str]:
+    """Return the titles of `width` columns in the last line above the rows, or above their units.
+
+    They may be separated in another way than the rows, as NumPy's `savetxt` writes them.
+    """
+    for separator in dict.fromkeys((delimiter, ",", ";", "\t")):
+        titles = _titles_at(above, separator)
+        if len(titles) == width:
+            return titles
+    return [] if delimiter is None else _titles_at(above, delimiter)  # not the words of a comment
+
+
+def _titles_at(above: list[str], delimiter: str | None) -> list[str]:
     lines = [unquoted(line.lstrip("# "), delimiter).split(delimiter) for line in above[-2:]]
     titles = with_units_below(*lines) if len(lines) == 2 else None
     titles = titles or (lines[-1] if lines else [])
@@ -128,8 +139,8 @@ def first_row(lines: list[str], least: int = 4) -> tuple[int, str | None, str] |
 
 
 def cells_of(line: str, delimiter: str | None, decimal: str) -> list[str]:
-    """Return a line's cells, with decimal points."""
-    return (line.replace(",", ".") if decimal == "," else line).split(delimiter)
+    """Return a line's cells without quotes, with decimal points."""
+    return unquoted(line, delimiter, decimal).split(delimiter)
 
 
 def number_of(cell: str) -> float:

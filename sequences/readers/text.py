@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -24,6 +25,9 @@ _log = logging.getLogger(__name__)
 IntArray = NDArray[np.int64]
 
 _LARGE_BYTES = 2_000_000
+
+_MARK_IN_ROW = re.compile(rb"[^\r\n]#")
+"""A `#` that begins no comment, as in `-1.#IND`, of which pandas would read -1."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,8 @@ class Table:
             return np.array(stamps, dtype=np.int64)
         except OverflowError:
             found = f"a time of {max(map(abs, stamps)):.3g} ns"
-            raise ReadError(self.path, "time", found, "at most 9.2e18 ns") from None
+            fix = "is its unit the one that the header names?"
+            raise ReadError(self.path, "time", found, "at most 9.2e18 ns", fix) from None
 
     def _stamp(self, row: int, cell: str, unit_ns: int) -> int:
         try:
@@ -138,7 +143,7 @@ def read_quickly(
     indices of its columns.
     """
     try:
-        if path.stat().st_size < _LARGE_BYTES:
+        if path.stat().st_size < _LARGE_BYTES or _MARK_IN_ROW.search(path.read_bytes()):
             return None
         pandas = importlib.import_module("pandas")
         frame = pandas.read_csv(

@@ -7,7 +7,12 @@ from pathlib import Path
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.columns import HEADER
 from stario.sequences.readers.lines import first_bytes, first_line
-from stario.sequences.readers.phones.files import incomplete_sensors, names_both_sensors
+from stario.sequences.readers.phones.files import (
+    incomplete_sensors,
+    names_both_sensors,
+    recording_with,
+    unread_files,
+)
 from stario.sequences.readers.poses import pose_files
 
 _EXPORT = "export as CSV, or as the zip or folder that the app writes"
@@ -33,8 +38,13 @@ def unrecognised(path: Path, inside: list[Path], known: str) -> ReadError:
     if inside:
         found, fix = f"a folder of {len(inside)} recordings", f"name one, such as {inside[0]}"
     elif sensors := incomplete_sensors(path):
-        expected = "a gyroscope and an accelerometer"
-        return ReadError(path, "sensors", f"only {' and '.join(sensors)}", expected, "log both")
+        found, expected = f"only {' and '.join(sensors)}", "a gyroscope and an accelerometer"
+        unread = [file.name for file in unread_files(path)] if path.is_dir() else []
+        no_rows = f"{' and '.join(unread)}: no rows with a time that grows and three values"
+        return ReadError(path, "sensors", found, expected, no_rows if unread else "log both")
+    elif part_of := recording_with(path):
+        found, fix = "one sensor of a recording", f"name its gyroscope: {part_of.gyro}"
+        return ReadError(path, "content", found, "a recording", fix)
     elif names_both_sensors(path):
         found, fix = "no column of times that grow", "name one `t [s]`; a count of samples is none"
         return ReadError(path, "time", found, "one next to the sensors'", fix)

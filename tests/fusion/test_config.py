@@ -44,6 +44,10 @@ def test_json_and_toml_give_the_same_configuration(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(json.dumps(values))
     (tmp_path / "a.toml").write_text("gravity = 9.8\n[filter]\ngate = 0.99\n")
     assert read_config(tmp_path / "a.json") == read_config(tmp_path / "a.toml")
+    for name in ("a.json", "a.toml"):
+        marked = tmp_path / f"MARKED{name[1:].upper()}"
+        marked.write_text((tmp_path / name).read_text(), encoding="utf-8-sig")
+        assert read_config(marked) == read_config(tmp_path / name)
 
 
 def test_an_empty_file_gives_the_defaults(tmp_path: Path) -> None:

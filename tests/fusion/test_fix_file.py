@@ -25,10 +25,24 @@ def test_a_file_of_fixes_is_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(yaw.covariance, [[0.0025]])
 
 
+def test_a_folder_is_no_file_of_fixes(tmp_path: Path) -> None:
+    with pytest.raises(ReadError, match="file: found is a directory, expected a readable file"):
+        read_fixes(tmp_path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
+def test_a_spreadsheets_blank_cells_and_encoding_are_read(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "fixes.csv"
+    table = "t,kind,x,y,sx,,\n1.5,position,1,2,0.1,,\n2,yaw,0.7,,0.05,,\n,,,,,\xa0,\n"
+    path.write_bytes(table.replace(",", "\t").encode(encoding))
+    assert [fix.kind for fix in read_fixes(path)] == ["position", "yaw"]
+
+
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("", "line 1.*header"),
+        ("", "no lines"),
+        (HEADER + "1,yaw [deg],17,,,500,,\n", r"yaw: found 17 \+- 500, expected radians$"),
         ("time,kind\n", "line 1.*header"),
         (HEADER + "1,altitude,1,2,3,1,,\n", "line 2, kind.*altitude"),
         (HEADER + "1,position,1,2,3,1,,\nx,position,1,2,3,1,,\n", "line 3, t"),

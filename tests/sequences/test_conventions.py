@@ -75,8 +75,11 @@ def test_apples_sign_is_reversed_unless_the_reader_did_so(walk: ImuSequence) -> 
     apple = replace(walk, accel=-walk.accel / STANDARD_GRAVITY)
     back = with_conventions(apple, accel_unit="g", accel_sign="apple")
     np.testing.assert_allclose(back.accel, walk.accel)
-    with pytest.raises(InputError, match="names its unit"):
-        with_conventions(replace(walk, converted=frozenset({"accel"})), accel_sign="apple")
+    named = replace(walk, accel=-walk.accel, converted=frozenset({"accel"}))  # `ax [g]`
+    back = with_conventions(named, accel_sign="apple")
+    np.testing.assert_allclose(back.accel, walk.accel)
+    with pytest.raises(InputError, match=r"sign was already turned .*omit"):
+        with_conventions(replace(walk, converted=frozenset({"sign"})), accel_sign="apple")
     with pytest.raises(InputError, match="accel_sign: found 'left'"):
         with_conventions(walk, accel_sign="left")
 

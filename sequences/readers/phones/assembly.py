@@ -56,13 +56,15 @@ def assemble_recording(
         ReadError: a file is malformed or the sensors do not overlap in time.
     """
     folder = files.gyro.parent
+    for file in files.unread:
+        _log.warning("%s: not read: it has no rows with a time that grows and three values", file)
     gyro = _read(files.tables["gyro"][0], "gyro")
     attitude = logged_attitude(files, gyro)
     accel = _force(files, attitude, core_motion)
     stamps, rate, force = resample_to_gyro(
         folder, gyro.stamps_ns, gyro.values, accel.samples.stamps_ns, accel.samples.values
     )
-    converted = {"gyro": gyro.unit not in ("", "rad/s"), "accel": accel.converted}
+    converted = {"gyro": gyro.unit not in ("", "rad/s"), **accel.converted}
     sequence = ImuSequence(
         name=name,
         time=seconds(stamps, stamps[0]),
@@ -93,10 +95,10 @@ def _read(table: SensorTable, sensor: Sensor) -> Samples:
 
 @dataclass(frozen=True)
 class _Force:
-    """Specific force, whether its unit or sign was converted, and whether Apple's sign is left."""
+    """Specific force, which of unit and sign were converted, and whether Apple's sign is left."""
 
     samples: Samples
-    converted: bool
+    converted: dict[str, bool]
     maybe_apple: bool
 
 
@@ -124,7 +126,10 @@ def _force(
     factor *= STANDARD_GRAVITY if in_g and inverted else 1.0
     return _Force(
         samples=replace(accel, values=factor * accel.values),
-        converted=inverted or accel.unit not in ("", "m/s^2"),
+        converted={
+            "accel": inverted or accel.unit.removeprefix("-") not in ("", "m/s^2"),
+            "sign": inverted or accel.unit.startswith("-"),
+        },
         maybe_apple=sign is None and in_two_parts and not in_g,
     )
 

@@ -50,10 +50,17 @@ _BY_FILE = {
 
 @dataclass
 class PhoneFiles:
-    """A recording's files by sensor, the preferred variant first."""
+    """A recording's files by sensor, the preferred variant first.
+
+    Attributes:
+        key: words that the files' names share.
+        tables: the files of each sensor.
+        unread: files of gyroscope or accelerometer that would be preferred, but hold no samples.
+    """
 
     key: str
     tables: dict[Sensor, list[SensorTable]] = field(default_factory=dict)
+    unread: list[Path] = field(default_factory=list)
 
     @property
     def gyro(self) -> Path:
@@ -63,8 +70,12 @@ class PhoneFiles:
     @property
     def shown(self) -> Path:
         """The recording's path in messages: the only file, or else the folder."""
-        files = {table.file for tables in self.tables.values() for table in tables}
-        return self.gyro if len(files) == 1 else self.gyro.parent
+        return self.gyro if len(self.files) == 1 else self.gyro.parent
+
+    @property
+    def files(self) -> set[Path]:
+        """The files of all sensors."""
+        return {table.file for tables in self.tables.values() for table in tables}
 
     def first(self, sensor: Sensor) -> SensorTable | None:
         """Return the preferred file of a sensor, or None."""
@@ -73,22 +84,43 @@ class PhoneFiles:
 
 def phone_recordings(folder: Path) -> list[PhoneFiles]:
     """Return the recordings whose gyroscope and accelerometer are in a folder; never raises."""
+    groups = _groups(folder)
+    complete = [group for group in groups if is_complete(group.tables)]
+    if complete:
+        return complete
+    merged = _merged_groups(groups)
+    return [merged] if is_complete(merged.tables) else []
+
+
+def recording_with(file: Path) -> PhoneFiles | None:
+    """Return the recording in a file's folder that the file is a part of; never raises."""
+    if not file.is_file():
+        return None
+    return next((one for one in phone_recordings(file.parent) if file in one.files), None)
+
+
+def unread_files(folder: Path) -> list[Path]:
+    """Return a folder's files of gyroscopes and accelerometers without samples; never raises."""
+    return [file for group in _groups(folder) for file in group.unread]
+
+
+def _groups(folder: Path) -> list[PhoneFiles]:
+    """Return a folder's files of each recording, complete or not."""
     named = [(file, words_of(file.stem)) for file in sorted(folder.iterdir()) if _may_hold(file)]
     groups: dict[str, PhoneFiles] = {}
     for file, words in sorted(named, key=lambda item: _preference(*item)):
         sensor = _sensor_of(words)
         table = sensor_table(file) if sensor else None
         # A file with both sensors is a recording by itself, such as the first walk, `walk_a.csv`.
-        if sensor is None or table is None or is_complete(table.axes):
+        if sensor is None or (table is not None and is_complete(table.axes)):
             continue
         key = " ".join(word for word in words if not is_sensor_word(word) and word not in _MOTION)
         group = groups.setdefault(key, PhoneFiles(key))
-        group.tables.setdefault(sensor, []).append(table)
-    complete = [group for group in groups.values() if is_complete(group.tables)]
-    if complete:
-        return complete
-    merged = _merged_groups(list(groups.values()))
-    return [merged] if is_complete(merged.tables) else []
+        if table is not None:
+            group.tables.setdefault(sensor, []).append(table)
+        elif sensor in ("gyro", "accel") and sensor not in group.tables:
+            group.unread.append(file)
+    return list(groups.values())
 
 
 def is_complete(sensors: Collection[str | None]) -> bool:

@@ -30,6 +30,9 @@ _INSTANCE = {"i", "instance", "imu", "imu_id", "imu id"}
 _MAX_IMUS = 9
 """Titles of a column that numbers IMUs, and their maximum number."""
 
+_MOSTLY = 0.8
+"""Share of a clock's steps that do not go back; loggers with a thread per sensor swap some rows."""
+
 _SAME_PACE = 0.02
 """Relative tolerance within which a column as fast as the time, in any unit, is another clock."""
 
@@ -153,17 +156,20 @@ def _finest(clocks: list[Column], head: FloatArray) -> Column:
 
 
 def _grows(column: FloatArray) -> bool:
-    steps = np.diff(column)
-    return bool(np.isfinite(column).all() and (steps >= 0).mean() > 0.8 and column[-1] > column[0])
+    return bool(np.isfinite(column).all() and _order(column) > _MOSTLY and column[-1] > column[0])
+
+
+def _order(column: FloatArray) -> float:
+    """Return the share of a column's steps that do not go back."""
+    return float((np.diff(column) >= 0).mean())
 
 
 def by_rows(head: FloatArray) -> Layout | None:
     """Return the layout of rows (N, K) without titles: time is first or fourth, and grows."""
     width = head.shape[1]
-    for time, start in ((0, 1), (3, 0)):
-        if time >= width or not (np.diff(head[:, time]) >= 0).all():
-            continue
-        if not head[-1, time] > head[0, time]:
+    places = [(time, start) for time, start in ((0, 1), (3, 0)) if time < width]
+    for time, start in sorted(places, key=lambda place: -_order(head[:, place[0]])):
+        if not _grows(head[:, time]):
             continue
         while start and start < width and _is_clock(head[:, start], head[:, time]):
             start += 1
@@ -184,7 +190,7 @@ def by_rows(head: FloatArray) -> Layout | None:
 
 def _is_clock(column: FloatArray, time: FloatArray) -> bool:
     """Return whether a column next to the time is another clock: large, or as fast as the time."""
-    if not (np.diff(column) >= 0).all():
+    if _order(column) <= _MOSTLY:
         return False
     if abs(column[0]) > _CLOCK_FROM:
         return True

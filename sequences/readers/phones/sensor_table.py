@@ -18,7 +18,7 @@ from stario.sequences.readers.columns import Column, unit_factor
 from stario.sequences.readers.phones.sensor_layout import Layout, by_header, by_rows
 from stario.sequences.readers.table_head import TableHead, table_heads
 from stario.sequences.readers.text import IntArray, Table
-from stario.sequences.sequence import FloatArray
+from stario.sequences.sequence import BoolArray, FloatArray
 from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS
 
 _log = logging.getLogger(__name__)
@@ -32,6 +32,9 @@ UNITS = {
 }
 _LIMITS = {"accel": 2e3, "linear": 2e3, "gravity": 2e3, "gyro": 1e4, "mag": 1e5}
 """Maximum values of any sensor, in m/s^2, deg/s and uT."""
+
+_WILD = 100.0
+"""Factor beyond these limits at which one sample would spoil integrals and interpolation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +106,8 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
         values = values - rows.values[kept, 4:7]
     named = next((place for place in places if place.unit), places[0])
     values = unit_factor(table.file, named, UNITS[sensor]) * values
-    _check_size(table.file, titles, sensor, values)
+    sound = _sound_samples(table.file, sensor, titles, values)
+    kept, time, values = kept[sound], time[sound], values[sound]
     per_second = time_unit(table.file, time, clock.unit)
     stamps = rows.stamps_ns(clock.index, per_second, kept)
     assumed = "" if clock.unit else assumed_unit(per_second, float(time[0]))
@@ -124,14 +128,24 @@ def _complete_rows(file: Path, sensor: str, titles: str, values: FloatArray) -> 
     return kept
 
 
-def _check_size(file: Path, titles: str, sensor: str, values: FloatArray) -> None:
-    largest = float(np.nanmax(np.abs(values), initial=0.0))
-    if largest > _LIMITS[sensor]:
+def _sound_samples(file: Path, sensor: str, titles: str, values: FloatArray) -> BoolArray:
+    """Return which samples (N,) are not wild, such as infinite, and warn of those that are.
+
+    Raises:
+        ReadError: most exceed any sensor's.
+    """
+    size = np.abs(values).max(axis=1)
+    typical = float(np.median(size))
+    if typical > _LIMITS[sensor]:
         unit = next(iter(UNITS[sensor]))
         raise ReadError(
-            file, titles, f"{largest:.3g}", f"a plausible value in {unit}",
+            file, titles, f"{typical:.3g} on average", f"a plausible value in {unit}",
             "is one of these columns a clock or of another sensor?",
         )  # fmt: skip
+    sound = size <= _WILD * _LIMITS[sensor]
+    if not sound.all():
+        _log.warning("%s: dropped %d wild samples of the %s", file, (~sound).sum(), sensor)
+    return np.asarray(sound)
 
 
 def read_quaternion(table: SensorTable) -> tuple[IntArray, FloatArray]:

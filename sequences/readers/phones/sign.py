@@ -89,11 +89,11 @@ def _by_metadata(file: Path) -> float | None:
 
 
 def _has_core_motion(files: PhoneFiles) -> bool:
-    """Return whether a wide file has columns that apps name after Apple's CMDeviceMotion."""
+    """Return whether a wide file has columns that apps name after Apple's Core Motion."""
     titles = [
         place.title.lower() for axes in files.tables["gyro"][0].axes.values() for place in axes
     ]
-    return any(title.startswith("motion") for title in titles)
+    return any(title.startswith(("motion", "accelerometeracceleration")) for title in titles)
 
 
 def _by_attitude(attitude: tuple[IntArray, Rotation] | None, accel: Samples) -> float | None:

@@ -142,7 +142,7 @@ def test_a_batch_continues_after_failures_and_reports_them(
     write_csv(tmp_path / "deg.csv", replace(walk, gyro=np.degrees(walk.gyro)))
     write_csv(tmp_path / "blind.csv", walk.without_truth())
     (tmp_path / "broken.csv").write_text("t,gx,gy,gz,ax,ay,az\n0,0,0,0,x,0,0\n")
-    (tmp_path / "list.txt").write_text("deg.csv\nnosuch.csv\n\nblind.csv\nbroken.csv\n")
+    (tmp_path / "list.txt").write_text("deg.csv\nnosuch.csv\n\n,blind.csv\nblind.csv\nbroken.csv\n")
     done = stario(
         "evaluate", recording, "list.txt", "missing", recording, "--jobs", jobs,
         "--out", "out", "--json",

@@ -21,7 +21,7 @@ from stario.sequences.sequence import PositionTrack
         ("gyro", 180.0 / np.pi, ["--gyro-unit", "deg/s"], True),
         ("gyro", 180.0 / np.pi, ["--gyro-unit", "deg/s"], False),
         ("accel", 1.0 / 9.80665, ["--accel-unit", "g"], True),
-        ("accel", -1.0, ["--accel-unit=-m/s^2"], True),
+        ("accel", -1.0, ["--accel-sign", "apple"], True),
     ],
 )
 @pytest.mark.usefixtures("no_figures")

@@ -58,6 +58,12 @@ def test_one_dropped_sample_among_thousands_is_not_reported_as_none() -> None:
     assert found == "Fewer than 0.1% of the samples were dropped (1 not finite)."
 
 
+def test_advice_on_dropped_samples_fits_most_of_them() -> None:
+    for reason, words in (("out_of_order", "split the recording"), ("duplicate", "the same rate")):
+        (found,) = (f for f in findings(Health({"used": 900, reason: 100})) if "dropped" in f.text)
+        assert words in found.advice
+
+
 def test_a_track_is_distrusted_only_if_sensor_weights_and_filter_all_warn() -> None:
     [verdict] = health_lines(SHAKEN)
     assert verdict.startswith("! This track cannot be trusted")

@@ -55,13 +55,12 @@ def test_wrong_entries_are_named_and_the_others_kept(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     path = tmp_path / "list.txt"
     path.write_text("own.csv\n\n,handheld\ngone.csv\nempty\nlist.txt\n# end\n")
-    with pytest.raises(ReadError, match=r"list\.txt: line 2: found an empty entry"):
+    with pytest.raises(ReadError, match=r"list\.txt: line 3: found an empty entry"):
         find_recordings(path)
     errors: list[StarioError] = []
     assert find_recordings(path, errors.append) == [tmp_path / "own.csv"]
     messages = [str(error).removeprefix(str(tmp_path)) for error in errors]
     assert [text.split(", expected")[0] for text in messages] == [
-        "/list.txt: line 2: found an empty entry",
         "/list.txt: line 3: found an empty entry",
         "/list.txt: line 4: found 'gone.csv', which does not exist",
         "/empty: folder: found no recording",

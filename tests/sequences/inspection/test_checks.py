@@ -84,6 +84,14 @@ def test_two_wrong_units_are_named_one_after_the_other(walk: ImuSequence) -> Non
     check_units(with_units(gyro_fixed, accel_unit="g"))
 
 
+def test_thousandths_of_a_unit_are_named_as_such(walk: ImuSequence) -> None:
+    gyro, accel = 1e3 * np.degrees(walk.gyro), 1e3 * walk.accel / STANDARD_GRAVITY
+    assert "--gyro-unit mdps" in refusal(replace(walk, gyro=gyro))
+    assert "`--gyro-unit" not in refusal(replace(walk, gyro=0.1 * gyro))
+    assert "--accel-unit mg" in refusal(replace(walk, accel=accel))
+    check_units(with_units(replace(walk, gyro=gyro, accel=accel), "mdps", "mg"))
+
+
 def test_specific_force_in_an_unknown_unit_is_refused(walk: ImuSequence) -> None:
     for factor in (1000.0 / STANDARD_GRAVITY, 100.0, 0.5, STANDARD_GRAVITY):
         assert "accelerometer" in refusal(replace(walk, accel=factor * walk.accel))
@@ -92,8 +100,8 @@ def test_specific_force_in_an_unknown_unit_is_refused(walk: ImuSequence) -> None
 
 def test_a_reversed_sign_is_detected_only_with_a_true_attitude(walk: ImuSequence) -> None:
     apple = replace(walk, accel=-walk.accel)
-    assert "--accel-unit=-m/s^2" in refusal(apple)
-    check_units(with_units(apple, accel_unit="-m/s^2"))
+    assert "--accel-sign apple" in refusal(apple)
+    check_units(with_conventions(apple, accel_sign="apple"))
     check_units(apple.without_truth())
 
 
@@ -123,7 +131,7 @@ def test_a_truth_with_z_down_is_told_from_a_reversed_sign_by_its_positions(
     )
     text = refusal(replace(walk, truth=down))
     assert "a world with z down" in text
-    assert "--accel-unit" in text.split("only if that is wrong")[1]
+    assert "--accel-sign" in text.split("only if that is wrong")[1]
     x, y, z, w = down.quat_xyzw.T
     px, py, pz = down.position_W.T
     assert "write px,-py,-pz,qw,-qz,qy,-qx as px,py,pz,qx,qy,qz,qw" in text
@@ -132,7 +140,7 @@ def test_a_truth_with_z_down_is_told_from_a_reversed_sign_by_its_positions(
     assert inspect_recording(replace(walk, truth=right)).problems == ()
     at_rest = replace(down, position_W=0.0 * down.position_W)
     undecided = refusal(replace(walk, truth=at_rest))
-    assert "--accel-unit=-m/s^2" in undecided
+    assert "--accel-sign apple" in undecided
     assert "or if the truth's world has z down" in undecided
 
 
@@ -304,7 +312,7 @@ def test_swapped_gyroscope_axes_are_not_mistaken_for_degrees() -> None:
 
 
 def test_no_option_is_suggested_that_the_file_rules_out(walk: ImuSequence) -> None:
-    named = replace(walk, converted=frozenset({"gyro", "accel"}))
+    named = replace(walk, converted=frozenset({"gyro", "accel", "sign"}))
     for altered in (
         in_degrees(named),
         replace(named, accel=named.accel / STANDARD_GRAVITY),

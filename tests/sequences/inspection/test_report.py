@@ -130,7 +130,7 @@ def test_a_clock_set_back_is_a_problem(walk: ImuSequence, by: float) -> None:
     [
         (lambda s: replace(s, gyro=np.degrees(s.gyro), truth=None), "--gyro-unit deg/s"),
         (lambda s: replace(s, accel=s.accel / STANDARD_GRAVITY), "--accel-unit g"),
-        (lambda s: replace(s, accel=-s.accel), "--accel-unit=-m/s^2"),
+        (lambda s: replace(s, accel=-s.accel), "--accel-sign apple"),
         (lambda s: replace(with_axes(s, "y,-x,z"), axes=SAME_AXES), "--axes=-y,x,z"),
         (lambda s: replace(with_axes(s, "y,z,x"), axes=SAME_AXES), "--axes=z,x,y"),
         (

@@ -135,6 +135,11 @@ def test_reference_points_take_the_time_unit_that_fits_the_recording(
     found = reference_points(tmp_path, "", np.int64(0), np.int64(30 * 10**9))
     assert found is not None
     np.testing.assert_allclose(found.time, [0.0, 2.0, 10.0, 28.0])
+    message = (
+        r"walk_ref\.csv: time: found .*, expected some within .*, 999999970\.000 to 1000000000"
+    )
+    with pytest.raises(ReadError, match=message):
+        reference_points(tmp_path, "", np.int64(10**18 - 30 * 10**9), np.int64(10**18))
 
 
 @pytest.mark.parametrize(("delay", "sorts"), [(2, True), (60, False)])

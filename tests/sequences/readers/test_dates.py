@@ -43,6 +43,7 @@ def written(path: Path, header: str, form: str, start: datetime, count: int = 20
         "%Y/%m/%d %H:%M:%S.%f",
         "%d-%b-%Y %H:%M:%S.%f",
         "%d.%m.%Y %H:%M:%S.%f",
+        "%d/%m/%y %H:%M:%S.%f",
         "%m/%d/%Y %H:%M:%S.%f",
     ],
 )
@@ -76,6 +77,16 @@ def test_what_is_no_time_stays_as_it_is(text: str) -> None:
 
 def test_a_comma_after_the_seconds_separates_cells() -> None:
     assert with_seconds(["00:00:01,5,6"])[0].endswith(",5,6")
+
+
+def test_a_comma_before_fractions_that_separates_cells_is_refused(tmp_path: Path) -> None:
+    """As Python's logging writes times: all values would be read from the column to their left."""
+    rows = [f"2024-05-01 12:00:0{k // 100},{10 * k % 1000:03d},0,0,0,0,0,9" for k in range(200)]
+    path = write_lines(tmp_path / "own.csv", GENERIC.replace(";", ","), *rows)
+    with pytest.raises(ReadError, match=r"line 2: found 8 values, expected 7 .* decimal points"):
+        read_recording(path)
+    write_lines(path, GENERIC.replace(";", ","), *(row.replace(",", ".", 1) for row in rows))
+    assert read_recording(path).rate == pytest.approx(100.0)
 
 
 def test_a_date_beside_the_time_leaves_the_unit_of_the_time(tmp_path: Path) -> None:

@@ -310,6 +310,9 @@ def test_a_unit_named_in_the_header_is_not_converted_again(tmp_path: Path) -> No
     for options in ({"gyro_unit": "deg/s"}, {"accel_unit": "-g"}):
         with pytest.raises(InputError, match=r"for named, whose file names its unit, .*omit the"):
             with_units(read, **options)
+    down = write_lines(tmp_path / "down.csv", header.replace("[g]", "[-g]"), *GOOD[1:])
+    with pytest.raises(InputError, match=r"for down, whose sign was already turned .*omit the"):
+        with_units(read_generic_csv(down), accel_unit="-m/s^2")
     assert np.array_equal(with_units(read).gyro, read.gyro)
     plain = read_generic_csv(write_lines(tmp_path / "plain.csv", *GOOD))  # SI may be overridden
     assert np.allclose(with_units(plain, gyro_unit="deg/s").gyro, np.radians(plain.gyro))

@@ -37,6 +37,17 @@ def test_words_above_rows_with_blanks_are_no_titles(tmp_path: Path) -> None:
     assert head_of(tmp_path, "t x y z", "0 1 2 3", "1 1 2 3").titles == ["t", "x", "y", "z"]
 
 
+def test_titles_may_be_separated_in_another_way_than_the_rows(tmp_path: Path) -> None:
+    """As NumPy's `savetxt` does: without its titles, columns z, y, x would be read as x, y, z."""
+    assert head_of(tmp_path, "# time,z,y,x", "0 1 2 3", "1 1 2 3").titles == ["time", "z", "y", "x"]
+
+
+def test_quoted_numbers_have_decimal_commas_between_commas(tmp_path: Path) -> None:
+    head = head_of(tmp_path, "t,x,y,z", '0,"0,5","-0,25","9,8"', '1,"0,5","-0,25","9,8"')
+    assert (head.delimiter, head.decimal) == (",", ",")
+    np.testing.assert_array_equal(head.read(4).values[1], [1.0, 0.5, -0.25, 9.8])
+
+
 def test_a_last_line_that_may_be_cut_does_not_count(tmp_path: Path) -> None:
     head = head_of(tmp_path, "t,x,y,z", "10,1,2,3", "20,1,2,3", "3,1,2,3")
     np.testing.assert_array_equal(head.rows[:, 0], [10.0, 20.0])

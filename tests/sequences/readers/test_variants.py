@@ -360,6 +360,11 @@ def test_an_error_in_a_large_file_is_named_too(tmp_path, walks, monkeypatch) -> 
     csv.write_text("\n".join([*lines[:99], lines[99].replace(".", "x", 1)]))
     with pytest.raises(ReadError, match="line 100, column "):
         read_recording(path)
+    write_csv(tmp_path / "own.csv", walks(200.0).without_truth())
+    text = (tmp_path / "own.csv").read_text().rstrip().rsplit(",", 1)[0]
+    (tmp_path / "own.csv").write_text(f"{text},-1.#IND\n")
+    with pytest.raises(ReadError, match=r"az.*: found '-1\.#IND', expected a number"):
+        read_recording(tmp_path / "own.csv")
 
 
 def test_a_missing_package_is_named_with_its_extra(tmp_path, walks, monkeypatch) -> None:

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from phone_files import save, zyx
+from phone_exports import pose
+from phone_files import ns, save, zyx
 
 from stario.sequences import ImuSequence, ReadError, read_recording
+from stario.sequences.windows import clean_samples
 
 
 @pytest.mark.parametrize(
@@ -77,3 +79,68 @@ def test_a_malformed_json_export_is_refused_in_one_line(
         read_recording(tmp_path / "x.json")
     assert "\n" not in str(error.value)
     assert "stario-" not in str(error.value)
+
+
+def test_a_sensors_file_without_samples_is_named(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    zyx(tmp_path, walk, Gyroscope=walk.gyro, GyroscopeUncalibrated=walk.gyro)
+    (tmp_path / "TotalAcceleration.csv").write_text("time,seconds_elapsed,z,y,x\n")
+    lacking = "no rows with a time that grows and three values"
+    message = rf"found only gyro, expected .*; TotalAcceleration\.csv: {lacking}$"
+    with pytest.raises(ReadError, match=message):
+        read_recording(tmp_path)
+    zyx(tmp_path, walk, TotalAcceleration=walk.accel)
+    (tmp_path / "Gyroscope.csv").write_text("")
+    read_recording(tmp_path)
+    assert "Gyroscope.csv: not read: it has no rows" in caplog.text
+
+
+def test_samples_without_an_accelerometer_are_counted(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It stopped halfway, say; that it starts a little late needs no mention."""
+    for part, dropped in ((slice(10, None), False), (slice(0, 751), True)):
+        zyx(tmp_path, walk, Gyroscope=walk.gyro)
+        zyx(tmp_path, walk.select(np.arange(len(walk))[part]), TotalAcceleration=walk.accel[part])
+        caplog.clear()
+        read_recording(tmp_path)
+        assert ("dropped 750 of 1501 samples at whose times only" in caplog.text) == dropped
+        assert ("dropped" in caplog.text) == dropped
+
+
+def test_a_file_of_one_sensor_names_that_of_the_gyroscope(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
+    zyx(tmp_path, walk, Gyroscope=walk.gyro, TotalAcceleration=walk.accel)
+    message = r"found one sensor of a recording, .*; name its gyroscope: .*/Gyroscope\.csv$"
+    with pytest.raises(ReadError, match=message):
+        read_recording(tmp_path / "TotalAcceleration.csv")
+    assert len(read_recording(tmp_path / "Gyroscope.csv")) == len(walk)
+
+
+def test_single_wild_samples_are_no_reason_to_refuse_a_file(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
+    """They would spoil the comparison with the phone's attitude, which tells Apple's sign."""
+    gyro, accel = walk.gyro.copy(), -walk.accel
+    gyro[500, 1], gyro[600, 0], accel[700, 2], accel[900, 0] = 1e30, 1e5, np.inf, -1e15
+    zyx(tmp_path, walk, Gyroscope=gyro, TotalAcceleration=accel)
+    header = "time,seconds_elapsed,qz,qy,qx,qw"
+    quat_xyzw = pose(walk).quat_xyzw[:, [2, 1, 0, 3]]
+    save(tmp_path / "Orientation.csv", header, ns(walk), walk.time, quat_xyzw)
+    time, rate, force = clean_samples(read_recording(tmp_path))
+    assert len(time) == len(walk) - 2
+    np.testing.assert_allclose(rate, np.delete(walk.gyro, [500, 600], axis=0))
+    assert np.abs(force - np.delete(walk.accel, [500, 600], axis=0)).max() < 2.0
+
+
+def test_a_clock_in_another_unit_than_its_title_says(walk: ImuSequence, tmp_path: Path) -> None:
+    for name, values in (("Gyroscope", walk.gyro), ("TotalAcceleration", walk.accel)):
+        save(tmp_path / f"{name}.csv", "t [s],x,y,z", ns(walk), values)
+    with pytest.raises(ReadError, match=r"time: found .*; is its unit the one that the header"):
+        read_recording(tmp_path)
+    for name, values, late in (("Gyroscope", walk.gyro, 5), ("TotalAcceleration", walk.accel, 0)):
+        save(tmp_path / f"{name}.csv", "t [s],x,y,z", 1e3 * walk.time + late, values)
+    with pytest.raises(ReadError, match=r"found samples 10 s apart, .*; is its unit"):
+        read_recording(tmp_path)

@@ -145,12 +145,20 @@ def gopro(folder: Path, walk: ImuSequence) -> None:
         save(folder / f"GX010001-{name}.csv", f'"cts","date","{title}","1","2"', *columns)
 
 
+def sensor_log(folder: Path, walk: ImuSequence) -> None:
+    """An app for iPhones without the attitude: columns as Core Motion names them tell the sign."""
+    titles = by_axis("accelerometerAcceleration#(G)", "gyroRotation#(rad/s)")
+    columns = -walk.accel / STANDARD_GRAVITY, walk.gyro
+    texts = dates(walk, "%Y-%m-%d %H:%M:%S.%f +0200")
+    save(folder / "a.csv", ",".join(["loggingTime(txt)", *titles]), texts, *columns)
+
+
 LOGGERS: dict[str, Callable[[Path, ImuSequence], None]] = {
     write.__name__: write
     for write in (
         shimmer, units_below_the_titles, matlab_mobile, metawear, polar, witmotion, vectornav,
         movella, hyperimu, gopro, microcontroller, date_and_time, titles_in_a_comment,
-        quoted_titles_with_commas,
+        quoted_titles_with_commas, sensor_log,
     )
 }  # fmt: skip
 
@@ -162,3 +170,17 @@ def test_a_loggers_export_is_read_as_the_walk(
     LOGGERS[logger](tmp_path / "s", walk)
     (found,) = find_recordings(tmp_path / "s")
     assert_same_samples(read_recording(found), walk)
+
+
+@pytest.mark.parametrize("second_clock", [False, True])
+def test_swapped_rows_at_the_start_of_a_file_without_titles(
+    second_clock: bool, walk: ImuSequence, tmp_path: Path
+) -> None:
+    order = np.arange(len(walk))
+    order[[4, 5, 12, 13]] = [5, 4, 13, 12]
+    clocks = [[stamp, stamp] if second_clock else [stamp] for stamp in ns(walk)]
+    for name, values in (("gyro", walk.gyro), ("acce", walk.accel), ("gyro_uncalib", walk.accel)):
+        rows = np.asarray(clocks)[order]
+        save(tmp_path / f"s/{name}.txt", "", rows, values[order], sep=" ")
+    sequence = read_recording(tmp_path / "s")
+    assert_same_samples(sequence.select(np.argsort(sequence.time)), walk)
