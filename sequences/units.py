@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -39,27 +40,41 @@ _SPELLINGS = {
         "mT": ("mt",),
         "T": ("t", "tesla"),
         "mg": ("milligauss",),
-        "s": ("sec", "second", "seconds"),
         "ms": ("msec", "millisecond", "milliseconds"),
         "us": ("usec", "microsecond", "microseconds", "µs", "μs"),
         "ns": ("nsec", "nanosecond", "nanoseconds"),
-        "rad/s": ("rads", "rads-1", "rad/sec", "radps"),
-        "deg/s": ("dps", "°/s", "\ufffd/s", "deg/sec", "degs", "degs-1"),
+        "rad/s": ("rads", "rads-1", "radps"),
+        "deg/s": ("dps", "°/s", "\ufffd/s", "degs", "degs-1"),
         "m/s^2": ("m/s2", "m/s/s", "m/s²", "m/s\ufffd", "ms2", "ms-2", "mps2", "m/(s2)"),
         "-m/s^2": ("-m/s2",),
     }.items()
     for spelling in spellings
 }
 
+_WORDS = (
+    ("squared", "2"),
+    ("degrees?", "deg"),
+    ("radians?", "rad"),
+    ("met(er|re)s?", "m"),
+    ("seconds?|sec", "s"),
+    ("per", "/"),
+)
+"""Words of units that are spelled out, `degrees per second`, without blanks."""
+
 
 def unit_named(text: str) -> str:
     """Return a unit in the tables' spelling, ignoring case, blanks and `^` (`rad s^-1`: `rad/s`).
 
-    In the names of columns a `_` stands for the `/`, as in `deg_s`.
+    It may be spelled out (`radians per second`). In the names of columns a `_` stands for the `/`,
+    as in `deg_s`.
 
     Characters garbled by a wrong encoding (`m/sÂ²`, `\ufffdT`) are recognised as well.
     """
     plain = text.lower().replace(" ", "").replace("^", "").replace("â", "").replace("_", "/")
+    if plain in _SPELLINGS:
+        return _SPELLINGS[plain]
+    for word, short in _WORDS:
+        plain = re.sub(word, short, plain)
     return _SPELLINGS.get(plain, plain)
 
 
