@@ -100,7 +100,7 @@ def test_a_streams_graph_is_as_certain_of_the_yaw_as_its_filter(
     make_walk: Make, make_oracle: Make
 ) -> None:
     """Although it marginalises all keyframes but the last seconds', and the turn with them."""
-    walk = make_walk(11, 60.0, 50.0)
+    walk = make_walk(11, 36.0, 50.0)
     model = Turned(make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03))
     ekf, graph = (end_of_stream(each, with_turn(0.1), model, walk) for each in ("ekf", "graph"))
     sigma = np.sqrt(graph.covariance[2, 2])

@@ -81,14 +81,14 @@ def last_state(navigator: Navigator, walk: ImuSequence) -> NavState:
 def test_the_field_bounds_the_yaw_of_a_stream(
     make_walk: Callable[..., Any], make_oracle: Callable[..., Any]
 ) -> None:
-    """A gyroscope as noisy as this is lost by 0.5 rad after 100 s, but for the magnetic field."""
-    truth = make_walk(3, 100.0).truth
+    """A gyroscope as noisy as this is lost by 0.5 rad after 40 s, but for the magnetic field."""
+    truth = make_walk(3, 40.0).truth
     walk = simulate_imu(truth, 50.0, magnetic_field=MagneticField(), seed=3)
-    noisy = replace(CONFIG, noise=replace(CONFIG.noise, gyro_noise=0.05))
+    noisy = replace(CONFIG, noise=replace(CONFIG.noise, gyro_noise=0.08))
     oracle = make_oracle(walk, truth, noisy, noise=0.03, sigma=0.03)
     graph, ekf = (
         np.sqrt(last_state(Navigator(oracle, noisy, backend=backend), walk).covariance[2, 2])
         for backend in ("graph", "ekf")
     )
-    assert ekf < 0.3
+    assert ekf < 0.4
     assert 0.9 * ekf < graph < 1.1 * ekf
