@@ -31,7 +31,8 @@ def read_euroc(path: Path) -> ImuSequence:
     """Read a recording from its folder, its `mav0` folder or its `imu0/data.csv`."""
     imu = imu_file(path)
     if imu is None:
-        raise ReadError(path, "imu0/data.csv", "no such file", "an EuRoC or TUM-VI folder")
+        expected = "an EuRoC or TUM-VI folder with its IMU"
+        raise ReadError(path, "mav0/imu0/data.csv", "no such file", expected, "unpack all of it")
     table = read_table(imu, columns=7)
     stamps = table.stamps_ns()
     truth_file = _truth_file(imu.parent.parent)
@@ -45,8 +46,8 @@ def read_euroc(path: Path) -> ImuSequence:
 
 
 def is_euroc(path: Path) -> bool:
-    """Return whether a path leads to an `imu0/data.csv`."""
-    return imu_file(path) is not None
+    """Return whether a path leads to an `imu0/data.csv`, or is a folder that should."""
+    return imu_file(path) is not None or (path / "mav0").is_dir()
 
 
 def imu_file(path: Path) -> Path | None:
