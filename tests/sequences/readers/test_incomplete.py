@@ -83,3 +83,13 @@ def test_a_sensor_file_without_permission_is_named(
     monkeypatch.setattr(os, "access", lambda path, mode: path != gyro and allowed(path, mode))
     with pytest.raises(ReadError, match=r"Gyroscope\.csv: path: found no permission to read"):
         read_recording(tmp_path)
+
+
+def test_a_line_of_words_among_rows_is_named_with_the_remedy(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
+    imu, *_ = write_euroc(tmp_path / "V1", walk)
+    lines = imu.read_text().splitlines()
+    imu.write_text("\n".join([*lines[:9], "recording paused", *lines[9:]]))
+    with pytest.raises(ReadError, match=r"line 10: found 1 values, .*, or remove the line"):
+        read_recording(tmp_path / "V1")
