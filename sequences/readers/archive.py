@@ -17,7 +17,7 @@ import numpy as np
 
 from stario.sequences.errors import ReadError
 from stario.sequences.lazy import optional_package
-from stario.sequences.readers.checked import checked, rotations
+from stario.sequences.readers.checked import checked, pose_mask, rotations
 from stario.sequences.readers.hdf5 import DAMAGED, is_hdf5, opened_hdf5
 from stario.sequences.sequence import (
     BoolArray,
@@ -208,7 +208,7 @@ def _truth(path: Path, group: Any) -> tuple[Trajectory | None, PositionTrack | N
     if "truth/quat_xyzw" not in group:
         return None, _positions(path, group, "positions", "truth/p")
     time = _column(path, group, "truth/t")
-    keep = increasing_mask(time)
+    keep = pose_mask(path, time)
     valid = _valid(path, group, "truth", time)
     quat = _column(path, group, "truth/quat_xyzw", (len(time), 4), finite=False)
     _check_known(path, "truth/quat_xyzw", quat, valid)
@@ -232,7 +232,7 @@ def _positions(
 ) -> PositionTrack:
     stem = field.split("/")[0]
     time = _column(path, group, f"{stem}/t")
-    keep = increasing_mask(time)
+    keep = pose_mask(path, time)
     valid = _valid(path, group, stem, time)
     position_W = _column(path, group, field, (len(time), 2), (len(time), 3), finite=False)
     _check_known(path, field, position_W, valid)

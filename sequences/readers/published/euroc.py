@@ -15,11 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import captured_rotations
+from stario.sequences.readers.checked import captured_rotations, pose_mask
 from stario.sequences.readers.lines import first_line
 from stario.sequences.readers.text import read_table, seconds
 from stario.sequences.sequence import ImuSequence, Trajectory
-from stario.sequences.time_order import increasing_mask
 
 _log = logging.getLogger(__name__)
 
@@ -74,7 +73,7 @@ def _truth(path: Path, start_ns: np.int64) -> Trajectory:
     columns = 11 if estimated and (first_line(path) or "").count(",") >= 10 else 8
     rows = read_table(path, columns=columns)
     table, time = rows.values, seconds(rows.stamps_ns(), start_ns)
-    keep = increasing_mask(time)
+    keep = pose_mask(path, time)
     table, time = table[keep], time[keep]
     attitude_WB, valid = captured_rotations(table[:, [5, 6, 7, 4]])
     valid &= np.isfinite(table[:, 1:4]).all(axis=1)

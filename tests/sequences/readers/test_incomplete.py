@@ -93,3 +93,17 @@ def test_a_line_of_words_among_rows_is_named_with_the_remedy(
     imu.write_text("\n".join([*lines[:9], "recording paused", *lines[9:]]))
     with pytest.raises(ReadError, match=r"line 10: found 1 values, .*, or remove the line"):
         read_recording(tmp_path / "V1")
+
+
+def test_poses_out_of_order_are_counted(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    _, truth = write_euroc(tmp_path / "V1", walk)
+    header, *poses = truth.read_text().splitlines()
+    truth.write_text(
+        "\n".join([header, *poses[:100], *poses[150:200], *poses[100:150], *poses[200:]])
+    )
+    found = read_recording(tmp_path / "V1").truth
+    assert found is not None
+    assert len(found) == len(poses) - 50
+    assert f"dropped 50 of {len(poses)} poses: their times do not increase" in caplog.text
