@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from stario.sequences.arrays import numbers, shown
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 
@@ -25,29 +26,31 @@ def shaped(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
         InputError: it is not numeric or has another shape.
     """
     try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+        array = numbers(name, value)
+    except InputError as error:
         expected = f"numbers of shape {shape}" if shape else "a number"
-        raise InputError(name, repr(value), expected) from None
+        raise InputError(name, error.found, expected) from None
     if array.shape != shape:
         raise InputError(name, f"shape {array.shape}", f"{shape}" if shape else "a number")
-    return array
+    return array.copy()
 
 
 def seconds(time: float) -> float:
     """Return a time [s] as a float; `InputError` if it is not a number."""
     try:
         return float(time)
-    except (TypeError, ValueError):
-        raise InputError("time", repr(time), "a number of seconds") from None
+    except (TypeError, ValueError, OverflowError):
+        raise InputError("time", shown(time), "a number of seconds") from None
 
 
 def three(name: str, value: Vector) -> tuple[float, float, float]:
     """Return the three numbers of a vector; `InputError` if it holds anything else."""
     try:
+        if getattr(value, "shape", (3,)) != (3,):  # a table would yield its columns' names
+            raise ValueError
         x, y, z = map(float, value)
-    except (TypeError, ValueError):
-        raise InputError(name, repr(value), "three numbers in body axes") from None
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(name, shown(value), "three numbers in body axes") from None
     return x, y, z
 
 

@@ -104,7 +104,7 @@ def unpack(data: bytes) -> dict[str, Any]:
     """
     if not isinstance(data, bytes | bytearray | memoryview):
         raise InputError("snapshot", type(data).__name__, f"bytes of a {FORMAT}")
-    if not zipfile.is_zipfile(io.BytesIO(data)):
+    if bytes(data[:2]) != b"PK" or not zipfile.is_zipfile(io.BytesIO(data)):
         raise InputError("snapshot", "bytes of something else", f"all bytes of a {FORMAT}")
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as file:

@@ -197,9 +197,8 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     except (safetensors.SafetensorError, RuntimeError) as error:
         # PyTorch lists the mismatches below an uninformative headline.
         lines = [line.strip() for line in str(error).splitlines()]
-        raise WeightsError(
-            path, "weights", lines[min(1, len(lines) - 1)], f"tensors of {card.architecture}"
-        ) from error
+        found = f"{lines[min(1, len(lines) - 1)]:.160}"  # all 200 names, if it is another network
+        raise WeightsError(path, "weights", found, f"tensors of {card.architecture}") from error
     return DisplacementModel(TorchEngine(network), card)
 
 

@@ -92,15 +92,17 @@ def shown(value: object) -> str:
 
 
 def numbers(name: str, value: object) -> FloatArray:
-    """Return an array-like as float64.
+    """Return an array-like as float64, NaN where a masked array has no value.
 
     Raises:
         InputError: it holds dates, text or rows of unequal length; names it.
     """
     try:
+        masked = np.ma.getmaskarray(value) if isinstance(value, np.ma.MaskedArray) else None
         array = np.asarray(value)
         if array.dtype.kind not in "Mm":
-            return np.asarray(array, dtype=np.float64)
+            array = np.asarray(array, dtype=np.float64)
+            return array if masked is None else np.where(masked, np.nan, array)
     except (TypeError, ValueError):
         raise InputError(name, shown(value), "an array of numbers") from None
     remedy = f"({name} - {name}[0]) / np.timedelta64(1, 's') gives seconds since the first"

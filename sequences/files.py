@@ -63,28 +63,39 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
 
 
 @contextmanager
-def atomic_folder(path: Path | str) -> Iterator[Path]:
+def atomic_folder(path: Path | str, replaced: Container[str] = ()) -> Iterator[Path]:
     """Create a folder that appears under its name only when it is complete.
 
     The block fills a temporary folder next to `path`, which is renamed to `path` at the end; an
     exception in the block leaves nothing behind.
 
     Args:
-        path: the folder to create; it may exist already if it is empty.
+        path: the folder to create; it may exist already if it holds no other files than `replaced`.
+        replaced: files in the folder that may be replaced, relative to it.
 
     Raises:
-        InputError: `path` exists and is not an empty folder, its parent does not exist, or the
+        InputError: `path` is a file or a folder with other files, its parent does not exist, or the
             system refuses to write there.
     """
     path = Path(path)
     with _temporary(path, "a folder") as temporary:
-        if path.exists() and not (path.is_dir() and not any(path.iterdir())):
-            raise InputError("path", f"{path}, which exists", "a new folder")
+        if path.exists():
+            _check_replaceable(path, replaced)
         temporary.mkdir()
         yield temporary
         if path.exists():
-            path.rmdir()
+            shutil.rmtree(path)
         temporary.rename(path)
+
+
+def _check_replaceable(path: Path, replaced: Container[str]) -> None:
+    """Check that a path is a folder without other files than `replaced`."""
+    if not path.is_dir():
+        raise InputError("path", f"the file {path}", "a folder, new or empty")
+    for other in sorted(path.rglob("*")):
+        if not other.is_dir() and other.relative_to(path).as_posix() not in replaced:
+            found = f"{other}, which would be lost"
+            raise InputError("path", found, "a new or empty folder", "choose another folder")
 
 
 @contextmanager

@@ -43,9 +43,25 @@ for command in (
 app.add_typer(check, name="check")
 
 
+class _Once(logging.Filter):
+    """Filter that passes each message once: a command may look at a recording several times."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._seen: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        text = record.getMessage()
+        new = text not in self._seen
+        self._seen.add(text)
+        return new
+
+
 def main() -> None:
     """Entry point of the `stario` command."""
-    logging.basicConfig(level=logging.WARNING, format="stario: %(message)s", stream=sys.stderr)
+    shown = logging.StreamHandler(sys.stderr)
+    shown.addFilter(_Once())
+    logging.basicConfig(level=logging.WARNING, format="stario: %(message)s", handlers=[shown])
     try:
         app()
     except StarioError as error:

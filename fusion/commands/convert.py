@@ -67,13 +67,16 @@ def convert(
 
 
 def _check_target(target: Path, sources: list[Path], overwrite: bool) -> None:
-    """Refuse to overwrite an input, or without `overwrite` any existing file."""
+    """Refuse to overwrite an input or a part of one, or without `overwrite` anything."""
     from stario.sequences.readers.archive import split_name
 
-    read = {split_name(source)[0] for source in sources}
-    if target.exists() and any(file.exists() and target.samefile(file) for file in read):
+    read = {split_name(source)[0].resolve() for source in sources}
+    if target.exists() and read & {target.resolve(), *target.resolve().parents}:
         raise InputError("OUT", f"{target}, which is also an input", "another file")
     check_new("OUT", target, overwrite)
+    if target.is_dir() and any(target.iterdir()) and not overwrite:
+        fix = "or pass --overwrite" if (target / "mav0/imu0/data.csv").is_file() else ""
+        raise InputError("OUT", f"{target}, which already exists", "a new or empty folder", fix)
 
 
 def _only(files: list[Path], skipped: list[Skipped]) -> Path:

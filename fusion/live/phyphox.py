@@ -40,6 +40,9 @@ _SENSORS = {
 }
 _TIMEOUT = 3.0
 _RETRY_SECONDS = 2.0
+_LARGEST = 1e9
+"""Limit of times [s] and readings; beyond it a buffer's value is invalid."""
+
 _MAX_RESPONSE_BYTES = 16 * 1024 * 1024
 
 _log = logging.getLogger(__name__)
@@ -171,7 +174,8 @@ def _column(buffers: Mapping[str, Any], name: str) -> list[float]:
     values = buffer.get("buffer") if isinstance(buffer, dict) else None
     numbers: list[float] = []
     for value in values if isinstance(values, list) else []:
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value:
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if not number or not abs(value) < _LARGEST:  # or NaN
             break
         numbers.append(float(value))
     return numbers

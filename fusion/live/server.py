@@ -132,6 +132,9 @@ async def _data(request: Request) -> Response:
         _check_origin(request)
         unit = request.query_params.get("accel_unit", "m/s^2")
         name = known_unit("accel_unit", unit, ACCEL_UNITS)
+        coding = request.headers.get("content-encoding", "identity")
+        if coding != "identity":
+            raise InputError("content-encoding", coding, "identity", "send it uncompressed")
         body = await _body(request)
         lines = request.headers.get("content-type", "").startswith("application/x-ndjson")
         sender = f"http {request.client.host if request.client else ''}"

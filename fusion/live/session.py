@@ -89,6 +89,9 @@ class Session:
 
         Returns:
             Number of samples processed.
+
+        Raises:
+            InputError: the batch continues the recording before this: two devices have one name.
         """
         self.received, self._factor = received, accel_factor
         if not self.running:
@@ -96,6 +99,10 @@ class Session:
         if self._is_of_previous(batch):
             self._delayed += len(batch.readings)
             return 0
+        if batch.readings and "" != batch.recording == self._previous != self._recording:
+            found = f"samples of two recordings in turn from {self.device!r}"
+            fix = "give each phone a name of its own"
+            raise InputError("device", found, "one at a time", fix)
         self._order.add(batch, received)
         return self._process_ready(received)
 
@@ -215,9 +222,10 @@ class Session:
             return False
         if self._recording and batch.recording and self._recording != batch.recording:
             return True
-        jump = _middle(batch) - self._newest_ns
+        middle, newest = _middle(batch), self._newest_ns
+        first = min(reading.time_ns for reading in _with_credible_time(batch))
         delayed = 0 <= batch.number < self._number  # rather than after the clock was set back
-        return jump >= FORWARD or (jump <= -BACKWARD and not delayed)
+        return first - newest >= FORWARD or (middle - newest <= -BACKWARD and not delayed)
 
     def _is_of_previous(self, batch: Batch) -> bool:
         """Return whether a batch is a delayed one of the recording before this."""

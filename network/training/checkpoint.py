@@ -57,13 +57,18 @@ def read_checkpoint(
     """
     try:
         with safetensors.safe_open(path, framework="pt") as file:
-            metadata = file.metadata()
+            metadata = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    except safetensors.SafetensorError as error:
-        raise ReadError(path, "checkpoint", str(error), "a complete checkpoint") from error
-    if not metadata or "config" not in metadata:
+    except (safetensors.SafetensorError, OSError) as error:
+        raise damaged(path, error) from error
+    if "config" not in metadata:
         raise ReadError(path, "checkpoint", "no recipe in it", "a checkpoint of a training run")
-    _check_same(path, json.loads(metadata["config"]), config)
+    try:
+        recipe, history = dict(json.loads(metadata["config"])), json.loads(metadata["history"])
+        step = int(metadata["step"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise damaged(path, error) from error
+    _check_same(path, recipe, config)
     if metadata.get("material") != material:
         raise ConfigError(
             str(path),
@@ -71,7 +76,15 @@ def read_checkpoint(
             "those of this run",
             "resume with the same ones or train into another folder (--out)",
         )
-    return int(metadata["step"]), json.loads(metadata["history"]), tensors
+    return step, history, tensors
+
+
+def damaged(path: Path, error: Exception) -> ReadError:
+    """Return the error of a checkpoint that cannot be used."""
+    lines = [line.strip() for line in str(error).splitlines()]
+    found = f"{type(error).__name__}: {lines[min(1, len(lines) - 1)] if lines else ''}"[:120]
+    fix = "remove it to train anew, or train into another folder (--out)"
+    return ReadError(path, "checkpoint", found, "a complete checkpoint", fix)
 
 
 def _check_same(path: Path, found: dict[str, Any], config: TrainingConfig) -> None:

@@ -22,7 +22,7 @@ from stario.network.architectures import architecture, build_network
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import DisplacementModel
 from stario.network.training.augment import WindowSampler
-from stario.network.training.checkpoint import read_checkpoint, write_checkpoint
+from stario.network.training.checkpoint import damaged, read_checkpoint, write_checkpoint
 from stario.network.training.config import TrainingConfig, learning_rate, loss_with_sigma
 from stario.network.training.history import EpochReport, History
 from stario.network.training.legs import LegBatch, LegSampler
@@ -260,8 +260,13 @@ class TrainingRun:
         if not self._checkpoint.exists():
             return
         self.step, history, tensors = read_checkpoint(self._checkpoint, self.config, self._material)
-        self.history.reports = [EpochReport(**report) for report in history]
-        self._restore(tensors)
+        try:
+            self.history.reports = [EpochReport(**report) for report in history]
+            self._restore(tensors)
+        except (RuntimeError, KeyError, TypeError, ValueError) as error:
+            raise damaged(self._checkpoint, error) from error
+        if self.workers.is_leader:
+            write_json(self.folder / "log.json", history)  # which may have been lost
         log.info("resumed %s at step %d", self._checkpoint, self.step)
 
     def _restore(self, tensors: dict[str, Tensor]) -> None:

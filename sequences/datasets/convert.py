@@ -29,6 +29,7 @@ _IMU_HEADER = (
 _POSE_HEADER = (
     "#timestamp,p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
 )
+_EUROC_FILES = ("mav0/imu0/data.csv", "mav0/state_groundtruth_estimate0/data.csv")
 _VELOCITY_HEADER = ",v_RS_R_x [m s^-1],v_RS_R_y [m s^-1],v_RS_R_z [m s^-1]"
 
 
@@ -43,7 +44,8 @@ def convert(sequence: ImuSequence, path: Path, layout: str | None = None) -> lis
 
     Args:
         sequence: the recording.
-        path: a file to write or replace, or the EuRoC recording's new folder.
+        path: a file to write or replace, or the EuRoC recording's folder, which is new or holds
+            nothing but such a recording.
         layout: one of `LAYOUTS`; None to infer it from the path's suffix, see `layout_of`.
 
     Returns:
@@ -106,7 +108,7 @@ def write_euroc(path: Path, sequence: ImuSequence) -> list[Path]:
         The files written.
 
     Raises:
-        InputError: a time is not finite, or the folder exists and is not empty.
+        InputError: a time is not finite, or the folder exists and holds other files.
     """
     if not np.isfinite(sequence.time).all():
         row = int(np.argmin(np.isfinite(sequence.time)))
@@ -125,7 +127,7 @@ def write_euroc(path: Path, sequence: ImuSequence) -> list[Path]:
             header, columns = header + _VELOCITY_HEADER, [*columns, truth.velocity_W]
         poses = np.hstack(columns)[truth.valid]
         tables["state_groundtruth_estimate0"] = (header, truth.time[truth.valid], poses)
-    with atomic_folder(path) as folder:
+    with atomic_folder(path, _EUROC_FILES) as folder:
         for name, (header, time, values) in tables.items():
             inner = folder / "mav0" / name
             inner.mkdir(parents=True)

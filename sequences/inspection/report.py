@@ -28,7 +28,12 @@ from stario.sequences.sequence import (
 )
 from stario.sequences.truth.findings import fit_as_dict, fit_lines, scale_problem
 from stario.sequences.truth.fit import TruthFit
-from stario.sequences.truth.position_findings import jump_problems, position_line, positions_as_dict
+from stario.sequences.truth.position_findings import (
+    jump_problems,
+    position_line,
+    position_time_problems,
+    positions_as_dict,
+)
 from stario.sequences.truth.positions import PositionFit
 from stario.sequences.truth.problems import examine_truth
 from stario.sequences.truth.yaw_drift import YawDrift, yaw_drift
@@ -244,7 +249,7 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
     except InputError:  # an invalid rate, which `check_units` reports
         rest = magnetic = None
     problems += magnetic_problems(sequence.name, magnetic) if magnetic else ()
-    problems += jump_problems(sequence)
+    problems += position_time_problems(sequence) + jump_problems(sequence)
     return Inspection(
         name=sequence.name,
         timing=_timing(sequence, given, int((~finite).sum())),

@@ -46,7 +46,10 @@ def check_time(sequence: ImuSequence) -> None:
     fix = "set the app to 50 Hz or more" if 1.0 <= rate < MIN_RATE else ""
     for unit, per_second in TIME_UNITS.items():
         if rate and unit != "s" and MIN_RATE <= rate * per_second <= MAX_RATE:
-            fix = f"time seems to be in {unit}: write `t [{unit}]` in the CSV's header"
+            fix = f"time seems to be in {unit}: convert it, or write `t [{unit}]` in a CSV's header"
         if rate and unit != "s" and MIN_RATE <= rate / per_second <= MAX_RATE:
-            fix = "time seems to be in seconds already: write `t [s]` in the CSV's header"
+            fix = (
+                f"its steps are {per_second:.0e} times too short for its unit: convert it, or name "
+                "another in a CSV's header, such as `t [s]`"
+            )
     raise InputError(f"{sequence.name}: time", f"{rate:.4g} samples/s", "50 to 1000", fix)

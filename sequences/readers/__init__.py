@@ -25,7 +25,6 @@ from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import is_generic_csv, read_generic_csv
 from stario.sequences.readers.lists import is_list, list_entries
 from stario.sequences.readers.phones.event_lines import is_event_lines, read_event_lines
-from stario.sequences.readers.phones.files import incomplete_sensors
 from stario.sequences.readers.phones.json_export import is_json_export, unpack_json
 from stario.sequences.readers.phones.long_form import is_long_form, unpack_long_form
 from stario.sequences.readers.phones.phone import is_phone, is_wide, read_phone, read_wide
@@ -39,7 +38,7 @@ from stario.sequences.readers.published.rnin import is_rnin, read_rnin
 from stario.sequences.readers.published.ronin import is_ronin, read_ronin
 from stario.sequences.readers.published.tlio import is_tlio, read_tlio
 from stario.sequences.readers.unpacked_names import named_after
-from stario.sequences.readers.unrecognised import unrecognised
+from stario.sequences.readers.unrecognised import has_some_sensors, unrecognised
 from stario.sequences.readers.zipped import is_zip, unpacked
 from stario.sequences.sequence import ImuSequence
 
@@ -180,7 +179,7 @@ def find_recordings(
         return _listed(path, on_error, where)
     found = [path] if path.is_file() else sorted(_below(path))
     if not found:
-        if pose_files(path) or incomplete_sensors(path):
+        if pose_files(path) or has_some_sensors(path):
             raise unrecognised(path, [], _KNOWN)
         raise ReadError(path, "folder", "no recording", f"recordings in {_KNOWN}")
     return _with_attributes(found, where)

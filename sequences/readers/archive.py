@@ -17,7 +17,7 @@ import numpy as np
 
 from stario.sequences.errors import ReadError
 from stario.sequences.lazy import optional_package
-from stario.sequences.readers.checked import checked, rotations
+from stario.sequences.readers.checked import checked, pose_mask, rotations
 from stario.sequences.readers.hdf5 import DAMAGED, is_hdf5, opened_hdf5
 from stario.sequences.sequence import (
     BoolArray,
@@ -38,8 +38,8 @@ AttributeFilter = Mapping[str, Sequence[str]]
 _RONIN = "data.hdf5"
 _EXPECTED = "an intact HDF5 archive"
 _OPTIONAL = {
-    "velocity_W": "truth/velocity",
-    "position_covariance_W": "truth/position_covariance",
+    "velocity_W": ("truth/velocity", (3,)),
+    "position_covariance_W": ("truth/position_covariance", (3, 3)),
 }
 
 
@@ -54,7 +54,7 @@ def split_name(path: Path) -> tuple[Path, str | None]:
 
 
 def is_archive(path: Path) -> bool:
-    """Return whether a file is an archive: HDF5 whose first group holds IMU samples or a track.
+    """Return whether a file is an archive: HDF5 with a group that holds IMU samples or a track.
 
     A file that cannot be opened counts as one unless it is named like RoNIN's: reading it then
     raises an error that names the damage.
@@ -64,8 +64,8 @@ def is_archive(path: Path) -> bool:
     h5py = optional_package("h5py", "readers")
     try:
         with h5py.File(path) as file:
-            first = next(iter(file.values()), None)
-            return isinstance(first, h5py.Group) and ("imu/t" in first or "truth/t" in first)
+            groups = (group for group in file.values() if isinstance(group, h5py.Group))
+            return any("imu/t" in group or "truth/t" in group for group in groups)
     except DAMAGED:
         return path.name != _RONIN
 
@@ -85,7 +85,7 @@ def archive_members(path: Path, where: AttributeFilter | None = None) -> list[Pa
     wanted = where or {}
     with opened_hdf5(path, _EXPECTED) as file:
         known = {
-            name: {"name": name, **(_attributes(group) if wanted else {})}
+            name: {**(_attributes(group) if wanted else {}), "name": name}
             for name, group in file.items()
             if "imu/t" in group
         }
@@ -164,11 +164,12 @@ def read_archive(path: Path) -> ImuSequence:
 
 def _sequence(path: Path, name: str, group: Any) -> ImuSequence:
     truth, positions = _truth(path, group)
+    time = _column(path, group, "imu/t", finite=False)
     return ImuSequence(
         name=name,
-        time=_column(path, group, "imu/t", finite=False),
-        gyro=_column(path, group, "imu/gyro", finite=False),
-        accel=_column(path, group, "imu/accel", finite=False),
+        time=time,
+        gyro=_column(path, group, "imu/gyro", (len(time), 3), finite=False),
+        accel=_column(path, group, "imu/accel", (len(time), 3), finite=False),
         truth=truth,
         converted=frozenset({"gyro", "accel", "sign"}),
         magnetometer=_magnetometer(path, group),
@@ -181,7 +182,8 @@ def _sequence(path: Path, name: str, group: Any) -> ImuSequence:
 def _magnetometer(path: Path, group: Any) -> Magnetometer | None:
     if "mag" not in group:
         return None
-    time, field = _column(path, group, "mag/t"), _column(path, group, "mag/field")
+    time = _column(path, group, "mag/t")
+    field = _column(path, group, "mag/field", (len(time), 3))
     keep = increasing_mask(time)
     return Magnetometer(time[keep], field[keep])
 
@@ -190,7 +192,7 @@ def _device_attitude(path: Path, group: Any) -> DeviceAttitude | None:
     if "attitude" not in group:
         return None
     time = _column(path, group, "attitude/t")
-    quat = _column(path, group, "attitude/quat_xyzw")
+    quat = _column(path, group, "attitude/quat_xyzw", (len(time), 4))
     keep = increasing_mask(time)
     return DeviceAttitude(time[keep], rotations(path, "attitude/quat_xyzw", quat[keep], "xyzw"))
 
@@ -206,19 +208,23 @@ def _truth(path: Path, group: Any) -> tuple[Trajectory | None, PositionTrack | N
     if "truth/quat_xyzw" not in group:
         return None, _positions(path, group, "positions", "truth/p")
     time = _column(path, group, "truth/t")
-    keep = increasing_mask(time)
-    valid = _valid(group, "truth", time)[keep]
-    quat = _column(path, group, "truth/quat_xyzw", finite=False)[keep]
+    keep = pose_mask(path, time)
+    valid = _valid(path, group, "truth", time)
+    quat = _column(path, group, "truth/quat_xyzw", (len(time), 4), finite=False)
+    _check_known(path, "truth/quat_xyzw", quat, valid)
     # Invalid rows may hold anything, but each must become a rotation.
-    usable = valid | np.isfinite(quat).all(axis=1)
-    quat = np.where(usable.reshape(-1, 1), quat, [0.0, 0.0, 0.0, 1.0])
-    attitude_WB = rotations(path, "truth/quat_xyzw", quat, "xyzw")
+    finite = np.isfinite(quat).all(axis=1)
+    quat = np.where(finite.reshape(-1, 1), quat, [0.0, 0.0, 0.0, 1.0])
+    attitude_WB = rotations(path, "truth/quat_xyzw", quat[keep], "xyzw")
     optional = {
-        name: _column(path, group, field, finite=False)[keep] if field in group else None
-        for name, field in _OPTIONAL.items()
+        name: _column(path, group, field, (len(time), *shape), finite=False)[keep]
+        for name, (field, shape) in _OPTIONAL.items()
+        if field in group
     }
-    position_W = _column(path, group, "truth/p", finite=False)[keep]
-    return Trajectory(time[keep], position_W, attitude_WB, valid=valid, **optional), positions
+    position_W = _column(path, group, "truth/p", (len(time), 3), finite=False)
+    _check_known(path, "truth/p", position_W, valid)
+    truth = Trajectory(time[keep], position_W[keep], attitude_WB, valid=valid[keep], **optional)
+    return truth, positions
 
 
 def _positions(
@@ -226,30 +232,54 @@ def _positions(
 ) -> PositionTrack:
     stem = field.split("/")[0]
     time = _column(path, group, f"{stem}/t")
-    keep = increasing_mask(time)
-    position_W = _column(path, group, field, finite=False)
+    keep = pose_mask(path, time)
+    valid = _valid(path, group, stem, time)
+    position_W = _column(path, group, field, (len(time), 2), (len(time), 3), finite=False)
+    _check_known(path, field, position_W, valid)
     sigma = f"{stem}/sigma"
     return PositionTrack(
         time[keep],
         position_W[keep],
         kind,
-        _valid(group, stem, time)[keep],
-        _column(path, group, sigma, finite=False)[keep] if sigma in group else None,
+        valid[keep],
+        _column(path, group, sigma, (len(time),), finite=False)[keep] if sigma in group else None,
     )
 
 
-def _valid(group: Any, stem: str, time: FloatArray) -> BoolArray:
+def _valid(path: Path, group: Any, stem: str, time: FloatArray) -> BoolArray:
     field = f"{stem}/valid"
     if field not in group:
         return np.ones(len(time), dtype=np.bool_)
-    return np.asarray(group[field][:], dtype=np.bool_)
+    return np.asarray(_column(path, group, field, (len(time),)), dtype=np.bool_)
 
 
-def _column(path: Path, group: Any, field: str, finite: bool = True) -> FloatArray:
-    """Return a dataset as numbers; IMU samples may be NaN, which the health report counts."""
+def _check_known(path: Path, field: str, values: FloatArray, valid: BoolArray) -> None:
+    """Check that the truth's values (N, K) are finite where it is valid."""
+    bad = valid & ~np.isfinite(values).all(axis=1)
+    if bad.any():
+        where = f"row {int(np.argmax(bad)) + 1}, {field}"
+        fix = f"write False there in {field.split('/')[0]}/valid"
+        raise ReadError(path, where, "a value that is not finite", "finite numbers", fix)
+
+
+def _column(
+    path: Path, group: Any, field: str, *shapes: tuple[int, ...], finite: bool = True
+) -> FloatArray:
+    """Return a dataset as numbers of one of some shapes, (N,) with any N > 0 without shapes.
+
+    IMU samples may be NaN, which the health report counts.
+    """
     if field not in group:
         raise ReadError(path, field, "no such dataset", "an array of numbers")
-    values: FloatArray = np.asarray(group[field][:], dtype=np.float64)
+    dataset = group[field]
+    if not hasattr(dataset, "dtype"):
+        raise ReadError(path, field, "a group", "a dataset of numbers")
+    if dataset.dtype.kind not in "fiub":
+        raise ReadError(path, field, f"values of type {dataset.dtype}", "an array of numbers")
+    if not (dataset.shape in shapes if shapes else dataset.ndim == 1 and dataset.size):
+        expected = " or ".join(map(str, shapes)) or "(N,) with at least one"
+        raise ReadError(path, field, f"shape {dataset.shape}", expected)
+    values: FloatArray = np.asarray(dataset[:], dtype=np.float64)
     return checked(path, field, values) if finite else values
 
 

@@ -39,6 +39,11 @@ _DOUBLES = {
 _GYRO, _ACCEL = slice(13, 16), slice(25, 28)
 _STAMP = slice(4, 12)
 
+_MEND = (
+    "is the download complete? `rosbag reindex`, `ros2 bag reindex` or `mcap recover` mend the bag "
+    "of a recorder that was killed"
+)
+
 NO_TRUTH = "none"
 """Value of `truth_topic` that disables ground truth."""
 
@@ -118,7 +123,7 @@ def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messag
         raise
     except Exception as error:  # any error of the library means a damaged file
         found = " ".join(f"{type(error).__name__} {error}".split())[:120]
-        raise ReadError(path, "file", found, "an intact bag", "is the download complete?") from None
+        raise ReadError(path, "file", found, "an intact bag", _MEND) from None
 
 
 def _imu_topic(path: Path, topics: dict[str, str], wanted: str) -> str:

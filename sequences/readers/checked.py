@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
 from stario.sequences.sequence import BoolArray, FloatArray, Magnetometer, Trajectory
 from stario.sequences.time_order import increasing_mask
+
+_log = logging.getLogger(__name__)
 
 _HELD_SHARE = 1.0 / 3.0
 
@@ -77,6 +80,20 @@ def magnetometer(time: FloatArray, field: FloatArray, held: bool = True) -> Magn
         if fresh.mean() < 1.0 - _HELD_SHARE:
             keep &= fresh
     return Magnetometer(time[keep], field[keep]) if keep.any() else None
+
+
+def pose_mask(path: Path, time: FloatArray) -> BoolArray:
+    """Return which of a truth's times (N,) [s] to keep, so that they increase.
+
+    Repeated rows are usual; a warning counts the others that are dropped.
+    """
+    keep = increasing_mask(time)
+    if (np.diff(time) < 0.0).any():
+        count = int((~keep).sum())
+        _log.warning(
+            "%s: dropped %d of %d poses: their times do not increase", path, count, len(keep)
+        )
+    return keep
 
 
 def trajectory(

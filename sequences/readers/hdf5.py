@@ -42,4 +42,6 @@ def opened_hdf5(path: Path, expected: str) -> Iterator[Any]:
         raise
     except DAMAGED as error:
         found = " ".join(str(error).split())[:200] or type(error).__name__
-        raise ReadError(path, "content", found, expected, "is the download complete?") from error
+        locked = isinstance(error, BlockingIOError) or "already open for write" in found
+        fix = "close it in the program that writes it" if locked else "is the download complete?"
+        raise ReadError(path, "content", found, expected, fix) from error

@@ -80,7 +80,7 @@ def _row(
     if len(cells) < needed:
         fix = "is the file cut short?"
         if len(cells) == 1 and delimiter is not None:
-            fix = f"separate the values by {delimiter!r} as in the header"
+            fix = f"separate the values by {delimiter!r} as in the other lines, or remove the line"
         raise ReadError(path, f"line {number}", f"{len(cells)} values", f"{needed}", fix)
     row = []
     for column, title in zip(columns, titles, strict=True):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.columns import HEADER
 from stario.sequences.readers.lines import first_bytes, first_line
 from stario.sequences.readers.phones.files import (
+    SUFFIXES,
     incomplete_sensors,
     names_both_sensors,
     recording_with,
@@ -37,11 +39,8 @@ def unrecognised(path: Path, inside: list[Path], known: str) -> ReadError:
     """
     if inside:
         found, fix = f"a folder of {len(inside)} recordings", f"name one, such as {inside[0]}"
-    elif sensors := incomplete_sensors(path):
-        found, expected = f"only {' and '.join(sensors)}", "a gyroscope and an accelerometer"
-        unread = [file.name for file in unread_files(path)] if path.is_dir() else []
-        no_rows = f"{' and '.join(unread)}: no rows with a time that grows and three values"
-        return ReadError(path, "sensors", found, expected, no_rows if unread else "log both")
+    elif has_some_sensors(path):
+        return _incomplete(path)
     elif part_of := recording_with(path):
         found, fix = "one sensor of a recording", f"name its gyroscope: {part_of.gyro}"
         return ReadError(path, "content", found, "a recording", fix)
@@ -52,17 +51,47 @@ def unrecognised(path: Path, inside: list[Path], known: str) -> ReadError:
         expected = "a gyroscope file and an accelerometer file"
         fix = "put the IMU files into the same folder"
         return ReadError(path, "content", f"only poses, {poses[0].name}", expected, fix)
+    elif path.is_dir() and (part := next(filter(has_some_sensors, _subfolders(path)), None)):
+        return _incomplete(part)
     else:
         found, fix = _folder(path) if path.is_dir() else _file(path)
     return ReadError(path, "content", found, known, fix)
 
 
+def has_some_sensors(path: Path) -> bool:
+    """Return whether a folder or file holds sensors, or files named like them, but no recording."""
+    return bool(incomplete_sensors(path)) or (path.is_dir() and bool(unread_files(path)))
+
+
+def _incomplete(path: Path) -> ReadError:
+    """Return the error of a folder or file that lacks a gyroscope or an accelerometer."""
+    unread = unread_files(path) if path.is_dir() else []
+    for file in unread:
+        if not os.access(file, os.R_OK):
+            expected = "a sensor of the recording"
+            return ReadError(file, "path", "no permission to read", expected, "fix its permissions")
+    sensors = " and ".join(incomplete_sensors(path))
+    names = " and ".join(file.name for file in unread)
+    fix = f"{names}: no rows with a time that grows and three values" if unread else "log both"
+    found = f"only {sensors}" if sensors else "none"
+    return ReadError(path, "sensors", found, "a gyroscope and an accelerometer", fix)
+
+
+def _subfolders(path: Path) -> list[Path]:
+    return [folder for folder in sorted(path.rglob("*")) if folder.is_dir()]
+
+
 def _folder(path: Path) -> tuple[str, str]:
-    """Return what a folder holds and what to do about it."""
+    """Return what a folder holds and what is wrong with the first file that may be a recording."""
     entries = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
     names = ", ".join(entries[:5]) or "nothing"
     more = f" and {len(entries) - 5} more" if len(entries) > 5 else ""
-    return f"a folder with {names}{more}", "name one recording in it"
+    found = f"a folder with {names}{more}"
+    files = [file for file in sorted(path.rglob("*")) if file.suffix.lower() in SUFFIXES]
+    if not files:
+        return found, "name a folder with a recording"
+    words, fix = _file(files[0])
+    return f"{found}; {files[0].relative_to(path)} holds {words}", fix
 
 
 def _file(path: Path) -> tuple[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.conventions import axes_matrix, axes_named, permuted
@@ -95,6 +96,20 @@ def _axes_problem(fit: PositionFit) -> TruthProblem:
         return TruthProblem(found, "give both in the same world, with z up")
     columns = permuted(nearest.T, ("px", "py", "pz"))
     return TruthProblem(found, f"write {columns} as px,py,pz in the file")
+
+
+def position_time_problems(sequence: ImuSequence) -> list[str]:
+    """Describe positions known without attitude at other times than the samples'."""
+    track, time = sequence.positions, sequence.time[np.isfinite(sequence.time)]
+    if track is None or not len(time) or not track.valid.any():
+        return []
+    known, start, stop = track.time[track.valid], float(time.min()), float(time.max())
+    if ((known >= start) & (known <= stop)).sum() >= min(2, len(known)):
+        return []
+    return [
+        f"{sequence.name}: positions: found times from {known[0]:.6g} to {known[-1]:.6g} s, "
+        f"expected some during the samples, {start:.6g} to {stop:.6g} s; use one clock for both"
+    ]
 
 
 def jump_problems(sequence: ImuSequence) -> list[str]:

@@ -57,7 +57,7 @@ def examine_truth(sequence: ImuSequence, known: str = "") -> TruthFindings:
         sequence: the recording.
         known: problems of the recording reported already, which are not repeated.
     """
-    if sequence.truth is None or sequence.truth.valid.sum() < 2:
+    if sequence.truth is None:
         return TruthFindings()
     if problems := _unusable_times(sequence, sequence.truth):
         return TruthFindings(problems=tuple(problems))
@@ -89,7 +89,7 @@ def truth_problems(sequence: ImuSequence) -> list[TruthProblem]:
     Where positions and accelerometer agree well, the gyroscope is not compared: an offset of the
     clocks of a few hundredths of a second then goes unnoticed, unlike in `examine_truth`.
     """
-    if sequence.truth is None or sequence.truth.valid.sum() < 2:
+    if sequence.truth is None:
         return []
     if problems := _unusable_times(sequence, sequence.truth):
         return problems
@@ -128,6 +128,12 @@ def check_truth(sequence: ImuSequence) -> None:
 
 def _unusable_times(sequence: ImuSequence, truth: Trajectory) -> list[TruthProblem]:
     """Return a problem if the true poses are too few, or at other times than the samples."""
+    count = int(truth.valid.sum())
+    if count < 2:
+        found = f"only {count} usable pose{'s' * (count != 1)}"
+        return [
+            TruthProblem(found, "do its times increase, and are its quaternions of unit length?")
+        ]
     if slow := low_rate_message(truth):
         return [TruthProblem(slow, unusable=False)]
     if _compared_s(sequence, truth) > 0.0:

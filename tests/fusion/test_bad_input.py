@@ -163,13 +163,23 @@ def test_a_recording_of_pieces_shorter_than_a_window_raises_a_clear_error(
         Navigator(still_model).run(holed)
 
 
-@pytest.mark.parametrize("vector", [(1.0, 2.0), 3.0, "abc", (1, 2, None), None])
+@pytest.mark.parametrize(
+    "vector", [(1.0, 2.0), 3.0, "abc", (1, 2, None), None, np.ones((3, 1)), np.ones((1, 3))]
+)
 def test_a_sample_that_is_not_a_vector_is_refused_by_name(still_model: Any, vector: Any) -> None:
     navigator = Navigator(still_model)
-    with pytest.raises(InputError, match="gyro"):
+    with pytest.raises(InputError, match=r"^gyro: found .*$"):
         navigator.push(0.0, vector, (0.0, 0.0, 9.8))
-    with pytest.raises(InputError, match="accel"):
+    with pytest.raises(InputError, match=r"^accel: found .*$"):
         navigator.push(0.0, (0.0, 0.0, 0.0), vector)
+
+
+def test_a_table_is_no_vector_though_its_columns_are_numbers(still_model: Any) -> None:
+    pandas = pytest.importorskip("pandas")
+    row = pandas.DataFrame([[0.0, 0.0, 9.8]])
+    with pytest.raises(InputError, match="accel"):
+        Navigator(still_model).push(0.0, (0.0, 0.0, 0.0), row)
+    Navigator(still_model).push(0.0, (0.0, 0.0, 0.0), row.iloc[0])
 
 
 @pytest.mark.parametrize("time", ["x", None, (1.0, 2.0)])

@@ -40,6 +40,12 @@ LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
         (lambda model: Navigator(model).restore("text"), "snapshot"),
         (lambda model: Navigator(model).update_yaw("x", 0.0, 0.1), "time.*expected a number"),
         (lambda model: Navigator(model).update_yaw(1.0, [0, 0], 0.1), "yaw.*expected a number"),
+        (
+            lambda model: Navigator(model).update_yaw(np.datetime64("2024"), 0.0, 0.1),
+            r"time: found values of type datetime64\[Y\], expected a number",
+        ),
+        (lambda model: Navigator(model).push(10**400, [0, 0, 0], [0, 0, 9.8]), "time: .*seconds"),
+        (lambda model: Navigator(model).restore(b"xx" + Navigator(model).snapshot()), "else"),
         (lambda model: compare("walk.csv", model, NavigatorConfig()), "sequence.*read_recording"),
         (lambda model: FilterConfig(gate="0.9"), "gate"),
         (lambda model: FilterConfig(gate=1.0), "gate"),

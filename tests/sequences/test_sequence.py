@@ -155,6 +155,13 @@ def test_an_imu_sequence_is_validated_for_shape_only() -> None:
         ImuSequence("odd", np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
 
 
+def test_masked_samples_are_missing_ones() -> None:
+    gyro = np.ma.masked_equal(np.where(np.eye(3) > 0, -9999.0, 0.5), -9999.0)
+    sequence = ImuSequence("masked", np.arange(3.0), gyro, np.zeros((3, 3)))
+    np.testing.assert_array_equal(np.isnan(sequence.gyro), np.eye(3) > 0)
+    assert np.nanmax(sequence.gyro) == 0.5
+
+
 def test_slicing_a_sequence_also_slices_its_truth() -> None:
     zeros = np.zeros((len(GRID), 3))
     sequence = ImuSequence("cut", GRID, zeros, zeros, screw(GRID))

@@ -9,6 +9,7 @@ indicates (Sensor Logger's `Metadata.csv`), or from the phone's own attitude.
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -57,7 +58,9 @@ def assemble_recording(
     """
     folder = files.gyro.parent
     for file in files.unread:
-        _log.warning("%s: not read: it has no rows with a time that grows and three values", file)
+        why = "it has no rows with a time that grows and three values"
+        why = why if os.access(file, os.R_OK) else "no permission"
+        _log.warning("%s: not read: %s", file, why)
     gyro = _read(files.tables["gyro"][0], "gyro")
     attitude = logged_attitude(files, gyro)
     accel = _force(files, attitude, core_motion)

@@ -146,7 +146,7 @@ def _logfile(path: Path) -> Events:
         if cells[0] in (*_CODES.values(), _POINT, _AHRS):
             events.setdefault(cells[0], []).append(cells[1:])
     sensors = {
-        sensor: _rows(path, code, [[row[1], *row[2:]] for row in events[code]], 10**9, slice(1, 4))
+        sensor: _rows(path, code, [row[1:] for row in events[code]], 10**9, slice(1, 4))
         for sensor, code in _CODES.items()
         if code in events
     }
@@ -154,22 +154,32 @@ def _logfile(path: Path) -> Events:
     attitude = _attitude(path, _AHRS, vectors, 10**9, slice(4, 7), sensors.get("gyro"))
     if _POINT not in events or "ACCE" not in events:
         return sensors, attitude, None
-    offsets = [float(row[0]) - float(row[1]) for row in events["ACCE"]]  # the app's clock differs
     stamps, degrees = _rows(path, _POINT, events[_POINT], 10**9, slice(2, 4))
-    stamps = stamps - round(float(np.median(offsets)) * 1e9)
+    # The app's clock, the first time of an event, differs from the sensors'.
+    app, sensor = _rows(path, _CODES["accel"], events[_CODES["accel"]], 10**9, slice(1, 2))
+    stamps = stamps - round(float(np.median(app * 1e-9 - sensor[:, 0])) * 1e9)
     return sensors, attitude, (stamps, east_north(degrees))
 
 
 def _rows(path: Path, kind: str, rows: Iterable[list[str]], unit_ns: int, used: slice) -> Rows:
     """Return the stamps and values of events whose first cell is the time."""
-    try:
-        cells = [(row[0], [float(cell) for cell in row[used]]) for row in rows]
-        stamps = [round(float(time) * unit_ns) if "." in time else int(time) * unit_ns
-                  for time, _ in cells]  # fmt: skip
-        values = np.array([numbers for _, numbers in cells], dtype=np.float64)
-    except ValueError as error:
-        raise ReadError(path, kind, " ".join(str(error).split()), "time and numbers") from None
-    if values.ndim != 2 or values.shape[1] != used.stop - used.start:
-        expected = f"{used.stop - used.start} values per line"
-        raise ReadError(path, kind, "a line that is cut short", expected)
-    return np.array(stamps, dtype=np.int64), checked(path, kind, values)
+    stamps, values = [], []
+    for number, row in enumerate(rows, 1):
+        if len(row) < used.stop:
+            expected = f"time and {used.stop - used.start} values"
+            raise ReadError(path, f"{kind}, line {number} of its kind", "a cut line", expected)
+        try:
+            stamps.append(_stamp_ns(row[0], unit_ns))
+            values.append([float(cell) for cell in row[used]])
+        except ValueError:
+            found = repr(" ".join([row[0], *row[used]]))
+            raise ReadError(path, f"{kind}, line {number} of its kind", found, "numbers") from None
+    return np.array(stamps, dtype=np.int64), checked(path, kind, np.array(values))
+
+
+def _stamp_ns(time: str, unit_ns: int) -> int:
+    """Return a time in nanoseconds; `ValueError` if it is no number, or too large for a clock."""
+    stamp = round(float(time) * unit_ns) if "." in time else int(time) * unit_ns
+    if abs(stamp) >= 2**63:
+        raise ValueError
+    return stamp

@@ -175,6 +175,8 @@ def by_rows(head: FloatArray) -> Layout | None:
             start += 1
         if start + 3 > width or not np.isfinite(head[:, start : start + 3]).all():
             continue
+        if width > 4 and _is_code(head[:, start]):  # as in ADVIO's `imu-gyro.csv`
+            continue
         x, y, z = (Column(start + k) for k in range(3))
         rest = width - start
         quaternion = tuple(Column(start + k) for k in range(4)) if start and rest >= 4 else ()
@@ -186,6 +188,12 @@ def by_rows(head: FloatArray) -> Layout | None:
         )
         return Layout(clock=clock, axes={"": (x, y, z)}, quaternion=quaternion, biases=biases)
     return None
+
+
+def _is_code(column: FloatArray) -> bool:
+    """Return whether a column holds the number of a sensor, the same in every row."""
+    code = float(column[0])
+    return code != 0.0 and code.is_integer() and not np.ptp(column)
 
 
 def _is_clock(column: FloatArray, time: FloatArray) -> bool:

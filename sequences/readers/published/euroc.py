@@ -15,11 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import captured_rotations
+from stario.sequences.readers.checked import captured_rotations, pose_mask
 from stario.sequences.readers.lines import first_line
 from stario.sequences.readers.text import read_table, seconds
 from stario.sequences.sequence import ImuSequence, Trajectory
-from stario.sequences.time_order import increasing_mask
 
 _log = logging.getLogger(__name__)
 
@@ -31,7 +30,8 @@ def read_euroc(path: Path) -> ImuSequence:
     """Read a recording from its folder, its `mav0` folder or its `imu0/data.csv`."""
     imu = imu_file(path)
     if imu is None:
-        raise ReadError(path, "imu0/data.csv", "no such file", "an EuRoC or TUM-VI folder")
+        expected = "an EuRoC or TUM-VI folder with its IMU"
+        raise ReadError(path, "mav0/imu0/data.csv", "no such file", expected, "unpack all of it")
     table = read_table(imu, columns=7)
     stamps = table.stamps_ns()
     truth_file = _truth_file(imu.parent.parent)
@@ -45,8 +45,8 @@ def read_euroc(path: Path) -> ImuSequence:
 
 
 def is_euroc(path: Path) -> bool:
-    """Return whether a path leads to an `imu0/data.csv`."""
-    return imu_file(path) is not None
+    """Return whether a path leads to an `imu0/data.csv`, or is a folder that should."""
+    return imu_file(path) is not None or (path / "mav0").is_dir()
 
 
 def imu_file(path: Path) -> Path | None:
@@ -73,7 +73,7 @@ def _truth(path: Path, start_ns: np.int64) -> Trajectory:
     columns = 11 if estimated and (first_line(path) or "").count(",") >= 10 else 8
     rows = read_table(path, columns=columns)
     table, time = rows.values, seconds(rows.stamps_ns(), start_ns)
-    keep = increasing_mask(time)
+    keep = pose_mask(path, time)
     table, time = table[keep], time[keep]
     attitude_WB, valid = captured_rotations(table[:, [5, 6, 7, 4]])
     valid &= np.isfinite(table[:, 1:4]).all(axis=1)

@@ -59,6 +59,25 @@ def test_an_archive_of_nothing_is_not_written_and_the_reason_is_told(stario, tmp
     assert not (tmp_path / "out.h5").exists()
 
 
+def test_overwrite_replaces_an_euroc_folder_and_nothing_else(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    assert stario("convert", recording, "there").code == 0
+    imu = tmp_path / "there/mav0/imu0/data.csv"
+    written = imu.read_text()
+    imu.write_text("old")
+    again = stario("convert", recording, "there")
+    again.assert_one_line_error("there, which already exists", "or pass --overwrite")
+    assert stario("convert", recording, "there", "--overwrite").code == 0
+    assert imu.read_text() == written
+    (tmp_path / "there/mav0/cam0.png").touch()
+    lost = stario("convert", recording, "there", "--overwrite")
+    lost.assert_one_line_error("there/mav0/cam0.png, which would be lost")
+    part = stario("convert", "there", imu, "--overwrite")
+    part.assert_one_line_error("data.csv, which is also an input")
+    assert imu.read_text() == written
+
+
 def test_a_folder_with_one_recording_is_converted(stario, recording: Path) -> None:
     assert stario("convert", recording.parent, "out.csv").code == 0
     there, here = read_generic_csv(Path("out.csv")), read_generic_csv(recording)

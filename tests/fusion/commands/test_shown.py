@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 import sys
 
 import pytest
+from phone_exports import androsensor
 
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
@@ -21,6 +23,18 @@ def test_run_writes_a_report_only_on_request(stario, recording, tmp_path, no_fig
     assert "factor graph" in text
     assert "Accuracy against ground truth" in text
     assert "in x and y only" in text
+
+
+def test_a_warning_is_shown_once_however_often_a_file_is_read(
+    stario, recording, tmp_path, monkeypatch
+):
+    androsensor(tmp_path, read_generic_csv(recording))
+    (file,) = tmp_path.glob("*AndroSensor.csv")
+    file.write_text(file.read_text()[:-9])
+    monkeypatch.setattr(logging.root, "handlers", [])
+    done = stario("convert", file, "out.csv")
+    assert done.code == 0
+    assert done.err.count("skipped the last row") == 1
 
 
 def test_compare_writes_a_report_next_to_the_tracks(stario, recording, tmp_path, no_figures):

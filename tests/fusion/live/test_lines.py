@@ -205,6 +205,19 @@ def test_a_cleared_experiment_is_followed_from_its_new_start():
     assert len(phone._readings("gyro", answer([0.1, 0.2]))) == 2
 
 
+@pytest.mark.parametrize("time", [float("inf"), 10**400, 1e300])
+def test_an_endless_time_neither_fails_nor_ends_the_stream(time):
+    phone = Phyphox("phone:8080")
+    phone._buffers = {"gyro": ("t", "x", "y", "z")}
+
+    def answer(times):
+        buffers = {name: {"buffer": [0.5] * len(times)} for name in ("x", "y", "z")}
+        return buffers | {"t": {"buffer": times}}
+
+    assert len(phone._readings("gyro", answer([1.0, time]))) == 1
+    assert len(phone._readings("gyro", answer([2.0, 3.0]))) == 2
+
+
 def test_a_paused_experiment_continues_as_another_recording(monkeypatch):
     """Its time does not count the pause, so the same track would miss what happened meanwhile."""
     phone, recordings = Phyphox("phone:8080"), []

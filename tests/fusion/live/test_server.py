@@ -63,6 +63,38 @@ def test_a_push_of_another_recording_begins_a_new_track_and_file(client, hub, pu
     assert len(read_recording(first)) == len(read_recording(session.path)) == 300
 
 
+def test_two_phones_of_one_name_are_told_apart_and_the_earlier_is_refused(client, hub, pushes):
+    one, two = pushes(seconds=3.0), pushes(session="two", offset_ns=10**18 + 10**6, seconds=3.0)
+    answers = send(client, [body for pair in zip(one, two, strict=True) for body in pair])
+    refused = [answer for answer in answers if answer.status_code != 200]
+    assert len(refused) > len(one) - 5  # all but those before the first sample
+    assert "two recordings in turn from 'phone'" in refused[0].json()["error"]
+    assert hub.sessions["phone"].samples > 240
+    assert len(list(hub.sessions["phone"].path.parent.iterdir())) <= 2
+
+
+def test_times_in_milliseconds_are_named_and_do_not_begin_tracks_without_end(client, hub, walk):
+    lines = [
+        json.dumps({"device": "rig", "t": 1e3 * t, "gyro": gyro, "accel": accel})
+        for t, gyro, accel in zip(
+            walk.time.tolist(), walk.gyro.tolist(), walk.accel.tolist(), strict=True
+        )
+    ]
+    headers = {"content-type": "application/x-ndjson"}
+    for begin in range(0, len(lines), 20):
+        body = "\n".join(lines[begin : begin + 20])
+        assert client.post("/data", content=body, headers=headers).status_code == 200
+    session = hub.sessions["rig"]
+    assert "give times in s" in session.status()["problem"]
+    assert len(list(session.path.parent.iterdir())) == 1
+
+
+def test_a_compressed_body_is_refused_with_the_remedy(client, pushes):
+    answer = client.post("/data", content=pushes()[0], headers={"content-encoding": "gzip"})
+    assert answer.status_code == 400
+    assert "send it uncompressed" in answer.json()["error"]
+
+
 def test_a_clock_that_jumps_back_begins_a_new_track(client, hub, pushes):
     for offset in (2 * 10**18, 10**18):
         send(client, pushes(session="", offset_ns=offset, seconds=3.0))

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors
 import safetensors.torch
 import torch
 from training_runs import STREAMS, TINY, VALIDATION, run, swaying
@@ -95,3 +96,40 @@ def test_a_truncated_checkpoint_is_named(
     (tmp_path / "checkpoint.safetensors").write_bytes(whole[:length])
     with pytest.raises(ReadError, match=r"checkpoint.safetensors: checkpoint: found .*complete"):
         run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "without"),
+    [
+        ({"step": "x"}, "none"),
+        ({"history": "["}, "none"),
+        ({"history": "[5]"}, "none"),
+        ({"config": "5"}, "none"),
+        ({}, "network."),
+        ({}, "random."),
+    ],
+)
+def test_a_damaged_checkpoint_is_named_with_the_remedy(
+    finished: tuple[Path, list[EpochReport]],
+    tmp_path: Path,
+    metadata: dict[str, str],
+    without: str,
+) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    with safetensors.safe_open(finished[0].parent / path.name, framework="pt") as whole:
+        tensors = {key: whole.get_tensor(key) for key in whole.keys()}  # noqa: SIM118
+        kept = {key: value for key, value in tensors.items() if not key.startswith(without)}
+        path.write_bytes(safetensors.torch.save(kept, {**whole.metadata(), **metadata}))
+    with pytest.raises(ReadError, match=r"checkpoint: found .*; remove it to train anew") as error:
+        run(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_lost_log_is_written_again(
+    finished: tuple[Path, list[EpochReport]], tmp_path: Path
+) -> None:
+    folder = finished[0].parent
+    name = "checkpoint.safetensors"
+    (tmp_path / name).write_bytes((folder / name).read_bytes())
+    run(tmp_path)
+    assert (tmp_path / "log.json").read_text() == (folder / "log.json").read_text()

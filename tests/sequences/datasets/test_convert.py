@@ -170,7 +170,7 @@ def test_what_cannot_be_converted_is_refused_with_the_reason(
     assert not list(tmp_path.iterdir())
     (tmp_path / "full").mkdir()
     (tmp_path / "full/file").touch()
-    with pytest.raises(InputError, match="exists"):
+    with pytest.raises(InputError, match="file, which would be lost"):
         convert(walk, tmp_path / "full")
     assert [p.name for p in (tmp_path / "full").iterdir()] == ["file"]
 

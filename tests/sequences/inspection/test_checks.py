@@ -152,6 +152,12 @@ def test_time_in_another_unit_is_named(walk: ImuSequence, unit: str) -> None:
     assert "`t [s]`" in refusal(replace(alone, time=alone.time / factor))
 
 
+def test_times_that_were_divided_too_often_are_named(walk: ImuSequence) -> None:
+    """As of an EuRoC folder in us: no header of it could name another unit."""
+    with pytest.raises(InputError, match=r"steps are 1e\+03 times too short for its unit: convert"):
+        check_units(replace(walk, time=1e-3 * walk.time))
+
+
 def test_a_sampling_rate_out_of_range_is_refused(walk: ImuSequence) -> None:
     slow = ImuSequence("slow", walk.time[::20], walk.gyro[::20], walk.accel[::20])
     assert "found 10 samples/s, expected 50 to 1000" in refusal(slow)

@@ -67,6 +67,19 @@ def test_jumps_of_satellite_positions_are_a_problem(walk: ImuSequence) -> None:
     assert "positions: found jumps of up to 100 m" in problem(outdoors)
 
 
+def test_positions_on_another_clock_are_a_problem(walk: ImuSequence) -> None:
+    taps = PositionTrack(np.array([1000.0, 9000.0]), np.zeros((2, 2)), "waypoints")
+    problems = inspect_recording(replace(walk, truth=None, positions=taps)).problems
+    assert any("positions: found times from 1000 to 9000 s" in problem for problem in problems)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_truth_of_hardly_any_poses_is_a_problem(walk: ImuSequence, count: int) -> None:
+    valid = np.arange(len(walk.truth)) < count
+    found = inspect_recording(replace(walk, truth=replace(walk.truth, valid=valid))).problems
+    assert any(f"truth: only {count} usable pose" in problem for problem in found)
+
+
 def test_a_good_recording_has_no_problems(walk: ImuSequence) -> None:
     found = inspect_recording(walk)
     assert found.problems == ()

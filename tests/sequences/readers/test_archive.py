@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 from pathlib import Path
 
 import h5py
@@ -95,6 +96,75 @@ def test_a_truncated_archive_is_refused_with_its_file_name(tmp_path: Path) -> No
     path.write_bytes(path.read_bytes()[:3000])
     with pytest.raises(ReadError, match=r"walks\.h5: content: found .*truncated.*complete"):
         read_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("field", "values", "error"),
+    [
+        ("imu/gyro", np.zeros((49, 3)), r"imu/gyro: found shape \(49, 3\), expected \(50, 3\)"),
+        ("imu/t", np.zeros((50, 1)), r"imu/t: found shape \(50, 1\), expected \(N,\)"),
+        ("imu/accel", 9.81, r"imu/accel: found shape \(\), expected \(50, 3\)"),
+        (
+            "imu/t",
+            [b"0.1"] * 50,
+            r"imu/t: found values of type object, expected an array of numbers",
+        ),
+        ("mag/field", np.ones((9, 3)), r"mag/field: found shape \(9, 3\), expected \(10, 3\)"),
+        ("mag/t", [], r"mag/t: found shape \(0,\), expected \(N,\) with at least one"),
+        ("truth/quat_xyzw", np.ones((50, 3)), r"found shape \(50, 3\), expected \(50, 4\)"),
+        (
+            "truth/valid",
+            np.ones(9, dtype=bool),
+            r"truth/valid: found shape \(9,\), expected \(50,\)",
+        ),
+        ("truth/p", np.full((50, 3), np.nan), "row 1, truth/p: .* False there in truth/valid"),
+        ("truth/quat_xyzw", np.full((50, 4), np.nan), "row 1, truth/quat_xyzw: .* in truth/valid"),
+        ("waypoints/xy", np.ones((2, 4)), r"found shape \(2, 4\), expected \(2, 2\) or \(2, 3\)"),
+    ],
+)
+def test_a_dataset_of_another_shape_or_type_is_named(
+    tmp_path: Path, field: str, values: object, error: str
+) -> None:
+    path = _archive(tmp_path / "walks.h5")
+    name = "c" if field.startswith("waypoints") else "a"
+    with h5py.File(path, "a") as file:
+        if field in file[name]:
+            del file[name][field]
+        file[name][field] = values
+    with pytest.raises(ReadError, match=rf"walks\.h5:{name}: .*{error}"):
+        read_recording(f"{path}:{name}")
+
+
+def test_a_group_in_place_of_a_dataset_is_named(tmp_path: Path) -> None:
+    path = _archive(tmp_path / "walks.h5")
+    with h5py.File(path, "a") as file:
+        del file["a/imu/accel"]
+        file.create_group("a/imu/accel")
+    with pytest.raises(ReadError, match="imu/accel: found a group, expected a dataset"):
+        read_recording(f"{path}:a")
+
+
+def test_the_name_of_a_recording_is_that_of_its_group(tmp_path: Path) -> None:
+    path = _archive(tmp_path / "walks.h5")
+    with h5py.File(path, "a") as file:
+        file["a"].attrs["name"] = "b"
+    assert archive_members(path, {"name": ["a"]}) == [Path(f"{path}:a")]
+
+
+def test_an_archive_may_begin_with_other_groups_and_datasets(tmp_path: Path) -> None:
+    path = _archive(tmp_path / "walks.h5")
+    with h5py.File(path, "a") as file:
+        file.create_group("Empty")
+        file["Notes"] = [1.0, 2.0]
+    assert len(find_recordings(path)) == 3
+
+
+def test_an_archive_that_another_program_writes_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    path = _archive(tmp_path / "walks.h5")
+    with path.open() as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        with pytest.raises(ReadError, match="close it in the program that writes it"):
+            read_recording(f"{path}:a")
 
 
 @pytest.mark.skipif(not ARCHIVES.is_dir(), reason="the development recordings are not here")

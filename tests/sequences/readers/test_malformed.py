@@ -199,7 +199,7 @@ def test_a_bag_cut_short_or_with_bad_values_is_refused(tmp_path) -> None:
     path = formats.bag(tmp_path / "b", walk)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    assert_refused(path, "b.bag: file: found ", "expected an intact bag")
+    assert_refused(path, "b.bag: file: found ", "expected an intact bag", "`rosbag reindex`")
     value = struct.pack("<d", walk.gyro[20, 1])
     path.write_bytes(whole.replace(value, struct.pack("<d", np.nan)))
     assert_refused(path, "row 20, /imu, values: found nan")

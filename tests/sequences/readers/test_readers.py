@@ -273,7 +273,7 @@ def test_unknown_content_is_shown_with_the_known_formats(tmp_path: Path) -> None
         assert all(name in str(caught.value) for name in FORMATS)
     with pytest.raises(ReadError, match="no such file"):
         read_recording(tmp_path / "none.csv")
-    with pytest.raises(ReadError, match=r"found a folder with imu\.csv, expected one of"):
+    with pytest.raises(ReadError, match=r"a folder with imu\.csv; imu\.csv holds 'seconds;"):
         read_recording(tmp_path)
     with pytest.raises(
         InputError, match=r"format: found 'bags', expected one of auto, archive, ronin, .*, csv"

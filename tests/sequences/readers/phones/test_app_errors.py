@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from phone_exports import pose
+from phone_exports import get_sensor_data, pose, trace
 from phone_files import ns, save, zyx
 
 from stario.sequences import ImuSequence, ReadError, read_recording
@@ -144,3 +145,35 @@ def test_a_clock_in_another_unit_than_its_title_says(walk: ImuSequence, tmp_path
         save(tmp_path / f"{name}.csv", "t [s],x,y,z", 1e3 * walk.time + late, values)
     with pytest.raises(ReadError, match=r"found samples 10 s apart, .*; is its unit"):
         read_recording(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("write", "whole", "changed", "error"),
+    [
+        (trace, "TYPE_GYROSCOPE\t", "TYPE_GYROSCOPE\tx", "TYPE_GYROSCOPE, line 1 .*'156.* x"),
+        (
+            trace,
+            "1560828400010\tTYPE_GYRO",
+            "9" * 25 + "\tTYPE_GYRO",
+            "TYPE_GYROSCOPE, line 2 .*'999",
+        ),
+        (get_sensor_data, "\nGYRO;5.010;0.0100;", "\nGYRO;5.010\nGYRO;", "GYRO, line 2 .*cut line"),
+        (
+            get_sensor_data,
+            "\nGYRO;5.010;",
+            "\nGYRO;5.010;9;1\nGYRO;5.010;",
+            "GYRO, line 2 .*cut line",
+        ),
+        (get_sensor_data, "\nACCE;5.010;", "\nACCE;;", "ACCE, line 2 .*' 0.0100'"),
+        (get_sensor_data, "\nPOSI;7.000;1;", "\nPOSI\nPOSI;7;1;", "POSI, line 1 .*cut line"),
+    ],
+)
+def test_a_damaged_event_line_is_named(
+    walk: ImuSequence, tmp_path: Path, write: Callable[[Path, ImuSequence], None], whole: str,
+    changed: str, error: str,
+) -> None:  # fmt: skip
+    write(tmp_path / "walk", walk)
+    (file,) = (tmp_path / "walk").iterdir()
+    file.write_text(file.read_text().replace(whole, changed, 1))
+    with pytest.raises(ReadError, match=error):
+        read_recording(file)

@@ -1,0 +1,109 @@
+"""Folders that lack a part of their recording: the error names the part and its fault."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import published_formats as formats
+import pytest
+
+from stario.sequences import ReadError, find_recordings, read_recording
+from stario.sequences.datasets.convert import write_euroc
+from stario.sequences.sequence import ImuSequence
+
+
+@pytest.fixture(scope="module")
+def walk() -> ImuSequence:
+    return formats.walk_of(100.0, 3.0)
+
+
+def rows(time: np.ndarray, *columns: np.ndarray) -> str:
+    table = np.column_stack([time, *columns])
+    return "\n".join(",".join(map(repr, row)) for row in table.tolist()) + "\n"
+
+
+def test_an_euroc_folder_without_its_imu_is_no_recording_of_its_truth(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
+    """Its truth has columns of gyroscope and accelerometer: their biases."""
+    write_euroc(tmp_path / "V1", walk)
+    (tmp_path / "V1/mav0/imu0/data.csv").unlink()
+    truth = tmp_path / "V1/mav0/state_groundtruth_estimate0/data.csv"
+    axes = [f"b_{s}_RS_S_{axis}" for s in "wa" for axis in "xyz"]
+    header, *poses = truth.read_text().splitlines()
+    lines = [
+        ",".join([header, *axes]),
+        *(f"{row},{k % 7},2,3,4,5,6" for k, row in enumerate(poses)),
+    ]
+    truth.write_text("\n".join(lines))
+    assert find_recordings(tmp_path) == [tmp_path / "V1"]
+    with pytest.raises(ReadError, match=r"V1: mav0/imu0/data\.csv: found no such file"):
+        read_recording(tmp_path / "V1")
+
+
+def test_an_empty_file_in_a_folder_is_named(tmp_path: Path) -> None:
+    (tmp_path / "dan/processed").mkdir(parents=True)
+    (tmp_path / "dan/processed/data.csv").touch()
+    with pytest.raises(
+        ReadError, match=r"processed/data\.csv holds no line of text, .* is it empty"
+    ):
+        read_recording(tmp_path / "dan")
+
+
+def test_a_column_of_a_code_is_no_axis_of_a_sensor(walk: ImuSequence, tmp_path: Path) -> None:
+    """ADVIO's `imu-gyro.csv` holds time, a code and other values: not the gyroscope."""
+    folder, code = tmp_path / "advio-01/iphone", np.full((len(walk), 1), 34.0)
+    folder.mkdir(parents=True)
+    (tmp_path / "advio-01/ground-truth").mkdir()
+    (tmp_path / "advio-01/ground-truth/pose.csv").touch()
+    (folder / "accelerometer.csv").write_text(rows(walk.time, walk.accel))
+    (folder / "imu-gyro.csv").write_text(rows(walk.time, code, walk.gyro, walk.accel))
+    (folder / "gyro.csv").touch()
+    with pytest.raises(ReadError, match=r"iphone: sensors: found only accel, .*gyro\.csv") as error:
+        read_recording(tmp_path / "advio-01")
+    assert "no rows with a time that grows" in str(error.value)
+
+
+def test_files_whose_rows_are_all_out_of_order_are_named(walk: ImuSequence, tmp_path: Path) -> None:
+    for name, values in (("Gyroscope", walk.gyro), ("Accelerometer", walk.accel)):
+        (tmp_path / f"{name}.csv").write_text(rows(walk.time[::-1], values))
+    with pytest.raises(ReadError, match=r"found none, .*Gyroscope\.csv: no rows with"):
+        read_recording(tmp_path)
+
+
+def test_a_sensor_file_without_permission_is_named(
+    walk: ImuSequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "Accelerometer.csv").write_text(rows(walk.time, walk.accel))
+    gyro = tmp_path / "Gyroscope.csv"
+    gyro.touch()  # whose content is as unknown as without permission, which the root user has
+    allowed = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: path != gyro and allowed(path, mode))
+    with pytest.raises(ReadError, match=r"Gyroscope\.csv: path: found no permission to read"):
+        read_recording(tmp_path)
+
+
+def test_a_line_of_words_among_rows_is_named_with_the_remedy(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
+    imu, *_ = write_euroc(tmp_path / "V1", walk)
+    lines = imu.read_text().splitlines()
+    imu.write_text("\n".join([*lines[:9], "recording paused", *lines[9:]]))
+    with pytest.raises(ReadError, match=r"line 10: found 1 values, .*, or remove the line"):
+        read_recording(tmp_path / "V1")
+
+
+def test_poses_out_of_order_are_counted(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    _, truth = write_euroc(tmp_path / "V1", walk)
+    header, *poses = truth.read_text().splitlines()
+    truth.write_text(
+        "\n".join([header, *poses[:100], *poses[150:200], *poses[100:150], *poses[200:]])
+    )
+    found = read_recording(tmp_path / "V1").truth
+    assert found is not None
+    assert len(found) == len(poses) - 50
+    assert f"dropped 50 of {len(poses)} poses: their times do not increase" in caplog.text
