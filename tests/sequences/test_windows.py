@@ -173,6 +173,41 @@ def test_a_misaligned_truth_does_not_affect_levelled_windows() -> None:
     assert off("levelled") < 0.02
 
 
+def test_the_truths_errors_of_heading_are_averaged_over_a_second(walk: ImuSequence) -> None:
+    """Also where they take the heading past half a turn."""
+    truth = walk.truth
+    noise = 0.1 * np.random.default_rng(0).standard_normal(len(truth))
+    base = np.pi - float(yaw_of(truth.attitude_WB)[0])
+    turned, noisy = (
+        replace(walk, truth=replace(truth, attitude_WB=about_z(base + off) * truth.attitude_WB))
+        for off in (0.0 * noise, noise)
+    )
+    (right,), (stream,) = world_streams(turned), world_streams(noisy)
+    headings = (np.arctan2(*s.facing_W.T[::-1]) for s in (right, stream))
+    off = np.subtract(*headings)[100:-100]  # half a second at either end has fewer
+    assert np.abs(np.angle(np.exp(1j * off))).max() < 0.03  # 0.1 / sqrt(200) is 0.007
+
+
+def test_levelled_windows_of_a_device_held_upright_have_its_true_heading() -> None:
+    """A tilt of the truth's world must not turn it, however far the device is from level."""
+    still = np.zeros((2001, 3))
+    R_WB = about_z(np.linspace(0.0, 6.0, 2001)) * Rotation.from_rotvec([1.4, 0.0, 0.0])
+    time = np.arange(2001) / 200.0
+    walk = simulate_imu(Trajectory(time, still, R_WB), 200.0, PERFECT_IMU)
+    tilted = Rotation.from_rotvec([0.0, 0.05, 0.0]) * R_WB
+    (stream,) = world_streams(replace(walk, truth=Trajectory(time, still, tilted)))
+    off = np.arctan2(*stream.facing_W.T[::-1]) - yaw_of(R_WB)[: len(stream)]
+    assert np.abs(np.angle(np.exp(1j * off))).max() < 2e-3
+
+
+def test_positions_far_from_the_origin_keep_their_precision(walk: ImuSequence) -> None:
+    """Coordinates of a national grid have steps of half a metre in single precision."""
+    truth = walk.truth
+    far = replace(truth, position_W=truth.position_W + [4.5e5, 5.4e6, 0.0])
+    (near,), (stream,) = world_streams(walk), world_streams(replace(walk, truth=far))
+    np.testing.assert_allclose(stream.position_W, near.position_W, atol=1e-5)
+
+
 def test_levelled_windows_equal_the_navigators_except_for_heading() -> None:
     walk = simulate_imu(generate_walk(7, 30.0, rate=200.0), 200.0, seed=7)
     (stream,) = world_streams(walk)
@@ -266,6 +301,7 @@ def test_heading_is_the_yaw_at_any_tilt_except_upside_down() -> None:
             R = (Rotation.from_rotvec([0.0, 0.0, yaw]) * R_tilt).as_matrix()
             heading = float(mean_heading(np.tile(facing(R), (10, 1))))
             assert heading == pytest.approx(yaw, abs=1e-9)
+            assert yaw_of(Rotation.from_matrix(R)) == pytest.approx(yaw, abs=1e-9)
     upside_down = facing(Rotation.from_rotvec([np.pi, 0.0, 0.0]).as_matrix())
     np.testing.assert_allclose(upside_down, 0.0, atol=1e-12)
 
