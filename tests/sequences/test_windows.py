@@ -13,9 +13,11 @@ from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import (
+    VELOCITY_WEIGHTS,
     Attitude,
     clean_samples,
     facing,
+    headings_at,
     imu_in_world,
     mean_heading,
     resample,
@@ -203,7 +205,7 @@ def test_levelled_windows_of_a_device_held_upright_have_its_true_heading() -> No
 def test_positions_far_from_the_origin_keep_their_precision(walk: ImuSequence) -> None:
     """Coordinates of a national grid have steps of half a metre in single precision."""
     truth = walk.truth
-    far = replace(truth, position_W=truth.position_W + [4.5e5, 5.4e6, 0.0])
+    far = replace(truth, position_W=truth.position_W + np.array([4.5e5, 5.4e6, 0.0]))
     (near,), (stream,) = world_streams(walk), world_streams(replace(walk, truth=far))
     np.testing.assert_allclose(stream.position_W, near.position_W, atol=1e-5)
 
@@ -289,6 +291,8 @@ def test_recordings_that_give_no_windows_are_refused(walk: ImuSequence) -> None:
         world_streams(walk.without_truth())
     with pytest.raises(InputError, match="is the time column in seconds"):
         world_streams(replace(walk, time=1e3 * walk.time))
+    with pytest.raises(InputError, match="is the time column in seconds"):
+        clean_samples(replace(walk, time=1e-3 * walk.time))
     with pytest.raises(InputError, match="0 usable"):
         clean_samples(replace(walk, gyro=np.nan * walk.gyro))
 
@@ -302,8 +306,15 @@ def test_heading_is_the_yaw_at_any_tilt_except_upside_down() -> None:
             heading = float(mean_heading(np.tile(facing(R), (10, 1))))
             assert heading == pytest.approx(yaw, abs=1e-9)
             assert yaw_of(Rotation.from_matrix(R)) == pytest.approx(yaw, abs=1e-9)
+    turning = facing(about_z(np.arange(400) / 200.0).as_matrix())
+    assert headings_at(turning, np.array([100])) == pytest.approx(0.5 + 0.45)  # ten instants
     upside_down = facing(Rotation.from_rotvec([np.pi, 0.0, 0.0]).as_matrix())
     np.testing.assert_allclose(upside_down, 0.0, atol=1e-12)
+
+
+def test_a_constant_acceleration_changes_the_mean_velocity_by_its_size() -> None:
+    """From one second to the next: the weights rise to 1 and fall again."""
+    assert (VELOCITY_WEIGHTS + VELOCITY_WEIGHTS[::-1]).sum() == pytest.approx(1.0)
 
 
 def test_rotating_a_window_rotates_its_vectors() -> None:
