@@ -59,3 +59,15 @@ def test_positions_seconds_apart_make_no_legs(recording: ImuSequence) -> None:
     time = TIME[::4]
     known = PositionTrack(time, recording.truth.at(time).position_W, "positions")
     assert leg_streams(replace(recording, truth=None, positions=known)) == []
+
+
+def test_a_part_has_the_legs_that_lie_within_it(recording: ImuSequence) -> None:
+    legs = legs_of(recording, TIME, "positions", None)
+    part = legs.part(1000, 3000)
+    inside = (legs.start >= 5.0) & (legs.stop <= 15.0)
+    assert 2 < inside.sum() < len(legs.start) - 2
+    np.testing.assert_allclose(part.start, legs.start[inside] - 5.0)
+    np.testing.assert_allclose(part.stop, legs.stop[inside] - 5.0)
+    np.testing.assert_array_equal(part.displacement, legs.displacement[inside])
+    np.testing.assert_array_equal(part.imu_N, legs.imu_N[1000:3000])
+    assert len(legs.part(3000, 1000)) == 0
