@@ -61,6 +61,14 @@ def test_positions_seconds_apart_make_no_legs(recording: ImuSequence) -> None:
     assert leg_streams(replace(recording, truth=None, positions=known)) == []
 
 
+def test_a_single_leg_is_not_enough(recording: ImuSequence) -> None:
+    """With its yaw unknown, a leg by itself says no more than its length."""
+    assert recording.truth is not None
+    time = np.array([5.0, 15.0])
+    known = PositionTrack(time, recording.truth.at(time).position_W, "waypoints")
+    assert leg_streams(replace(recording, truth=None, positions=known)) == []
+
+
 def test_a_part_has_the_legs_that_lie_within_it(recording: ImuSequence) -> None:
     legs = legs_of(recording, TIME, "positions", None)
     part = legs.part(1000, 3000)
