@@ -56,3 +56,5 @@ def test_after_a_confirmed_jump_earlier_times_are_dropped() -> None:
 def test_late_times_do_not_refute_a_gap() -> None:
     time = np.concatenate([TIME[:100], TIME[200:201], TIME[50:60], TIME[201:]])
     assert dropped_rows(time) == list(range(101, 111))
+    repeated = np.concatenate([TIME[:100], TIME[200:201], TIME[200:]])
+    assert dropped_rows(repeated) == [101]
