@@ -155,6 +155,14 @@ def test_an_imu_sequence_is_validated_for_shape_only() -> None:
         ImuSequence("odd", np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
 
 
+def test_a_wild_time_changes_neither_duration_nor_rate() -> None:
+    time, zero = np.arange(1001) / 100.0, np.zeros((1001, 3))
+    time[500] += 1e9
+    sequence = ImuSequence("wild", time, zero, zero)
+    assert sequence.duration == pytest.approx(10.0)
+    assert sequence.rate == pytest.approx(100.0)
+
+
 def test_slicing_a_sequence_also_slices_its_truth() -> None:
     zeros = np.zeros((len(GRID), 3))
     sequence = ImuSequence("cut", GRID, zeros, zeros, screw(GRID))

@@ -56,6 +56,15 @@ def test_samples_late_for_a_moment_are_not_worth_a_note() -> None:
     assert "late for 0.6 s" in note
 
 
+def test_of_endless_gaps_the_newest_are_listed_and_all_are_counted() -> None:
+    counts = SampleCounts()
+    for k in range(150):
+        counts.add_gap(float(k), 0.2)
+    health = counts.health()
+    assert health.gap_count == 150
+    assert [start for start, _ in health.gaps] == [float(k) for k in range(50, 150)]
+
+
 def test_one_dropped_sample_among_thousands_is_not_reported_as_none() -> None:
     (found,) = [
         finding.text

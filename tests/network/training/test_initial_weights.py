@@ -83,3 +83,13 @@ def test_errors_on_recordings_that_were_learned_are_named_so(tmp_path: Path) -> 
     once = replace(TINY, epochs=1, epoch_windows=16)
     path = train(once, everything, [1.0] * 4, VALIDATION, tmp_path)
     assert list(load_model(path).card.figures) == ["validation_mse_m2_after_it_was_learned"]
+
+
+def test_the_recipes_dropout_replaces_the_networks_own(tmp_path: Path) -> None:
+    once = replace(TINY, epochs=1, epoch_windows=16)
+    none, most = (
+        load_model(run(tmp_path / str(share), replace(once, dropout=share))).training_form
+        for share in (0.0, 0.9)
+    )
+    pairs = zip(none.parameters(), most.parameters(), strict=True)
+    assert not all(torch.equal(one, other) for one, other in pairs)

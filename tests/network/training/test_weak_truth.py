@@ -171,8 +171,9 @@ def test_jumps_and_rides_of_a_track_make_no_legs() -> None:
     [whole], [cut] = leg_streams(recording), leg_streams(jumped)
     assert len(whole.start) - len(cut.start) == 1
     assert not ((cut.start < 30.0) & (cut.stop > 30.1)).any()
-    ride = replace(recording, positions=PositionTrack(time, 9.0 * position, "positions"))
-    assert leg_streams(ride) == []
+    for faster in (4.0, 9.0):  # also below the speed of a jump
+        ride = replace(recording, positions=PositionTrack(time, faster * position, "positions"))
+        assert leg_streams(ride) == []
 
 
 @pytest.mark.parametrize(("every", "legs"), [(0.1, 28), (0.5, 28), (1.0, 28), (2.5, 22)])

@@ -99,6 +99,10 @@ def test_routes_stop_turn_climb_and_keep_to_pedestrian_speeds() -> None:
     heights = [np.ptp(route.position_W[:, 2]) for route in routes]
     assert max(heights) > 1.5
     assert min(heights) == pytest.approx(0.0, abs=1e-9)
+    climb = np.abs(np.concatenate([route.climb for route in routes]))
+    on_stairs = climb > 0.8 * climb.max()
+    slope = climb[on_stairs] / speed[on_stairs]
+    assert np.median(slope) == pytest.approx(0.17 / 0.29, rel=0.02)
     backward = [_forward_speed_is_negative(route.position_W, route.heading) for route in routes]
     assert any(backward)
 
