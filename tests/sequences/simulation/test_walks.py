@@ -8,8 +8,14 @@ from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
-from stario.sequences.simulation.routes import band_noise, drift, random_route
-from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk, step_rate
+from stario.sequences.simulation.routes import Route, band_noise, drift, random_route
+from stario.sequences.simulation.walks import (
+    CARRYING_MODES,
+    WalkStyle,
+    _gait,
+    generate_walk,
+    step_rate,
+)
 
 
 @pytest.mark.parametrize("carry", CARRYING_MODES)
@@ -154,6 +160,18 @@ def test_noise_has_unit_deviation_in_its_band() -> None:
     assert noise.std() == pytest.approx(1.0, rel=0.05)
     f, power = welch(noise[:, 0], 100.0, nperseg=1024)
     assert power[(f > 4.0) & (f < 11.0)].sum() > 0.7 * power.sum()
+
+
+def test_turning_on_the_spot_takes_steps() -> None:
+    count, still = 500, np.zeros(500)
+    route = Route(np.zeros((count, 3)), 0.02 * np.arange(count), still, still + 2.0, still)
+    standing = replace(route, turn_rate=still)
+    turning, resting = (
+        _gait(np.random.default_rng(0), 100.0, r, WalkStyle()) for r in (route, standing)
+    )
+    assert turning.effort.min() > 0.3
+    assert resting.effort.max() < 1e-9
+    assert turning.step_rate.mean() > 1.2 * resting.step_rate.mean()
 
 
 def test_styles_and_arguments_are_checked() -> None:

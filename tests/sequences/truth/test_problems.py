@@ -12,6 +12,7 @@ from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk
+from stario.sequences.truth.positions import fit_positions
 from stario.sequences.truth.problems import check_truth, examine_truth, truth_problems
 
 LATE_S = 20.0
@@ -131,3 +132,16 @@ def test_the_comparison_is_part_of_the_findings(walk: ImuSequence) -> None:
     assert values["axes"] == ["x", "y", "z"]
     assert values["correlation"] > 0.8
     assert any("positions scaled by 1" in line for line in found.lines())
+
+
+@pytest.mark.parametrize("of", ["imu", "truth"])
+def test_positions_are_not_compared_across_gaps(of: str) -> None:
+    walk = simulate_imu(generate_walk(3, 60.0, style=WalkStyle()), 100.0, seed=1)
+    known = walk.time % 3.0 > 0.5
+    assert walk.truth is not None
+    position = walk.truth.position_W + np.cumsum(~known)[:, None] * [0.01, 0.0, 0.0]  # relocalised
+    lost = replace(walk.truth, position_W=position, valid=known)
+    gappy = walk.select(known) if of == "imu" else replace(walk, truth=lost)
+    fit = fit_positions(gappy, 0.0)
+    assert fit is not None
+    assert fit.correlation > 0.99
