@@ -246,6 +246,9 @@ def test_relative_error_is_nan_if_a_gap_leaves_no_pair():
     ends = (truth.time < 5.0) | (truth.time > 66.0)
     found = evaluate_track(replace(drifted(truth), valid=ends), truth)
     assert np.isnan(found.rte_m)
+    coarse = walk().select(np.arange(2001) % 140 == 0)  # every 7 s: 63 s are not 60
+    assert np.isnan(evaluate_track(coarse, walk()).rte_m)
+    assert evaluate_track(coarse, walk(), rte_interval=63.0).rte_m < 1e-9
     assert not found.rte_scaled
     assert found.ate_m > 0
 

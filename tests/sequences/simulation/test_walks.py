@@ -174,6 +174,17 @@ def test_turning_on_the_spot_takes_steps() -> None:
     assert turning.step_rate.mean() > 1.2 * resting.step_rate.mean()
 
 
+def test_a_change_of_carrying_mode_turns_the_device_in_the_hand() -> None:
+    angles = []
+    for seed in range(8):
+        walk = generate_walk(seed, 20.0, style=WalkStyle(carry="bag", next_carry="bag"))
+        up_B = walk.attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)
+        before, after = up_B[:400].mean(axis=0), up_B[-400:].mean(axis=0)
+        cosine = before @ after / (np.linalg.norm(before) * np.linalg.norm(after))
+        angles.append(np.arccos(cosine))
+    assert np.median(angles) > 0.3
+
+
 def test_styles_and_arguments_are_checked() -> None:
     with pytest.raises(InputError, match="carry"):
         WalkStyle(carry="on a hat")
