@@ -19,10 +19,12 @@ def recording() -> ImuSequence:
     return simulate_imu(generate_walk(3, 40.0), 100.0, PERFECT_IMU, 0, name="walk")
 
 
-def legs_of(recording: ImuSequence, time: FloatArray, kind: str, sigma: object) -> LegStream:
+def legs_of(
+    recording: ImuSequence, time: FloatArray, kind: str, sigma: object, valid: object = ()
+) -> LegStream:
     assert recording.truth is not None
     position = recording.truth.at(time).position_W
-    known = PositionTrack(time, position, kind, sigma=sigma)  # type: ignore[arg-type]
+    known = PositionTrack(time, position, kind, valid, sigma)  # type: ignore[arg-type]
     [legs] = leg_streams(replace(recording, truth=None, positions=known))
     return legs
 
@@ -30,7 +32,8 @@ def legs_of(recording: ImuSequence, time: FloatArray, kind: str, sigma: object) 
 def test_the_ends_of_a_leg_are_as_certain_as_their_own_positions(recording: ImuSequence) -> None:
     """Those of satellites share most of their error, which a displacement does not contain."""
     stated = 3.0 + 0.1 * TIME
-    legs = legs_of(recording, TIME, "positions", stated)
+    known = TIME > 4.0
+    legs = legs_of(recording, TIME, "positions", np.where(known, stated, np.nan), known)
     ends = np.stack([legs.start, legs.stop], axis=1)
     relative = legs.sigma / np.interp(ends, TIME, stated)
     np.testing.assert_allclose(relative, relative[0, 0])

@@ -9,6 +9,7 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.recording import cut_recording
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import InputError
+from stario.sequences.levelled_stream import levelled_streams
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
@@ -315,6 +316,15 @@ def test_heading_is_the_yaw_at_any_tilt_except_upside_down() -> None:
 def test_a_constant_acceleration_changes_the_mean_velocity_by_its_size() -> None:
     """From one second to the next: the weights rise to 1 and fall again."""
     assert (VELOCITY_WEIGHTS + VELOCITY_WEIGHTS[::-1]).sum() == pytest.approx(1.0)
+
+
+def test_windows_of_a_levelled_stream_reach_its_end(walk: ImuSequence) -> None:
+    (stream,) = levelled_streams(walk)
+    windows = stream.windows()
+    assert (len(stream), len(windows), len(stream.headings)) == (4000, 39, 39)
+    np.testing.assert_array_equal(windows[-1], stream.imu_N[3800:].T)
+    at_ticks = np.stack([facing(R) for R in stream.R_NB])
+    np.testing.assert_allclose(at_ticks, stream.facing_N[::100], atol=1e-6)
 
 
 def test_rotating_a_window_rotates_its_vectors() -> None:

@@ -93,3 +93,17 @@ def test_the_recipes_dropout_replaces_the_networks_own(tmp_path: Path) -> None:
     )
     pairs = zip(none.parameters(), most.parameters(), strict=True)
     assert not all(torch.equal(one, other) for one, other in pairs)
+
+
+def test_averaged_weights_of_a_short_run_are_not_the_initial_ones(
+    model: Path, tmp_path: Path
+) -> None:
+    """The first steps are averaged over fewer than the recipe's number."""
+    first, short = load_model(model), replace(TINY, epochs=1, epoch_windows=64)
+    initial = torch.nn.utils.parameters_to_vector(first.training_form.parameters())
+    moved = []
+    for average in (0.0, 0.9999):
+        path = run(tmp_path / str(average), replace(short, average=average), start_from=first)
+        learned = torch.nn.utils.parameters_to_vector(load_model(path).training_form.parameters())
+        moved.append(float((learned - initial).detach().norm()))
+    assert moved[1] > 0.5 * moved[0]

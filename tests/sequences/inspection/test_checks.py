@@ -155,6 +155,7 @@ def test_time_in_another_unit_is_named(walk: ImuSequence, unit: str) -> None:
 def test_a_sampling_rate_out_of_range_is_refused(walk: ImuSequence) -> None:
     slow = ImuSequence("slow", walk.time[::20], walk.gyro[::20], walk.accel[::20])
     assert "found 10 samples/s, expected 50 to 1000" in refusal(slow)
+    assert "set the app to 50 Hz" in refusal(slow)
 
 
 def test_times_of_batches_are_not_taken_for_a_fast_sensor(walk: ImuSequence) -> None:

@@ -14,6 +14,7 @@ from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk
 from stario.sequences.truth.positions import fit_positions
 from stario.sequences.truth.problems import check_truth, examine_truth, truth_problems
+from stario.sequences.truth.tracking import tracking_faults
 
 LATE_S = 20.0
 
@@ -145,3 +146,11 @@ def test_positions_are_not_compared_across_gaps(of: str) -> None:
     fit = fit_positions(gappy, 0.0)
     assert fit is not None
     assert fit.correlation > 0.99
+
+
+def test_a_shift_while_tracking_is_lost_is_not_a_jump(walk: ImuSequence) -> None:
+    assert walk.truth is not None
+    lost = replace(walk.truth, position_W=jumping(walk.truth))
+    assert len(tracking_faults(replace(walk, truth=lost)).jumps) == 1
+    blank = replace(lost, valid=np.abs(lost.time - LATE_S - 0.05) > 0.08)
+    assert tracking_faults(replace(walk, truth=blank)).jumps == ()
