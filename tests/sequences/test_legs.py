@@ -31,9 +31,11 @@ def legs_of(
 
 def test_the_ends_of_a_leg_are_as_certain_as_their_own_positions(recording: ImuSequence) -> None:
     """Those of satellites share most of their error, which a displacement does not contain."""
-    stated = 3.0 + 0.1 * TIME
     known = TIME > 4.0
-    legs = legs_of(recording, TIME, "positions", np.where(known, stated, np.nan), known)
+    stated = np.where(known, 3.0 + 0.1 * TIME, 99.0)
+    track = PositionTrack(TIME, np.zeros((len(TIME), 2)), "positions", known, stated)
+    assert track.typical_sigma == pytest.approx(np.median(stated[known]))
+    legs = legs_of(recording, TIME, "positions", stated, known)
     ends = np.stack([legs.start, legs.stop], axis=1)
     relative = legs.sigma / np.interp(ends, TIME, stated)
     np.testing.assert_allclose(relative, relative[0, 0])

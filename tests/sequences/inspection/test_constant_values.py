@@ -6,7 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stario.sequences.inspection.constant_values import dead_axis_problems, warn_of_dead_axes
+from stario.sequences.inspection.constant_values import (
+    dead_axis_problems,
+    stuck_problems,
+    warn_of_dead_axes,
+)
 from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.imu import simulate_imu
@@ -55,3 +59,9 @@ def test_motion_in_a_plane_is_no_problem() -> None:
     for gyro, accel in (floor, swing, rest):
         planar = ImuSequence("planar", t, np.column_stack(gyro), np.column_stack(accel))
         assert dead_axis_problems(planar) == []
+
+
+def test_two_equal_samples_are_not_stuck_for_the_seconds_of_a_wrong_unit(walk: ImuSequence) -> None:
+    gyro = walk.gyro.copy()
+    gyro[501] = gyro[500]
+    assert stuck_problems("w", 1e3 * walk.time, gyro, walk.accel) == []

@@ -7,6 +7,7 @@ from scipy.signal import welch
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, Trajectory
+from stario.sequences.simulation.carrying import Gait, heel_strikes, trunk
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.routes import Route, band_noise, drift, random_route
 from stario.sequences.simulation.walks import (
@@ -130,6 +131,19 @@ def test_a_trolley_neither_climbs_nor_bounces() -> None:
 def _low_band(walk: Trajectory) -> float:
     f, power = welch(np.diff(walk.position_W[:, 2], 2) * 1e4, 100.0, nperseg=1024)
     return float(power[(f > 1.0) & (f < 3.0)].sum())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_heel_strikes_and_surge_have_the_phases_of_people(seed: int) -> None:
+    """The trunk is slowest where it is highest, and rings in the half step after the strike."""
+    time, one = np.arange(2000) / 200.0, np.ones(2000)
+    phase = 2.0 * np.pi * 1.8 * time
+    gait = Gait(np.random.default_rng(seed), 200.0, phase, 1.8 * one, one, 1.3 * one, 1.75, 1.0)
+    body = trunk(gait)
+    assert np.corrcoef(np.gradient(body[:, 0], time), body[:, 2])[0, 1] < -0.8
+    ring = np.gradient(np.gradient(heel_strikes(gait, 1.0)[:, 2], time), time) ** 2
+    after_strike = np.mod(phase, 2.0 * np.pi) > np.pi
+    assert ring[after_strike].mean() > 2.0 * ring[~after_strike].mean()
 
 
 def test_a_rig_turns_fast() -> None:

@@ -14,7 +14,12 @@ from recorded import DATA
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.folders import fresh_folder
-from stario.fusion.evaluation.judging.displacement_error import RecordingErrors, recording_errors
+from stario.fusion.evaluation.judging.displacement_error import (
+    RecordingErrors,
+    _stretches,
+    _Sums,
+    recording_errors,
+)
 from stario.fusion.evaluation.judging.judge import POOLED, RecordingResult, judge, rows_of
 from stario.fusion.evaluation.judging.network_alone import Predictions, predictions
 from stario.fusion.evaluation.judging.prepared import Prepared, prepare, prepared_recordings
@@ -291,6 +296,15 @@ def test_rows_compare_weights_by_group_and_pooled(
     assert rows["all"].ratios["rms_10s_m"].ratio == pytest.approx(np.sqrt(0.25 * 0.5), abs=0.04)
     assert rows["a"].path_km == pytest.approx(1e-3 * horizontal_path(walk), rel=0.05)
     assert rows["a"].medians["theirs"]["length_ratio"] == pytest.approx(0.8, abs=0.02)
+
+
+def test_stretches_at_rest_have_no_error_relative_to_their_path() -> None:
+    rng, sums = np.random.default_rng(0), _Sums()
+    track, truth = (0.01 * (rng.normal(size=100) + 1j * rng.normal(size=100)) for _ in range(2))
+    _stretches(track, truth, np.zeros(100, dtype=np.int64), sums)
+    assert sums.squares == {}
+    _stretches(track, truth + np.arange(100.0), np.zeros(100, dtype=np.int64), sums)
+    assert len(sums.squares["stretch"]) == 3
 
 
 def test_a_recording_without_errors_has_no_ratio(judged_pair: list[RecordingResult]) -> None:
