@@ -43,6 +43,16 @@ def test_the_error_stays_far_below_that_of_dead_reckoning(
     assert ate(track, walk) < 0.03 * alone
 
 
+def test_only_the_state_at_the_end_of_a_gap_is_invalid(
+    walk: ImuSequence, without: Make, still_model: Any
+) -> None:
+    """Where the device moved meanwhile is unknown until measurements follow."""
+    gappy = without(walk, (walk.time > 8.0) & (walk.time < 9.5))
+    for backend in ("ekf", "graph"):
+        track = Navigator(still_model, CONFIG, backend=backend).run(gappy)
+        assert track.time[~track.trajectory.valid] == pytest.approx([9.5], abs=0.01)
+
+
 def test_attitude_and_speed_are_estimated_too(walk: ImuSequence, track: Track) -> None:
     aligned = align(track.trajectory, walk.truth, "first")
     errors = pose_errors(aligned, walk.truth)
