@@ -166,6 +166,10 @@ def test_every_track_continues_across_gaps_in_the_imu_data(
         assert np.isfinite(track.trajectory.position_W).all()
         assert (np.diff(track.time) > 0).all()
         assert track.time[-1] > 19.9
+    inertial = inertial_track(preprocessed, CONFIG).trajectory
+    k = int(np.argmax(np.diff(inertial.time)))
+    moved = inertial.position_W[k + 1] - inertial.position_W[k]
+    np.testing.assert_allclose(moved, 2.0 * inertial.velocity_W[k], rtol=0.02)
 
 
 def test_a_recording_without_poses_is_refused_by_what_it_has() -> None:

@@ -354,3 +354,9 @@ def test_one_huge_value_neither_refuses_nor_warns(walk: ImuSequence) -> None:
 def test_the_unit_g_given_for_metres_is_named(walk: ImuSequence) -> None:
     text = refusal(with_units(walk.without_truth(), accel_unit="g"))
     assert "omit the unit g" in text
+
+
+def test_one_spike_does_not_turn_the_average_force(walk: ImuSequence) -> None:
+    accel = walk.accel.copy()
+    accel[100] = [9e4, 0.0, 0.0]
+    check_units(replace(walk, accel=accel))

@@ -12,6 +12,7 @@ from stario.sequences.inspection.constant_values import (
     warn_of_dead_axes,
 )
 from stario.sequences.inspection.report import inspect_recording
+from stario.sequences.inspection.samples import sample_problems
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
@@ -65,3 +66,12 @@ def test_two_equal_samples_are_not_stuck_for_the_seconds_of_a_wrong_unit(walk: I
     gyro = walk.gyro.copy()
     gyro[501] = gyro[500]
     assert stuck_problems("w", 1e3 * walk.time, gyro, walk.accel) == []
+
+
+def test_few_or_coarsely_rounded_maxima_are_no_limit(walk: ImuSequence) -> None:
+    short = walk.slice(0.0, 4.0)
+    accel = short.accel.copy()
+    accel[100:103, 0] = 40.0  # twice a repetition: a knock
+    assert not [p for p in sample_problems(replace(short, accel=accel)) if "limit" in p]
+    rounded = replace(walk, gyro=np.clip(np.round(walk.gyro), -1.0, 1.0))
+    assert not [p for p in sample_problems(rounded) if "limit" in p]

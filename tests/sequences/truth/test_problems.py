@@ -40,6 +40,7 @@ def jumping(truth: Trajectory) -> FloatArray:
 POSITIONS = {
     "in mm": (lambda t: 1000.0 * t.position_W, "divide them by 1000"),
     "in cm": (lambda t: 100.0 * t.position_W, "divide them by 100 "),
+    "in km": (lambda t: 0.001 * t.position_W, "divide them by 0.001"),
     "in feet": (lambda t: t.position_W / 0.3048, "divide them by 3.281"),
     "positions mirrored": (lambda t: t.position_W * [-1, 1, 1], "write -px,py,pz as"),
     "mirrored relative": (lambda t: t.position_W[:, [1, 0, 2]], "write py,px,pz as"),
@@ -154,3 +155,8 @@ def test_a_shift_while_tracking_is_lost_is_not_a_jump(walk: ImuSequence) -> None
     assert len(tracking_faults(replace(walk, truth=lost)).jumps) == 1
     blank = replace(lost, valid=np.abs(lost.time - LATE_S - 0.05) > 0.08)
     assert tracking_faults(replace(walk, truth=blank)).jumps == ()
+
+
+def test_a_truth_too_short_to_compare_is_no_problem(walk: ImuSequence) -> None:
+    assert walk.truth is not None
+    assert examine_truth(replace(walk, truth=walk.truth.slice(10.0, 18.0))).problems == ()
