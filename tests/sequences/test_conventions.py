@@ -45,6 +45,12 @@ def test_axes_name_the_file_axis_used_as_each_new_axis(walk: ImuSequence) -> Non
     assert with_axes(walk, "x,y,z") is walk
 
 
+def test_axes_applied_one_after_the_other_are_named_by_those_of_the_file(walk: ImuSequence) -> None:
+    twice = with_axes(with_axes(walk, "y,z,x"), "y,-x,z")
+    assert twice.axes == "z,-y,x"
+    assert np.array_equal(twice.gyro, with_axes(walk, twice.axes).gyro)
+
+
 def test_all_24_right_handed_axes_are_rotations_and_are_named() -> None:
     names = {axes_named(R.as_matrix()) for R in Rotation.create_group("O")}
     assert len(names) == 24

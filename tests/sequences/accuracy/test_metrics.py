@@ -359,3 +359,5 @@ def test_yaw_alignment_of_a_stationary_track_uses_its_attitudes(poses: int) -> N
     found = evaluate_track(estimate, truth, alignment="yaw")
     assert found.aye_rad < 1e-9
     assert found.ate_m < 3e-3
+    moving = replace(truth, position_W=np.outer(truth.time, [1.0, 0.5, 0.0]))
+    assert evaluate_track(estimate, moving, alignment="yaw").aye_rad < 1e-9
