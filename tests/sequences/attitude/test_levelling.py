@@ -128,6 +128,7 @@ def test_after_a_gap_the_tilt_is_gravitys_and_bias_and_yaw_are_kept() -> None:
     turned = exp_so3(np.array([0.9, 0.4, 0.0]))  # with the device, unobserved
     attitude.level(np.eye(3), start_at(turned.T))
     np.testing.assert_array_equal(attitude.b_g, learned)
+    assert not attitude._P[:3, 3:].any()  # gravity's tilt is independent of the bias
     assert tilt_error(attitude.R_NB @ turned, np.eye(3)) < 1e-9
     about = Rotation.from_matrix(attitude.R_NB @ before.T).as_rotvec()
     assert abs(about[2]) < 1e-9
