@@ -87,6 +87,11 @@ def test_apples_sign_is_reversed_unless_the_reader_did_so(walk: ImuSequence) -> 
     np.testing.assert_allclose(back.accel, walk.accel)
     stated_twice = with_conventions(walk, accel_unit="-m/s^2", accel_sign="apple")
     np.testing.assert_allclose(stated_twice.accel, walk.accel)
+    for sign, doubted in (("apple", False), ("up", True)):
+        assert (
+            with_conventions(replace(walk, maybe_apple=True), accel_sign=sign).maybe_apple
+            == doubted
+        )
     turned = replace(walk, converted=frozenset({"sign"}))
     assert np.array_equal(with_conventions(turned).accel, walk.accel)
     with pytest.raises(InputError, match=r"accel_unit: .*sign was already turned .*omit"):

@@ -7,6 +7,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import (
     FloatArray,
     ImuSequence,
+    PositionTrack,
     Trajectory,
     low_rate_message,
     whole_seconds,
@@ -153,6 +154,14 @@ def test_an_imu_sequence_is_validated_for_shape_only() -> None:
         ImuSequence("odd", time, zeros, zeros[:, :2])
     with pytest.raises(InputError, match="time"):
         ImuSequence("odd", np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
+
+
+def test_without_truth_neither_poses_nor_positions_are_left() -> None:
+    zero = np.zeros((101, 3))
+    known = PositionTrack(GRID, zero, "positions")
+    sequence = ImuSequence("both", GRID, zero, zero, screw(GRID), positions=known)
+    bare = sequence.without_truth()
+    assert bare.truth is bare.positions is None
 
 
 def test_a_wild_time_changes_neither_duration_nor_rate() -> None:

@@ -59,6 +59,8 @@ def test_late_times_do_not_refute_a_gap() -> None:
     assert dropped_rows(time) == list(range(101, 111))
     repeated = np.concatenate([TIME[:100], TIME[200:201], TIME[200:]])
     assert dropped_rows(repeated) == [101]
+    swapped = np.concatenate([TIME[:101], [0.5, 1.02, 1.01], TIME[103:]])
+    assert dropped_rows(swapped) == [101, 103]
 
 
 def test_rows_far_out_of_order_are_neither_sorted_nor_thinned_out() -> None:

@@ -294,6 +294,14 @@ def test_drift_per_metre_of_a_stationary_track_is_nan():
     assert np.isnan(evaluate_track(truth, truth).pde)
 
 
+@pytest.mark.parametrize(("horizontal", "path"), [(True, 30.0), (False, 50.0)])
+def test_the_path_is_that_of_the_compared_coordinates(horizontal: bool, path: float):
+    time = np.arange(101) / 10.0
+    climb = Trajectory(time, np.outer(time, [3.0, 0.0, 4.0]), about_z(0.0 * time))
+    found = evaluate_track(climb, climb, horizontal=horizontal)
+    assert found.path_m == pytest.approx(path)
+
+
 def test_every_metric_has_a_description():
     described_elsewhere = {"rte_interval_s", "rte_scaled"}  # described under rte_m
     assert set(TrackMetrics.__dataclass_fields__) - described_elsewhere <= set(CONVENTIONS)

@@ -146,6 +146,17 @@ def test_heel_strikes_and_surge_have_the_phases_of_people(seed: int) -> None:
     assert ring[after_strike].mean() > 2.0 * ring[~after_strike].mean()
 
 
+def test_a_mount_changes_neither_path_nor_rotation_in_the_world() -> None:
+    rates, paths = [], []
+    for mount in ((0.0, 0.0, 0.0), (0.4, -0.7, 1.1)):
+        walk = generate_walk(2, 10.0, style=WalkStyle(carry="swinging", mount_rotvec=mount))
+        imu = simulate_imu(walk, 100.0, PERFECT_IMU)
+        rates.append(imu.truth.attitude_WB.apply(imu.gyro))
+        paths.append(walk.position_W)
+    np.testing.assert_array_equal(*paths)
+    np.testing.assert_allclose(*rates, atol=0.01)
+
+
 def test_a_rig_turns_fast() -> None:
     peaks = []
     for seed in range(6):

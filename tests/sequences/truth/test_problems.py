@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.report import inspect_recording
-from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk
 from stario.sequences.truth.positions import fit_positions
@@ -160,3 +160,20 @@ def test_a_shift_while_tracking_is_lost_is_not_a_jump(walk: ImuSequence) -> None
 def test_a_truth_too_short_to_compare_is_no_problem(walk: ImuSequence) -> None:
     assert walk.truth is not None
     assert examine_truth(replace(walk, truth=walk.truth.slice(10.0, 18.0))).problems == ()
+
+
+def test_only_poses_whose_attitude_repeats_as_well_are_lost(walk: ImuSequence) -> None:
+    still = moved(walk, lambda truth: 0.0 * truth.position_W)
+    assert still.truth is not None
+    assert tracking_faults(still).lost.sum() == 1  # the first, which the others repeat
+    frozen = replace(still.truth, attitude_WB=Rotation.identity(len(still.truth)))
+    assert tracking_faults(replace(still, truth=frozen)).lost.all()
+
+
+def test_a_wrong_unit_of_the_accelerometer_is_not_blamed_on_the_positions(
+    walk: ImuSequence,
+) -> None:
+    in_mg = replace(walk, accel=1e3 * walk.accel / STANDARD_GRAVITY)
+    (problem,) = examine_truth(in_mg).problems
+    assert problem.found.startswith("positions that")
+    assert examine_truth(in_mg, known="w: accelerometer: found an average of 1").problems == ()
