@@ -57,8 +57,8 @@ def test_after_a_confirmed_jump_earlier_times_are_dropped() -> None:
 def test_late_times_do_not_refute_a_gap() -> None:
     time = np.concatenate([TIME[:100], TIME[200:201], TIME[50:60], TIME[201:]])
     assert dropped_rows(time) == list(range(101, 111))
-    repeated = np.concatenate([TIME[:100], TIME[200:201], TIME[200:]])
-    assert dropped_rows(repeated) == [101]
+    repeated = np.concatenate([TIME[:100], TIME[200:201], TIME[50:60], TIME[200:]])
+    assert dropped_rows(repeated) == list(range(101, 112))
     swapped = np.concatenate([TIME[:101], [0.5, 1.02, 1.01], TIME[103:]])
     assert dropped_rows(swapped) == [101, 103]
 
