@@ -63,9 +63,10 @@ def test_motion_in_a_plane_is_no_problem() -> None:
 
 
 def test_two_equal_samples_are_not_stuck_for_the_seconds_of_a_wrong_unit(walk: ImuSequence) -> None:
-    gyro = walk.gyro.copy()
+    gyro, accel = walk.gyro.copy(), walk.accel.copy()
     gyro[501] = gyro[500]
-    assert stuck_problems("w", 1e3 * walk.time, gyro, walk.accel) == []
+    accel[501, 0] += 9.0
+    assert stuck_problems("w", 1e3 * walk.time, gyro, accel) == []
 
 
 def test_few_or_coarsely_rounded_maxima_are_no_limit(walk: ImuSequence) -> None:
