@@ -304,6 +304,12 @@ def test_invalid_fixes_are_refused_and_counted(
     assert np.isfinite(navigator.state.covariance).all()
 
 
+@pytest.mark.parametrize("degrees", [90.0, -90.0])
+def test_a_yaw_in_degrees_is_refused_in_either_direction(degrees: float) -> None:
+    assert yaw_fix(1.0, degrees, 0.1).fault() == "yaw not in radians"
+    assert yaw_fix(1.0, np.radians(degrees), 0.1).fault() == ""
+
+
 def test_fixes_with_a_time_or_value_that_is_not_finite_are_refused(
     walk: ImuSequence, model: Any
 ) -> None:
