@@ -13,8 +13,8 @@ import numpy as np
 from stario.sequences.arrays import BoolArray, FloatArray
 
 MAX_IMU_GAP = 0.1
-"""Longest step [s] between IMU samples that is no gap. In use, steps up to twice as long are bridged
-as well, with more noise (`fusion.imu.front_end`)."""
+"""Longest step [s] between IMU samples that is no gap. In use, steps up to twice as long are
+bridged as well, with more noise (`fusion.imu.front_end`)."""
 
 FAR_AHEAD = 10.0
 """A jump ahead by more than this [s] is far, and needs more samples to be confirmed."""

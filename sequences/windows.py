@@ -134,7 +134,7 @@ def rotated_windows(windows: NDArray[np.float32], yaw: FloatArray) -> NDArray[np
 
 
 def resample(time: FloatArray, values: FloatArray, grid: FloatArray) -> FloatArray:
-    """Resample values (N, K) at `time` to the even `grid` (M,) at 200 Hz.
+    """Resample values (N, K) at `time` to the even `grid` (M,) at 200 Hz within it.
 
     Faster sensors are averaged over each grid step, so that noise and vibration above 100 Hz do
     not alias; slower ones are interpolated linearly.
@@ -145,9 +145,7 @@ def resample(time: FloatArray, values: FloatArray, grid: FloatArray) -> FloatArr
         return interpolated(grid, time, values)
     total = integral(time, values)
     edges = np.clip(np.append(grid - 0.5 * step, grid[-1] + 0.5 * step), time[0], time[-1])
-    widths = np.diff(edges)
-    means = np.diff(interpolated(edges, time, total), axis=0) / np.maximum(widths, 1e-9)[:, None]
-    return np.where((widths > 0.25 * step)[:, None], means, interpolated(grid, time, values))
+    return np.asarray(np.diff(interpolated(edges, time, total), axis=0) / np.diff(edges)[:, None])
 
 
 def world_streams(sequence: ImuSequence, attitude: Attitude = "levelled") -> list[WorldStream]:

@@ -1,6 +1,7 @@
 """The continuous position never steps, and converges to the corrected one."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -83,3 +84,9 @@ def test_returned_arrays_may_be_overwritten(walk: ImuSequence, make_oracle: Make
         ends.append((navigator.state.p_W, navigator.state.b_g, navigator.continuous.p_W))
     for clean, written in zip(*ends, strict=True):
         np.testing.assert_array_equal(clean, written)
+
+
+def test_the_continuous_position_is_reset_at_the_end_of_a_gap() -> None:
+    before = advanced(None, state_at(0.0, 0.0))
+    after = replace(state_at(3.0, 5.0), in_gap=True)
+    np.testing.assert_array_equal(advanced(before, after).p_W, after.p_W)

@@ -5,8 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stario.fusion.fix_file import read_fixes
-from stario.sequences.errors import ReadError
+from stario.fusion.fix_file import check_within, read_fixes
+from stario.fusion.fixes import position_fix
+from stario.sequences.errors import InputError, ReadError
+from stario.sequences.sequence import ImuSequence
 
 HEADER = "t,kind,x,y,z,sx,sy,sz\n"
 
@@ -101,3 +103,13 @@ def test_decimal_commas_are_read(tmp_path: Path, separator: str) -> None:
 def test_a_missing_file_raises_an_error(tmp_path: Path) -> None:
     with pytest.raises(ReadError, match="fixes"):
         read_fixes(tmp_path / "fixes.csv")
+
+
+@pytest.mark.parametrize("by", [-100.0, 100.0])
+def test_fixes_before_or_after_the_recording_are_on_another_clock(by: float) -> None:
+    time, zero = np.arange(101) / 10.0, np.zeros((101, 3))
+    sequence = ImuSequence("walk", time, zero, zero)
+    fixes = [position_fix(at + by, np.zeros(3), np.eye(3)) for at in (2.0, 4.0)]
+    with pytest.raises(InputError, match=r"fixes: found times from .* expected some within"):
+        check_within(fixes, sequence)
+    check_within([*fixes, position_fix(5.0, np.zeros(3), np.eye(3))], sequence)

@@ -10,7 +10,7 @@ import support
 
 from stario.fusion import Navigator, NavState, PriorPose, Track
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.fixes import Fix, position_fix, velocity_fix, yaw_fix
+from stario.fusion.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_fix
 from stario.fusion.imu.intervals import split_at
 from stario.fusion.lie import UNKNOWN_YAW
 from stario.fusion.recording import cut_recording
@@ -304,6 +304,12 @@ def test_invalid_fixes_are_refused_and_counted(
     assert np.isfinite(navigator.state.covariance).all()
 
 
+@pytest.mark.parametrize("degrees", [90.0, -90.0])
+def test_a_yaw_in_degrees_is_refused_in_either_direction(degrees: float) -> None:
+    assert yaw_fix(1.0, degrees, 0.1).fault() == "yaw not in radians"
+    assert yaw_fix(1.0, np.radians(degrees), 0.1).fault() == ""
+
+
 def test_fixes_with_a_time_or_value_that_is_not_finite_are_refused(
     walk: ImuSequence, model: Any
 ) -> None:
@@ -352,3 +358,10 @@ def test_the_covariance_of_an_exact_fix_has_a_floor(walk: ImuSequence, model: An
     assert track.health.fixes == {"applied": 1}
     assert np.isfinite(track.covariance).all()
     assert np.linalg.eigvalsh(track.covariance).min() > -1e-9
+
+
+def test_beyond_the_most_that_wait_those_furthest_ahead_are_refused() -> None:
+    eye = np.eye(3)
+    queue = FixQueue((position_fix(time, np.zeros(3), eye) for time in (3.0, 1.0, 2.0)), most=2)
+    assert [fix.time for fix in queue.waiting] == [1.0, 2.0]
+    assert queue.refused == {"too many waiting": 1}

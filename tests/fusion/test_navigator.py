@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support import CONFIG, ate, stream, stream_deviation, swivelled
 
-from stario.fusion import Navigator, PriorPose, Track
+from stario.fusion import Navigator, NavState, PriorPose, Track
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.tracks import inertial_track
 from stario.sequences.accuracy.metrics import align, pose_errors
@@ -41,6 +41,27 @@ def test_the_error_stays_far_below_that_of_dead_reckoning(
     alone = ate(inertial_track(preprocessed, CONFIG), walk)
     assert ate(track, walk) < 0.6
     assert ate(track, walk) < 0.03 * alone
+
+
+def test_only_the_state_at_the_end_of_a_gap_is_invalid(
+    walk: ImuSequence, without: Make, still_model: Any
+) -> None:
+    """Where the device moved meanwhile is unknown until measurements follow."""
+    gappy = without(walk, (walk.time > 8.0) & (walk.time < 9.5))
+    for backend in ("ekf", "graph"):
+        track = Navigator(still_model, CONFIG, backend=backend).run(gappy)
+        assert track.time[~track.trajectory.valid] == pytest.approx([9.5], abs=0.01)
+
+
+def test_the_blocks_of_the_covariance_have_names() -> None:
+    covariance, zero = np.arange(225.0).reshape(15, 15), np.zeros(3)
+    state = NavState(0.0, np.eye(3), zero, zero, zero, zero, covariance)
+    names = ("attitude", "velocity", "position", "gyro_bias", "accel_bias")
+    for first, name in zip(range(0, 15, 3), names, strict=True):
+        block = slice(first, first + 3)
+        np.testing.assert_array_equal(
+            getattr(state, f"{name}_covariance"), covariance[block, block]
+        )
 
 
 def test_attitude_and_speed_are_estimated_too(walk: ImuSequence, track: Track) -> None:

@@ -12,7 +12,7 @@ import torch
 import stario.network
 from stario.network.card import MAX_SIGMA, Calibration, card_path
 from stario.network.model import load_model
-from stario.sequences.errors import StarioError, WeightsError
+from stario.sequences.errors import InputError, StarioError, WeightsError
 
 DEFAULT = Path(stario.network.__file__).with_name("weights") / "default.safetensors"
 
@@ -136,3 +136,11 @@ def test_tensors_of_another_network_are_refused(model: Path, change: str) -> Non
     write_weights(model, state if change != "none" else {})
     found = {"unknown": "another.weight", "missing": "head.7.bias", "shape": "head.7.bias"}
     assert found.get(change, "Missing") in refusal(model)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_windows_with_a_value_that_is_not_finite_are_refused(value: float) -> None:
+    windows = np.zeros((2, 6, 200))
+    windows[1, 4, 7] = value
+    with pytest.raises(InputError, match="not finite"):
+        load_model().predict(windows)

@@ -18,6 +18,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Magnetometer
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import generate_walk
+from stario.sequences.units import MAGNETIC_UNITS
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +43,12 @@ def test_axes_name_the_file_axis_used_as_each_new_axis(walk: ImuSequence) -> Non
     assert seen is not None
     assert np.array_equal(seen.field, field.field[:, [1, 0, 2]] * [1, -1, 1])
     assert with_axes(walk, "x,y,z") is walk
+
+
+def test_axes_applied_one_after_the_other_are_named_by_those_of_the_file(walk: ImuSequence) -> None:
+    twice = with_axes(with_axes(walk, "y,z,x"), "y,-x,z")
+    assert twice.axes == "z,-y,x"
+    assert np.array_equal(twice.gyro, with_axes(walk, twice.axes).gyro)
 
 
 def test_all_24_right_handed_axes_are_rotations_and_are_named() -> None:
@@ -78,10 +85,26 @@ def test_apples_sign_is_reversed_unless_the_reader_did_so(walk: ImuSequence) -> 
     named = replace(walk, accel=-walk.accel, converted=frozenset({"accel"}))  # `ax [g]`
     back = with_conventions(named, accel_sign="apple")
     np.testing.assert_allclose(back.accel, walk.accel)
-    with pytest.raises(InputError, match=r"sign was already turned .*omit"):
-        with_conventions(replace(walk, converted=frozenset({"sign"})), accel_sign="apple")
+    stated_twice = with_conventions(walk, accel_unit="-m/s^2", accel_sign="apple")
+    np.testing.assert_allclose(stated_twice.accel, walk.accel)
+    for sign, doubted in (("apple", False), ("up", True)):
+        assert (
+            with_conventions(replace(walk, maybe_apple=True), accel_sign=sign).maybe_apple
+            == doubted
+        )
+    turned = replace(walk, converted=frozenset({"sign"}))
+    assert np.array_equal(with_conventions(turned).accel, walk.accel)
+    with pytest.raises(InputError, match=r"accel_unit: .*sign was already turned .*omit"):
+        with_conventions(turned, accel_sign="apple")
     with pytest.raises(InputError, match="accel_sign: found 'left'"):
         with_conventions(walk, accel_sign="left")
+
+
+def test_magnetic_units_agree() -> None:
+    field = {"uT": 50.0, "nT": 5e4, "mT": 0.05, "T": 5e-5, "gauss": 0.5, "mg": 500.0}
+    assert {unit: value * MAGNETIC_UNITS[unit] for unit, value in field.items()} == pytest.approx(
+        dict.fromkeys(MAGNETIC_UNITS, 50.0)
+    )
 
 
 def test_all_conventions_are_undone_at_once(walk: ImuSequence) -> None:

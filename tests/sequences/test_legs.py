@@ -19,18 +19,23 @@ def recording() -> ImuSequence:
     return simulate_imu(generate_walk(3, 40.0), 100.0, PERFECT_IMU, 0, name="walk")
 
 
-def legs_of(recording: ImuSequence, time: FloatArray, kind: str, sigma: object) -> LegStream:
+def legs_of(
+    recording: ImuSequence, time: FloatArray, kind: str, sigma: object, valid: object = ()
+) -> LegStream:
     assert recording.truth is not None
     position = recording.truth.at(time).position_W
-    known = PositionTrack(time, position, kind, sigma=sigma)  # type: ignore[arg-type]
+    known = PositionTrack(time, position, kind, valid, sigma)  # type: ignore[arg-type]
     [legs] = leg_streams(replace(recording, truth=None, positions=known))
     return legs
 
 
 def test_the_ends_of_a_leg_are_as_certain_as_their_own_positions(recording: ImuSequence) -> None:
     """Those of satellites share most of their error, which a displacement does not contain."""
-    stated = 3.0 + 0.1 * TIME
-    legs = legs_of(recording, TIME, "positions", stated)
+    known = TIME > 4.0
+    stated = np.where(known, 3.0 + 0.1 * TIME, 99.0)
+    track = PositionTrack(TIME, np.zeros((len(TIME), 2)), "positions", known, stated)
+    assert track.typical_sigma == pytest.approx(np.median(stated[known]))
+    legs = legs_of(recording, TIME, "positions", stated, known)
     ends = np.stack([legs.start, legs.stop], axis=1)
     relative = legs.sigma / np.interp(ends, TIME, stated)
     np.testing.assert_allclose(relative, relative[0, 0])
@@ -59,3 +64,23 @@ def test_positions_seconds_apart_make_no_legs(recording: ImuSequence) -> None:
     time = TIME[::4]
     known = PositionTrack(time, recording.truth.at(time).position_W, "positions")
     assert leg_streams(replace(recording, truth=None, positions=known)) == []
+
+
+def test_a_single_leg_is_not_enough(recording: ImuSequence) -> None:
+    """With its yaw unknown, a leg by itself says no more than its length."""
+    assert recording.truth is not None
+    time = np.array([5.0, 15.0])
+    known = PositionTrack(time, recording.truth.at(time).position_W, "waypoints")
+    assert leg_streams(replace(recording, truth=None, positions=known)) == []
+
+
+def test_a_part_has_the_legs_that_lie_within_it(recording: ImuSequence) -> None:
+    legs = legs_of(recording, TIME, "positions", None)
+    part = legs.part(1000, 3000)
+    inside = (legs.start >= 5.0) & (legs.stop <= 15.0)
+    assert 2 < inside.sum() < len(legs.start) - 2
+    np.testing.assert_allclose(part.start, legs.start[inside] - 5.0)
+    np.testing.assert_allclose(part.stop, legs.stop[inside] - 5.0)
+    np.testing.assert_array_equal(part.displacement, legs.displacement[inside])
+    np.testing.assert_array_equal(part.imu_N, legs.imu_N[1000:3000])
+    assert len(legs.part(3000, 1000)) == 0

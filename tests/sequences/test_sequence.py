@@ -7,6 +7,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import (
     FloatArray,
     ImuSequence,
+    PositionTrack,
     Trajectory,
     low_rate_message,
     whole_seconds,
@@ -160,6 +161,22 @@ def test_masked_samples_are_missing_ones() -> None:
     sequence = ImuSequence("masked", np.arange(3.0), gyro, np.zeros((3, 3)))
     np.testing.assert_array_equal(np.isnan(sequence.gyro), np.eye(3) > 0)
     assert np.nanmax(sequence.gyro) == 0.5
+
+
+def test_without_truth_neither_poses_nor_positions_are_left() -> None:
+    zero = np.zeros((101, 3))
+    known = PositionTrack(GRID, zero, "positions")
+    sequence = ImuSequence("both", GRID, zero, zero, screw(GRID), positions=known)
+    bare = sequence.without_truth()
+    assert bare.truth is bare.positions is None
+
+
+def test_a_wild_time_changes_neither_duration_nor_rate() -> None:
+    time, zero = np.arange(1001) / 100.0, np.zeros((1001, 3))
+    time[500] += 1e9
+    sequence = ImuSequence("wild", time, zero, zero)
+    assert sequence.duration == pytest.approx(10.0)
+    assert sequence.rate == pytest.approx(100.0)
 
 
 def test_slicing_a_sequence_also_slices_its_truth() -> None:

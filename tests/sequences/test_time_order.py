@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from stario.sequences.sequence import FloatArray
+from stario.sequences.inspection.samples import in_order, without_times_ahead
+from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.time_order import CONFIRMED_FAR, increasing_mask
 
 TIME = np.arange(400) / 100.0
@@ -56,3 +57,15 @@ def test_after_a_confirmed_jump_earlier_times_are_dropped() -> None:
 def test_late_times_do_not_refute_a_gap() -> None:
     time = np.concatenate([TIME[:100], TIME[200:201], TIME[50:60], TIME[201:]])
     assert dropped_rows(time) == list(range(101, 111))
+    repeated = np.concatenate([TIME[:100], TIME[200:201], TIME[50:60], TIME[200:]])
+    assert dropped_rows(repeated) == list(range(101, 112))
+    swapped = np.concatenate([TIME[:101], [0.5, 1.02, 1.01], TIME[103:]])
+    assert dropped_rows(swapped) == [101, 103]
+
+
+def test_rows_far_out_of_order_are_neither_sorted_nor_thinned_out() -> None:
+    """They are refused as they are, with how many there are."""
+    time = np.random.default_rng(0).permutation(TIME)
+    shuffled = ImuSequence("shuffled", time, np.zeros((400, 3)), np.ones((400, 3)))
+    assert in_order(shuffled) is shuffled
+    assert without_times_ahead(shuffled) is shuffled

@@ -9,13 +9,16 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.recording import cut_recording
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import InputError
+from stario.sequences.levelled_stream import levelled_streams
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import (
+    VELOCITY_WEIGHTS,
     Attitude,
     clean_samples,
     facing,
+    headings_at,
     imu_in_world,
     mean_heading,
     resample,
@@ -173,6 +176,41 @@ def test_a_misaligned_truth_does_not_affect_levelled_windows() -> None:
     assert off("levelled") < 0.02
 
 
+def test_the_truths_errors_of_heading_are_averaged_over_a_second(walk: ImuSequence) -> None:
+    """Also where they take the heading past half a turn."""
+    truth = walk.truth
+    noise = 0.1 * np.random.default_rng(0).standard_normal(len(truth))
+    base = np.pi - float(yaw_of(truth.attitude_WB)[0])
+    turned, noisy = (
+        replace(walk, truth=replace(truth, attitude_WB=about_z(base + off) * truth.attitude_WB))
+        for off in (0.0 * noise, noise)
+    )
+    (right,), (stream,) = world_streams(turned), world_streams(noisy)
+    headings = (np.arctan2(*s.facing_W.T[::-1]) for s in (right, stream))
+    off = np.subtract(*headings)[100:-100]  # half a second at either end has fewer
+    assert np.abs(np.angle(np.exp(1j * off))).max() < 0.03  # 0.1 / sqrt(200) is 0.007
+
+
+def test_levelled_windows_of_a_device_held_upright_have_its_true_heading() -> None:
+    """A tilt of the truth's world must not turn it, however far the device is from level."""
+    still = np.zeros((2001, 3))
+    R_WB = about_z(np.linspace(0.0, 6.0, 2001)) * Rotation.from_rotvec([1.4, 0.0, 0.0])
+    time = np.arange(2001) / 200.0
+    walk = simulate_imu(Trajectory(time, still, R_WB), 200.0, PERFECT_IMU)
+    tilted = Rotation.from_rotvec([0.0, 0.05, 0.0]) * R_WB
+    (stream,) = world_streams(replace(walk, truth=Trajectory(time, still, tilted)))
+    off = np.arctan2(*stream.facing_W.T[::-1]) - yaw_of(R_WB)[: len(stream)]
+    assert np.abs(np.angle(np.exp(1j * off))).max() < 2e-3
+
+
+def test_positions_far_from_the_origin_keep_their_precision(walk: ImuSequence) -> None:
+    """Coordinates of a national grid have steps of half a metre in single precision."""
+    truth = walk.truth
+    far = replace(truth, position_W=truth.position_W + np.array([4.5e5, 5.4e6, 0.0]))
+    (near,), (stream,) = world_streams(walk), world_streams(replace(walk, truth=far))
+    np.testing.assert_allclose(stream.position_W, near.position_W, atol=1e-5)
+
+
 def test_levelled_windows_equal_the_navigators_except_for_heading() -> None:
     walk = simulate_imu(generate_walk(7, 30.0, rate=200.0), 200.0, seed=7)
     (stream,) = world_streams(walk)
@@ -254,6 +292,8 @@ def test_recordings_that_give_no_windows_are_refused(walk: ImuSequence) -> None:
         world_streams(walk.without_truth())
     with pytest.raises(InputError, match="is the time column in seconds"):
         world_streams(replace(walk, time=1e3 * walk.time))
+    with pytest.raises(InputError, match="is the time column in seconds"):
+        clean_samples(replace(walk, time=1e-3 * walk.time))
     with pytest.raises(InputError, match="0 usable"):
         clean_samples(replace(walk, gyro=np.nan * walk.gyro))
 
@@ -266,8 +306,25 @@ def test_heading_is_the_yaw_at_any_tilt_except_upside_down() -> None:
             R = (Rotation.from_rotvec([0.0, 0.0, yaw]) * R_tilt).as_matrix()
             heading = float(mean_heading(np.tile(facing(R), (10, 1))))
             assert heading == pytest.approx(yaw, abs=1e-9)
+            assert yaw_of(Rotation.from_matrix(R)) == pytest.approx(yaw, abs=1e-9)
+    turning = facing(about_z(np.arange(400) / 200.0).as_matrix())
+    assert headings_at(turning, np.array([100])) == pytest.approx(0.5 + 0.45)  # ten instants
     upside_down = facing(Rotation.from_rotvec([np.pi, 0.0, 0.0]).as_matrix())
     np.testing.assert_allclose(upside_down, 0.0, atol=1e-12)
+
+
+def test_a_constant_acceleration_changes_the_mean_velocity_by_its_size() -> None:
+    """From one second to the next: the weights rise to 1 and fall again."""
+    assert (VELOCITY_WEIGHTS + VELOCITY_WEIGHTS[::-1]).sum() == pytest.approx(1.0)
+
+
+def test_windows_of_a_levelled_stream_reach_its_end(walk: ImuSequence) -> None:
+    (stream,) = levelled_streams(walk)
+    windows = stream.windows()
+    assert (len(stream), len(windows), len(stream.headings)) == (4000, 39, 39)
+    np.testing.assert_array_equal(windows[-1], stream.imu_N[3800:].T)
+    at_ticks = np.stack([facing(R) for R in stream.R_NB])
+    np.testing.assert_allclose(at_ticks, stream.facing_N[::100], atol=1e-6)
 
 
 def test_rotating_a_window_rotates_its_vectors() -> None:

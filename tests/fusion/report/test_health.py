@@ -8,6 +8,7 @@ import pytest
 from recorded import DATA
 
 from stario.fusion import Health, Navigator
+from stario.fusion.health import SampleCounts
 from stario.fusion.report.health import findings, health_lines
 from stario.network import load_model
 from stario.sequences import read_recording
@@ -47,6 +48,21 @@ SHAKEN = Health(
     mean_nis=8.0,
     notes=[UNFAMILIAR],
 )
+
+
+def test_samples_late_for_a_moment_are_not_worth_a_note() -> None:
+    assert SampleCounts(longest_late=0.4).health().notes == []
+    (note,) = SampleCounts(longest_late=0.6).health().notes
+    assert "late for 0.6 s" in note
+
+
+def test_of_endless_gaps_the_newest_are_listed_and_all_are_counted() -> None:
+    counts = SampleCounts()
+    for k in range(150):
+        counts.add_gap(float(k), 0.2)
+    health = counts.health()
+    assert health.gap_count == 150
+    assert [start for start, _ in health.gaps] == [float(k) for k in range(50, 150)]
 
 
 def test_one_dropped_sample_among_thousands_is_not_reported_as_none() -> None:

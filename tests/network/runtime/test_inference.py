@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from stario.network.architectures import ARCHITECTURES, build_network
 from stario.network.displacement import DisplacementNetwork
 from stario.network.runtime.benchmark import network_speed
+from stario.network.runtime.fast_stario import FastStarIO
 from stario.network.runtime.inference import inference_form
 from stario.network.stario import StarIO
 from stario.sequences.sequence import STANDARD_GRAVITY
@@ -125,6 +126,14 @@ def test_results_do_not_depend_on_the_size_of_batches() -> None:
         for sizes in ([1, 1, 1, 4], [2, 5], [3, 3, 1], [1, 6], [7]):
             parts = [fast(part)[0] for part in windows.split(sizes)]
             torch.testing.assert_close(torch.cat(parts), whole, rtol=0.0, atol=1e-5)
+
+
+def test_buffers_are_kept_for_the_latest_sizes_of_batches_only() -> None:
+    fast = inference_form(randomised_network())
+    for size in (1, 2, 3, 4, 5, 1, 6):
+        fast(random_windows(size))
+    assert isinstance(fast.network, FastStarIO)
+    assert list(fast.network._local.recordings) == [4, 5, 1, 6]
 
 
 def test_a_result_is_not_overwritten_by_the_next_call() -> None:

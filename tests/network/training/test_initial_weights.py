@@ -83,3 +83,27 @@ def test_errors_on_recordings_that_were_learned_are_named_so(tmp_path: Path) -> 
     once = replace(TINY, epochs=1, epoch_windows=16)
     path = train(once, everything, [1.0] * 4, VALIDATION, tmp_path)
     assert list(load_model(path).card.figures) == ["validation_mse_m2_after_it_was_learned"]
+
+
+def test_the_recipes_dropout_replaces_the_networks_own(tmp_path: Path) -> None:
+    once = replace(TINY, epochs=1, epoch_windows=16)
+    none, most = (
+        load_model(run(tmp_path / str(share), replace(once, dropout=share))).training_form
+        for share in (0.0, 0.9)
+    )
+    pairs = zip(none.parameters(), most.parameters(), strict=True)
+    assert not all(torch.equal(one, other) for one, other in pairs)
+
+
+def test_averaged_weights_of_a_short_run_are_not_the_initial_ones(
+    model: Path, tmp_path: Path
+) -> None:
+    """The first steps are averaged over fewer than the recipe's number."""
+    first, short = load_model(model), replace(TINY, epochs=1, epoch_windows=64)
+    initial = torch.nn.utils.parameters_to_vector(first.training_form.parameters())
+    moved = []
+    for average in (0.0, 0.9999):
+        path = run(tmp_path / str(average), replace(short, average=average), start_from=first)
+        learned = torch.nn.utils.parameters_to_vector(load_model(path).training_form.parameters())
+        moved.append(float((learned - initial).detach().norm()))
+    assert moved[1] > 0.5 * moved[0]

@@ -47,6 +47,18 @@ def test_rate_and_acceleration_belong_to_one_rotation() -> None:
     assert torch.allclose((accel * lever).sum(1), -(velocity**2).sum(1), atol=1e-5)
 
 
+def test_a_swing_turns_the_rates_that_were_recorded() -> None:
+    """Rate of the device in the world: its own, turned with it, and that of the swing."""
+    swing, imu = draw_swing(8), at_rest(8)
+    imu[..., :3] = torch.tensor([0.3, -0.2, 0.5])
+    alone, _ = apply_swing(at_rest(8), torch.zeros(8, 1, 3, dtype=torch.float64), swing)
+    both, _ = apply_swing(imu, torch.zeros(8, 1, 3, dtype=torch.float64), swing)
+    angle = swing.angle(torch.arange(200, dtype=torch.float64) / 200.0)[0]
+    for k in (0, 70, 199):
+        turned = rotated(imu[:, k, :3], swing.axis, angle[:, k])
+        assert torch.allclose(both[:, k, :3] - alone[:, k, :3], turned, atol=1e-5)
+
+
 def test_no_swing_is_faster_than_its_bound() -> None:
     swing = draw_swing(512)
     time = torch.linspace(0.0, 1.0, 101, dtype=torch.float64)

@@ -193,6 +193,17 @@ def test_a_loss_that_is_not_finite_stops_before_it_corrupts_anything(tmp_path: P
     assert [r.epoch for r in reports] == [2]
 
 
+def test_a_gradient_that_is_not_finite_stops_before_the_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is infinite a step before the loss is."""
+    monkeypatch.setattr(
+        torch.nn.utils, "clip_grad_norm_", lambda parameters, most: torch.tensor(torch.inf)
+    )
+    with pytest.raises(InputError, match="with a gradient of norm inf in step 1"):
+        run(tmp_path, replace(TINY, epochs=1, epoch_windows=16))
+
+
 def test_the_log_holds_every_epoch(finished: tuple[Path, list[EpochReport]]) -> None:
     log = json.loads((finished[0].parent / "log.json").read_text(encoding="utf-8"))
     assert [entry["epoch"] for entry in log] == [1, 2, 3, 4]

@@ -173,6 +173,11 @@ def test_jumps_and_rides_of_a_track_make_no_legs() -> None:
     assert not ((cut.start < 30.0) & (cut.stop > 30.1)).any()
     ride = replace(recording, positions=PositionTrack(time, 9.0 * position, "positions"))
     assert leg_streams(ride) == []
+    run = replace(recording, positions=PositionTrack(time, 2.5 * position, "positions"))
+    [slow] = leg_streams(run)  # without those of the full pace, which is below that of a jump
+    speed = np.linalg.norm(slow.displacement, axis=1) / (slow.stop - slow.start)
+    assert len(slow.start) < len(cut.start)
+    assert speed.max() <= 2.5
 
 
 @pytest.mark.parametrize(("every", "legs"), [(0.1, 28), (0.5, 28), (1.0, 28), (2.5, 22)])

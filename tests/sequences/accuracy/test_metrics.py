@@ -246,6 +246,11 @@ def test_relative_error_is_nan_if_a_gap_leaves_no_pair():
     ends = (truth.time < 5.0) | (truth.time > 66.0)
     found = evaluate_track(replace(drifted(truth), valid=ends), truth)
     assert np.isnan(found.rte_m)
+    coarse = walk().select(np.arange(2001) % 140 == 0)  # every 7 s: 63 s are not 60
+    assert np.isnan(evaluate_track(coarse, walk()).rte_m)
+    assert evaluate_track(coarse, walk(), rte_interval=63.0).rte_m < 1e-9
+    even, odd = (evaluate_track(drifted(walk()), walk(), rte_interval=s) for s in (60.0, 60.01))
+    assert odd.rte_m == pytest.approx(even.rte_m, rel=0.01)  # with the nearest sample
     assert not found.rte_scaled
     assert found.ate_m > 0
 
@@ -288,6 +293,14 @@ def test_unknown_choices_are_refused():
 def test_drift_per_metre_of_a_stationary_track_is_nan():
     truth = straight(10.0, speed=0.0)
     assert np.isnan(evaluate_track(truth, truth).pde)
+
+
+@pytest.mark.parametrize(("horizontal", "path"), [(True, 30.0), (False, 50.0)])
+def test_the_path_is_that_of_the_compared_coordinates(horizontal: bool, path: float):
+    time = np.arange(101) / 10.0
+    climb = Trajectory(time, np.outer(time, [3.0, 0.0, 4.0]), about_z(0.0 * time))
+    found = evaluate_track(climb, climb, horizontal=horizontal)
+    assert found.path_m == pytest.approx(path)
 
 
 def test_every_metric_has_a_description():
@@ -355,3 +368,5 @@ def test_yaw_alignment_of_a_stationary_track_uses_its_attitudes(poses: int) -> N
     found = evaluate_track(estimate, truth, alignment="yaw")
     assert found.aye_rad < 1e-9
     assert found.ate_m < 3e-3
+    moving = replace(truth, position_W=np.outer(truth.time, [1.0, 0.5, 0.0]))
+    assert evaluate_track(estimate, moving, alignment="yaw").aye_rad < 1e-9

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.levelling import (
+    BIAS_SIGMA,
     GravityStart,
     LevelledAttitude,
     integrate,
@@ -118,13 +119,16 @@ def test_after_a_gap_the_tilt_is_gravitys_and_bias_and_yaw_are_kept() -> None:
     time = np.arange(21) / 200.0
     accel = np.tile(STANDARD_GRAVITY * UP, (21, 1))
     attitude = LevelledAttitude(start_at(np.eye(3)))
+    assert attitude.bias_sigma == pytest.approx(BIAS_SIGMA)
     for _ in range(300):
         attitude.advance(time, np.tile([0.02, -0.01, 0.0], (21, 1)), accel)
+    assert attitude.bias_sigma < 0.3 * BIAS_SIGMA
     learned, before = attitude.b_g.copy(), attitude.R_NB
     np.testing.assert_allclose(learned, [0.02, -0.01, 0.0], atol=3e-3)
     turned = exp_so3(np.array([0.9, 0.4, 0.0]))  # with the device, unobserved
     attitude.level(np.eye(3), start_at(turned.T))
     np.testing.assert_array_equal(attitude.b_g, learned)
+    assert not attitude._P[:3, 3:].any()  # gravity's tilt is independent of the bias
     assert tilt_error(attitude.R_NB @ turned, np.eye(3)) < 1e-9
     about = Rotation.from_matrix(attitude.R_NB @ before.T).as_rotvec()
     assert abs(about[2]) < 1e-9

@@ -161,6 +161,7 @@ def test_times_that_were_divided_too_often_are_named(walk: ImuSequence) -> None:
 def test_a_sampling_rate_out_of_range_is_refused(walk: ImuSequence) -> None:
     slow = ImuSequence("slow", walk.time[::20], walk.gyro[::20], walk.accel[::20])
     assert "found 10 samples/s, expected 50 to 1000" in refusal(slow)
+    assert "set the app to 50 Hz" in refusal(slow)
 
 
 def test_times_of_batches_are_not_taken_for_a_fast_sensor(walk: ImuSequence) -> None:
@@ -359,3 +360,9 @@ def test_one_huge_value_neither_refuses_nor_warns(walk: ImuSequence) -> None:
 def test_the_unit_g_given_for_metres_is_named(walk: ImuSequence) -> None:
     text = refusal(with_units(walk.without_truth(), accel_unit="g"))
     assert "omit the unit g" in text
+
+
+def test_one_spike_does_not_turn_the_average_force(walk: ImuSequence) -> None:
+    accel = walk.accel.copy()
+    accel[100] = [9e4, 0.0, 0.0]
+    check_units(replace(walk, accel=accel))

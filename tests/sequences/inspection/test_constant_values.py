@@ -6,8 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stario.sequences.inspection.constant_values import dead_axis_problems, warn_of_dead_axes
+from stario.sequences.inspection.constant_values import (
+    dead_axis_problems,
+    stuck_problems,
+    warn_of_dead_axes,
+)
 from stario.sequences.inspection.report import inspect_recording
+from stario.sequences.inspection.samples import sample_problems
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
@@ -55,3 +60,19 @@ def test_motion_in_a_plane_is_no_problem() -> None:
     for gyro, accel in (floor, swing, rest):
         planar = ImuSequence("planar", t, np.column_stack(gyro), np.column_stack(accel))
         assert dead_axis_problems(planar) == []
+
+
+def test_two_equal_samples_are_not_stuck_for_the_seconds_of_a_wrong_unit(walk: ImuSequence) -> None:
+    gyro, accel = walk.gyro.copy(), walk.accel.copy()
+    gyro[501] = gyro[500]
+    accel[501, 0] += 9.0
+    assert stuck_problems("w", 1e3 * walk.time, gyro, accel) == []
+
+
+def test_few_or_coarsely_rounded_maxima_are_no_limit(walk: ImuSequence) -> None:
+    short = walk.slice(0.0, 4.0)
+    accel = short.accel.copy()
+    accel[100:103, 0] = 40.0  # twice a repetition: a knock
+    assert not [p for p in sample_problems(replace(short, accel=accel)) if "limit" in p]
+    rounded = replace(walk, gyro=np.clip(np.round(walk.gyro), -1.0, 1.0))
+    assert not [p for p in sample_problems(rounded) if "limit" in p]

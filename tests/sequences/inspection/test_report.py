@@ -62,9 +62,12 @@ def test_jumps_of_satellite_positions_are_a_problem(walk: ImuSequence) -> None:
     path, sigma = np.outer(time, [1.2, 0.0]), np.full(len(time), 5.0)
     known = PositionTrack(time, path, "positions", sigma=sigma)
     outdoors = replace(walk, truth=None, positions=known)
+    taps = replace(outdoors, positions=replace(known, kind="waypoints"))
+    path[5] += [0.0, 12.0]  # within the stated errors
     assert inspect_recording(outdoors).problems == ()
     path[10:15] += [0.0, 100.0]
     assert "positions: found jumps of up to 100 m" in problem(outdoors)
+    assert inspect_recording(taps).problems == ()  # no source of positions jumps there
 
 
 def test_positions_on_another_clock_are_a_problem(walk: ImuSequence) -> None:

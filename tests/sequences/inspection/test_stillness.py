@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.inspection.stillness import find_rest
+from stario.sequences.inspection.stillness import find_rest, scatter_bound
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.imu import simulate_imu
@@ -75,3 +75,11 @@ def test_a_large_bias_is_one_if_gravity_does_not_turn() -> None:
 def test_less_than_a_second_of_rest_is_too_short() -> None:
     assert find_rest(device_at_rest(0.8, 100.0)) is None
     assert find_rest(device_at_rest(0.2, 100.0)) is None
+
+
+def test_one_in_a_thousand_stretches_at_rest_fails_the_test_whatever_their_length() -> None:
+    for count in (3, 20):
+        white = np.random.default_rng(0).normal(size=(200_000 // count, count, 3)) * np.sqrt(100.0)
+        squares = np.square(white - white.mean(axis=1, keepdims=True)).sum(axis=(1, 2))
+        failing = (squares > scatter_bound(count, count / 100.0, 1.0)).mean()
+        assert 0.0005 < failing < 0.0015

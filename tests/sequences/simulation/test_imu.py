@@ -195,3 +195,9 @@ def test_tracks_and_parameters_that_cannot_be_simulated_are_refused() -> None:
         ImuErrors(gyro_scale=-1.0)
     with pytest.raises(InputError, match="accel_range"):
         ImuErrors(accel_range=0.0)
+
+
+def test_the_last_pose_is_measured_despite_rounding() -> None:
+    """In floating point, 0.29 s at 100 Hz are 28.999999999999996 steps."""
+    track = waving(duration=0.29)
+    assert len(simulate_imu(track, 100.0, PERFECT_IMU)) == len(track) == 30

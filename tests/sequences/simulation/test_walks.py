@@ -7,9 +7,16 @@ from scipy.signal import welch
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, Trajectory
+from stario.sequences.simulation.carrying import Gait, heel_strikes, trunk
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
-from stario.sequences.simulation.routes import band_noise, drift, random_route
-from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk, step_rate
+from stario.sequences.simulation.routes import Route, band_noise, drift, random_route
+from stario.sequences.simulation.walks import (
+    CARRYING_MODES,
+    WalkStyle,
+    _gait,
+    generate_walk,
+    step_rate,
+)
 
 
 @pytest.mark.parametrize("carry", CARRYING_MODES)
@@ -99,6 +106,10 @@ def test_routes_stop_turn_climb_and_keep_to_pedestrian_speeds() -> None:
     heights = [np.ptp(route.position_W[:, 2]) for route in routes]
     assert max(heights) > 1.5
     assert min(heights) == pytest.approx(0.0, abs=1e-9)
+    climb = np.abs(np.concatenate([route.climb for route in routes]))
+    on_stairs = climb > 0.8 * climb.max()
+    slope = climb[on_stairs] / speed[on_stairs]
+    assert np.median(slope) == pytest.approx(0.17 / 0.29, rel=0.02)
     backward = [_forward_speed_is_negative(route.position_W, route.heading) for route in routes]
     assert any(backward)
 
@@ -120,6 +131,30 @@ def test_a_trolley_neither_climbs_nor_bounces() -> None:
 def _low_band(walk: Trajectory) -> float:
     f, power = welch(np.diff(walk.position_W[:, 2], 2) * 1e4, 100.0, nperseg=1024)
     return float(power[(f > 1.0) & (f < 3.0)].sum())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_heel_strikes_and_surge_have_the_phases_of_people(seed: int) -> None:
+    """The trunk is slowest where it is highest, and rings in the half step after the strike."""
+    time, one = np.arange(2000) / 200.0, np.ones(2000)
+    phase = 2.0 * np.pi * 1.8 * time
+    gait = Gait(np.random.default_rng(seed), 200.0, phase, 1.8 * one, one, 1.3 * one, 1.75, 1.0)
+    body = trunk(gait)
+    assert np.corrcoef(np.gradient(body[:, 0], time), body[:, 2])[0, 1] < -0.8
+    ring = np.gradient(np.gradient(heel_strikes(gait, 1.0)[:, 2], time), time) ** 2
+    after_strike = np.mod(phase, 2.0 * np.pi) > np.pi
+    assert ring[after_strike].mean() > 2.0 * ring[~after_strike].mean()
+
+
+def test_a_mount_changes_neither_path_nor_rotation_in_the_world() -> None:
+    rates, paths = [], []
+    for mount in ((0.0, 0.0, 0.0), (0.4, -0.7, 1.1)):
+        walk = generate_walk(2, 10.0, style=WalkStyle(carry="swinging", mount_rotvec=mount))
+        imu = simulate_imu(walk, 100.0, PERFECT_IMU)
+        rates.append(imu.truth.attitude_WB.apply(imu.gyro))
+        paths.append(walk.position_W)
+    np.testing.assert_array_equal(*paths)
+    np.testing.assert_allclose(*rates, atol=0.01)
 
 
 def test_a_rig_turns_fast() -> None:
@@ -150,6 +185,29 @@ def test_noise_has_unit_deviation_in_its_band() -> None:
     assert noise.std() == pytest.approx(1.0, rel=0.05)
     f, power = welch(noise[:, 0], 100.0, nperseg=1024)
     assert power[(f > 4.0) & (f < 11.0)].sum() > 0.7 * power.sum()
+
+
+def test_turning_on_the_spot_takes_steps() -> None:
+    count, still = 500, np.zeros(500)
+    route = Route(np.zeros((count, 3)), 0.02 * np.arange(count), still, still + 2.0, still)
+    standing = replace(route, turn_rate=still)
+    turning, resting = (
+        _gait(np.random.default_rng(0), 100.0, r, WalkStyle()) for r in (route, standing)
+    )
+    assert turning.effort.min() > 0.3
+    assert resting.effort.max() < 1e-9
+    assert turning.step_rate.mean() > 1.2 * resting.step_rate.mean()
+
+
+def test_a_change_of_carrying_mode_turns_the_device_in_the_hand() -> None:
+    angles = []
+    for seed in range(8):
+        walk = generate_walk(seed, 20.0, style=WalkStyle(carry="bag", next_carry="bag"))
+        up_B = walk.attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)
+        before, after = up_B[:400].mean(axis=0), up_B[-400:].mean(axis=0)
+        cosine = before @ after / (np.linalg.norm(before) * np.linalg.norm(after))
+        angles.append(np.arccos(cosine))
+    assert np.median(angles) > 0.3
 
 
 def test_styles_and_arguments_are_checked() -> None:

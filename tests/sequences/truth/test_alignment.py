@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import samples_in
 from stario.sequences.attitude.rotations import cumulative_rotations
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, Trajectory
@@ -41,6 +42,10 @@ def test_cumulative_rotations_equal_products_taken_one_by_one() -> None:
     assert len(products) == 201
     assert (products.inv() * Rotation.concatenate(one_by_one)).magnitude().max() < 1e-12
     assert len(cumulative_rotations(Rotation.identity(1)[:0])) == 1
+
+
+def test_a_span_shorter_than_a_step_is_one_step() -> None:
+    assert samples_in(0.03, np.arange(10) / 10.0) == 1
 
 
 @pytest.mark.parametrize("ahead", [0.4, -1.65, 3000.0])

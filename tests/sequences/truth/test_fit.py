@@ -13,6 +13,7 @@ from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.truth.findings import fit_problems
 from stario.sequences.truth.fit import fit_truth
+from stario.sequences.truth.part import middle_part
 
 
 def recorded_in(sequence: ImuSequence, axes: str) -> ImuSequence:
@@ -34,6 +35,8 @@ def test_a_truth_that_fits_needs_no_correction(walk: ImuSequence) -> None:
     assert fit.agreeing > 0.99
     assert fit.jumps == 0
     assert fit.axes() is None
+    measured = np.interp(fit.times, walk.time, np.linalg.norm(walk.gyro, axis=1))
+    assert np.nanmedian(fit.speed / measured) == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.parametrize("offset", [-3.21, -0.05, 0.4, 2.503])
@@ -162,3 +165,9 @@ def test_a_spike_of_the_accelerometer_does_not_tilt_the_world(walk: ImuSequence)
     accel = walk.accel.copy()
     accel[3000] = [1e4, 0.0, 0.0]
     assert fit_truth(replace(walk, accel=accel)).tilt < np.radians(1.0)
+
+
+def test_of_a_long_recording_the_middle_is_compared() -> None:
+    time, zero = np.arange(18_000) / 10.0, np.zeros((18_000, 3))
+    part = middle_part(ImuSequence("long", time, zero, zero))
+    assert (part.time[0], part.time[-1]) == pytest.approx((600.0, 1200.0), abs=0.2)

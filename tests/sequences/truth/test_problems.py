@@ -9,10 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.report import inspect_recording
-from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk
+from stario.sequences.truth.positions import fit_positions
 from stario.sequences.truth.problems import check_truth, examine_truth, truth_problems
+from stario.sequences.truth.tracking import tracking_faults
 
 LATE_S = 20.0
 
@@ -38,6 +40,7 @@ def jumping(truth: Trajectory) -> FloatArray:
 POSITIONS = {
     "in mm": (lambda t: 1000.0 * t.position_W, "divide them by 1000"),
     "in cm": (lambda t: 100.0 * t.position_W, "divide them by 100 "),
+    "in km": (lambda t: 0.001 * t.position_W, "divide them by 0.001"),
     "in feet": (lambda t: t.position_W / 0.3048, "divide them by 3.281"),
     "positions mirrored": (lambda t: t.position_W * [-1, 1, 1], "write -px,py,pz as"),
     "mirrored relative": (lambda t: t.position_W[:, [1, 0, 2]], "write py,px,pz as"),
@@ -131,3 +134,46 @@ def test_the_comparison_is_part_of_the_findings(walk: ImuSequence) -> None:
     assert values["axes"] == ["x", "y", "z"]
     assert values["correlation"] > 0.8
     assert any("positions scaled by 1" in line for line in found.lines())
+
+
+@pytest.mark.parametrize("of", ["imu", "truth"])
+def test_positions_are_not_compared_across_gaps(of: str) -> None:
+    walk = simulate_imu(generate_walk(3, 60.0, style=WalkStyle()), 100.0, seed=1)
+    known = walk.time % 3.0 > 0.5
+    assert walk.truth is not None
+    position = walk.truth.position_W + np.cumsum(~known)[:, None] * [0.01, 0.0, 0.0]  # relocalised
+    lost = replace(walk.truth, position_W=position, valid=known)
+    gappy = walk.select(known) if of == "imu" else replace(walk, truth=lost)
+    fit = fit_positions(gappy, 0.0)
+    assert fit is not None
+    assert fit.correlation > 0.99
+
+
+def test_a_shift_while_tracking_is_lost_is_not_a_jump(walk: ImuSequence) -> None:
+    assert walk.truth is not None
+    lost = replace(walk.truth, position_W=jumping(walk.truth))
+    assert len(tracking_faults(replace(walk, truth=lost)).jumps) == 1
+    blank = replace(lost, valid=np.abs(lost.time - LATE_S - 0.05) > 0.08)
+    assert tracking_faults(replace(walk, truth=blank)).jumps == ()
+
+
+def test_a_truth_too_short_to_compare_is_no_problem(walk: ImuSequence) -> None:
+    assert walk.truth is not None
+    assert examine_truth(replace(walk, truth=walk.truth.slice(10.0, 18.0))).problems == ()
+
+
+def test_only_poses_whose_attitude_repeats_as_well_are_lost(walk: ImuSequence) -> None:
+    still = moved(walk, lambda truth: 0.0 * truth.position_W)
+    assert still.truth is not None
+    assert tracking_faults(still).lost.sum() == 1  # the first, which the others repeat
+    frozen = replace(still.truth, attitude_WB=Rotation.identity(len(still.truth)))
+    assert tracking_faults(replace(still, truth=frozen)).lost.all()
+
+
+def test_a_wrong_unit_of_the_accelerometer_is_not_blamed_on_the_positions(
+    walk: ImuSequence,
+) -> None:
+    in_mg = replace(walk, accel=1e3 * walk.accel / STANDARD_GRAVITY)
+    (problem,) = examine_truth(in_mg).problems
+    assert problem.found.startswith("positions that")
+    assert examine_truth(in_mg, known="w: accelerometer: found an average of 1").problems == ()

@@ -20,6 +20,7 @@ from stario.fusion.navigator import Navigator
 from stario.sequences.errors import InputError
 
 SECONDS = 20.0
+SAMPLES = ("time", "gyro", "accel")
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +33,21 @@ def test_every_fault_ends_in_finite_states(results: dict[str, FaultResult]) -> N
     assert list(results) == [fault.name for fault in faults(SECONDS)]
     assert all(result.finite and np.isfinite(result.error_with) for result in results.values())
     assert results["none"].error_with == results["none"].error_without
+
+
+def test_every_fault_but_none_modifies_samples_or_predictions() -> None:
+    sequence, _ = matched_walk(SECONDS, seed=1)
+    for fault in faults(SECONDS)[1:]:
+        rng = np.random.default_rng(0)
+        if fault.modify_samples is not None:
+            faulty = fault.modify_samples(sequence, rng)
+            pairs = ((getattr(sequence, name), getattr(faulty, name)) for name in SAMPLES)
+            assert not all(np.array_equal(*pair) for pair in pairs), fault.name
+        if fault.modify_predictions is not None:
+            mean, covariance = np.ones((200, 3)), np.tile(np.eye(3), (200, 1, 1))
+            fault.modify_predictions(mean, covariance, rng)
+            same = (mean == 1.0).all() and (covariance == np.eye(3)).all()
+            assert not same, fault.name
 
 
 def test_a_refused_recording_is_a_row_of_the_table() -> None:

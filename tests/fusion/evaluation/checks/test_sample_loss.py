@@ -9,10 +9,17 @@ import numpy as np
 import pytest
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.checks.sample_loss import EndShift, end_shift_table, end_shifts
+from stario.fusion.evaluation.checks.sample_loss import (
+    EndShift,
+    _end_shift,
+    end_shift_table,
+    end_shifts,
+)
+from stario.fusion.state import Track
 from stario.network.model import load_model
+from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import ImuSequence
+from stario.sequences.sequence import ImuSequence, Trajectory
 
 
 def test_gaps_of_a_tenth_of_a_second_and_5_percent_loss_hardly_move_the_end(
@@ -44,3 +51,13 @@ def test_the_table_counts_ends_within_both_limits() -> None:
     assert row[:3] == ["set", "4", "50%"]
     assert row[-1] == "4.00"
     assert row[5] == "2.00"
+
+
+def test_a_shift_is_a_share_of_the_path_and_a_turn_in_degrees() -> None:
+    time, position = np.arange(3.0), np.outer(np.arange(3.0), [5.0, 0.0, 0.0])
+    turned = about_z(np.radians([0.0, 10.0, -20.0]))
+    straight, other = (
+        Track(Trajectory(time, position + shift, attitude))
+        for shift, attitude in (([0.0, 0.0, 0.0], about_z(np.zeros(3))), ([0.3, 0.4, 9.0], turned))
+    )
+    assert _end_shift(straight, other, 10.0) == pytest.approx((0.05, 20.0))

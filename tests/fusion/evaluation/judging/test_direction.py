@@ -1,9 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from stario.fusion.evaluation.judging.direction import Direction, direction
 from stario.sequences import PHONE_IMU, generate_walk, simulate_imu
 from stario.sequences.levelled_stream import TICK_SAMPLES, levelled_streams
+from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.windows import WINDOW_SAMPLES
 
 
@@ -22,6 +25,20 @@ def stream_and_truth():
 def test_true_displacements_agree_in_direction_with_the_accelerometer(stream_and_truth):
     found = direction(*stream_and_truth)
     assert abs(found.turn) < 3.0 * found.sigma < np.radians(45.0)
+
+
+def test_with_an_exact_attitude_both_directions_agree_exactly():
+    """The accelerometer's changes of velocity are those of the displacements."""
+    sequence = simulate_imu(generate_walk(3, 30.0), 200.0, PERFECT_IMU)
+    (stream,) = levelled_streams(sequence)
+    force_W = sequence.truth.attitude_WB.apply(sequence.accel)[: len(stream)]
+    exact = replace(stream, imu_N=np.concatenate([stream.imu_N[:, :3], force_W], axis=1))
+    starts = stream.ticks[: stream.window_count]
+    first, last = (sequence.truth.at(t).position_W for t in (starts, starts + 1.0))
+    found = direction(exact, last - first)
+    assert abs(found.turn) < 2e-3
+    assert found.sigma < 2e-3
+    assert abs(found.product) / found.network == pytest.approx(1.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("degrees", [-120.0, 45.0, 180.0])

@@ -11,9 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from recorded import DATA
+from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.folders import fresh_folder
-from stario.fusion.evaluation.judging.displacement_error import RecordingErrors, recording_errors
+from stario.fusion.evaluation.judging.displacement_error import (
+    RecordingErrors,
+    _stretches,
+    _Sums,
+    recording_errors,
+)
 from stario.fusion.evaluation.judging.judge import POOLED, RecordingResult, judge, rows_of
 from stario.fusion.evaluation.judging.network_alone import Predictions, predictions
 from stario.fusion.evaluation.judging.prepared import Prepared, prepare, prepared_recordings
@@ -25,6 +31,7 @@ from stario.fusion.evaluation.judging.table import (
     write_judgement,
 )
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
+from stario.sequences.attitude.rotations import about_z
 from stario.sequences.datasets.batch import Skipped
 from stario.sequences.errors import InputError
 from stario.sequences.readers import read_recording
@@ -103,6 +110,15 @@ def test_with_poses_displacements_of_nine_tenths_give_that_length_ratio(walk: Im
     assert len(found.blocks["1"]) == 3  # of 30 s each, the last one shorter
     total, count = found.blocks["1"].sum(axis=0)
     assert np.sqrt(total / count) == pytest.approx(found.figures["rms_1s_m"])
+
+
+def test_the_yaw_from_the_levelled_frame_to_the_world_is_the_truths(walk: ImuSequence) -> None:
+    [piece] = prepared_once(walk).pieces
+    known = np.isfinite(piece.yaw_WN)
+    attitude_WB = about_z(piece.yaw_WN[known]) * Rotation.from_matrix(piece.stream.R_NB[known])
+    assert walk.truth is not None
+    true_WB = walk.truth.at(piece.stream.ticks[known]).attitude_WB
+    assert (attitude_WB * true_WB.inv()).magnitude().max() < 0.1  # what levelling is off by
 
 
 def test_with_poses_a_rotation_raises_displacement_errors_but_not_the_fitted_ate(
@@ -280,6 +296,26 @@ def test_rows_compare_weights_by_group_and_pooled(
     assert rows["all"].ratios["rms_10s_m"].ratio == pytest.approx(np.sqrt(0.25 * 0.5), abs=0.04)
     assert rows["a"].path_km == pytest.approx(1e-3 * horizontal_path(walk), rel=0.05)
     assert rows["a"].medians["theirs"]["length_ratio"] == pytest.approx(0.8, abs=0.02)
+
+
+def test_stretches_at_rest_have_no_error_relative_to_their_path() -> None:
+    rng, sums = np.random.default_rng(0), _Sums()
+    track, truth = (0.01 * (rng.normal(size=100) + 1j * rng.normal(size=100)) for _ in range(2))
+    _stretches(track, truth, np.zeros(100, dtype=np.int64), sums)
+    assert sums.squares == {}
+    _stretches(track, truth + np.arange(100.0), np.zeros(100, dtype=np.int64), sums)
+    assert len(sums.squares["stretch"]) == 3
+
+
+def test_a_recording_without_errors_has_no_ratio(judged_pair: list[RecordingResult]) -> None:
+    """Of a device at rest, for example."""
+    first = judged_pair[0]
+    perfect = {
+        name: replace(found, blocks={key: 0.0 * sums for key, sums in found.blocks.items()})
+        for name, found in first.errors.items()
+    }
+    [row] = rows_of([replace(first, errors=perfect)], "set", "ours", "theirs")
+    assert row.ratios == {}
 
 
 def test_a_judgement_is_written_as_tables_and_figure(
