@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import logging
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -25,9 +24,6 @@ _log = logging.getLogger(__name__)
 IntArray = NDArray[np.int64]
 
 _LARGE_BYTES = 2_000_000
-
-_MARK_IN_ROW = re.compile(rb"[^\r\n]#")
-"""A `#` that begins no comment, as in `-1.#IND`, of which pandas would read -1."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +139,7 @@ def read_quickly(
     indices of its columns.
     """
     try:
-        if path.stat().st_size < _LARGE_BYTES or _MARK_IN_ROW.search(path.read_bytes()):
+        if path.stat().st_size < _LARGE_BYTES or _has_mark_within_a_row(path.read_bytes()):
             return None
         pandas = importlib.import_module("pandas")
         frame = pandas.read_csv(
@@ -165,6 +161,11 @@ def read_quickly(
         return _column(_numbered_rows(path, skip, delimiter, decimal), delimiter, column)
 
     return Table(path, frame[wanted].to_numpy(dtype=np.float64), skip + 1, cells, frame)
+
+
+def _has_mark_within_a_row(content: bytes) -> bool:
+    """Return whether a `#` begins no comment, as in `-1.#IND`, of which pandas would read -1."""
+    return content.count(b"#") > content.startswith(b"#") + content.count(b"\n#")
 
 
 def _numbered_rows(
