@@ -195,11 +195,19 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     try:
         network.network.load_state_dict(safetensors.torch.load_file(path))
     except (safetensors.SafetensorError, RuntimeError) as error:
-        # PyTorch lists the mismatches below an uninformative headline.
-        lines = [line.strip() for line in str(error).splitlines()]
-        found = f"{lines[min(1, len(lines) - 1)]:.160}"  # all 200 names, if it is another network
-        raise WeightsError(path, "weights", found, f"tensors of {card.architecture}") from error
+        expected = f"tensors of {card.architecture}"
+        raise WeightsError(path, "weights", first_mismatch(error), expected) from error
     return DisplacementModel(TorchEngine(network), card)
+
+
+def first_mismatch(error: Exception) -> str:
+    """Return what an error of loading tensors names first.
+
+    PyTorch lists the mismatches below an uninformative headline, all 200 names in one line if they
+    are those of another network.
+    """
+    lines = [line.strip() for line in str(error).splitlines()] or [""]
+    return f"{lines[min(1, len(lines) - 1)]:.160}"
 
 
 def weights_named(name: str, runs: Path) -> str | Path:

@@ -68,6 +68,7 @@ def convert(
 
 def _check_target(target: Path, sources: list[Path], overwrite: bool) -> None:
     """Refuse to overwrite an input or a part of one, or without `overwrite` anything."""
+    from stario.sequences.datasets.convert import EUROC_FILES
     from stario.sequences.readers.archive import split_name
 
     read = {split_name(source)[0].resolve() for source in sources}
@@ -75,7 +76,7 @@ def _check_target(target: Path, sources: list[Path], overwrite: bool) -> None:
         raise InputError("OUT", f"{target}, which is also an input", "another file")
     check_new("OUT", target, overwrite)
     if target.is_dir() and any(target.iterdir()) and not overwrite:
-        fix = "or pass --overwrite" if (target / "mav0/imu0/data.csv").is_file() else ""
+        fix = "or pass --overwrite" if (target / EUROC_FILES[0]).is_file() else ""
         raise InputError("OUT", f"{target}, which already exists", "a new or empty folder", fix)
 
 

@@ -96,10 +96,10 @@ class Session:
         self.received, self._factor = received, accel_factor
         if not self.running:
             return 0
-        if self._is_of_previous(batch):
+        if self._is_of_previous(batch) and batch.number >= 0 and _middle(batch) < self._opened_ns:
             self._delayed += len(batch.readings)
             return 0
-        if batch.readings and "" != batch.recording == self._previous != self._recording:
+        if self._is_of_previous(batch) and batch.recording:
             found = f"samples of two recordings in turn from {self.device!r}"
             fix = "give each phone a name of its own"
             raise InputError("device", found, "one at a time", fix)
@@ -228,10 +228,9 @@ class Session:
         return first - newest >= FORWARD or (middle - newest <= -BACKWARD and not delayed)
 
     def _is_of_previous(self, batch: Batch) -> bool:
-        """Return whether a batch is a delayed one of the recording before this."""
-        if batch.number < 0 or not batch.readings or batch.recording == self._recording:
-            return False
-        return batch.recording == self._previous and _middle(batch) < self._opened_ns
+        """Return whether a batch is one of the recording before this."""
+        of_this = not batch.readings or batch.recording == self._recording
+        return batch.recording == self._previous and not of_this
 
     def _push_field(self, time_ns: int, field: Vector) -> None:
         self._navigator.push_magnetometer((time_ns - self._first_ns) / 1e9, field)

@@ -12,6 +12,7 @@ import safetensors
 import safetensors.torch
 from torch import Tensor
 
+from stario.network.model import first_mismatch
 from stario.network.training.config import TrainingConfig
 from stario.sequences.errors import ConfigError, ReadError
 from stario.sequences.files import atomic_write
@@ -81,8 +82,7 @@ def read_checkpoint(
 
 def damaged(path: Path, error: Exception) -> ReadError:
     """Return the error of a checkpoint that cannot be used."""
-    lines = [line.strip() for line in str(error).splitlines()]
-    found = f"{type(error).__name__}: {lines[min(1, len(lines) - 1)] if lines else ''}"[:120]
+    found = f"{type(error).__name__}: {first_mismatch(error)}"[:120]
     fix = "remove it to train anew, or train into another folder (--out)"
     return ReadError(path, "checkpoint", found, "a complete checkpoint", fix)
 

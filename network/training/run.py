@@ -63,7 +63,7 @@ class TrainingRun:
         self.config, self.sampler, self.legs, self.folder = config, sampler, legs, folder
         self.workers, self.device, self._material = workers, workers.device, material
         self.network = DisplacementNetwork(build_network(config.architecture)).to(self.device)
-        self._checkpoint = folder / "checkpoint.safetensors"
+        self._checkpoint, self._log = folder / "checkpoint.safetensors", folder / "log.json"
         if config.dropout is not None:
             for module in self.network.modules():
                 if isinstance(module, nn.Dropout):
@@ -228,7 +228,7 @@ class TrainingRun:
             history = [asdict(r) for r in self.history.reports]
             path, config = self._checkpoint, self.config
             write_checkpoint(path, config, self._material, self.step, history, self._tensors())
-            write_json(self.folder / "log.json", history)
+            write_json(self._log, history)
         return report
 
     def _tensors(self) -> dict[str, Tensor]:
@@ -266,7 +266,7 @@ class TrainingRun:
         except (RuntimeError, KeyError, TypeError, ValueError) as error:
             raise damaged(self._checkpoint, error) from error
         if self.workers.is_leader:
-            write_json(self.folder / "log.json", history)  # which may have been lost
+            write_json(self._log, history)  # which may have been lost
         log.info("resumed %s at step %d", self._checkpoint, self.step)
 
     def _restore(self, tensors: dict[str, Tensor]) -> None:

@@ -29,8 +29,10 @@ _IMU_HEADER = (
 _POSE_HEADER = (
     "#timestamp,p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
 )
-_EUROC_FILES = ("mav0/imu0/data.csv", "mav0/state_groundtruth_estimate0/data.csv")
 _VELOCITY_HEADER = ",v_RS_R_x [m s^-1],v_RS_R_y [m s^-1],v_RS_R_z [m s^-1]"
+
+EUROC_FILES = ("mav0/imu0/data.csv", "mav0/state_groundtruth_estimate0/data.csv")
+"""Files of an EuRoC folder that is written, the IMU's first."""
 
 
 def convert(sequence: ImuSequence, path: Path, layout: str | None = None) -> list[Path]:
@@ -127,7 +129,7 @@ def write_euroc(path: Path, sequence: ImuSequence) -> list[Path]:
             header, columns = header + _VELOCITY_HEADER, [*columns, truth.velocity_W]
         poses = np.hstack(columns)[truth.valid]
         tables["state_groundtruth_estimate0"] = (header, truth.time[truth.valid], poses)
-    with atomic_folder(path, _EUROC_FILES) as folder:
+    with atomic_folder(path, EUROC_FILES) as folder:
         for name, (header, time, values) in tables.items():
             inner = folder / "mav0" / name
             inner.mkdir(parents=True)

@@ -23,6 +23,7 @@ from stario.sequences.readers.archive import (
 from stario.sequences.readers.bag import is_bag, read_bag
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import is_generic_csv, read_generic_csv
+from stario.sequences.readers.lines import may_be_read
 from stario.sequences.readers.lists import is_list, list_entries
 from stario.sequences.readers.phones.event_lines import is_event_lines, read_event_lines
 from stario.sequences.readers.phones.json_export import is_json_export, unpack_json
@@ -196,7 +197,7 @@ def _check_readable(path: Path, expected: str) -> None:
         raise ReadError(path, "path", "no such file or folder", expected)
     if not (file.is_file() or file.is_dir()):  # readers look at a file several times
         raise ReadError(path, "path", "a pipe or device", expected, "save its content as a file")
-    if not os.access(file, os.R_OK | (os.X_OK if file.is_dir() else 0)):
+    if not may_be_read(file):
         raise ReadError(path, "path", "no permission to read", expected, "fix its permissions")
 
 

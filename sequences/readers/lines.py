@@ -61,6 +61,11 @@ def _without_padding(path: Path, content: bytes) -> bytes:
     return text
 
 
+def may_be_read(path: Path) -> bool:
+    """Return whether permissions allow to read a file, or to list a folder."""
+    return os.access(path, os.R_OK | (os.X_OK if path.is_dir() else 0))
+
+
 def first_line(path: Path, comments: bool = False) -> str | None:
     """Return the first line as in `first_lines`, None if there is none."""
     return next(iter(first_lines(path, 1, comments)), None)

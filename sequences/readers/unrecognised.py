@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.columns import HEADER
-from stario.sequences.readers.lines import first_bytes, first_line
+from stario.sequences.readers.lines import first_bytes, first_line, may_be_read
 from stario.sequences.readers.phones.files import (
+    NO_SAMPLES,
     SUFFIXES,
     incomplete_sensors,
     names_both_sensors,
@@ -67,12 +67,12 @@ def _incomplete(path: Path) -> ReadError:
     """Return the error of a folder or file that lacks a gyroscope or an accelerometer."""
     unread = unread_files(path) if path.is_dir() else []
     for file in unread:
-        if not os.access(file, os.R_OK):
+        if not may_be_read(file):
             expected = "a sensor of the recording"
             return ReadError(file, "path", "no permission to read", expected, "fix its permissions")
     sensors = " and ".join(incomplete_sensors(path))
     names = " and ".join(file.name for file in unread)
-    fix = f"{names}: no rows with a time that grows and three values" if unread else "log both"
+    fix = f"{names}: {NO_SAMPLES}" if unread else "log both"
     found = f"only {sensors}" if sensors else "none"
     return ReadError(path, "sensors", found, "a gyroscope and an accelerometer", fix)
 

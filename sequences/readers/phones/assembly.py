@@ -9,7 +9,6 @@ indicates (Sensor Logger's `Metadata.csv`), or from the phone's own attitude.
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,8 +19,9 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import resample_to_gyro, source_words
+from stario.sequences.readers.lines import may_be_read
 from stario.sequences.readers.phones.attitude import device_attitude, logged_attitude
-from stario.sequences.readers.phones.files import PhoneFiles, app_of
+from stario.sequences.readers.phones.files import NO_SAMPLES, PhoneFiles, app_of
 from stario.sequences.readers.phones.reference_points import reference_points
 from stario.sequences.readers.phones.satellites import satellite_positions
 from stario.sequences.readers.phones.sensor_table import Samples, SensorTable, read_samples
@@ -58,8 +58,7 @@ def assemble_recording(
     """
     folder = files.gyro.parent
     for file in files.unread:
-        why = "it has no rows with a time that grows and three values"
-        why = why if os.access(file, os.R_OK) else "no permission"
+        why = f"it has {NO_SAMPLES}" if may_be_read(file) else "no permission"
         _log.warning("%s: not read: %s", file, why)
     gyro = _read(files.tables["gyro"][0], "gyro")
     attitude = logged_attitude(files, gyro)

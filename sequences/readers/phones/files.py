@@ -27,6 +27,8 @@ SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")
 _MOTION = {"mot", "motion", "full"}
 """Words in names of Core Motion's files, `MotMagnFull.txt`, that identify no recording."""
 
+NO_SAMPLES = "no rows with a time that grows and three values"
+"""What a file of `PhoneFiles.unread` has, if it may be read."""
 
 _BY_HEADER = {
     "seconds_elapsed": "Sensor Logger",
