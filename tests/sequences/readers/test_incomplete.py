@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import published_formats as formats
 import pytest
+from phone_files import save
 
 from stario.sequences import ReadError, find_recordings, read_recording
 from stario.sequences.datasets.convert import write_euroc
@@ -17,11 +18,6 @@ from stario.sequences.sequence import ImuSequence
 @pytest.fixture(scope="module")
 def walk() -> ImuSequence:
     return formats.walk_of(100.0, 3.0)
-
-
-def rows(time: np.ndarray, *columns: np.ndarray) -> str:
-    table = np.column_stack([time, *columns])
-    return "\n".join(",".join(map(repr, row)) for row in table.tolist()) + "\n"
 
 
 def test_an_euroc_folder_without_its_imu_is_no_recording_of_its_truth(
@@ -55,11 +51,10 @@ def test_an_empty_file_in_a_folder_is_named(tmp_path: Path) -> None:
 def test_a_column_of_a_code_is_no_axis_of_a_sensor(walk: ImuSequence, tmp_path: Path) -> None:
     """ADVIO's `imu-gyro.csv` holds time, a code and other values: not the gyroscope."""
     folder, code = tmp_path / "advio-01/iphone", np.full((len(walk), 1), 34.0)
-    folder.mkdir(parents=True)
-    (tmp_path / "advio-01/ground-truth").mkdir()
+    (tmp_path / "advio-01/ground-truth").mkdir(parents=True)
     (tmp_path / "advio-01/ground-truth/pose.csv").touch()
-    (folder / "accelerometer.csv").write_text(rows(walk.time, walk.accel))
-    (folder / "imu-gyro.csv").write_text(rows(walk.time, code, walk.gyro, walk.accel))
+    save(folder / "accelerometer.csv", "", walk.time, walk.accel)
+    save(folder / "imu-gyro.csv", "", walk.time, code, walk.gyro, walk.accel)
     (folder / "gyro.csv").touch()
     with pytest.raises(ReadError, match=r"iphone: sensors: found only accel, .*gyro\.csv") as error:
         read_recording(tmp_path / "advio-01")
@@ -68,7 +63,7 @@ def test_a_column_of_a_code_is_no_axis_of_a_sensor(walk: ImuSequence, tmp_path: 
 
 def test_files_whose_rows_are_all_out_of_order_are_named(walk: ImuSequence, tmp_path: Path) -> None:
     for name, values in (("Gyroscope", walk.gyro), ("Accelerometer", walk.accel)):
-        (tmp_path / f"{name}.csv").write_text(rows(walk.time[::-1], values))
+        save(tmp_path / f"{name}.csv", "", walk.time[::-1], values)
     with pytest.raises(ReadError, match=r"found none, .*Gyroscope\.csv: no rows with"):
         read_recording(tmp_path)
 
@@ -76,7 +71,7 @@ def test_files_whose_rows_are_all_out_of_order_are_named(walk: ImuSequence, tmp_
 def test_a_sensor_file_without_permission_is_named(
     walk: ImuSequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "Accelerometer.csv").write_text(rows(walk.time, walk.accel))
+    save(tmp_path / "Accelerometer.csv", "", walk.time, walk.accel)
     gyro = tmp_path / "Gyroscope.csv"
     gyro.touch()  # whose content is as unknown as without permission, which the root user has
     allowed = os.access
