@@ -303,7 +303,8 @@ class Navigator:
                 counts = self._front_end.counts
                 (displacement,) = displacements_of(self._network, [interval.window], counts)
         finally:  # if the network fails, the IMU's motion must not be lost
-            self._estimator.step(interval, displacement, self._fixes.due(interval.stop))
+            due = self._fixes.due(interval.stop)
+            self._estimator.step(interval.without_window(), displacement, due)
         state = self._estimator.nav_state()
         self._continuous = copied(advanced(self._continuous, state))  # `state` is writable
         return state

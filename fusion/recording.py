@@ -43,7 +43,7 @@ class PreprocessedRecording:
     """A recording after front end and network.
 
     Attributes:
-        intervals: IMU intervals, in order.
+        intervals: IMU intervals, in order, without their windows.
         update_rate: network updates per second that it was cut for.
         measurements: predicted displacement of the window ending with each interval, None if no
             window ends there.
@@ -90,7 +90,7 @@ def preprocess(
     measurements = _displacements(intervals, network, front_end.counts, progress)
     seconds_network = perf_counter() - began
     return PreprocessedRecording(
-        intervals=intervals,
+        intervals=[interval.without_window() for interval in intervals],
         update_rate=config.filter.update_rate,
         measurements=measurements,
         front_end=front_end,

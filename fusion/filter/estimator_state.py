@@ -207,7 +207,7 @@ def with_step(
         displacement: displacement given with it; None if there is none.
         fixes: fixes given with it.
     """
-    step = Step(changed(state, history=()), interval.without_window(), displacement, tuple(fixes))
+    step = Step(changed(state, history=()), interval, displacement, tuple(fixes))
     oldest = interval.stop - WINDOW_SECONDS - SAME_TIME
     return (*(s for s in state.history if s.interval.stop >= oldest), step)
 

@@ -120,7 +120,7 @@ class GraphBuilder:
             start = self.graph.keyframe(before)
             segment = segment_of([interval], start.b_g, start.b_a, self._config)
         self.segments[self.graph.last].append(segment)
-        self._pending.append(interval.without_window())
+        self._pending.append(interval)
         due = self.count % self._spacing == 0
         if due:
             self.close(guess)

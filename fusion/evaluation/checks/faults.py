@@ -187,18 +187,15 @@ def with_true_displacements(
     """
     covariance = noise**2 / config.filter.covariance_scale * np.eye(3)
     measurements = list(preprocessed.measurements)
-    with_window = {
-        k: (interval.stop, interval.window.R_NB)
-        for k, interval in enumerate(preprocessed.intervals)
-        if interval.window is not None
-    }
-    stop, attitudes = (np.array(values) for values in zip(*with_window.values(), strict=True))
+    measured = {k: each for k, each in enumerate(measurements) if each is not None}
+    stop = np.array([preprocessed.intervals[k].stop for k in measured])
+    attitudes = np.array([each.R_NB for each in measured.values()])
     ends = np.clip([stop - WINDOW_SECONDS, stop], truth.time[0], truth.time[-1])
     first, last = truth.at(ends[0]), truth.at(ends[1])
     turn = about_z(yaw_of(Rotation.from_matrix(attitudes) * first.attitude_WB.inv()))
     displacement_N = turn.apply(last.position_W - first.position_W)
     times = stop - truth.time[0]
-    for k, d_N, R_NB, time in zip(with_window, displacement_N, attitudes, times, strict=True):
+    for k, d_N, R_NB, time in zip(measured, displacement_N, attitudes, times, strict=True):
         rng = np.random.default_rng([seed, max(0, round(time * config.filter.output_rate))])
         noisy_N = d_N + noise * rng.standard_normal(3)
         measurements[k] = WindowDisplacement(noisy_N, covariance, R_NB)
