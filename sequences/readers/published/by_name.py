@@ -49,9 +49,8 @@ class NamedColumns:
         self._columns = [header.index(name) for name in read]
         self._table = read_table(path, self._columns, skip=1)
         values = self._table.values[:, : len(names)]
-        whole = np.isfinite(values).all(axis=0)
-        damaged = [name for name, good in zip(names, whole, strict=True) if not good]
-        self._rows = finite_rows(path, ", ".join(damaged), values)
+        damaged = np.flatnonzero(~np.isfinite(values).all(axis=0))
+        self._rows = finite_rows(path, ", ".join(read[k] for k in damaged), values)
 
     def stack(self, stem: str, axes: str = "xyz") -> FloatArray:
         """Return the columns `stem_x`, `stem_y`, ... side by side (N, K)."""
