@@ -194,9 +194,7 @@ def test_oxiod_gaps_in_the_imu_do_not_affect_the_truth(
     assert_same_poses(true_track(read), phone_walk, 2.0, 0.1)
 
 
-def test_oxiod_poses_next_to_missing_ones_are_used(
-    tmp_path: Path, phone_walk: ImuSequence
-) -> None:
+def test_oxiod_poses_next_to_missing_ones_are_used(tmp_path: Path, phone_walk: ImuSequence) -> None:
     imu = write_oxiod(tmp_path, phone_walk)
     vicon = tmp_path / "syn/vi1.csv"
     rows = [line.split(",") for line in vicon.read_text().splitlines()]
