@@ -19,17 +19,17 @@ _log = logging.getLogger(__name__)
 _HELD_SHARE = 1.0 / 3.0
 
 
-def checked(path: Path, field: str, values: FloatArray, first_row: int = 1) -> FloatArray:
+def checked(path: Path, field: str, values: FloatArray) -> FloatArray:
     """Return values (N,) or (N, K) if all are finite.
 
     Raises:
-        ReadError: one is not; the error names the field and its row, counted from `first_row`.
+        ReadError: one is not; the error names the field and its row, counted from 1.
     """
     good = np.isfinite(values).reshape(len(values), -1).all(axis=1)
     if not good.all():
         k = int(np.argmin(good))
         found = "nan" if np.isnan(values[k]).any() else "inf"
-        where = f"row {k + first_row}, {field}"
+        where = f"row {k + 1}, {field}"
         raise ReadError(path, where, found, "finite numbers", "cut the recording there")
     return values
 
