@@ -240,6 +240,11 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
         InputError: fewer than two samples are left, or their rate is not accepted.
     """
     index = np.flatnonzero(np.isfinite(sequence.time) & usable(sequence))
+    if lost := len(sequence) - len(index):
+        log.warning(
+            "%s: samples that are not finite or too large dropped: %d of %d",
+            sequence.name, lost, len(sequence),
+        )  # fmt: skip
     kept = increasing_mask(sequence.time[index])
     if ahead := int(ahead_mask(sequence.time[index], kept).sum()):
         log.warning("%s: samples ahead of their time dropped: %d", sequence.name, ahead)
@@ -250,6 +255,8 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
     rate = float(1.0 / np.median(np.diff(time)))
     if not MIN_RATE <= rate <= MAX_RATE:
         found, fix = f"{rate:.1f} Hz", "is the time column in seconds?"
+        if lost > len(sequence) / 2:
+            fix = "most samples are not finite"
         raise InputError(f"{sequence.name}: rate", found, "50 Hz to 1 kHz", fix)
     return time, sequence.gyro[index], sequence.accel[index]
 

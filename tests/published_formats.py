@@ -58,7 +58,7 @@ def cut(walk: ImuSequence, rows: slice) -> ImuSequence:
         time=time,
         gyro=walk.gyro[rows],
         accel=walk.accel[rows],
-        truth=trajectory(time, truth.position_W[rows], truth.attitude_WB[rows]),
+        truth=trajectory(Path(), time, truth.position_W[rows], truth.attitude_WB[rows]),
         magnetometer=Magnetometer(time, field_of(walk)[rows]),
     )
 
@@ -171,7 +171,7 @@ def imunet_raw(folder: Path, walk: ImuSequence, world: Rotation = Y_UP) -> Writt
         save(folder / f"{name}.txt", f"# {name}", text(stamps, values[rows], sep=" "))
     expected = cut(walk, slice(8, -12))
     time = truth.time[poses] - truth.time[8]
-    known = trajectory(time, truth.position_W[poses], truth.attitude_WB[poses])
+    known = trajectory(Path(), time, truth.position_W[poses], truth.attitude_WB[poses])
     magnetic = slice(11, None, 4)
     field = Magnetometer(walk.time[magnetic] - walk.time[8], field_of(walk)[magnetic])
     expected = replace(expected, name=folder.name, truth=known, magnetometer=field)
@@ -254,7 +254,7 @@ def tlio_raw(
     }  # fmt: skip
     (folder / "calibration.json").write_text(json.dumps(calibration))
     rows = slice(None, None, every)
-    known = trajectory(truth.time[rows], truth.position_W[rows], truth.attitude_WB[rows])
+    known = trajectory(Path(), truth.time[rows], truth.position_W[rows], truth.attitude_WB[rows])
     expected = replace(walk, name=folder.name, truth=known)
     return Written(folder / "imu_samples_0.csv", expected)
 

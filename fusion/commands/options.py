@@ -130,7 +130,20 @@ class ReadingOptions:
         return files, [skipped("", error) for error in errors]
 
     def read(self, path: Path) -> ImuSequence:
-        """Read a recording in rad/s, m/s^2 of specific force and the axes of its ground truth."""
+        """Read a recording in rad/s, m/s^2 of specific force and the axes of its ground truth.
+
+        Raises:
+            InputError: it cannot be read; an option's invalid value is named by the option.
+        """
+        try:
+            return self._read(path)
+        except InputError as error:
+            if error.field not in self.as_read():
+                raise
+            field = _option(error.field)
+            raise InputError(field, error.found, error.expected, error.fix) from None
+
+    def _read(self, path: Path) -> ImuSequence:
         from stario.sequences.conventions import with_conventions
         from stario.sequences.readers import read_recording
 
@@ -199,10 +212,15 @@ def changed(group: ReadingOptions | EstimatorOptions, *names: str) -> dict[str, 
     """Return by command-line option whether these fields, or all, differ from their defaults."""
     default, negated = type(group)(), {"magnetometer": "no-magnetometer"}
     return {
-        f"--{negated.get(name, name).replace('_', '-')}": value != getattr(default, name)
+        _option(negated.get(name, name)): value != getattr(default, name)
         for name, value in asdict(group).items()
         if not names or name in names
     }
+
+
+def _option(name: str) -> str:
+    """Return how a command line spells the option of a field or an argument."""
+    return f"--{name.replace('_', '-')}"
 
 
 def refuse_unused(given: Mapping[str, bool], found: str, expected: str) -> None:

@@ -35,6 +35,10 @@ MAX_ENTRIES = 50_000
 MAX_SPAN = 600 * 10**9
 """Maximum time [ns] between a push's first and last sample; beyond it a timestamp is wrong."""
 
+_MIN_STEP, _FEW_SAMPLES = 100_000, 5
+"""Minimum average step [ns] between that many samples of a sensor: none has 10 kHz, but times in
+microseconds or a coarser unit seem to be so dense."""
+
 MAX_READING = 1e4
 """Maximum reading of any sensor in rad/s, m/s^2 or uT."""
 
@@ -107,10 +111,28 @@ def parse_push(body: bytes) -> Batch:
     if times and max(times) - min(times) > MAX_SPAN:
         found = f"times {(max(times) - min(times)) / 1e9:.3g} s apart"
         raise InputError("payload", found, f"at most {MAX_SPAN / 1e9:g} s in one push")
+    _check_unit(readings)
     number = message.get("messageId")
     if not recording or type(number) is not int:
         number = -1
     return Batch(device, recording, readings, number)
+
+
+def _check_unit(readings: list[Reading]) -> None:
+    """Check that the times of a push can be nanoseconds, by the rate of each sensor.
+
+    Raises:
+        InputError: no sensor has so high a rate.
+    """
+    times: dict[str, list[int]] = {}
+    for reading in readings:
+        times.setdefault(reading.sensor, []).append(reading.time_ns)
+    for sensor, at in times.items():
+        steps = len(at) - 1
+        if steps >= _FEW_SAMPLES - 1 and max(at) - min(at) < steps * _MIN_STEP:
+            found = f"samples of {sensor} less than {_MIN_STEP / 1e6:g} ms apart"
+            fix = "send integers: times in s, ms or us seem to stand still"
+            raise InputError("payload.time", found, "times in nanoseconds", fix)
 
 
 def parse_line(line: bytes, sender: str) -> Batch:

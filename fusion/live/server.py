@@ -140,8 +140,9 @@ async def _data(request: Request) -> Response:
         sender = f"http {request.client.host if request.client else ''}"
         # In a thread, so that a large body does not block other requests.
         batches = await asyncio.to_thread(_parsed, body, sender if lines else "")
-    except InputError:
+    except InputError as error:
         hub.refused["http"] += 1
+        _log.warning("a message is refused: %s", error)  # few apps show the response
         raise
     count = 0
     for batch in batches:

@@ -13,6 +13,7 @@ from itertools import pairwise
 from typing import Literal
 
 from stario.fusion.health import Health
+from stario.fusion.imu.gap import INTERPOLATED
 from stario.sequences.attitude.levelling import START_SECONDS
 
 Level = Literal["good", "note", "warning"]
@@ -39,9 +40,6 @@ LOST_YAW_SIGMA = 1.5
 _APART = "at least six times their sigma apart"
 """How far apart two positions determine the direction (`filter.map_frame.MAX_POSITION_YAW_SIGMA`):
 the root of two over that sigma, and some more for the drift between them."""
-
-LONG_GAP = 1.0
-"""Length of a gap [s] after which the heading is no longer known."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +167,7 @@ def _gaps(health: Health) -> Iterator[Finding]:
     amount = f"{health.gap_count} gaps" if health.gap_count > 1 else "1 gap"
     text = f"{amount} in the samples (longest: {health.longest_gap:.2f} s)."
     logger = "Keep the logger in the foreground and exempt it from battery saving"
-    if health.longest_gap >= LONG_GAP:
+    if health.longest_gap > INTERPOLATED:
         restore = "a yaw fix or position fixes after the gap restore the heading"
         yield Finding("warning", text, f"{logger}; {restore}.")
     else:
@@ -243,7 +241,7 @@ def _direction(health: Health) -> Iterator[Finding]:
     if yaw > YAW_SIGMA:
         text = f"The heading is known only to {math.degrees(yaw):.0f} degrees (1 sigma)."
         advice = f"A yaw fix or two position fixes {_APART} determine it."
-        if health.longest_gap < LONG_GAP and yaw < LOST_YAW_SIGMA:
+        if health.longest_gap <= INTERPOLATED and yaw < LOST_YAW_SIGMA:
             advice = (
                 "Keep still for two seconds now and then; a yaw fix or two position fixes "
                 f"{_APART} help too."

@@ -19,6 +19,7 @@ from stario.sequences.inspection.magnetic import (
 )
 from stario.sequences.inspection.samples import sample_problems, without_times_ahead
 from stario.sequences.inspection.stillness import Rest, find_rest
+from stario.sequences.inspection.times import magnetometer_time_problems
 from stario.sequences.sequence import (
     GAP_STEPS,
     STANDARD_GRAVITY,
@@ -249,6 +250,7 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
     except InputError:  # an invalid rate, which `check_units` reports
         rest = magnetic = None
     problems += magnetic_problems(sequence.name, magnetic) if magnetic else ()
+    problems += magnetometer_time_problems(sequence)
     problems += position_time_problems(sequence) + jump_problems(sequence)
     return Inspection(
         name=sequence.name,

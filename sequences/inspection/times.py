@@ -13,6 +13,9 @@ from stario.sequences.windows import MAX_RATE, MIN_RATE
 _ROUNDED_TIMES = 1.5
 """Least number of samples that share a time on average if times are rounded too coarsely."""
 
+_INSIDE = 0.5
+"""Share of the magnetometer's samples during the IMU's below which its clock is another."""
+
 
 def check_time(sequence: ImuSequence) -> None:
     """Check order, rate and unit of a recording's times.
@@ -53,3 +56,22 @@ def check_time(sequence: ImuSequence) -> None:
                 "another in a CSV's header, such as `t [s]`"
             )
     raise InputError(f"{sequence.name}: time", f"{rate:.4g} samples/s", "50 to 1000", fix)
+
+
+def magnetometer_time_problems(sequence: ImuSequence) -> list[str]:
+    """Describe a magnetometer of which most samples are at other times than the IMU's."""
+    field, times = sequence.magnetometer, sequence.time[np.isfinite(sequence.time)]
+    if field is None or not len(times):
+        return []
+    start, stop = float(times.min()), float(times.max())
+    if ((field.time >= start) & (field.time <= stop)).mean() >= _INSIDE:
+        return []
+    longer = float(np.ptp(field.time)) / max(stop - start, 1e-9)
+    units = (unit for unit, n in TIME_UNITS.items() if unit != "s" and 0.5 < longer / n < 2.0)
+    unit = next(units, None)
+    fix = f"they seem to be in {unit}" if unit else "use one clock for both"
+    return [
+        f"{sequence.name}: magnetometer: found times from {field.time[0]:.6g} to "
+        f"{field.time[-1]:.6g} s, expected most during the samples, {start:.6g} to {stop:.6g} s; "
+        f"{fix}"
+    ]

@@ -20,7 +20,7 @@ import numpy as np
 
 from stario.sequences.errors import ReadError
 from stario.sequences.lazy import optional_package
-from stario.sequences.readers.checked import checked, magnetometer, rotations, trajectory
+from stario.sequences.readers.checked import finite_rows, magnetometer, rotations, trajectory
 from stario.sequences.readers.lines import first_bytes
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -64,11 +64,6 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
     messages = _messages(path, imu_topic, truth_topic)
     imu = messages[_IMU]
     stamps = imu.stamps_ns
-    # Orientation and covariances, which a driver may leave NaN, are not used.
-    gyro, accel = (
-        checked(path, f"{imu.topic}, values", imu.values[:, part], first_row=0)
-        for part in (_GYRO, _ACCEL)
-    )
     truth = next((m for kind, m in messages.items() if kind not in (_IMU, _MAGNETIC)), None)
     magnetic = None
     if (field := messages.get(_MAGNETIC)) is not None:
@@ -77,8 +72,8 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
     return ImuSequence(
         name=path.resolve().stem,
         time=seconds(stamps, stamps[0]),
-        gyro=gyro,
-        accel=accel,
+        gyro=imu.values[:, _GYRO],
+        accel=imu.values[:, _ACCEL],
         truth=None if truth is None else _truth(path, truth, stamps[0]),
         magnetometer=magnetic,
     )
@@ -190,6 +185,8 @@ def _decoded(
 
 
 def _truth(path: Path, poses: _Messages, start_ns: np.int64) -> Trajectory:
-    position = checked(path, f"{poses.topic}, position", poses.values[:, :3], first_row=0)
-    attitude_WB = rotations(path, f"{poses.topic}, quaternion", poses.values[:, 3:7], "xyzw", 0)
-    return trajectory(seconds(poses.stamps_ns, start_ns), position, attitude_WB)
+    rows = finite_rows(path, poses.topic, poses.values[:, :7])
+    quat = poses.values[:, 3:7]
+    attitude_WB = rotations(path, f"{poses.topic}, quaternion", quat, "xyzw", 0, rows)
+    time = seconds(poses.stamps_ns[rows], start_ns)
+    return trajectory(path, time, poses.values[rows, :3], attitude_WB)

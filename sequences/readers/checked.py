@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
+from stario.sequences.readers.text import IntArray
 from stario.sequences.sequence import BoolArray, FloatArray, Magnetometer, Trajectory
 from stario.sequences.time_order import increasing_mask
 
@@ -18,35 +19,66 @@ _log = logging.getLogger(__name__)
 _HELD_SHARE = 1.0 / 3.0
 
 
-def checked(path: Path, field: str, values: FloatArray, first_row: int = 1) -> FloatArray:
+def checked(path: Path, field: str, values: FloatArray) -> FloatArray:
     """Return values (N,) or (N, K) if all are finite.
 
     Raises:
-        ReadError: one is not; the error names the field and its row, counted from `first_row`.
+        ReadError: one is not; the error names the field and its row, counted from 1.
     """
     good = np.isfinite(values).reshape(len(values), -1).all(axis=1)
     if not good.all():
         k = int(np.argmin(good))
         found = "nan" if np.isnan(values[k]).any() else "inf"
-        where = f"row {k + first_row}, {field}"
+        where = f"row {k + 1}, {field}"
         raise ReadError(path, where, found, "finite numbers", "cut the recording there")
     return values
 
 
+def finite_rows(path: Path, field: str, values: FloatArray) -> IntArray:
+    """Return the rows of values (N,) or (N, K) that are finite, and warn of the others.
+
+    Raises:
+        ReadError: most are not finite; the error names the field.
+    """
+    rows = np.flatnonzero(np.isfinite(values).reshape(len(values), -1).all(axis=1))
+    if lost := len(values) - len(rows):
+        if lost > len(values) / 2:
+            found = f"{lost} of {len(values)} rows that are not finite"
+            raise ReadError(path, field, found, "finite numbers")
+        count = len(values)
+        _log.warning("%s: %s: dropped %d of %d rows that are not finite", path, field, lost, count)
+    return rows
+
+
 def rotations(
-    path: Path, field: str, quat: FloatArray, order: str = "wxyz", first_row: int = 1
+    path: Path,
+    field: str,
+    quat: FloatArray,
+    order: str = "wxyz",
+    first_row: int = 1,
+    rows: IntArray | None = None,
 ) -> Rotation:
-    """Return rotations from unit quaternions (N, 4) in the order `wxyz` or `xyzw`.
+    """Return rotations from unit quaternions.
+
+    Args:
+        path: the file, for errors.
+        field: name of the quaternions, for errors.
+        quat: (N, 4) quaternions.
+        order: order of their components, `wxyz` or `xyzw`.
+        first_row: number of the first row, for errors.
+        rows: rows to return the rotations of; all if None.
 
     Raises:
         ReadError: a component is not finite or a norm differs from 1 by more than a percent; the
-            error names the field and its row, counted from `first_row`.
+            error names the field and its row.
     """
-    norm = np.linalg.norm(checked(path, field, quat, first_row), axis=1)
-    bad = np.abs(norm - 1.0) > NORM_TOLERANCE
+    rows = np.arange(len(quat)) if rows is None else rows
+    quat = quat[rows]
+    norm = np.linalg.norm(quat, axis=1)
+    bad = ~(np.abs(norm - 1.0) <= NORM_TOLERANCE)
     if bad.any():
         k = int(np.argmax(bad))
-        where = f"row {k + first_row}, {field}"
+        where = f"row {rows[k] + first_row}, {field}"
         raise ReadError(
             path, where, f"norm {norm[k]:.4g}", "a unit quaternion", "cut the recording there"
         )
@@ -97,13 +129,14 @@ def pose_mask(path: Path, time: FloatArray) -> BoolArray:
 
 
 def trajectory(
+    path: Path,
     time: FloatArray,
     position_W: FloatArray,
     attitude_WB: Rotation,
     velocity_W: FloatArray | None = None,
 ) -> Trajectory:
-    """Return a trajectory of the poses whose times advance; files may repeat rows."""
-    keep = increasing_mask(time)
+    """Return a trajectory of a file's poses whose times advance, as `pose_mask` selects them."""
+    keep = pose_mask(path, time)
     return Trajectory(
         time=time[keep],
         position_W=position_W[keep],

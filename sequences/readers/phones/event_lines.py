@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import checked, magnetometer
+from stario.sequences.readers.checked import finite_rows, magnetometer
 from stario.sequences.readers.clocks import resample_to_gyro
 from stario.sequences.readers.geodesy import east_north
 from stario.sequences.readers.lines import head_lines, read_lines
@@ -174,7 +174,8 @@ def _rows(path: Path, kind: str, rows: Iterable[list[str]], unit_ns: int, used: 
         except ValueError:
             found = repr(" ".join([row[0], *row[used]]))
             raise ReadError(path, f"{kind}, line {number} of its kind", found, "numbers") from None
-    return np.array(stamps, dtype=np.int64), checked(path, kind, np.array(values))
+    finite = finite_rows(path, kind, np.array(values))
+    return np.array(stamps, dtype=np.int64)[finite], np.array(values)[finite]
 
 
 def _stamp_ns(time: str, unit_ns: int) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import checked, magnetometer, rotations
+from stario.sequences.readers.checked import finite_rows, magnetometer, rotations
 from stario.sequences.readers.json_file import read_json
 from stario.sequences.readers.lines import first_line, read_lines
 from stario.sequences.readers.text import read_table, seconds
@@ -23,7 +23,7 @@ def header_names(path: Path) -> list[str]:
 
 
 class NamedColumns:
-    """Columns of a CSV with a header, all finite.
+    """Columns of a CSV with a header: its rows without a cell that is not finite.
 
     Args:
         path: the file.
@@ -31,8 +31,8 @@ class NamedColumns:
         magnetic: stems, the first one present of which is the magnetic field; it may be NaN.
 
     Raises:
-        ReadError: the file or a column is missing, a row is cut short, or a cell is not a
-            finite number.
+        ReadError: the file or a column is missing, a row is cut short, a cell is not a number, or
+            most rows have one that is not finite.
     """
 
     def __init__(self, path: Path, names: Collection[str], magnetic: Collection[str]) -> None:
@@ -48,26 +48,32 @@ class NamedColumns:
         self._places = {name: k for k, name in enumerate(read)}
         self._columns = [header.index(name) for name in read]
         self._table = read_table(path, self._columns, skip=1)
-        for k, name in enumerate(names):
-            checked(path, name, self._table.values[:, k], self._table.first_row)
+        values = self._table.values[:, : len(names)]
+        damaged = np.flatnonzero(~np.isfinite(values).all(axis=0))
+        self._rows = finite_rows(path, ", ".join(read[k] for k in damaged), values)
 
     def stack(self, stem: str, axes: str = "xyz") -> FloatArray:
         """Return the columns `stem_x`, `stem_y`, ... side by side (N, K)."""
-        return self._table.values[:, [self._places[name] for name in axes_of(stem, axes)]]
+        return self._all_rows(stem, axes)[self._rows]
 
     def rotations(self, stem: str) -> Rotation:
         """Return the N rotations in the columns `stem_w`, ..., `stem_z`."""
-        quat_wxyz = self.stack(stem, "wxyz")
-        return rotations(self._table.path, stem, quat_wxyz, first_row=self._table.first_row)
+        quat_wxyz = self._all_rows(stem, "wxyz")
+        first = self._table.first_row
+        return rotations(self._table.path, stem, quat_wxyz, first_row=first, rows=self._rows)
 
     def seconds(self, name: str, per_second: int = 10**9) -> FloatArray:
         """Return a column of times (N,) as seconds since the first."""
-        stamps = self._table.stamps_ns(self._columns[self._places[name]], per_second)
+        place = self._columns[self._places[name]]
+        stamps = self._table.stamps_ns(place, per_second, self._rows)
         return seconds(stamps, stamps[0])
 
     def magnetometer(self, time: FloatArray) -> Magnetometer | None:
         """Return the magnetic field at the rows' times (N,), None if there is none."""
         return magnetometer(time, self.stack(self._magnetic)) if self._magnetic else None
+
+    def _all_rows(self, stem: str, axes: str) -> FloatArray:
+        return self._table.values[:, [self._places[name] for name in axes_of(stem, axes)]]
 
 
 def axes_of(stem: str, axes: str = "xyz") -> list[str]:

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Slerp
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import checked, magnetometer, rotations, trajectory
+from stario.sequences.readers.checked import finite_rows, magnetometer, rotations, trajectory
 from stario.sequences.readers.clocks import resample_to_gyro
 from stario.sequences.readers.lines import first_line
 from stario.sequences.readers.poses import pose_files, with_pose
@@ -61,13 +61,14 @@ def is_imunet(path: Path) -> bool:
 def _magnetometer(path: Path, start_ns: np.int64) -> Magnetometer | None:
     if not path.is_file() or first_line(path) is None:
         return None
-    stamps, field = _rows(path, 3)
-    return magnetometer(seconds(stamps, start_ns), field)
+    table = read_table(path, columns=4, delimiter=None)
+    return magnetometer(seconds(table.stamps_ns(), start_ns), table.values[:, 1:])
 
 
 def _rows(path: Path, width: int) -> tuple[IntArray, FloatArray]:
     table = read_table(path, columns=1 + width, delimiter=None)
-    return table.stamps_ns(), checked(path, "values", table.values[:, 1:], table.first_row)
+    rows = finite_rows(path, "values", table.values)
+    return table.stamps_ns(rows=rows), table.values[rows, 1:]
 
 
 def _truth(folder: Path, start_ns: np.int64, time: FloatArray, accel: FloatArray) -> Trajectory:
@@ -87,4 +88,4 @@ def _truth(folder: Path, start_ns: np.int64, time: FloatArray, accel: FloatArray
     at_force = R_WU * known(np.clip(time, known.times[0], known.times[-1]))
     if y_is_up(folder / "pose.txt", at_force, accel):
         attitude_WB, position = UPRIGHT * attitude_WB, UPRIGHT.apply(position)
-    return trajectory(pose_time, position, attitude_WB)
+    return trajectory(folder / "pose.txt", pose_time, position, attitude_WB)

@@ -129,12 +129,14 @@ def _truth(path: Path, phone: ImuSequence, start_ns: np.int64 | None) -> Traject
     table = read_table(path, columns=max(8, len(first_numbers(path))))
     position = table.values[:, -7:-4]
     attitude_WV, valid = captured_rotations(table.values[:, -4:])
-    # Zeros are written while the body is out of sight.
-    valid &= np.isfinite(position).all(axis=1) & (position != 0.0).any(axis=1)
+    valid &= (position != 0.0).any(axis=1)  # zeros are written while the body is out of sight
     known = np.isfinite(phone.gyro).all(axis=1) & np.isfinite(phone.accel).all(axis=1)
     imu = (phone.time[known], phone.gyro[known], phone.accel[known])
     try:
         time, kept = _capture_time(table, phone, start_ns)
+        # Left in as invalid, they would spoil the averages over their neighbours.
+        finite = np.isfinite(table.values[kept, -7:]).all(axis=1)
+        time, kept = time[finite], kept[finite]
         position, attitude_WV, valid = position[kept], attitude_WV[kept], valid[kept]
         valid &= ~_position_glitches(time, position)
         if start_ns is not None:

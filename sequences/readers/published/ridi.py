@@ -62,7 +62,7 @@ def read_ridi(path: Path) -> ImuSequence:
         time=time,
         gyro=columns.stack("gyro"),
         accel=accel,
-        truth=trajectory(time, columns.stack("pos"), attitude_WB),
+        truth=trajectory(file, time, columns.stack("pos"), attitude_WB),
         magnetometer=columns.magnetometer(time),
     )
 

@@ -51,7 +51,7 @@ def read_rnin(path: Path) -> ImuSequence:
         time=time,
         gyro=columns.stack("gyro") - columns.stack("vio_gyro_bias")[-1],
         accel=columns.stack("acce") - columns.stack("vio_acce_bias")[-1],
-        truth=trajectory(time, columns.stack(f"{source}_p"), attitude_WB),
+        truth=trajectory(file, time, columns.stack(f"{source}_p"), attitude_WB),
         magnetometer=columns.magnetometer(time),
     )
 

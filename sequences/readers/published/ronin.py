@@ -25,13 +25,14 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import (
-    checked,
+    finite_rows,
     magnetometer,
     rotations,
     trajectory,
 )
 from stario.sequences.readers.hdf5 import is_hdf5, opened_hdf5
 from stario.sequences.readers.published.by_name import JsonFields
+from stario.sequences.readers.text import IntArray
 from stario.sequences.sequence import FloatArray, ImuSequence
 
 _FIELDS = {
@@ -55,22 +56,23 @@ def read_ronin(path: Path) -> ImuSequence:
     file = _data_file(path)
     info = JsonFields(file.with_name("info.json"))
     fields = _fields(file)
+    required = np.column_stack([fields[name] for name in _FIELDS])
+    rows = finite_rows(file, "synced and pose", required)
     gyro = fields["synced/gyro_uncalib"] - info.array("imu_init_gyro_bias", 3)
     bias, scale = info.array("imu_acce_bias", 3), info.array("imu_acce_scale", 3)
     accel = scale * (fields["synced/acce"] - bias)
-    attitude_WB = _device_attitude(file, info, fields, gyro)
-    time = fields["synced/time"]
-    start = _start_frame(info, len(time))
-    time = time[start:] - time[start]
+    attitude_WB = _device_attitude(file, info, fields, gyro, rows)
+    start = int(np.searchsorted(rows, _start_frame(info, int(rows[-1]))))
+    rows, attitude_WB = rows[start:], attitude_WB[start:]
+    time = fields["synced/time"][rows]
+    time = time - time[0]
     return ImuSequence(
         name=file.resolve().parent.name,
         time=time,
-        gyro=gyro[start:],
-        accel=accel[start:],
-        truth=trajectory(time, fields["pose/tango_pos"][start:], attitude_WB[start:]),
-        magnetometer=(
-            magnetometer(time, fields[_MAGNETIC][start:]) if _MAGNETIC in fields else None
-        ),
+        gyro=gyro[rows],
+        accel=accel[rows],
+        truth=trajectory(file, time, fields["pose/tango_pos"][rows], attitude_WB),
+        magnetometer=magnetometer(time, fields[_MAGNETIC][rows]) if _MAGNETIC in fields else None,
     )
 
 
@@ -87,7 +89,7 @@ def _data_file(path: Path) -> Path:
 
 
 def _fields(file: Path) -> dict[str, FloatArray]:
-    """Return the required fields, finite and of one length, and the optional ones present."""
+    """Return the required fields and the optional ones present, all of one length."""
     with opened_hdf5(file, "HDF5 data") as data:
         names = [*_FIELDS, *(name for name in _OPTIONAL if name in data)]
         missing = [name for name in names if name not in data]
@@ -99,24 +101,30 @@ def _fields(file: Path) -> dict[str, FloatArray]:
         shape = (count, *(_FIELDS | _OPTIONAL)[name])
         if values.shape != shape or not count:
             raise ReadError(file, name, f"shape {values.shape}", f"{shape} as for synced/time")
-        if name not in _OPTIONAL:
-            checked(file, name, values, first_row=0)
     return fields
 
 
 def _device_attitude(
-    file: Path, info: JsonFields, fields: dict[str, FloatArray], gyro: FloatArray
+    file: Path,
+    info: JsonFields,
+    fields: dict[str, FloatArray],
+    gyro: FloatArray,
+    rows: IntArray,
 ) -> Rotation:
     """Return the phone's attitude in the Tango's world, from the source the authors would use."""
-    game_rv = rotations(file, "synced/game_rv", fields["synced/game_rv"], first_row=0)
+
+    def attitudes(name: str, rows: IntArray) -> Rotation:
+        return rotations(file, name, fields[name], first_row=0, rows=rows)
+
+    game_rv = attitudes("synced/game_rv", rows)
     name = _source(info, _EKF in fields)
     if name == "game_rv":
         source = game_rv
     elif name == "ekf":
-        source = rotations(file, _EKF, fields[_EKF], first_row=0)
+        source = attitudes(_EKF, rows)
     else:
-        source = game_rv[0] * integrated_gyro(fields["synced/time"], gyro)
-    first = rotations(file, "pose/tango_ori", fields["pose/tango_ori"][:1], first_row=0)[0]
+        source = game_rv[0] * integrated_gyro(fields["synced/time"][rows], gyro[rows])
+    first = attitudes("pose/tango_ori", rows[:1])[0]
     calibration = info.array("start_calibration", 4)[None]
     R_TB = rotations(info.path, "start_calibration", calibration, first_row=0)[0]
     return first * R_TB * source[0].inv() * source
@@ -136,8 +144,8 @@ def _source(info: JsonFields, has_ekf: bool) -> str:
     return min(errors, key=lambda name: errors[name])
 
 
-def _start_frame(info: JsonFields, count: int) -> int:
+def _start_frame(info: JsonFields, last: int) -> int:
     start = info.get("start_frame", 0)
-    if not isinstance(start, int) or not 0 <= start < count:
-        raise ReadError(info.path, "start_frame", repr(start), f"a row from 0 to {count - 1}")
+    if not isinstance(start, int) or not 0 <= start <= last:
+        raise ReadError(info.path, "start_frame", repr(start), f"a row from 0 to {last}")
     return start

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import interpolated, trapezoids
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import checked, rotations, trajectory
+from stario.sequences.readers.checked import finite_rows, rotations, trajectory
 from stario.sequences.readers.published.by_name import JsonFields
 from stario.sequences.readers.text import IntArray, read_table, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -71,22 +71,24 @@ def _read_resampled(file: Path) -> tuple[IntArray, ImuSequence]:
     if table.ndim != 2 or table.shape[1] < width or not len(table):
         raise ReadError(file, "array", f"shape {table.shape}", f"(N, {width}) as in {_DESCRIPTION}")
     quat_name = next(name for name in _QUATERNIONS if name in places)
-    checked(file, "array", table[:, :width], first_row=0)
+    rows = finite_rows(file, "array", table[:, :width])
     order, quat = _QUATERNIONS[quat_name], table[:, places[quat_name]]
-    attitude_WB = rotations(file, quat_name, quat, order, first_row=0)
+    attitude_WB = rotations(file, quat_name, quat, order, first_row=0, rows=rows)
+    table = table[rows]
     us = table[:, places["ts_us"].start]
     time = (us - us[0]) * 1e-6
     gyro = table[:, places["gyr_compensated_rotated_in_World"]]
     accel = table[:, places["acc_compensated_rotated_in_World"]]
     if not _in_body_axes(time, gyro, attitude_WB):
         gyro, accel = (attitude_WB.apply(values, inverse=True) for values in (gyro, accel))
+    position_W = table[:, places["pos_World_Device"]]
     velocity_W = table[:, places[_VELOCITY]] if _VELOCITY in places else None
     sequence = ImuSequence(
         name=file.resolve().parent.name,
         time=time,
         gyro=gyro,
         accel=accel,
-        truth=trajectory(time, table[:, places["pos_World_Device"]], attitude_WB, velocity_W),
+        truth=trajectory(file, time, position_W, attitude_WB, velocity_W),
     )
     return np.rint(us).astype(np.int64), sequence
 
@@ -144,8 +146,9 @@ def _width(place: slice) -> int:
 
 def _read_raw(file: Path) -> ImuSequence:
     table = read_table(file, columns=8)
-    stamps = table.stamps_ns()
-    samples = checked(file, "samples", table.values[:, 2:8], table.first_row)
+    samples = table.values[:, 2:8]
+    rows = finite_rows(file, "samples", samples)
+    stamps, samples = table.stamps_ns(rows=rows), samples[rows]
     calibration = JsonFields(file.with_name(_CALIBRATION))
     sequence = ImuSequence(
         name=file.resolve().parent.name,

@@ -128,3 +128,13 @@ def test_a_push_with_one_arbitrary_field_is_read_or_refused(path, value):
     except InputError as error:
         message_of_error = str(error)
     assert (0 < len(message_of_error) < 400) or isinstance(batch, Batch)
+
+
+@pytest.mark.parametrize("per_second", [1, 1_000, 1_000_000])
+def test_a_push_whose_times_are_not_in_nanoseconds_is_refused_with_the_reason(per_second):
+    entry = PUSH["payload"][0]
+    payload = [entry | {"time": round((1.7e9 + 0.01 * k) * per_second)} for k in range(20)]
+    with pytest.raises(
+        InputError, match=r"gyroscope less than 0\.1 ms apart, .* nanoseconds; send"
+    ):
+        parse_push(json.dumps(PUSH | {"payload": payload}).encode())

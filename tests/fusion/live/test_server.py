@@ -89,10 +89,11 @@ def test_times_in_milliseconds_are_named_and_do_not_begin_tracks_without_end(cli
     assert len(list(session.path.parent.iterdir())) == 1
 
 
-def test_a_compressed_body_is_refused_with_the_remedy(client, pushes):
+def test_a_compressed_body_is_refused_with_the_remedy(client, pushes, caplog):
     answer = client.post("/data", content=pushes()[0], headers={"content-encoding": "gzip"})
     assert answer.status_code == 400
     assert "send it uncompressed" in answer.json()["error"]
+    assert answer.json()["error"] in caplog.text
 
 
 def test_a_clock_that_jumps_back_begins_a_new_track(client, hub, pushes):

@@ -9,6 +9,7 @@ from recorded import DATA
 
 from stario.fusion import Health, Navigator
 from stario.fusion.health import SampleCounts
+from stario.fusion.imu.gap import INTERPOLATED
 from stario.fusion.report.health import findings, health_lines
 from stario.network import load_model
 from stario.sequences import read_recording
@@ -107,7 +108,8 @@ def test_small_innovations_are_not_reported_as_small_errors() -> None:
 
 
 @pytest.mark.parametrize(
-    ("gap", "yaw_sigma", "helps"), [(0.0, 0.5, True), (4.0, 0.5, False), (0.0, 1.8, False)]
+    ("gap", "yaw_sigma", "helps"),
+    [(0.0, 0.5, True), (INTERPOLATED, 0.5, True), (4.0, 0.5, False), (0.0, 1.8, False)],
 )
 def test_standing_still_is_advised_only_where_the_yaw_drifts(
     gap: float, yaw_sigma: float, helps: bool

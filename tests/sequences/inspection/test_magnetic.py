@@ -21,6 +21,7 @@ from stario.sequences import (
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.inspection.magnetic import assess_magnetometer, magnetic_problems
+from stario.sequences.inspection.times import magnetometer_time_problems
 from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import clean_samples
@@ -138,3 +139,21 @@ def test_a_magnetometer_next_to_magnets_is_not_usable() -> None:
     name = "archives/tyrex.h5:Thibaud_Nexus5_Dist_Texting"
     magnets = assess_magnetometer(read_recording(DATA / name))
     assert magnets.verdict == "not usable"
+
+
+@pytest.mark.parametrize(
+    ("factor", "offset", "words"),
+    [(1e3, 0.0, "they seem to be in ms"), (1.0, 500.0, "use one clock for both")],
+)
+def test_a_magnetometer_at_other_times_than_the_samples_is_reported(
+    factor: float, offset: float, words: str
+) -> None:
+    sequence = walk(MagneticField())
+    field = sequence.magnetometer
+    assert field is not None
+    assert magnetometer_time_problems(sequence) == []
+    elsewhere = replace(sequence, magnetometer=replace(field, time=factor * field.time + offset))
+    problems = [p for p in inspect_recording(elsewhere).problems if "found times from" in p]
+    assert len(problems) == 1
+    assert problems[0].startswith(f"{sequence.name}: magnetometer: ")
+    assert problems[0].endswith(words)

@@ -102,3 +102,16 @@ def test_poses_out_of_order_are_counted(
     assert found is not None
     assert len(found) == len(poses) - 50
     assert f"dropped 50 of {len(poses)} poses: their times do not increase" in caplog.text
+
+
+def test_poses_of_imunet_that_go_back_in_time_are_counted(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = formats.imunet_raw(tmp_path / "seq", walk).path
+    header, *poses = (path / "pose.txt").read_text().splitlines()
+    early = poses[3].split()[0]
+    poses[20:22] = [f"{early} {pose.split(maxsplit=1)[1]}" for pose in poses[20:22]]
+    (path / "pose.txt").write_text("\n".join([header, *poses]))
+    found = read_recording(path).truth
+    assert found is not None
+    assert f"pose.txt: dropped 2 of {len(poses)} poses: their times do not" in caplog.text

@@ -68,9 +68,7 @@ def test_an_hdf5_with_a_missing_or_shorter_field_is_refused(ronin) -> None:
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("synced/gyro_uncalib", np.nan, "row 17, synced/gyro_uncalib: found nan"),
         ("synced/game_rv", 0.0, "row 17, synced/game_rv: found norm 0, expected a unit quaternion"),
-        ("synced/time", np.inf, "row 17, synced/time: found inf"),
     ],
 )
 def test_an_hdf5_with_a_bad_row_is_refused(ronin, name, value, message) -> None:
@@ -116,15 +114,10 @@ def test_a_damaged_csv_with_named_columns_is_refused(
     path = getattr(formats, which)(tmp_path / "seq", walks(200.0)).path
     csv = csv_of(path)
     good = csv.read_text()
-    change(csv, 40, "acce_y", "nan")
-    assert_refused(path, csv.name, "row 42, acce_y: found nan, expected finite numbers")
-    csv.write_text(good)
-    change(csv, 40, "acce_y", "")
-    assert_refused(path, "row 42, acce_y: found nan")
-    csv.write_text(good)
     change(csv, 40, "acce_y", "high")
     assert_refused(path, "line 42, column ", "found 'high', expected a number")
     csv.write_text(good)
+    change(csv, 20, "acce_y", "nan")
     for axis in "wxyz":
         change(csv, 40, f"{quaternion}_{axis}", "0.0")
     assert_refused(path, f"row 42, {quaternion}: found norm 0, expected a unit quaternion")
@@ -159,14 +152,10 @@ def test_an_npy_that_does_not_fit_its_description_is_refused(tmp_path, walks) ->
     path = formats.tlio(tmp_path / "7", walks(200.0)).path
     file, description = path / "imu0_resampled.npy", path / "imu0_resampled_description.json"
     table, text = np.load(file), description.read_text()
-    for column, value, message in (
-        (4, np.nan, "row 9, array: found nan"),
-        (slice(7, 11), 0.0, "row 9, qxyzw_World_Device: found norm 0"),
-    ):
-        bad = table.copy()
-        bad[9, column] = value
-        np.save(file, bad)
-        assert_refused(path, message)
+    bad = table.copy()
+    bad[9, 7:11] = 0.0
+    np.save(file, bad)
+    assert_refused(path, "row 9, qxyzw_World_Device: found norm 0")
     np.save(file, table[:, :10])
     assert_refused(path, "array: found shape (4001, 10), expected (N, 17)")
     np.save(file, np.array(["a", "b"]))
@@ -200,9 +189,6 @@ def test_a_bag_cut_short_or_with_bad_values_is_refused(tmp_path) -> None:
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     assert_refused(path, "b.bag: file: found ", "expected an intact bag", "`rosbag reindex`")
-    value = struct.pack("<d", walk.gyro[20, 1])
-    path.write_bytes(whole.replace(value, struct.pack("<d", np.nan)))
-    assert_refused(path, "row 20, /imu, values: found nan")
     quat = walk.truth.attitude_WB[20].as_quat()
     empty = formats.bag(tmp_path / "q", walk, imu_topics=("/imu",))
     content = empty.read_bytes().replace(struct.pack("<4d", *quat), struct.pack("<4d", 0, 0, 0, 0))

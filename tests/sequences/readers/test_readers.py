@@ -194,6 +194,18 @@ def test_oxiod_gaps_in_the_imu_do_not_affect_the_truth(
     assert_same_poses(true_track(read), phone_walk, 2.0, 0.1)
 
 
+def test_oxiod_poses_next_to_missing_ones_are_used(tmp_path: Path, phone_walk: ImuSequence) -> None:
+    imu = write_oxiod(tmp_path, phone_walk)
+    vicon = tmp_path / "syn/vi1.csv"
+    rows = [line.split(",") for line in vicon.read_text().splitlines()]
+    for row in rows[7::10]:
+        row[-7:] = ["nan"] * 7
+    vicon.write_text("\n".join(",".join(row) for row in rows))
+    read = read_oxiod(imu)
+    assert true_track(read).covers(read.time[50:-50]).mean() > 0.97
+    assert_same_poses(true_track(read), phone_walk, 2.0, 0.1)
+
+
 @pytest.mark.parametrize("rows", [1, 20, 500])
 def test_oxiod_too_short_to_determine_the_mount_has_no_truth(
     tmp_path: Path, phone_walk: ImuSequence, rows: int, caplog: pytest.LogCaptureFixture

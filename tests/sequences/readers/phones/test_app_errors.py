@@ -177,3 +177,20 @@ def test_a_damaged_event_line_is_named(
     file.write_text(file.read_text().replace(whole, changed, 1))
     with pytest.raises(ReadError, match=error):
         read_recording(file)
+
+
+@pytest.mark.parametrize(
+    ("write", "cell"), [(trace, "TYPE_GYROSCOPE\t"), (get_sensor_data, "\nACCE;5.010;0.0100;")]
+)
+def test_an_event_that_is_not_finite_is_dropped_with_a_warning(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture,
+    write: Callable[[Path, ImuSequence], None], cell: str,
+) -> None:  # fmt: skip
+    write(tmp_path / "walk", walk)
+    (file,) = (tmp_path / "walk").iterdir()
+    before, _, after = file.read_text().rpartition(cell)
+    separator = cell[-1]
+    file.write_text(separator.join([f"{before}{cell}nan", *after.split(separator)[1:]]))
+    read = read_recording(file)
+    assert np.isfinite(np.column_stack([read.gyro, read.accel])).all()
+    assert f"dropped 1 of {len(walk)} rows that are not finite" in caplog.text
