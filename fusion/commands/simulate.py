@@ -14,7 +14,7 @@ from stario.sequences.errors import InputError
 
 def simulate(
     path: Annotated[Path, typer.Argument(help="CSV file to write.")],
-    seconds: Annotated[float, typer.Option(help="Duration in s.")] = 60.0,
+    seconds: Annotated[float, typer.Option(min=1.0, help="Duration in s.")] = 60.0,
     rate: Annotated[float, typer.Option(min=50.0, max=1000.0, help="Sampling rate in Hz.")] = 200.0,
     carry: Annotated[
         str,
