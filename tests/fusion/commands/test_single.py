@@ -61,6 +61,7 @@ def test_every_command_prints_its_help(command: str) -> None:
         ["run"],
         ["run", "a.csv", "--nosuch"],
         ["simulate", "a.csv", "--seconds", "long"],
+        ["simulate", "a.csv", "--seconds", "0"],
         ["simulate", "a.csv", "--seed", "-1"],
         ["simulate", "a.csv", "--rate", "10"],
         ["train", "--epochs", "0"],
