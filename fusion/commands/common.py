@@ -26,19 +26,6 @@ _NAMED = 3
 """Number of skipped recordings with the same reason that are listed one by one."""
 
 
-def collect_results(
-    outcomes: Iterable[Result | Skipped], skipped: list[Skipped]
-) -> Iterator[Result]:
-    """Yield the results in order; append recordings that could not be used to `skipped`."""
-    from stario.sequences.datasets.batch import Skipped
-
-    for outcome in outcomes:
-        if isinstance(outcome, Skipped):
-            skipped.append(outcome)
-        else:
-            yield outcome
-
-
 def map_recordings(
     title: str,
     reading: ReadingOptions,
@@ -46,11 +33,11 @@ def map_recordings(
     work: Callable[[Path, ImuSequence], Result],
 ) -> tuple[list[Result], list[Skipped]]:
     """Apply `work` to each recording and its path; return results and failures."""
-    from stario.sequences.datasets.batch import each
+    from stario.sequences.datasets.batch import each, without_skipped
 
     files, skipped = reading.recordings(paths)
     outcomes = each(lambda file: work(file, reading.read(file)), files, jobs=1)
-    return list(collect_results(with_bar(title, outcomes, len(files)), skipped)), skipped
+    return list(without_skipped(with_bar(title, outcomes, len(files)), skipped)), skipped
 
 
 def process_each(
@@ -73,7 +60,7 @@ def process_each(
     """
     from stario.fusion.evaluation.folders import check_folder
     from stario.fusion.evaluation.many import distinct_name
-    from stario.sequences.datasets.batch import each
+    from stario.sequences.datasets.batch import each, without_skipped
 
     files, skipped = reading.recordings(paths)
     if single and len(files) > 1:
@@ -91,7 +78,7 @@ def process_each(
             typer.echo(text)
         return record
 
-    records = list(collect_results(each(recorded, files, jobs=1), skipped))
+    records = list(without_skipped(each(recorded, files, jobs=1), skipped))
     if as_json and records:
         print_result(True, records[0] if len(files) == 1 else records)
     exit_if_skipped(skipped)

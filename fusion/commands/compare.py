@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import typer
 
 from stario.fusion.commands.common import (
-    collect_results,
     exit_if_skipped,
     print_result,
     progress_bar,
@@ -54,6 +53,7 @@ def compare(
     from stario.fusion.evaluation.results import scores_dict, write_comparison
     from stario.fusion.evaluation.summary import scores_of
     from stario.fusion.fix_file import read_fixes
+    from stario.sequences.datasets.batch import without_skipped
     from stario.sequences.lazy import optional_package
 
     if not paths:
@@ -75,7 +75,7 @@ def compare(
         outcomes = compare_recordings(
             files, model, settings, read, jobs, absolute_fixes, progress=progress
         )
-        comparisons = list(collect_results(outcomes, skipped))
+        comparisons = list(without_skipped(outcomes, skipped))
     written = write_comparison(folder, comparisons, settings) if comparisons else []
     if report:
         from stario.fusion.report.page import write_report
