@@ -94,11 +94,5 @@ def _cell(
 
 
 def _known_values(recordings: Sequence[Scores], track: str, metric: str) -> FloatArray:
-    values = [_value(scores, track, metric) for scores in recordings]
-    return np.array([value for value in values if value is not None])
-
-
-def _value(scores: Scores, track: str, metric: str) -> float | None:
-    """Return a figure; None if unknown."""
-    value = scores.metrics.get(track, {}).get(metric)
-    return value if value is not None and math.isfinite(value) else None
+    values = [scores.metrics.get(track, {}).get(metric) for scores in recordings]
+    return np.array([value for value in values if value is not None and math.isfinite(value)])

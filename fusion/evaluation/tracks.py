@@ -26,6 +26,7 @@ from stario.sequences.windows import (
     WINDOW_SAMPLES,
     WINDOW_SECONDS,
     clean_samples,
+    cut_windows,
     headings_at,
     imu_in_world,
     runs,
@@ -168,8 +169,7 @@ def _true_windows(
     starts = starts[bad_before[starts + WINDOW_SAMPLES] == bad_before[starts]]
     if len(starts) == 0:
         raise InputError(f"{sequence.name}: truth", "no second without gaps", "at least one")
-    rows = starts[:, None] + np.arange(WINDOW_SAMPLES)
-    windows = world.imu[rows].transpose(0, 2, 1)
+    windows = cut_windows(world.imu, starts)
     return world.time[starts], windows, headings_at(world.facing, starts)
 
 
