@@ -19,6 +19,7 @@ from stario.fusion.report.health import Finding, findings
 from stario.fusion.report.panels import bias_panels, innovation_panels, motion_panels, style
 from stario.fusion.report.series import Series, track_series, trajectory_series
 from stario.fusion.state import Track
+from stario.sequences.drawing.text_table import figure
 from stario.sequences.files import atomic_write
 from stario.sequences.sequence import ImuSequence, PositionTrack
 
@@ -149,12 +150,9 @@ def _table(found: Comparison) -> str:
     head = "".join(f"<th>{METRIC_TITLES[key]}</th>" for key in _DIGITS)
     rows = []
     for name, figures in found.metrics.items():
-        cells = []
-        for key, digits in _DIGITS.items():
-            value = figures.get(key)
-            finite = value is not None and np.isfinite(value)
-            cells.append(f"<td>{value:.{digits}f}</td>" if finite else "<td>-</td>")
-        rows.append(f"<tr><th>{html.escape(style(name)[0])}</th>{''.join(cells)}</tr>")
+        cells = (figure(figures.get(key), f".{digits}f") for key, digits in _DIGITS.items())
+        row = "".join(f"<td>{cell}</td>" for cell in cells)
+        rows.append(f"<tr><th>{html.escape(style(name)[0])}</th>{row}</tr>")
     words = metric_words(found.alignment)
     explanations = "".join(
         f"<li><b>{METRIC_TITLES[key].split()[0]}</b> {html.escape(words[key])}.</li>"
