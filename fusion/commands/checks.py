@@ -27,12 +27,12 @@ from stario.fusion.commands.options import (
     OptionalPathsArgument,
     PathsArgument,
     ReadingOptions,
-    backend_named,
     changed,
     expand_option_groups,
     refuse_unused,
     refuse_unused_sources,
 )
+from stario.fusion.commands.values import backend_named
 
 if TYPE_CHECKING:
     from stario.fusion.backends import BackendName

@@ -25,10 +25,10 @@ from stario.fusion.commands.options import (
     RunsOption,
     changed,
     expand_option_groups,
-    names_in,
     refuse_unused,
     refuse_unused_sources,
 )
+from stario.fusion.commands.values import names_in
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:

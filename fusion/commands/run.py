@@ -19,9 +19,9 @@ from stario.fusion.commands.options import (
     PathsArgument,
     ReadingOptions,
     ReportOption,
-    backend_named,
     expand_option_groups,
 )
+from stario.fusion.commands.values import backend_named
 
 if TYPE_CHECKING:
     from stario.fusion.fixes import Fix
