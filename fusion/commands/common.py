@@ -15,10 +15,10 @@ from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
+    from stario.fusion.evaluation.compare import Comparison
     from stario.fusion.recording import Progress
-    from stario.fusion.state import Track
     from stario.sequences.datasets.batch import Skipped
-    from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+    from stario.sequences.sequence import ImuSequence
 
 Result = TypeVar("Result")
 
@@ -158,22 +158,11 @@ _EXPLAINED = (
 """Metrics explained below a table."""
 
 
-def track_table(
-    metrics: dict[str, dict[str, float | None]],
-    time: FloatArray,
-    truth: Trajectory | None,
-    words: dict[str, str],
-) -> str:
-    """Format a table with a row of known metrics per track, and the meaning of its columns.
-
-    Args:
-        metrics: metrics by track.
-        time: (N,) times of a track [s].
-        truth: ground truth, or None.
-        words: meaning of each metric.
-    """
+def track_table(found: Comparison) -> str:
+    """Format a table with a row of known metrics per track, and the meaning of its columns."""
     from stario.fusion.evaluation.compare import METRIC_TITLES
 
+    metrics, truth, words = found.metrics, found.sequence.truth, found.words
     known = {
         key for values in metrics.values() for key, value in values.items() if value is not None
     }
@@ -187,15 +176,16 @@ def track_table(
     lines += [f"{key}: {words[key]}." for key in explained]
     if truth is None:
         return "\n".join(lines)
-    covered = float(truth.covers(time).mean())
+    covered = float(truth.covers(found.tracks[found.main].time).mean())
     if covered < _FULL_COVERAGE:
         lines.append(f"The truth covers {covered:.0%} of the track; metrics refer to that part.")
     return "\n".join(lines)
 
 
-def tracked_words(sequence: ImuSequence, track: Track) -> str:
-    """Return how much of a recording a track covers: less where a sensor stopped, for example."""
-    recorded, tracked = sequence.duration, float(track.time[-1] - track.time[0])
+def tracked_words(found: Comparison) -> str:
+    """Return how much of a recording is tracked: less where a sensor stopped, for example."""
+    time = found.tracks[found.main].time
+    recorded, tracked = found.sequence.duration, float(time[-1] - time[0])
     if recorded - tracked < _UNTRACKED:
         return f"{recorded:.1f} s"
     return f"{tracked:.1f} of {recorded:.1f} s tracked"

@@ -92,15 +92,11 @@ def compare(
 
 
 def _lines(comparison: Comparison) -> list[str]:
-    from stario.fusion.evaluation.compare import metric_words
-
-    sequence = comparison.sequence
-    path = comparison.path_m
+    sequence, path = comparison.sequence, comparison.path_m
     length = f"truth: {sequence.truth_summary()}" if path is None else f"{path:.1f} m"
-    track, words = comparison.tracks["ekf"], metric_words(comparison.alignment)
     lines = [
-        f"{sequence.name}: {tracked_words(sequence, track)}, {length}",
-        track_table(comparison.metrics, track.time, sequence.truth, words),
+        f"{sequence.name}: {tracked_words(comparison)}, {length}",
+        track_table(comparison),
     ]
     if sequence.truth is None and sequence.positions is not None:
         from stario.fusion.evaluation.known_positions import position_error_words

@@ -70,7 +70,7 @@ def _run(
     """Write one recording's track; return its record and a summary."""
     import numpy as np
 
-    from stario.fusion.evaluation.compare import Comparison, alignment_with, measure, metric_words
+    from stario.fusion.evaluation.compare import Comparison, alignment_with, measure
     from stario.fusion.evaluation.known_positions import position_error_words
     from stario.fusion.evaluation.results import write_run
     from stario.fusion.fix_file import check_within
@@ -81,10 +81,8 @@ def _run(
     with progress_bar(f"run {sequence.name}") as progress:
         track = navigator.run(sequence, progress, fixes)
     warn_of_truth(sequence)
-    truth, backend = sequence.truth, navigator.backend
-    alignment = alignment_with(fixes)
+    backend, alignment = navigator.backend, alignment_with(fixes)
     metrics = measure(track, sequence, alignment)
-    words = metric_words(alignment)
     found = Comparison(sequence, {backend: track}, {backend: metrics}, alignment)
     written = write_run(folder, found, navigator.config)
     if report:
@@ -96,23 +94,19 @@ def _run(
 
         written.append(write_view(folder / "track.rrd", found))
         open_view(written[-1])
-    duration, length = tracked_words(sequence, track), track.trajectory.path_length()
+    length = track.trajectory.path_length()
     ends = np.linalg.norm(np.diff(track.trajectory.position_W[[0, -1], :2], axis=0))
     lines = [
         sequence.summary(),
-        f"{sequence.name}: {duration}, {length:.1f} m travelled (estimated), "
+        f"{sequence.name}: {tracked_words(found)}, {length:.1f} m travelled (estimated), "
         f"ending {ends:.1f} m from the start",
     ]
-    if truth is not None:
-        lines.append(track_table({backend: metrics}, track.time, truth, words))
+    if sequence.truth is not None:
+        lines.append(track_table(found))
     elif sequence.positions is not None:
         lines.append(position_error_words(track, sequence.positions))
     if track.health is not None:
         lines += [*track.health.lines(), *health_lines(track.health)]
     lines.append(f"{len(written)} files in {folder}")
-    record: dict[str, object] = {
-        "recording": sequence.name,
-        backend: metrics,
-        "folder": str(folder),
-    }
-    return record, "\n".join(lines)
+    record: dict[str, object] = {"recording": sequence.name, backend: metrics}
+    return record | {"folder": str(folder)}, "\n".join(lines)
