@@ -48,8 +48,7 @@ def true_poses(sequence: ImuSequence) -> Trajectory:
 def inertial_track(preprocessed: PreprocessedRecording, config: NavigatorConfig) -> Track:
     """Integrate the IMU alone (strapdown) from the levelled start at rest, with zero biases."""
     began = perf_counter()
-    start = preprocessed.front_end.start
-    assert start is not None  # observe() rejects recordings without one
+    start = preprocessed.start
     zero = np.zeros(3)
     R, v, p = start.R_WB, zero, zero
     rows = [(start.time, R, v, p)]
@@ -73,8 +72,7 @@ def inertial_track(preprocessed: PreprocessedRecording, config: NavigatorConfig)
 def network_track(preprocessed: PreprocessedRecording) -> Track:
     """Chain the network's displacements along the attitude levelled from the IMU, without truth."""
     began = perf_counter()
-    start = preprocessed.front_end.start
-    assert start is not None  # observe() rejects recordings without one
+    start = preprocessed.start
     time = np.array([start.time, *(e.stop for e in preprocessed.intervals)])
     attitude = np.stack([start.R_WB, *(e.R_NB for e in preprocessed.intervals)])
     windows = [
