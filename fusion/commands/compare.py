@@ -12,8 +12,6 @@ from stario.fusion.commands.common import (
     exit_if_skipped,
     print_result,
     progress_bar,
-    track_table,
-    tracked_words,
 )
 from stario.fusion.commands.options import (
     EstimatorOptions,
@@ -92,6 +90,8 @@ def compare(
 
 
 def _lines(comparison: Comparison) -> list[str]:
+    from stario.fusion.evaluation.track_table import track_table, tracked_words
+
     sequence, path = comparison.sequence, comparison.path_m
     length = f"truth: {sequence.truth_summary()}" if path is None else f"{path:.1f} m"
     lines = [

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import process_each, progress_bar, track_table, tracked_words
+from stario.fusion.commands.common import process_each, progress_bar
 from stario.fusion.commands.options import (
     BackendOption,
     EstimatorOptions,
@@ -73,6 +73,7 @@ def _run(
     from stario.fusion.evaluation.compare import Comparison, alignment_with, measure
     from stario.fusion.evaluation.known_positions import position_error_words
     from stario.fusion.evaluation.results import write_run
+    from stario.fusion.evaluation.track_table import track_table, tracked_words
     from stario.fusion.fix_file import check_within
     from stario.fusion.report.health import health_lines
     from stario.sequences.truth.problems import warn_of_truth
