@@ -84,14 +84,6 @@ METRIC_WORDS = {
 _FITTED = "least squares in yaw and position over all poses, because fixes define the frame"
 
 
-def alignment_with(fixes: Sequence[Fix]) -> Alignment:
-    """Return how a track is aligned with the truth.
-
-    Where fixes define the frame, the first pose's yaw is the least certain one.
-    """
-    return "yaw" if fixes else "first"
-
-
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Tracks of one recording and their metrics.
@@ -178,7 +170,15 @@ def compare(
             log.warning("no track with true attitude: %s", error)
     tracks["ekf"] = navigator.track(preprocessed, progress, fixes)
     tracks["graph"] = Navigator(model, config, backend="graph").track(preprocessed, fixes=fixes)
-    alignment = alignment_with(fixes)
+    return measured(sequence, tracks, fixes)
+
+
+def measured(
+    sequence: ImuSequence, tracks: dict[str, Track], fixes: Sequence[Fix] = ()
+) -> Comparison:
+    """Return tracks of a recording, computed with these fixes, with their metrics."""
+    # Where fixes define the frame, the first pose's yaw is the least certain one.
+    alignment: Alignment = "yaw" if fixes else "first"
     metrics = {name: measure(track, sequence, alignment) for name, track in tracks.items()}
     return Comparison(sequence, tracks, metrics, alignment)
 
