@@ -180,8 +180,10 @@ def speed_table(report: dict[str, Any]) -> str:
         "push: {push_us_median:.1f} us (median), "
         "{push_ms:.1f} ms with a network update (99th percentile)",
     ]
-    network = "network, batch {batch}: {inference_form:.3f} ms/window "
-    network += "(as trained: {training_form:.3f}), {threads} threads"
+    network = (
+        "network, batch {batch}: {inference_form:.3f} ms/window "
+        "(as trained: {training_form:.3f}), {threads} threads"
+    )
     push_ms = report["push_us_with_update_p99"] / 1e3
     return "\n".join(
         [
