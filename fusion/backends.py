@@ -158,10 +158,8 @@ def _filtered(
     queue: FixQueue,
     progress: Progress,
 ) -> FilteredRecording:
-    start = recording.front_end.start
-    assert start is not None  # recordings without one are refused
-    queue.start(start.time)
-    estimator = Estimator(config, start, prior)
+    queue.start(recording.start.time)
+    estimator = Estimator(config, recording.start, prior)
     filtered = FilteredRecording(estimator, [estimator.estimate()], [], [])
     pairs = zip(recording.intervals, recording.measurements, strict=True)
     for k, (interval, displacement) in enumerate(pairs):

@@ -13,7 +13,7 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.health import SampleCounts
 from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
-from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.imu.stateful import (
     Predictor,
     StatefulInference,
@@ -58,6 +58,12 @@ class PreprocessedRecording:
     front_end: FrontEnd
     seconds_front_end: float
     seconds_network: float
+
+    @property
+    def start(self) -> Start:
+        """Time and levelled attitude of the first sample."""
+        assert self.front_end.start is not None  # `preprocess` refuses recordings without one
+        return self.front_end.start
 
 
 def preprocess(

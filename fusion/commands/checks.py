@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -27,12 +28,12 @@ from stario.fusion.commands.options import (
     OptionalPathsArgument,
     PathsArgument,
     ReadingOptions,
-    backend_named,
     changed,
     expand_option_groups,
     refuse_unused,
     refuse_unused_sources,
 )
+from stario.fusion.commands.values import backend_named
 
 if TYPE_CHECKING:
     from stario.fusion.backends import BackendName
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
 
-    Judge = Callable[[Predictor, ImuSequence, NavigatorConfig, str], Sequence[Any]]
+Result = TypeVar("Result")
 
 _WALKS, _SECONDS, _SPLIT = 20, 120.0, "validation"
 
@@ -192,14 +193,9 @@ def fusion(
     from stario.fusion.evaluation.checks.fusion_gain import fusion_gain, fusion_gain_table
 
     backends: tuple[BackendName, ...] = ("ekf", "graph") if graph else ("ekf",)
-    _judge_each(
-        "check fusion",
-        (reading, paths, estimating, by, as_json),
-        lambda model, recording, config, group: [
-            fusion_gain(model, recording, config, group, backends)
-        ],
-        fusion_gain_table,
-    )
+    judge = partial(fusion_gain, backends=backends)
+    gains, skipped = _judge_each("check fusion", reading, paths, estimating, by, judge)
+    _print_table(gains, skipped, fusion_gain_table, as_json)
 
 
 @expand_option_groups
@@ -216,15 +212,9 @@ def fixes(
     """Supply periodic true positions; check that position and yaw errors match their sigmas."""
     from stario.fusion.evaluation.checks.with_fixes import fixes_table, track_with_fixes
 
-    chosen = backend_named(backend)
-    _judge_each(
-        "check fixes",
-        (reading, paths, estimating, by, as_json),
-        lambda model, recording, config, group: [
-            track_with_fixes(model, recording, config, group, every, sigma, chosen)
-        ],
-        fixes_table,
-    )
+    judge = partial(track_with_fixes, every=every, sigma=sigma, backend=backend_named(backend))
+    found, skipped = _judge_each("check fixes", reading, paths, estimating, by, judge)
+    _print_table(found, skipped, fixes_table, as_json)
 
 
 @expand_option_groups
@@ -238,29 +228,37 @@ def gaps(
     """Remove 0.1 s at one of six instants or 5 % of the samples; report how far the end moves."""
     from stario.fusion.evaluation.checks.sample_loss import end_shift_table, end_shifts
 
-    _judge_each(
-        "check gaps", (reading, paths, estimating, by, as_json), end_shifts, end_shift_table
-    )
+    shifts, skipped = _judge_each("check gaps", reading, paths, estimating, by, end_shifts)
+    _print_table([shift for each in shifts for shift in each], skipped, end_shift_table, as_json)
 
 
 def _judge_each(
     title: str,
-    options: tuple[ReadingOptions, Sequence[Path], EstimatorOptions, str, bool],
-    judge: Judge,
-    table: Callable[[Sequence[Any]], str],
-) -> None:
-    """Evaluate each recording, print a table or JSON, and exit with 1 if any was skipped."""
+    reading: ReadingOptions,
+    paths: Sequence[Path],
+    estimating: EstimatorOptions,
+    by: str,
+    judge: Callable[[Predictor, ImuSequence, NavigatorConfig, str], Result],
+) -> tuple[list[Result], list[Skipped]]:
+    """Judge each recording as one of its group; return the results and what was skipped."""
     from stario.fusion.evaluation.judging.judge import check_by, labels
 
-    reading, paths, estimating, by, as_json = options
     grouping = check_by(by)
     model, settings = estimating.network(), estimating.settings()
 
-    def judged(path: Path, sequence: ImuSequence) -> Sequence[Any]:
+    def judged(path: Path, sequence: ImuSequence) -> Result:
         return judge(model, sequence, settings, labels(path, sequence.attributes)[grouping])
 
-    results, skipped = map_recordings(title, reading, paths, judged)
-    found = [result for group in results for result in group]
+    return map_recordings(title, reading, paths, judged)
+
+
+def _print_table(
+    found: Sequence[Any],
+    skipped: Sequence[Skipped],
+    table: Callable[[Sequence[Any]], str],
+    as_json: bool,
+) -> None:
+    """Print results as a table or JSON, and exit with 1 if any recording was skipped."""
     if as_json or found:
         print_result(as_json, [asdict(result) for result in found], table(found) if found else "")
     exit_if_skipped(skipped)

@@ -1,4 +1,4 @@
-"""Shared parts of the commands: iteration over recordings, progress, tables and JSON."""
+"""Shared parts of the commands: iteration over recordings, what they skip, progress, JSON."""
 
 from __future__ import annotations
 
@@ -11,32 +11,17 @@ from typing import TYPE_CHECKING, TypeVar
 import typer
 
 from stario.fusion.commands.options import ReadingOptions
-from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.fusion.recording import Progress
-    from stario.fusion.state import Track
     from stario.sequences.datasets.batch import Skipped
-    from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+    from stario.sequences.sequence import ImuSequence
 
 Result = TypeVar("Result")
 
 _NAMED = 3
 """Number of skipped recordings with the same reason that are listed one by one."""
-
-
-def collect_results(
-    outcomes: Iterable[Result | Skipped], skipped: list[Skipped]
-) -> Iterator[Result]:
-    """Yield the results in order; append recordings that could not be used to `skipped`."""
-    from stario.sequences.datasets.batch import Skipped
-
-    for outcome in outcomes:
-        if isinstance(outcome, Skipped):
-            skipped.append(outcome)
-        else:
-            yield outcome
 
 
 def map_recordings(
@@ -46,11 +31,11 @@ def map_recordings(
     work: Callable[[Path, ImuSequence], Result],
 ) -> tuple[list[Result], list[Skipped]]:
     """Apply `work` to each recording and its path; return results and failures."""
-    from stario.sequences.datasets.batch import each
+    from stario.sequences.datasets.batch import each, without_skipped
 
     files, skipped = reading.recordings(paths)
     outcomes = each(lambda file: work(file, reading.read(file)), files, jobs=1)
-    return list(collect_results(with_bar(title, outcomes, len(files)), skipped)), skipped
+    return list(without_skipped(with_bar(title, outcomes, len(files)), skipped)), skipped
 
 
 def process_each(
@@ -73,7 +58,7 @@ def process_each(
     """
     from stario.fusion.evaluation.folders import check_folder
     from stario.fusion.evaluation.many import distinct_name
-    from stario.sequences.datasets.batch import each
+    from stario.sequences.datasets.batch import each, without_skipped
 
     files, skipped = reading.recordings(paths)
     if single and len(files) > 1:
@@ -91,7 +76,7 @@ def process_each(
             typer.echo(text)
         return record
 
-    records = list(collect_results(each(recorded, files, jobs=1), skipped))
+    records = list(without_skipped(each(recorded, files, jobs=1), skipped))
     if as_json and records:
         print_result(True, records[0] if len(files) == 1 else records)
     exit_if_skipped(skipped)
@@ -155,63 +140,6 @@ def progress_bar(title: str, total: int = 100, shown: bool = True) -> Iterator[P
             bar.update(max(0, round(share * total) - bar.n))
 
         yield advance
-
-
-_FULL_COVERAGE = 0.98
-"""Share of a track below which the coverage by ground truth is reported as partial."""
-
-_UNTRACKED = 1.5
-"""Time at a recording's ends without a track [s] below which all of it counts as tracked: a track
-starts where the attitude is known, up to a second after the first sample."""
-
-_EXPLAINED = (
-    *("ate_m", "horizontal", "alignment", "ate_fit_m", "rte_m", "pde", "aye_rad"),
-    *("nees_median", "nis_mean"),
-)
-"""Metrics explained below a table."""
-
-
-def track_table(
-    metrics: dict[str, dict[str, float | None]],
-    time: FloatArray,
-    truth: Trajectory | None,
-    words: dict[str, str],
-) -> str:
-    """Format a table with a row of known metrics per track, and the meaning of its columns.
-
-    Args:
-        metrics: metrics by track.
-        time: (N,) times of a track [s].
-        truth: ground truth, or None.
-        words: meaning of each metric.
-    """
-    from stario.fusion.evaluation.compare import METRIC_TITLES
-
-    known = {
-        key for values in metrics.values() for key, value in values.items() if value is not None
-    }
-    columns = {key: title for key, title in METRIC_TITLES.items() if key in known}
-    rows = [
-        [name, *(figure(values.get(key)) for key in columns)] for name, values in metrics.items()
-    ]
-    lines = aligned([["", *columns.values()], *rows])
-    general = () if truth is None else ("horizontal", "alignment")
-    explained = [key for key in _EXPLAINED if key in (*columns, *general)]
-    lines += [f"{key}: {words[key]}." for key in explained]
-    if truth is None:
-        return "\n".join(lines)
-    covered = float(truth.covers(time).mean())
-    if covered < _FULL_COVERAGE:
-        lines.append(f"The truth covers {covered:.0%} of the track; metrics refer to that part.")
-    return "\n".join(lines)
-
-
-def tracked_words(sequence: ImuSequence, track: Track) -> str:
-    """Return how much of a recording a track covers: less where a sensor stopped, for example."""
-    recorded, tracked = sequence.duration, float(track.time[-1] - track.time[0])
-    if recorded - tracked < _UNTRACKED:
-        return f"{recorded:.1f} s"
-    return f"{tracked:.1f} of {recorded:.1f} s tracked"
 
 
 def print_result(as_json: bool, record: object, text: str = "") -> None:

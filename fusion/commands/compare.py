@@ -9,12 +9,9 @@ from typing import TYPE_CHECKING
 import typer
 
 from stario.fusion.commands.common import (
-    collect_results,
     exit_if_skipped,
     print_result,
     progress_bar,
-    track_table,
-    tracked_words,
 )
 from stario.fusion.commands.options import (
     EstimatorOptions,
@@ -54,6 +51,7 @@ def compare(
     from stario.fusion.evaluation.results import scores_dict, write_comparison
     from stario.fusion.evaluation.summary import scores_of
     from stario.fusion.fix_file import read_fixes
+    from stario.sequences.datasets.batch import without_skipped
     from stario.sequences.lazy import optional_package
 
     if not paths:
@@ -75,7 +73,7 @@ def compare(
         outcomes = compare_recordings(
             files, model, settings, read, jobs, absolute_fixes, progress=progress
         )
-        comparisons = list(collect_results(outcomes, skipped))
+        comparisons = list(without_skipped(outcomes, skipped))
     written = write_comparison(folder, comparisons, settings) if comparisons else []
     if report:
         from stario.fusion.report.page import write_report
@@ -92,15 +90,13 @@ def compare(
 
 
 def _lines(comparison: Comparison) -> list[str]:
-    from stario.fusion.evaluation.compare import metric_words
+    from stario.fusion.evaluation.track_table import track_table, tracked_words
 
-    sequence = comparison.sequence
-    path = comparison.path_m
+    sequence, path = comparison.sequence, comparison.path_m
     length = f"truth: {sequence.truth_summary()}" if path is None else f"{path:.1f} m"
-    track, words = comparison.tracks["ekf"], metric_words(comparison.alignment)
     lines = [
-        f"{sequence.name}: {tracked_words(sequence, track)}, {length}",
-        track_table(comparison.metrics, track.time, sequence.truth, words),
+        f"{sequence.name}: {tracked_words(comparison)}, {length}",
+        track_table(comparison),
     ]
     if sequence.truth is None and sequence.positions is not None:
         from stario.fusion.evaluation.known_positions import position_error_words

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import check_new, collect_results, exit_if_skipped
+from stario.fusion.commands.common import check_new, exit_if_skipped
 from stario.fusion.commands.options import OverwriteOption, ReadingOptions, expand_option_groups
 from stario.sequences.errors import InputError, StarioError
 
@@ -96,13 +96,13 @@ def _read(
     reading: ReadingOptions, files: list[Path], skipped: list[Skipped], names: list[str]
 ) -> Iterator[ImuSequence]:
     """Yield each recording and append its name; add those that cannot be used to `skipped`."""
-    from stario.sequences.datasets.batch import each
+    from stario.sequences.datasets.batch import each, without_skipped
     from stario.sequences.datasets.convert import check_content
 
     def checked(file: Path) -> ImuSequence:
         return check_content(reading.read(file))
 
-    for sequence in collect_results(each(checked, files, jobs=1), skipped):
+    for sequence in without_skipped(each(checked, files, jobs=1), skipped):
         typer.echo(sequence.summary())
         names.append(sequence.name)
         yield sequence

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stario.fusion.commands.common import (
-    collect_results,
     exit_if_skipped,
     print_result,
     progress_bar,
+    with_bar,
 )
 from stario.fusion.commands.options import (
     DataOption,
@@ -25,10 +25,10 @@ from stario.fusion.commands.options import (
     RunsOption,
     changed,
     expand_option_groups,
-    names_in,
     refuse_unused,
     refuse_unused_sources,
 )
+from stario.fusion.commands.values import names_in
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -161,6 +161,7 @@ def _tracks(
     from stario.fusion.evaluation.many import compare_recordings
     from stario.fusion.evaluation.results import write_recording, write_summary
     from stario.fusion.evaluation.summary import Scores, scores_of, summary, summary_table
+    from stario.sequences.datasets.batch import without_skipped
 
     settings, model = estimating.settings(), estimating.network_for(jobs)
     skipped: list[Skipped] = []
@@ -169,7 +170,7 @@ def _tracks(
         outcomes = compare_recordings(
             files, model, settings, reading.read, jobs, truth_needed=True, progress=progress
         )
-        for comparison in collect_results(outcomes, skipped):
+        for comparison in without_skipped(outcomes, skipped):
             if out is not None:
                 if not recordings:
                     fresh_folder(out)
@@ -248,14 +249,8 @@ def _groups(
     paths = [entry.path for entry in recordings]
     prepared = prepared_recordings(paths, reading.read, reading.as_read(), cache_folder(), jobs)
     groups = {entry.path: entry.group for entry in recordings}
-    with progress_bar("judge", len(recordings)) as progress:
-        judged, skipped = judge(
-            prepared,
-            models,
-            groups,
-            reading.read if ekf else None,
-            lambda done: progress(done / len(recordings)),
-        )
+    shown = with_bar("judge", prepared, len(recordings))
+    judged, skipped = judge(shown, models, groups, reading.read if ekf else None)
     if not judged:
         return skipped
     found = JudgingResult(ours, theirs, rows_of(judged, grouping, ours, theirs), judged)

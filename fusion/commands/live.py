@@ -39,12 +39,9 @@ def live(
 
     model, settings = estimating.network(), estimating.settings()
     check_folder(out)
+    if lines_port is None:
+        lines_port = port + 1 if 0 < port < 65535 else 0
     server = LiveServer(
-        lambda: Navigator(model, settings),
-        out,
-        host,
-        port,
-        port + 1 if lines_port is None and 0 < port < 65535 else lines_port or 0,
-        phyphox or [],
+        lambda: Navigator(model, settings), out, host, port, lines_port, phyphox or []
     )
     server.run(started=lambda: typer.echo("\n".join(server.addresses()), err=True))

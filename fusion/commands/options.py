@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import inspect
-import json
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stario.sequences.errors import ConfigError, InputError, StarioError
+from stario.fusion.commands.values import assignment
+from stario.sequences.errors import InputError, StarioError
 
 if TYPE_CHECKING:
-    from stario.fusion.backends import BackendName
     from stario.fusion.config import NavigatorConfig
     from stario.network.model import DisplacementModel
     from stario.sequences.datasets.batch import Skipped
@@ -279,52 +278,6 @@ def expand_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     flat.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     flat.__annotations__ = {option.name: option.annotation for option in options}
     return flat
-
-
-def backend_named(name: str) -> BackendName:
-    """Return the back end of this name.
-
-    Raises:
-        InputError: there is none.
-    """
-    from stario.fusion.backends import BACKENDS
-    from stario.sequences.arrays import check_choice
-
-    check_choice("--backend", name, BACKENDS)
-    return cast("BackendName", name)
-
-
-def recipe_values(path: Path) -> dict[str, Any]:
-    """Read the settings of a training recipe from a JSON file.
-
-    Raises:
-        ConfigError: the file cannot be read, or is not a table of settings.
-    """
-    try:
-        values = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError) as error:
-        found = "no such file" if isinstance(error, FileNotFoundError) else str(error)
-        raise ConfigError(str(path), found, "a JSON file with settings") from error
-    if not isinstance(values, dict):
-        raise ConfigError(str(path), type(values).__name__, "a table of settings")
-    return values
-
-
-def assignment(option: str, word: str, expected: str, example: str) -> tuple[str, str]:
-    """Return what is left and right of the first `=` in the value of an option.
-
-    Raises:
-        InputError: there is no `=`, or nothing on one side of it.
-    """
-    key, _, value = word.partition("=")
-    if not (key and value):
-        raise InputError(option, repr(word), expected, example)
-    return key, value
-
-
-def names_in(text: str) -> list[str]:
-    """Return the names in a comma-separated list."""
-    return [name.strip() for name in text.split(",")]
 
 
 def _attributes(words: Iterable[str]) -> dict[str, list[str]]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import process_each, progress_bar, track_table, tracked_words
+from stario.fusion.commands.common import process_each, progress_bar
 from stario.fusion.commands.options import (
     BackendOption,
     EstimatorOptions,
@@ -19,13 +19,15 @@ from stario.fusion.commands.options import (
     PathsArgument,
     ReadingOptions,
     ReportOption,
-    backend_named,
     expand_option_groups,
 )
+from stario.fusion.commands.values import backend_named
 
 if TYPE_CHECKING:
+    from stario.fusion.evaluation.compare import Comparison
     from stario.fusion.fixes import Fix
     from stario.fusion.navigator import Navigator
+    from stario.fusion.state import Track
     from stario.sequences.sequence import ImuSequence
 
 
@@ -68,24 +70,16 @@ def _run(
     view: bool,
 ) -> tuple[dict[str, object], str]:
     """Write one recording's track; return its record and a summary."""
-    import numpy as np
-
-    from stario.fusion.evaluation.compare import Comparison, alignment_with, measure, metric_words
-    from stario.fusion.evaluation.known_positions import position_error_words
+    from stario.fusion.evaluation.compare import measured
     from stario.fusion.evaluation.results import write_run
     from stario.fusion.fix_file import check_within
-    from stario.fusion.report.health import health_lines
     from stario.sequences.truth.problems import warn_of_truth
 
     check_within(fixes, sequence)
     with progress_bar(f"run {sequence.name}") as progress:
         track = navigator.run(sequence, progress, fixes)
     warn_of_truth(sequence)
-    truth, backend = sequence.truth, navigator.backend
-    alignment = alignment_with(fixes)
-    metrics = measure(track, sequence, alignment)
-    words = metric_words(alignment)
-    found = Comparison(sequence, {backend: track}, {backend: metrics}, alignment)
+    found = measured(sequence, {navigator.backend: track}, fixes)
     written = write_run(folder, found, navigator.config)
     if report:
         from stario.fusion.report.page import write_report
@@ -96,23 +90,31 @@ def _run(
 
         written.append(write_view(folder / "track.rrd", found))
         open_view(written[-1])
-    duration, length = tracked_words(sequence, track), track.trajectory.path_length()
+    lines = [*_lines(found, track), f"{len(written)} files in {folder}"]
+    record: dict[str, object] = {"recording": sequence.name, **found.metrics}
+    return record | {"folder": str(folder)}, "\n".join(lines)
+
+
+def _lines(found: Comparison, track: Track) -> list[str]:
+    """Return what was recorded, the track, its errors and its health as lines of text."""
+    import numpy as np
+
+    from stario.fusion.evaluation.known_positions import position_error_words
+    from stario.fusion.evaluation.track_table import track_table, tracked_words
+    from stario.fusion.report.health import health_lines
+
+    sequence = found.sequence
+    length = track.trajectory.path_length()
     ends = np.linalg.norm(np.diff(track.trajectory.position_W[[0, -1], :2], axis=0))
     lines = [
         sequence.summary(),
-        f"{sequence.name}: {duration}, {length:.1f} m travelled (estimated), "
+        f"{sequence.name}: {tracked_words(found)}, {length:.1f} m travelled (estimated), "
         f"ending {ends:.1f} m from the start",
     ]
-    if truth is not None:
-        lines.append(track_table({backend: metrics}, track.time, truth, words))
+    if sequence.truth is not None:
+        lines.append(track_table(found))
     elif sequence.positions is not None:
         lines.append(position_error_words(track, sequence.positions))
     if track.health is not None:
         lines += [*track.health.lines(), *health_lines(track.health)]
-    lines.append(f"{len(written)} files in {folder}")
-    record: dict[str, object] = {
-        "recording": sequence.name,
-        backend: metrics,
-        "folder": str(folder),
-    }
-    return record, "\n".join(lines)
+    return lines

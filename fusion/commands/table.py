@@ -12,11 +12,9 @@ from stario.fusion.commands.common import exit_if_skipped
 from stario.fusion.commands.options import (
     CacheOption,
     ReadingOptions,
-    assignment,
-    names_in,
-    recipe_values,
     refuse_unused,
 )
+from stario.fusion.commands.values import assignment, names_in, recipe_values
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:

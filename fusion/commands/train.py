@@ -16,7 +16,6 @@ from stario.fusion.commands.options import (
     ReadingOptions,
     changed,
     expand_option_groups,
-    recipe_values,
     refuse_unused,
 )
 from stario.fusion.commands.training_data import (
@@ -26,6 +25,7 @@ from stario.fusion.commands.training_data import (
     training_material,
     validation_material,
 )
+from stario.fusion.commands.values import recipe_values
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:

@@ -84,19 +84,6 @@ METRIC_WORDS = {
 _FITTED = "least squares in yaw and position over all poses, because fixes define the frame"
 
 
-def alignment_with(fixes: Sequence[Fix]) -> Alignment:
-    """Return how a track is aligned with the truth.
-
-    Where fixes define the frame, the first pose's yaw is the least certain one.
-    """
-    return "yaw" if fixes else "first"
-
-
-def metric_words(alignment: Alignment) -> dict[str, str]:
-    """Return the meaning of the figures of `measure`."""
-    return METRIC_WORDS | ({"alignment": _FITTED} if alignment == "yaw" else {})
-
-
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Tracks of one recording and their metrics.
@@ -115,15 +102,25 @@ class Comparison:
     alignment: Alignment = "first"
 
     @property
+    def main(self) -> str:
+        """Name of the track that words and innovations are about: the EKF's, or a run's graph's."""
+        return "ekf" if "ekf" in self.tracks else "graph"
+
+    @property
+    def words(self) -> dict[str, str]:
+        """Meaning of the metrics."""
+        return METRIC_WORDS | ({"alignment": _FITTED} if self.alignment == "yaw" else {})
+
+    @property
     def path_m(self) -> float | None:
-        """Length of the true path [m] that the filter's track is compared with; None without truth.
+        """Length of the true path [m] that the main track is compared with; None without truth.
 
         Like the errors it is horizontal and within the times compared.
         """
         truth = self.sequence.truth
         if truth is None:
             return None
-        return evaluate_track(self.tracks["ekf"].trajectory, truth, alignment="none").path_m
+        return evaluate_track(self.tracks[self.main].trajectory, truth, alignment="none").path_m
 
     def as_dict(self) -> dict[str, object]:
         """Return the recording's entry in `metrics.json`."""
@@ -173,7 +170,15 @@ def compare(
             log.warning("no track with true attitude: %s", error)
     tracks["ekf"] = navigator.track(preprocessed, progress, fixes)
     tracks["graph"] = Navigator(model, config, backend="graph").track(preprocessed, fixes=fixes)
-    alignment = alignment_with(fixes)
+    return measured(sequence, tracks, fixes)
+
+
+def measured(
+    sequence: ImuSequence, tracks: dict[str, Track], fixes: Sequence[Fix] = ()
+) -> Comparison:
+    """Return tracks of a recording, computed with these fixes, with their metrics."""
+    # Where fixes define the frame, the first pose's yaw is the least certain one.
+    alignment: Alignment = "yaw" if fixes else "first"
     metrics = {name: measure(track, sequence, alignment) for name, track in tracks.items()}
     return Comparison(sequence, tracks, metrics, alignment)
 

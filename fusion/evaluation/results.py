@@ -7,11 +7,10 @@ from dataclasses import asdict
 from pathlib import Path
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.compare import METRIC_WORDS, Comparison, metric_words
+from stario.fusion.evaluation.compare import METRIC_WORDS, Comparison
 from stario.fusion.evaluation.folders import fresh_folder
 from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.evaluation.summary import Scores, scores_of
-from stario.fusion.state import Track
 from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.plan import plan_view
 from stario.sequences.drawing.plots import error_over_time, innovations
@@ -33,15 +32,15 @@ def write_run(folder: Path, run: Comparison, config: NavigatorConfig) -> list[Pa
     fresh_folder(folder)
     [track] = run.tracks.values()
     written = _track_files(folder, run)
-    words = metric_words(run.alignment)
+    metrics = {"recording": run.sequence.name, **run.metrics, "conventions": run.words}
     for file, content in (
-        ("metrics.json", {"recording": run.sequence.name, **run.metrics, "conventions": words}),
+        ("metrics.json", metrics),
         ("config.json", asdict(config)),
         ("health.json", asdict(track.health) if track.health else None),
     ):
         write_json(folder / file, content)
         written.append(folder / file)
-    return written + _figures(folder, run, track)
+    return written + _figures(folder, run)
 
 
 def write_comparison(
@@ -83,7 +82,7 @@ def write_recording(folder: Path, comparison: Comparison) -> list[Path]:
     if truth is not None:
         write_tum(inner / "truth.tum", truth)
         written.append(inner / "truth.tum")
-    return written + _figures(inner, comparison, comparison.tracks["ekf"])
+    return written + _figures(inner, comparison)
 
 
 def scores_dict(recordings: Sequence[Scores]) -> dict[str, object]:
@@ -103,9 +102,10 @@ def _track_files(folder: Path, found: Comparison) -> list[Path]:
     return written
 
 
-def _figures(folder: Path, found: Comparison, track: Track) -> list[Path]:
-    """Write plan and errors of all tracks, and the innovations of one."""
+def _figures(folder: Path, found: Comparison) -> list[Path]:
+    """Write plan and errors of all tracks, and the innovations of the main one."""
     name, truth, tracks = found.sequence.name, found.sequence.truth, found.aligned()
+    track = found.tracks[found.main]
     figures = {"plan.png": plan_view(tracks, truth, name, shown_positions(found.sequence, track))}
     if truth is not None:
         shown = {k: v for k, v in tracks.items() if k != "inertial"}

@@ -14,7 +14,6 @@ from stario.fusion.evaluation.compare import (
     TRACKS,
     Comparison,
     Metrics,
-    metric_words,
 )
 from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.sequence import FloatArray
@@ -50,8 +49,8 @@ class Scores:
 
 def scores_of(comparison: Comparison) -> Scores:
     """Return the figures of a comparison."""
-    words = metric_words(comparison.alignment)
-    return Scores(comparison.sequence.name, comparison.metrics, comparison.as_dict(), words)
+    name, record = comparison.sequence.name, comparison.as_dict()
+    return Scores(name, comparison.metrics, record, comparison.words)
 
 
 def summary(recordings: Sequence[Scores]) -> dict[str, object]:
@@ -94,11 +93,5 @@ def _cell(
 
 
 def _known_values(recordings: Sequence[Scores], track: str, metric: str) -> FloatArray:
-    values = [_value(scores, track, metric) for scores in recordings]
-    return np.array([value for value in values if value is not None])
-
-
-def _value(scores: Scores, track: str, metric: str) -> float | None:
-    """Return a figure; None if unknown."""
-    value = scores.metrics.get(track, {}).get(metric)
-    return value if value is not None and math.isfinite(value) else None
+    values = [scores.metrics.get(track, {}).get(metric) for scores in recordings]
+    return np.array([value for value in values if value is not None and math.isfinite(value)])

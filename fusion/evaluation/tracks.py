@@ -26,6 +26,7 @@ from stario.sequences.windows import (
     WINDOW_SAMPLES,
     WINDOW_SECONDS,
     clean_samples,
+    cut_windows,
     headings_at,
     imu_in_world,
     runs,
@@ -47,8 +48,7 @@ def true_poses(sequence: ImuSequence) -> Trajectory:
 def inertial_track(preprocessed: PreprocessedRecording, config: NavigatorConfig) -> Track:
     """Integrate the IMU alone (strapdown) from the levelled start at rest, with zero biases."""
     began = perf_counter()
-    start = preprocessed.front_end.start
-    assert start is not None  # observe() rejects recordings without one
+    start = preprocessed.start
     zero = np.zeros(3)
     R, v, p = start.R_WB, zero, zero
     rows = [(start.time, R, v, p)]
@@ -72,8 +72,7 @@ def inertial_track(preprocessed: PreprocessedRecording, config: NavigatorConfig)
 def network_track(preprocessed: PreprocessedRecording) -> Track:
     """Chain the network's displacements along the attitude levelled from the IMU, without truth."""
     began = perf_counter()
-    start = preprocessed.front_end.start
-    assert start is not None  # observe() rejects recordings without one
+    start = preprocessed.start
     time = np.array([start.time, *(e.stop for e in preprocessed.intervals)])
     attitude = np.stack([start.R_WB, *(e.R_NB for e in preprocessed.intervals)])
     windows = [
@@ -168,8 +167,7 @@ def _true_windows(
     starts = starts[bad_before[starts + WINDOW_SAMPLES] == bad_before[starts]]
     if len(starts) == 0:
         raise InputError(f"{sequence.name}: truth", "no second without gaps", "at least one")
-    rows = starts[:, None] + np.arange(WINDOW_SAMPLES)
-    windows = world.imu[rows].transpose(0, 2, 1)
+    windows = cut_windows(world.imu, starts)
     return world.time[starts], windows, headings_at(world.facing, starts)
 
 

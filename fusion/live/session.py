@@ -67,7 +67,7 @@ class Session:
         self._first_ns = self._newest_ns = -1
         self._health_time = -math.inf
         self.drawn = DisplayedTrack(revision=self.drawn.revision + 1)
-        self.problem = ""
+        self._push_error = ""
         self.words: list[dict[str, str]] = []
         self._unwritten: tuple[list[Sample], list[Field]] = [], []
         self.samples = self.fixes = self._delayed = self._stray = 0
@@ -96,13 +96,14 @@ class Session:
         self.received, self._factor = received, accel_factor
         if not self.running:
             return 0
-        if self._is_of_previous(batch) and batch.number >= 0 and _middle(batch) < self._opened_ns:
-            self._delayed += len(batch.readings)
-            return 0
-        if self._is_of_previous(batch) and batch.recording:
-            found = f"samples of two recordings in turn from {self.device!r}"
-            fix = "give each phone a name of its own"
-            raise InputError("device", found, "one at a time", fix)
+        if self._is_of_previous(batch):
+            if batch.number >= 0 and _middle(batch) < self._opened_ns:
+                self._delayed += len(batch.readings)
+                return 0
+            if batch.recording:
+                found = f"samples of two recordings in turn from {self.device!r}"
+                fix = "give each phone a name of its own"
+                raise InputError("device", found, "one at a time", fix)
         self._order.add(batch, received)
         return self._process_ready(received)
 
@@ -187,15 +188,6 @@ class Session:
 
     def status(self) -> dict[str, Any]:
         """Return what the page shows next to the track."""
-        problem = self.problem
-        if not problem and self._merger.missing:
-            problem = f"no samples of {self._merger.missing}: enable it in the logger"
-        if not problem and self._factor * self._merger.upward < -_CERTAIN:
-            other = "-m/s2" if self._factor > 0 else "m/s2"
-            problem = (
-                "the accelerometer points down where the phone's own attitude points up, as on an "
-                f"iPhone: send to the address with accel_unit={other}"
-            )
         return {
             "id": self.device,
             "running": self.running,
@@ -206,9 +198,23 @@ class Session:
             "fixes": self.fixes,
             "dropped": self._dropped(),
             "file": None if self.path is None else self.path.name,
-            "problem": problem,
+            "problem": self._problem(),
             "health": self.words,
         }
+
+    def _problem(self) -> str:
+        """Return what keeps the track from being right, in words; empty if nothing does."""
+        if self._push_error:
+            return self._push_error
+        if self._merger.missing:
+            return f"no samples of {self._merger.missing}: enable it in the logger"
+        if self._factor * self._merger.upward < -_CERTAIN:
+            other = "-m/s2" if self._factor > 0 else "m/s2"
+            return (
+                "the accelerometer points down where the phone's own attitude points up, as on an "
+                f"iPhone: send to the address with accel_unit={other}"
+            )
+        return ""
 
     def _dropped(self) -> dict[str, int]:
         dropped = self._merger.dropped
@@ -239,11 +245,11 @@ class Session:
         try:
             state = self._navigator.push(time, gyro, accel)
         except InputError as error:
-            self.problem = str(error)
+            self._push_error = str(error)
             return
         if state is None:
             return
-        self.problem = ""
+        self._push_error = ""
         self.drawn.add(state)
         self._update_health(state.time)
 

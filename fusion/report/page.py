@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 from plotly.offline import get_plotlyjs
 
-from stario.fusion.evaluation.compare import METRIC_TITLES, Comparison, metric_words
+from stario.fusion.evaluation.compare import METRIC_TITLES, Comparison
 from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.report.figures import map_figure, time_figure
 from stario.fusion.report.health import Finding, findings
 from stario.fusion.report.panels import bias_panels, innovation_panels, motion_panels, style
 from stario.fusion.report.series import Series, track_series, trajectory_series
 from stario.fusion.state import Track
+from stario.sequences.drawing.text_table import figure
 from stario.sequences.files import atomic_write
 from stario.sequences.sequence import ImuSequence, PositionTrack
 
@@ -49,7 +50,7 @@ def write_report(path: Path, found: Comparison) -> Path:
         for name, aligned in found.aligned().items()
     }
     true_series = None if truth is None else trajectory_series(truth, start)
-    main = "ekf" if "ekf" in tracks else "graph"  # whose facts, health and innovations are shown
+    main = found.main
     # The inertial-only track is kilometres off within a minute: no axis fits it and the others.
     drawn = {name: s for name, s in series.items() if name != "inertial"}
     panels = motion_panels(drawn, true_series) + bias_panels(main, series[main])
@@ -149,13 +150,10 @@ def _table(found: Comparison) -> str:
     head = "".join(f"<th>{METRIC_TITLES[key]}</th>" for key in _DIGITS)
     rows = []
     for name, figures in found.metrics.items():
-        cells = []
-        for key, digits in _DIGITS.items():
-            value = figures.get(key)
-            finite = value is not None and np.isfinite(value)
-            cells.append(f"<td>{value:.{digits}f}</td>" if finite else "<td>-</td>")
-        rows.append(f"<tr><th>{html.escape(style(name)[0])}</th>{''.join(cells)}</tr>")
-    words = metric_words(found.alignment)
+        cells = (figure(figures.get(key), f".{digits}f") for key, digits in _DIGITS.items())
+        row = "".join(f"<td>{cell}</td>" for cell in cells)
+        rows.append(f"<tr><th>{html.escape(style(name)[0])}</th>{row}</tr>")
+    words = found.words
     explanations = "".join(
         f"<li><b>{METRIC_TITLES[key].split()[0]}</b> {html.escape(words[key])}.</li>"
         for key in _DIGITS

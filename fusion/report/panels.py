@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,9 +21,6 @@ _DASHES = {"ekf": "solid", "graph": "dash", "network": "dot", "network_true_atti
 _MAX_INNOVATIONS = 1500
 _MAX_PAUSE = 1.0
 """Longest time between updates [s] across which the innovations' band is drawn."""
-
-Column = Callable[[Series], FloatArray | None]
-"""Function from a track to the column that a panel draws."""
 
 
 class Panel(NamedTuple):
@@ -45,22 +42,18 @@ def style(name: str) -> tuple[str, str, str]:
 def motion_panels(tracks: Mapping[str, Series], truth: Series | None) -> list[Panel]:
     """Return panels of height, speed and yaw, and of position error if there is ground truth."""
     shown = dict(tracks) if truth is None else {TRUTH: truth, **tracks}
-    panels = [] if truth is None else [_error_panel(tracks, truth)]
-    columns: tuple[tuple[str, str, Column, Column], ...] = (
-        ("Height [m]", "m", lambda s: s.position[:, 2], lambda s: s.height_sigma),
-        ("Speed [m/s]", "m/s", lambda s: s.speed, lambda s: s.speed_sigma),
-        ("Yaw, unwrapped [deg]", "deg", lambda s: s.yaw, lambda s: s.yaw_sigma),
-    )
-    for title, unit, value_of, sigma_of in columns:
-        traces = []
-        for name, series in shown.items():
-            value, sigma = value_of(series), sigma_of(series)
-            assert value is not None  # only a sigma may be unknown
-            if title.startswith("Yaw"):
-                value = value + _whole_turns(series, next(iter(shown.values())))
-            traces += _curve(name, series.time, value, unit, sigma)
-        panels.append(Panel(f"{title}, band: 3 sigma", traces, {"range": _limits(traces)}))
-    return panels
+    first = next(iter(shown.values()))
+    height, speed, yaw = [], [], []
+    for name, s in shown.items():
+        height += _curve(name, s.time, s.position[:, 2], "m", s.height_sigma)
+        speed += _curve(name, s.time, s.speed, "m/s", s.speed_sigma)
+        yaw += _curve(name, s.time, s.yaw + _whole_turns(s, first), "deg", s.yaw_sigma)
+    return [
+        *([] if truth is None else [_error_panel(tracks, truth)]),
+        _fitted("Height [m], band: 3 sigma", height),
+        _fitted("Speed [m/s], band: 3 sigma", speed),
+        _fitted("Yaw, unwrapped [deg], band: 3 sigma", yaw),
+    ]
 
 
 def bias_panels(name: str, series: Series) -> list[Panel]:
@@ -77,7 +70,7 @@ def bias_panels(name: str, series: Series) -> list[Panel]:
             value, sigma = bias[0][:, k], bias[1][:, k]
             traces += _curve(name, series.time, value, unit, sigma, (f"{label} {axis}", *look))
         words = f"{title} [{unit}]: x \u2014 y \u2013 \u2013 z \u00b7\u00b7\u00b7"
-        panels.append(Panel(words, traces, {"range": _limits(traces)}))
+        panels.append(_fitted(words, traces))
     return panels
 
 
@@ -95,16 +88,12 @@ def innovation_panels(innovations: Innovations, start: float) -> list[Panel]:
     for k, axis in enumerate("xyz"):
         residual, sigma = innovations.residual_W[rows, k], innovations.sigma[rows, k]
         ticks, edge = split_at_gaps(time, sigma[:, None], max_gap=_MAX_PAUSE)
-        traces = _band("innovation", ticks, 0.0 * edge[:, 0], edge[:, 0], FAINT)
-        traces += _dots(time, residual, gated, "m")
-        title = f"Innovation {axis} [m], band: 3 sigma"
-        panels.append(Panel(title, traces, {"range": _limits(traces)}))
+        band = _band("innovation", ticks, 0.0 * edge[:, 0], edge[:, 0], FAINT)
+        traces = [band, *_dots(time, residual, gated, "m")]
+        panels.append(_fitted(f"Innovation {axis} [m], band: 3 sigma", traces))
     nis = np.maximum(innovations.nis[rows], 1e-2)
-    ends = time[[0, -1]]
-    traces = _dots(time, nis, gated, "")
-    traces.append(_expected_nis(ends))
-    title = "NIS [1], dotted: expected 3"
-    panels.append(Panel(title, traces, {"type": "log", "dtick": 1}))
+    traces = [*_dots(time, nis, gated, ""), _expected_nis(time[[0, -1]])]
+    panels.append(Panel("NIS [1], dotted: expected 3", traces, {"type": "log", "dtick": 1}))
     return panels
 
 
@@ -130,8 +119,7 @@ def _curve(
         + ("" if sigma is None else f", sigma %{{customdata:.2g}} {unit}")
         + "<extra></extra>",
     )
-    band = [] if sigma is None else _band(name, time, value, sigma, colour)
-    return [*band, line]
+    return [line] if sigma is None else [_band(name, time, value, sigma, colour), line]
 
 
 def _error_panel(tracks: Mapping[str, Series], truth: Series) -> Panel:
@@ -147,23 +135,21 @@ def _error_panel(tracks: Mapping[str, Series], truth: Series) -> Panel:
 
 def _band(
     group: str, time: FloatArray, value: FloatArray, sigma: FloatArray, colour: str
-) -> list[go.Scatter]:
+) -> go.Scatter:
     red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
     edges = unbroken(np.column_stack([time, value - 3.0 * sigma, value + 3.0 * sigma]))
     outlines = [np.vstack([part[:, [0, 1]], part[::-1, [0, 2]], [[np.nan] * 2]]) for part in edges]
     x, y = np.vstack([np.empty((0, 2)), *outlines]).T
-    return [
-        go.Scatter(
-            x=_rounded(x),
-            y=_rounded(y),
-            mode="lines",
-            line={"width": 0},
-            hoverinfo="skip",
-            legendgroup=group,
-            fill="toself",  # each stretch between gaps on its own; "tonexty" would fill the gaps
-            fillcolor=f"rgba({red},{green},{blue},0.16)",
-        )
-    ]
+    return go.Scatter(
+        x=_rounded(x),
+        y=_rounded(y),
+        mode="lines",
+        line={"width": 0},
+        hoverinfo="skip",
+        legendgroup=group,
+        fill="toself",  # each stretch between gaps on its own; "tonexty" would fill the gaps
+        fillcolor=f"rgba({red},{green},{blue},0.16)",
+    )
 
 
 def _dots(time: FloatArray, value: FloatArray, gated: BoolArray, unit: str) -> list[go.Scatter]:
@@ -196,8 +182,8 @@ def _expected_nis(ends: FloatArray) -> go.Scatter:
     )
 
 
-def _limits(traces: Sequence[go.Scatter]) -> list[float]:
-    """Return axis limits that fit all curves, and the bands except for brief wide parts."""
+def _fitted(title: str, traces: list[go.Scatter]) -> Panel:
+    """Return a panel that fits all curves, and the bands except for brief wide parts."""
     curves = np.concatenate([t.y for t in traces if t.hoverinfo != "skip"])
     bands = np.concatenate([[np.nan], *(t.y for t in traces if t.hoverinfo == "skip")])
     low, high = np.nanmin(curves), np.nanmax(curves)
@@ -205,7 +191,7 @@ def _limits(traces: Sequence[go.Scatter]) -> list[float]:
         inner = np.nanpercentile(bands, [2.5, 97.5])
         low, high = min(low, inner[0]), max(high, inner[1])
     margin = 0.06 * max(float(high - low), 1e-3)
-    return [float(low - margin), float(high + margin)]
+    return Panel(title, traces, {"range": [float(low - margin), float(high + margin)]})
 
 
 def _whole_turns(series: Series, reference: Series) -> float:

@@ -24,7 +24,7 @@ from stario.fusion.evaluation.tables import (
 from stario.fusion.table.training import ReaderConfig
 from stario.network.model import DisplacementModel
 from stario.sequences.accuracy.metrics import Convention, align, pose_errors
-from stario.sequences.datasets.batch import Skipped, skipped
+from stario.sequences.datasets.batch import Skipped, skipped, without_skipped
 from stario.sequences.datasets.splits import ListEntry
 from stario.sequences.errors import StarioError
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -61,18 +61,17 @@ def test_errors(
     left_out: list[Skipped] = []
     paths = [entry.path for entry in test]
     outcomes = prepared_recordings(paths, reading.read, reading.options, reading.cache, 1)
-    for entry, outcome in zip(test, outcomes, strict=True):
-        if isinstance(outcome, Skipped):
-            left_out.append(outcome)
-            continue
+    groups = {entry.path: entry.group for entry in test}
+    for prepared in without_skipped(outcomes, left_out):
+        path = prepared.path
         try:
-            row, track = _recording(model, outcome, reading)
+            row, track = _recording(model, prepared, reading)
         except StarioError as error:
-            left_out.append(skipped(entry.path, error))
+            left_out.append(skipped(path, error))
             continue
-        found.append({"path": str(entry.path), "group": entry.group, **row})
+        found.append({"path": str(path), "group": groups[path], **row})
         if track is not None and len(shown) < MAX_DRAWN:
-            shown[outcome.name] = track
+            shown[prepared.name] = track
     return found, shown, left_out
 
 

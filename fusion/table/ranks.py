@@ -20,8 +20,8 @@ from stario.fusion.evaluation.judging.bootstrap import (
 )
 from stario.sequences.sequence import FloatArray
 
-Recordings = Sequence[tuple[str, str, FloatArray]]
-"""For each recording: its set, its name, (B, 2) sums of squares and counts per block."""
+Recordings = Mapping[tuple[str, str], FloatArray]
+"""(B, 2) sums of squares and counts per block, by a recording's set and name."""
 
 
 @dataclass(frozen=True)
@@ -74,19 +74,17 @@ def ranks(networks: Mapping[str, Sequence[Recordings]], against: str) -> dict[st
 
 def _common(networks: Mapping[str, Sequence[Recordings]]) -> dict[str, list[str]]:
     """Return the names of the recordings that every network has errors on, by set."""
-    runs = [run for seeds in networks.values() for run in seeds]
-    recordings = [{(stratum, name) for stratum, name, _ in run} for run in runs]
+    runs = [set(run) for seeds in networks.values() for run in seeds]
     strata: dict[str, list[str]] = {}
-    for stratum, name in sorted(set.intersection(*recordings)) if recordings else []:
+    for stratum, name in sorted(set.intersection(*runs)) if runs else []:
         strata.setdefault(stratum, []).append(name)
     return strata
 
 
 def _score(run: Recordings, common: Mapping[str, Sequence[str]]) -> float:
     """Return the mean over sets of the mean log error over their recordings."""
-    blocks = {(stratum, name): value for stratum, name, value in run}
     means = [
-        np.mean([_log_error(blocks[stratum, name].sum(axis=0)) for name in names])
+        np.mean([_log_error(run[stratum, name].sum(axis=0)) for name in names])
         for stratum, names in common.items()
     ]
     return float(np.mean(means))
@@ -94,12 +92,11 @@ def _score(run: Recordings, common: Mapping[str, Sequence[str]]) -> float:
 
 def _replicates(run: Recordings, common: Mapping[str, Sequence[str]]) -> FloatArray:
     """Return the score of every replicate (R,); draws depend only on the recordings."""
-    blocks = {(stratum, name): value for stratum, name, value in run}
     strata = []
     for s, (stratum, names) in enumerate(common.items()):
         errors = []
         for k, name in enumerate(names):
-            value = blocks[stratum, name]
+            value = run[stratum, name]
             rng = np.random.default_rng([0, s, k])
             rows = rng.integers(len(value), size=(REPLICATES, len(value)))
             errors.append(_log_error(value[rows].sum(axis=1)))

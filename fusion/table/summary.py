@@ -220,10 +220,10 @@ def _over_seeds(values: Sequence[float]) -> Mean | None:
 
 def _blocks(seeds: Mapping[int, Content], measure: str) -> list[Recordings]:
     return [
-        [
-            (recording["group"], recording["path"], np.array(recording["blocks"][measure]))
+        {
+            (recording["group"], recording["path"]): np.array(recording["blocks"][measure])
             for recording in content["recordings"]
             if recording["blocks"].get(measure)
-        ]
+        }
         for content in seeds.values()
     ]

@@ -62,6 +62,17 @@ def each(
     yield from parallel(delayed(_attempt)(work, item) for item in items)
 
 
+def without_skipped(
+    outcomes: Iterable[Result | Skipped], skipped: list[Skipped]
+) -> Iterator[Result]:
+    """Yield the results of `each` in order; append the items that were skipped to `skipped`."""
+    for outcome in outcomes:
+        if isinstance(outcome, Skipped):
+            skipped.append(outcome)
+        else:
+            yield outcome
+
+
 def _attempt(work: Callable[[Item], Result], item: Item) -> Result | Skipped:
     try:
         return work(item)

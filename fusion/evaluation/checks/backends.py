@@ -178,9 +178,7 @@ def _streamed(
     preprocessed: PreprocessedRecording, config: NavigatorConfig
 ) -> tuple[Track, FloatArray]:
     """Return the newest states of the fixed-lag graph, and the processor time of each step [s]."""
-    start = preprocessed.front_end.start
-    assert start is not None  # observe() rejects recordings without one
-    estimator = FixedLagEstimator(config, start)
+    estimator = FixedLagEstimator(config, preprocessed.start)
     states, times = [estimator.nav_state()], []
     for interval, measurement in zip(
         preprocessed.intervals, preprocessed.measurements, strict=True

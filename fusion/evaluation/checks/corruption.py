@@ -37,9 +37,9 @@ def faults(duration: float) -> list[Fault]:
     half, block = 0.5 * duration, 5.0 / duration
     return [
         Fault("none"),
-        Fault("network off by 1 m for 5 s", None, partial(_offset_block, share=block)),
-        Fault("5 % of windows off by 2 m", None, _outliers),
-        Fault("covariance 100 times too small", None, _overconfident),
+        Fault("network off by 1 m for 5 s", modify_predictions=partial(_offset_block, share=block)),
+        Fault("5 % of windows off by 2 m", modify_predictions=_outliers),
+        Fault("covariance 100 times too small", modify_predictions=_overconfident),
         *(Fault(f"gap of {length:g} s", gap(half, length)) for length in (0.1, 1.0, 3.0)),
         *(Fault(f"{share:.0%} of samples dropped", drops(share)) for share in (0.05, 0.2)),
         *(Fault(f"{rate:g} Hz", partial(_resampled, rate=rate)) for rate in (190.0, 500.0)),
@@ -48,8 +48,8 @@ def faults(duration: float) -> list[Fault]:
             Fault(f"one NaN in {field}", partial(_one_nan, field=field))
             for field in ("time", "gyro", "accel")
         ),
-        Fault("one NaN from the network", None, partial(_nan_prediction, which=0)),
-        Fault("one NaN in the covariance", None, partial(_nan_prediction, which=1)),
+        Fault("one NaN from the network", modify_predictions=partial(_nan_prediction, which=0)),
+        Fault("one NaN in the covariance", modify_predictions=partial(_nan_prediction, which=1)),
         Fault("1 % duplicated, 1 % swapped", _reordered),
         Fault("three wild timestamps", _wild_times),
         Fault("ten spikes", _spikes),

@@ -27,7 +27,7 @@ from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.state import Track
 from stario.sequences.accuracy.metrics import align, evaluate_track
 from stario.sequences.attitude.rotations import about_z, yaw_of
-from stario.sequences.drawing.text_table import aligned
+from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -128,7 +128,7 @@ def fault_table(results: Sequence[FaultResult]) -> str:
     rows = [["fault", "back end", "ATE without [m]", "with [m]", "end [m]", "sigma [m]"]]
     for r in results:
         figures = (r.error_without, r.error_with, r.end_error, r.end_sigma)
-        rows.append([r.fault, r.backend, *("-" if math.isnan(v) else f"{v:.3f}" for v in figures)])
+        rows.append([r.fault, r.backend, *map(figure, figures)])
     reports = [("" if r.finite else "NOT FINITE, ") + r.reported for r in results]
     lines = zip(aligned(rows), ["reported", *reports], strict=True)
     return "\n".join(f"{line}   {words}" for line, words in lines)

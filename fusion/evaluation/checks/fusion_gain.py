@@ -71,8 +71,6 @@ def fusion_gain(
     if truth is None and sequence.positions is None:
         raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
     preprocessed = Navigator(model, config).observe(sequence)
-    tracks = {name: Navigator(model, config, backend=name).track(preprocessed) for name in backends}
-    figures = {name: measure(track, sequence) for name, track in tracks.items()}
     network_m = _error(measure(network_track(preprocessed), sequence))
     if math.isnan(network_m):
         raise InputError(
@@ -80,6 +78,8 @@ def fusion_gain(
             f"fewer than {MIN_POSITIONS} within the track",
             f"{MIN_POSITIONS} or more",
         )
+    tracks = {name: Navigator(model, config, backend=name).track(preprocessed) for name in backends}
+    figures = {name: measure(track, sequence) for name, track in tracks.items()}
     first = backends[0]
     yaw_error = yaw_sigma = math.nan
     if truth is not None:

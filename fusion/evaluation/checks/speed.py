@@ -127,9 +127,9 @@ def speed_report(model: DisplacementModel) -> dict[str, Any]:
     }
 
 
-def windows_speed(seconds: float = 600.0) -> dict[str, float]:
+def windows_speed() -> dict[str, float]:
     """Time reading training windows from a CSV and from the cache, in s per hour of data."""
-    sequence = simulate_imu(generate_walk(DEMONSTRATION_SEED, seconds), 200.0, PHONE_IMU)
+    sequence = simulate_imu(generate_walk(DEMONSTRATION_SEED, duration=600.0), 200.0, PHONE_IMU)
     hours = sequence.duration / 3600.0
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "walk.csv"
@@ -180,8 +180,10 @@ def speed_table(report: dict[str, Any]) -> str:
         "push: {push_us_median:.1f} us (median), "
         "{push_ms:.1f} ms with a network update (99th percentile)",
     ]
-    network = "network, batch {batch}: {inference_form:.3f} ms/window "
-    network += "(as trained: {training_form:.3f}), {threads} threads"
+    network = (
+        "network, batch {batch}: {inference_form:.3f} ms/window "
+        "(as trained: {training_form:.3f}), {threads} threads"
+    )
     push_ms = report["push_us_with_update_p99"] / 1e3
     return "\n".join(
         [

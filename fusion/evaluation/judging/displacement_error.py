@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -80,6 +81,36 @@ class RecordingErrors:
     blocks: dict[str, FloatArray]
 
 
+class _AtTicks(NamedTuple):
+    """Track and truth (n,) at the ticks of a piece, and the truth's breaks (n,) before each."""
+
+    track: Complex
+    truth: Complex
+    breaks: np.ndarray
+
+    def unbroken(self, span: int) -> BoolArray:
+        """Return whether the `span` ticks after each tick (n - span,) have neither gap nor jump."""
+        ends = np.isfinite(self.truth[:-span]) & np.isfinite(self.truth[span:])
+        return np.asarray(ends & (self.breaks[:-span] == self.breaks[span:]))
+
+    def displacements(self, seconds: int) -> tuple[Complex, Complex, np.ndarray]:
+        """Return displacements of track and truth over a span, and the ticks they start at."""
+        span = round(seconds / TICK_SECONDS)
+        start = np.flatnonzero(self.unbroken(span))
+        moved, true = (xy[start + span] - xy[start] for xy in (self.track, self.truth))
+        return moved, true, start
+
+    def turn_of_stretches(self, seconds: int) -> Complex:
+        """Return exp(i yaw) (n,) that best fits the legs from each tick on; NaN across a break."""
+        span = round(seconds / TICK_SECONDS)
+        turn = np.full(len(self.track), complex(np.nan, np.nan))
+        unbroken = np.flatnonzero(self.unbroken(span))
+        legs, true_legs = (xy[_LEG:] - xy[:-_LEG] for xy in (self.track, self.truth))
+        total = np.concatenate([[0.0], np.cumsum(np.conj(legs) * np.nan_to_num(true_legs))])
+        turn[unbroken] = np.exp(1j * np.angle(total[unbroken + span - _LEG + 1] - total[unbroken]))
+        return turn
+
+
 @dataclass(eq=False)
 class _Sums:
     """Sums over the pieces of a recording."""
@@ -131,7 +162,8 @@ def recording_errors(prepared: Prepared, found: Sequence[Predictions]) -> Record
 
 
 def _poses(piece: PreparedPiece, predictions: Predictions, sums: _Sums) -> None:
-    track, truth, breaks = _at_ticks(piece, predictions)
+    at = _at_ticks(piece, predictions)
+    track, truth = at.track, at.truth
     finite = np.isfinite(truth)
     if finite.sum() < 2:
         return
@@ -141,39 +173,31 @@ def _poses(piece: PreparedPiece, predictions: Predictions, sums: _Sums) -> None:
     first = np.flatnonzero(finite)[0]
     on_first = truth[first] + turn[first] * (track - track[first])
     sums.add("first", np.abs(on_first - truth)[finite])
-    _along_the_path(track, truth, breaks, predictions, dict.fromkeys(HORIZONS, turn), sums)
+    _along_the_path(at, predictions, dict.fromkeys(HORIZONS, turn), sums)
 
 
 def _positions(piece: PreparedPiece, predictions: Predictions, sums: _Sums) -> None:
-    track, truth, breaks = _at_ticks(piece, predictions)
-    turns = {
-        horizon: _turn_of_stretches(track, truth, breaks, max(horizon, STRETCH_SECONDS))
-        for horizon in HORIZONS
-    }
-    _along_the_path(track, truth, breaks, predictions, turns, sums)
+    at = _at_ticks(piece, predictions)
+    turns = {h: at.turn_of_stretches(max(h, STRETCH_SECONDS)) for h in HORIZONS}
+    _along_the_path(at, predictions, turns, sums)
 
 
 def _along_the_path(
-    track: Complex,
-    truth: Complex,
-    breaks: np.ndarray,
-    predictions: Predictions,
-    turns: Mapping[int, Complex],
-    sums: _Sums,
+    at: _AtTicks, predictions: Predictions, turns: Mapping[int, Complex], sums: _Sums
 ) -> None:
     """Add the errors over all horizons, given exp(i yaw) from N to W at each tick for each."""
-    _lengths(track, truth, breaks, sums)
+    _lengths(at, sums)
     for horizon in HORIZONS:
-        estimated, true, start = _displacements(track, truth, breaks, horizon)
+        estimated, true, start = at.displacements(horizon)
         turn = turns[horizon][start]
         if horizon == 1:  # the windows themselves
             estimated = _windows_xy(predictions)[start]
             known = np.isfinite(turn)
             _nis(predictions, start[known], np.conj(turn[known]) * true[known], sums)
-        errors = np.full(len(track), np.nan)
+        errors = np.full(len(at.track), np.nan)
         errors[start] = np.abs(turn * estimated - true)
         sums.add_blocks(str(horizon), errors)
-    _stretches(track, truth, breaks, sums)
+    _stretches(at, sums)
 
 
 def _waypoints(piece: PreparedPiece, predictions: Predictions, sums: _Sums) -> None:
@@ -198,13 +222,11 @@ def block_sums(seconds: FloatArray, squares: FloatArray) -> FloatArray:
     return np.asarray(rows[rows[:, 1] > 0])
 
 
-def _at_ticks(
-    piece: PreparedPiece, predictions: Predictions
-) -> tuple[Complex, Complex, np.ndarray]:
+def _at_ticks(piece: PreparedPiece, predictions: Predictions) -> _AtTicks:
     """Return track, truth and its breaks at the ticks common to all."""
     track = predictions.track()
     count = min(len(track), len(piece.position_W))
-    return track[:count], piece.position_W[:count], piece.breaks[:count]
+    return _AtTicks(track[:count], piece.position_W[:count], piece.breaks[:count])
 
 
 def fit_yaw_and_position(track: Complex, truth: Complex) -> Complex:
@@ -214,49 +236,24 @@ def fit_yaw_and_position(track: Complex, truth: Complex) -> Complex:
     return np.asarray(target + np.exp(1j * np.angle(turn)) * (track - centre))
 
 
-def _displacements(
-    track: Complex, truth: Complex, breaks: np.ndarray, seconds: int
-) -> tuple[Complex, Complex, np.ndarray]:
-    """Return displacements of track and truth over a span, and the ticks (n,) they start at."""
-    span = round(seconds / TICK_SECONDS)
-    start = np.flatnonzero(_unbroken(truth, breaks, span))
-    return track[start + span] - track[start], truth[start + span] - truth[start], start
-
-
-def _unbroken(truth: Complex, breaks: np.ndarray, span: int) -> BoolArray:
-    """Return whether the `span` ticks after each tick (n - span,) contain neither gap nor jump."""
-    ends = np.isfinite(truth[:-span]) & np.isfinite(truth[span:])
-    return np.asarray(ends & (breaks[:-span] == breaks[span:]))
-
-
-def _lengths(track: Complex, truth: Complex, breaks: np.ndarray, sums: _Sums) -> None:
-    estimated, true, start = _displacements(track, truth, breaks, 2)
+def _lengths(at: _AtTicks, sums: _Sums) -> None:
+    estimated, true, start = at.displacements(2)
     legs = start % _LEG == 0
     sums.path += float(np.abs(true[legs]).sum())
     sums.length += float(np.abs(estimated[legs]).sum())
 
 
-def _turn_of_stretches(track: Complex, truth: Complex, breaks: np.ndarray, seconds: int) -> Complex:
-    """Return exp(i yaw) (n,) that best fits the legs from each tick on; NaN across a break."""
-    span = round(seconds / TICK_SECONDS)
-    turn = np.full(len(track), complex(np.nan, np.nan))
-    unbroken = np.flatnonzero(_unbroken(truth, breaks, span))
-    product = np.conj(track[_LEG:] - track[:-_LEG]) * np.nan_to_num(truth[_LEG:] - truth[:-_LEG])
-    total = np.concatenate([[0.0], np.cumsum(product)])
-    turn[unbroken] = np.exp(1j * np.angle(total[unbroken + span - _LEG + 1] - total[unbroken]))
-    return turn
-
-
-def _stretches(track: Complex, truth: Complex, breaks: np.ndarray, sums: _Sums) -> None:
+def _stretches(at: _AtTicks, sums: _Sums) -> None:
     """Add position errors relative to the path [1] after fitting each half-overlapping stretch."""
     span = round(STRETCH_SECONDS / TICK_SECONDS)
-    unbroken = _unbroken(truth, breaks, span)
+    unbroken = at.unbroken(span)
     for start in span // 2 * np.flatnonzero(unbroken[:: span // 2]):
         part = slice(start, start + span + 1)
-        path = float(np.abs(np.diff(truth[part][::_LEG])).sum())
+        track, truth = at.track[part], at.truth[part]
+        path = float(np.abs(np.diff(truth[::_LEG])).sum())
         if path < 5.0:  # stationary: there is no path to relate errors to
             continue
-        errors = np.abs(fit_yaw_and_position(track[part], truth[part]) - truth[part])
+        errors = np.abs(fit_yaw_and_position(track, truth) - truth)
         sums.add("stretch", errors / path)
 
 

@@ -26,7 +26,7 @@ from stario.fusion.evaluation.judging.prepared import Prepared
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.sequences.arrays import check_choice
-from stario.sequences.datasets.batch import Skipped
+from stario.sequences.datasets.batch import Skipped, without_skipped
 from stario.sequences.readers.archive import split_name
 from stario.sequences.sequence import ImuSequence
 
@@ -95,7 +95,6 @@ def judge(
     models: Mapping[str, Callable[[str], Predictor | RecordingPredictor]],
     groups: Mapping[Path, str],
     read: Callable[[Path], ImuSequence] | None = None,
-    progress: Callable[[int], None] = lambda done: None,
 ) -> tuple[list[RecordingResult], list[Skipped]]:
     """Run every recording through every network.
 
@@ -105,23 +104,15 @@ def judge(
             differ between groups if each group was held out of training in turn.
         groups: group of each recording, by path; the name of the set where missing.
         read: function that reads a path; if given, the EKF is run for its mean NIS, which is slow.
-        progress: called with the number of recordings done.
     """
     judged: list[RecordingResult] = []
     skipped: list[Skipped] = []
-    for done, prepared in enumerate(recordings, 1):
-        if isinstance(prepared, Skipped):
-            skipped.append(prepared)
-        else:
-            recording_labels = labels(
-                prepared.path, prepared.attributes, groups.get(prepared.path, "")
-            )
-            errors = {
-                name: _errors(model(recording_labels["group"]), prepared, read)
-                for name, model in models.items()
-            }
-            judged.append(RecordingResult(prepared.path, recording_labels, errors))
-        progress(done)
+    for prepared in without_skipped(recordings, skipped):
+        named = labels(prepared.path, prepared.attributes, groups.get(prepared.path, ""))
+        errors = {
+            name: _errors(model(named["group"]), prepared, read) for name, model in models.items()
+        }
+        judged.append(RecordingResult(prepared.path, named, errors))
     _warn_of_not_compared(judged)
     return judged, skipped
 

@@ -90,7 +90,7 @@ class Prepared:
     kind: Kind
     attributes: dict[str, str]
     pieces: list[PreparedPiece]
-    problems: tuple[str, ...] = ()
+    problems: tuple[str, ...]
 
 
 def prepare(sequence: ImuSequence, path: Path) -> Prepared:
@@ -204,14 +204,13 @@ def _store(file: Path, prepared: Prepared) -> None:
     for k, piece in enumerate(prepared.pieces):
         values = {name: getattr(piece.stream, name) for name in _STREAM}
         values |= {name: getattr(piece, name) for name in _TRUTH}
-        values["start"] = np.array([piece.stream.start])
         for name, value in values.items():  # the format knows no complex numbers
             arrays[f"{k}.{name}"] = value.view(np.float64) if np.iscomplexobj(value) else value
     description = {
         "name": prepared.name,
         "kind": prepared.kind,
         "attributes": prepared.attributes,
-        "pieces": len(prepared.pieces),
+        "starts": [piece.stream.start for piece in prepared.pieces],
         "problems": prepared.problems,
     }
     content = safetensors.numpy.save(arrays, metadata={"recording": json.dumps(description)})
@@ -230,12 +229,10 @@ def _load(file: Path, path: Path) -> Prepared | None:
         with safetensors.safe_open(file, "numpy") as source:
             description = json.loads(source.metadata()["recording"])
             pieces = []
-            for k in range(description["pieces"]):
-                names = ("start", *_STREAM, *_TRUTH)
-                found = {name: source.get_tensor(f"{k}.{name}") for name in names}
+            for k, start in enumerate(description["starts"]):
+                found = {n: source.get_tensor(f"{k}.{n}") for n in (*_STREAM, *_TRUTH)}
                 for name in ("position_W", "waypoint_W"):
                     found[name] = found[name].view(np.complex128)
-                start = float(found["start"][0])
                 stream = LevelledStream(start, *(found[name] for name in _STREAM))
                 pieces.append(PreparedPiece(stream, *(found[name] for name in _TRUTH)))
     except (OSError, KeyError, ValueError, safetensors.SafetensorError) as error:

@@ -20,9 +20,7 @@ def final_factor(
     """Factor with accelerometer errors `shake` [m/s^2] of 0.1 s each and `false` displacements."""
     config, rng = NavigatorConfig(), np.random.default_rng(3)
     preprocessed = Navigator(oracle, config).observe(walk)
-    start = preprocessed.front_end.start
-    assert start is not None
-    estimator = Estimator(config, start)
+    estimator = Estimator(config, preprocessed.start)
     pairs = zip(preprocessed.intervals, preprocessed.measurements, strict=True)
     for k, (interval, measured) in enumerate(pairs):
         shaken = replace(interval, accel=interval.accel + rng.normal(0.0, shake, 3))

@@ -83,9 +83,7 @@ def track_with_outliers(
     preprocessed: PreprocessedRecording, config: NavigatorConfig, metres: float, intervals: range
 ) -> tuple[np.ndarray, int]:
     """Positions until 3 s after intervals with false displacements, and the number gated."""
-    start = preprocessed.front_end.start
-    assert start is not None
-    estimator, positions = FixedLagEstimator(config, start), []
+    estimator, positions = FixedLagEstimator(config, preprocessed.start), []
     for k in range(intervals.stop + 3 * config.filter.output_rate):
         measurement = preprocessed.measurements[k]
         if measurement is not None and k in intervals:

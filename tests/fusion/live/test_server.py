@@ -190,7 +190,7 @@ MALFORMED = st.one_of(
 
 
 def test_two_hundred_malformed_pushes_do_not_affect_a_replay(client, hub, pushes, walk, tmp_path):
-    bodies = iter(pushes())
+    bodies = iter(pushes(seconds=8.0))
     sent, refused = [], []
 
     @settings(
@@ -211,10 +211,10 @@ def test_two_hundred_malformed_pushes_do_not_affect_a_replay(client, hub, pushes
     push()
     sent += [answer.json()["samples"] for answer in send(client, bodies)]
     assert len(refused) >= 200
-    assert sum(sent) == len(walk)
+    assert sum(sent) == 800
     assert list(hub.sessions) == ["phone"]
     undisturbed = hub._new_navigator()
-    for row in zip(walk.time - walk.time[0], walk.gyro, walk.accel, strict=True):
+    for row in zip(walk.time[:800] - walk.time[0], walk.gyro, walk.accel, strict=False):
         undisturbed.push(*row)
     end = hub.sessions["phone"].drawn.points[-1][1:4]
     np.testing.assert_allclose(end, undisturbed.state.p_W, atol=1e-5)
@@ -360,17 +360,17 @@ def test_a_magnetometer_is_recorded_and_used(client, hub, pushes, new_navigator,
         | {"values": dict(zip("xyz", value, strict=True))}
         for t, value in zip(walk.time.tolist(), field.tolist(), strict=True)
     ]
-    for k, body in enumerate(pushes()):
+    for k, body in enumerate(pushes(seconds=12.0)):
         message = json.loads(body)
         message["payload"] += entries[max(first, 20 * k - lag) : 20 * (k + 1) - lag]
         assert client.post("/data", json=message).status_code == 200
     session = hub.sessions["phone"]
     recording = read_recording(session.path)
-    np.testing.assert_array_equal(recording.gyro, walk.gyro)
+    np.testing.assert_array_equal(recording.gyro, walk.gyro[:1200])
     np.testing.assert_array_equal(
         recording.magnetometer.field, field[first : first + len(recording.magnetometer)]
     )
-    assert len(walk) - first - len(recording.magnetometer) <= lag + 1
+    assert 1200 - first - len(recording.magnetometer) <= lag + 1
     bearings = session._navigator.health.bearings
     assert bearings["applied"] > 10
     track = rerun(session, new_navigator)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from training_runs import narrow
 from typer.testing import CliRunner
 
 from stario.fusion.commands.cli import app
@@ -45,16 +46,23 @@ def reading(tmp_path_factory: pytest.TempPathFactory) -> ReaderConfig:
     return ReaderConfig(read_recording, {}, tmp_path_factory.mktemp("cache"))
 
 
-def cell(dataset: DataSet, network: str = "DeepILS", seed: int = 0, steps: int = 4) -> Cell:
+@pytest.fixture
+def narrow_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Train a small StarIO, by default the network of the cells here."""
+    narrow(monkeypatch)
+
+
+def cell(dataset: DataSet, network: str = "StarIO", seed: int = 0, steps: int = 4) -> Cell:
     return Cell(dataset, network, seed, cell_recipe(RECIPE, network, seed, steps))
 
 
+@pytest.mark.usefixtures("narrow_network")
 def test_a_filled_cell_writes_model_errors_and_tracks(
     dataset: DataSet, reading: ReaderConfig, tmp_path: Path
 ) -> None:
     done = cell(dataset, steps=2)
     fill_cell(done, tmp_path, reading)
-    folder = tmp_path / "own/DeepILS/2-steps/seed-0"
+    folder = tmp_path / "own/StarIO/2-steps/seed-0"
     names = {"errors.json", "log.json", "model.json", "model.safetensors", "tracks.npz"}
     assert {path.name for path in folder.iterdir()} == {*names, "trained.json"}
     trained = json.loads((folder / "trained.json").read_text())
@@ -90,7 +98,7 @@ def test_without_recorded_poses_the_legs_alone_select_the_weights(
         write_csv(path, make_walk(seed=seed, seconds=16.0))
     monkeypatch.setattr(training, "train", trained)
     monkeypatch.setattr(training, "cached_walks", lambda *arguments, **rest: [])
-    recipe = cell_recipe(RECIPE, "DeepILS", 0, 1)
+    recipe = cell_recipe(RECIPE, "StarIO", 0, 1)
     for files, read in ((long, waypoints), (long, read_recording)):
         alone = replace(dataset, training=tuple(files[:1]), validation=tuple(files[1:]))
         with pytest.raises(InputError, match="stop"):
@@ -100,6 +108,7 @@ def test_without_recorded_poses_the_legs_alone_select_the_weights(
     assert chosen == [True, False]
 
 
+@pytest.mark.usefixtures("narrow_network")
 def test_a_killed_cell_resumes_and_gives_the_same_model(
     dataset: DataSet, reading: ReaderConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -123,6 +132,7 @@ def test_a_killed_cell_resumes_and_gives_the_same_model(
     assert len(json.loads((folder / "log.json").read_text())) == 2
 
 
+@pytest.mark.usefixtures("narrow_network")
 def test_filled_cells_are_kept_and_only_new_networks_and_seeds_are_trained(
     dataset: DataSet, reading: ReaderConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -138,12 +148,12 @@ def test_filled_cells_are_kept_and_only_new_networks_and_seeds_are_trained(
     assert list(fill(first, tmp_path, reading)) == first
     errors = first[0].folder(tmp_path) / "errors.json"
     written = errors.stat().st_mtime_ns
-    more = [*first, cell(dataset, "I-MobileNet", steps=1), cell(dataset, seed=1, steps=1)]
+    more = [*first, cell(dataset, "StarIO without MSGCU", steps=1), cell(dataset, seed=1, steps=1)]
     assert list(fill(more, tmp_path, reading)) == more
-    assert trained == ["DeepILS 0", "I-MobileNet 0", "DeepILS 1"]
+    assert trained == ["StarIO 0", "StarIO without MSGCU 0", "StarIO 1"]
     assert errors.stat().st_mtime_ns == written
     table = set_table(dataset, filled_cells(more, tmp_path)["own"], {})
-    assert [row.network for row in table.rows] == ["pdr", "I-MobileNet", "DeepILS"]
+    assert [row.network for row in table.rows] == ["pdr", "StarIO without MSGCU", "StarIO"]
     mean = table.rows[2].figures["ate"]
     values = [
         json.loads((one.folder(tmp_path) / "errors.json").read_text())["recordings"][0]
@@ -158,12 +168,13 @@ def test_filled_cells_are_kept_and_only_new_networks_and_seeds_are_trained(
     assert sorted(row.rank.rank for row in table.rows if row.rank) == [1, 2]
 
 
+@pytest.mark.usefixtures("narrow_network")
 def test_cells_of_another_recipe_are_refused_and_other_step_counts_are_separate(
     dataset: DataSet, reading: ReaderConfig, tmp_path: Path
 ) -> None:
     done = cell(dataset, steps=1)
     fill_cell(done, tmp_path, reading)
-    other = Cell(dataset, "DeepILS", 0, cell_recipe({**RECIPE, "rate": 1e-2}, "DeepILS", 0, 1))
+    other = Cell(dataset, "StarIO", 0, cell_recipe({**RECIPE, "rate": 1e-2}, "StarIO", 0, 1))
     with pytest.raises(ConfigError, match=r"errors\.json.*another recipe"):
         fill_cell(other, tmp_path, reading)
     [outcome] = fill([other], tmp_path, reading)
@@ -214,6 +225,8 @@ def test_the_command_writes_tables_and_figures(
     folder = dataset.training[0].parent
     monkeypatch.setenv("STARIO_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("stario.network.runtime.survey._RUNS", {1: 1, 64: 1})
+    saved = "stario.fusion.evaluation.figures.save_figure"  # rendering is slow
+    monkeypatch.setattr(saved, lambda figure, path: path.touch())
     (tmp_path / "recipe.json").write_text(json.dumps(RECIPE))
     out = tmp_path / "out"
     arguments = ["--set", f"ronin={folder}", "--out", str(out), "--steps", "1", "--seeds", "1"]

@@ -9,14 +9,20 @@ from stario.fusion.table.ranks import ranks
 from stario.fusion.table.text import published
 
 
-def errors(scale: float, noise: float = 0.0, seed: int = 0) -> list[tuple[str, str, np.ndarray]]:
+def errors(scale: float, noise: float = 0.0, seed: int = 0) -> dict[tuple[str, str], np.ndarray]:
     """Errors on twelve recordings of two sets, easy and hard, with noise of a network's own."""
     common, rng = np.random.default_rng(9), np.random.default_rng(seed)
-    found = []
+    found = {}
     for k in range(12):
         sums = common.lognormal(0.0, 1.5, 6) * scale**2 * np.exp(noise * rng.standard_normal(6))
-        found.append((f"set {k % 2}", str(k), np.stack([sums, np.full(6, 1.0)], axis=1)))
+        found[f"set {k % 2}", str(k)] = np.stack([sums, np.full(6, 1.0)], axis=1)
     return found
+
+
+def part(
+    errors: dict[tuple[str, str], np.ndarray], recordings: slice
+) -> dict[tuple[str, str], np.ndarray]:
+    return {key: errors[key] for key in list(errors)[recordings]}
 
 
 def test_twice_the_error_is_certain_however_much_recordings_differ_in_difficulty() -> None:
@@ -37,18 +43,18 @@ def test_networks_that_differ_by_chance_alone_may_have_either_rank() -> None:
 
 
 def test_seeds_are_averaged_over_common_recordings_only() -> None:
-    half = errors(2.0)[:6]
-    found = ranks({"StarIO": [errors(1.0)], "two": [errors(1.0)[:6], half]}, "StarIO")
+    halves = [part(errors(scale), slice(6)) for scale in (1.0, 2.0)]
+    found = ranks({"StarIO": [errors(1.0)], "two": halves}, "StarIO")
     ratio = found["two"].ratio
     assert ratio is not None
     assert ratio.ratio == pytest.approx(np.sqrt(2.0))
-    assert ranks({"a": [errors(1.0)], "b": [[]]}, "a") == {}
+    assert ranks({"a": [errors(1.0)], "b": [{}]}, "a") == {}
 
 
 def test_sets_have_equal_weights_however_many_recordings_they_have() -> None:
     """Eight times the error on the two recordings of one set, none on the six of the other."""
-    small, large = errors(8.0)[:3:2], errors(1.0)[1::2]
-    found = ranks({"StarIO": [errors(1.0)], "other": [[*small, *large]]}, "StarIO")["other"].ratio
+    other = part(errors(8.0), slice(0, 3, 2)) | part(errors(1.0), slice(1, None, 2))
+    found = ranks({"StarIO": [errors(1.0)], "other": [other]}, "StarIO")["other"].ratio
     assert found is not None
     assert found.ratio == pytest.approx(np.sqrt(8.0))
 

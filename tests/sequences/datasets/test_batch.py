@@ -6,7 +6,7 @@ import time
 import pytest
 from joblib import parallel_config
 
-from stario.sequences.datasets.batch import Skipped, each
+from stario.sequences.datasets.batch import Skipped, each, without_skipped
 from stario.sequences.errors import InputError
 
 
@@ -20,7 +20,11 @@ def test_a_failing_item_is_skipped_with_its_reason(jobs: int | None) -> None:
         return number // 2
 
     odd = Skipped("3", "number: found 3, expected an even one")
-    assert list(each(halve, [2, 3, 8], jobs)) == [1, odd, 4]
+    outcomes = list(each(halve, [2, 3, 8], jobs))
+    assert outcomes == [1, odd, 4]
+    skipped: list[Skipped] = []
+    assert list(without_skipped(outcomes, skipped)) == [1, 4]
+    assert skipped == [odd]
 
 
 def test_results_are_yielded_one_by_one() -> None:

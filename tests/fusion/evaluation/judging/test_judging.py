@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from stario.fusion.evaluation.folders import fresh_folder
 from stario.fusion.evaluation.judging.displacement_error import (
     RecordingErrors,
+    _AtTicks,
     _stretches,
     _Sums,
     recording_errors,
@@ -301,9 +302,10 @@ def test_rows_compare_weights_by_group_and_pooled(
 def test_stretches_at_rest_have_no_error_relative_to_their_path() -> None:
     rng, sums = np.random.default_rng(0), _Sums()
     track, truth = (0.01 * (rng.normal(size=100) + 1j * rng.normal(size=100)) for _ in range(2))
-    _stretches(track, truth, np.zeros(100, dtype=np.int64), sums)
+    breaks = np.zeros(100, dtype=np.int64)
+    _stretches(_AtTicks(track, truth, breaks), sums)
     assert sums.squares == {}
-    _stretches(track, truth + np.arange(100.0), np.zeros(100, dtype=np.int64), sums)
+    _stretches(_AtTicks(track, truth + np.arange(100.0), breaks), sums)
     assert len(sums.squares["stretch"]) == 3
 
 
