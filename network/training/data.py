@@ -185,9 +185,7 @@ def _is_long(stream: Stream) -> bool:
     return len(stream) >= _SHORTEST and (isinstance(stream, WorldStream) or len(stream.start) > 1)
 
 
-def cached_walks(
-    count: int, seed: int, folder: Path, attitude: Attitude = "levelled"
-) -> list[WorldStream]:
+def cached_walks(count: int, seed: int, folder: Path, attitude: Attitude) -> list[WorldStream]:
     """Return streams of a simulated phone's IMU along walks of one minute, cached in `folder`."""
 
     def build() -> list[WorldStream]:
