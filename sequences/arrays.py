@@ -21,6 +21,12 @@ def correlation(x: FloatArray, y: FloatArray) -> float:
     return float(np.corrcoef(x.ravel(), y.ravel())[0, 1])
 
 
+def peak_offset(before: float, peak: float, after: float) -> float:
+    """Return where the parabola through three values peaks, in steps from the second one."""
+    curvature = before - 2.0 * peak + after
+    return 0.5 * (before - after) / curvature if curvature < 0.0 else 0.0
+
+
 def interpolated(at: FloatArray, time: FloatArray, values: FloatArray) -> FloatArray:
     """Interpolate columns of values (N, k) linearly at times (M,), clamped at the ends."""
     return np.stack([np.interp(at, time, column) for column in values.T], axis=1)

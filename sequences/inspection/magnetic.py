@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.sequences.arrays import correlation, integral, interpolated, samples_in
+from stario.sequences.arrays import correlation, integral, interpolated, peak_offset, samples_in
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import clean_samples, longest_unbroken
@@ -221,9 +221,8 @@ def _against_gyro(
     best = int(np.argmax(scores))
     if best in (0, len(scores) - 1):
         return float(scores[best]), None, None, None
-    a, b, c = scores[best - 1 : best + 2]
-    lag = float(_LAGS_S[best])
-    lag += 0.5 * (a - c) / min(a - 2.0 * b + c, -1e-12) * float(_LAGS_S[1] - _LAGS_S[0])
+    step = float(_LAGS_S[1] - _LAGS_S[0])
+    lag = float(_LAGS_S[best]) + peak_offset(*scores[best - 1 : best + 2]) * step
     agreement, iron, spread = fit(lag)
     return agreement, lag, iron, spread
 
