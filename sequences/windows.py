@@ -231,6 +231,12 @@ def usable(sequence: ImuSequence) -> BoolArray:
     return np.asarray((np.abs(values) < MAX_SENSOR_VALUE).all(axis=1))
 
 
+def finite_samples(sequence: ImuSequence) -> BoolArray:
+    """Return which samples (N,) have a finite time and finite values."""
+    columns = np.column_stack([sequence.time, sequence.gyro, sequence.accel])
+    return np.asarray(np.isfinite(columns).all(axis=1))
+
+
 def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return time, gyroscope and accelerometer without bad, repeated and out-of-order samples.
 

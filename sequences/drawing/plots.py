@@ -45,6 +45,7 @@ from stario.sequences.sequence import (
     is_gap,
     whole_seconds,
 )
+from stario.sequences.windows import finite_samples
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -146,7 +147,7 @@ def imu_overview(
         gaps: first and last time of stretches without samples [s]: shaded, or marked at the upper
             edge if they are short enough to be bridged.
     """
-    finite = np.isfinite(np.column_stack([sequence.time, sequence.gyro, sequence.accel])).all(1)
+    finite = finite_samples(sequence)
     order = np.flatnonzero(finite)[np.argsort(sequence.time[finite], kind="stable")]
     time, gyro, accel = sequence.time[order], sequence.gyro[order], sequence.accel[order]
     count = 2 + (rotation is not None) + (sequence.truth is not None)
