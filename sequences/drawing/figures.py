@@ -100,7 +100,7 @@ def split_at_gaps(
     )
 
 
-def unbroken(values: FloatArray) -> list[FloatArray]:
+def split_at_nan(values: FloatArray) -> list[FloatArray]:
     """Return the stretches (n, k) of values (N, k) between rows with a NaN."""
     known = np.asarray(np.isfinite(values).all(axis=1))
     return [values[a:b] for a, b in runs(known)]
