@@ -1,4 +1,4 @@
-"""Array types of sequences, and validation of arrays that users pass in."""
+"""Array types of sequences, sums and means over samples, and validation of what users pass in."""
 
 from __future__ import annotations
 
@@ -19,6 +19,16 @@ def correlation(x: FloatArray, y: FloatArray) -> float:
     if x.size < 3 or min(np.ptp(x), np.ptp(y)) == 0.0:
         return 0.0
     return float(np.corrcoef(x.ravel(), y.ravel())[0, 1])
+
+
+def rms(rows: NDArray[np.floating]) -> float:
+    """Return the root mean square of the lengths of rows (N, k)."""
+    return float(np.sqrt(np.square(rows).sum(axis=1).mean()))
+
+
+def scatter(rows: FloatArray) -> float:
+    """Return the root mean square distance of rows (N, k) from their mean."""
+    return float(np.linalg.norm(rows.std(axis=0)))
 
 
 def peak_offset(before: float, peak: float, after: float) -> float:

@@ -19,7 +19,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.sequences.arrays import correlation, integral, interpolated, peak_offset, samples_in
+from stario.sequences.arrays import (
+    correlation,
+    integral,
+    interpolated,
+    peak_offset,
+    rms,
+    samples_in,
+)
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import clean_samples, longest_unbroken
@@ -159,9 +166,8 @@ def assess_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
     stamps, values = field.time[inside], field.field[inside]
     if len(stamps) < 20 or stamps[-1] - stamps[0] < _SHORTEST_S:
         return None
-    turning = float(np.sqrt(np.square(gyro).sum(axis=1).mean()))
     agreement = lag = iron = sigma = None
-    if turning > _TURNING_RAD_S:
+    if rms(gyro) > _TURNING_RAD_S:
         agreement, lag, iron, sigma = _against_gyro(time, gyro, stamps, values)
     following = np.clip(np.searchsorted(time, stamps), 0, len(time) - 1)
     R_NB = levelled_attitudes(time, gyro, accel)[following]
