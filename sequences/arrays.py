@@ -42,6 +42,12 @@ def interpolated(at: FloatArray, time: FloatArray, values: FloatArray) -> FloatA
     return np.stack([np.interp(at, time, column) for column in values.T], axis=1)
 
 
+def runs(flags: BoolArray) -> list[tuple[int, int]]:
+    """Return the maximal runs [start, stop) of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
 def evenly_spaced(count: int, most: int) -> NDArray[np.intp]:
     """Return up to `most` of `count` indices, evenly spaced from the first to the last."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.intp))

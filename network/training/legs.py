@@ -17,16 +17,11 @@ from torch import Tensor
 from stario.network.training.augment import Augmentation, WindowSampler, augmented, heading_of
 from stario.network.training.config import TrainingConfig
 from stario.network.training.parallel import Workers
+from stario.sequences.arrays import runs
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.legs import LegStream
 from stario.sequences.sequence import FloatArray
-from stario.sequences.windows import (
-    HEADING_STEP,
-    VELOCITY_WEIGHTS,
-    WINDOW_RATE,
-    WINDOW_SAMPLES,
-    runs,
-)
+from stario.sequences.windows import HEADING_STEP, VELOCITY_WEIGHTS, WINDOW_RATE, WINDOW_SAMPLES
 
 log = logging.getLogger(__name__)
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stario.sequences.arrays import runs
 from stario.sequences.files import atomic_write
 from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray
-from stario.sequences.windows import runs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,6 +14,7 @@ import numpy as np
 
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.accuracy.metrics import PoseErrors, pose_errors
+from stario.sequences.clean_samples import finite_samples
 from stario.sequences.drawing.figures import (
     ABOVE_LEFT,
     ABOVE_RIGHT,
@@ -35,7 +36,6 @@ from stario.sequences.drawing.figures import (
 )
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import (
-    MAX_IMU_GAP,
     MAX_TRUTH_GAP,
     STANDARD_GRAVITY,
     BoolArray,
@@ -45,7 +45,7 @@ from stario.sequences.sequence import (
     is_gap,
     whole_seconds,
 )
-from stario.sequences.windows import finite_samples
+from stario.sequences.time_order import MAX_IMU_GAP
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,10 +12,10 @@ import logging
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import scatter
+from stario.sequences.arrays import runs, scatter
+from stario.sequences.clean_samples import MIN_RATE, usable
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, BoolArray, FloatArray, ImuSequence
-from stario.sequences.windows import MIN_RATE, runs, usable
 
 _log = logging.getLogger(__name__)
 

@@ -28,8 +28,8 @@ from stario.sequences.arrays import (
     samples_in,
 )
 from stario.sequences.attitude.levelling import levelled_attitudes
+from stario.sequences.clean_samples import clean_samples, longest_unbroken
 from stario.sequences.sequence import FloatArray, ImuSequence
-from stario.sequences.windows import clean_samples, longest_unbroken
 
 _LONGEST_S = 600.0
 _SHORTEST_S = 10.0

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from stario.sequences.arrays import check_type
+from stario.sequences.clean_samples import finite_samples, usable
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.inspection.constant_values import dead_axis_problems
@@ -37,7 +38,6 @@ from stario.sequences.truth.position_findings import (
 from stario.sequences.truth.positions import PositionFit
 from stario.sequences.truth.problems import examine_truth
 from stario.sequences.truth.yaw_drift import YawDrift, yaw_drift
-from stario.sequences.windows import finite_samples, usable
 
 
 @dataclass(frozen=True)

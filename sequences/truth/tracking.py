@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import median_filter
 
-from stario.sequences.arrays import rms, scatter
+from stario.sequences.arrays import rms, runs, scatter
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory, is_gap
 from stario.sequences.truth.findings import TruthProblem
-from stario.sequences.windows import runs
 
 _JUMP_M, _FASTEST_M_S = 0.5, 15.0
 """Length [m] and speed [m/s] above which a step between successive poses may be a jump."""
