@@ -25,7 +25,8 @@ from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.inspection.constant_values import warn_of_dead_axes
 from stario.sequences.sequence import FloatArray, ImuSequence
-from stario.sequences.windows import MAX_IMU_GAP, WINDOW_SECONDS
+from stario.sequences.time_order import MAX_IMU_GAP
+from stario.sequences.windows import WINDOW_SECONDS
 
 _BATCH = 512
 """Number of windows per batch of the network."""

@@ -1,4 +1,4 @@
-"""Array types of sequences, and validation of arrays that users pass in."""
+"""Array types of sequences, sums and means over samples, and validation of what users pass in."""
 
 from __future__ import annotations
 
@@ -21,9 +21,31 @@ def correlation(x: FloatArray, y: FloatArray) -> float:
     return float(np.corrcoef(x.ravel(), y.ravel())[0, 1])
 
 
+def rms(rows: NDArray[np.floating]) -> float:
+    """Return the root mean square of the lengths of rows (N, k)."""
+    return float(np.sqrt(np.square(rows).sum(axis=1).mean()))
+
+
+def scatter(rows: FloatArray) -> float:
+    """Return the root mean square distance of rows (N, k) from their mean."""
+    return float(np.linalg.norm(rows.std(axis=0)))
+
+
+def peak_offset(before: float, peak: float, after: float) -> float:
+    """Return where the parabola through three values peaks, in steps from the second one."""
+    curvature = before - 2.0 * peak + after
+    return 0.5 * (before - after) / curvature if curvature < 0.0 else 0.0
+
+
 def interpolated(at: FloatArray, time: FloatArray, values: FloatArray) -> FloatArray:
     """Interpolate columns of values (N, k) linearly at times (M,), clamped at the ends."""
     return np.stack([np.interp(at, time, column) for column in values.T], axis=1)
+
+
+def runs(flags: BoolArray) -> list[tuple[int, int]]:
+    """Return the maximal runs [start, stop) of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def evenly_spaced(count: int, most: int) -> NDArray[np.intp]:

@@ -77,8 +77,9 @@ class LegStream:
 
     def part(self, start: int, stop: int) -> LegStream:
         """Return samples [start, stop) and the legs that lie within them."""
-        begin, end = start / WINDOW_RATE, max(stop, start) / WINDOW_RATE
-        inside = (self.start >= begin) & (self.stop <= end)
+        begin = start / WINDOW_RATE
+        length = max(stop - start, 0) / WINDOW_RATE
+        inside = (self.start >= begin) & (self.stop <= begin + length)
         part = slice(start, max(stop, start))
         return LegStream(
             self.name,

@@ -13,16 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stario.sequences.attitude.levelling import levelled_attitudes
+from stario.sequences.clean_samples import clean_samples, unbroken
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import (
     WINDOW_RATE,
     WINDOW_SAMPLES,
-    clean_samples,
     cut_windows,
     facing,
     headings_at,
     resample,
-    unbroken,
 )
 
 TICK_SAMPLES = 100

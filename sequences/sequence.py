@@ -31,7 +31,6 @@ from stario.sequences.auxiliary import Magnetometer as Magnetometer
 from stario.sequences.auxiliary import PositionTrack as PositionTrack
 from stario.sequences.auxiliary import Timed
 from stario.sequences.errors import InputError
-from stario.sequences.time_order import MAX_IMU_GAP as MAX_IMU_GAP
 from stario.sequences.time_order import ahead_mask, increasing_mask
 
 STANDARD_GRAVITY = 9.80665

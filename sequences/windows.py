@@ -14,7 +14,6 @@ down throughout, for which any heading is acceptable.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sized
 from dataclasses import dataclass
 from itertools import pairwise
@@ -25,21 +24,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import integral, interpolated, samples_in
+from stario.sequences.arrays import integral, interpolated, runs, samples_in
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import about_z, yaw_of
+from stario.sequences.clean_samples import clean_samples, unbroken
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import MAX_IMU_GAP as MAX_IMU_GAP
-from stario.sequences.sequence import (
-    MAX_SENSOR_VALUE,
-    BoolArray,
-    FloatArray,
-    ImuSequence,
-    Trajectory,
-)
-from stario.sequences.time_order import ahead_mask, increasing_mask
-
-log = logging.getLogger(__name__)
+from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
+from stario.sequences.time_order import MAX_IMU_GAP
 
 WINDOW_RATE = 200.0
 """Sampling rate of a window [Hz]."""
@@ -52,9 +43,6 @@ WINDOW_SECONDS = WINDOW_SAMPLES / WINDOW_RATE
 
 Attitude = Literal["levelled", "true"]
 """Attitude that rotates training windows into the world frame; see `world_streams`."""
-
-MIN_RATE, MAX_RATE = 40.0, 1200.0
-"""Limits of accepted sampling rates [Hz] (50 Hz to 1 kHz, with a margin for jitter)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,53 +213,6 @@ def _levelled(
     return about_z(turn) * levelled_NB
 
 
-def usable(sequence: ImuSequence) -> BoolArray:
-    """Return which samples (N,) are numbers that a sensor can measure, whatever their time."""
-    values = np.column_stack([sequence.gyro, sequence.accel])
-    return np.asarray((np.abs(values) < MAX_SENSOR_VALUE).all(axis=1))
-
-
-def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return time, gyroscope and accelerometer without bad, repeated and out-of-order samples.
-
-    A few samples that jump ahead of later ones are dropped as well, and their number is logged.
-
-    Raises:
-        InputError: fewer than two samples are left, or their rate is not accepted.
-    """
-    index = np.flatnonzero(np.isfinite(sequence.time) & usable(sequence))
-    if lost := len(sequence) - len(index):
-        log.warning(
-            "%s: samples that are not finite or too large dropped: %d of %d",
-            sequence.name, lost, len(sequence),
-        )  # fmt: skip
-    kept = increasing_mask(sequence.time[index])
-    if ahead := int(ahead_mask(sequence.time[index], kept).sum()):
-        log.warning("%s: samples ahead of their time dropped: %d", sequence.name, ahead)
-    index = index[kept]
-    if len(index) < 2:
-        raise InputError(f"{sequence.name}: samples", f"{len(index)} usable", "at least 2")
-    time = sequence.time[index]
-    rate = float(1.0 / np.median(np.diff(time)))
-    if not MIN_RATE <= rate <= MAX_RATE:
-        found, fix = f"{rate:.1f} Hz", "is the time column in seconds?"
-        if lost > len(sequence) / 2:
-            fix = "most samples are not finite"
-        raise InputError(f"{sequence.name}: rate", found, "50 Hz to 1 kHz", fix)
-    return time, sequence.gyro[index], sequence.accel[index]
-
-
-def unbroken(time: FloatArray) -> list[tuple[int, int]]:
-    """Return stretches [start, stop) of increasing times (N,) [s] without a gap of the IMU."""
-    breaks = np.flatnonzero(np.diff(time) > MAX_IMU_GAP) + 1
-    return list(pairwise([0, *breaks.tolist(), len(time)]))
-
-
-def longest_unbroken(time: FloatArray) -> slice:
-    """Return the longest of the stretches of `unbroken`, by its samples."""
-    return slice(*max(unbroken(time), key=lambda piece: piece[1] - piece[0]))
-
-
 def window_starts(samples: Sized, stride: int) -> NDArray[np.int64]:
     """Return the first samples (M,) of windows every `stride` of some samples."""
     return np.arange(0, len(samples) - WINDOW_SAMPLES, stride)
@@ -291,9 +232,3 @@ def headings_at(facing: NDArray[np.float32], starts: NDArray[np.int64]) -> Float
         starts: (M,) first samples of the windows.
     """
     return mean_heading(facing[starts[:, None] + np.arange(0, WINDOW_SAMPLES, HEADING_STEP)])
-
-
-def runs(flags: BoolArray) -> list[tuple[int, int]]:
-    """Return the maximal runs [start, stop) of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

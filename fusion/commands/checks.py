@@ -61,7 +61,7 @@ def models(
 
     with progress_bar("models") as progress:
         rows = survey(names or list(ARCHITECTURES), cache_folder(), progress)
-    print_result(as_json, [row.as_dict() for row in rows], survey_table(rows))
+    print_result(as_json, rows, survey_table(rows))
 
 
 @expand_option_groups

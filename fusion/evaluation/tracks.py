@@ -17,19 +17,18 @@ from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.imu.stateful import Predictor, StatefulInference
 from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.state import Track
-from stario.sequences.arrays import integral, interpolated, trapezoids
+from stario.sequences.arrays import integral, interpolated, runs, trapezoids
 from stario.sequences.attitude.so3 import exp_so3
+from stario.sequences.clean_samples import clean_samples
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.windows import (
     WINDOW_RATE,
     WINDOW_SAMPLES,
     WINDOW_SECONDS,
-    clean_samples,
     cut_windows,
     headings_at,
     imu_in_world,
-    runs,
 )
 
 

@@ -28,10 +28,10 @@ import numpy as np
 
 from stario.fusion.health import Stopped
 from stario.fusion.imu.intervals import NO_FLAGS, Flags, Sample
+from stario.sequences.clean_samples import MIN_RATE
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.constant_values import shaken, tilting
 from stario.sequences.sequence import BoolArray, FloatArray
-from stario.sequences.windows import MIN_RATE
 
 SET_BACK_SECONDS = 5.0
 """Late samples that advance for this long in a row [s] come from a clock that was set back; batches

@@ -43,8 +43,7 @@ from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
-from stario.sequences.time_order import CONFIRMED, CONFIRMED_FAR, FAR_AHEAD
-from stario.sequences.windows import MAX_IMU_GAP
+from stario.sequences.time_order import CONFIRMED, CONFIRMED_FAR, FAR_AHEAD, MAX_IMU_GAP
 
 BRIDGED = 0.2
 """A hole no longer than this [s] is bridged by interpolating between the samples at its ends, which

@@ -11,11 +11,11 @@ from __future__ import annotations
 import numpy as np
 
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval, Start
+from stario.sequences.clean_samples import MAX_RATE, MIN_RATE
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_gyro
 from stario.sequences.inspection.constant_values import check_not_dead
 from stario.sequences.sequence import FloatArray
-from stario.sequences.windows import MAX_RATE, MIN_RATE
 
 _START_FORCE = (5.0, 15.0)
 """Accepted mean force of the first second [m/s^2]: allows for a jump, excludes units of g."""

@@ -24,7 +24,8 @@ from stario.fusion.live.payload import (
     Reading,
     Vector,
 )
-from stario.sequences.sequence import MAX_IMU_GAP, FloatArray
+from stario.sequences.sequence import FloatArray
+from stario.sequences.time_order import MAX_IMU_GAP
 
 Sample = tuple[int, Vector, Vector]
 """Time [ns], angular rate [rad/s], specific force [m/s^2]."""

@@ -11,7 +11,7 @@ import plotly.graph_objects as go
 from stario.fusion.report.series import Series
 from stario.fusion.state import Innovations
 from stario.sequences.arrays import evenly_spaced, interpolated
-from stario.sequences.drawing.figures import TRACK_STYLES, split_at_gaps, unbroken
+from stario.sequences.drawing.figures import TRACK_STYLES, split_at_gaps, split_at_nan
 from stario.sequences.sequence import BoolArray, FloatArray
 
 INK, GRID, FAINT = "#222222", "#E3E6EA", "#767676"
@@ -137,7 +137,7 @@ def _band(
     group: str, time: FloatArray, value: FloatArray, sigma: FloatArray, colour: str
 ) -> go.Scatter:
     red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
-    edges = unbroken(np.column_stack([time, value - 3.0 * sigma, value + 3.0 * sigma]))
+    edges = split_at_nan(np.column_stack([time, value - 3.0 * sigma, value + 3.0 * sigma]))
     outlines = [np.vstack([part[:, [0, 1]], part[::-1, [0, 2]], [[np.nan] * 2]]) for part in edges]
     x, y = np.vstack([np.empty((0, 2)), *outlines]).T
     return go.Scatter(

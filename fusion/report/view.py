@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.compare import Comparison
 from stario.fusion.state import Track
-from stario.sequences.drawing.figures import split_at_gaps, unbroken
+from stario.sequences.drawing.figures import split_at_gaps, split_at_nan
 from stario.sequences.errors import InputError
 from stario.sequences.lazy import optional_package
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -83,7 +83,9 @@ def _log_path(
 ) -> None:
     """Log a whole path at once, broken in gaps and where poses are not valid."""
     _, path = split_at_gaps(trajectory.time, trajectory.position_W, trajectory.valid)
-    stream.log(entity, rr.LineStrips3D(unbroken(path), colors=[colour], radii=[0.02]), static=True)
+    stream.log(
+        entity, rr.LineStrips3D(split_at_nan(path), colors=[colour], radii=[0.02]), static=True
+    )
 
 
 def _log_device(stream: Any, trajectory: Trajectory, start: float) -> None:

@@ -39,7 +39,7 @@ def known_costs(names: Sequence[str], out: Path) -> list[ModelRow]:
     missing = [name for name in names if name not in measured]
     if missing:
         measured |= {row.name: row for row in survey(missing)}
-        write_json(path, [row.as_dict() for row in measured.values()])
+        write_json(path, list(measured.values()))
     return [measured[name] for name in names]
 
 

@@ -50,7 +50,7 @@ def table_dict(
             }
             for table in tables
         },
-        "costs": [row.as_dict() for row in costs],
+        "costs": [asdict(row) for row in costs],
         "work": {name: dict(zip(_WORK, times, strict=True)) for name, times in work.items()},
         "conventions": _words(),
     }

@@ -29,18 +29,16 @@ class TorchEngine:
 
     Args:
         network: network with its weights; it is left in evaluation mode.
+
+    Attributes:
+        training_form: that network, whose weights are trainable.
     """
 
     def __init__(self, network: DisplacementNetwork) -> None:
         from stario.network.runtime.inference import inference_form
 
-        self._training_form = network.eval()
+        self.training_form = network.eval()
         self._network = inference_form(network)
-
-    @property
-    def training_form(self) -> DisplacementNetwork:
-        """Network with trainable weights, in evaluation mode."""
-        return self._training_form
 
     @property
     def is_recurrent(self) -> bool:

@@ -55,10 +55,6 @@ class ModelRow:
     milliseconds: Milliseconds
     peak_memory_mb: float
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the row as plain values."""
-        return dict(vars(self))
-
     def counts(self) -> list[str]:
         """Return parameters and FLOPs in millions, with the paper's figures in parentheses."""
         published = ARCHITECTURES[self.name]

@@ -196,7 +196,7 @@ def augmented(
     heading: Tensor,
     augmentation: Augmentation,
     generator: torch.Generator,
-    together: int = 1,
+    together: int,
 ) -> tuple[Tensor, Tensor]:
     """Rotate windows (B, 200, 6) from W into frame H, as an imperfect device would measure them.
 

@@ -11,6 +11,7 @@ from types import MappingProxyType
 import numpy as np
 
 from stario.network.training.config import SIMULATED
+from stario.sequences.arrays import rms
 from stario.sequences.datasets.batch import Skipped
 from stario.sequences.datasets.stream_cache import Stream, cached
 from stario.sequences.errors import ConfigError
@@ -161,7 +162,7 @@ def _length(streams: Sequence[Stream]) -> str:
 def _liveliness(stream: WorldStream) -> float:
     """Return the root mean square linear acceleration [m/s^2]: errors are large where it is."""
     linear = stream.imu_W[::10, 3:] - np.array([0.0, 0.0, STANDARD_GRAVITY], np.float32)
-    return float(np.sqrt(np.square(linear).sum(axis=1).mean()))
+    return rms(linear)
 
 
 def split_off(
@@ -185,9 +186,7 @@ def _is_long(stream: Stream) -> bool:
     return len(stream) >= _SHORTEST and (isinstance(stream, WorldStream) or len(stream.start) > 1)
 
 
-def cached_walks(
-    count: int, seed: int, folder: Path, attitude: Attitude = "levelled"
-) -> list[WorldStream]:
+def cached_walks(count: int, seed: int, folder: Path, attitude: Attitude) -> list[WorldStream]:
     """Return streams of a simulated phone's IMU along walks of one minute, cached in `folder`."""
 
     def build() -> list[WorldStream]:

@@ -17,16 +17,11 @@ from torch import Tensor
 from stario.network.training.augment import Augmentation, WindowSampler, augmented, heading_of
 from stario.network.training.config import TrainingConfig
 from stario.network.training.parallel import Workers
+from stario.sequences.arrays import runs
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.legs import LegStream
 from stario.sequences.sequence import FloatArray
-from stario.sequences.windows import (
-    HEADING_STEP,
-    VELOCITY_WEIGHTS,
-    WINDOW_RATE,
-    WINDOW_SAMPLES,
-    runs,
-)
+from stario.sequences.windows import HEADING_STEP, VELOCITY_WEIGHTS, WINDOW_RATE, WINDOW_SAMPLES
 
 log = logging.getLogger(__name__)
 
@@ -96,7 +91,6 @@ class LegSampler:
         generator: torch.Generator,
     ) -> None:
         self._seconds, self.augmentation = seconds, augmentation
-        self._length = seconds * WINDOW_SAMPLES
         found = [_beginnings(stream, seconds) for stream in streams]
         if not any(found):
             raise _too_far_apart(streams, seconds)
@@ -117,10 +111,8 @@ class LegSampler:
     def batch(self, size: int) -> LegBatch:
         """Draw stretches that hold two or more legs each."""
         drawn = [self._draw() for _ in range(size)]
-        imu_N = torch.from_numpy(np.stack([s.imu_N[o : o + self._length] for s, o in drawn]))
-        facing_N = torch.from_numpy(
-            np.stack([s.facing_N[o : o + self._length : HEADING_STEP] for s, o in drawn])
-        )
+        imu_N = torch.from_numpy(np.stack([part.imu_N for part in drawn]))
+        facing_N = torch.from_numpy(np.stack([part.facing_N[::HEADING_STEP] for part in drawn]))
         heading = heading_of(facing_N.view(size, self._seconds, -1, 2)).flatten()
         change = velocity_change(imu_N[..., 3:5].view(size, self._seconds, WINDOW_SAMPLES, 2))
         imu_N = imu_N.view(-1, WINDOW_SAMPLES, 6)
@@ -129,17 +121,18 @@ class LegSampler:
         leg_tensors = [*_padded(drawn, self._seconds), change]
         return LegBatch(windows.contiguous(), R_NH.view(size, -1, 3, 3), *leg_tensors)
 
-    def _draw(self) -> tuple[LegStream, int]:
+    def _draw(self) -> LegStream:
         uniform = torch.rand(2, generator=self._generator, dtype=torch.float64)
         index = int(torch.searchsorted(self._cumulative, uniform[0]))
         stream, first, count = self._runs[min(index, len(self._runs) - 1)]
-        return stream, first + int(uniform[1] * count)
+        begin = first + int(uniform[1] * count)
+        return stream.part(begin, begin + self._seconds * WINDOW_SAMPLES)
 
 
 def _beginnings(stream: LegStream, seconds: int) -> list[tuple[int, int]]:
     """Return the runs of samples, first and count, where a stretch with two legs may begin."""
     begin = np.arange(len(stream) - seconds * WINDOW_SAMPLES) / WINDOW_RATE
-    # Counted as in `_padded`: legs are in order of time.
+    # Counted as in `LegStream.part`: legs are in order of time.
     over = np.searchsorted(stream.stop, begin + seconds, side="right")
     enough = over - np.searchsorted(stream.start, begin) >= 2
     return [(first, stop - first) for first, stop in runs(enough)]
@@ -157,32 +150,25 @@ def _too_far_apart(streams: Sequence[LegStream], seconds: int) -> InputError:
     return InputError(kind, found, f"two legs within {seconds} s", fix)
 
 
-def _padded(drawn: Sequence[tuple[LegStream, int]], seconds: int) -> list[Tensor]:
-    """Return the tensors of a `LegBatch` that describe the legs."""
-    # The legs that lie within each stretch.
-    rows = [
-        np.flatnonzero((stream.start >= begin) & (stream.stop <= begin + seconds))
-        for stream, offset in drawn
-        for begin in (offset / WINDOW_RATE,)
-    ]
-    size, width = len(drawn), max(1, *(len(row) for row in rows))
+def _padded(drawn: Sequence[LegStream], seconds: int) -> list[Tensor]:
+    """Return the tensors of a `LegBatch` that describe the legs of stretches."""
+    counts = [len(part.start) for part in drawn]
+    size, width = len(drawn), max(1, *counts)
     share = np.zeros((size, width, seconds))
     displacement, whitening = np.zeros((size, width, 3)), np.zeros((size, width, width))
     variance, duration = np.zeros((size, width)), np.ones((size, width))
     edges = np.arange(seconds)
-    for s, ((stream, offset), legs) in enumerate(zip(drawn, rows, strict=True)):
-        count = len(legs)
-        start = stream.start[legs, None] - offset / WINDOW_RATE
-        stop = stream.stop[legs, None] - offset / WINDOW_RATE
+    for s, (part, count) in enumerate(zip(drawn, counts, strict=True)):
+        start, stop = part.start[:, None], part.stop[:, None]
         overlap = np.minimum(stop, edges + 1.0) - np.maximum(start, edges)
         share[s, :count] = np.maximum(overlap, 0.0)
-        displacement[s, :count] = stream.displacement[legs]
-        duration[s, :count] = (stop - start)[:, 0]
-        C = ends_covariance(stream.start[legs], stream.stop[legs], stream.sigma[legs])
+        displacement[s, :count] = part.displacement
+        duration[s, :count] = part.stop - part.start
+        C = ends_covariance(part.start, part.stop, part.sigma)
         variance[s, :count] = np.diag(C)
         C += VARIANCE_RATE * np.diag(duration[s, :count])
         whitening[s, :count, :count] = np.linalg.inv(np.linalg.cholesky(C)) if count else 0.0
-    known = np.arange(width) < np.array([[len(row)] for row in rows])
+    known = np.arange(width) < np.array(counts)[:, None]
     arrays = [share, displacement, whitening, variance, duration]
     return [torch.from_numpy(a).float() for a in arrays] + [torch.from_numpy(known)]
 

@@ -19,6 +19,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from stario.sequences.arrays import rms, scatter
 from stario.sequences.attitude.rotations import tilt_aligning
 from stario.sequences.attitude.so3 import cross, exp_so3
 from stario.sequences.sequence import FloatArray
@@ -96,8 +97,8 @@ def start_from_gravity(time: FloatArray, gyro: FloatArray, accel: FloatArray) ->
     """
     R_0B = integrate(np.eye(3), time, gyro)
     force_0 = (R_0B @ accel[:, :, None])[:, :, 0]
-    turn_rate = math.sqrt(float((gyro**2).sum(axis=1).mean()))
-    still = bool(np.linalg.norm(force_0.std(axis=0)) < STILL_ACCEL and turn_rate < STILL_GYRO)
+    turn_rate = rms(gyro)
+    still = scatter(force_0) < STILL_ACCEL and turn_rate < STILL_GYRO
     up = force_0.mean(axis=0)
     force = float(np.linalg.norm(up))
     R_WB = tilt_aligning(up).as_matrix() if force > MIN_GRAVITY_FORCE else np.eye(3)

@@ -69,21 +69,20 @@ def convert(sequence: ImuSequence, path: Path, layout: str | None = None) -> lis
     return [path]
 
 
-def layout_of(path: Path, layout: str | None = None) -> str:
+def layout_of(path: Path, layout: str | None) -> str:
     """Return the given layout, or else csv for `.csv`, archive for `.h5`, euroc for a folder.
 
     Raises:
         InputError: the layout or the path's suffix is unknown, or they contradict each other.
     """
-    if layout is not None:
-        check_choice("layout", layout, LAYOUTS)
     by_suffix = {".csv": "csv", "": "euroc", **dict.fromkeys(ARCHIVE_SUFFIXES, "archive")}
     implied = by_suffix.get(path.suffix.lower())
-    if layout is None and implied is None:
-        known = ".csv, .h5 or a folder name without a dot"
-        raise InputError(str(path), path.suffix, known, "choose the layout with --to")
     if layout is None:
-        return str(implied)
+        if implied is None:
+            known = ".csv, .h5 or a folder name without a dot"
+            raise InputError(str(path), path.suffix, known, "choose the layout with --to")
+        return implied
+    check_choice("layout", layout, LAYOUTS)
     if path.suffix and implied not in (None, layout):  # it would be read as the other one
         raise InputError(str(path), f"{path.suffix} for the layout {layout}", "a suffix that fits")
     return layout

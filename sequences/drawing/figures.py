@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stario.sequences.arrays import runs
 from stario.sequences.files import atomic_write
 from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray
-from stario.sequences.windows import runs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -100,7 +100,7 @@ def split_at_gaps(
     )
 
 
-def unbroken(values: FloatArray) -> list[FloatArray]:
+def split_at_nan(values: FloatArray) -> list[FloatArray]:
     """Return the stretches (n, k) of values (N, k) between rows with a NaN."""
     known = np.asarray(np.isfinite(values).all(axis=1))
     return [values[a:b] for a, b in runs(known)]

@@ -14,6 +14,7 @@ import numpy as np
 
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.accuracy.metrics import PoseErrors, pose_errors
+from stario.sequences.clean_samples import finite_samples
 from stario.sequences.drawing.figures import (
     ABOVE_LEFT,
     ABOVE_RIGHT,
@@ -35,7 +36,6 @@ from stario.sequences.drawing.figures import (
 )
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import (
-    MAX_IMU_GAP,
     MAX_TRUTH_GAP,
     STANDARD_GRAVITY,
     BoolArray,
@@ -45,6 +45,7 @@ from stario.sequences.sequence import (
     is_gap,
     whole_seconds,
 )
+from stario.sequences.time_order import MAX_IMU_GAP
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -146,7 +147,7 @@ def imu_overview(
         gaps: first and last time of stretches without samples [s]: shaded, or marked at the upper
             edge if they are short enough to be bridged.
     """
-    finite = np.isfinite(np.column_stack([sequence.time, sequence.gyro, sequence.accel])).all(1)
+    finite = finite_samples(sequence)
     order = np.flatnonzero(finite)[np.argsort(sequence.time[finite], kind="stable")]
     time, gyro, accel = sequence.time[order], sequence.gyro[order], sequence.accel[order]
     count = 2 + (rotation is not None) + (sequence.truth is not None)

@@ -17,6 +17,7 @@ import numpy as np
 
 from stario.sequences.arrays import check_type
 from stario.sequences.attitude.rotations import integrated_gyro
+from stario.sequences.clean_samples import clean_samples, unbroken
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.constant_values import check_not_dead
 from stario.sequences.inspection.times import check_time
@@ -25,7 +26,6 @@ from stario.sequences.truth.fit import TruthFit, fit_truth
 from stario.sequences.truth.part import without_spikes
 from stario.sequences.truth.positions import fit_positions
 from stario.sequences.units import FAST_RAD_S, GYRO_UNITS
-from stario.sequences.windows import clean_samples, unbroken
 
 log = logging.getLogger(__name__)
 

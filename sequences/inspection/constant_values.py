@@ -12,9 +12,10 @@ import logging
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import runs, scatter
+from stario.sequences.clean_samples import MIN_RATE, usable
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, BoolArray, FloatArray, ImuSequence
-from stario.sequences.windows import MIN_RATE, runs, usable
 
 _log = logging.getLogger(__name__)
 
@@ -117,8 +118,7 @@ def shaken(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
     world's (turning in place).
     """
     turned = Rotation.from_rotvec(np.outer(time - time[0], gyro[0])).apply(accel)
-    scatter = min(float(np.linalg.norm(force.std(axis=0))) for force in (accel, turned))
-    return scatter > _SHAKEN_M_S2
+    return min(scatter(accel), scatter(turned)) > _SHAKEN_M_S2
 
 
 def tilting(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
@@ -128,4 +128,4 @@ def tilting(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
     """
     size = float(np.linalg.norm(accel[0]))
     across = np.cross(gyro, accel[0] / size) if size > 0.0 else gyro
-    return float(np.linalg.norm(across.std(axis=0))) > _TILTING_RAD_S
+    return scatter(across) > _TILTING_RAD_S

@@ -15,8 +15,8 @@ import numpy as np
 
 from stario.sequences.arrays import samples_in
 from stario.sequences.attitude.rotations import integrated_gyro
+from stario.sequences.clean_samples import clean_samples, unbroken
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
-from stario.sequences.windows import clean_samples, unbroken
 
 _MIN_TILT = 0.2
 """Change of gravity between successive seconds in the device's axes that counts, relative to it."""

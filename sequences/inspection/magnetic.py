@@ -19,10 +19,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.sequences.arrays import correlation, integral, interpolated, samples_in
+from stario.sequences.arrays import (
+    correlation,
+    integral,
+    interpolated,
+    peak_offset,
+    rms,
+    samples_in,
+)
 from stario.sequences.attitude.levelling import levelled_attitudes
+from stario.sequences.clean_samples import clean_samples, longest_unbroken
 from stario.sequences.sequence import FloatArray, ImuSequence
-from stario.sequences.windows import clean_samples, longest_unbroken
 
 _LONGEST_S = 600.0
 _SHORTEST_S = 10.0
@@ -159,14 +166,13 @@ def assess_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
     stamps, values = field.time[inside], field.field[inside]
     if len(stamps) < 20 or stamps[-1] - stamps[0] < _SHORTEST_S:
         return None
-    turning = float(np.sqrt(np.square(gyro).sum(axis=1).mean()))
     agreement = lag = iron = sigma = None
-    if turning > _TURNING_RAD_S:
+    if rms(gyro) > _TURNING_RAD_S:
         agreement, lag, iron, sigma = _against_gyro(time, gyro, stamps, values)
-    removed = np.zeros(3) if iron is None or sigma is None or not _is_iron(iron, sigma) else iron
-    nearest = np.clip(np.searchsorted(time, stamps), 0, len(time) - 1)
-    R_NB = levelled_attitudes(time, gyro, accel)[nearest]
-    field_N = np.einsum("nij,nj->ni", R_NB, values - removed)
+    following = np.clip(np.searchsorted(time, stamps), 0, len(time) - 1)
+    R_NB = levelled_attitudes(time, gyro, accel)[following]
+    certain = _certain_iron(iron, sigma)
+    field_N = np.einsum("nij,nj->ni", R_NB, values if certain is None else values - certain)
     level = np.hypot(field_N[:, 0], field_N[:, 1])
     spread, drift = _steadiness(stamps, field_N[:, :2])
     sizes = np.linalg.norm(values, axis=1)
@@ -221,17 +227,18 @@ def _against_gyro(
     best = int(np.argmax(scores))
     if best in (0, len(scores) - 1):
         return float(scores[best]), None, None, None
-    a, b, c = scores[best - 1 : best + 2]
-    lag = float(_LAGS_S[best])
-    lag += 0.5 * (a - c) / min(a - 2.0 * b + c, -1e-12) * float(_LAGS_S[1] - _LAGS_S[0])
+    step = float(_LAGS_S[1] - _LAGS_S[0])
+    lag = float(_LAGS_S[best]) + peak_offset(*scores[best - 1 : best + 2]) * step
     agreement, iron, spread = fit(lag)
     return agreement, lag, iron, spread
 
 
-def _is_iron(iron: FloatArray, sigma: FloatArray) -> bool:
-    """Return whether an offset must be removed before the field is assessed."""
+def _certain_iron(iron: FloatArray | None, sigma: FloatArray | None) -> FloatArray | None:
+    """Return the hard iron if it must be removed before the field is assessed."""
+    if iron is None or sigma is None:
+        return None
     sure = np.abs(iron) > _SURE * sigma
-    return bool(np.linalg.norm(iron[sure]) > _IRON_UT)
+    return iron if np.linalg.norm(iron[sure]) > _IRON_UT else None
 
 
 def _held(time: FloatArray, field: FloatArray) -> float:
@@ -276,7 +283,7 @@ def _steadiness(time: FloatArray, level: FloatArray) -> tuple[float, float]:
 def magnetic_problems(name: str, findings: MagneticFindings) -> list[str]:
     """Return problems of the magnetometer of recording `name`, one line each."""
     field, problems = f"{name}: magnetometer", []
-    iron, sigma = findings.hard_iron_uT, findings.hard_iron_sigma_uT
+    iron = _certain_iron(findings.hard_iron_uT, findings.hard_iron_sigma_uT)
     agreement = findings.correlation_with_gyroscope
     if not _SIZES_UT[0] < findings.size_median_uT < _SIZES_UT[1]:
         problems.append(
@@ -288,7 +295,7 @@ def magnetic_problems(name: str, findings: MagneticFindings) -> list[str]:
             f"{field}: does not follow the gyroscope (correlation {agreement:.2f}): "
             "a disturbed field, stale readings or different axes"
         )
-    if iron is not None and sigma is not None and _is_iron(iron, sigma):
+    if iron is not None:
         offset = ", ".join(f"{b:+.0f}" for b in iron)
         problems.append(f"{field}: the device adds a constant field of {offset} uT (hard iron)")
     if findings.dip_rad < -_UP_RAD:

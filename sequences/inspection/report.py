@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from stario.sequences.arrays import check_type
+from stario.sequences.clean_samples import finite_samples, usable
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.inspection.constant_values import dead_axis_problems
@@ -38,7 +39,6 @@ from stario.sequences.truth.position_findings import (
 from stario.sequences.truth.positions import PositionFit
 from stario.sequences.truth.problems import examine_truth
 from stario.sequences.truth.yaw_drift import YawDrift, yaw_drift
-from stario.sequences.windows import usable
 
 
 @dataclass(frozen=True)
@@ -228,7 +228,7 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
     """
     check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
     given, sequence = len(sequence), without_times_ahead(sequence)
-    finite = np.isfinite(np.column_stack([sequence.time, sequence.gyro, sequence.accel])).all(1)
+    finite = finite_samples(sequence)
     if not finite.any():
         raise InputError(f"{sequence.name}: samples", "no finite sample", "numbers")
     valid = finite & usable(sequence) if (finite & usable(sequence)).any() else finite

@@ -6,10 +6,11 @@ import logging
 
 import numpy as np
 
+from stario.sequences.arrays import runs
+from stario.sequences.clean_samples import usable
 from stario.sequences.inspection.constant_values import stuck_problems
-from stario.sequences.sequence import MAX_IMU_GAP, FloatArray, ImuSequence
-from stario.sequences.time_order import ahead_mask, increasing_mask
-from stario.sequences.windows import runs, usable
+from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.time_order import MAX_IMU_GAP, ahead_mask, increasing_mask
 
 _log = logging.getLogger(__name__)
 

@@ -20,10 +20,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.sequences.accuracy.chi_square import chi2_quantile
-from stario.sequences.arrays import samples_in
+from stario.sequences.arrays import runs, samples_in
+from stario.sequences.clean_samples import clean_samples
 from stario.sequences.noise import PHONE_NOISE
 from stario.sequences.sequence import FloatArray, ImuSequence
-from stario.sequences.windows import MAX_IMU_GAP, clean_samples, runs
+from stario.sequences.time_order import MAX_IMU_GAP
 
 _INSPECTION_FACTOR = 6.0
 """Factor for a device at rest, used by inspection: its sensors may be noisier than a phone's."""

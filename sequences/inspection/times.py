@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from stario.sequences.clean_samples import MAX_RATE, MIN_RATE
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.samples import disorder
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.units import TIME_UNITS
-from stario.sequences.windows import MAX_RATE, MIN_RATE
 
 _ROUNDED_TIMES = 1.5
 """Least number of samples that share a time on average if times are rounded too coarsely."""

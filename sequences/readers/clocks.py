@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.arrays import interpolated
+from stario.sequences.clean_samples import MAX_RATE
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.phones.sensor_words import XSENS_CLOCK
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import MAX_TRUTH_GAP, FloatArray
 from stario.sequences.units import TIME_UNITS
-from stario.sequences.windows import MAX_RATE
 
 _log = logging.getLogger(__name__)
 

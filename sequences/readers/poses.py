@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.arrays import interpolated
 from stario.sequences.attitude.levelling import MIN_GRAVITY_FORCE
 from stario.sequences.attitude.rotations import NORM_TOLERANCE, tilt_aligning
+from stario.sequences.clean_samples import clean_samples
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.clocks import time_unit
 from stario.sequences.readers.phones.sensor_words import words_of
@@ -31,7 +32,6 @@ from stario.sequences.time_order import increasing_mask
 from stario.sequences.truth.accel_axes import accel_axes
 from stario.sequences.truth.alignment import BodyAlignment, align_tracked_body
 from stario.sequences.truth.clock_offset import clock_offset
-from stario.sequences.windows import clean_samples
 
 _log = logging.getLogger(__name__)
 

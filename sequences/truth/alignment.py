@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import correlation, interpolated, samples_in
+from stario.sequences.arrays import correlation, interpolated, peak_offset, samples_in
 from stario.sequences.attitude.levelling import MIN_GRAVITY_FORCE
 from stario.sequences.attitude.rotations import GyroIntegral, tilt_aligning
 from stario.sequences.errors import InputError
@@ -191,7 +191,5 @@ def _best_lag(score: Callable[[float], float], reach: float) -> float:
     lags = centre + _LAG_STEP_S * np.arange(-4, 5)
     scores = [score(lag) for lag in lags]
     best = int(np.clip(np.argmax(scores), 1, len(lags) - 2))
-    before, peak, after = scores[best - 1 : best + 2]
-    curvature = before - 2 * peak + after
-    offset = 0.5 * (before - after) / curvature if curvature < 0 else 0.0
-    return float(lags[best] + np.clip(offset, -1, 1) * _LAG_STEP_S)
+    offset = np.clip(peak_offset(*scores[best - 1 : best + 2]), -1.0, 1.0)
+    return float(lags[best] + offset * _LAG_STEP_S)

@@ -130,17 +130,14 @@ def fit_problems(fit: TruthFit, known: str) -> list[TruthProblem]:
 
 
 def _inconsistent(fit: TruthFit) -> TruthProblem:
-    found = (
-        f"an attitude that disagrees with the gyroscope (correlation {fit.correlation:.2f}, "
-        f"{fit.agreeing:.0%} of the poses agree)"
-    )
     if abs(fit.time_offset) > MAX_OFFSET_S - EDGE_S and fit.agrees:
         return TruthProblem(
             f"a clock that is off by {MAX_OFFSET_S:.0f} s or more",
             f"add {fit.time_offset:+.2f} s to its times in the file and inspect it again",
         )
     return TruthProblem(
-        found,
+        f"an attitude that disagrees with the gyroscope (correlation {fit.correlation:.2f}, "
+        f"{fit.agreeing:.0%} of the poses agree)",
         f"are the clocks more than {MAX_OFFSET_S:.0f} s apart, is the truth of another recording, "
         "or has the gyroscope a wrong axis or sign?",
     )

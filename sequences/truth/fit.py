@@ -16,10 +16,10 @@ from stario.sequences.arrays import interpolated
 from stario.sequences.conventions import SAME_AXES, axes_matrix, axes_named
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
+from stario.sequences.time_order import MAX_IMU_GAP
 from stario.sequences.truth.alignment import align_tracked_body
 from stario.sequences.truth.clock_offset import convolved
 from stario.sequences.truth.part import compared_samples
-from stario.sequences.windows import MAX_IMU_GAP
 
 MAX_OFFSET_S = 5.0
 """Largest time offset searched, in either direction [s]."""

@@ -82,9 +82,12 @@ def fitted_mounts(
         if not gyro_B.has_long_gap(*sorted((time[here], time[there]))):
             across = attitude_B[there].inv() * attitude_B[here]
             carried = attitude_WV[here].inv() * attitude_WV[there] * mount * across
-        same = _same_mount(mount, carried) or (fit is not None and _same_mount(mount, fit))
-        agrees = fit is not None and _same_mount(fit, carried)
-        mounts[k] = mount if same else (fit if agrees and fit else carried)
+        if _same_mount(mount, carried) or (fit and _same_mount(mount, fit)):
+            mounts[k] = mount
+        elif fit and _same_mount(fit, carried):
+            mounts[k] = fit
+        else:
+            mounts[k] = carried
     return [mounts[k] for k in range(count)]
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from stario.sequences.clean_samples import clean_samples
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence
-from stario.sequences.windows import clean_samples
 
 LONGEST_S = 600.0
 """Length of the middle part that is used of a longer recording [s], which bounds the cost."""

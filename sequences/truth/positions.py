@@ -22,13 +22,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import correlation, integral, interpolated
-from stario.sequences.sequence import (
-    MAX_IMU_GAP,
-    BoolArray,
-    FloatArray,
-    ImuSequence,
-    Trajectory,
-)
+from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
+from stario.sequences.time_order import MAX_IMU_GAP
 from stario.sequences.truth.part import compared_samples
 
 _H_S = 0.3

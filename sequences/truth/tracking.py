@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import median_filter
 
+from stario.sequences.arrays import rms, runs, scatter
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory, is_gap
 from stario.sequences.truth.findings import TruthProblem
-from stario.sequences.windows import runs
 
 _JUMP_M, _FASTEST_M_S = 0.5, 15.0
 """Length [m] and speed [m/s] above which a step between successive poses may be a jump."""
@@ -112,6 +112,4 @@ def _moves(sequence: ImuSequence, start: float, stop: float) -> bool:
     values = values[np.isfinite(values).all(axis=1)]
     if len(values) < 2:
         return False
-    rate = float(np.sqrt(np.square(values[:, :3]).sum(axis=1).mean()))
-    force = float(np.linalg.norm(values[:, 3:].std(axis=0)))
-    return rate > _MOVING_RAD_S and force > _MOVING_M_S2
+    return rms(values[:, :3]) > _MOVING_RAD_S and scatter(values[:, 3:]) > _MOVING_M_S2

@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import yaw_of
+from stario.sequences.clean_samples import clean_samples, longest_unbroken
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.truth.fit import TruthFit
 from stario.sequences.truth.part import middle_part
-from stario.sequences.windows import clean_samples, longest_unbroken
 
 _STEP_S = 0.1
 _MIN_TURNED_RAD = 0.3

@@ -185,8 +185,6 @@ def test_slicing_a_sequence_also_slices_its_truth() -> None:
     part = sequence.slice(0.5, 1.0)
     assert np.array_equal(part.time, part.truth.time)
     assert part.duration == 0.5
-    assert sequence.rate == pytest.approx(50.0)
-    assert sequence.without_truth().truth is None
 
 
 def test_about_z_and_yaw_of_are_inverses() -> None:

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.recording import cut_recording
 from stario.sequences.attitude.rotations import about_z, yaw_of
+from stario.sequences.clean_samples import clean_samples
 from stario.sequences.errors import InputError
 from stario.sequences.levelled_stream import levelled_streams
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -16,7 +17,6 @@ from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import (
     VELOCITY_WEIGHTS,
     Attitude,
-    clean_samples,
     facing,
     headings_at,
     imu_in_world,

@@ -18,11 +18,12 @@ from stario.fusion.evaluation.tracks import (
 from stario.fusion.navigator import Navigator
 from stario.sequences.accuracy.metrics import align, pose_errors
 from stario.sequences.attitude.rotations import about_z
+from stario.sequences.clean_samples import clean_samples
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
-from stario.sequences.windows import WINDOW_SECONDS, clean_samples, headings_at, imu_in_world
+from stario.sequences.windows import WINDOW_SECONDS, headings_at, imu_in_world
 
 CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=10, covariance_scale=1.0))
 

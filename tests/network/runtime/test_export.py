@@ -9,9 +9,10 @@ from stario.network.architectures import ARCHITECTURES, build_network
 from stario.network.card import Calibration, Card
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import DisplacementModel, load_model, save_model
+from stario.network.runtime.benchmark import random_windows
 from stario.network.runtime.engines import TorchEngine
 from stario.sequences.errors import InputError, WeightsError
-from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
+from stario.sequences.sequence import FloatArray
 
 pytest.importorskip("onnx")
 pytest.importorskip("onnxscript")
@@ -27,12 +28,6 @@ def untrained(name: str) -> DisplacementModel:
     return DisplacementModel(
         TorchEngine(DisplacementNetwork(build_network(name))), Card(name, calibration=CALIBRATION)
     )
-
-
-def random_windows(count: int) -> FloatArray:
-    windows = np.random.default_rng(count).standard_normal((count, 6, 200)).astype(np.float32)
-    windows[:, 5] += STANDARD_GRAVITY
-    return windows
 
 
 def assert_close(found: FloatArray, expected: FloatArray) -> None:

@@ -37,7 +37,7 @@ def test_rows_hold_counts_times_and_memory(tmp_path: Path, monkeypatch: pytest.M
         assert times is not None
         assert sorted(times) == ["1", "64"]
         assert min(times.values()) > 0.0
-        assert set(row.as_dict()) == {*measured(), "name"}
+        assert set(vars(row)) == {*measured(), "name"}
     table = survey_table(rows)
     assert "3.659 (3.659)" in table
     assert "threads" in table

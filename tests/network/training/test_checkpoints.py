@@ -36,7 +36,7 @@ def test_a_killed_and_resumed_run_gives_the_same_weights(
 
 
 def test_a_finished_run_is_not_trained_further(
-    finished: tuple[Path, list[EpochReport]], tmp_path: Path
+    finished: tuple[Path, list[EpochReport]], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     checkpoint = tmp_path / "checkpoint.safetensors"
     checkpoint.write_bytes((finished[0].parent / checkpoint.name).read_bytes())
@@ -44,12 +44,6 @@ def test_a_finished_run_is_not_trained_further(
     path = run(tmp_path, on_step=lambda step, loss: steps.append(step), trained_on=["swings"])
     assert steps == []
     assert path.read_bytes() == finished[0].read_bytes()
-
-
-def test_a_finished_run_logs_that_all_epochs_are_done(
-    finished: tuple[Path, list[EpochReport]], caplog: pytest.LogCaptureFixture
-) -> None:
-    run(finished[0].parent, trained_on=["swings"])
     assert "all 4 epochs are done" in caplog.text
 
 

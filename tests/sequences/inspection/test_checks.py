@@ -242,8 +242,9 @@ def test_units_are_converted_by_name(walk: ImuSequence) -> None:
 def test_real_recordings_pass_and_their_wrong_units_are_named() -> None:
     paths = [path for name in ("euroc", "oxiod", "tumvi") for path in find_recordings(DATA / name)]
     for path in paths[::6]:
-        recording = read_recording(path)
-        check_units(recording)
+        whole = read_recording(path)
+        check_units(whole)
+        recording = whole.slice(whole.time[0], whole.time[0] + 60.0)
         assert "--gyro-unit deg/s" in refusal(in_degrees(recording))
         alone = recording.without_truth()
         in_g = replace(alone, accel=alone.accel / STANDARD_GRAVITY)

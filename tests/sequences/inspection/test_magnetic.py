@@ -20,11 +20,11 @@ from stario.sequences import (
 )
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import yaw_of
+from stario.sequences.clean_samples import clean_samples
 from stario.sequences.inspection.magnetic import assess_magnetometer, magnetic_problems
 from stario.sequences.inspection.times import magnetometer_time_problems
 from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
-from stario.sequences.windows import clean_samples
 
 IRON = (15.0, -6.0, 9.0)
 

@@ -12,7 +12,7 @@ from phone_exports import get_sensor_data, pose, trace
 from phone_files import ns, save, zyx
 
 from stario.sequences import ImuSequence, ReadError, read_recording
-from stario.sequences.windows import clean_samples
+from stario.sequences.clean_samples import clean_samples
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,70 @@
+"""Usable samples of a recording: measurable values at increasing times, in unbroken stretches."""
+
+from __future__ import annotations
+
+import logging
+from itertools import pairwise
+
+import numpy as np
+
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import MAX_SENSOR_VALUE, BoolArray, FloatArray, ImuSequence
+from stario.sequences.time_order import MAX_IMU_GAP, ahead_mask, increasing_mask
+
+log = logging.getLogger(__name__)
+
+MIN_RATE, MAX_RATE = 40.0, 1200.0
+"""Limits of accepted sampling rates [Hz] (50 Hz to 1 kHz, with a margin for jitter)."""
+
+
+def usable(sequence: ImuSequence) -> BoolArray:
+    """Return which samples (N,) are numbers that a sensor can measure, whatever their time."""
+    values = np.column_stack([sequence.gyro, sequence.accel])
+    return np.asarray((np.abs(values) < MAX_SENSOR_VALUE).all(axis=1))
+
+
+def finite_samples(sequence: ImuSequence) -> BoolArray:
+    """Return which samples (N,) have a finite time and finite values."""
+    columns = np.column_stack([sequence.time, sequence.gyro, sequence.accel])
+    return np.asarray(np.isfinite(columns).all(axis=1))
+
+
+def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return time, gyroscope and accelerometer without bad, repeated and out-of-order samples.
+
+    A few samples that jump ahead of later ones are dropped as well, and their number is logged.
+
+    Raises:
+        InputError: fewer than two samples are left, or their rate is not accepted.
+    """
+    index = np.flatnonzero(np.isfinite(sequence.time) & usable(sequence))
+    if lost := len(sequence) - len(index):
+        log.warning(
+            "%s: samples that are not finite or too large dropped: %d of %d",
+            sequence.name, lost, len(sequence),
+        )  # fmt: skip
+    kept = increasing_mask(sequence.time[index])
+    if ahead := int(ahead_mask(sequence.time[index], kept).sum()):
+        log.warning("%s: samples ahead of their time dropped: %d", sequence.name, ahead)
+    index = index[kept]
+    if len(index) < 2:
+        raise InputError(f"{sequence.name}: samples", f"{len(index)} usable", "at least 2")
+    time = sequence.time[index]
+    rate = float(1.0 / np.median(np.diff(time)))
+    if not MIN_RATE <= rate <= MAX_RATE:
+        found, fix = f"{rate:.1f} Hz", "is the time column in seconds?"
+        if lost > len(sequence) / 2:
+            fix = "most samples are not finite"
+        raise InputError(f"{sequence.name}: rate", found, "50 Hz to 1 kHz", fix)
+    return time, sequence.gyro[index], sequence.accel[index]
+
+
+def unbroken(time: FloatArray) -> list[tuple[int, int]]:
+    """Return stretches [start, stop) of increasing times (N,) [s] without a gap of the IMU."""
+    breaks = np.flatnonzero(np.diff(time) > MAX_IMU_GAP) + 1
+    return list(pairwise([0, *breaks.tolist(), len(time)]))
+
+
+def longest_unbroken(time: FloatArray) -> slice:
+    """Return the longest of the stretches of `unbroken`, by its samples."""
+    return slice(*max(unbroken(time), key=lambda piece: piece[1] - piece[0]))
