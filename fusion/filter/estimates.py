@@ -68,8 +68,7 @@ def nav_states(estimates: Sequence[Estimate], which: int = ACTUAL) -> list[NavSt
     return states
 
 
-def smoothed_pose(clone: Estimate) -> SmoothedPose:
-    """Convert the estimate of a clone to a `SmoothedPose`."""
-    (s,) = nav_states([clone])
-    covariance = s.covariance[np.ix_(CLONED, CLONED)]
-    return SmoothedPose(s.time, s.R_WB, s.p_W, covariance, s.map_frame)
+def smoothed_pose(clone: NavState) -> SmoothedPose:
+    """Return the pose of a clone, without the velocity and biases that it does not have."""
+    covariance = clone.covariance[np.ix_(CLONED, CLONED)]
+    return SmoothedPose(clone.time, clone.R_WB, clone.p_W, covariance, clone.map_frame)

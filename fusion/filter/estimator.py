@@ -21,7 +21,7 @@ from stario.fusion.filter.estimator_state import (
     rewound,
     with_step,
 )
-from stario.fusion.filter.frame_transform import with_undirected
+from stario.fusion.filter.frame_transform import to_final_frame, with_undirected
 from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior
 from stario.fusion.filter.hypotheses import HypothesisPair
 from stario.fusion.filter.initial import PriorPose, initialise, reinitialise, tilt_sigma
@@ -282,8 +282,12 @@ class Estimator:
 
     @property
     def smoothed(self) -> SmoothedPose | None:
-        """`released` as a `SmoothedPose`; None at first."""
-        return None if self.released is None else smoothed_pose(self.released)
+        """`released` as a `SmoothedPose` in the current map frame; None at first."""
+        if self.released is None:
+            return None
+        frame = self.frame.state
+        poses = to_final_frame(nav_states([self.released]), frame.transforms)
+        return smoothed_pose(with_undirected(poses, frame.undirected)[0])
 
     def estimate(self) -> Estimate:
         """Return the estimate of the filter's newest state."""

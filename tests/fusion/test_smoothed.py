@@ -93,5 +93,30 @@ def test_a_stream_gives_the_same_poses_as_a_batch(make_walk: Make, make_oracle: 
     last = [pose.map_frame == poses[-1].map_frame for pose in poses]
     ours = np.array([pose.p_W for pose in poses])[last]
     np.testing.assert_allclose(ours, track.smoothed.position_W[last], atol=1e-9)
+    covariances = np.array([pose.covariance[3:, 3:] for pose in poses])[last]
+    expected = track.smoothed.position_covariance_W[last]
+    np.testing.assert_allclose(covariances, expected, rtol=1e-9, atol=1e-12)
     truth = walk.truth.at(track.smoothed.time)
     assert np.linalg.norm(truth.position_W - track.smoothed.position_W, axis=1).max() < 1.0
+
+
+def test_a_smoothed_pose_of_unknown_direction_is_as_uncertain_as_the_newest_state(
+    make_walk: Make, make_oracle: Make
+) -> None:
+    """One position places the track and leaves its yaw in the map unknown."""
+    walk = make_walk(1, 8.0, 100.0, ERRORS)
+    fix = position_fix(3.0, walk.truth.at(np.array([3.0])).position_W[0], 1e-3 * np.eye(3))
+    model = make_oracle(walk, walk.truth, CONFIG)
+    track, navigator = Navigator(model, CONFIG).run(walk, fixes=[fix]), Navigator(model, CONFIG)
+    for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
+        if row[0] == pytest.approx(3.5):
+            navigator.update_position(fix.time, fix.value, fix.covariance)
+            released = navigator.smoothed  # before the fix, and now in its frame
+            assert released.map_frame == navigator.state.map_frame == 1
+        navigator.push(*row)
+    pose = navigator.smoothed
+    yaw_variance = navigator.state.covariance[2, 2]
+    assert yaw_variance > 3.0
+    assert pose.covariance[2, 2] == pytest.approx(yaw_variance, rel=0.05)
+    expected = track.smoothed.position_covariance_W[-1]
+    np.testing.assert_allclose(pose.covariance[3:, 3:], expected, rtol=1e-9)
