@@ -107,8 +107,16 @@ class Navigator:
             self.prior, self._fixes = None, FixQueue()
             self._begin_stream()
             raise
-        for interval in intervals:
-            state = self._advance(interval)
+        failure: Exception | None = None
+        for interval in intervals:  # several after a hole that was bridged
+            try:
+                state = self._advance(interval)
+            except Exception as error:
+                if self._estimator is None:  # the stream begins again
+                    raise
+                failure = failure or error
+        if failure is not None:
+            raise failure
         return state
 
     def push_magnetometer(self, time: float, field: Vector) -> None:

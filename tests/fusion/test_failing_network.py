@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,32 @@ def test_a_stream_continues_after_its_network_has_failed(
     errors = [np.linalg.norm(s.p_W - expected[s.time]) for s in states if s is not None]
     assert len(errors) == len(expected) - 3
     assert max(errors) < 0.1
+
+
+def test_no_motion_is_lost_if_the_network_fails_within_a_hole(
+    walk: ImuSequence, make_oracle: Callable[..., Any], without: Callable[..., ImuSequence]
+) -> None:
+    """The sample after a bridged hole completes two intervals, the first of which fails here."""
+    config = replace(CONFIG, filter=replace(CONFIG.filter, update_rate=10))
+    holed = without(walk, (walk.time > 10.055) & (walk.time < 10.205))
+    samples = list(zip(holed.time, holed.gyro, holed.accel, strict=True))
+    oracle = make_oracle(holed, walk.truth, config)
+    whole = Navigator(Failing(oracle, set()), config)
+    calls = []
+    for sample in samples:
+        calls.append(whole.model.calls)
+        whole.push(*sample)
+    (k,) = np.flatnonzero(np.diff(calls) == 2)
+    navigator = Navigator(Failing(oracle, {calls[k] + 1}), config)
+    for sample in samples[:k]:
+        navigator.push(*sample)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        navigator.push(*samples[k])
+    for sample in samples[k + 1 :]:
+        navigator.push(*sample)
+    assert navigator.model.calls == whole.model.calls
+    assert navigator.state.time == whole.state.time
+    assert np.linalg.norm(navigator.state.p_W - whole.state.p_W) < 0.01
 
 
 def zeros(count: int) -> np.ndarray:
