@@ -155,6 +155,8 @@ class AdaptiveBiasPrior:
 
     def widen_for_rest(self) -> None:
         """Widen the prior before a zero-velocity update measures the bias."""
+        if not self._config.filter.adaptive:
+            return
         sigma = _STILLNESS_SIGMA if self.prior.refused_seconds < _LONG_STILLNESS else _RAW_SIGMA
         self._replace_prior(changed(self.prior, variance=max(self.prior.variance, sigma**2)))
 

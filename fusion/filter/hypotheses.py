@@ -69,9 +69,11 @@ class HypothesisPair:
         if self.alternative is None:
             return None
         filter_state, self.ekf.state = self.ekf.state, self.alternative.ekf
-        result = work()
-        self.alternative = changed(self.alternative, ekf=self.ekf.state)
-        self.ekf.state = filter_state
+        try:
+            result = work()
+            self.alternative = changed(self.alternative, ekf=self.ekf.state)
+        finally:
+            self.ekf.state = filter_state
         return result
 
     def judge(self, fits: bool, fits_filter: bool) -> tuple[float, ...]:

@@ -134,6 +134,19 @@ def hypotheses() -> HypothesisPair:
     return pair
 
 
+def test_the_filter_keeps_its_state_if_an_update_of_the_alternative_fails() -> None:
+    pair = hypotheses()
+    before = pair.ekf.state
+
+    def failing() -> None:
+        pair.ekf.state = replace(pair.ekf.state, b_a=2.0 * np.ones(3))
+        raise np.linalg.LinAlgError
+
+    with pytest.raises(np.linalg.LinAlgError):
+        pair.apply_to_alternative(failing)
+    assert pair.ekf.state is before
+
+
 def test_a_displacement_that_fits_only_the_alternative_adopts_it() -> None:
     pair = hypotheses()
     assert pair.judge(False, fits_filter=False) == ()
