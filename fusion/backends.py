@@ -7,11 +7,11 @@ it turns the filter's output into the states of the track.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from time import perf_counter
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -27,13 +27,15 @@ from stario.fusion.filter.frame_transform import (
 )
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import ASSUMED, GYRO_BIAS
-from stario.fusion.fixes import Fix, FixQueue
+from stario.fusion.fixes import Accepted, Fix, FixQueue
 from stario.fusion.graph.batch import smooth
 from stario.fusion.graph.covariances import with_actual_covariances
 from stario.fusion.graph.fixed_lag import FixedLagEstimator
-from stario.fusion.imu.intervals import Start
+from stario.fusion.health import Health, SampleCounts
+from stario.fusion.imu.intervals import ImuInterval, Start
+from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.recording import PreprocessedRecording, Progress
-from stario.fusion.state import NavState, Track, track_from_states
+from stario.fusion.state import NavState, SmoothedPose, Track, track_from_states
 from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import Trajectory
@@ -42,8 +44,36 @@ BackendName = Literal["ekf", "graph"]
 """The EKF, or the factor graph: fixed-lag for streams, the whole track for recordings."""
 
 
-StreamEstimator = Estimator | FixedLagEstimator
-"""An estimator that runs on a stream, interval by interval."""
+class StreamEstimator(Protocol):
+    """An estimator that runs on a stream, interval by interval; see `filter.estimator`."""
+
+    state: Any
+    """Complete state, which can be assigned back."""
+
+    def step(
+        self,
+        interval: ImuInterval,
+        displacement: WindowDisplacement | None,
+        fixes: Sequence[Fix] = (),
+    ) -> object:
+        """Move to the interval's end and apply the displacement of the window that ends there."""
+
+    def late_fix(self, fix: Fix) -> list[Accepted] | None:
+        """Apply a fix from the past; return all fixes applied since, None if it is too late."""
+
+    def nav_state(self) -> NavState:
+        """Return the newest state."""
+
+    def health(self, counts: SampleCounts) -> Health:
+        """Return the health report so far."""
+
+    @property
+    def time(self) -> float:
+        """Time of the newest state [s]."""
+
+    @property
+    def smoothed(self) -> SmoothedPose | None:
+        """Newest pose delayed by one window; None at first, and if there are none."""
 
 
 class FilteredRecording(NamedTuple):

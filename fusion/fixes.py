@@ -71,12 +71,22 @@ class Fix:
         return ""
 
 
+FixOutcome = Literal["applied", "inflated", "waiting", "refused"]
+"""What became of a fix: applied, applied with a larger covariance as an outlier, waiting for its
+time, or refused (`Health.fixes` counts the reasons)."""
+
+
 class Accepted(NamedTuple):
     """A fix applied by a filter."""
 
     fix: Fix
     scale: float
     """Factor applied to its covariance."""
+
+    @property
+    def outcome(self) -> FixOutcome:
+        """Whether it was an outlier."""
+        return "inflated" if self.scale > 1.0 else "applied"
 
     @property
     def inflated(self) -> Fix:
@@ -138,16 +148,19 @@ class FixQueue:
         for fix in fixes:
             self.add(fix)
 
-    def add(self, fix: Fix) -> None:
+    def add(self, fix: Fix) -> FixOutcome:
         """Keep a fix until it is due; invalid ones are refused and counted."""
         check_type("fixes", fix, Fix, "position_fix, velocity_fix and yaw_fix create one")
         if reason := fix.fault():
             self.refuse(reason)
-            return
+            return "refused"
         bisect.insort(self.waiting, fix, key=by_time)
         if len(self.waiting) > self._most:
-            self.waiting.pop()
+            furthest = self.waiting.pop()
             self.refuse("too many waiting")
+            if furthest is fix:
+                return "refused"
+        return "waiting"
 
     def due(self, time: float) -> list[Fix]:
         """Remove and return the fixes up to a time [s], in order."""

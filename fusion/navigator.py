@@ -15,20 +15,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stario.fusion.backends import BACKENDS, BackendName, StreamEstimator, track_recording
+from stario.fusion.backends import BACKENDS, BackendName, track_recording
 from stario.fusion.checked import Vector, seconds, three
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.initial import PriorPose
-from stario.fusion.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_fix
+from stario.fusion.fixes import Fix, FixOutcome, position_fix, velocity_fix, yaw_fix
 from stario.fusion.health import Health
-from stario.fusion.imu.faults import ClockSetBackError
-from stario.fusion.imu.front_end import FrontEnd
-from stario.fusion.imu.intervals import ImuInterval
-from stario.fusion.imu.stateful import Predictor, StatefulInference, displacements_of
-from stario.fusion.imu.units import check_start
+from stario.fusion.imu.stateful import Predictor
 from stario.fusion.recording import PreprocessedRecording, Progress, preprocess, silent
 from stario.fusion.snapshot import check_same, pack, unpack
-from stario.fusion.state import ContinuousPose, NavState, SmoothedPose, Track, advanced, copied
+from stario.fusion.state import ContinuousPose, NavState, SmoothedPose, Track, copied
+from stario.fusion.stream import Stream
 from stario.sequences.arrays import check_choice, check_type
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
@@ -65,13 +62,8 @@ class Navigator:
         check_type("prior", prior, PriorPose, optional=True)
         self.backend = backend
         self.model = model
-        self.prior = prior
         self.config = config or NavigatorConfig()
-        self._fixes = FixQueue()
-        self._estimator: StreamEstimator | None
-        self._continuous: ContinuousPose | None
-        self._front_end: FrontEnd
-        self._begin_stream()
+        self._stream = self._new_stream(prior)
 
     def push(self, time: float, gyro: Vector, accel: Vector) -> NavState | None:
         """Process one sample of a stream.
@@ -98,26 +90,7 @@ class Navigator:
                 up). After the last five the stream starts again; after a clock that was set back,
                 without prior and fixes.
         """
-        sample = (seconds(time), *three("gyro", gyro), *three("accel", accel))
-        state = None
-        try:
-            intervals = self._front_end.push(sample)
-        except ClockSetBackError:
-            # The prior and the waiting fixes belong to the other clock.
-            self.prior, self._fixes = None, FixQueue()
-            self._begin_stream()
-            raise
-        failure: Exception | None = None
-        for interval in intervals:  # several after a hole that was bridged
-            try:
-                state = self._advance(interval)
-            except Exception as error:
-                if self._estimator is None:  # the stream begins again
-                    raise
-                failure = failure or error
-        if failure is not None:
-            raise failure
-        return state
+        return self._stream.push((seconds(time), *three("gyro", gyro), *three("accel", accel)))
 
     def push_magnetometer(self, time: float, field: Vector) -> None:
         """Process one magnetometer sample of a stream, before the IMU samples that follow it.
@@ -133,9 +106,9 @@ class Navigator:
         Raises:
             InputError: time is not a number, or field does not hold three numbers.
         """
-        self._front_end.push_field(seconds(time), np.array(three("field", field)))
+        self._stream.front_end.push_field(seconds(time), np.array(three("field", field)))
 
-    def update_position(self, time: float, p_W: ArrayLike, covariance: ArrayLike) -> None:
+    def update_position(self, time: float, p_W: ArrayLike, covariance: ArrayLike) -> FixOutcome:
         """Apply a position fix to the stream.
 
         It is applied at its own time, which may lie up to one window (1 s) before the newest state
@@ -150,35 +123,46 @@ class Navigator:
             p_W: (3,) [m].
             covariance: (3, 3) [m^2]; use a large variance, such as 1e6, for an unknown height.
 
+        Returns:
+            What became of it: "applied", "inflated" (an outlier, with a larger covariance),
+            "waiting" until its time or the first state, or "refused", with the reason in `health`.
+
         Raises:
             InputError: a value has another shape.
         """
-        self._take(position_fix(time, p_W, covariance))
+        return self._stream.take(position_fix(time, p_W, covariance))
 
-    def update_velocity(self, time: float, v_W: ArrayLike, covariance: ArrayLike) -> None:
+    def update_velocity(self, time: float, v_W: ArrayLike, covariance: ArrayLike) -> FixOutcome:
         """Apply a velocity fix (3,) [m/s] in W with covariance (3, 3); see `update_position`.
 
         Rotate velocities measured along the body's axes, as by wheels, by the attitude first.
         """
-        self._take(velocity_fix(time, v_W, covariance))
+        return self._stream.take(velocity_fix(time, v_W, covariance))
 
-    def update_yaw(self, time: float, yaw: float, sigma: float) -> None:
+    def update_yaw(self, time: float, yaw: float, sigma: float) -> FixOutcome:
         """Apply a fix of the body's yaw [rad]; see `update_position`.
 
         Yaw counts counter-clockwise from the map's x axis, unlike a compass heading; at any tilt it
         is that of the twist about the vertical (`lie.yaw_twist`).
         """
-        self._take(yaw_fix(time, yaw, sigma))
+        return self._stream.take(yaw_fix(time, yaw, sigma))
+
+    @property
+    def prior(self) -> PriorPose | None:
+        """Prior on the first pose."""
+        return self._stream.prior
 
     @property
     def state(self) -> NavState | None:
         """Newest state of the stream; None during the first second."""
-        return None if self._estimator is None else self._estimator.nav_state()
+        estimator = self._stream.estimator
+        return None if estimator is None else estimator.nav_state()
 
     @property
     def continuous(self) -> ContinuousPose | None:
         """Newest pose, without steps at updates; None during the first second."""
-        return None if self._continuous is None else copied(self._continuous)
+        pose = self._stream.continuous
+        return None if pose is None else copied(pose)
 
     @property
     def smoothed(self) -> SmoothedPose | None:
@@ -186,15 +170,13 @@ class Navigator:
 
         It changes with each network update; None before the first, and for the graph.
         """
-        return None if self._estimator is None else self._estimator.smoothed
+        estimator = self._stream.estimator
+        return None if estimator is None else estimator.smoothed
 
     @property
     def health(self) -> Health:
         """Health report of the stream so far."""
-        counts = self._front_end.counts
-        return self._fixes.health(
-            counts.health() if self._estimator is None else self._estimator.health(counts)
-        )
+        return self._stream.health()
 
     def snapshot(self) -> bytes:
         """Return the current stream as bytes, to be continued by `restore` in any process.
@@ -202,17 +184,7 @@ class Navigator:
         The format is documented in `stario.fusion.snapshot`; nothing is pickled. The bytes identify
         the configuration and the weights but do not contain the weights.
         """
-        return pack(
-            {
-                **self._identity(),
-                "prior": self.prior,
-                "front end": self._front_end,
-                "fixes": self._fixes,
-                "network": self._network.memory,
-                "continuous": self._continuous,
-                "estimator": None if self._estimator is None else self._estimator.state,
-            }
-        )
+        return pack(self._identity() | self._stream.parts())
 
     def restore(self, data: bytes) -> None:
         """Continue the stream of a `snapshot`; the states are those without the interruption.
@@ -224,19 +196,12 @@ class Navigator:
             InputError: the bytes are not a complete snapshot of this version, or belong to another
                 back end, configuration or model. The navigator is then unchanged.
         """
-        tree = unpack(data)
+        parts = unpack(data)
         for name, value in self._identity().items():
-            check_same(name, tree[name], value)
-        network = StatefulInference(self.model, self.config.filter.window_updates)
-        network.memory = tree["network"]
-        front_end, prior = tree["front end"], tree["prior"]
-        estimator: StreamEstimator | None = None
-        if tree["estimator"] is not None:
-            estimator = BACKENDS[self.backend].stream(self.config, front_end.start, prior)
-            estimator.state = tree["estimator"]
-        self.prior, self._fixes, self._front_end = prior, tree["fixes"], front_end
-        self._network, self._estimator = network, estimator
-        self._continuous = tree["continuous"]
+            check_same(name, parts[name], value)
+        stream = self._new_stream(None)
+        stream.continue_from(parts)
+        self._stream = stream
 
     def run(
         self, sequence: ImuSequence, progress: Progress = silent, fixes: Iterable[Fix] = ()
@@ -284,45 +249,5 @@ class Navigator:
         checksum = str(getattr(getattr(self.model, "card", None), "sha256", ""))
         return {"backend": self.backend, "config": asdict(self.config), "model": checksum}
 
-    def _begin_stream(self) -> None:
-        self._front_end = FrontEnd(self.config)
-        self._estimator = None
-        self._continuous = None
-        self._network = StatefulInference(self.model, self.config.filter.window_updates)
-
-    def _advance(self, interval: ImuInterval) -> NavState:
-        start = self._front_end.start
-        assert start is not None  # set before the first interval
-        try:
-            self._front_end.sensors.check(interval)
-            if self._estimator is None:
-                check_start(start, self.config.gravity)
-        except InputError:
-            self._begin_stream()
-            raise
-        if self._estimator is None:
-            self._estimator = BACKENDS[self.backend].stream(self.config, start, self.prior)
-            self._fixes.start(start.time)
-        if interval.gap:
-            self._network.restart()
-        displacement = None
-        try:
-            if interval.window is not None:
-                counts = self._front_end.counts
-                (displacement,) = displacements_of(self._network, [interval.window], counts)
-        finally:  # if the network fails, the IMU's motion must not be lost
-            due = self._fixes.due(interval.stop)
-            self._estimator.step(interval.without_window(), displacement, due)
-        state = self._estimator.nav_state()
-        self._continuous = copied(advanced(self._continuous, state))  # `state` is writable
-        return state
-
-    def _take(self, fix: Fix) -> None:
-        if self._estimator is None or fix.fault() or fix.time > self._estimator.time:
-            self._fixes.add(fix)
-        elif self._estimator.late_fix(fix) is None:
-            self._fixes.refuse("too late")
-        elif self._continuous is not None:
-            state = self._estimator.nav_state()
-            if state.map_frame != self._continuous.map_frame:
-                self._continuous = advanced(self._continuous, state)
+    def _new_stream(self, prior: PriorPose | None) -> Stream:
+        return Stream(self.model, self.config, prior, self.backend)

@@ -135,6 +135,22 @@ def test_future_fixes_wait_for_their_time(walk: ImuSequence, model: Any) -> None
     assert_same(state, Navigator(model, CONFIG).run(walk, fixes=fixes_of(walk)))
 
 
+@pytest.mark.parametrize("backend", ["ekf", "graph"])
+def test_a_fix_tells_what_became_of_it(walk: ImuSequence, model: Any, backend: Any) -> None:
+    navigator = Navigator(model, CONFIG, backend=backend)
+    p = [truth_at(walk, t)[0] for t in (4.0, 12.0, 16.0)]
+    assert navigator.update_position(4.0, p[0], 0.01 * EYE) == "waiting"
+    assert navigator.update_position(4.0, p[0], -EYE) == "refused"
+    support.stream(navigator, walk.slice(0.0, 16.5))
+    assert navigator.update_yaw(15.9, 0.0, 1.5) == "refused"  # too coarse
+    assert navigator.update_position(16.0, p[2], 0.01 * EYE) == "applied"
+    assert navigator.update_position(16.0, p[2] + [9.0, 0.0, 0.0], 0.01 * EYE) == "inflated"
+    assert navigator.update_velocity(12.0, np.zeros(3), EYE) == "refused"  # too late
+    assert navigator.update_position(20.0, p[2], EYE) == "waiting"
+    reasons = {"too coarse": 1, "too late": 1, "covariance not positive definite": 1}
+    assert {key: navigator.health.fixes[key] for key in reasons} == reasons
+
+
 def test_an_interval_split_in_two_keeps_its_window_and_integrals(walk: ImuSequence) -> None:
     interval = next(e for e in cut_recording(walk, CONFIG)[0] if e.window is not None)
     for time in (interval.start + 0.033, float(interval.time[4]), interval.stop - 1e-4):

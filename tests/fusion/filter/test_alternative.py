@@ -114,8 +114,8 @@ def test_a_snapshot_includes_the_alternative(
     whole = Navigator(model, CONFIG)
     stream(whole, parts[0])
     # The false displacements have not ended yet.
-    assert whole._estimator is not None
-    state = whole._estimator.state
+    assert whole._stream.estimator is not None
+    state = whole._stream.estimator.state
     assert isinstance(getattr(state, "alternative", None), AlternativeHypothesis)
     second_model = OffByOneMetre(oracle, 98, 106)
     second_model.count = model.count

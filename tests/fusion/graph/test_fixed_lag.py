@@ -193,7 +193,7 @@ def test_marginalisation_leaves_the_newest_state_unchanged(
     """Even where windows reach from the removed keyframes past the first one that stays."""
     navigator = lagged(make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03))
     stream(navigator, walk.slice(0.0, 6.2))
-    graph = navigator._estimator._builder.graph
+    graph = navigator._stream.estimator._builder.graph
     graph.solve()
     before, oldest = graph.state(graph.last), graph.keyframes[0]
     graph.marginalise(oldest + 3)

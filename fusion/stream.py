@@ -1,0 +1,152 @@
+"""A navigator's stream: all that changes from sample to sample.
+
+A sample passes the front end, which cuts it into intervals; the network predicts the displacement
+of the window that ends with an interval, and both step the estimator.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from stario.fusion.backends import BACKENDS, BackendName, StreamEstimator
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.filter.initial import PriorPose
+from stario.fusion.fixes import Fix, FixOutcome, FixQueue
+from stario.fusion.health import Health
+from stario.fusion.imu.faults import ClockSetBackError
+from stario.fusion.imu.front_end import FrontEnd
+from stario.fusion.imu.intervals import ImuInterval, Sample
+from stario.fusion.imu.stateful import Predictor, StatefulInference, displacements_of
+from stario.fusion.imu.units import check_start
+from stario.fusion.state import ContinuousPose, NavState, advanced, copied
+from stario.sequences.errors import InputError
+
+
+class Stream:
+    """Front end, network's memory, estimator and waiting fixes of one stream.
+
+    Args:
+        model: predicts displacements.
+        config: settings.
+        prior: prior on the first pose, or None.
+        backend: name of the back end.
+
+    Attributes:
+        prior: the prior; None after the clock was set back.
+        estimator: estimator; None before the first state.
+        continuous: newest pose without steps at updates; None before the first state.
+    """
+
+    def __init__(
+        self,
+        model: Predictor,
+        config: NavigatorConfig,
+        prior: PriorPose | None,
+        backend: BackendName,
+    ) -> None:
+        self._model, self._config, self._backend = model, config, BACKENDS[backend]
+        self.prior, self._fixes = prior, FixQueue()
+        self._begin()
+
+    def _begin(self) -> None:
+        self.front_end = FrontEnd(self._config)
+        self.estimator: StreamEstimator | None = None
+        self.continuous: ContinuousPose | None = None
+        self._network = StatefulInference(self._model, self._config.filter.window_updates)
+
+    def push(self, sample: Sample) -> NavState | None:
+        """Process one sample: time, gyro and accel; return the newest state if it completed one.
+
+        Raises:
+            InputError: the stream begins again, since its samples cannot be right; or the model's
+                predictions have other shapes.
+        """
+        try:
+            intervals = self.front_end.push(sample)
+        except ClockSetBackError:
+            # The prior and the waiting fixes belong to the other clock.
+            self.prior, self._fixes = None, FixQueue()
+            self._begin()
+            raise
+        state: NavState | None = None
+        failure: Exception | None = None
+        for interval in intervals:  # several after a hole that was bridged
+            try:
+                state = self._advance(interval)
+            except Exception as error:
+                if self.estimator is None:  # the stream begins again
+                    raise
+                failure = failure or error
+        if failure is not None:
+            raise failure
+        return state
+
+    def _advance(self, interval: ImuInterval) -> NavState:
+        start = self.front_end.start
+        assert start is not None  # set before the first interval
+        try:
+            self.front_end.sensors.check(interval)
+            if self.estimator is None:
+                check_start(start, self._config.gravity)
+        except InputError:
+            self._begin()
+            raise
+        if self.estimator is None:
+            self.estimator = self._backend.stream(self._config, start, self.prior)
+            self._fixes.start(start.time)
+        if interval.gap:
+            self._network.restart()
+        displacement = None
+        try:
+            if interval.window is not None:
+                counts = self.front_end.counts
+                (displacement,) = displacements_of(self._network, [interval.window], counts)
+        finally:  # if the network fails, the IMU's motion must not be lost
+            due = self._fixes.due(interval.stop)
+            self.estimator.step(interval.without_window(), displacement, due)
+        state = self.estimator.nav_state()
+        self.continuous = copied(advanced(self.continuous, state))  # `state` is writable
+        return state
+
+    def take(self, fix: Fix) -> FixOutcome:
+        """Apply a fix, or keep it until its time."""
+        if self.estimator is None or fix.fault() or fix.time > self.estimator.time:
+            return self._fixes.add(fix)
+        accepted = self.estimator.late_fix(fix)
+        if accepted is None:
+            self._fixes.refuse("too late")
+            return "refused"
+        if self.continuous is not None:
+            state = self.estimator.nav_state()
+            if state.map_frame != self.continuous.map_frame:
+                self.continuous = advanced(self.continuous, state)
+        return next((applied.outcome for applied in accepted if applied.fix is fix), "refused")
+
+    def health(self) -> Health:
+        """Return the health report so far."""
+        counts = self.front_end.counts
+        return self._fixes.health(
+            counts.health() if self.estimator is None else self.estimator.health(counts)
+        )
+
+    def parts(self) -> dict[str, Any]:
+        """Return all that a snapshot holds of the stream, by name."""
+        return {
+            "prior": self.prior,
+            "front end": self.front_end,
+            "fixes": self._fixes,
+            "network": self._network.memory,
+            "continuous": self.continuous,
+            "estimator": None if self.estimator is None else self.estimator.state,
+        }
+
+    def continue_from(self, parts: dict[str, Any]) -> None:
+        """Continue a new stream from the parts of another."""
+        self.prior, self._fixes = parts["prior"], parts["fixes"]
+        self.front_end, self.continuous = parts["front end"], parts["continuous"]
+        self._network.memory = parts["network"]
+        if parts["estimator"] is not None:
+            start = self.front_end.start
+            assert start is not None  # there is a state
+            self.estimator = self._backend.stream(self._config, start, self.prior)
+            self.estimator.state = parts["estimator"]
