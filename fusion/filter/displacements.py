@@ -5,7 +5,6 @@ README.md, "Displacement measurement" and "Gates".
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -69,19 +68,18 @@ class DisplacementUpdates:
         f, before = self._config, self._ekf.state
         self._hypotheses.apply_to_both(self._propagate_turn)
         rare = self.statistics.outlier_share < _RARE_SHARE
-        update = partial(self._update, slot, displacement)
-        result = update(f.gate, _RARE_POWER if rare else 1.0)
+        result = self._apply(slot, displacement, f.gate, _RARE_POWER if rare else 1.0)
         self.statistics = self.statistics.updated(result, f)
         if self._hypotheses.alternative is None and rare and result.gated:
             assert result.residual is not None  # it has been compared with the gate
             first = AlternativeHypothesis(before, result.residual, (before.time,))
             self._hypotheses.alternative = first
         elif result.accepted:
-            fits = self._update_alternative(update)
+            fits = self._fits_alternative(slot, displacement)
             return result, self._hypotheses.judge(fits, not result.gated)
         return result, ()
 
-    def _update_alternative(self, update: Callable[..., UpdateResult]) -> bool:
+    def _fits_alternative(self, slot: int, displacement: WindowDisplacement) -> bool:
         """Update the alternative with a displacement: as it is if it fits, else less the offset.
 
         An alternative that is uncertain after some seconds would take any displacement for right,
@@ -90,7 +88,8 @@ class DisplacementUpdates:
         Return whether it fits.
         """
         alternative = self._hypotheses.alternative
-        result = self._hypotheses.apply_to_alternative(partial(update, _ALTERNATIVE_GATE, None))
+        apply = partial(self._apply, slot, displacement)
+        result = self._hypotheses.apply_to_alternative(partial(apply, _ALTERNATIVE_GATE, None))
         if result is None or alternative is None or result.residual is None:
             return True
         offset_W, residual = alternative.offset_W, result.residual
@@ -100,18 +99,18 @@ class DisplacementUpdates:
         offset_W = offset_W + _OFFSET_GAIN * (residual - offset_W)
         outliers = (*alternative.outliers, alternative.ekf.time)
         self._hypotheses.alternative = changed(alternative, offset_W=offset_W, outliers=outliers)
-        self._hypotheses.apply_to_alternative(partial(update, None, offset_W=offset_W))
+        self._hypotheses.apply_to_alternative(partial(apply, None, None, offset_W))
         return False
 
-    def _update(
+    def _apply(
         self,
         slot: int,
         displacement: WindowDisplacement,
         gate: float | None,
-        inflation: float | None = 1.0,
+        inflation: float | None,
         offset_W: FloatArray | None = None,
     ) -> UpdateResult:
-        """Update the filter's current state, with the displacement less an offset (3,) [m]."""
+        """Apply a displacement to the current state, in W and less an offset (3,) [m]."""
         f, (d_N, covariance_N, R_NB) = self._config, displacement
         R_WN = yaw_rotation(self._ekf.state.clone_pose(slot)[0] @ R_NB.T)
         # Values that are not finite are rejected and counted by the filter.
