@@ -21,6 +21,7 @@ from stario.fusion.commands.options import (
     ReportOption,
     expand_option_groups,
 )
+from stario.fusion.commands.origin import origin_of
 from stario.fusion.commands.values import backend_named
 
 if TYPE_CHECKING:
@@ -57,7 +58,14 @@ def run(
     chosen = backend_named(backend)
     navigator = Navigator(estimating.network(), estimating.settings(), backend=chosen)
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
-    work = partial(_run, navigator=navigator, fixes=absolute_fixes, report=report, view=view)
+    work = partial(
+        _run,
+        navigator=navigator,
+        fixes=absolute_fixes,
+        origin=origin_of([chosen], paths, reading, estimating, fixes),
+        report=report,
+        view=view,
+    )
     process_each(reading, paths, out, work, as_json, single="--fixes" if fixes else "")
 
 
@@ -66,6 +74,7 @@ def _run(
     folder: Path,
     navigator: Navigator,
     fixes: Sequence[Fix],
+    origin: dict[str, object],
     report: bool,
     view: bool,
 ) -> tuple[dict[str, object], str]:
@@ -80,7 +89,7 @@ def _run(
         track = navigator.run(sequence, progress, fixes)
     warn_of_truth(sequence)
     found = measured(sequence, {navigator.backend: track}, fixes)
-    written = write_run(folder, found, navigator.config)
+    written = write_run(folder, found, navigator.config, origin)
     if report:
         from stario.fusion.report.page import write_report
 
