@@ -20,6 +20,7 @@ from stario.fusion.commands.evaluate import evaluate
 from stario.fusion.commands.export import export
 from stario.fusion.commands.inspect import inspect
 from stario.fusion.commands.live import live
+from stario.fusion.commands.options import flag
 from stario.fusion.commands.run import run
 from stario.fusion.commands.simulate import simulate
 from stario.fusion.commands.table import table
@@ -42,7 +43,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _stario(
     printed: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="The version.")
+        bool, flag("--version", callback=_print_version, is_eager=True, help="The version.")
     ] = False,
 ) -> None:
     """Inertial navigation: fused trajectories from IMU recordings."""

@@ -25,6 +25,7 @@ from stario.fusion.commands.options import (
     RunsOption,
     changed,
     expand_option_groups,
+    flag,
     refuse_unused,
     refuse_unused_sources,
 )
@@ -72,7 +73,7 @@ def evaluate(
         ),
     ] = None,
     ekf: Annotated[
-        bool, typer.Option("--ekf", help="With --by: also report the mean NIS of the EKF; slow.")
+        bool, flag("--ekf", help="With --by: also report the mean NIS of the EKF; slow.")
     ] = False,
     models: Annotated[
         str | None,

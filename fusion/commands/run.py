@@ -7,8 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from stario.fusion.commands.common import process_each, progress_bar
 from stario.fusion.commands.options import (
     BackendOption,
@@ -20,6 +18,7 @@ from stario.fusion.commands.options import (
     ReadingOptions,
     ReportOption,
     expand_option_groups,
+    flag,
 )
 from stario.fusion.commands.origin import origin_of
 from stario.fusion.commands.values import backend_named
@@ -42,7 +41,7 @@ def run(
     out: OutOption = None,
     report: ReportOption = False,
     view: Annotated[
-        bool, typer.Option("--view", help="Open the rerun 3-D viewer; its file is kept in --out.")
+        bool, flag("--view", help="Open the rerun 3-D viewer; its file is kept in --out.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:

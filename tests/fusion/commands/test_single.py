@@ -28,6 +28,7 @@ from stario.network.displacement import DisplacementNetwork
 from stario.network.model import DisplacementModel, load_model, save_model
 from stario.network.runtime.engines import OnnxEngine
 from stario.sequences.conventions import with_axes
+from stario.sequences.readers import FORMATS
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
 from stario.sequences.readers.tum import read_tum
@@ -57,6 +58,16 @@ def test_every_command_prints_its_help(command: str) -> None:
     assert result.exit_code == 0
     assert f"stario {command}" in result.output.replace("root", "stario")
     assert " . " not in result.output  # left if the formatter drops a word in brackets
+
+
+def test_help_shows_a_commands_own_options_first_and_names_every_format() -> None:
+    result = CliRunner().invoke(app, ["run", "--help"], terminal_width=200)
+    options, reading, estimation = re.split("─ (?:Reading|Estimation) ─", result.output)
+    assert "--backend" in options
+    assert re.search(r"--report +Also", options)  # a flag takes no value
+    assert "--model" in estimation
+    words = re.findall(r"\w+", reading)
+    assert {"auto", *FORMATS} <= set(words)
 
 
 @pytest.mark.parametrize(
