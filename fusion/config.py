@@ -193,4 +193,8 @@ def read_config(path: Path | str) -> NavigatorConfig:
         raise ConfigError(str(path), str(error), "a TOML or JSON file") from error
     if not isinstance(values, dict):
         raise ConfigError(str(path), type(values).__name__, "a table of values")
-    return with_settings(NavigatorConfig(), values)
+    try:
+        return with_settings(NavigatorConfig(), values)
+    except ConfigError as error:
+        field = f"{path}: {error.field}"
+        raise ConfigError(field, error.found, error.expected, error.fix) from error

@@ -30,6 +30,7 @@ from stario.fusion.commands.options import (
     ReadingOptions,
     changed,
     expand_option_groups,
+    flag,
     refuse_unused,
     refuse_unused_sources,
 )
@@ -123,7 +124,7 @@ def faults(
     ] = None,
     network: Annotated[
         bool,
-        typer.Option(
+        flag(
             "--network",
             help="Use the network's displacements instead of true ones with white noise.",
         ),
@@ -186,7 +187,7 @@ def fusion(
     reading: ReadingOptions,
     estimating: EstimatorOptions,
     by: ByOption = "set",
-    graph: Annotated[bool, typer.Option("--graph", help="Also run the graph (slower).")] = False,
+    graph: Annotated[bool, flag("--graph", help="Also run the graph (slower).")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Compare the filter's error with the network's by group, with NIS and consistency of yaw."""

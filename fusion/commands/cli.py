@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import logging
 import sys
+from importlib.metadata import version
+from typing import Annotated
 
 import typer
 
@@ -18,6 +20,7 @@ from stario.fusion.commands.evaluate import evaluate
 from stario.fusion.commands.export import export
 from stario.fusion.commands.inspect import inspect
 from stario.fusion.commands.live import live
+from stario.fusion.commands.options import flag
 from stario.fusion.commands.run import run
 from stario.fusion.commands.simulate import simulate
 from stario.fusion.commands.table import table
@@ -28,8 +31,23 @@ app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    help="Inertial navigation: fused trajectories from IMU recordings.",
 )
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(version("stario"))
+        raise typer.Exit
+
+
+@app.callback()
+def _stario(
+    printed: Annotated[
+        bool, flag("--version", callback=_print_version, is_eager=True, help="The version.")
+    ] = False,
+) -> None:
+    """Inertial navigation: fused trajectories from IMU recordings."""
+
 
 for command in (run, live, compare, evaluate, inspect, convert, train, simulate, export):
     app.command()(command)

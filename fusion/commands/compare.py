@@ -26,6 +26,7 @@ from stario.fusion.commands.options import (
     expand_option_groups,
     refuse_unused,
 )
+from stario.fusion.commands.origin import origin_of
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ def compare(
     as_json: JsonOption = False,
 ) -> None:
     """Compare tracks: inertial only, network only, EKF, graph. Without PATH: a simulated walk."""
+    from stario.fusion.backends import BACKENDS
     from stario.fusion.evaluation.compare import demonstration
     from stario.fusion.evaluation.folders import check_folder
     from stario.fusion.evaluation.many import compare_recordings
@@ -61,6 +63,7 @@ def compare(
     settings, model = estimating.settings(), estimating.network_for(jobs)
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
     files, skipped = reading.recordings(paths or [])
+    origin = origin_of(BACKENDS, files, reading, estimating, fixes)
     read: Callable[[Path], ImuSequence] = reading.read
     if not paths:
         typer.echo("demonstration: a simulated walk not used in training", err=True)
@@ -74,7 +77,7 @@ def compare(
             files, model, settings, read, jobs, absolute_fixes, progress=progress
         )
         comparisons = list(without_skipped(outcomes, skipped))
-    written = write_comparison(folder, comparisons, settings) if comparisons else []
+    written = write_comparison(folder, comparisons, settings, origin) if comparisons else []
     if report:
         from stario.fusion.report.page import write_report
 

@@ -25,9 +25,11 @@ from stario.fusion.commands.options import (
     RunsOption,
     changed,
     expand_option_groups,
+    flag,
     refuse_unused,
     refuse_unused_sources,
 )
+from stario.fusion.commands.origin import origin_of
 from stario.fusion.commands.values import names_in
 from stario.sequences.errors import InputError
 
@@ -71,7 +73,7 @@ def evaluate(
         ),
     ] = None,
     ekf: Annotated[
-        bool, typer.Option("--ekf", help="With --by: also report the mean NIS of the EKF; slow.")
+        bool, flag("--ekf", help="With --by: also report the mean NIS of the EKF; slow.")
     ] = False,
     models: Annotated[
         str | None,
@@ -157,6 +159,7 @@ def _tracks(
     as_json: bool,
 ) -> list[Skipped]:
     """Write and print the table of recordings; return those that were skipped."""
+    from stario.fusion.backends import BACKENDS
     from stario.fusion.evaluation.folders import fresh_folder
     from stario.fusion.evaluation.many import compare_recordings
     from stario.fusion.evaluation.results import write_recording, write_summary
@@ -164,6 +167,7 @@ def _tracks(
     from stario.sequences.datasets.batch import without_skipped
 
     settings, model = estimating.settings(), estimating.network_for(jobs)
+    origin = origin_of(BACKENDS, files, reading, estimating)
     skipped: list[Skipped] = []
     recordings: list[Scores] = []
     with progress_bar("evaluate", 100 * len(files)) as progress:
@@ -178,7 +182,7 @@ def _tracks(
             recordings.append(scores_of(comparison))
     if recordings:
         if out is not None:
-            write_summary(out, recordings, settings)
+            write_summary(out, recordings, settings, origin)
         print_result(as_json, summary(recordings), summary_table(recordings))
     return skipped
 

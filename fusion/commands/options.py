@@ -6,7 +6,7 @@ import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,6 +20,11 @@ if TYPE_CHECKING:
     from stario.network.model import DisplacementModel
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
+
+_reading = partial(typer.Option, rich_help_panel="Reading")
+_estimation = partial(typer.Option, rich_help_panel="Estimation")
+flag = partial(typer.Option, metavar="")
+"""Option without a value; the help would show `<bool>` after it."""
 
 _PATHS = typer.Argument(metavar="PATH...", help="Recordings, folders or list files.")
 PathsArgument = Annotated[list[Path], _PATHS]
@@ -35,7 +40,7 @@ DataOption = Annotated[
 ]
 ConfigOption = Annotated[
     Path | None,
-    typer.Option(help="TOML or JSON file with settings: gravity, tables noise, filter, graph."),
+    _estimation(help="TOML or JSON file with settings: gravity, tables noise, filter, graph."),
 ]
 OutOption = Annotated[
     Path | None, typer.Option(help="Folder for the results; replaces those of an earlier run.")
@@ -55,50 +60,52 @@ JobsOption = Annotated[
     int, typer.Option(min=1, help="Number of processes that share the recordings.")
 ]
 ReportOption = Annotated[
-    bool, typer.Option("--report", help="Also write report.html: map, time slider, plots, health.")
+    bool, flag("--report", help="Also write report.html: map, time slider, plots, health.")
 ]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the results as JSON on stdout.")]
+OverwriteOption = Annotated[bool, flag("--overwrite", help="Replace an existing file.")]
+JsonOption = Annotated[bool, flag("--json", help="Print the results as JSON on stdout.")]
 
 
 @dataclass(frozen=True)
 class ReadingOptions:
     """Options for reading a recording."""
 
-    format: Annotated[str, typer.Option(help="Format of the recording: auto or a format name.")] = (
-        "auto"
-    )
-    gyro_unit: Annotated[str, typer.Option(help="Unit of the gyroscope: rad/s, deg/s or mdps.")] = (
+    format: Annotated[
+        str,
+        _reading(
+            help="Format: auto, or archive, ronin, ridi, imunet, rnin, tlio, bag, euroc (also "
+            "TUM-VI), oxiod, advio, phone, wide, events, zip, json, csv or long."
+        ),
+    ] = "auto"
+    gyro_unit: Annotated[str, _reading(help="Unit of the gyroscope: rad/s, deg/s or mdps.")] = (
         "rad/s"
     )
     accel_unit: Annotated[
-        str, typer.Option(help="Unit of the accelerometer: m/s^2, g, mg, -m/s^2, -g or -mg.")
+        str, _reading(help="Unit of the accelerometer: m/s^2, g, mg, -m/s^2, -g or -mg.")
     ] = "m/s^2"
     accel_sign: Annotated[
-        str, typer.Option(help="Direction of the accelerometer at rest: up, or apple (down).")
+        str, _reading(help="Direction of the accelerometer at rest: up, or apple (down).")
     ] = "up"
     axes: Annotated[
         str,
-        typer.Option(
+        _reading(
             help="Axes of the ground truth in the file's axes, such as y,-x,z (or --axes=-y,x,z)."
         ),
     ] = "x,y,z"
-    imu_topic: Annotated[str | None, typer.Option(help="IMU topic of a bag with several IMUs.")] = (
-        None
-    )
+    imu_topic: Annotated[str | None, _reading(help="IMU topic of a bag with several IMUs.")] = None
     truth_topic: Annotated[
-        str | None, typer.Option(help="Topic of true poses or odometry in a bag.")
+        str | None, _reading(help="Topic of true poses or odometry in a bag.")
     ] = None
     gravity: Annotated[
         str,
-        typer.Option(
+        _reading(
             help="Gravity in the accelerometer: included, or removed and restored from the true "
             "attitude, or else the device's own."
         ),
     ] = "included"
     where: Annotated[
         list[str] | None,
-        typer.Option(
+        _reading(
             help="Only recordings of archives with this attribute, such as person=dan or "
             "'name=r*'. Repeatable: any value of one attribute, but all attributes must match."
         ),
@@ -161,16 +168,16 @@ class EstimatorOptions:
     config: ConfigOption = None
     model: Annotated[
         str,
-        typer.Option(
+        _estimation(
             help="Weights: default, open, first-stage, walks-36min, or a safetensors or ONNX file."
         ),
     ] = "default"
-    magnetometer: Annotated[bool, typer.Option(help="Use the magnetometer, if there is one.")] = (
-        True
-    )
+    magnetometer: Annotated[
+        bool, _estimation(metavar="", help="Use the magnetometer, if there is one.")
+    ] = True
     declination: Annotated[
         float | None,
-        typer.Option(
+        _estimation(
             min=-180.0,
             max=180.0,
             help="Magnetic declination in degrees east; the track's y axis then points north.",

@@ -7,8 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from stario.fusion.commands.common import process_each, progress_bar
 from stario.fusion.commands.options import (
     BackendOption,
@@ -20,7 +18,9 @@ from stario.fusion.commands.options import (
     ReadingOptions,
     ReportOption,
     expand_option_groups,
+    flag,
 )
+from stario.fusion.commands.origin import origin_of
 from stario.fusion.commands.values import backend_named
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def run(
     out: OutOption = None,
     report: ReportOption = False,
     view: Annotated[
-        bool, typer.Option("--view", help="Open the rerun 3-D viewer; its file is kept in --out.")
+        bool, flag("--view", help="Open the rerun 3-D viewer; its file is kept in --out.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -57,7 +57,14 @@ def run(
     chosen = backend_named(backend)
     navigator = Navigator(estimating.network(), estimating.settings(), backend=chosen)
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
-    work = partial(_run, navigator=navigator, fixes=absolute_fixes, report=report, view=view)
+    work = partial(
+        _run,
+        navigator=navigator,
+        fixes=absolute_fixes,
+        origin=origin_of([chosen], paths, reading, estimating, fixes),
+        report=report,
+        view=view,
+    )
     process_each(reading, paths, out, work, as_json, single="--fixes" if fixes else "")
 
 
@@ -66,6 +73,7 @@ def _run(
     folder: Path,
     navigator: Navigator,
     fixes: Sequence[Fix],
+    origin: dict[str, object],
     report: bool,
     view: bool,
 ) -> tuple[dict[str, object], str]:
@@ -80,7 +88,7 @@ def _run(
         track = navigator.run(sequence, progress, fixes)
     warn_of_truth(sequence)
     found = measured(sequence, {navigator.backend: track}, fixes)
-    written = write_run(folder, found, navigator.config)
+    written = write_run(folder, found, navigator.config, origin)
     if report:
         from stario.fusion.report.page import write_report
 

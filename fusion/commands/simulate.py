@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from stario.fusion.commands.common import check_new, print_result
-from stario.fusion.commands.options import JsonOption, OverwriteOption
+from stario.fusion.commands.options import JsonOption, OverwriteOption, flag
 from stario.sequences.errors import InputError
 
 
@@ -25,7 +25,7 @@ def simulate(
     ] = "random",
     imu: Annotated[str, typer.Option(help="Sensor model: phone, good or perfect.")] = "phone",
     magnetometer: Annotated[
-        bool, typer.Option("--magnetometer", help="Also simulate a magnetometer inside a building.")
+        bool, flag("--magnetometer", help="Also simulate a magnetometer inside a building.")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of walk and sensor.")] = 0,
     overwrite: OverwriteOption = False,

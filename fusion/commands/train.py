@@ -11,11 +11,11 @@ import typer
 from stario.fusion.commands.common import list_skipped, progress_bar
 from stario.fusion.commands.options import (
     CacheOption,
-    JobsOption,
     OptionalPathsArgument,
     ReadingOptions,
     changed,
     expand_option_groups,
+    flag,
     refuse_unused,
 )
 from stario.fusion.commands.training_data import (
@@ -84,7 +84,7 @@ def train(
         int | None, typer.Option(min=0, help=f"Simulated walks of 60 s. Default: {_GENERATED}.")
     ] = None,
     recorded_only: Annotated[
-        bool, typer.Option("--recorded-only", help="Train without simulated walks.")
+        bool, flag("--recorded-only", help="Train without simulated walks.")
     ] = False,
     config: Annotated[Path | None, typer.Option(help="JSON file with recipe settings.")] = None,
     epochs: Annotated[int | None, typer.Option(min=1, help="Epochs; overrides --config.")] = None,
@@ -104,7 +104,14 @@ def train(
         ),
     ] = None,
     cache: CacheOption = None,
-    jobs: JobsOption = 1,
+    jobs: Annotated[
+        int,
+        typer.Option(
+            min=1,
+            help="Processes that read recordings into the cache; to train in several, use "
+            "torchrun.",
+        ),
+    ] = 1,
 ) -> None:
     """Train a network on recordings with ground truth and on simulated walks; a rerun resumes.
 

@@ -12,7 +12,7 @@ from stario.sequences.errors import InputError
 _FIGURES = ("plan.png", "error.png", "innovations.png", "report.html")
 
 RESULTS = {
-    "metrics.json": ("config.json",),
+    "metrics.json": ("config.json", "run.json"),
     "health.json": (*_FIGURES, "track.rrd", "ekf.tum", "ekf.npz", "graph.tum", "graph.npz"),
     "inertial.npz": (
         *(*_FIGURES, "truth.tum"),

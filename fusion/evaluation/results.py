@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -18,13 +18,15 @@ from stario.sequences.files import write_json, write_npz
 from stario.sequences.readers.tum import write_tum
 
 
-def write_run(folder: Path, run: Comparison, config: NavigatorConfig) -> list[Path]:
+def write_run(
+    folder: Path, run: Comparison, config: NavigatorConfig, origin: Mapping[str, object]
+) -> list[Path]:
     """Write the fused track of a run, its only one, and return the files written.
 
     These are `ekf.tum` (9 decimals), `ekf.npz` (velocity, biases, covariance), `metrics.json`,
-    `config.json`, `health.json` and the figures; the graph's track is called `graph`. Without
-    truth, known positions in the track's frame (`known_positions.placed`) are drawn. Results of an
-    earlier run into this folder are removed.
+    `config.json`, `run.json` (`origin`: what produced them), `health.json` and the figures; the
+    graph's track is called `graph`. Without truth, known positions in the track's frame
+    (`known_positions.placed`) are drawn. Results of an earlier run into this folder are removed.
 
     Raises:
         InputError: the folder cannot be created.
@@ -36,6 +38,7 @@ def write_run(folder: Path, run: Comparison, config: NavigatorConfig) -> list[Pa
     for file, content in (
         ("metrics.json", metrics),
         ("config.json", asdict(config)),
+        ("run.json", origin),
         ("health.json", asdict(track.health) if track.health else None),
     ):
         write_json(folder / file, content)
@@ -44,9 +47,12 @@ def write_run(folder: Path, run: Comparison, config: NavigatorConfig) -> list[Pa
 
 
 def write_comparison(
-    folder: Path, comparisons: Sequence[Comparison], config: NavigatorConfig
+    folder: Path,
+    comparisons: Sequence[Comparison],
+    config: NavigatorConfig,
+    origin: Mapping[str, object],
 ) -> list[Path]:
-    """Write `metrics.json`, `config.json` and a sub-folder of tracks and figures per recording.
+    """Write what `write_summary` does, and a sub-folder of tracks and figures per recording.
 
     Results of an earlier run into these folders are removed; other recordings' folders stay.
 
@@ -54,19 +60,27 @@ def write_comparison(
         InputError: a folder cannot be created.
     """
     fresh_folder(folder)
-    written = write_summary(folder, [scores_of(c) for c in comparisons], config)
+    written = write_summary(folder, [scores_of(c) for c in comparisons], config, origin)
     for comparison in comparisons:
         written += write_recording(folder, comparison)
     return written
 
 
 def write_summary(
-    folder: Path, recordings: Sequence[Scores], config: NavigatorConfig
+    folder: Path,
+    recordings: Sequence[Scores],
+    config: NavigatorConfig,
+    origin: Mapping[str, object],
 ) -> list[Path]:
-    """Write `metrics.json` and `config.json` of several recordings into an existing folder."""
-    write_json(folder / "metrics.json", scores_dict(recordings))
-    write_json(folder / "config.json", asdict(config))
-    return [folder / "metrics.json", folder / "config.json"]
+    """Write `metrics.json`, `config.json` and `run.json` of recordings into an existing folder."""
+    contents = {
+        "metrics.json": scores_dict(recordings),
+        "config.json": asdict(config),
+        "run.json": origin,
+    }
+    for file, content in contents.items():
+        write_json(folder / file, content)
+    return [folder / file for file in contents]
 
 
 def write_recording(folder: Path, comparison: Comparison) -> list[Path]:

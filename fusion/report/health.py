@@ -13,6 +13,7 @@ from itertools import pairwise
 from typing import Literal
 
 from stario.fusion.health import Health
+from stario.fusion.imu.front_end import BRIDGED
 from stario.fusion.imu.gap import INTERPOLATED
 from stario.sequences.attitude.levelling import START_SECONDS
 
@@ -172,7 +173,8 @@ def _gaps(health: Health) -> Iterator[Finding]:
         yield Finding("warning", text, f"{logger}; {restore}.")
     else:
         yield Finding("note", text)
-    between = [b - (a + length) for (a, length), (b, _) in pairwise(health.gaps)]
+    gaps = [(start, length) for start, length in health.gaps if length > BRIDGED]
+    between = [b - (a + length) for (a, length), (b, _) in pairwise(gaps)]
     if short := sum(seconds < START_SECONDS for seconds in between):
         text = (
             f"{short} of the stretches between gaps are shorter than a second, which does not "

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stario.sequences.drawing.figures import (
+    GREY,
     INK,
     LEGEND,
     RED,
@@ -73,7 +74,7 @@ def plan_view(
         near.append(_box_of(known.position_W))
     frame = _frame_around(np.array([home, *near]))
     width, height = np.ptp(frame, axis=0) / np.ptp(frame, axis=0).max()
-    fig = new_figure(7.0 * max(width, 0.85) + 1.0, 7.0 * height + 1.5, title)
+    fig = new_figure(7.0 * width + 1.0, 7.0 * height + 1.5, title)
     (axes,) = panels_of(fig)
     length = float(np.nansum(np.linalg.norm(np.diff(typical, axis=0), axis=1)))
     fine = 0.6 if length / _size_of(home) > _CROWDED else 1.0
@@ -86,10 +87,7 @@ def plan_view(
         _draw_path(axes, paths[name], label, colour, width=1.3 * fine, order=3)
     _mark_gaps(axes, tracks, frame)
     if known is not None:
-        size = 7.0 if known.kind == "waypoints" else 3.0
-        label = f"{known.kind}, fitted"
-        x, y = known.position_W.T
-        axes.plot(x, y, "x", color="black", ms=size, mew=1.6, label=label, zorder=4)
+        _draw_known(axes, known)
     axes.set(xlim=frame[:, 0], ylim=frame[:, 1], xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axes.plot([], [], "o", mfc="white", mec=INK, label="start")
     axes.plot([], [], "s", mfc=INK, mec="white", label="end")
@@ -109,6 +107,16 @@ def _draw_path(
     known = path[np.isfinite(path).all(axis=1)]
     axes.plot(*known[0], "o", ms=8, mfc="white", mec=colour, mew=1.5, zorder=order + 3)
     axes.plot(*known[-1], "s", ms=8, mfc=colour, mec="white", mew=1.0, zorder=order + 3)
+
+
+def _draw_known(axes: Axes, known: PositionTrack) -> None:
+    """Mark waypoints with crosses, and positions, of which there are many, below the tracks."""
+    x, y = known.position_W.T
+    label = f"{known.kind}, fitted"
+    if known.kind == "waypoints":
+        axes.plot(x, y, "x", color="black", ms=7.0, mew=1.6, label=label, zorder=4)
+    else:
+        axes.plot(x, y, "o", color=GREY, mfc="none", ms=4.0, mew=0.8, label=label, zorder=1.9)
 
 
 def _mark_gaps(axes: Axes, tracks: Mapping[str, Trajectory], frame: FloatArray) -> None:

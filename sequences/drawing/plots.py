@@ -54,6 +54,10 @@ if TYPE_CHECKING:
 _AXIS_COLOURS = (BLUE, ORANGE, GREEN)
 _CLIP_FACTOR = 3.0
 
+_SETTLED_S, _MOST_PERCENT = 3.0, 99.0
+"""Time after a filter's first update [s] from which the axes of its innovations fit them, and how
+many of them: the first sigmas are ten times the later ones."""
+
 
 def error_over_time(
     tracks: Mapping[str, Trajectory], truth: Trajectory, title: str = "Position error"
@@ -106,6 +110,8 @@ def innovations(
 ) -> Figure:
     """Draw a filter's innovations, one or more, with their 3 sigma bands, and the NIS.
 
+    The axes fit most of them; what is beyond, such as the first update, is drawn at the edge.
+
     Args:
         time: (M,) times of the updates [s].
         residual: (M, 3) innovation, x y z [m].
@@ -116,9 +122,11 @@ def innovations(
     """
     fig = new_figure(9.0, 9.0, title)
     panels = panels_of(fig, 1, 1, 1, 1.3)
+    settled = time >= min(time[0] + _SETTLED_S, time[-1])
     for k, (axes, axis) in enumerate(zip(panels, "xyz", strict=False)):
         _draw_band(axes, time, sigma[:, k], max_gap=1.0, color=BLUE)
-        reach = reach_of(residual[~gated, k], 3 * sigma[:, k])
+        used = np.abs(residual[settled & ~gated, k])
+        reach = reach_of(_most(used), _most(3 * sigma[settled, k]))
         # A gated residual can be huge: drawn at the edge, it leaves room for the others.
         _draw_dots(axes, time, np.clip(residual[:, k], -reach, reach), gated)
         axes.set(ylabel=f"{axis} [m]", ylim=(-reach, reach))
@@ -212,6 +220,11 @@ def _draw_axis_errors(panels: list[Axes], errors: PoseErrors, label: str, colour
             sigma = np.sqrt(errors.estimate.position_covariance_W[:, k, k])
             _draw_band(axes, time, sigma, color=colour, label=f"{label}, 3 sigma")
         axes.set_ylabel(f"error in {axis} [m]")
+
+
+def _most(values: FloatArray) -> FloatArray:
+    """Return what most values (N,) lie below, as (1,); nothing if there are none."""
+    return np.percentile(values, [_MOST_PERCENT]) if len(values) else values
 
 
 def _draw_band(

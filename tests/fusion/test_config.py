@@ -110,6 +110,14 @@ def test_a_malformed_file_is_named_in_one_line(tmp_path: Path, name: str, conten
     assert "\n" not in str(caught.value)
 
 
+def test_an_invalid_setting_in_a_file_is_named_with_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "device.toml"
+    path.write_text("[noise]\ngyro = 1e-3\n")
+    with pytest.raises(ConfigError, match="an unknown key") as caught:
+        read_config(path)
+    assert caught.value.field == f"{path}: noise.gyro"
+
+
 def test_a_missing_file_or_a_folder_raises_a_stario_error(tmp_path: Path) -> None:
     for path in (tmp_path / "none.toml", tmp_path):
         with pytest.raises(StarioError):

@@ -7,6 +7,8 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from datetime import datetime, timedelta
+from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,6 +19,8 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from stario.fusion.commands.cli import app
+from stario.fusion.commands.options import EstimatorOptions, ReadingOptions
+from stario.fusion.commands.origin import origin_of
 from stario.fusion.config import read_config
 from stario.network.architectures import build_network
 from stario.network.card import Card
@@ -24,6 +28,7 @@ from stario.network.displacement import DisplacementNetwork
 from stario.network.model import DisplacementModel, load_model, save_model
 from stario.network.runtime.engines import OnnxEngine
 from stario.sequences.conventions import with_axes
+from stario.sequences.readers import FORMATS
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
 from stario.sequences.readers.tum import read_tum
@@ -33,6 +38,7 @@ COMMANDS = (
     *("run", "live", "compare", "evaluate", "inspect"),
     *("convert", "train", "simulate", "export"),
 )
+BOTH = ["ekf", "graph"]
 CHECKS = ("models", "backends", "faults", "consistency", "benchmark")
 
 
@@ -54,6 +60,16 @@ def test_every_command_prints_its_help(command: str) -> None:
     assert " . " not in result.output  # left if the formatter drops a word in brackets
 
 
+def test_help_shows_a_commands_own_options_first_and_names_every_format() -> None:
+    result = CliRunner().invoke(app, ["run", "--help"], terminal_width=200)
+    options, reading, estimation = re.split("─ (?:Reading|Estimation) ─", result.output)
+    assert "--backend" in options
+    assert re.search(r"--report +Also", options)  # a flag takes no value
+    assert "--model" in estimation
+    words = re.findall(r"\w+", reading)
+    assert {"auto", *FORMATS} <= set(words)
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -71,6 +87,11 @@ def test_wrong_usage_exits_with_code_2(stario, arguments: list[str]) -> None:
     done = stario(*arguments)
     assert done.code == 2
     assert "Usage" in done.err
+
+
+def test_the_version_is_that_of_the_distribution(stario) -> None:
+    done = stario("--version")
+    assert (done.code, done.out, done.err) == (0, f"{version('stario')}\n", "")
 
 
 def test_the_installed_command_has_the_same_exit_codes(tmp_path: Path) -> None:
@@ -139,12 +160,12 @@ def test_run_writes_a_track_and_prints_a_summary(stario, recording: Path, tmp_pa
     assert done.err == ""
     for words in (
         *("walk: 12.0 s", "ATE [m]", "in x and y only"),
-        *("samples used 1201", "updates", "8 files in out"),
+        *("samples used 1201", "updates", "9 files in out"),
     ):
         assert words in done.out
     track = read_tum(tmp_path / "out" / "ekf.tum")
     assert track.time[-1] - track.time[0] == pytest.approx(12.0, abs=0.11)
-    assert len(list((tmp_path / "out").iterdir())) == 8
+    assert len(list((tmp_path / "out").iterdir())) == 9
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -252,6 +273,33 @@ def test_settings_are_read_from_a_file_and_saved(stario, recording: Path, tmp_pa
     assert stario("run", recording, "--config", "slow.toml", "--out", "a").code == 0
     assert read_config(tmp_path / "a/config.json") == read_config(tmp_path / "slow.toml")
     assert json.loads((tmp_path / "a/health.json").read_text())["updates"] == 23
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_run_compare_and_evaluate_state_what_produced_their_results(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    for command, backends in (("run", ["ekf"]), *((c, BOTH) for c in ("compare", "evaluate"))):
+        done = stario(command, recording, "--axes", "x,y,z", "--accel-sign", "up", "--out", command)
+        assert done.code == 0, done.err
+        origin = json.loads((tmp_path / command / "run.json").read_text())
+        assert datetime.fromisoformat(origin.pop("date")).utcoffset() == timedelta()
+        assert origin == {
+            "stario": version("stario"),
+            "model": "default",
+            "weights_sha256": load_model("default").card.sha256,
+            "backends": backends,
+            "inputs": [str(recording)],
+            "reading": {},
+            "fixes": None,
+        }
+
+
+def test_what_produced_a_run_names_fixes_and_changed_reading_options(tmp_path: Path) -> None:
+    reading = ReadingOptions(gyro_unit="deg/s", where=["person=dan"])
+    origin = origin_of(["graph"], [], reading, EstimatorOptions(), tmp_path / "fixes.csv")
+    assert origin["reading"] == {"gyro_unit": "deg/s", "where": ["person=dan"]}
+    assert origin["fixes"] == str(tmp_path / "fixes.csv")
 
 
 @pytest.mark.usefixtures("no_figures")

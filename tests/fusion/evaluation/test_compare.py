@@ -31,6 +31,7 @@ from stario.sequences.readers.tum import read_tum
 from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
 
 CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=10, covariance_scale=1.0))
+ORIGIN = {"stario": "0.1.0"}
 KEYS = {
     *("ate_m", "ate_fit_m", "rte_m", "pde", "aye_rad", "known_positions_m"),
     *("nees_median", "nis_mean", "seconds_network", "seconds_filter"),
@@ -76,7 +77,7 @@ def folder(
     compared: Comparison, blind: Comparison, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     path = tmp_path_factory.mktemp("compare") / "deep" / "out"
-    written = write_comparison(path, [compared, blind], CONFIG)
+    written = write_comparison(path, [compared, blind], CONFIG, ORIGIN)
     assert sorted(written) == sorted(p for p in path.rglob("*") if p.is_file())
     return path
 
@@ -208,9 +209,9 @@ def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_run_writes_its_files(tmp_path: Path, compared: Comparison, walk: ImuSequence) -> None:
     track = compared.tracks["ekf"]
     alone = Comparison(walk, {"ekf": track}, {"ekf": compared.metrics["ekf"]})
-    files = write_run(tmp_path / "run", alone, CONFIG)
+    files = write_run(tmp_path / "run", alone, CONFIG, ORIGIN)
     assert {p.name for p in files} == {
-        "ekf.tum", "ekf.npz", "metrics.json", "config.json", "health.json",
+        "ekf.tum", "ekf.npz", "metrics.json", "config.json", "run.json", "health.json",
         "plan.png", "error.png", "innovations.png",
     }  # fmt: skip
     assert sorted(files) == sorted((tmp_path / "run").iterdir())
@@ -224,12 +225,12 @@ def test_files_of_an_earlier_run_do_not_pass_for_those_of_a_later_one(
 ) -> None:
     """The first has truth, a report and the other back end; a file of the user's stays."""
     track = compared.tracks["ekf"]
-    write_run(tmp_path, Comparison(walk, {"graph": track}, {"graph": {}}), CONFIG)
+    write_run(tmp_path, Comparison(walk, {"graph": track}, {"graph": {}}), CONFIG, ORIGIN)
     (tmp_path / "report.html").touch()
     (tmp_path / "notes.txt").touch()
     (tmp_path / "truth.tum").touch()  # no result of a run
     blind = Comparison(walk.without_truth(), {"ekf": track}, {"ekf": {}})
-    files = write_run(tmp_path, blind, CONFIG)
+    files = write_run(tmp_path, blind, CONFIG, ORIGIN)
     mine = {tmp_path / "notes.txt", tmp_path / "truth.tum"}
     assert {*files, *mine} == set(tmp_path.iterdir())
 
@@ -238,11 +239,11 @@ def test_files_of_an_earlier_run_do_not_pass_for_those_of_a_later_one(
 def test_a_comparison_leaves_nothing_of_an_earlier_one_but_other_recordings(
     tmp_path: Path, compared: Comparison, blind: Comparison
 ) -> None:
-    write_comparison(tmp_path, [compared, blind], CONFIG)
+    write_comparison(tmp_path, [compared, blind], CONFIG, ORIGIN)
     kept = set((tmp_path / "blind").iterdir())
     (tmp_path / compared.sequence.name / "report.html").touch()
     sequence = compared.sequence.without_truth()
-    files = write_comparison(tmp_path, [replace(compared, sequence=sequence)], CONFIG)
+    files = write_comparison(tmp_path, [replace(compared, sequence=sequence)], CONFIG, ORIGIN)
     assert {*files, *kept} == {path for path in tmp_path.rglob("*") if path.is_file()}
 
 
@@ -270,7 +271,7 @@ def test_a_folder_that_cannot_be_created_raises_a_stario_error(
 ) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(StarioError, match="file"):
-        write_comparison(tmp_path / "file" / "out", [compared], CONFIG)
+        write_comparison(tmp_path / "file" / "out", [compared], CONFIG, ORIGIN)
 
 
 def test_truth_that_ends_early_is_compared_up_to_its_end(

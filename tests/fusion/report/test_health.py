@@ -163,3 +163,5 @@ def test_stretches_too_short_to_level_the_attitude_are_named() -> None:
     assert short.text.startswith("1 of the stretches between gaps")
     health.gaps = [(5.0, 0.25), (7.0, 0.25)]
     assert all(each.level != "warning" for each in findings(health))
+    health.gaps = [(5.0, 0.15), (5.6, 0.15), (6.2, 0.15)]  # bridged: the attitude goes on
+    assert all(each.level != "warning" for each in findings(health))

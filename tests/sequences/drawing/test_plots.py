@@ -18,7 +18,7 @@ from stario.sequences.drawing.plots import (
     innovations,
 )
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
 
 
 @pytest.fixture
@@ -131,6 +131,20 @@ def test_gated_innovations_are_marked_and_kept_within_the_axes():
     assert line(fig.axes[3], "expected 3").get_ydata()[0] == 3
 
 
+@pytest.mark.parametrize("count", [1, 150])
+def test_the_first_update_does_not_set_the_axes_of_innovations(count):
+    rng = np.random.default_rng(3)
+    time, residual = 0.5 * np.arange(count), rng.normal(0, 0.1, (count, 3))
+    sigma, nothing = np.full((count, 3), 0.1), np.zeros(count, dtype=bool)
+    residual[0], sigma[0] = 1.2, 1.0
+    fig = innovations(time, residual, sigma, np.ones(count), nothing, "")
+    for axes in fig.axes[:3]:
+        top = axes.get_ylim()[1]
+        assert 0.3 < top < (0.4 if count > 1 else 4.0)
+        assert line(axes, "used").get_ydata()[0] == pytest.approx(min(top, 1.2))
+    innovations(time, residual, sigma, np.ones(count), ~nothing, "")  # all gated
+
+
 def test_imu_overview_tolerates_the_bad_samples_that_readers_keep(truth):
     rng = np.random.default_rng(4)
     n = 20_000
@@ -207,6 +221,21 @@ def test_the_mark_after_a_gap_is_at_the_first_valid_pose_and_only_within_the_fra
     far = with_growing_error(cut, 0.5, power=2)
     fig = plan_view({"inertial": far, "ekf": truth}, truth, "")
     assert "after a gap" not in labels(fig.legends[0])
+
+
+def test_positions_are_drawn_below_the_tracks_and_waypoints_above(tracks):
+    ekf = tracks["ekf"]
+    for kind, above in (("positions", False), ("waypoints", True)):
+        known = PositionTrack(ekf.time, ekf.position_W[:, :2], kind=kind)
+        (axes,) = plan_view({"ekf": ekf}, None, "", known).axes
+        assert (line(axes, kind).get_zorder() > line(axes, "EKF").get_zorder()) == above
+
+
+def test_the_axes_of_a_tall_plan_fill_its_figure(truth):
+    tall = replace(truth, position_W=np.outer(truth.time, [0.1, 1.2, 0.0]))
+    fig = plan_view({"ekf": tall}, None, "")
+    fig.canvas.draw()
+    assert fig.axes[0].get_tightbbox().x1 > 0.95 * fig.bbox.x1
 
 
 def test_the_legend_of_many_distant_tracks_fits_the_figure(truth, tracks):
