@@ -140,11 +140,13 @@ class Comparison:
 def compare(
     model: Predictor,
     sequence: ImuSequence,
-    config: NavigatorConfig,
+    config: NavigatorConfig | None = None,
     progress: Progress = silent,
     fixes: Sequence[Fix] = (),
 ) -> Comparison:
     """Compute every track of a recording; tracks share predictions, EKF and graph use the fixes.
+
+    Configuration, progress and fixes are those of `Navigator` and its `run`.
 
     Raises:
         InputError: the recording is too short, its units or rate are wrong, no fix is within its
@@ -153,6 +155,7 @@ def compare(
     check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
     check_within(fixes, sequence)
     navigator = Navigator(model, config)
+    config = navigator.config
     preprocessed = navigator.observe(sequence, progress)
     warn_of_truth(sequence)
     tracks = {

@@ -23,7 +23,7 @@ from stario.sequences.sequence import ImuSequence
 def compare_recordings(
     paths: Sequence[Path],
     model: Predictor | str,
-    config: NavigatorConfig,
+    config: NavigatorConfig | None = None,
     read: Callable[[Path], ImuSequence] = read_recording,
     jobs: int | None = None,
     fixes: Sequence[Fix] = (),
@@ -39,7 +39,7 @@ def compare_recordings(
         paths: paths of the recordings.
         model: network, or name of weights, which each process loads once: faster than passing the
             network with every recording.
-        config: configuration of the navigator.
+        config: configuration of the navigator; None has its defaults.
         read: function that reads a path; must be picklable.
         jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
         fixes: fixes given to EKF and graph for every recording.
@@ -84,7 +84,7 @@ def distinct_name(name: str, taken: set[str]) -> str:
 def _compare(
     path: Path,
     model: Predictor | str,
-    config: NavigatorConfig,
+    config: NavigatorConfig | None,
     read: Callable[[Path], ImuSequence],
     fixes: Sequence[Fix],
     truth_needed: bool,
