@@ -38,6 +38,9 @@ class DisplacementModel:
         self.card = card
         self._engine = engine
 
+    def __repr__(self) -> str:
+        return f"DisplacementModel({self.name}, sha256 {self.card.sha256[:12] or 'unknown'})"
+
     @property
     def name(self) -> str:
         """Name of the architecture."""

@@ -41,6 +41,11 @@ def refusal(path: Path) -> str:
     return text
 
 
+def test_a_model_prints_its_architecture_and_checksum() -> None:
+    model = load_model("default")
+    assert repr(model) == f"DisplacementModel(StarIO, sha256 {model.card.sha256[:12]})"
+
+
 @pytest.mark.parametrize(
     ("field", "value"),
     [
