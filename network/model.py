@@ -70,9 +70,11 @@ class DisplacementModel:
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Predict the displacement over each window, from its start to one second later.
 
+        For a recording, `Navigator.observe(recording).measurements` gives the displacements.
+
         Args:
             windows: (B, 6, 200), gyroscope [rad/s] then specific force [m/s^2] at 200 Hz, rotated
-                into a gravity-aligned frame (z up, any yaw).
+                into frame H: z up, the device's heading zero (README, "The window and its frame").
 
         Returns:
             Displacement (B, 3) [m] and covariance (B, 3, 3) [m^2], in the window's frame; inflated
