@@ -238,7 +238,10 @@ def weights_named(name: str, runs: Path) -> str | Path:
 
 
 def _checked_windows(windows: ArrayLike) -> Float32Array:
-    batch = np.require(windows, np.float32, ["C", "W"])  # torch warns about read-only arrays
+    try:
+        batch = np.require(windows, np.float32, ["C", "W"])  # torch warns about read-only arrays
+    except (TypeError, ValueError) as error:
+        raise InputError("windows", str(error), f"numbers (B, 6, {WINDOW_SAMPLES})") from error
     if batch.ndim != 3 or batch.shape[1:] != (6, WINDOW_SAMPLES):
         raise InputError("windows", f"shape {batch.shape}", f"(B, 6, {WINDOW_SAMPLES})")
     if not np.isfinite(batch).all():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from stario.fusion.config import NavigatorConfig
@@ -15,7 +15,7 @@ from stario.fusion.evaluation.tracks import (
     network_track_true_attitude,
 )
 from stario.fusion.fix_file import check_within
-from stario.fusion.fixes import Fix
+from stario.fusion.fixes import Fix, fix_list
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.recording import Progress, silent
@@ -142,7 +142,7 @@ def compare(
     sequence: ImuSequence,
     config: NavigatorConfig | None = None,
     progress: Progress = silent,
-    fixes: Sequence[Fix] = (),
+    fixes: Iterable[Fix] = (),
 ) -> Comparison:
     """Compute every track of a recording; tracks share predictions, EKF and graph use the fixes.
 
@@ -153,6 +153,7 @@ def compare(
             time, or an argument has the wrong type.
     """
     check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
+    fixes = fix_list(fixes)
     check_within(fixes, sequence)
     navigator = Navigator(model, config)
     config = navigator.config

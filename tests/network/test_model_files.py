@@ -149,3 +149,9 @@ def test_windows_with_a_value_that_is_not_finite_are_refused(value: float) -> No
     windows[1, 4, 7] = value
     with pytest.raises(InputError, match="not finite"):
         load_model().predict(windows)
+
+
+@pytest.mark.parametrize("windows", ["walk.csv", [[1.0], [1.0, 2.0]], np.zeros((6, 200))])
+def test_windows_that_are_none_are_refused(windows: object) -> None:
+    with pytest.raises(InputError, match=r"windows: .*\(B, 6, 200\)"):
+        load_model().predict(windows)
