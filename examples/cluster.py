@@ -15,7 +15,7 @@ from pathlib import Path
 import joblib
 from distributed import Client, LocalCluster
 
-from stario.fusion import NavigatorConfig, Scores, compare_recordings, scores_of, summary_table
+from stario.fusion import Scores, compare_recordings, scores_of, summary_table
 from stario.sequences import Skipped, generate_walk, simulate_imu, write_csv
 
 
@@ -23,7 +23,7 @@ def evaluate(paths: list[Path], client: Client) -> tuple[list[Scores], list[Skip
     """Return the recordings' figures, in their order, and the recordings that were skipped."""
     scores, skipped = [], []
     with joblib.parallel_config(backend="dask", client=client):
-        for outcome in compare_recordings(paths, "default", NavigatorConfig(), truth_needed=True):
+        for outcome in compare_recordings(paths, "default", truth_needed=True):
             if isinstance(outcome, Skipped):
                 skipped.append(outcome)
             else:

@@ -5,7 +5,7 @@ python examples/compare_tracks.py
 
 from __future__ import annotations
 
-from stario.fusion import Comparison, NavigatorConfig, compare
+from stario.fusion import Comparison, compare
 from stario.network import load_model
 from stario.sequences import PHONE_IMU, WalkStyle, generate_walk, simulate_imu
 
@@ -15,7 +15,7 @@ def main(seconds: float = 60.0) -> Comparison:
     style = WalkStyle(carry="pocket", preferred_speed=1.3)
     walk = generate_walk(seed=2**31 + 1, duration=seconds, style=style)
     recording = simulate_imu(walk, 100.0, PHONE_IMU, seed=7, name="pocket")
-    return compare(load_model("default"), recording, NavigatorConfig())
+    return compare(load_model("default"), recording)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
     subscribes  imu/data   sensor_msgs/Imu in the IMU's frame (REP 103: x forward, z up; any
                            mounting works, as the device is levelled by gravity)
+                imu/mag    sensor_msgs/MagneticField in the same frame, optional
                 fix        geometry_msgs/PoseWithCovarianceStamped, a position in `map`, optional
     publishes   odometry   nav_msgs/Odometry, pose in `odom`, twist in `base_link`
                 tf         map -> odom -> base_link (REP 105)
@@ -99,14 +100,12 @@ class OdometryBridge:
         Raises:
             InputError: as for `Navigator.push`, which then starts again.
         """
-        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         if self._first_ns is None:
-            self._first_ns = stamp_ns  # nanoseconds since 1970 exceed the precision of a float
+            self._first_ns = _stamp_ns(message)
         rate, force = message.angular_velocity, message.linear_acceleration
         gyro = (rate.x, rate.y, rate.z)
-        time = (stamp_ns - self._first_ns) / 1e9
         try:
-            state = self._navigator.push(time, gyro, (force.x, force.y, force.z))
+            state = self._navigator.push(self._seconds(message), gyro, (force.x, force.y, force.z))
         except InputError:
             self._begin()
             raise
@@ -120,21 +119,30 @@ class OdometryBridge:
         self._last = self._navigator.continuous
         return self._odometry(state, np.array(gyro))
 
+    def field(self, message: Any) -> None:
+        """Process a sensor_msgs/MagneticField, which makes the vertical gyroscope bias known."""
+        if self._first_ns is not None:
+            tesla = message.magnetic_field
+            field = [1e6 * axis for axis in (tesla.x, tesla.y, tesla.z)]
+            self._navigator.push_magnetometer(self._seconds(message), field)
+
     def fix(self, message: Any) -> None:
         """Apply the position of a geometry_msgs/PoseWithCovarianceStamped in map."""
         before, continuous = self._navigator.state, self._navigator.continuous
-        if before is None or continuous is None or self._first_ns is None:
+        if before is None or continuous is None:
             return
-        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
         at = message.pose.pose.position
         covariance = np.reshape(message.pose.covariance, (6, 6))[:3, :3]
-        time = (stamp_ns - self._first_ns) / 1e9
-        self._navigator.update_position(time, [at.x, at.y, at.z], covariance)
+        self._navigator.update_position(self._seconds(message), [at.x, at.y, at.z], covariance)
         after = self._navigator.state
         if after.map_frame == before.map_frame:
             return  # an ordinary correction, which is applied gradually
         self._follow(Transform(_attitude(before), continuous.p_W), after)
         self._last = self._navigator.continuous
+
+    def _seconds(self, message: Any) -> float:
+        """Return a message's time since the first one: a float cannot hold ns since 1970."""
+        return (_stamp_ns(message) - (self._first_ns or 0)) / 1e9
 
     def _follow(self, before: Transform, after: NavState) -> None:
         """Keep base_link where it was in odom after the map moved; odom stays level (REP 105)."""
@@ -163,6 +171,10 @@ class OdometryBridge:
             angular=gyro - state.b_g,
             twist_covariance=twist,
         )
+
+
+def _stamp_ns(message: Any) -> int:
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
 
 def _attitude(pose: NavState | ContinuousPose) -> Rotation:
@@ -210,7 +222,7 @@ def spin() -> None:
     from nav_msgs.msg import Odometry as OdometryMessage
     from rclpy.node import Node
     from rclpy.qos import qos_profile_sensor_data
-    from sensor_msgs.msg import Imu
+    from sensor_msgs.msg import Imu, MagneticField
     from tf2_ros import TransformBroadcaster
 
     class StarIONode(Node):
@@ -221,6 +233,9 @@ def spin() -> None:
             self.odometry = self.create_publisher(OdometryMessage, "odometry", 10)
             self.transforms = TransformBroadcaster(self)
             self.create_subscription(Imu, "imu/data", self.on_imu, qos_profile_sensor_data)
+            self.create_subscription(
+                MagneticField, "imu/mag", self.bridge.field, qos_profile_sensor_data
+            )
             self.create_subscription(PoseWithCovarianceStamped, "fix", self.bridge.fix, 10)
 
         def on_imu(self, message: Imu) -> None:

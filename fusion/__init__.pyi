@@ -1,5 +1,6 @@
 """Public names of `stario.fusion`, which are imported on first use."""
 
+from stario.fusion.backends import BackendName as BackendName
 from stario.fusion.config import FilterConfig as FilterConfig
 from stario.fusion.config import GraphConfig as GraphConfig
 from stario.fusion.config import NavigatorConfig as NavigatorConfig
@@ -14,6 +15,7 @@ from stario.fusion.evaluation.summary import summary_table as summary_table
 from stario.fusion.evaluation.tracks import inertial_track as inertial_track
 from stario.fusion.evaluation.tracks import network_track as network_track
 from stario.fusion.filter.ekf import StateCloningEkf as StateCloningEkf
+from stario.fusion.filter.engine import UpdateResult as UpdateResult
 from stario.fusion.filter.initial import PriorPose as PriorPose
 from stario.fusion.fix_file import read_fixes as read_fixes
 from stario.fusion.fixes import Fix as Fix
@@ -21,7 +23,10 @@ from stario.fusion.fixes import position_fix as position_fix
 from stario.fusion.fixes import velocity_fix as velocity_fix
 from stario.fusion.fixes import yaw_fix as yaw_fix
 from stario.fusion.health import Health as Health
+from stario.fusion.imu.preintegration import Segment as Segment
+from stario.fusion.imu.preintegration import preintegrate as preintegrate
 from stario.fusion.imu.stateful import Predictor as Predictor
+from stario.fusion.imu.stateful import WindowDisplacement as WindowDisplacement
 from stario.fusion.live.run import LiveServer as LiveServer
 from stario.fusion.navigator import Navigator as Navigator
 from stario.fusion.recording import PreprocessedRecording as PreprocessedRecording

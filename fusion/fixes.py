@@ -124,6 +124,19 @@ def yaw_fix(time: float, yaw: Any, sigma: Any) -> Fix:
     return make_fix(time, "yaw", np.atleast_1d(shaped("yaw", yaw, ())), variance)
 
 
+def fix_list(fixes: Iterable[Fix]) -> list[Fix]:
+    """Return fixes as a list; `InputError` if there is anything else among them."""
+    check_type("fixes", fixes, Iterable, "a list of them")
+    listed = list(fixes)
+    for fix in listed:
+        _check_fix(fix)
+    return listed
+
+
+def _check_fix(fix: object) -> None:
+    check_type("fixes", fix, Fix, "position_fix, velocity_fix and yaw_fix create one")
+
+
 def by_time(fix: Fix) -> tuple[float, str]:
     """Return the sort key, which makes the result independent of the order of arrival."""
     return fix.time, fix.kind
@@ -150,7 +163,7 @@ class FixQueue:
 
     def add(self, fix: Fix) -> FixOutcome:
         """Keep a fix until it is due; invalid ones are refused and counted."""
-        check_type("fixes", fix, Fix, "position_fix, velocity_fix and yaw_fix create one")
+        _check_fix(fix)
         if reason := fix.fault():
             self.refuse(reason)
             return "refused"

@@ -57,6 +57,9 @@ class Health:
     final_sigma: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
+
     def lines(self) -> list[str]:
         """Format the counts as text; `stario.fusion.report.health` interprets them."""
         dropped = {k: v for k, v in self.samples.items() if k != "used" and v}

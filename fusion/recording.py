@@ -39,7 +39,7 @@ def silent(share: float) -> None:
     """Ignore progress."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PreprocessedRecording:
     """A recording after front end and network.
 
@@ -59,6 +59,10 @@ class PreprocessedRecording:
     front_end: FrontEnd
     seconds_front_end: float
     seconds_network: float
+
+    def __repr__(self) -> str:
+        windows = sum(m is not None for m in self.measurements)
+        return f"PreprocessedRecording({len(self.intervals)} intervals, {windows} windows)"
 
     @property
     def start(self) -> Start:

@@ -28,7 +28,13 @@ def changed(state: T, **attributes: Any) -> T:
     return new
 
 
-@dataclass(frozen=True, eq=False)
+def _pose_text(pose: NavState | SmoothedPose | ContinuousPose) -> str:
+    """Return a pose's `repr`: time and position, in one line."""
+    p_W = np.array2string(pose.p_W, precision=3, suppress_small=True)
+    return f"{type(pose).__name__}(time={pose.time:.3f} s, p_W={p_W} m)"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class NavState:
     """Estimated state at one time.
 
@@ -55,6 +61,7 @@ class NavState:
     covariance: FloatArray
     in_gap: bool = False
     map_frame: int = 0
+    __repr__ = _pose_text
 
     @property
     def quat_xyzw(self) -> FloatArray:
@@ -96,7 +103,7 @@ class NavState:
         return changed(self, p_W=self.p_W + by)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SmoothedPose:
     """A pose estimated one window later, using the measurements made since.
 
@@ -113,6 +120,7 @@ class SmoothedPose:
     p_W: FloatArray
     covariance: FloatArray
     map_frame: int = 0
+    __repr__ = _pose_text
 
 
 MAX_STEP = 0.01
@@ -122,7 +130,7 @@ BLEED_SECONDS = 1.0
 """Time constant for bleeding in a small correction [s]."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ContinuousPose:
     """A pose whose position does not step at updates.
 
@@ -141,6 +149,7 @@ class ContinuousPose:
     v_W: FloatArray
     correction_W: FloatArray
     map_frame: int = 0
+    __repr__ = _pose_text
 
 
 def advanced(before: ContinuousPose | None, state: NavState) -> ContinuousPose:
@@ -189,7 +198,7 @@ class Innovations:
     gated: BoolArray
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Track:
     """An estimated track.
 
@@ -215,6 +224,10 @@ class Track:
     smoothed: Trajectory | None = None
     seconds_network: float = 0.0
     seconds_filter: float = 0.0
+
+    def __repr__(self) -> str:
+        nis = "" if self.nis is None else f", mean NIS {self.nis:.2f}"
+        return f"Track({self.trajectory!r}{nis})"
 
     @property
     def time(self) -> FloatArray:

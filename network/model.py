@@ -38,6 +38,9 @@ class DisplacementModel:
         self.card = card
         self._engine = engine
 
+    def __repr__(self) -> str:
+        return f"DisplacementModel({self.name}, sha256 {self.card.sha256[:12] or 'unknown'})"
+
     @property
     def name(self) -> str:
         """Name of the architecture."""
@@ -67,9 +70,11 @@ class DisplacementModel:
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Predict the displacement over each window, from its start to one second later.
 
+        For a recording, `Navigator.observe(recording).measurements` gives the displacements.
+
         Args:
             windows: (B, 6, 200), gyroscope [rad/s] then specific force [m/s^2] at 200 Hz, rotated
-                into a gravity-aligned frame (z up, any yaw).
+                into frame H: z up, the device's heading zero (README, "The window and its frame").
 
         Returns:
             Displacement (B, 3) [m] and covariance (B, 3, 3) [m^2], in the window's frame; inflated
@@ -233,7 +238,10 @@ def weights_named(name: str, runs: Path) -> str | Path:
 
 
 def _checked_windows(windows: ArrayLike) -> Float32Array:
-    batch = np.require(windows, np.float32, ["C", "W"])  # torch warns about read-only arrays
+    try:
+        batch = np.require(windows, np.float32, ["C", "W"])  # torch warns about read-only arrays
+    except (TypeError, ValueError) as error:
+        raise InputError("windows", str(error), f"numbers (B, 6, {WINDOW_SAMPLES})") from error
     if batch.ndim != 3 or batch.shape[1:] != (6, WINDOW_SAMPLES):
         raise InputError("windows", f"shape {batch.shape}", f"(B, 6, {WINDOW_SAMPLES})")
     if not np.isfinite(batch).all():

@@ -1,7 +1,10 @@
 """Public names of `stario.sequences`, which are imported on first use."""
 
+from stario.sequences.accuracy.metrics import Alignment as Alignment
+from stario.sequences.accuracy.metrics import TrackMetrics as TrackMetrics
 from stario.sequences.accuracy.metrics import align as align
 from stario.sequences.accuracy.metrics import evaluate_track as evaluate_track
+from stario.sequences.accuracy.nees import PositionNees as PositionNees
 from stario.sequences.accuracy.nees import position_nees as position_nees
 from stario.sequences.attitude.rotations import about_z as about_z
 from stario.sequences.attitude.rotations import yaw_of as yaw_of
@@ -13,6 +16,7 @@ from stario.sequences.errors import ReadError as ReadError
 from stario.sequences.errors import StarioError as StarioError
 from stario.sequences.errors import WeightsError as WeightsError
 from stario.sequences.inspection.checks import check_units as check_units
+from stario.sequences.inspection.report import Inspection as Inspection
 from stario.sequences.inspection.report import inspect_recording as inspect_recording
 from stario.sequences.legs import LegStream as LegStream
 from stario.sequences.legs import leg_streams as leg_streams
@@ -37,6 +41,8 @@ from stario.sequences.simulation.magnetometer import INDOOR_FIELD as INDOOR_FIEL
 from stario.sequences.simulation.magnetometer import MagneticField as MagneticField
 from stario.sequences.simulation.walks import WalkStyle as WalkStyle
 from stario.sequences.simulation.walks import generate_walk as generate_walk
+from stario.sequences.truth.findings import TruthProblem as TruthProblem
 from stario.sequences.truth.problems import truth_problems as truth_problems
 from stario.sequences.units import with_units as with_units
+from stario.sequences.windows import WorldStream as WorldStream
 from stario.sequences.windows import world_streams as world_streams

@@ -21,7 +21,7 @@ from stario.sequences.arrays import (
 from stario.sequences.errors import InputError
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Timed:
     """Rows at increasing times.
 
@@ -32,6 +32,16 @@ class Timed:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def __repr__(self) -> str:
+        rate = f" at {self.rate:.1f} Hz" if len(self) > 1 else ""
+        span = f"{self.time[0]:.2f} to {self.time[-1]:.2f} s"
+        return f"{type(self).__name__}({len(self)} rows, {span}{rate})"
+
+    @property
+    def rate(self) -> float:
+        """Median rate [Hz]; 0 for a single row."""
+        return float(1.0 / np.median(np.diff(self.time))) if len(self) > 1 else 0.0
 
     def select(self, keep: BoolArray) -> Self:
         """Return the rows for which `keep` (N,) is True."""
@@ -47,7 +57,7 @@ class Timed:
 Kind = Literal["positions", "waypoints"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PositionTrack(Timed):
     """Known positions without attitude: a position track, or waypoints that the user passed.
 
@@ -91,7 +101,7 @@ class PositionTrack(Timed):
         return float(np.median(self.sigma[self.valid]))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Magnetometer(Timed):
     """Magnetic field measured alongside the IMU, at its own times.
 
@@ -110,13 +120,8 @@ class Magnetometer(Timed):
         field = checked_array("magnetic field", self.field, (len(time), 3))
         vars(self).update(time=time, field=field)
 
-    @property
-    def rate(self) -> float:
-        """Median sampling rate [Hz]; 0 for a single sample."""
-        return float(1.0 / np.median(np.diff(self.time))) if len(self) > 1 else 0.0
 
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DeviceAttitude(Timed):
     """Attitude estimated by the device's own sensor fusion, in its own world frame with z up.
 

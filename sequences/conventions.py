@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import check_choice
+from stario.sequences.arrays import check_choice, check_type
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import (
     STANDARD_GRAVITY,
@@ -52,8 +52,10 @@ def with_conventions(
 
     Raises:
         InputError: an argument's value is unknown, a unit is given for numbers already converted
-            from the one named in their file, or gravity cannot be restored.
+            from the one named in their file, gravity cannot be restored, or the recording has the
+            wrong type.
     """
+    check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
     check_choice("gravity", gravity, GRAVITY)
     check_choice("accel_sign", accel_sign, ACCEL_SIGNS)
     if accel_sign == "apple":

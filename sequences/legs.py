@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 from stario.sequences.levelled_stream import levelled_streams
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, PositionTrack
@@ -48,7 +49,7 @@ _TAP_SIGMA, _TAP_TIME = 0.4, 0.3
 """Sigma of a waypoint's position [m], and of the time at which it is tapped [s]."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LegStream:
     """Unbroken stretch of levelled IMU samples with legs between known positions.
 
@@ -75,6 +76,9 @@ class LegStream:
     def __len__(self) -> int:
         return len(self.imu_N)
 
+    def __repr__(self) -> str:
+        return f"LegStream({len(self)} samples and {len(self.start)} legs of {self.name})"
+
     def part(self, start: int, stop: int) -> LegStream:
         """Return samples [start, stop) and the legs that lie within them."""
         begin = start / WINDOW_RATE
@@ -97,8 +101,10 @@ def leg_streams(sequence: ImuSequence) -> list[LegStream]:
     """Cut a recording with known positions into unbroken stretches with at least two legs.
 
     Raises:
-        InputError: the recording has no known positions, or its rate is not accepted.
+        InputError: the recording has no known positions, its rate is not accepted, or it has the
+            wrong type.
     """
+    check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
     if sequence.positions is None:
         raise InputError(f"{sequence.name}: positions", "none", "positions or waypoints")
     start, stop, displacement, sigma = _legs(sequence.positions)

@@ -49,7 +49,7 @@ _ROUNDING_S = 1e-6
 """Rounding error allowed in a step [s]: 0.3 - 0.2 > 0.1, and more for seconds since 1970."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Trajectory(Timed):
     """A track of poses in the world frame W.
 
@@ -163,7 +163,7 @@ _TRAJECTORY_SHAPES: dict[str, tuple[int, ...]] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ImuSequence:
     """Recording of an inertial measurement unit, in body axes B.
 
@@ -219,6 +219,9 @@ class ImuSequence:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def __repr__(self) -> str:
+        return f"ImuSequence({len(self)} samples of {self.summary()})"
 
     @property
     def duration(self) -> float:

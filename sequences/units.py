@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 
-from stario.sequences.arrays import shown
+from stario.sequences.arrays import check_type, shown
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 
@@ -101,8 +101,9 @@ def with_units(
 
     Raises:
         InputError: a unit is unknown, or given for numbers already converted from the unit named
-            in their file; or so is a minus.
+            in their file; or so is a minus; or the recording has the wrong type.
     """
+    check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
     return replace(
         sequence,
         gyro=sequence.gyro * _factor(sequence, "gyro", gyro_unit, GYRO_UNITS),

@@ -17,14 +17,21 @@ from __future__ import annotations
 from collections.abc import Sized
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import integral, interpolated, runs, samples_in
+from stario.sequences.arrays import (
+    check_choice,
+    check_type,
+    integral,
+    interpolated,
+    runs,
+    samples_in,
+)
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.clean_samples import clean_samples, unbroken
@@ -45,7 +52,7 @@ Attitude = Literal["levelled", "true"]
 """Attitude that rotates training windows into the world frame; see `world_streams`."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class WorldStream:
     """Unbroken stretch of a recording at 200 Hz in the world frame, ready to be cut into windows.
 
@@ -63,6 +70,9 @@ class WorldStream:
 
     def __len__(self) -> int:
         return len(self.imu_W)
+
+    def __repr__(self) -> str:
+        return f"WorldStream({len(self)} samples of {self.name})"
 
     def part(self, start: int, stop: int) -> WorldStream:
         """Return samples [start, stop); empty if there are none."""
@@ -149,8 +159,11 @@ def world_streams(sequence: ImuSequence, attitude: Attitude = "levelled") -> lis
             facing direction from that cue, which is missing at inference.
 
     Raises:
-        InputError: the recording has no truth or its rate is not between 50 Hz and 1 kHz.
+        InputError: the recording has no truth, its rate is not between 50 Hz and 1 kHz, or an
+            argument has the wrong type or value.
     """
+    check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
+    check_choice("attitude", attitude, get_args(Attitude))
     if sequence.truth is None:
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory for training")
     truth, known = sequence.truth, sequence.truth.valid

@@ -176,6 +176,25 @@ def test_ros2_node_keeps_odom_continuous_and_corrects_map_to_odom_by_fixes():
     np.testing.assert_allclose(up, [0.0, 0.0, 1.0], atol=1e-9)
 
 
+def test_ros2_node_passes_the_magnetic_field_on_in_microtesla():
+    example = load("ros2_node")
+    navigator, expected = (Navigator(load_model("default")) for _ in range(2))
+    bridge, walk = example.OdometryBridge(navigator), demonstration()
+    fields_uT = walk.truth.at(walk.time).attitude_WB.inv().apply([0.0, 20.0, -45.0])
+    for k, message in enumerate(example.demonstration_messages(8.0)):
+        if k % 4 == 0:
+            x, y, z = 1e-6 * fields_uT[k]
+            field = SimpleNamespace(x=x, y=y, z=z)
+            bridge.field(SimpleNamespace(header=message.header, magnetic_field=field))
+            if k > 0:  # the first field comes before the first sample, which sets the time
+                expected.push_magnetometer(walk.time[k], fields_uT[k])
+        bridge.imu(message)
+        expected.push(walk.time[k], walk.gyro[k], walk.accel[k])
+    assert navigator.health.bearings == expected.health.bearings
+    assert navigator.health.bearings["applied"] > 5
+    np.testing.assert_allclose(navigator.state.p_W, expected.state.p_W, atol=1e-6)
+
+
 @pytest.mark.parametrize("ahead_ns", [0, 30_000_000])
 def test_ros2_node_follows_a_map_moved_by_a_fix_at_the_current_time(ahead_ns):
     """The fix waits for the sample of its time and is applied between two odometry outputs."""

@@ -2,10 +2,12 @@
 
 import ast
 import importlib
+import inspect
 import re
 import subprocess
 import sys
 import tomllib
+import typing
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -32,6 +34,20 @@ def test_readme_names_every_public_name_and_each_can_be_imported(package):
     for name in module.__all__:
         assert getattr(module, name) is not None
         assert re.search(rf"`{name}\b", text), name
+
+
+def test_what_public_functions_return_is_public_too():
+    public = {
+        getattr(module, name)
+        for module in map(importlib.import_module, (f"stario.{folder}" for folder in FOLDERS))
+        for name in module.__all__
+        if callable(getattr(module, name))
+    }
+    for function in filter(inspect.isfunction, public):
+        returned = typing.get_type_hints(function)["return"]
+        for kind in (returned, *typing.get_args(returned)):
+            if getattr(kind, "__module__", "").startswith("stario."):
+                assert kind in public, f"{function.__name__} returns {kind}"
 
 
 def test_examples_import_only_from_public_packages():

@@ -242,7 +242,7 @@ def _groups(
         judgement_text,
         write_judgement,
     )
-    from stario.sequences.datasets.stream_cache import cache_folder
+    from stario.sequences.datasets.cache_files import cache_folder
 
     grouping = check_by(by)
     names = [ours] if theirs is None else [ours, theirs]

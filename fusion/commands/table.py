@@ -75,7 +75,7 @@ def table(
     from stario.fusion.table.training import ReaderConfig
     from stario.network.architectures import ARCHITECTURES
     from stario.sequences.datasets.batch import Skipped
-    from stario.sequences.datasets.stream_cache import cache_folder
+    from stario.sequences.datasets.cache_files import cache_folder
 
     datasets = _data_sets(data, sets, published or [], split_seed, per_group)
     chosen = None if networks is None else names_in(networks)

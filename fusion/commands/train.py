@@ -122,7 +122,7 @@ def train(
     from stario.fusion.evaluation.folders import make_folder
     from stario.network.model import load_model
     from stario.network.training.parallel import is_leader
-    from stario.sequences.datasets.stream_cache import cache_folder
+    from stario.sequences.datasets.cache_files import cache_folder
 
     walks = _number_of_walks(generated, recorded_only)
     first = load_model(start_from) if start_from else None  # fails before anything slow starts

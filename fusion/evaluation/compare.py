@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from stario.fusion.config import NavigatorConfig
@@ -15,7 +15,7 @@ from stario.fusion.evaluation.tracks import (
     network_track_true_attitude,
 )
 from stario.fusion.fix_file import check_within
-from stario.fusion.fixes import Fix
+from stario.fusion.fixes import Fix, fix_list
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.recording import Progress, silent
@@ -140,19 +140,23 @@ class Comparison:
 def compare(
     model: Predictor,
     sequence: ImuSequence,
-    config: NavigatorConfig,
+    config: NavigatorConfig | None = None,
     progress: Progress = silent,
-    fixes: Sequence[Fix] = (),
+    fixes: Iterable[Fix] = (),
 ) -> Comparison:
     """Compute every track of a recording; tracks share predictions, EKF and graph use the fixes.
+
+    Configuration, progress and fixes are those of `Navigator` and its `run`.
 
     Raises:
         InputError: the recording is too short, its units or rate are wrong, no fix is within its
             time, or an argument has the wrong type.
     """
     check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
+    fixes = fix_list(fixes)
     check_within(fixes, sequence)
     navigator = Navigator(model, config)
+    config = navigator.config
     preprocessed = navigator.observe(sequence, progress)
     warn_of_truth(sequence)
     tracks = {

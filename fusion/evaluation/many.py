@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -10,23 +10,25 @@ from pathlib import Path
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import Comparison, compare
 from stario.fusion.evaluation.tracks import true_poses
-from stario.fusion.fixes import Fix
+from stario.fusion.fixes import Fix, fix_list
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.recording import Progress, silent
 from stario.network.model import load_model
+from stario.sequences.arrays import shown
 from stario.sequences.datasets.batch import Skipped, each
+from stario.sequences.errors import InputError
 from stario.sequences.files import unused_name
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import ImuSequence
 
 
 def compare_recordings(
-    paths: Sequence[Path],
+    paths: Iterable[Path],
     model: Predictor | str,
-    config: NavigatorConfig,
+    config: NavigatorConfig | None = None,
     read: Callable[[Path], ImuSequence] = read_recording,
     jobs: int | None = None,
-    fixes: Sequence[Fix] = (),
+    fixes: Iterable[Fix] = (),
     truth_needed: bool = False,
     progress: Progress = silent,
 ) -> Iterator[Comparison | Skipped]:
@@ -39,15 +41,21 @@ def compare_recordings(
         paths: paths of the recordings.
         model: network, or name of weights, which each process loads once: faster than passing the
             network with every recording.
-        config: configuration of the navigator.
+        config: configuration of the navigator; None has its defaults.
         read: function that reads a path; must be picklable.
         jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
         fixes: fixes given to EKF and graph for every recording.
         truth_needed: whether to skip recordings without ground truth.
         progress: called with the share of the work done; with a single process also within a
             recording.
+
+    Raises:
+        InputError: `paths` is a single path, or an argument has the wrong type.
     """
-    done = 0
+    if isinstance(paths, str | Path):
+        remedy = "find_recordings(path) returns one"
+        raise InputError("paths", shown(paths), "a list of paths", remedy)
+    paths, done = list(paths), 0
 
     def report_share(share: float) -> None:
         progress((done + share) / len(paths))
@@ -57,7 +65,7 @@ def compare_recordings(
         model=model,
         config=config,
         read=read,
-        fixes=fixes,
+        fixes=fix_list(fixes),
         truth_needed=truth_needed,
         progress=report_share if jobs == 1 else silent,
     )
@@ -84,7 +92,7 @@ def distinct_name(name: str, taken: set[str]) -> str:
 def _compare(
     path: Path,
     model: Predictor | str,
-    config: NavigatorConfig,
+    config: NavigatorConfig | None,
     read: Callable[[Path], ImuSequence],
     fixes: Sequence[Fix],
     truth_needed: bool,

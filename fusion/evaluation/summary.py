@@ -15,6 +15,7 @@ from stario.fusion.evaluation.compare import (
     Comparison,
     Metrics,
 )
+from stario.sequences.arrays import check_type
 from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.sequence import FloatArray
 
@@ -69,7 +70,13 @@ def summary(recordings: Sequence[Scores]) -> dict[str, object]:
 
 
 def summary_table(recordings: Sequence[Scores]) -> str:
-    """Return the summary as text: horizontal ATE of each track, consistency of the back ends."""
+    """Return the summary as text: horizontal ATE of each track, consistency of the back ends.
+
+    Raises:
+        InputError: a recording's figures are of another type.
+    """
+    for scores in recordings:
+        check_type("recordings", scores, Scores, "scores_of(comparison) returns one")
     rows = [[r.name, *(_cell([r], t, m, np.mean) for t, m, _ in _COLUMNS)] for r in recordings]
     for name, over in (("median", np.median), ("mean", np.mean)):
         rows.append([name, *(_cell(recordings, t, m, over) for t, m, _ in _COLUMNS)])

@@ -17,7 +17,7 @@ from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.imu.stateful import Predictor, StatefulInference
 from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.state import Track
-from stario.sequences.arrays import integral, interpolated, runs, trapezoids
+from stario.sequences.arrays import check_type, integral, interpolated, runs, trapezoids
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.clean_samples import clean_samples
 from stario.sequences.errors import InputError
@@ -44,8 +44,16 @@ def true_poses(sequence: ImuSequence) -> Trajectory:
     return sequence.truth
 
 
-def inertial_track(preprocessed: PreprocessedRecording, config: NavigatorConfig) -> Track:
-    """Integrate the IMU alone (strapdown) from the levelled start at rest, with zero biases."""
+def inertial_track(
+    preprocessed: PreprocessedRecording, config: NavigatorConfig | None = None
+) -> Track:
+    """Integrate the IMU alone (strapdown) from the levelled start at rest, with zero biases.
+
+    Raises:
+        InputError: an argument has the wrong type.
+    """
+    _check_preprocessed(preprocessed)
+    config = config or NavigatorConfig()
     began = perf_counter()
     start = preprocessed.start
     zero = np.zeros(3)
@@ -69,7 +77,12 @@ def inertial_track(preprocessed: PreprocessedRecording, config: NavigatorConfig)
 
 
 def network_track(preprocessed: PreprocessedRecording) -> Track:
-    """Chain the network's displacements along the attitude levelled from the IMU, without truth."""
+    """Chain the network's displacements along the attitude levelled from the IMU, without truth.
+
+    Raises:
+        InputError: the argument has the wrong type.
+    """
+    _check_preprocessed(preprocessed)
     began = perf_counter()
     start = preprocessed.start
     time = np.array([start.time, *(e.stop for e in preprocessed.intervals)])
@@ -87,6 +100,11 @@ def network_track(preprocessed: PreprocessedRecording) -> Track:
         seconds_network=preprocessed.seconds_network,
         seconds_filter=preprocessed.seconds_front_end + perf_counter() - began,
     )
+
+
+def _check_preprocessed(preprocessed: object) -> None:
+    remedy = "navigator.observe(recording) returns one"
+    check_type("preprocessed", preprocessed, PreprocessedRecording, remedy)
 
 
 def network_track_true_attitude(

@@ -11,7 +11,7 @@ from typing import Literal, cast, get_args
 
 import numpy as np
 
-from stario.sequences.arrays import check_choice
+from stario.sequences.arrays import check_choice, check_type
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, Trajectory, low_rate_message
@@ -128,8 +128,10 @@ def align(estimate: Trajectory, truth: Trajectory, mode: Alignment) -> Trajector
             The positions of a stationary device give no yaw; there it comes from the attitudes.
 
     Raises:
-        InputError: unknown mode, or no overlap.
+        InputError: unknown mode, no overlap, or an argument has the wrong type.
     """
+    check_type("estimate", estimate, Trajectory, "pass track.trajectory")
+    check_type("truth", truth, Trajectory, "pass recording.truth, if it has poses")
     check_choice("alignment", mode, get_args(Alignment))
     if mode == "none":
         return estimate
@@ -166,7 +168,8 @@ def evaluate_track(
         rte_interval: span of the relative error [s].
 
     Raises:
-        InputError: no overlap, an unknown choice, or an interval that is not positive.
+        InputError: no overlap, an unknown choice, an interval that is not positive, or an argument
+            has the wrong type.
     """
     check_choice("convention", convention, get_args(Convention))
     if not (np.isfinite(rte_interval) and rte_interval > 0):

@@ -8,6 +8,7 @@ import numpy as np
 
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.accuracy.metrics import Alignment, align, pose_errors
+from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, Trajectory
 
@@ -71,8 +72,10 @@ def position_nees(
     the covariance: to check that too, pass the estimate in the truth's frame and "none".
 
     Raises:
-        InputError: no overlap, no covariance, or one that is not positive definite.
+        InputError: no overlap, no covariance, one that is not positive definite, or an argument has
+            the wrong type.
     """
+    check_type("estimate", estimate, Trajectory, "pass track.trajectory")
     if estimate.position_covariance_W is None:
         raise InputError("estimate.position_covariance_W", "None", "(N, 3, 3) [m^2]")
     errors = pose_errors(align(estimate, truth, alignment), truth)

@@ -4,24 +4,16 @@ There is one file per recording and set of options, in the layout of safetensors
 the numbers of all stretches. A file gets its name only when it is complete: a killed writer leaves
 nothing that would be read, and if two write at once, the second replaces the first's file by the
 same content. The folder may be deleted at any time.
-
-A recording's key consists of its path, the names, sizes and modification times of its files, the
-options it is read with, and the code that reads it. Hashing the files' bytes instead would read
-100 hours of recordings, and the images next to some of them, at every start; it would detect only
-one more case: a file replaced by one of the same size and modification time.
 """
 
 from __future__ import annotations
 
-import hashlib
-import importlib.resources
 import json
 import logging
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +22,17 @@ import safetensors.numpy
 from numpy.typing import NDArray
 
 from stario.sequences.datasets.batch import Skipped, each, skipped
+from stario.sequences.datasets.cache_files import (
+    STREAMS,
+    cache_file,
+    recording_file,
+    remove_unused,
+)
 from stario.sequences.errors import InputError, StarioError
 from stario.sequences.files import atomic_write
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.legs import LegStream, leg_streams
-from stario.sequences.readers import FORMATS
 from stario.sequences.readers.archive import split_name
-from stario.sequences.readers.published.oxiod import capture_file
 from stario.sequences.sequence import ImuSequence, low_rate_message
 from stario.sequences.truth.problems import check_truth
 from stario.sequences.windows import Attitude, WorldStream, world_streams
@@ -47,17 +43,9 @@ Stream = WorldStream | LegStream
 """Training data of a network: with poses, or with legs between known positions."""
 
 _POSES = "poses"
-_SUFFIX = ".streams"
 _ABANDONED_S = 3600.0
 _OPEN_FILES = 10_240
 """Number of open files to ask for where a system states no limit; macOS allows no more."""
-
-
-def cache_folder() -> Path:
-    """Return the folder `STARIO_CACHE`, else `stario` in `XDG_CACHE_HOME`, else in `~/.cache`."""
-    if named := os.environ.get("STARIO_CACHE"):
-        return Path(named)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stario"
 
 
 def recorded(
@@ -111,48 +99,8 @@ def cached(
 
     The key has plain values that determine the result, except for this package's code.
     """
-    kept = _kept(folder / (_digest({**key, "code": _code()}) + _SUFFIX), build)
+    kept = _kept(cache_file(folder, key, STREAMS), build)
     return (_opened(kept) or build()) if isinstance(kept, Path) else kept
-
-
-def recording_key(path: Path, options: Mapping[str, object]) -> str:
-    """Return a digest of a recording's path and files, the options and this package's code.
-
-    The options are everything else that the result depends on.
-    """
-    stamps = [
-        (str(file), stat.st_size, stat.st_mtime_ns)
-        for file in recording_files(path)
-        for stat in (file.stat(),)
-    ]
-    return _digest(
-        {"path": str(path.resolve()), "files": stamps, "options": options, "code": _code()}
-    )
-
-
-def recording_files(path: Path) -> list[Path]:
-    """Return the files that a recording is read from, and possibly others next to them."""
-    path, member = split_name(path)
-    if member is not None:
-        return [path]
-    while path != path.parent and _is_recording(path.parent, path.parent.stat().st_mtime_ns):
-        path = path.parent  # imu0/data.csv belongs to the folder that also holds its truth
-    if path.is_dir():
-        return sorted(p for p in path.rglob("*") if p.is_file())
-    if any(FORMATS[name].recognises(path) for name in ("phone", "wide")):
-        return sorted(p for p in path.parent.iterdir() if p.is_file())  # other sensors, poses
-    if not FORMATS["oxiod"].recognises(path):
-        return [path]
-    number = "".join(filter(str.isdigit, path.stem))
-    siblings = (p for p in path.parent.iterdir() if p.suffix == path.suffix and p.is_file())
-    same_number = {p for p in siblings if "".join(filter(str.isdigit, p.stem)) == number}
-    return sorted(same_number | set(filter(None, [capture_file(path)])))
-
-
-@cache
-def _is_recording(folder: Path, changed_ns: int) -> bool:
-    """Return whether a folder is a recording; cached, as it may hold thousands of files."""
-    return any(known.recognises(folder) for known in FORMATS.values())
 
 
 def _stored(
@@ -165,7 +113,7 @@ def _stored(
     """Return a recording's cache file, or its streams if that cannot be written."""
     if not split_name(path)[0].exists():
         return _streams(read(path), attitude)
-    file = folder / (recording_key(path, {**options, "attitude": attitude}) + _SUFFIX)
+    file = recording_file(folder, path, {**options, "attitude": attitude}, STREAMS)
     return _kept(file, lambda: _streams(read(path), attitude))
 
 
@@ -198,25 +146,6 @@ def _streams(sequence: ImuSequence, attitude: Attitude) -> list[Stream]:
     return streams
 
 
-def _digest(key: Mapping[str, object]) -> str:
-    text = json.dumps(key, sort_keys=True, default=str)
-    return hashlib.blake2b(text.encode(), digest_size=20).hexdigest()
-
-
-@cache
-def _code() -> str:
-    """Return a digest of this package's code, so that streams of other versions are not reused."""
-    digest = hashlib.blake2b(digest_size=20)
-    for file in code_files():
-        digest.update(file.read_bytes())
-    return digest.hexdigest()
-
-
-def code_files() -> list[Path]:
-    """Return the source files that streams depend on: readers, levelling, windows, simulation."""
-    return sorted(Path(str(importlib.resources.files("stario.sequences"))).rglob("*.py"))
-
-
 def _written(file: Path, streams: Sequence[Stream]) -> bool:
     """Write streams to the cache; return False, with a warning, if they cannot be written."""
     if not streams:
@@ -240,6 +169,7 @@ def _written(file: Path, streams: Sequence[Stream]) -> bool:
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         _sweep(file)
+        remove_unused(file.parent)
         with atomic_write(file, "wb") as target:
             target.write(content)
     except (OSError, InputError) as error:

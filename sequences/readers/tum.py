@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import check_type
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.files import atomic_write
@@ -21,8 +22,10 @@ def write_tum(path: Path | str, trajectory: Trajectory) -> None:
     """Write the valid poses with 9 decimals.
 
     Raises:
-        InputError: there is no valid pose, or the folder does not exist.
+        InputError: there is no valid pose, the folder does not exist, or an argument has the wrong
+            type.
     """
+    check_type("trajectory", trajectory, Trajectory, "pass track.trajectory")
     valid = trajectory.valid
     if not valid.any():
         raise InputError("trajectory", "no valid pose", "at least one")

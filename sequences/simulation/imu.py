@@ -16,6 +16,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 from stario.sequences.noise import PHONE_NOISE, ImuNoise
 from stario.sequences.sequence import (
@@ -124,8 +125,10 @@ def simulate_imu(
 
     Raises:
         InputError: too few poses, a gap between valid poses longer than 0.1 s and 1.8 median
-            steps, or a rate or gravity out of range.
+            steps, a rate or gravity out of range, or an argument has the wrong type.
     """
+    check_type("trajectory", trajectory, Trajectory, "generate_walk(seed) returns one")
+    check_type("errors", errors, ImuErrors, "such as PHONE_IMU; pass a seed by name: seed=7")
     _check(trajectory, rate, gravity)
     truth, gyro, acceleration_W = _sampled(trajectory, rate)
     up = np.array([0.0, 0.0, gravity])

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, Trajectory, low_rate_message
 from stario.sequences.truth.findings import TruthProblem, fit_problems
@@ -88,7 +89,11 @@ def truth_problems(sequence: ImuSequence) -> list[TruthProblem]:
 
     Where positions and accelerometer agree well, the gyroscope is not compared: an offset of the
     clocks of a few hundredths of a second then goes unnoticed, unlike in `examine_truth`.
+
+    Raises:
+        InputError: the argument has the wrong type.
     """
+    check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
     if sequence.truth is None:
         return []
     if problems := _unusable_times(sequence, sequence.truth):

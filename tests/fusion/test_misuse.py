@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,11 @@ from stario.fusion import (
     NavigatorConfig,
     PriorPose,
     compare,
+    compare_recordings,
+    inertial_track,
+    network_track,
     position_fix,
+    summary_table,
     yaw_fix,
 )
 from stario.network import load_model
@@ -47,6 +52,10 @@ LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
         (lambda model: Navigator(model).push(10**400, [0, 0, 0], [0, 0, 9.8]), "time: .*seconds"),
         (lambda model: Navigator(model).restore(b"xx" + Navigator(model).snapshot()), "else"),
         (lambda model: compare("walk.csv", model, NavigatorConfig()), "sequence.*read_recording"),
+        (lambda model: network_track("walk.csv"), "preprocessed.*observe"),
+        (lambda model: inertial_track("walk.csv"), "preprocessed.*observe"),
+        (lambda model: summary_table(["walk"]), "recordings.*scores_of"),
+        (lambda model: next(compare_recordings("walk.csv", model)), "paths.*find_recordings"),
         (lambda model: FilterConfig(gate="0.9"), "gate"),
         (lambda model: FilterConfig(gate=1.0), "gate"),
         (lambda model: FilterConfig(magnetometer="no"), "magnetometer"),
@@ -68,13 +77,17 @@ def test_a_wrong_argument_is_named(still_model: Any, make: Any, named: str) -> N
 def test_a_fix_of_the_wrong_type_is_refused_with_a_remedy(
     walk: ImuSequence, still_model: Any
 ) -> None:
-    with pytest.raises(InputError, match="position_fix"):
-        Navigator(still_model).run(walk, fixes=[(1.0, "position")])
+    for wrong in ([(1.0, "position")], ["fix"]):
+        for run in (Navigator(still_model).run, partial(compare, still_model)):
+            with pytest.raises(InputError, match="position_fix"):
+                run(walk, fixes=wrong)
 
 
 def test_a_single_fix_in_place_of_a_list_is_named(walk: ImuSequence, still_model: Any) -> None:
-    with pytest.raises(InputError, match="fixes"):
-        Navigator(still_model).run(walk, fixes=position_fix(1.0, np.zeros(3), np.eye(3)))
+    fix = position_fix(1.0, np.zeros(3), np.eye(3))
+    for run in (Navigator(still_model).run, partial(compare, still_model)):
+        with pytest.raises(InputError, match="fixes"):
+            run(walk, fixes=fix)
 
 
 def test_numpy_numbers_are_accepted() -> None:

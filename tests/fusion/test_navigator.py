@@ -27,6 +27,18 @@ def track(walk: ImuSequence, make_oracle: Make) -> Track:
     return Navigator(make_oracle(walk, walk.truth, CONFIG)).run(walk)
 
 
+def test_results_print_without_their_arrays(track: Track, walk: ImuSequence, still_model) -> None:
+    nis = f"mean NIS {track.nis:.2f}"
+    assert repr(track) == f"Track(Trajectory(201 rows, 0.00 to 20.00 s at 10.0 Hz), {nis})"
+    assert str(track.health).splitlines() == track.health.lines()
+    navigator = Navigator(still_model)
+    assert repr(navigator.observe(walk)) == "PreprocessedRecording(200 intervals, 39 windows)"
+    state = stream(navigator, walk.slice(0.0, 3.0))[-1]
+    for pose in (state, navigator.continuous, navigator.smoothed):
+        assert repr(pose).startswith(f"{type(pose).__name__}(time={pose.time:.3f} s, p_W=[")
+        assert len(repr(pose)) < 80
+
+
 # --- accuracy --------------------------------------------------------------------------------
 
 

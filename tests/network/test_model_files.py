@@ -41,6 +41,11 @@ def refusal(path: Path) -> str:
     return text
 
 
+def test_a_model_prints_its_architecture_and_checksum() -> None:
+    model = load_model("default")
+    assert repr(model) == f"DisplacementModel(StarIO, sha256 {model.card.sha256[:12]})"
+
+
 @pytest.mark.parametrize(
     ("field", "value"),
     [
@@ -143,4 +148,10 @@ def test_windows_with_a_value_that_is_not_finite_are_refused(value: float) -> No
     windows = np.zeros((2, 6, 200))
     windows[1, 4, 7] = value
     with pytest.raises(InputError, match="not finite"):
+        load_model().predict(windows)
+
+
+@pytest.mark.parametrize("windows", ["walk.csv", [[1.0], [1.0, 2.0]], np.zeros((6, 200))])
+def test_windows_that_are_none_are_refused(windows: object) -> None:
+    with pytest.raises(InputError, match=r"windows: .*\(B, 6, 200\)"):
         load_model().predict(windows)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from stario.sequences import (
     DeviceAttitude,
@@ -17,14 +18,25 @@ from stario.sequences import (
     Magnetometer,
     PositionTrack,
     Trajectory,
+    align,
     check_units,
+    evaluate_track,
     inspect_recording,
+    leg_streams,
+    position_nees,
+    simulate_imu,
+    truth_problems,
+    with_conventions,
+    with_units,
+    world_streams,
     write_csv,
+    write_tum,
 )
 
 TIME = np.arange(200) / 100.0
 SEQUENCE = ImuSequence("s", TIME, np.zeros((200, 3)), np.tile([0.0, 0.0, 9.8], (200, 1)))
 ROWS = np.zeros((200, 3))
+POSES = Trajectory(TIME, ROWS, Rotation.identity(200))
 DATES = np.datetime64("2026-01-01") + (1e9 * TIME).astype("timedelta64[ns]")
 
 
@@ -48,6 +60,19 @@ DATES = np.datetime64("2026-01-01") + (1e9 * TIME).astype("timedelta64[ns]")
         (lambda: write_csv(SEQUENCE, Path("s.csv")), "sequence", "write_csv(path, sequence)"),
         (lambda: inspect_recording("x"), "sequence", "read_recording(path)"),
         (lambda: check_units("x"), "sequence", "read_recording(path)"),
+        (lambda: world_streams("x"), "sequence", "read_recording(path)"),
+        (lambda: world_streams(SEQUENCE, "tilted"), "attitude", "levelled, true"),
+        (lambda: leg_streams("x"), "sequence", "read_recording(path)"),
+        (lambda: truth_problems("x"), "sequence", "read_recording(path)"),
+        (lambda: with_units("x", "deg/s"), "sequence", "read_recording(path)"),
+        (lambda: with_conventions("x", axes="y,-x,z"), "sequence", "read_recording(path)"),
+        (lambda: simulate_imu(SEQUENCE), "trajectory", "generate_walk(seed)"),
+        (lambda: simulate_imu(POSES, 100.0, 7), "errors", "seed=7"),
+        (lambda: align(SEQUENCE, POSES, "none"), "estimate", "track.trajectory"),
+        (lambda: evaluate_track(SEQUENCE, POSES), "estimate", "track.trajectory"),
+        (lambda: evaluate_track(POSES, SEQUENCE.truth), "truth", "recording.truth"),
+        (lambda: position_nees(SEQUENCE, POSES), "estimate", "track.trajectory"),
+        (lambda: write_tum("track.tum", SEQUENCE), "trajectory", "track.trajectory"),
     ],
 )
 def test_a_wrong_argument_is_named(make: Callable[[], Any], field: str, text: str) -> None:

@@ -156,6 +156,15 @@ def test_an_imu_sequence_is_validated_for_shape_only() -> None:
         ImuSequence("odd", np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
 
 
+def test_recordings_and_trajectories_print_in_one_line() -> None:
+    track = screw(GRID)
+    assert repr(track) == "Trajectory(101 rows, 0.00 to 2.00 s at 50.0 Hz)"
+    walk = ImuSequence("walk", GRID, np.zeros((101, 3)), np.zeros((101, 3)), track)
+    text = "101 samples of walk: 2.0 s at 50.0 Hz, no magnetometer, truth: 101 poses"
+    assert repr(walk) == f"ImuSequence({text})"
+    assert repr(track.slice(0.0, 0.0)) == "Trajectory(1 rows, 0.00 to 0.00 s)"
+
+
 def test_masked_samples_are_missing_ones() -> None:
     gyro = np.ma.masked_equal(np.where(np.eye(3) > 0, -9999.0, 0.5), -9999.0)
     sequence = ImuSequence("masked", np.arange(3.0), gyro, np.zeros((3, 3)))

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.datasets.batch import Skipped, each
-from stario.sequences.datasets.stream_cache import recording_key
+from stario.sequences.datasets.cache_files import JUDGED, recording_file, remove_unused
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_write
 from stario.sequences.inspection.checks import check_units
@@ -145,8 +145,7 @@ def prepared_recordings(
 def _cached(
     path: Path, read: Callable[[Path], ImuSequence], options: dict[str, object], folder: Path
 ) -> Prepared:
-    key = recording_key(path, {**options, "preparation": _code()})
-    file = folder / f"{key}.judged"
+    file = recording_file(folder, path, {**options, "preparation": _code()}, JUDGED)
     found = _load(file, path)
     if found is None:
         found = prepare(read(path), path)
@@ -216,6 +215,7 @@ def _store(file: Path, prepared: Prepared) -> None:
     content = safetensors.numpy.save(arrays, metadata={"recording": json.dumps(description)})
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
+        remove_unused(file.parent)
         with atomic_write(file, "wb") as target:
             target.write(content)
     except (OSError, InputError) as error:

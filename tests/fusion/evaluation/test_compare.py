@@ -24,6 +24,7 @@ from stario.fusion.evaluation.folders import fresh_folder
 from stario.fusion.evaluation.many import distinct_name
 from stario.fusion.evaluation.results import write_comparison, write_run
 from stario.fusion.evaluation.summary import scores_of, summary, summary_table
+from stario.fusion.fixes import position_fix
 from stario.sequences.accuracy.metrics import evaluate_track
 from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.errors import StarioError
@@ -106,6 +107,12 @@ def test_a_fit_gives_no_larger_ate_than_the_first_pose(compared: Comparison) -> 
         truth, track = compared.sequence.truth, compared.tracks[name].trajectory
         assert fitted == evaluate_track(track, truth, alignment="yaw").ate_m
         assert figures["known_positions_m"] is None
+
+
+def test_fixes_may_come_from_a_generator(walk: ImuSequence, still_model: Any) -> None:
+    fixes = (position_fix(t, np.zeros(3), np.eye(3)) for t in (5.0, 6.0))
+    tracks = compare(still_model, walk, fixes=fixes).tracks
+    assert [sum(tracks[name].health.fixes.values()) for name in ("ekf", "graph")] == [2, 2]
 
 
 def test_figures_with_fixes_are_those_after_a_fit(compared: Comparison) -> None:

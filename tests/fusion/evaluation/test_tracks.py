@@ -150,7 +150,7 @@ def test_the_memory_of_a_network_ends_at_a_gap(walk: ImuSequence, without: Make)
 
 def test_tracks_without_a_filter_have_no_covariance(walk: ImuSequence, still_model: Any) -> None:
     preprocessed = Navigator(still_model).observe(walk)
-    for track in (inertial_track(preprocessed, CONFIG), network_track(preprocessed)):
+    for track in (inertial_track(preprocessed), network_track(preprocessed)):
         assert track.covariance is None
         assert track.nis is None
         assert set(track.arrays()) == {

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -12,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stario.sequences.datasets import stream_cache
+from stario.sequences.datasets import cache_files
 from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.datasets.batch import Skipped
-from stario.sequences.datasets.stream_cache import cache_folder, cached, recorded, recording_files
+from stario.sequences.datasets.stream_cache import cached, recorded
 from stario.sequences.readers import find_recordings, read_recording, write_csv
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.imu import simulate_imu
@@ -121,7 +122,7 @@ def test_changed_content_options_or_code_change_the_key(
     os.utime(recording, ns=(0, 0))
     streams_of(recording, folder, read)
     assert read.calls == 4
-    monkeypatch.setattr(stream_cache, "_code", lambda: "later")
+    monkeypatch.setattr(cache_files, "_code", lambda: "later")
     streams_of(recording, folder, read)
     assert read.calls == 5
 
@@ -194,6 +195,23 @@ def test_without_a_writable_folder_streams_are_built_in_memory(
     assert "not kept" in caplog.text
 
 
+def test_files_of_other_code_are_removed_once_nobody_uses_them(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "cache"
+    streams_of(recording, folder, Reader())
+    (own,) = folder.iterdir()
+    names = (own.name, "0-old.streams", "0-old.judged", "0-recent.streams", "notes.txt")
+    for name in names:
+        (folder / name).touch()
+        os.utime(folder / name, (0, 0))
+    os.utime(folder / "0-recent.streams", (time.time() - 29 * 86_400, 0))  # read, not written
+    streams_of(recording, folder, Reader(), axes="y,-x,z")
+    left = {file.name for file in folder.iterdir()}
+    assert left & set(names) == {own.name, "0-recent.streams", "notes.txt"}
+    assert len(left) == 4
+
+
 def test_processes_return_memory_mapped_files(recording: Path, tmp_path: Path) -> None:
     paths = [recording, tmp_path / "missing.csv", recording]
     first, missing, second = recorded(paths, read_recording, {}, tmp_path / "cache", jobs=2)
@@ -236,31 +254,6 @@ def test_built_streams_are_cached_by_key(tmp_path: Path) -> None:
     assert cached({"seed": 3}, list, tmp_path) == []
 
 
-def test_the_files_of_a_recording_are_those_that_are_read(tmp_path: Path) -> None:
-    """Changing a neighbouring file must trigger a rebuild only if the recording reads it."""
-    mav = tmp_path / "room" / "mav0"
-    for name in ("imu0", "mocap0"):
-        (mav / name).mkdir(parents=True)
-        (mav / name / "data.csv").write_text("0,0,0,0,0,0,9.8\n")
-    both = [mav / "imu0/data.csv", mav / "mocap0/data.csv"]
-    for path in (tmp_path / "room", mav, mav / "imu0/data.csv"):
-        assert recording_files(path) == both
-    syn = tmp_path / "data1" / "syn"
-    syn.mkdir(parents=True)
-    row = ",".join(["0"] * 7 + ["0", "0", "1"] + ["0"] * 6)
-    for name in ("imu1", "vi1", "imu2", "vi2"):
-        (syn / f"{name}.csv").write_text(row + "\n")
-    assert recording_files(syn / "imu2.csv") == [syn / "imu2.csv", syn / "vi2.csv"]
-    raw, tango = tmp_path / "floor1" / "raw", tmp_path / "floor1" / "tango"
-    for folder, name in ((raw, "imu1"), (tango, "tango1"), (tango, "tango2")):
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / f"{name}.csv").write_text(row + "\n")
-    assert recording_files(raw / "imu1.csv") == [raw / "imu1.csv", tango / "tango1.csv"]
-    for name in ("a", "b"):
-        write_csv(tmp_path / f"{name}.csv", WALK)
-    assert recording_files(tmp_path / "a.csv") == [tmp_path / "a.csv"]
-
-
 def test_a_recording_of_an_archive_is_cached_by_its_name(tmp_path: Path) -> None:
     archive, read = tmp_path / "walks.h5", Reader()
     write_archive(archive, [WALK, WALK.slice(0.0, 5.0)])
@@ -273,29 +266,6 @@ def test_a_recording_of_an_archive_is_cached_by_its_name(tmp_path: Path) -> None
     write_archive(archive, [WALK.slice(0.0, 6.0)])
     streams_of(whole, tmp_path / "cache", read)
     assert read.calls == 3
-
-
-def test_the_cache_folder_is_set_by_environment_variables(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setenv("STARIO_CACHE", str(tmp_path))
-    assert cache_folder() == tmp_path
-    monkeypatch.delenv("STARIO_CACHE")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert cache_folder() == tmp_path / "stario"
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    assert cache_folder() == Path.home() / ".cache" / "stario"
-
-
-def test_readers_levelling_windows_and_simulation_are_part_of_the_key() -> None:
-    names = {"/".join(file.parts[-2:]) for file in stream_cache.code_files()}
-    assert {
-        "sequences/windows.py",
-        "readers/generic_csv.py",
-        "attitude/levelling.py",
-        "simulation/imu.py",
-        "datasets/stream_cache.py",
-    } <= names
 
 
 def test_a_truth_that_contradicts_the_imu_is_skipped_with_the_reason(tmp_path: Path) -> None:
