@@ -19,6 +19,7 @@ from stario.fusion.filter.engine import UpdateResult as UpdateResult
 from stario.fusion.filter.initial import PriorPose as PriorPose
 from stario.fusion.fix_file import read_fixes as read_fixes
 from stario.fusion.fixes import Fix as Fix
+from stario.fusion.fixes import FixOutcome as FixOutcome
 from stario.fusion.fixes import position_fix as position_fix
 from stario.fusion.fixes import velocity_fix as velocity_fix
 from stario.fusion.fixes import yaw_fix as yaw_fix

@@ -29,6 +29,8 @@ class Health:
         zero_velocity: numbers of zero-velocity updates (one per state) applied, and refused by
             reason.
         bearings: numbers of magnetic bearings, likewise; 1 under "north" if they determined it.
+        fields_dropped: number of magnetometer samples dropped: their value or time is wrong, or
+            repeats an earlier one.
         accel_noise_factor: final factor on the accelerometer's configured noise density, estimated
             from the innovations.
         network_error_level: final variance of the network's errors that change within seconds, as a
@@ -52,6 +54,7 @@ class Health:
     fixes: dict[str, int] = field(default_factory=dict)
     zero_velocity: dict[str, int] = field(default_factory=dict)
     bearings: dict[str, int] = field(default_factory=dict)
+    fields_dropped: int = 0
     accel_noise_factor: float = 1.0
     network_error_level: float = 1.0
     final_sigma: dict[str, float] = field(default_factory=dict)
@@ -81,6 +84,8 @@ class Health:
             text.append(f"zero-velocity updates {_counted(self.zero_velocity)}")
         if self.bearings:
             text.append(f"bearings of the magnetic field {_counted(self.bearings)}")
+        if self.fields_dropped:
+            text.append(f"magnetometer samples dropped: {self.fields_dropped}")
         if self.accel_noise_factor > 1.0:
             text.append(
                 f"accelerometer noise {self.accel_noise_factor:.1f} times the configured one"
@@ -176,6 +181,7 @@ class SampleCounts:
             gap_count=self.gap_count,
             longest_gap=self.longest_gap,
             gaps=list(self.gaps),
+            fields_dropped=self.field_dropped,
             notes=self._notes(),
         )
 

@@ -247,7 +247,8 @@ def test_repeated_and_invalid_fields_are_dropped_and_counted(still_model: Any) -
     navigator = Navigator(still_model, CONFIG)
     for time, field in ((0.0, FIELD_W), (0.0, FIELD_W), (1.0, [np.nan, 0.0, 0.0])):
         navigator.push_magnetometer(time, field)
-    assert navigator._stream.front_end.counts.field_dropped == 2
+    assert navigator.health.fields_dropped == 2
+    assert "magnetometer samples dropped: 2" in navigator.health.lines()
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e-2])  # T, mT, gauss
