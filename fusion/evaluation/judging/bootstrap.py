@@ -8,6 +8,7 @@ of 30 s in each recording, all with replacement.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -20,6 +21,9 @@ CONFIDENCE = 0.95
 BOUNDS = (50.0 * (1.0 - CONFIDENCE), 50.0 * (1.0 + CONFIDENCE))
 """Percentiles of the replicates that bound an interval."""
 
+_MIN_BLOCKS = 5
+"""Minimum number of blocks of a single recording for an interval: that of one has no width."""
+
 Blocks = tuple[FloatArray, FloatArray]
 """Sums of squared errors of a recording's blocks: evaluated network (B,) and baseline (B,)."""
 
@@ -29,13 +33,18 @@ Groups = Mapping[str, Sequence[Blocks]]
 
 @dataclass(frozen=True)
 class Interval:
-    """Geometric mean of the ratios of root mean square errors to the baseline's, and its bounds."""
+    """Geometric mean of the ratios of root mean square errors to the baseline's, and its bounds.
+
+    The bounds are NaN if there is too little to draw from.
+    """
 
     ratio: float
     low: float
     high: float
 
     def __format__(self, form: str) -> str:
+        if not math.isfinite(self.low):
+            return f"{self.ratio:{form}} [too few data]"
         return f"{self.ratio:{form}} [{self.low:{form}}, {self.high:{form}}]"
 
 
@@ -49,7 +58,11 @@ def paired_ratio(strata: Mapping[str, Groups]) -> Interval | None:
     rng = np.random.default_rng(0)
     results = [_stratum(groups, rng) for groups in strata.values()]
     means, replicates = zip(*results, strict=True)
-    return interval(float(np.mean(means)), np.mean(replicates, axis=0))
+    found = interval(float(np.mean(means)), np.mean(replicates, axis=0))
+    recordings = [one for groups in strata.values() for group in groups.values() for one in group]
+    if len(recordings) == 1 and len(recordings[0][0]) < _MIN_BLOCKS:
+        return Interval(found.ratio, math.nan, math.nan)
+    return found
 
 
 def interval(log_ratio: float, replicates: FloatArray) -> Interval:

@@ -61,6 +61,10 @@ FIGURES = {
 """Figures of a recording and their meaning; NaN if its kind of truth does not provide one."""
 
 
+_MIN_PATH_M = 1.0
+"""Length of the true path [m] below which a recording is not compared."""
+
+
 @dataclass(frozen=True, eq=False)
 class RecordingErrors:
     """Errors of one network on one recording.
@@ -68,7 +72,8 @@ class RecordingErrors:
     Attributes:
         name: name of the recording.
         kind: kind of its ground truth.
-        path_m: length of the true path that was compared [m].
+        path_m: length of the true path that was compared [m]; 0 if the device hardly moved: errors
+            at rest are related to nothing, and would count in means of ratios like those of a walk.
         figures: figures by name, see `FIGURES`.
         blocks: (B, 2) arrays by horizon ("1", "10", "30" s): sum of squared errors [m^2] and number
             of errors in each block of 30 s. For waypoints, their residuals are listed under "10".
@@ -145,6 +150,9 @@ def recording_errors(prepared: Prepared, found: Sequence[Predictions]) -> Record
     for piece, predictions in zip(prepared.pieces, found, strict=True):
         add_errors(piece, predictions, sums)
         total_direction += direction(piece.stream, predictions.displacement_N)
+    if sums.path < _MIN_PATH_M:
+        unknown = dict.fromkeys(FIGURES, float("nan"))
+        return RecordingErrors(prepared.name, prepared.kind, 0.0, unknown, {})
     fitted = sums.rms("fit")
     figures = {
         "ate_fit_m": fitted,

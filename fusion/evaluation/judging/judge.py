@@ -38,8 +38,8 @@ POOLED = "all"
 """Name of the row over all sets, equally weighted; a group may have this name, too."""
 
 _NOT_COMPARED = (
-    "not compared, because the ground truth has neither 2 s of known positions nor three waypoints "
-    "within an unbroken stretch of samples"
+    "not compared, because the ground truth moves by less than a metre, or has neither 2 s of "
+    "known positions nor three waypoints within an unbroken stretch of samples"
 )
 
 

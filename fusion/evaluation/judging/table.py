@@ -214,13 +214,14 @@ def _draw_medians(
 
 def _draw_ratios(axes: Axes, rows: Sequence[Row]) -> None:
     for k, row in enumerate(rows):
-        found = row.ratios.get("rms_10s_m")
-        if found is not None:
-            axes.plot([found.low, found.high], [k, k], color=_AFTER, lw=2.0)
-            axes.plot(found.ratio, k, "o", color=_AFTER, ms=8)
+        ratio = row.ratios.get("rms_10s_m")
+        if ratio is not None:
+            axes.plot([ratio.low, ratio.high], [k, k], color=_AFTER, lw=2.0)
+            axes.plot(ratio.ratio, k, "o", color=_AFTER, ms=8)
     axes.axvline(1.0, color=INK, lw=1.0)
     axes.set_xscale("log")
-    limits = [x for row in rows if (r := row.ratios.get("rms_10s_m")) for x in (r.low, r.high)]
+    found = [row.ratios["rms_10s_m"] for row in rows if "rms_10s_m" in row.ratios]
+    limits = [x for r in found for x in (r.low, r.ratio, r.high) if np.isfinite(x)]
     ticks = [t for t in (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)
              if min([0.7, *limits]) <= t <= max([1.5, *limits])]  # fmt: skip
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])

@@ -52,6 +52,15 @@ def test_a_single_recording_has_an_interval_from_its_blocks() -> None:
     assert uneven.low < 0.8 * uneven.ratio < 1.2 * uneven.ratio < uneven.high
 
 
+def test_a_few_blocks_have_no_interval() -> None:
+    """A single block would have one without width: certainty from nothing."""
+    theirs = np.ones(4)
+    few = interval_of(g=[(0.25 * theirs, theirs)])
+    assert few.ratio == pytest.approx(0.5)
+    assert np.isnan([few.low, few.high]).all()
+    assert f"{few:.3f}" == "0.500 [too few data]"
+
+
 BETTER = Interval(0.8, 0.7, 0.9)
 
 
