@@ -97,13 +97,17 @@ def prepare(sequence: ImuSequence, path: Path) -> Prepared:
     """Level a recording and resample its truth at the ticks.
 
     Raises:
-        InputError: there is no truth of any kind, no unbroken stretch of 2 s, or a wrong unit.
+        InputError: there is no truth of any kind, or only one pose or position of it is valid, no
+            unbroken stretch of 2 s, or a wrong unit.
     """
     check_units(sequence)
     warn_of_dead_axes(sequence)
     streams = levelled_streams(sequence)
     if not streams:
         raise InputError(f"{sequence.name}: samples", "no unbroken stretch", "one of 2 s")
+    known = sequence.truth or sequence.positions
+    if known is not None and known.valid.sum() < 2:
+        raise InputError(f"{sequence.name}: truth", f"{known.valid.sum()} valid", "two or more")
     if sequence.truth is not None:
         kind: Kind = "poses"
         pieces = [_with_poses(stream, sequence.truth) for stream in streams]
@@ -113,8 +117,8 @@ def prepare(sequence: ImuSequence, path: Path) -> Prepared:
         if kind == "waypoints":
             pieces = [_with_waypoints(stream, track) for stream in streams]
         else:
-            known = track.time[track.valid], track.position_W[track.valid]
-            pieces = [_with_known(stream, *known, gaps_and_jumps(*known)) for stream in streams]
+            at = track.time[track.valid], track.position_W[track.valid]
+            pieces = [_with_known(stream, *at, gaps_and_jumps(*at)) for stream in streams]
     else:
         raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
     attributes = {name: str(value) for name, value in sequence.attributes.items()}

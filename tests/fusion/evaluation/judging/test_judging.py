@@ -224,6 +224,13 @@ def test_pedestrian_dead_reckoning_is_near_the_truth_on_real_recordings(
     assert found.figures[error] < 15.0
 
 
+@pytest.mark.parametrize("count", [0, 1])
+def test_ground_truth_with_one_valid_pose_or_none_is_refused(walk: ImuSequence, count: int) -> None:
+    valid = np.arange(len(walk.truth.time)) < count
+    with pytest.raises(InputError, match=f"truth: found {count} valid"):
+        prepare(replace(walk, truth=replace(walk.truth, valid=valid)), Path("walk"))
+
+
 def test_prepared_recordings_are_cached(walk: ImuSequence, tmp_path: Path) -> None:
     path = tmp_path / "walk.csv"
     path.write_text("stands for the recording")
