@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stario.sequences.arrays import check_type
+from stario.sequences.arrays import check_type, scatter
+from stario.sequences.clean_samples import usable
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, Trajectory, low_rate_message
 from stario.sequences.truth.findings import TruthProblem, fit_problems
@@ -31,6 +32,11 @@ _AGREEING = 0.85
 
 _NEAR_AXES_RAD = np.deg2rad(20.0)
 """Misalignment above which gravity, rotated by the true attitude, hides the acceleration."""
+
+
+_RESTING_RAD_S, _RESTING_RAD = 0.03, np.deg2rad(3.0)
+"""Scatter of the gyroscope, and largest turn of the true attitude, of a device at rest: a phone's
+noise, and a capture's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +71,8 @@ def examine_truth(sequence: ImuSequence, known: str = "") -> TruthFindings:
     faults = tracking_faults(sequence)
     problems = tracking_problems(faults)
     truth = without_lost(sequence.truth, faults)
+    if _rests(sequence, truth):  # there is no rotation to compare
+        return TruthFindings(truth, problems=tuple(problems))
     tracked = replace(sequence, truth=truth)
     try:
         fit = fit_truth(tracked)
@@ -151,6 +159,15 @@ def _unusable_times(sequence: ImuSequence, truth: Trajectory) -> list[TruthProbl
             "use one clock for both, or shift the truth's times in the file",
         )
     ]
+
+
+def _rests(sequence: ImuSequence, truth: Trajectory) -> bool:
+    """Return whether neither the gyroscope nor the true attitude shows any rotation."""
+    known, gyro = truth.attitude_WB[truth.valid], sequence.gyro[usable(sequence)]
+    if not (len(known) and len(gyro)):
+        return False
+    turned = float((known[0].inv() * known).magnitude().max())
+    return scatter(gyro) < _RESTING_RAD_S and turned < _RESTING_RAD
 
 
 def _compared_s(sequence: ImuSequence, truth: Trajectory) -> float:

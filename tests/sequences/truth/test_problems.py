@@ -177,3 +177,18 @@ def test_a_wrong_unit_of_the_accelerometer_is_not_blamed_on_the_positions(
     (problem,) = examine_truth(in_mg).problems
     assert problem.found.startswith("positions that")
     assert examine_truth(in_mg, known="w: accelerometer: found an average of 1").problems == ()
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_the_truth_of_a_device_at_rest_is_not_called_wrong(noise: float) -> None:
+    """No rotation is there to be compared: neither of them turns."""
+    rng, time = np.random.default_rng(0), np.arange(0.0, 40.0, 0.01)
+    gyro = [0.0, 0.0, 0.005] + 2e-3 * rng.normal(size=(len(time), 3))
+    accel = [0.0, 0.0, STANDARD_GRAVITY] + 0.02 * rng.normal(size=(len(time), 3))
+    attitude_WB = Rotation.from_rotvec(noise * rng.normal(size=(len(time), 3)))
+    truth = Trajectory(time, 1e-4 * rng.normal(size=(len(time), 3)), attitude_WB)
+    resting = ImuSequence("rest", time, gyro, accel, truth=truth)
+    assert truth_problems(resting) == []
+    check_truth(resting)
+    shaken = replace(resting, gyro=gyro + np.outer(np.sin(7.0 * time), [0.5, 0.0, 0.0]))
+    assert any("disagrees" in problem.found for problem in truth_problems(shaken))
