@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.known_positions import MIN_POSITIONS, position_error
@@ -20,7 +20,13 @@ from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.recording import Progress, silent
 from stario.fusion.state import Track
-from stario.sequences.accuracy.metrics import CONVENTIONS, Alignment, align, evaluate_track
+from stario.sequences.accuracy.metrics import (
+    CONVENTIONS,
+    Alignment,
+    align,
+    evaluate_track,
+    pose_errors,
+)
 from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
@@ -44,6 +50,7 @@ METRICS = (
     "rte_m",
     "pde",
     "aye_rad",
+    "coverage",
     "known_positions_m",
     "nees_median",
     "nis_mean",
@@ -80,6 +87,9 @@ METRIC_WORDS = {
     "horizontal": "position errors and paths are in x and y only, except in the NEES",
 }
 """Meaning of each figure in `metrics.json`."""
+
+MIN_COMPARED_S = 10.0
+"""Compared time [s] below which there is no RTE, which would be an extrapolation to a minute."""
 
 _FITTED = "least squares in yaw and position over all poses, because fixes define the frame"
 
@@ -180,7 +190,17 @@ def compare(
 def measured(
     sequence: ImuSequence, tracks: dict[str, Track], fixes: Sequence[Fix] = ()
 ) -> Comparison:
-    """Return tracks of a recording, computed with these fixes, with their metrics."""
+    """Return tracks of a recording, computed with these fixes, with their metrics.
+
+    If the truth is known at no time of the tracks, they are those of a recording without any.
+    """
+    if sequence.truth is not None:
+        try:
+            for track in tracks.values():
+                pose_errors(track.trajectory, sequence.truth)
+        except InputError as error:
+            log.warning("%s: no errors are computed: %s", sequence.name, error)
+            sequence = replace(sequence, truth=None)
     # Where fixes define the frame, the first pose's yaw is the least certain one.
     alignment: Alignment = "yaw" if fixes else "first"
     metrics = {name: measure(track, sequence, alignment) for name, track in tracks.items()}
@@ -193,7 +213,10 @@ def measure(track: Track, sequence: ImuSequence, alignment: Alignment = "first")
     truth = sequence.truth
     if truth is not None:
         result = evaluate_track(track.trajectory, truth, alignment=alignment)
-        figures |= {name: getattr(result, name) for name in ("ate_m", "rte_m", "pde", "aye_rad")}
+        names = ("ate_m", "rte_m", "pde", "aye_rad", "coverage")
+        figures |= {name: getattr(result, name) for name in names}
+        if result.duration_s < MIN_COMPARED_S:
+            figures["rte_m"] = None
         figures["ate_fit_m"] = evaluate_track(track.trajectory, truth, alignment="yaw").ate_m
         if track.trajectory.position_covariance_W is not None:
             figures["nees_median"] = position_nees(track.trajectory, truth, alignment).median

@@ -31,6 +31,11 @@ _COLUMNS = (
 )
 
 
+_FULL_COVERAGE, _MIN_COVERAGE = 0.98, 0.5
+"""Share of a track at which the truth is known below which the table says so, and below which the
+recording does not count in medians and means."""
+
+
 @dataclass(frozen=True)
 class Scores:
     """Figures of one recording, kept after a comparison's arrays are released.
@@ -47,6 +52,12 @@ class Scores:
     record: dict[str, object]
     words: dict[str, str]
 
+    @property
+    def coverage(self) -> float:
+        """Smallest share of a track at which the truth is known; 1 without truth."""
+        shares = [track.get("coverage") for track in self.metrics.values()]
+        return min((share for share in shares if share is not None), default=1.0)
+
 
 def scores_of(comparison: Comparison) -> Scores:
     """Return the figures of a comparison."""
@@ -55,14 +66,17 @@ def scores_of(comparison: Comparison) -> Scores:
 
 
 def summary(recordings: Sequence[Scores]) -> dict[str, object]:
-    """Return figures of every recording, with medians and means over them, as plain values."""
+    """Return figures of every recording, with medians and means over them, as plain values.
+
+    Medians and means leave out recordings whose truth is known for less than half of the track.
+    """
     records = {scores.name: scores.record for scores in recordings}
     metrics = [metric for metric in METRICS if not metric.startswith("seconds_")]
     over = {
         track: {
             metric: {"median": float(np.median(values)), "mean": float(np.mean(values))}
             for metric in metrics
-            if len(values := _known_values(recordings, track, metric))
+            if len(values := _known_values(_counted(recordings), track, metric))
         }
         for track in TRACKS
     }
@@ -77,16 +91,32 @@ def summary_table(recordings: Sequence[Scores]) -> str:
     """
     for scores in recordings:
         check_type("recordings", scores, Scores, "scores_of(comparison) returns one")
-    rows = [[r.name, *(_cell([r], t, m, np.mean) for t, m, _ in _COLUMNS)] for r in recordings]
+    rows = [
+        [_name_with_coverage(r), *(_cell([r], t, m, np.mean) for t, m, _ in _COLUMNS)]
+        for r in recordings
+    ]
+    counted = _counted(recordings)
     for name, over in (("median", np.median), ("mean", np.mean)):
-        rows.append([name, *(_cell(recordings, t, m, over) for t, m, _ in _COLUMNS)])
+        rows.append([name, *(_cell(counted, t, m, over) for t, m, _ in _COLUMNS)])
     lines = aligned([["", *(title for _, _, title in _COLUMNS)], *rows])
+    if len(counted) < len(recordings):
+        least = f"{_MIN_COVERAGE:.0%}"
+        lines.append(f"median and mean without recordings whose truth covers less than {least};")
     lines.append(f"ATE in m: {METRIC_WORDS['ate_m']};")
     lines.append(f"in parentheses {METRIC_WORDS['ate_fit_m']};")
     lines.append(f"horizontal: {METRIC_WORDS['horizontal']};")
     lines.append(f"NIS: {METRIC_WORDS['nis_mean']};")
     lines.append(f"NEES: {METRIC_WORDS['nees_median']}; alignment: {METRIC_WORDS['alignment']}.")
     return "\n".join(lines)
+
+
+def _name_with_coverage(scores: Scores) -> str:
+    share = scores.coverage
+    return scores.name + (f" (truth of {share:.0%})" if share < _FULL_COVERAGE else "")
+
+
+def _counted(recordings: Sequence[Scores]) -> list[Scores]:
+    return [scores for scores in recordings if scores.coverage >= _MIN_COVERAGE]
 
 
 def _cell(

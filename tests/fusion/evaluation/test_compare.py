@@ -34,8 +34,8 @@ from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
 CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=10, covariance_scale=1.0))
 ORIGIN = {"stario": "0.1.0"}
 KEYS = {
-    *("ate_m", "ate_fit_m", "rte_m", "pde", "aye_rad", "known_positions_m"),
-    *("nees_median", "nis_mean", "seconds_network", "seconds_filter"),
+    *("ate_m", "ate_fit_m", "rte_m", "pde", "aye_rad", "coverage"),
+    *("known_positions_m", "nees_median", "nis_mean", "seconds_network", "seconds_filter"),
 }
 
 Make = Callable[..., Any]
@@ -300,10 +300,34 @@ def test_truth_shorter_than_a_window_loses_only_the_true_attitude_track(
     result = compare(model, short_truth, CONFIG)
     assert set(result.tracks) == {"inertial", "pdr", "network", "ekf", "graph"}
     assert "no track with true attitude" in caplog.text
-    scores = [scores_of(result)]
-    assert "nan" not in summary_table(scores)
-    over_recordings = summary(scores)["over_recordings"]
-    assert {name for name, figures in over_recordings.items() if figures} == set(result.tracks)
+    assert result.metrics["ekf"]["rte_m"] is None  # it would be extrapolated 75 times
+
+
+def test_a_recording_with_little_truth_counts_in_no_median(
+    walk: ImuSequence, model: OracleWithFallback, compared: Comparison
+) -> None:
+    little = compare(model, replace(walk, truth=walk.truth.slice(3.0, 8.0)), CONFIG)
+    whole, part = scores_of(compared), scores_of(little)
+    assert part.coverage == pytest.approx(0.25, abs=0.02)
+    assert summary([whole, part])["over_recordings"] == summary([whole])["over_recordings"]
+    table = summary_table([whole, part])
+    assert f"{walk.name} (truth of 25%)" in table
+    assert "median and mean without recordings whose truth covers less than 50%" in table
+    assert "truth of" not in summary_table([whole])
+
+
+@pytest.mark.parametrize("late", [True, False])
+def test_a_truth_that_cannot_be_compared_leaves_the_tracks(
+    walk: ImuSequence, model: OracleWithFallback, caplog: pytest.LogCaptureFixture, late: bool
+) -> None:
+    truth = replace(walk.truth, valid=np.arange(len(walk.truth)) < 1)
+    if late:
+        truth = replace(walk.truth, time=walk.truth.time + 100.0)
+    result = compare(model, replace(walk, truth=truth), CONFIG)
+    assert {"network", "ekf", "graph"} <= set(result.tracks)
+    assert result.path_m is None
+    assert result.metrics["ekf"]["ate_m"] is None
+    assert "no errors are computed" in caplog.text
 
 
 def test_summary_has_median_and_mean_over_recordings(
