@@ -180,11 +180,11 @@ class Inspection:
         if t.gaps:
             start, length = max(t.gaps, key=lambda gap: gap[1])
             lines.append(
-                f"gaps: {len(t.gaps)}, {t.samples_lost_in_gaps} samples lost; "
-                f"longest {length:.3f} s at {start:.1f} s"
+                f"{t.samples_lost_in_gaps} samples missing in {len(t.gaps)} places; "
+                f"longest step {length:.3f} s at {start:.1f} s"
             )
         else:
-            lines.append("gaps: none")
+            lines.append("samples missing: none")
         ahead = f", {t.times_ahead} ahead of their time and left out" if t.times_ahead else ""
         lines.append(
             f"times: {t.times_repeated} repeated, {t.times_backward} backward{ahead}; "
