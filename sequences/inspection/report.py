@@ -13,11 +13,8 @@ from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.inspection.constant_values import dead_axis_problems
 from stario.sequences.inspection.gyro_axes import GyroAxes, compare_gyro_axes
-from stario.sequences.inspection.magnetic import (
-    MagneticFindings,
-    assess_magnetometer,
-    magnetic_problems,
-)
+from stario.sequences.inspection.magnetic import assess_magnetometer
+from stario.sequences.inspection.magnetic_findings import MagneticFindings, magnetic_problems
 from stario.sequences.inspection.samples import sample_problems, without_times_ahead
 from stario.sequences.inspection.stillness import Rest, find_rest
 from stario.sequences.inspection.times import magnetometer_time_problems
