@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -45,6 +45,7 @@ def process_each(
     work: Callable[[ImuSequence, Path], tuple[dict[str, object], str]],
     as_json: bool,
     single: str = "",
+    explained: Mapping[str, str] | None = None,
 ) -> None:
     """Apply `work` to each recording, giving each its own folder for files, and print the results.
 
@@ -55,6 +56,7 @@ def process_each(
         work: function of a recording and its folder, distinct for each; returns record and text.
         as_json: whether to print the records rather than the texts.
         single: name of an option in use that allows only one recording; empty if none.
+        explained: meaning of words in the texts, which `work` may fill; printed once, at the end.
     """
     from stario.fusion.evaluation.folders import check_folder
     from stario.fusion.evaluation.many import distinct_name
@@ -79,7 +81,14 @@ def process_each(
     records = list(without_skipped(each(recorded, files, jobs=1), skipped))
     if as_json and records:
         print_result(True, records[0] if len(files) == 1 else records)
+    elif explained:
+        typer.echo("\n".join(explanations(explained)))
     exit_if_skipped(skipped)
+
+
+def explanations(words: Mapping[str, str]) -> list[str]:
+    """Return lines that explain words."""
+    return [f"{word}: {meaning}." for word, meaning in words.items()]
 
 
 def check_new(field: str, path: Path, overwrite: bool) -> None:

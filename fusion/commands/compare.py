@@ -10,6 +10,7 @@ import typer
 
 from stario.fusion.commands.common import (
     exit_if_skipped,
+    explanations,
     print_result,
     progress_bar,
 )
@@ -52,6 +53,7 @@ def compare(
     from stario.fusion.evaluation.many import compare_recordings
     from stario.fusion.evaluation.results import scores_dict, write_comparison
     from stario.fusion.evaluation.summary import scores_of
+    from stario.fusion.evaluation.track_table import column_words
     from stario.fusion.fix_file import read_fixes
     from stario.sequences.datasets.batch import without_skipped
     from stario.sequences.lazy import optional_package
@@ -86,6 +88,8 @@ def compare(
             written.append(write_report(path, comparison))
     if comparisons:
         lines = [line for comparison in comparisons for line in _lines(comparison)]
+        words = {k: v for comparison in comparisons for k, v in column_words(comparison).items()}
+        lines += explanations(words)
         lines.append(f"{len(written)} files in {folder}")
         scores = [scores_of(comparison) for comparison in comparisons]
         print_result(as_json, scores_dict(scores), "\n".join(lines))

@@ -57,6 +57,7 @@ def run(
     chosen = backend_named(backend)
     navigator = Navigator(estimating.network(), estimating.settings(), backend=chosen)
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
+    words: dict[str, str] = {}
     work = partial(
         _run,
         navigator=navigator,
@@ -64,8 +65,9 @@ def run(
         origin=origin_of([chosen], paths, reading, estimating, fixes),
         report=report,
         view=view,
+        words=words,
     )
-    process_each(reading, paths, out, work, as_json, single="--fixes" if fixes else "")
+    process_each(reading, paths, out, work, as_json, "--fixes" if fixes else "", words)
 
 
 def _run(
@@ -76,10 +78,12 @@ def _run(
     origin: dict[str, object],
     report: bool,
     view: bool,
+    words: dict[str, str],
 ) -> tuple[dict[str, object], str]:
-    """Write one recording's track; return its record and a summary."""
+    """Write one recording's track; return its record and a summary; `words` explain its columns."""
     from stario.fusion.evaluation.compare import measured
     from stario.fusion.evaluation.results import write_run
+    from stario.fusion.evaluation.track_table import column_words
     from stario.fusion.fix_file import check_within
     from stario.sequences.truth.problems import warn_of_truth
 
@@ -98,6 +102,8 @@ def _run(
 
         written.append(write_view(folder / "track.rrd", found))
         open_view(written[-1])
+    if sequence.truth is not None:
+        words |= column_words(found)
     lines = [*_lines(found, track), f"{len(written)} files in {folder}"]
     record: dict[str, object] = {"recording": sequence.name, **found.metrics}
     return record | {"folder": str(folder)}, "\n".join(lines)

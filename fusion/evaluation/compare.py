@@ -73,20 +73,27 @@ METRIC_TITLES = {
 """Columns of a table of tracks."""
 
 METRIC_WORDS = {
-    **CONVENTIONS,
-    "ate_fit_m": "the same after a fit of yaw and position over all poses, which leaves errors "
-    "in the track's shape and length only [m]",
+    "ate_m": CONVENTIONS["ate_m"],
+    "ate_fit_m": "ATE after a fit of yaw and position over all poses, which leaves errors in the "
+    "track's shape and length only [m]",
+    **{key: CONVENTIONS[key] for key in ("rte_m", "pde", "aye_rad")},
     "known_positions_m": "root mean square of the horizontal distance to positions or waypoints "
     "known without attitude, after a fit of yaw and position [m]",
     "nees_median": "median over time of the 3-D position's NEES, aligned as the track "
-    "(expected: 2.4)",
+    "(expected: 2.4, the median of chi-square with 3 degrees of freedom)",
     "nis_mean": "mean NIS of the network's measurements (expected: 3)",
     "seconds_network": "computing time of the network [s]",
     "seconds_filter": "computing time of everything except the network [s]",
     "alignment": "yaw and position of the first common pose; tilt is never aligned",
     "horizontal": "position errors and paths are in x and y only, except in the NEES",
 }
-"""Meaning of each figure in `metrics.json`."""
+"""Meaning of a track's figures in `metrics.json`."""
+
+RECORDING_WORDS = {
+    "duration_s": "time between the recording's first and last sample [s]",
+    "path_m": CONVENTIONS["path_m"],
+}
+"""Meaning of a recording's figures in the `metrics.json` of several."""
 
 MIN_COMPARED_S = 10.0
 """Compared time [s] below which there is no RTE, which would be an extrapolation to a minute."""

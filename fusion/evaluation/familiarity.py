@@ -80,9 +80,11 @@ class Familiarity:
     def _motion_lines(self) -> list[str]:
         if not self.medians:
             return ["motion: no unbroken stretch is long enough to assess it"]
-        text = ", ".join(f"{_WORDS[k][0]} {v:.2f} {_WORDS[k][1]}".rstrip() for k, v in
-                         self.medians.items())  # fmt: skip
-        lines = [f"motion: {text}"]
+        width = max(len(_WORDS[name][0]) for name in self.medians)
+        lines = ["motion, medians:"]
+        for name, value in self.medians.items():
+            word, unit = _WORDS[name]
+            lines.append(f"  {word:<{width}} {value:6.2f} {unit}".rstrip())
         if self.outside is None:
             return [*lines, "  the weights' card does not describe the motion they were trained on"]
         share = f"{self.outside:.0%} of the windows lie outside the weights' training data"
@@ -95,8 +97,10 @@ class Familiarity:
             for low, high in (self.ranges[name],)
             if not low <= value <= high
         ]
-        reason = ": " + ", ".join(beyond) if beyond else ", each within its range: a new mixture"
-        return [*lines, f"! {share}{reason}; the network's sigma is inflated there"]
+        reason = ", ".join(beyond) or (
+            "each feature is within the range of the training, but not their combination"
+        )
+        return [*lines, f"! {share}: {reason}; the network's sigma is inflated there"]
 
 
 def familiarity(model: DisplacementModel, sequence: ImuSequence) -> Familiarity:

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.compare import METRIC_WORDS, Comparison
+from stario.fusion.evaluation.compare import METRIC_WORDS, RECORDING_WORDS, Comparison
 from stario.fusion.evaluation.folders import fresh_folder
 from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.evaluation.summary import Scores, scores_of
@@ -104,7 +104,7 @@ def scores_dict(recordings: Sequence[Scores]) -> dict[str, object]:
     records = {scores.name: scores.record for scores in recordings}
     # Fixes change how tracks are aligned; they are given for a single recording only.
     words = next((scores.words for scores in recordings), METRIC_WORDS)
-    return {"recordings": records, "conventions": words}
+    return {"recordings": records, "conventions": RECORDING_WORDS | words}
 
 
 def _track_files(folder: Path, found: Comparison) -> list[Path]:

@@ -11,6 +11,7 @@ import numpy as np
 from stario.fusion.evaluation.compare import (
     METRIC_WORDS,
     METRICS,
+    RECORDING_WORDS,
     TRACKS,
     Comparison,
     Metrics,
@@ -80,7 +81,8 @@ def summary(recordings: Sequence[Scores]) -> dict[str, object]:
         }
         for track in TRACKS
     }
-    return {"recordings": records, "over_recordings": over, "conventions": METRIC_WORDS}
+    words = RECORDING_WORDS | METRIC_WORDS
+    return {"recordings": records, "over_recordings": over, "conventions": words}
 
 
 def summary_table(recordings: Sequence[Scores]) -> str:

@@ -74,7 +74,7 @@ def plan_view(
         near.append(_box_of(known.position_W))
     frame = _frame_around(np.array([home, *near]))
     width, height = np.ptp(frame, axis=0) / np.ptp(frame, axis=0).max()
-    fig = new_figure(7.0 * width + 1.0, 7.0 * height + 1.5, title)
+    fig = new_figure(7.0 * width + 1.0, 7.0 * height + 1.0, title)
     (axes,) = panels_of(fig)
     length = float(np.nansum(np.linalg.norm(np.diff(typical, axis=0), axis=1)))
     fine = 0.6 if length / _size_of(home) > _CROWDED else 1.0
@@ -134,10 +134,12 @@ def _mark_gaps(axes: Axes, tracks: Mapping[str, Trajectory], frame: FloatArray) 
 
 
 def _add_legend(fig: Figure) -> None:
-    """Add a legend below the axes, in as many columns as fit the figure's width."""
+    """Add a legend below the axes, in as many columns as fit the width; the figure grows by it."""
     for columns in (3, 2, 1):
         legend = fig.legend(loc="outside lower center", ncols=columns, **LEGEND)
-        if columns == 1 or legend.get_window_extent().width < fig.bbox.width:
+        extent = legend.get_window_extent()
+        if columns == 1 or extent.width < fig.bbox.width:
+            fig.set_figheight(fig.get_figheight() + extent.height / fig.dpi)
             return
         legend.remove()
 

@@ -15,7 +15,6 @@ except for the gyroscope's drift. Its steadiness within a minute is what a filte
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,22 +28,21 @@ from stario.sequences.arrays import (
 )
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.clean_samples import clean_samples, longest_unbroken
+from stario.sequences.inspection.magnetic_findings import (
+    LAGS_S,
+    WINDOW_S,
+    MagneticFindings,
+    certain_iron,
+)
 from stario.sequences.sequence import FloatArray, ImuSequence
 
 _LONGEST_S = 600.0
 _SHORTEST_S = 10.0
 _STEP_S = 0.05
 _SPAN_S = 0.1
-_LAGS_S = np.arange(-0.05, 0.151, 0.01)
-_WINDOW_S = 60.0
 
 _TURNING_RAD_S = 0.1
 """Rate (root mean square) below which neither hard iron nor lag can be determined."""
-
-_SIZES_UT = (15.0, 90.0)
-_LEVEL_UT = 6.0
-_VERDICTS = (("good", math.radians(12.0), 0.75), ("coarse", math.radians(25.0), 0.5))
-"""Maximum RMS of the bearing [rad] and minimum correlation of each verdict."""
 
 HELD_CHANGE = 2e-3
 """Minimum relative change in magnitude of a measured field within half a second. Some phones report
@@ -54,99 +52,8 @@ a calibrated field that they extrapolate with their own gyroscope: its magnitude
 _NO_FIELD_UT = 1e-9
 """Smallest magnitude to divide by [uT], for a sensor that reports zeros."""
 
-_HALF_SECOND, _TURNED_RAD, _REPORTED_SHARE = 0.5, 0.05, 0.5
-"""Half seconds in which the field turns by more than this in the sensor's axes are examined; share
-of them above which an extrapolated field is reported."""
-
-_UP_RAD = math.radians(20.0)
-_IRON_UT = 10.0
-_SURE = 5.0
-"""Upward dip and hard iron above which a problem is reported; components of hard iron count if they
-exceed this many of their standard deviations."""
-
-
-@dataclass(frozen=True, eq=False)
-class MagneticFindings:
-    """Findings about a magnetometer.
-
-    Attributes:
-        samples: number of samples as recorded.
-        rate_hz: median rate [Hz].
-        size_median_uT: median magnitude of the field [uT].
-        size_p10_p90_uT: 10th and 90th percentile of the magnitude [uT].
-        dip_rad: median angle below the horizontal [rad].
-        correlation_with_gyroscope: correlation of dm/dt and -w x (m - b); None if the device hardly
-            turns.
-        lag_s: time by which the samples are stamped late [s]; None in that case, and if it is
-            outside the range searched.
-        hard_iron_uT: hard iron b (3,) [uT]; None if the lag is.
-        hard_iron_sigma_uT: standard deviation of the hard iron (3,) [uT]; None if the lag is.
-        levelled_bearing_rms_rad: median RMS of the bearing about a line over a minute [rad].
-        gyroscope_drift_rad_s: median slope of that line: the gyroscope's drift in yaw [rad/s].
-        held_share: share of the half seconds with rotation in which the device extrapolated the
-            field instead of measuring it.
-    """
-
-    samples: int
-    rate_hz: float
-    size_median_uT: float
-    size_p10_p90_uT: tuple[float, float]
-    dip_rad: float
-    correlation_with_gyroscope: float | None
-    lag_s: float | None
-    hard_iron_uT: FloatArray | None
-    hard_iron_sigma_uT: FloatArray | None
-    levelled_bearing_rms_rad: float
-    gyroscope_drift_rad_s: float
-    held_share: float
-
-    @property
-    def verdict(self) -> str:
-        """Quality of the levelled bearing as a yaw reference: "good", "coarse" or "not usable"."""
-        level = self.size_median_uT * math.cos(self.dip_rad)
-        agreement = self.correlation_with_gyroscope
-        for word, steady, follows in _VERDICTS:
-            agrees = agreement is None or agreement > follows
-            if self.levelled_bearing_rms_rad < steady and level > _LEVEL_UT and agrees:
-                return word
-        return "not usable"
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the findings as plain values, with units in their names."""
-        return vars(self) | {"verdict": self.verdict}
-
-    def lines(self) -> list[str]:
-        """Return the findings as lines to print."""
-        low, high = self.size_p10_p90_uT
-        lines = [
-            f"magnetometer: {self.samples} samples, {self.rate_hz:.1f} Hz, "
-            f"{self.size_median_uT:.1f} uT (80 % within {low:.1f} to {high:.1f}), "
-            f"dip {math.degrees(self.dip_rad):.0f} deg"
-        ]
-        if self.correlation_with_gyroscope is not None:
-            lines.append(
-                f"  against the gyroscope: correlation {self.correlation_with_gyroscope:.3f}, "
-                f"{self._lag_words()}"
-            )
-        lines.append(
-            f"  levelled bearing: steady to {math.degrees(self.levelled_bearing_rms_rad):.1f} deg "
-            f"within a minute, drifts by {math.degrees(60.0 * self.gyroscope_drift_rad_s):+.1f} "
-            f"deg/min against the gyroscope; as a yaw reference: {self.verdict}"
-        )
-        if self.held_share > _REPORTED_SHARE:
-            lines.append(
-                f"  constant in magnitude: extrapolated by the device's own gyroscope "
-                f"{self.held_share:.0%} of the time that it turns, and given little weight then"
-            )
-        return lines
-
-    def _lag_words(self) -> str:
-        if self.lag_s is None or self.hard_iron_uT is None or self.hard_iron_sigma_uT is None:
-            first, last = (1e3 * lag for lag in (_LAGS_S[0], _LAGS_S[-1]))
-            return f"lag outside {first:+.0f} to {last:+.0f} ms; lag and hard iron unknown"
-        pairs = zip(self.hard_iron_uT, self.hard_iron_sigma_uT, strict=True)
-        iron = ", ".join(f"{b:+.1f} +- {s:.1f}" for b, s in pairs)
-        return f"lag {1e3 * self.lag_s:+.0f} ms, hard iron {iron} uT"
+_HALF_SECOND, _TURNED_RAD = 0.5, 0.05
+"""Half seconds in which the field turns by more than this in the sensor's axes are examined."""
 
 
 def assess_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
@@ -171,7 +78,7 @@ def assess_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
         agreement, lag, iron, sigma = _against_gyro(time, gyro, stamps, values)
     following = np.clip(np.searchsorted(time, stamps), 0, len(time) - 1)
     R_NB = levelled_attitudes(time, gyro, accel)[following]
-    certain = _certain_iron(iron, sigma)
+    certain = certain_iron(iron, sigma)
     field_N = np.einsum("nij,nj->ni", R_NB, values if certain is None else values - certain)
     level = np.hypot(field_N[:, 0], field_N[:, 1])
     spread, drift = _steadiness(stamps, field_N[:, :2])
@@ -187,6 +94,7 @@ def assess_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
         lag_s=lag,
         hard_iron_uT=iron,
         hard_iron_sigma_uT=sigma,
+        assessed_s=float(stamps[-1] - stamps[0]),
         levelled_bearing_rms_rad=spread,
         gyroscope_drift_rad_s=drift,
         held_share=_held(stamps, values),
@@ -200,7 +108,7 @@ def _against_gyro(
 
     A lag at the edge of the search is not the best one and corrupts the hard iron: both are None.
     """
-    edge = _SPAN_S + float(np.abs(_LAGS_S).max())
+    edge = _SPAN_S + float(np.abs(LAGS_S).max())
     grid = np.arange(max(time[0], stamps[0]) + edge, min(time[-1], stamps[-1]) - edge, _STEP_S)
     if len(grid) < 20:
         return None, None, None, None
@@ -223,22 +131,14 @@ def _against_gyro(
         expected = -np.cross(rate, mean - iron).ravel()
         return correlation(change.ravel(), expected), iron, np.asarray(spread, dtype=np.float64)
 
-    scores = np.array([fit(lag)[0] for lag in _LAGS_S])
+    scores = np.array([fit(lag)[0] for lag in LAGS_S])
     best = int(np.argmax(scores))
     if best in (0, len(scores) - 1):
         return float(scores[best]), None, None, None
-    step = float(_LAGS_S[1] - _LAGS_S[0])
-    lag = float(_LAGS_S[best]) + peak_offset(*scores[best - 1 : best + 2]) * step
+    step = float(LAGS_S[1] - LAGS_S[0])
+    lag = float(LAGS_S[best]) + peak_offset(*scores[best - 1 : best + 2]) * step
     agreement, iron, spread = fit(lag)
     return agreement, lag, iron, spread
-
-
-def _certain_iron(iron: FloatArray | None, sigma: FloatArray | None) -> FloatArray | None:
-    """Return the hard iron if it must be removed before the field is assessed."""
-    if iron is None or sigma is None:
-        return None
-    sure = np.abs(iron) > _SURE * sigma
-    return iron if np.linalg.norm(iron[sure]) > _IRON_UT else None
 
 
 def _held(time: FloatArray, field: FloatArray) -> float:
@@ -266,9 +166,9 @@ def _steadiness(time: FloatArray, level: FloatArray) -> tuple[float, float]:
     field = level[:, 0] + 1j * level[:, 1]
     smooth = np.convolve(field, np.ones(count) / count, mode="same")
     spreads, slopes = [], []
-    last = max(float(time[-1]) - 0.5 * _WINDOW_S, float(time[0]) + 1e-9)
-    for edge in np.arange(time[0], last, _WINDOW_S):
-        part = (time >= edge) & (time < edge + _WINDOW_S)
+    last = max(float(time[-1]) - 0.5 * WINDOW_S, float(time[0]) + 1e-9)
+    for edge in np.arange(time[0], last, WINDOW_S):
+        part = (time >= edge) & (time < edge + WINDOW_S)
         if part.sum() > count:
             clock = time[part] - edge
             line = np.polyfit(clock, np.unwrap(np.angle(smooth[part])), 1)
@@ -278,29 +178,3 @@ def _steadiness(time: FloatArray, level: FloatArray) -> tuple[float, float]:
     if not slopes:
         return math.inf, 0.0
     return float(np.median(spreads)), float(np.median(slopes))
-
-
-def magnetic_problems(name: str, findings: MagneticFindings) -> list[str]:
-    """Return problems of the magnetometer of recording `name`, one line each."""
-    field, problems = f"{name}: magnetometer", []
-    iron = _certain_iron(findings.hard_iron_uT, findings.hard_iron_sigma_uT)
-    agreement = findings.correlation_with_gyroscope
-    if not _SIZES_UT[0] < findings.size_median_uT < _SIZES_UT[1]:
-        problems.append(
-            f"{field}: found {findings.size_median_uT:.3g} uT, expected the earth's 25 to 65; "
-            "is it uncalibrated, in another unit or near a magnet?"
-        )
-    if agreement is not None and agreement < _VERDICTS[-1][2]:
-        problems.append(
-            f"{field}: does not follow the gyroscope (correlation {agreement:.2f}): "
-            "a disturbed field, stale readings or different axes"
-        )
-    if iron is not None:
-        offset = ", ".join(f"{b:+.0f}" for b in iron)
-        problems.append(f"{field}: the device adds a constant field of {offset} uT (hard iron)")
-    if findings.dip_rad < -_UP_RAD:
-        problems.append(
-            f"{field}: points up by {math.degrees(-findings.dip_rad):.0f} degrees, as south of the "
-            "magnetic equator; elsewhere, the accelerometer has Apple's sign: --accel-sign apple"
-        )
-    return problems

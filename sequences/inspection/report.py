@@ -13,11 +13,8 @@ from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.inspection.constant_values import dead_axis_problems
 from stario.sequences.inspection.gyro_axes import GyroAxes, compare_gyro_axes
-from stario.sequences.inspection.magnetic import (
-    MagneticFindings,
-    assess_magnetometer,
-    magnetic_problems,
-)
+from stario.sequences.inspection.magnetic import assess_magnetometer
+from stario.sequences.inspection.magnetic_findings import MagneticFindings, magnetic_problems
 from stario.sequences.inspection.samples import sample_problems, without_times_ahead
 from stario.sequences.inspection.stillness import Rest, find_rest
 from stario.sequences.inspection.times import magnetometer_time_problems
@@ -180,11 +177,11 @@ class Inspection:
         if t.gaps:
             start, length = max(t.gaps, key=lambda gap: gap[1])
             lines.append(
-                f"gaps: {len(t.gaps)}, {t.samples_lost_in_gaps} samples lost; "
-                f"longest {length:.3f} s at {start:.1f} s"
+                f"{t.samples_lost_in_gaps} samples missing in {len(t.gaps)} places; "
+                f"longest step {length:.3f} s at {start:.1f} s"
             )
         else:
-            lines.append("gaps: none")
+            lines.append("samples missing: none")
         ahead = f", {t.times_ahead} ahead of their time and left out" if t.times_ahead else ""
         lines.append(
             f"times: {t.times_repeated} repeated, {t.times_backward} backward{ahead}; "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -90,6 +91,19 @@ def test_compare_accepts_folders_of_recordings(stario, recording: Path, tmp_path
     done = stario("compare", "a", "b", "--out", "out", "--json")
     assert set(json.loads(done.out)["recordings"]) == {"walk", "walk-2"}
     assert {p.name for p in (tmp_path / "out").iterdir() if p.is_dir()} == {"walk", "walk-2"}
+
+
+@pytest.mark.usefixtures("no_figures")
+@pytest.mark.parametrize("command", ["run", "compare"])
+def test_tables_of_several_recordings_are_explained_once_below_all(
+    stario, recording: Path, tmp_path: Path, command: str
+) -> None:
+    shutil.copy(recording, tmp_path / "again.csv")
+    lines = stario(command, recording, "again.csv", "--out", "out").out.splitlines()
+    heads = [k for k, line in enumerate(lines) if "fitted [m]" in line]
+    (explained,) = (k for k, line in enumerate(lines) if line.startswith("fitted: ATE after"))
+    assert len(heads) == 2
+    assert explained > max(heads)
 
 
 @pytest.mark.usefixtures("no_figures")

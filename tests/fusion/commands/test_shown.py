@@ -48,7 +48,7 @@ def test_compare_without_truth_shows_only_what_is_known(stario, recording, no_fi
     write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
     done = stario("compare", "blind.csv", "--out", "told", "--report")
     assert "ATE" not in done.out
-    assert "nis_mean: mean NIS" in done.out
+    assert "NIS: mean NIS" in done.out
     text = (tmp_path / "told/blind/report.html").read_text()
     assert "</svg>EKF</button>" in text
     assert "</svg>inertial</button>" not in text  # the map without truth leaves it out

@@ -147,7 +147,8 @@ def test_metrics_json_has_the_documented_keys(folder: Path, walk: ImuSequence) -
     assert entry["duration_s"] == pytest.approx(20.0)
     horizontal_truth = replace(walk.truth, position_W=walk.truth.position_W * [1.0, 1.0, 0.0])
     assert entry["path_m"] == pytest.approx(horizontal_truth.path_length(), rel=0.01)
-    assert set(content["conventions"]) >= KEYS
+    about = {"duration_s", "path_m", "alignment", "horizontal"}
+    assert set(content["conventions"]) == KEYS | about
 
 
 def test_metrics_that_cannot_be_computed_are_null(folder: Path, walk: ImuSequence) -> None:
@@ -221,6 +222,8 @@ def test_a_run_writes_its_files(tmp_path: Path, compared: Comparison, walk: ImuS
         "ekf.tum", "ekf.npz", "metrics.json", "config.json", "run.json", "health.json",
         "plan.png", "error.png", "innovations.png",
     }  # fmt: skip
+    words = json.loads((tmp_path / "run/metrics.json").read_text())["conventions"]
+    assert set(words) == KEYS | {"alignment", "horizontal"}
     assert sorted(files) == sorted((tmp_path / "run").iterdir())
     health = json.loads((tmp_path / "run/health.json").read_text())
     assert health == json.loads(json.dumps(asdict(track.health)))

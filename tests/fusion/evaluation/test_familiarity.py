@@ -56,6 +56,10 @@ def test_a_walk_like_the_training_data_is_familiar_and_a_vibrating_one_is_not(
     assert unfamiliar.is_unfamiliar
     [line] = [line for line in unfamiliar.lines() if line.startswith("!")]
     assert "share of power above 10 Hz" in line
+    [shown] = [line for line in usual.lines() if "step rate" in line]
+    assert shown.split() == ["step", "rate", f"{usual.medians['step_rate']:.2f}", "Hz"]
+    mixed = replace(unfamiliar, ranges={})
+    assert any("but not their combination" in line for line in mixed.lines())
     assert unfamiliar.medians["step_rate"] == pytest.approx(usual.medians["step_rate"], abs=0.2)
 
 

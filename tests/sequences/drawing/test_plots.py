@@ -233,9 +233,11 @@ def test_positions_are_drawn_below_the_tracks_and_waypoints_above(tracks):
 
 def test_the_axes_of_a_tall_plan_fill_its_figure(truth):
     tall = replace(truth, position_W=np.outer(truth.time, [0.1, 1.2, 0.0]))
-    fig = plan_view({"ekf": tall}, None, "")
-    fig.canvas.draw()
-    assert fig.axes[0].get_tightbbox().x1 > 0.95 * fig.bbox.x1
+    names = ("inertial", "pdr", "network", "network_true_attitude", "ekf", "graph")
+    for shown in (names[:1], names):  # with a legend of one row or of several
+        fig = plan_view(dict.fromkeys(shown, tall), None, "")
+        fig.canvas.draw()
+        assert fig.axes[0].get_tightbbox().x1 > 0.95 * fig.bbox.x1
 
 
 def test_the_legend_of_many_distant_tracks_fits_the_figure(truth, tracks):

@@ -21,7 +21,8 @@ from stario.sequences import (
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.clean_samples import clean_samples
-from stario.sequences.inspection.magnetic import assess_magnetometer, magnetic_problems
+from stario.sequences.inspection.magnetic import assess_magnetometer
+from stario.sequences.inspection.magnetic_findings import magnetic_problems
 from stario.sequences.inspection.times import magnetometer_time_problems
 from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
@@ -48,6 +49,19 @@ def test_correlation_lag_hard_iron_dip_and_drift_are_recovered() -> None:
     assert found.dip_rad == pytest.approx(math.radians(63.0), abs=0.1)
     assert found.gyroscope_drift_rad_s == pytest.approx(drift, rel=0.15)
     assert "hard iron" in magnetic_problems("walk", found)[0]
+
+
+def test_a_short_recording_gives_no_verdict_and_its_span_is_named() -> None:
+    whole = walk(MagneticField())
+    for end, verdict, words in (
+        (30.0, "too short to tell", "over 30 s: steady to"),
+        (45.0, "good", "over 45 s: steady to"),
+    ):
+        found = assess_magnetometer(whole.slice(0.0, end))
+        assert found.assessed_s == pytest.approx(end, abs=0.5)
+        assert found.verdict == verdict
+        (line,) = (line for line in found.lines() if words in line)
+        assert "within a minute" not in line
 
 
 @pytest.mark.parametrize("lag", [-0.08, 0.2])

@@ -102,9 +102,8 @@ def test_gaps_and_wrong_times_are_counted(walk: ImuSequence) -> None:
     time[100], time[200] = time[99], time[190]
     accel = walk.accel.copy()
     accel[300, 1] = np.nan
-    timing = inspect_recording(
-        ImuSequence("dirty", time[keep], walk.gyro[keep], accel[keep])
-    ).timing
+    found = inspect_recording(ImuSequence("dirty", time[keep], walk.gyro[keep], accel[keep]))
+    timing = found.timing
     lengths = {round(start, 2): round(length, 2) for start, length in timing.gaps}
     assert lengths[4.99] == 2.51
     assert lengths[11.99] == 0.04
@@ -113,6 +112,8 @@ def test_gaps_and_wrong_times_are_counted(walk: ImuSequence) -> None:
     assert timing.samples_not_finite == 1
     # The two samples with wrong times leave gaps where they should have been.
     assert timing.samples_lost_in_gaps >= 250 + 3
+    places = f"{timing.samples_lost_in_gaps} samples missing in {len(timing.gaps)} places; longest"
+    assert any(line.startswith(places) for line in found.lines())
     assert timing.jitter_s < 1e-9
 
 
