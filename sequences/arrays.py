@@ -182,6 +182,8 @@ def check_rotations(name: str, value: Rotation, time: FloatArray) -> None:
         InputError: it has another type, or their number differs.
     """
     check_type(name, value, Rotation, "Rotation.from_quat(quat_xyzw)")
+    if value.single:  # it has no length
+        raise InputError(name, "a single rotation", f"{len(time)} as time")
     if len(value) != len(time):
         raise InputError(name, f"{len(value)} rotations", f"{len(time)} as time")
 

@@ -117,6 +117,7 @@ def axes_matrix(axes: str) -> FloatArray:
     Raises:
         InputError: as for `with_axes`.
     """
+    check_type("axes", axes, str, "a text such as y,-x,z")
     words = [word.strip().lower().removeprefix("+") for word in axes.split(",")]
     expected = "x, y and z once each, optionally with a minus, such as y,-x,z"
     if sorted(word.removeprefix("-") for word in words) != ["x", "y", "z"]:

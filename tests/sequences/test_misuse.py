@@ -56,6 +56,8 @@ DATES = np.datetime64("2026-01-01") + (1e9 * TIME).astype("timedelta64[ns]")
         (lambda: PositionTrack(TIME, ROWS, "positions", sigma=ROWS), "positions' sigma", "(200,)"),
         (lambda: Magnetometer(TIME, "north"), "magnetic field", "an array of numbers"),
         (lambda: Trajectory(TIME, ROWS, np.zeros((200, 4))), "attitude_WB", "Rotation.from_quat"),
+        (lambda: Trajectory(TIME, ROWS, Rotation.identity()), "attitude_WB", "200 as time"),
+        (lambda: with_conventions(SEQUENCE, axes=["y", "-x", "z"]), "axes", "such as y,-x,z"),
         (lambda: DeviceAttitude(TIME, ROWS), "device attitude's attitude_WB", "Rotation"),
         (lambda: write_csv(SEQUENCE, Path("s.csv")), "sequence", "write_csv(path, sequence)"),
         (lambda: inspect_recording("x"), "sequence", "read_recording(path)"),
