@@ -37,7 +37,7 @@ CHOOSING = 5 * 10**8
 """Time [ns] allowed for every sensor of a device to appear before choosing among them."""
 
 MAX_WAIT = 5 * 10**9
-"""Maximum time [ns] a gyroscope sample waits for the accelerometer."""
+"""Maximum time [ns] a sensor's samples wait for those of the other."""
 
 _MAX_GAP = round(MAX_IMU_GAP * 1e9)
 _GYROS = (GYRO, GYRO_RAW)
@@ -84,6 +84,8 @@ class Join:
         while self._first and self._newest[0] - self._first[0][0] > MAX_WAIT:
             self._first.popleft()
             self.alone += 1
+        while self._second and self._newest[1] - self._second[0][0] > MAX_WAIT:
+            self._second.popleft()
         return complete
 
     def _at(self, time: int) -> Vector | None:
@@ -112,7 +114,8 @@ class Merger:
     def __init__(self) -> None:
         self.upward = 0.0
         self._fields: list[Field] = []
-        self._newest_field, self._field_late = -1, 0
+        self._newest: dict[str, int] = {}
+        self._field_late = 0
         self._waiting: list[Reading] = []
         self._gyro = ""
         self._accel: tuple[str, ...] = ()
@@ -136,6 +139,13 @@ class Merger:
         if not gyro:
             return "gyroscope"
         return "" if accel else "total acceleration, or accelerometer with gravity"
+
+    @property
+    def silent(self) -> str:
+        """Sensor of the track whose samples ended `MAX_WAIT` before the newest; empty if none."""
+        end = max(self._newest.values(), default=0) - MAX_WAIT
+        sensors = (self._gyro, *self._accel)
+        return next((name for name in sensors if self._newest.get(name, end) < end), "")
 
     def add(self, readings: Iterable[Reading]) -> list[Sample]:
         """Add readings as they arrive; return the samples they complete."""
@@ -161,8 +171,7 @@ class Merger:
     def _take(self, reading: Reading) -> None:
         sensor, time, value = reading.sensor, reading.time_ns, reading.value
         if sensor == MAG:
-            if time > self._newest_field:
-                self._newest_field = time
+            if time > self._newest.get(MAG, -1):
                 self._fields.append((time, value))
             else:
                 self._field_late += 1
@@ -172,6 +181,7 @@ class Merger:
             self._gravity.add(self._accel.index(sensor), time, value)
         elif sensor in self._accel:
             self._join.add(1, time, value)
+        self._newest[sensor] = max(time, self._newest.get(sensor, -1))
 
     def _best(self) -> tuple[str, tuple[str, ...]]:
         """Return the best gyroscope and accelerometer of the readings so far; empty if none."""

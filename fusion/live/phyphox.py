@@ -67,7 +67,7 @@ class Phyphox:
         self._buffers: dict[str, tuple[str, str, str, str]] = {}
         self._newest: dict[str, float] = {}
         self._session = ""
-        self._pauses, self._measuring = 0, True
+        self._restarts, self._measuring = 0, True
 
     def fetch(self) -> Batch:
         """Fetch the samples recorded since the last call.
@@ -88,12 +88,36 @@ class Phyphox:
             if started:
                 self._buffers, self._newest = {}, {}
                 return Batch(self.device, session, [])
+        if self._is_forced(buffers):
+            self._restart()
         readings = [r for sensor in self._buffers for r in self._readings(sensor, buffers)]
         measuring = status.get("measuring") is not False
         if measuring and not self._measuring:
-            self._pauses += 1  # phyphox's time does not count it, so the track cannot continue
+            self._restarts += 1  # phyphox's time does not count a pause: the track cannot continue
         self._measuring = measuring
-        return Batch(self.device, f"{session} {self._pauses}", readings)
+        if measuring and not readings and self._is_behind():
+            self._restart()
+        return Batch(self.device, f"{session} {self._restarts}", readings)
+
+    def _restart(self) -> None:
+        """Follow a cleared experiment, whose time restarts at 0, from its beginning."""
+        self._newest, self._restarts = {}, self._restarts + 1
+
+    def _is_forced(self, buffers: Mapping[str, Any]) -> bool:
+        """Return whether whole buffers answer a request for their ends: once after a clear."""
+        times = [buffers.get(self._buffers[sensor][0]) for sensor in self._newest]
+        return any(isinstance(time, dict) and time.get("updateMode") == "full" for time in times)
+
+    def _is_behind(self) -> bool:
+        """Return whether the phone's newest times lie before those known, after a lost answer."""
+        if not self._newest:
+            return False
+        newest = {self._buffers[sensor][0]: time for sensor, time in self._newest.items()}
+        buffers = self._get(f"/get?{'&'.join(map(quote, newest))}").get("buffer")
+        if not isinstance(buffers, dict):
+            return False
+        times = [(_column(buffers, name), time) for name, time in newest.items()]
+        return any(not column or column[-1] < time for column, time in times)
 
     def _query(self) -> list[str]:
         parts = []
@@ -109,8 +133,6 @@ class Phyphox:
     def _readings(self, sensor: str, buffers: Mapping[str, Any]) -> list[Reading]:
         columns = [_column(buffers, name) for name in self._buffers[sensor]]
         readings = []
-        if columns[0] and columns[0][-1] < self._newest.get(sensor, -1.0):
-            self._newest = {}  # the experiment was cleared: its time restarts
         for t, *value in zip(*columns, strict=False):  # one column may be a sample longer
             if t <= self._newest.get(sensor, -1.0) or max(map(abs, value)) > MAX_READING:
                 continue

@@ -13,21 +13,21 @@ import numpy as np
 
 from stario.fusion.fixes import position_fix
 from stario.fusion.live.drawn import DisplayedTrack
-from stario.fusion.live.merging import Field, Merger, Sample
+from stario.fusion.live.merging import MAX_WAIT, Field, Merger, Sample
 from stario.fusion.live.ordering import PushOrder
-from stario.fusion.live.payload import Batch, Reading, Vector
+from stario.fusion.live.payload import Batch, Vector
 from stario.fusion.live.storage import LiveFile
+from stario.fusion.live.times import BACKWARD, middle_time, with_credible_time
 from stario.fusion.navigator import Navigator
 from stario.fusion.report.health import findings
 from stario.fusion.state import NavState
 from stario.sequences.errors import InputError
 
-BACKWARD, FORWARD = 5 * 10**9, 60 * 10**9
-"""A jump of the device's clock beyond these [ns] starts a new track."""
+FORWARD = 60 * 10**9
+"""A jump of the device's clock ahead by this [ns], or back by `BACKWARD`, starts a new track."""
 
-_STRAY_SHARE = 0.1
-"""Maximum share of a batch's readings whose times, `BACKWARD` or more from the batch's middle, are
-taken to be wrong; more are a backlog."""
+_MAX_UNWRITTEN = 6000
+"""Maximum number of samples kept for the next attempt to write: a minute of a phone's."""
 
 _HEALTH_SECONDS = 1.0
 
@@ -67,10 +67,10 @@ class Session:
         self._first_ns = self._newest_ns = -1
         self._health_time = -math.inf
         self.drawn = DisplayedTrack(revision=self.drawn.revision + 1)
-        self._push_error = ""
+        self._push_error = self._write_error = ""
         self.words: list[dict[str, str]] = []
         self._unwritten: tuple[list[Sample], list[Field]] = [], []
-        self.samples = self.fixes = self._delayed = self._stray = 0
+        self.samples = self.fixes = self._delayed = self._stray = self._lost = 0
         self.rate = 0.0
         self.running = True
 
@@ -97,7 +97,7 @@ class Session:
         if not self.running:
             return 0
         if self._is_of_previous(batch):
-            if batch.number >= 0 and _middle(batch) < self._opened_ns:
+            if batch.number >= 0 and middle_time(batch) < self._opened_ns:
                 self._delayed += len(batch.readings)
                 return 0
             if batch.recording:
@@ -114,10 +114,10 @@ class Session:
         if not batch.readings:
             return 0
         if self._is_new(batch):
-            self._previous, self._opened_ns = self._recording, _middle(batch)
+            self._previous, self._opened_ns = self._recording, middle_time(batch)
             self._begin(batch.recording)
         self._recording, self._number = batch.recording, max(self._number, batch.number)
-        factor, readings = self._factor, _with_credible_time(batch)
+        factor, readings = self._factor, with_credible_time(batch)
         self._stray += len(batch.readings) - len(readings)
         samples = [
             (time, gyro, (factor * a[0], factor * a[1], factor * a[2]))
@@ -128,12 +128,7 @@ class Session:
         if not samples:
             return 0
         fields = [*self._unwritten[1], *self._merger.fields()]
-        self._unwritten = samples, fields
-        if self._file is None:
-            self._file = LiveFile(self._folder, self.device)
-            self._first_ns = samples[0][0]
-        self._file.append(samples, received, fields)
-        self._unwritten = [], []
+        self._write(samples, received, fields)
         pending = deque(fields)
         for time_ns, gyro, accel in samples:
             while pending and pending[0][0] <= time_ns:
@@ -143,6 +138,21 @@ class Session:
             self._push_field(time_ns, field)
         self._count(samples[0][0], samples[-1][0], len(samples))
         return len(samples)
+
+    def _write(self, samples: list[Sample], received: float, fields: list[Field]) -> None:
+        """Write to disk, or keep for the next attempt as much as memory allows."""
+        try:
+            if self._file is None:
+                self._file = LiveFile(self._folder, self.device)
+            self._file.append(samples, received, fields)
+        except (OSError, InputError) as error:
+            self._write_error = f"the recording cannot be written: {error}"
+            self._lost += max(0, len(samples) - _MAX_UNWRITTEN)
+            self._unwritten = samples[-_MAX_UNWRITTEN:], fields[-_MAX_UNWRITTEN:]
+            raise
+        self._write_error, self._unwritten = "", ([], [])
+        if self._first_ns < 0:
+            self._first_ns = samples[0][0]
 
     def stop(self) -> None:
         """End the track; ignore data until `start`."""
@@ -204,10 +214,12 @@ class Session:
 
     def _problem(self) -> str:
         """Return what keeps the track from being right, in words; empty if nothing does."""
-        if self._push_error:
-            return self._push_error
+        if self._write_error or self._push_error:
+            return self._write_error or self._push_error
         if self._merger.missing:
             return f"no samples of {self._merger.missing}: enable it in the logger"
+        if self._merger.silent:
+            return f"no samples of {self._merger.silent} for {MAX_WAIT / 1e9:g} s: the track waits"
         if self._factor * self._merger.upward < -_CERTAIN:
             other = "-m/s2" if self._factor > 0 else "m/s2"
             return (
@@ -219,7 +231,7 @@ class Session:
     def _dropped(self) -> dict[str, int]:
         dropped = self._merger.dropped
         late = dropped.get("late", 0) + self._delayed
-        counts = dropped | {"late": late, "wrong time": self._stray}
+        counts = dropped | {"late": late, "wrong time": self._stray, "not written": self._lost}
         return {reason: count for reason, count in counts.items() if count}
 
     def _is_new(self, batch: Batch) -> bool:
@@ -228,8 +240,9 @@ class Session:
             return False
         if self._recording and batch.recording and self._recording != batch.recording:
             return True
-        middle, newest = _middle(batch), self._newest_ns
-        first = min(reading.time_ns for reading in _with_credible_time(batch))
+        waiting = self._unwritten[0]
+        middle, newest = middle_time(batch), waiting[-1][0] if waiting else self._newest_ns
+        first = min(reading.time_ns for reading in with_credible_time(batch))
         delayed = 0 <= batch.number < self._number  # rather than after the clock was set back
         return first - newest >= FORWARD or (middle - newest <= -BACKWARD and not delayed)
 
@@ -277,17 +290,3 @@ class Session:
         if state is None:
             raise InputError(self.device, "no position yet", "a second of samples first")
         return state
-
-
-def _with_credible_time(batch: Batch) -> list[Reading]:
-    """Return the readings without single ones far from the rest, which would seem to be newest."""
-    middle = _middle(batch)
-    near = [reading for reading in batch.readings if abs(reading.time_ns - middle) < BACKWARD]
-    stray = len(batch.readings) - len(near)
-    return near if stray <= _STRAY_SHARE * len(batch.readings) else batch.readings
-
-
-def _middle(batch: Batch) -> int:
-    """Return the median time of a batch that is not empty [ns]."""
-    times = sorted(reading.time_ns for reading in batch.readings)
-    return times[len(times) // 2]

@@ -51,7 +51,6 @@ class LiveFile:
             found = f"{folder}: {error.strerror or error}"
             raise InputError("out", found, "a writable folder") from error
         self.fixes_path = self.path.with_name(f"{self.path.stem}-fixes.csv")
-        self._file.write(HEADER.encode())
 
     def append(
         self, samples: Sequence[Sample], received: float, fields: Sequence[Field] = ()
@@ -96,13 +95,20 @@ def _write_whole(file: BinaryIO, data: bytes) -> None:
 
 
 def _new_file(folder: Path, device: str) -> tuple[Path, BinaryIO]:
-    """Create a new file, named by time and device."""
+    """Create a new file with the header, named by time and device."""
     slug = re.sub(r"[^A-Za-z0-9]+", "-", device).strip("-")[:32] or "device"
     stem = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{slug}"
     for number in range(1, 1000):
         path = folder / (f"{stem}.csv" if number == 1 else f"{stem}-{number}.csv")
         try:
-            return path, path.open("xb", buffering=0)
+            file = path.open("xb", buffering=0)
         except FileExistsError:
             continue
+        try:
+            _write_whole(file, HEADER.encode())
+        except OSError:  # on a full disk; each attempt would leave another empty file
+            file.close()
+            path.unlink()
+            raise
+        return path, file
     raise InputError("out", f"999 files named {stem}", "an unused name", "choose another folder")

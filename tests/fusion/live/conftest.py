@@ -1,12 +1,14 @@
 """Pushes of a recording as a phone sends them, and a navigator with a cheap network."""
 
 import json
+import threading
 
 import numpy as np
 import pytest
 
 from stario.fusion import Navigator
 from stario.fusion.live.hub import Hub
+from stario.fusion.live.run import LiveServer
 
 
 class SteadyWalk:
@@ -51,3 +53,24 @@ def pushes(walk):
         return encoded
 
     return bodies
+
+
+@pytest.fixture
+def serve(tmp_path, new_navigator):
+    """Start a server, with a token as if it were not on loopback, or without one."""
+    running = []
+
+    def start(token="", phones=()):
+        server = LiveServer(new_navigator, tmp_path, port=0, lines_port=0, phones=phones)
+        server._lines._token = token
+        listening = threading.Event()
+        thread = threading.Thread(target=server.run, args=(listening.set,))
+        thread.start()
+        running.append((server, thread))
+        assert listening.wait(20.0)
+        return server
+
+    yield start
+    for server, thread in running:
+        server.stop()
+        thread.join(20.0)

@@ -101,6 +101,25 @@ def test_memory_stays_small_if_the_accelerometer_stops_sending():
     assert join.alone == 19_999 - len(join._first)
 
 
+def test_values_kept_for_a_stopped_gyroscope_are_limited():
+    join = Join()
+    for k in range(1, 2_000):
+        join.add(1, k * SECOND // 100, (0.0, 0.0, 9.8))
+        join.ready()
+    assert len(join._second) <= MAX_WAIT // (SECOND // 100) + 1
+
+
+@pytest.mark.parametrize("stopped", ["gyroscope", "totalacceleration"])
+def test_a_sensor_that_stops_is_named_until_it_continues(stopped):
+    merger = Merger()
+    sensors = [linear(name, 100, 0, seconds=20.0) for name in ("gyroscope", "totalacceleration")]
+    readings = phone(*sensors)
+    for end in (4, 8, 12, 16):
+        group = [r for r in readings if end - 4 <= r.time_ns / SECOND < end]
+        merger.add(r for r in group if r.sensor != stopped or end not in (8, 12))
+        assert merger.silent == (stopped if end == 12 else "")
+
+
 def test_a_missing_sensor_is_named():
     merger = Merger()
     merger.add(linear("gyroscope", 100, 0))

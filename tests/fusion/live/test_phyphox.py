@@ -1,0 +1,154 @@
+"""Samples of a phone running phyphox are recorded, whatever is done on the phone."""
+
+import json
+import threading
+import time
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from urllib.parse import parse_qsl, urlsplit
+
+import numpy as np
+import pytest
+
+from stario.fusion.live.phyphox import Phyphox, buffers_of
+from stario.sequences import InputError, read_recording
+
+CONFIG = {
+    "inputs": [
+        {"source": "gyroscope", "outputs": [{"x": "gX", "y": "gY"}, {"z": "gZ"}, {"t": "gt"}]},
+        {"source": "accelerometer", "outputs": [{k: f"acc {k}"} for k in "xyzt"]},
+        {"source": "light", "outputs": [{"x": "lux"}]},
+    ]
+}  # fmt: skip
+
+
+class FakePhone:
+    """An experiment whose buffers are requested as from phyphox: whole, last values or ends."""
+
+    def __init__(self, walk):
+        self.walk, self.count, self.measuring, self.cleared = walk, 0, True, False
+
+    def clear(self):
+        """Empty the buffers; the next answer is whole, so that this is noticed."""
+        self.count, self.measuring, self.cleared = 0, False, True
+
+    def answer(self, path):
+        """Answer a request."""
+        url = urlsplit(path)
+        if url.path == "/config":
+            return CONFIG
+        columns, buffers = self._columns(), {}
+        for name, asked in parse_qsl(url.query, keep_blank_values=True):
+            since, _, by = asked.partition("|")
+            if not since:
+                mode, values = "single", columns[name][-1:].tolist() or [None]
+            elif since == "full" or self.cleared:
+                mode, values = "full", columns[name].tolist()
+            else:
+                mode = "partial"
+                values = columns[name][columns[by or name] > float(since)].tolist()
+            buffers[name] = {"updateMode": mode, "buffer": values}
+        self.cleared = False
+        return {"buffer": buffers, "status": {"session": "abc", "measuring": self.measuring}}
+
+    def _columns(self):
+        known = slice(0, self.count)
+        columns = dict.fromkeys(("gt", "acc t"), self.walk.time[known])
+        for k, axis in enumerate("xyz"):
+            columns[f"g{axis.upper()}"] = self.walk.gyro[known, k]
+            columns[f"acc {axis}"] = self.walk.accel[known, k]
+        return columns
+
+
+@pytest.fixture
+def fake(walk):
+    return FakePhone(walk)
+
+
+@pytest.fixture
+def phone(fake, monkeypatch):
+    """A client of the fake phone, without a network."""
+    phone = Phyphox("phone:8080")
+    monkeypatch.setattr(phone, "_get", fake.answer)
+    return phone
+
+
+def test_a_phone_is_polled_until_all_samples_are_recorded(serve, fake):
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            fake.count += 20  # each request finds 0.2 s more of the walk
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(json.dumps(fake.answer(self.path)).encode())
+
+        def log_message(self, *args):
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Handler) as listener:
+        threading.Thread(target=listener.serve_forever, daemon=True).start()
+        address = f"127.0.0.1:{listener.server_port}"
+        server = serve(phones=[address])
+        stop = time.monotonic() + 20.0
+        sessions, device = server.hub.sessions, f"phyphox {address}"
+        while device not in sessions or sessions[device].samples < 200:
+            assert time.monotonic() < stop
+            time.sleep(0.02)
+        recording = read_recording(sessions[device].path)
+        np.testing.assert_array_equal(recording.accel, fake.walk.accel[: len(recording)])
+        listener.shutdown()
+
+
+def test_an_experiment_without_both_sensors_is_refused():
+    with pytest.raises(InputError, match="gyroscope and acceleration with g"):
+        buffers_of({"inputs": CONFIG["inputs"][1:]})
+
+
+@pytest.mark.parametrize("lost", [False, True], ids=["noticed", "the answer after it is lost"])
+def test_a_cleared_experiment_is_followed_from_its_new_start(phone, fake, lost):
+    fake.count = 500
+    before = phone.fetch()
+    assert len(before.readings) == 1000
+    fake.clear()
+    if lost:
+        fake.cleared = False
+    assert phone.fetch().readings == []
+    fake.measuring, fake.count = True, 20
+    after = [phone.fetch() for _ in range(2)]
+    assert sum(len(batch.readings) for batch in after) == 40
+    fake.count = 40
+    assert len(phone.fetch().readings) == 40
+    assert after[-1].recording != before.recording
+
+
+def test_an_experiment_cleared_while_the_phone_was_away_begins_another_recording(phone, fake):
+    fake.count = 100
+    before = phone.fetch()
+    fake.clear()
+    fake.measuring, fake.count = True, 500
+    after = phone.fetch()
+    assert len(after.readings) == 1000
+    assert after.recording != before.recording
+
+
+@pytest.mark.parametrize("time", [float("inf"), 10**400, 1e300])
+def test_an_endless_time_neither_fails_nor_ends_the_stream(time):
+    phone = Phyphox("phone:8080")
+    phone._buffers = {"gyro": ("t", "x", "y", "z")}
+
+    def answer(times):
+        buffers = {name: {"buffer": [0.5] * len(times)} for name in ("x", "y", "z")}
+        return buffers | {"t": {"buffer": times}}
+
+    assert len(phone._readings("gyro", answer([1.0, time]))) == 1
+    assert len(phone._readings("gyro", answer([2.0, 3.0]))) == 2
+
+
+def test_a_paused_experiment_continues_as_another_recording(phone, fake):
+    """Its time does not count the pause, so the same track would miss what happened meanwhile."""
+    batches = []
+    for fake.measuring in (False, True, True, False, False, True, True):
+        fake.count += 10 * fake.measuring
+        batches.append(phone.fetch())
+    recordings = [batch.recording for batch in batches]
+    assert len(set(recordings[1:5])) == len(set(recordings[5:])) == 1
+    assert recordings[4] != recordings[5]
+    assert sum(len(batch.readings) for batch in batches) == 80
