@@ -43,7 +43,7 @@ class TrainingRun:
         sampler: sampler of windows with full truth.
         legs: samplers of weak truth, each with the number of stretches per step.
         material: digest of the recordings and initial weights, for the checkpoint.
-        folder: folder for checkpoint, model and log.
+        folder: existing folder for checkpoint, model and log.
         workers: the processes that share the run.
 
     Attributes:
@@ -60,7 +60,7 @@ class TrainingRun:
         workers: Workers,
     ) -> None:
         torch.manual_seed(config.seed)
-        self.config, self.sampler, self.legs, self.folder = config, sampler, legs, folder
+        self.config, self.sampler, self.legs = config, sampler, legs
         self.workers, self.device, self._material = workers, workers.device, material
         self.network = DisplacementNetwork(build_network(config.architecture)).to(self.device)
         self._checkpoint, self._log = folder / "checkpoint.safetensors", folder / "log.json"
@@ -83,7 +83,6 @@ class TrainingRun:
         self.step = 0
         self._windows, self._drawing_s, self._learning_s = 0, 0.0, 0.0
         self.history = History(config)
-        folder.mkdir(parents=True, exist_ok=True)
 
     def start_from(self, model: DisplacementModel) -> None:
         """Start from a model's weights.
@@ -254,9 +253,6 @@ class TrainingRun:
                 weights.
             ReadError: the checkpoint cannot be read.
         """
-        if self.workers.is_leader:
-            for leftover in self.folder.glob(".*.tmp"):  # from an interrupted write
-                leftover.unlink(missing_ok=True)
         if not self._checkpoint.exists():
             return
         self.step, history, tensors = read_checkpoint(self._checkpoint, self.config, self._material)

@@ -64,7 +64,7 @@ def test_a_filled_cell_writes_model_errors_and_tracks(
     fill_cell(done, tmp_path, reading)
     folder = tmp_path / "own/StarIO/2-steps/seed-0"
     names = {"errors.json", "log.json", "model.json", "model.safetensors", "tracks.npz"}
-    assert {path.name for path in folder.iterdir()} == {*names, "trained.json"}
+    assert {path.name for path in folder.glob("[!.]*")} == {*names, "trained.json"}
     trained = json.loads((folder / "trained.json").read_text())
     assert (trained["steps"], trained["windows"]) == (2, 6)
     assert 0.0 < trained["step_seconds"] < trained["seconds"]
