@@ -82,7 +82,8 @@ class Row:
         seeds: filled seeds.
         figures: means by column key.
         training_error: mean squared error of the last epoch's windows [m^2]; None for weights.
-        validation_error: the same on the validation recordings.
+        validation_error: that of the best epoch, whose weights are kept, on the validation
+            recordings.
         rank: rank among the networks of the set; None without an error in the measure.
         learned: number of test recordings that given weights were trained on.
     """
