@@ -126,7 +126,7 @@ def filled_cells(cells: Iterable[Cell], out: Path) -> dict[str, Filled]:
     """Return the contents of the filled cells, by set.
 
     Raises:
-        ConfigError: a cell was filled with another recipe or other recordings.
+        ConfigError: a cell was filled with another recipe, other weights or other recordings.
     """
     found: dict[str, Filled] = {}
     for cell in cells:
