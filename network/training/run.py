@@ -232,14 +232,14 @@ class TrainingRun:
 
     def _tensors(self) -> dict[str, Tensor]:
         """Return the tensors of a checkpoint, from which `_restore` continues."""
+        random = {"sampler": self.sampler.generator.get_state(), "torch": torch.get_rng_state()}
+        if self.device.type == "cuda":
+            random["cuda"] = torch.cuda.get_rng_state(self.device)
         parts = {
             "network": self.network.state_dict(),
             "averaged": self.averaged.state_dict(),
             "best": self.best,
-            "random": {
-                "sampler": self.sampler.generator.get_state(),
-                "torch": torch.get_rng_state(),
-            },
+            "random": random,
         }
         for index, state in self.optimiser.state_dict()["state"].items():
             parts[f"optimiser.{index}"] = state
@@ -281,6 +281,8 @@ class TrainingRun:
         self.sampler.generator.set_state(tensors["random.sampler"])
         if self.workers.is_leader:
             torch.set_rng_state(tensors["random.torch"])
+            if self.device.type == "cuda" and "random.cuda" in tensors:  # not in older ones
+                torch.cuda.set_rng_state(tensors["random.cuda"], self.device)
         else:
             torch.manual_seed(self.config.seed + self.workers.rank + self.step)
 
