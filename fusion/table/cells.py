@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from time import process_time
 
@@ -18,7 +19,13 @@ from stario.fusion.evaluation.pedestrian import NAME as PDR
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
 from stario.fusion.table.errors import Model, Shown, test_errors
 from stario.fusion.table.sets import ALL, DataSet
-from stario.fusion.table.training import TEMPORARY_FILES, ReaderConfig, recipe_digest, train_cell
+from stario.fusion.table.training import (
+    TEMPORARY_FILES,
+    ReaderConfig,
+    recipe_digest,
+    recording_stamps,
+    train_cell,
+)
 from stario.network.architectures import ARCHITECTURES
 from stario.network.model import load_model
 from stario.network.training.config import TrainingConfig
@@ -58,9 +65,17 @@ class Cell:
     @property
     def digest(self) -> str:
         """Digest of everything that its results depend on except the code."""
-        test = [str(entry.path) for entry in self.dataset.test]
-        trained = "" if self.recipe is None else recipe_digest(self.recipe, self.dataset)
-        return hashlib.sha256(json.dumps([self.network, trained, test]).encode()).hexdigest()
+        test = [recording_stamps(entry.path) for entry in self.dataset.test]
+        if self.recipe is None:
+            learned = "" if self.network == PDR else _weights_sha256(self.network)
+        else:
+            learned = recipe_digest(self.recipe, self.dataset)
+        return hashlib.sha256(json.dumps([self.network, learned, test]).encode()).hexdigest()
+
+
+@cache
+def _weights_sha256(name: str) -> str:
+    return load_model(name).card.sha256
 
 
 def reference_rows(dataset: DataSet) -> tuple[str, ...]:
@@ -76,7 +91,8 @@ def fill_cell(cell: Cell, out: Path, reading: ReaderConfig) -> Cell:
     """Train and evaluate a cell, except for what is already done.
 
     Raises:
-        ConfigError: existing results were made with another recipe or other recordings.
+        ConfigError: existing results were made with another recipe, other weights or other
+            recordings.
         InputError: the network cannot be trained.
     """
     folder = cell.folder(out)
@@ -93,7 +109,7 @@ def read_cell(cell: Cell, out: Path) -> dict[str, object] | None:
     """Return the content of a cell's `errors.json` and `trained.json`; None if it is not filled.
 
     Raises:
-        ConfigError: it was filled with another recipe or other recordings.
+        ConfigError: it was filled with another recipe, other weights or other recordings.
     """
     folder = cell.folder(out)
     content = _read_if_done(cell, folder / "errors.json")
@@ -153,9 +169,9 @@ def _read_if_done(cell: Cell, path: Path) -> dict[str, object] | None:
     if content is not None and content.get("cell") != cell.digest:
         raise ConfigError(
             str(path),
-            "made with another recipe or other recordings",
+            "made with another recipe, other weights, or recordings that differ or changed since",
             "those of this table",
-            "use the settings it was made with, or another folder (--out)",
+            "use what it was made with, remove it to make it anew, or use another folder (--out)",
         )
     return content
 

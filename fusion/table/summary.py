@@ -82,7 +82,8 @@ class Row:
         seeds: filled seeds.
         figures: means by column key.
         training_error: mean squared error of the last epoch's windows [m^2]; None for weights.
-        validation_error: the same on the validation recordings.
+        validation_error: that of the best epoch, whose weights are kept, on the validation
+            recordings.
         rank: rank among the networks of the set; None without an error in the measure.
         learned: number of test recordings that given weights were trained on.
     """
@@ -125,7 +126,7 @@ def filled_cells(cells: Iterable[Cell], out: Path) -> dict[str, Filled]:
     """Return the contents of the filled cells, by set.
 
     Raises:
-        ConfigError: a cell was filled with another recipe or other recordings.
+        ConfigError: a cell was filled with another recipe, other weights or other recordings.
     """
     found: dict[str, Filled] = {}
     for cell in cells:

@@ -165,10 +165,10 @@ def _words() -> str:
         "by the true attitude. Waypoints: residual after a fit in yaw and position, in m and in % "
         "of the path, and the length of the track over that of the truth. Positions: error within "
         "stretches of 20 s, each fitted, in % of the path. Training and validation error: mean "
-        "squared displacement error of windows in the last epoch [m^2] (in validation, legs count "
-        "in m^2/s). +-: standard error over training seeds, for one split. Intervals (95 %): "
-        "bootstrap over recordings and blocks of 30 s, with the same draws for all networks; seeds "
-        "are averaged."
+        "squared displacement error of windows [m^2] in the last epoch and in the best one, whose "
+        "weights are kept (in validation, legs count in m^2/s). +-: standard error over training "
+        "seeds, for one split. Intervals (95 %): bootstrap over recordings and blocks of 30 s, "
+        "with the same draws for all networks; seeds are averaged."
     )
 
 

@@ -19,8 +19,10 @@ from stario.network.training.data import (
     mix_sources,
     recording_streams,
 )
+from stario.network.training.history import EpochReport, History
 from stario.network.training.train import train
 from stario.sequences.datasets.batch import Skipped
+from stario.sequences.datasets.cache_files import recording_files
 from stario.sequences.datasets.stream_cache import recorded
 from stario.sequences.files import write_json
 from stario.sequences.sequence import ImuSequence
@@ -83,7 +85,8 @@ def train_cell(
     """Train a cell's network, resuming from its checkpoint; write the model and `TEMPORARY_FILES`.
 
     Returns:
-        Plain values: errors of the last epoch [m^2], number of steps, windows per step, total and
+        Plain values: training error of the last epoch and validation error of the best one, whose
+        weights are kept [m^2], number of steps, windows per step, total and
         mean computing time per step [s], the recipe, and the skipped recordings.
 
     Raises:
@@ -93,7 +96,8 @@ def train_cell(
     held_out, missing = _streams(dataset.validation, recipe.attitude, reading)
     simulated = partial(cached_walks, folder=reading.cache, attitude=recipe.attitude)
     poses = any(isinstance(s, WorldStream) for recording in streams for s in recording.streams)
-    material = mix_sources(streams, [] if poses else simulated(_WALKS, 0), reach=recipe.reach)
+    walks = [] if poses else simulated(_WALKS, 0)
+    material = mix_sources(streams, walks, recipe.shares, recipe.reach)
     validation_data = mix_sources(held_out, [])
     clock = _Clock(folder / TEMPORARY_FILES[1])
     train(
@@ -111,26 +115,41 @@ def train_cell(
         chosen_by_legs=not validation_data.streams,
     )
     clock.keep()
-    history = json.loads((folder / "log.json").read_text(encoding="utf-8"))
+    reports = _reports(folder / "log.json")
     return {
         "steps": recipe.steps,
         "windows": recipe.batch + _leg_windows(recipe, material.legs),
         "seconds": clock.seconds,
         "step_seconds": clock.step_seconds,
-        "training_error_m2": history[-1]["training_error"],
-        "validation_error_m2": history[-1]["validation_error"],
+        "training_error_m2": reports[-1].training_error,
+        "validation_error_m2": History(recipe, reports).best().validation_error,
         "recipe": asdict(recipe),
         "skipped": [asdict(failure) for failure in skipped + missing],
     }
+
+
+def _reports(log: Path) -> list[EpochReport]:
+    """Return the reports of a run's epochs; in JSON, errors that are not finite are null."""
+    rows = json.loads(log.read_text(encoding="utf-8"))
+    return [EpochReport(**{k: math.nan if v is None else v for k, v in r.items()}) for r in rows]
 
 
 def recipe_digest(recipe: TrainingConfig, dataset: DataSet) -> str:
     """Return the digest of everything that a cell's training depends on except the code."""
     inputs = [
         asdict(recipe),
-        [[str(path) for path in part] for part in (dataset.training, dataset.validation)],
+        [[*map(recording_stamps, part)] for part in (dataset.training, dataset.validation)],
     ]
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
+
+
+def recording_stamps(path: Path) -> list[object]:
+    """Return a recording's path, and name, size and modification time [ns] of each of its files.
+
+    They tell that it has changed, as in the cache of windows, without reading it.
+    """
+    stats = [(file.name, file.stat()) for file in recording_files(path)]
+    return [str(path), *((name, stat.st_size, stat.st_mtime_ns) for name, stat in stats)]
 
 
 @lru_cache(maxsize=2)  # training and validation part of the set that cells are filled for

@@ -26,6 +26,9 @@ from stario.sequences.windows import HEADING_STEP, WINDOW_RATE, WINDOW_SAMPLES, 
 log = logging.getLogger(__name__)
 
 
+_SHARES = ("replayed", "swung", "mirrored", "any_yaw")
+
+
 @dataclass(frozen=True)
 class Augmentation:
     """Extent of the random variation of windows.
@@ -65,7 +68,7 @@ class Augmentation:
         if not _is_range(self.speeds):
             raise ConfigError("speeds", repr(self.speeds), "two factors in (0, 10], slow then fast")
         for item in fields(self)[1:]:
-            check_number(self, item.name, 0.0, 100.0)
+            check_number(self, item.name, 0.0, 1.0 if item.name in _SHARES else 100.0)
 
 
 def _is_range(speeds: object) -> bool:

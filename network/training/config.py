@@ -118,10 +118,11 @@ class TrainingConfig:
         track_stretches: stretches along a track of positions without attitude, per step.
         track_seconds: number of windows in each; few, because heads and phones drift
             apart in yaw.
-        shares: share of the windows for each source, given by a part of its recordings' path;
-            recordings of no named source are drawn by their length and liveliness. The share of
-            a source that is absent goes to the other recordings. "simulated" is the share of
-            simulated walks among all windows.
+        shares: share of the windows for each source, named by a folder, archive or file in its
+            recordings' paths ("ridi.h5" or "ridi" for `archives/ridi.h5:name`); recordings of no
+            named source are drawn by their length and liveliness. The share of a source that is
+            absent goes to the other recordings. "simulated" is the share of simulated walks among
+            all windows.
         compiled: compile the network for training (torch.compile; on CPUs, it needs a C++
             compiler and saves a third of the time).
         augmentation: how windows are varied.
@@ -164,7 +165,8 @@ class TrainingConfig:
         for name, low, high in _RANGES:
             check_number(self, name, low, high)
         for name, share in self.shares.items():
-            if not (isinstance(share, int | float) and 0.0 <= share <= 1.0):
+            is_number = isinstance(share, int | float) and not isinstance(share, bool)
+            if not (is_number and 0.0 <= share <= 1.0):
                 raise ConfigError(f"shares, {name}", repr(share), "a share from 0 to 1")
         recorded = sum(share for name, share in self.shares.items() if name != SIMULATED)
         if recorded > 1.0 + 1e-9:

@@ -89,9 +89,10 @@ def mix_sources(
     Args:
         recorded: streams of each recording.
         generated: simulated walks.
-        shares: share of each source among the recordings' windows, by a part of their path;
-            other recordings make up the rest of 1. The share of a source that is absent goes to
-            the others. `SIMULATED` is the share of simulated walks among all windows.
+        shares: share of each source among the recordings' windows, by a folder, archive or file in
+            their paths, with or without its suffix; other recordings make up the rest of 1. The
+            share of a source that is absent goes to the others. `SIMULATED` is the share of
+            simulated walks among all windows.
         reach: minimum number of samples of a stream to draw from (`TrainingConfig.reach`).
 
     Raises:
@@ -144,7 +145,7 @@ def _sources(
     shares = {name: share for name, share in shares.items() if name != SIMULATED}
     members: dict[str, list[WorldStream]] = {name: [] for name in [*shares, ""]}
     for recording in recorded:
-        source = next((name for name in shares if name in str(recording.path)), "")
+        source = next((name for name in shares if _is_in(recording.path, name)), "")
         members[source] += [s for s in recording.streams if isinstance(s, WorldStream)]
     left = 1.0 - sum(shares.values())
     if members[""] and left < 1e-9:
@@ -152,6 +153,13 @@ def _sources(
             "shares", "a sum of 1 or more", "less than 1", f"{members[''][0].name} matches no share"
         )
     return [(name or "others", shares.get(name, left), found) for name, found in members.items()]
+
+
+def _is_in(path: Path, source: str) -> bool:
+    """Return whether a source names folders, the archive or the file of a recording, or itself."""
+    file, member = split_name(path)
+    places = file.as_posix(), (file.parent / file.stem).as_posix(), member
+    return any(f"/{source.strip('/')}/" in f"/{place}/" for place in places)
 
 
 def _length(streams: Sequence[Stream]) -> str:

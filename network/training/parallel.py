@@ -76,7 +76,21 @@ class Workers:
 
 def is_leader() -> bool:
     """Return whether this process is the only one or the launcher's first one."""
-    return os.environ.get("RANK", "0") == "0"
+    return _count() == 1 or os.environ["RANK"] == "0"
+
+
+def _count() -> int:
+    """Return the number of processes; 1 unless the launcher has set all of its variables.
+
+    Job schedulers set some of them for processes that do not belong together.
+    """
+    if not all(name in os.environ for name in ("RANK", "WORLD_SIZE", "MASTER_ADDR")):
+        return 1
+    words = os.environ["WORLD_SIZE"]
+    if not (words.isdecimal() and int(words) >= 1):
+        fix = "start several processes with torchrun, or unset it"
+        raise ConfigError("WORLD_SIZE", repr(words), "the number of processes", fix)
+    return int(words)
 
 
 @contextmanager
@@ -88,9 +102,10 @@ def workers(device: str, batch: int) -> Iterator[Workers]:
         batch: rows to divide evenly among the processes.
 
     Raises:
-        ConfigError: no GPU is available for "cuda", or the batch cannot be divided evenly.
+        ConfigError: no GPU is available for "cuda", the batch cannot be divided evenly, or the
+            number of processes is no number.
     """
-    count = int(os.environ.get("WORLD_SIZE", "1"))
+    count = _count()
     chosen = _device(device)
     if count == 1:
         yield Workers(0, 1, chosen)

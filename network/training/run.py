@@ -43,7 +43,7 @@ class TrainingRun:
         sampler: sampler of windows with full truth.
         legs: samplers of weak truth, each with the number of stretches per step.
         material: digest of the recordings and initial weights, for the checkpoint.
-        folder: folder for checkpoint, model and log.
+        folder: existing folder for checkpoint, model and log.
         workers: the processes that share the run.
 
     Attributes:
@@ -60,7 +60,7 @@ class TrainingRun:
         workers: Workers,
     ) -> None:
         torch.manual_seed(config.seed)
-        self.config, self.sampler, self.legs, self.folder = config, sampler, legs, folder
+        self.config, self.sampler, self.legs = config, sampler, legs
         self.workers, self.device, self._material = workers, workers.device, material
         self.network = DisplacementNetwork(build_network(config.architecture)).to(self.device)
         self._checkpoint, self._log = folder / "checkpoint.safetensors", folder / "log.json"
@@ -83,7 +83,6 @@ class TrainingRun:
         self.step = 0
         self._windows, self._drawing_s, self._learning_s = 0, 0.0, 0.0
         self.history = History(config)
-        folder.mkdir(parents=True, exist_ok=True)
 
     def start_from(self, model: DisplacementModel) -> None:
         """Start from a model's weights.
@@ -233,14 +232,14 @@ class TrainingRun:
 
     def _tensors(self) -> dict[str, Tensor]:
         """Return the tensors of a checkpoint, from which `_restore` continues."""
+        random = {"sampler": self.sampler.generator.get_state(), "torch": torch.get_rng_state()}
+        if self.device.type == "cuda":
+            random["cuda"] = torch.cuda.get_rng_state(self.device)
         parts = {
             "network": self.network.state_dict(),
             "averaged": self.averaged.state_dict(),
             "best": self.best,
-            "random": {
-                "sampler": self.sampler.generator.get_state(),
-                "torch": torch.get_rng_state(),
-            },
+            "random": random,
         }
         for index, state in self.optimiser.state_dict()["state"].items():
             parts[f"optimiser.{index}"] = state
@@ -254,9 +253,6 @@ class TrainingRun:
                 weights.
             ReadError: the checkpoint cannot be read.
         """
-        if self.workers.is_leader:
-            for leftover in self.folder.glob(".*.tmp"):  # from an interrupted write
-                leftover.unlink(missing_ok=True)
         if not self._checkpoint.exists():
             return
         self.step, history, tensors = read_checkpoint(self._checkpoint, self.config, self._material)
@@ -285,6 +281,8 @@ class TrainingRun:
         self.sampler.generator.set_state(tensors["random.sampler"])
         if self.workers.is_leader:
             torch.set_rng_state(tensors["random.torch"])
+            if self.device.type == "cuda" and "random.cuda" in tensors:  # not in older ones
+                torch.cuda.set_rng_state(tensors["random.cuda"], self.device)
         else:
             torch.manual_seed(self.config.seed + self.workers.rank + self.step)
 

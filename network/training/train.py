@@ -6,6 +6,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from stario.network.training.augment import WindowSampler
 from stario.network.training.config import TrainingConfig
 from stario.network.training.history import EpochReport
 from stario.network.training.legs import leg_samplers
+from stario.network.training.lock import exclusive
 from stario.network.training.parallel import workers
 from stario.network.training.result import write_result
 from stario.network.training.run import TrainingRun
@@ -70,13 +72,17 @@ def train(
     Raises:
         InputError: no stretch to learn from or to validate on, or the loss of a step is not
             finite. In the latter case the folder keeps the last epoch's checkpoint.
-        ConfigError: the checkpoint belongs to another recipe or other recordings, or the batch
-            cannot be divided evenly among the processes that the launcher started.
+        ConfigError: the checkpoint belongs to another recipe or other recordings, the batch
+            cannot be divided evenly among the processes that the launcher started, or another run
+            is training in the folder.
     """
     if not streams or not validation:
         fix = "positions and waypoints can only be learned alongside them" if legs else ""
         raise InputError("streams", "none", "stretches of at least 2 s with poses", fix)
-    with workers(config.device, config.batch // config.successive) as processes:
+    with (
+        workers(config.device, config.batch // config.successive) as processes,
+        exclusive(folder) if processes.is_leader else nullcontext(),
+    ):
         sampler = WindowSampler(
             streams, weights, config.augmentation, config.seed, config.successive
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import pickle
 from dataclasses import replace
 from functools import partial
@@ -25,7 +26,7 @@ from stario.fusion.table.summary import filled_cells, set_table
 from stario.fusion.table.training import ReaderConfig, cell_recipe
 from stario.network.architectures import ARCHITECTURES
 from stario.sequences.datasets.batch import Skipped
-from stario.sequences.errors import ConfigError, InputError
+from stario.sequences.errors import ConfigError, InputError, WeightsError
 from stario.sequences.readers import read_recording
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.sequence import ImuSequence, PositionTrack
@@ -64,7 +65,7 @@ def test_a_filled_cell_writes_model_errors_and_tracks(
     fill_cell(done, tmp_path, reading)
     folder = tmp_path / "own/StarIO/2-steps/seed-0"
     names = {"errors.json", "log.json", "model.json", "model.safetensors", "tracks.npz"}
-    assert {path.name for path in folder.iterdir()} == {*names, "trained.json"}
+    assert {path.name for path in folder.glob("[!.]*")} == {*names, "trained.json"}
     trained = json.loads((folder / "trained.json").read_text())
     assert (trained["steps"], trained["windows"]) == (2, 6)
     assert 0.0 < trained["step_seconds"] < trained["seconds"]
@@ -212,6 +213,23 @@ def test_results_belong_to_a_network_a_recipe_and_all_recordings_of_their_set(
     sets = [replace(dataset, **{part: ()}) for part in ("training", "validation", "test")]
     others = [*map(cell, sets), cell(dataset, "R-ResNet"), cell(dataset, seed=1)]
     assert len({cell(dataset).digest, *(other.digest for other in others)}) == 6
+
+
+def test_new_weights_or_changed_recordings_do_not_keep_old_results(
+    dataset: DataSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = Cell(dataset, "default", 0, None)
+    before = given.digest, cell(dataset).digest
+    with monkeypatch.context() as patch:
+        patch.setattr(cells_module, "_weights_sha256", lambda name: "new")
+        assert given.digest != before[0]
+        assert cell(dataset).digest == before[1]
+    os.utime(dataset.training[0])  # as if it were written again
+    assert (given.digest, cell(dataset).digest != before[1]) == (before[0], True)
+    os.utime(dataset.test[0].path)
+    assert given.digest != before[0]
+    with pytest.raises(WeightsError, match="no such file"):
+        _ = Cell(dataset, "missing", 0, None).digest
 
 
 def test_an_unknown_backend_is_refused() -> None:

@@ -74,6 +74,27 @@ def test_named_sources_get_their_shares_whatever_their_length() -> None:
         mix_sources(recorded, [], {"long.h5": 0.5, "short.h5": 0.5})
 
 
+@pytest.mark.parametrize(
+    ("source", "path"),
+    [
+        ("ridi", "/data/archives/ridi.h5:dan_body1"),
+        ("ridi.h5", "archives/ridi.h5:dan_body1"),
+        ("archives", "archives/ridi.h5:dan_body1"),
+        ("dan_body1", "archives/ridi.h5:dan_body1"),
+        ("ridi", "/data/ridi/dan.csv"),
+        ("ridi/dan", "/data/ridi/dan.csv"),
+        ("walk", "walk.csv"),
+    ],
+)
+def test_a_source_is_named_by_a_folder_an_archive_or_a_file(source: str, path: str) -> None:
+    """Not by a part of such a name: somebody's home may be called /home/ridi-user."""
+    other = RecordingStreams(Path("/home/ridi-user/walks/my-archives/x.csv"), [moving("z", 1.0)])
+    recorded = [RecordingStreams(Path(path), [moving("x", 1.0)]), other]
+    assert drawn_shares(mix_sources(recorded, [], {source: 0.2})) == pytest.approx(
+        {"x": 0.2, "z": 0.8}
+    )
+
+
 def test_the_share_of_an_absent_source_goes_to_the_other_recordings() -> None:
     recorded = [
         RecordingStreams(Path("a/ridi.h5:x"), [moving("x", 1.0)]),

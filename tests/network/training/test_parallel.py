@@ -10,7 +10,7 @@ import pytest
 import safetensors.torch
 import torch
 
-from stario.network.training.parallel import workers
+from stario.network.training.parallel import is_leader, workers
 from stario.sequences.errors import ConfigError
 
 SCRIPT = """
@@ -90,7 +90,35 @@ def test_without_a_launcher_the_only_process_is_the_leader() -> None:
         assert torch.equal(group.share(batch), batch)
 
 
+def launch(monkeypatch: pytest.MonkeyPatch, **variables: str) -> None:
+    for name in ("RANK", "WORLD_SIZE", "MASTER_ADDR"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+
+
 def test_a_batch_that_cannot_be_divided_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("WORLD_SIZE", "2")
+    launch(monkeypatch, RANK="0", WORLD_SIZE="2", MASTER_ADDR="localhost")
     with pytest.raises(ConfigError, match="7 for 2 processes"), workers("cpu", 7):
+        pass
+
+
+@pytest.mark.parametrize(
+    "variables", [{"WORLD_SIZE": "2"}, {"WORLD_SIZE": "two"}, {"RANK": "1", "WORLD_SIZE": "2"}]
+)
+def test_variables_of_a_job_scheduler_are_not_those_of_the_launcher(
+    monkeypatch: pytest.MonkeyPatch, variables: dict[str, str]
+) -> None:
+    launch(monkeypatch, **variables)
+    with workers("cpu", 7) as group:
+        assert (group.rank, group.count) == (0, 1)
+        assert is_leader()
+
+
+@pytest.mark.parametrize("count", ["two", "", "0", "-1"])
+def test_a_number_of_processes_that_is_none_is_refused(
+    monkeypatch: pytest.MonkeyPatch, count: str
+) -> None:
+    launch(monkeypatch, RANK="0", WORLD_SIZE=count, MASTER_ADDR="localhost")
+    with pytest.raises(ConfigError, match=r"WORLD_SIZE: found .*torchrun"), workers("cpu", 7):
         pass

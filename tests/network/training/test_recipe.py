@@ -59,6 +59,11 @@ def test_sigma_does_not_affect_the_gradient_of_the_mean() -> None:
         ({"seed": -1}, "seed"),
         ({"dropout": "no"}, "dropout"),
         ({"augmentation": {"speeds": 3}}, "augmentation.speeds"),
+        *(
+            ({"augmentation": {share: 1.1}}, f"augmentation.{share}")
+            for share in ("replayed", "swung", "mirrored", "any_yaw")
+        ),
+        ({"shares": {"simulated": True}}, "shares, simulated"),
         ({"augmentation": {"speeds": [1]}}, "augmentation.speeds"),
         ({"augmentation": {"speeds": ["slow", "fast"]}}, "augmentation.speeds"),
     ],
