@@ -72,8 +72,8 @@ class Health:
         text.append(f"gaps {self.gap_count}, longest {self.longest_gap:.2f} s")
         if self.updates:
             text.append(
-                f"updates {self.updates}, gated {self.gated / self.updates:.1%}, "
-                f"refused {_counted(self.refused)}, "
+                f"updates {self.updates}, outliers {self.gated / self.updates:.1%} "
+                f"(given less weight), refused {_counted(self.refused)}, "
                 f"mean NIS {self.mean_nis:.2f} (expected {self.nis_expected})"
             )
         else:
@@ -92,7 +92,7 @@ class Health:
             )
         if self.network_error_level != 1.0:
             level = math.sqrt(self.network_error_level)
-            text.append(f"network's errors within seconds {level:.1f} times their predicted sigma")
+            text.append(f"short-term errors of the network: {level:.1f} times the predicted sigma")
         sigma = ", ".join(f"{k} {v:.3g}" for k, v in self.final_sigma.items())
         return [*text, f"final sigma: {sigma}"]
 
