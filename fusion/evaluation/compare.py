@@ -76,7 +76,7 @@ METRIC_WORDS = {
     "ate_m": CONVENTIONS["ate_m"],
     "ate_fit_m": "ATE after a fit of yaw and position over all poses, which leaves errors in the "
     "track's shape and length only [m]",
-    **{key: CONVENTIONS[key] for key in ("rte_m", "pde", "aye_rad")},
+    **{key: CONVENTIONS[key] for key in ("rte_m", "pde", "aye_rad", "coverage")},
     "known_positions_m": "root mean square of the horizontal distance to positions or waypoints "
     "known without attitude, after a fit of yaw and position [m]",
     "nees_median": "median over time of the 3-D position's NEES, aligned as the track "

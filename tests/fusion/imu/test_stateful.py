@@ -9,6 +9,7 @@ from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.tracks import network_track_true_attitude
 from stario.fusion.imu.stateful import StatefulInference
 from stario.fusion.navigator import Navigator
+from stario.fusion.recording import cut_recording
 from stario.sequences.errors import InputError
 
 
@@ -109,10 +110,12 @@ class Walking:
 def test_slopes_and_missing_samples_make_displacements_less_certain(walk, without) -> None:
     """A floor of unknown slope (0.03) the height, missing samples all axes: sigma is doubled."""
     holed = without(walk, (walk.time > 6.0) & (walk.time < 6.1))
-    preprocessed = Navigator(Walking(), NavigatorConfig()).observe(holed)
-    pairs = zip(preprocessed.intervals, preprocessed.measurements, strict=True)
+    measurements = Navigator(Walking(), NavigatorConfig()).observe(holed).measurements
+    intervals, _ = cut_recording(holed, NavigatorConfig())
     known = [
-        (i.window.flagged, measured.covariance_N) for i, measured in pairs if measured is not None
+        (interval.window.flagged, measured.covariance_N)
+        for interval, measured in zip(intervals, measurements, strict=True)
+        if measured is not None
     ]
     assert {flagged for flagged, _ in known} == {True, False}
     for flagged, covariance in known:
