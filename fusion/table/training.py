@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
 from time import process_time
+from typing import Any
 
 from stario.fusion.table.sets import DataSet
 from stario.network.training.config import TrainingConfig, training_config
@@ -130,8 +131,10 @@ def train_cell(
 
 def _reports(log: Path) -> list[EpochReport]:
     """Return the reports of a run's epochs; in JSON, errors that are not finite are null."""
-    rows = json.loads(log.read_text(encoding="utf-8"))
-    return [EpochReport(**{k: math.nan if v is None else v for k, v in r.items()}) for r in rows]
+    rows: list[dict[str, Any]] = json.loads(log.read_text(encoding="utf-8"))
+    for row in rows:
+        row.update({name: math.nan for name, value in row.items() if value is None})
+    return [EpochReport(**row) for row in rows]
 
 
 def recipe_digest(recipe: TrainingConfig, dataset: DataSet) -> str:
