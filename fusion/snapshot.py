@@ -4,7 +4,8 @@ Format: an npz (a zip of arrays). Its member `tree` is the UTF-8 text, as bytes,
 which `{"array": k}` stands for the member `a<k>`, `{"tuple": [...]}` and
 `{"deque": [...], "maxlen": n}` for such sequences, `{"map": [[key, value], ...]}` for a
 dictionary whose keys are not strings, and `{"is": name, "has": {...}}` for an object of a class in
-`_PACKAGES` and `_MODULES`; NaN and infinity are written as NaN and Infinity. The tree contains
+`_PACKAGES` and `_MODULES`; NaN and infinity are written as NaN and Infinity. The member
+`sha256` is the checksum of all others. The tree contains
 
     format     "stario snapshot"
     version    version of this layout; others are refused
@@ -23,12 +24,14 @@ Arrays and numbers keep every bit, so the continued stream gives the same states
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import io
 import json
 import pkgutil
 import zipfile
 from collections import deque
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -36,7 +39,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 23
+FORMAT, VERSION = "stario snapshot", 24
 
 
 _PACKAGES = ("fusion.filter", "fusion.graph", "fusion.imu")
@@ -91,16 +94,25 @@ def pack(tree: dict[str, Any]) -> bytes:
 
     text = json.dumps(plain({"format": FORMAT, "version": VERSION, **tree}))
     members = {f"a{k}": array for k, array in arrays.values()}
+    members["tree"] = np.frombuffer(text.encode(), dtype=np.uint8)
     file = io.BytesIO()
-    np.savez(file, tree=np.frombuffer(text.encode(), dtype=np.uint8), **members)  # type: ignore[arg-type]
+    np.savez(file, sha256=_checksum(members), **members)  # type: ignore[arg-type]
     return file.getvalue()
+
+
+def _checksum(members: Mapping[str, np.ndarray[Any, Any]]) -> np.ndarray[Any, Any]:
+    """Return the SHA-256 of the names, types, shapes and values of arrays, (32,) bytes."""
+    digest = hashlib.sha256()
+    for name, array in sorted(members.items()):
+        digest.update(f"{name} {array.dtype.str} {array.shape} ".encode() + array.tobytes())
+    return np.frombuffer(digest.digest(), dtype=np.uint8)
 
 
 def unpack(data: bytes) -> dict[str, Any]:
     """Return the tree given to `pack`.
 
     Raises:
-        InputError: the bytes are not a snapshot, or one of another version.
+        InputError: the bytes are not a snapshot, one of another version, or edited or damaged.
     """
     if not isinstance(data, bytes | bytearray | memoryview):
         raise InputError("snapshot", type(data).__name__, f"bytes of a {FORMAT}")
@@ -114,6 +126,9 @@ def unpack(data: bytes) -> dict[str, Any]:
             raise ValueError(f"the format {tree['format']!r}")
         if tree["version"] != VERSION:
             raise InputError("snapshot: version", repr(tree["version"]), str(VERSION))
+        if not np.array_equal(arrays.pop("sha256"), _checksum(arrays)):
+            found, fix = "edited or damaged content", "use another snapshot or begin a new stream"
+            raise InputError("snapshot", found, "the bytes as they were written", fix)
         return {key: _whole(value, arrays) for key, value in tree.items()}
     except InputError:
         raise

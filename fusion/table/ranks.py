@@ -1,7 +1,8 @@
 """Ranks of networks and ratios of their errors, with intervals by a paired bootstrap.
 
-Every replicate draws the same recordings, and the same blocks of 30 s in each, for all networks, so
-that difficulty common to all of them cancels. Sets have equal weights and are not resampled.
+Every replicate draws the same groups (people, places), the same recordings in each and the same
+blocks of 30 s in these for all networks, so that difficulty common to all of them cancels. Sets
+have equal weights and are not resampled; the groups of a set have equal weights.
 """
 
 from __future__ import annotations
@@ -20,8 +21,11 @@ from stario.fusion.evaluation.judging.bootstrap import (
 )
 from stario.sequences.sequence import FloatArray
 
-Recordings = Mapping[tuple[str, str], FloatArray]
-"""(B, 2) sums of squares and counts per block, by a recording's set and name."""
+Recordings = Mapping[tuple[str, str, str], FloatArray]
+"""(B, 2) sums of squares and counts per block, by a recording's set, group and name."""
+
+Strata = Mapping[str, Mapping[str, Sequence[str]]]
+"""Names of recordings by set and group."""
 
 
 @dataclass(frozen=True)
@@ -72,36 +76,49 @@ def ranks(networks: Mapping[str, Sequence[Recordings]], against: str) -> dict[st
     return found
 
 
-def _common(networks: Mapping[str, Sequence[Recordings]]) -> dict[str, list[str]]:
-    """Return the names of the recordings that every network has errors on, by set."""
+def _common(networks: Mapping[str, Sequence[Recordings]]) -> Strata:
+    """Return the names of the recordings that every network has errors on, by set and group."""
     runs = [set(run) for seeds in networks.values() for run in seeds]
-    strata: dict[str, list[str]] = {}
-    for stratum, name in sorted(set.intersection(*runs)) if runs else []:
-        strata.setdefault(stratum, []).append(name)
+    strata: dict[str, dict[str, list[str]]] = {}
+    for stratum, group, name in sorted(set.intersection(*runs)) if runs else []:
+        strata.setdefault(stratum, {}).setdefault(group, []).append(name)
     return strata
 
 
-def _score(run: Recordings, common: Mapping[str, Sequence[str]]) -> float:
-    """Return the mean over sets of the mean log error over their recordings."""
+def _score(run: Recordings, common: Strata) -> float:
+    """Return the mean over sets, of the mean over groups, of the mean log error of recordings."""
     means = [
-        np.mean([_log_error(run[stratum, name].sum(axis=0)) for name in names])
-        for stratum, names in common.items()
-    ]
+        np.mean([
+            np.mean([_log_error(run[stratum, group, name].sum(axis=0)) for name in names])
+            for group, names in groups.items()
+        ])
+        for stratum, groups in common.items()
+    ]  # fmt: skip
     return float(np.mean(means))
 
 
-def _replicates(run: Recordings, common: Mapping[str, Sequence[str]]) -> FloatArray:
-    """Return the score of every replicate (R,); draws depend only on the recordings."""
+def _replicates(run: Recordings, common: Strata) -> FloatArray:
+    """Return the score of every replicate (R,); draws depend only on the recordings.
+
+    Seeds begin with their level: NumPy ignores zeros at the end, so [0, 0] and [0] are one seed.
+    """
     strata = []
-    for s, (stratum, names) in enumerate(common.items()):
-        errors = []
-        for k, name in enumerate(names):
-            value = run[stratum, name]
-            rng = np.random.default_rng([0, s, k])
-            rows = rng.integers(len(value), size=(REPLICATES, len(value)))
-            errors.append(_log_error(value[rows].sum(axis=1)))
-        strata.append(means_of_draws(np.stack(errors), np.random.default_rng([0, s])))
+    for s, (stratum, groups) in enumerate(common.items()):
+        means = []
+        for g, (group, names) in enumerate(groups.items()):
+            errors = [
+                _of_draws(run[stratum, group, name], np.random.default_rng([1, s, g, k]))
+                for k, name in enumerate(names)
+            ]
+            means.append(means_of_draws(np.stack(errors), np.random.default_rng([2, s, g])))
+        strata.append(means_of_draws(np.stack(means), np.random.default_rng([3, s])))
     return np.asarray(np.mean(strata, axis=0))
+
+
+def _of_draws(blocks: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return the log errors (R,) of a recording's blocks (B, 2) drawn with replacement."""
+    rows = rng.integers(len(blocks), size=(REPLICATES, len(blocks)))
+    return _log_error(blocks[rows].sum(axis=1))
 
 
 def _log_error(sums: FloatArray) -> FloatArray:

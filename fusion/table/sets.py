@@ -45,8 +45,8 @@ class DataSet:
         name: short name, also of its folder.
         training: recordings to train on.
         validation: recordings that select a run's epoch and calibrate sigma.
-        test: recordings that the table reports on, each with its group; where there are several
-            groups, each has the same weight.
+        test: recordings that the table reports on, each with its group, which begins with its
+            set; sets, and the groups of a set, have equal weights.
         words: description of the split.
     """
 
@@ -82,7 +82,7 @@ def development_sets(
     return [
         _combined(data, seed, per_group)
         if name == ALL
-        else _split(name, [entry for entry in recordings if _set_of(entry) in words], seed)
+        else _split(name, [entry for entry in recordings if set_of(entry) in words], seed)
         for name, (_, words) in _SETS.items()
         if chosen is None or name in chosen
     ]
@@ -110,7 +110,7 @@ def _split(name: str, recordings: Sequence[ListEntry], seed: int) -> DataSet:
         name,
         tuple(entry.path for entry in members(split.training)),
         tuple(entry.path for entry in members(split.validation)),
-        tuple(ListEntry(entry.path, _set_of(entry)) for entry in members(split.test)),
+        tuple(members(split.test)),
         f"random 8:1:1 split by recording, seed {seed}",
     )
 
@@ -125,28 +125,29 @@ def _combined(data: Path, seed: int, per_group: int) -> DataSet:
     outside, held_out = without_holdout(read_packaged_list("all", data), data)
     rng = np.random.default_rng(seed)
     validation = set()
-    for members in _by(outside, _set_of).values():
+    for members in _by(outside, set_of).values():
         walks = list(_by(members, _walk).values())
         count = max(1, round(_VALIDATION_SHARE * len(walks)))
         chosen = rng.permutation(len(walks))[:count]
         validation |= {entry.path for k in chosen for entry in walks[k]}
     test = [
-        ListEntry(entry.path, name)
-        for name, members in _by(held_out, lambda entry: entry.group).items()
+        entry
+        for members in _by(held_out, lambda entry: entry.group).values()
         for entry in _spread(members, per_group)
     ]
     return DataSet(
         ALL,
         tuple(entry.path for entry in outside if entry.path not in validation),
         tuple(entry.path for entry in outside if entry.path in validation),
-        tuple(ListEntry(entry.path, _set_of(entry)) for entry in test),
+        tuple(test),
         f"tested on people, devices and places of the list `holdout`, at most {per_group} "
         f"recordings of each; validated on a random {_VALIDATION_SHARE:.0%} of each set's other "
         f"walks, seed {seed}",
     )
 
 
-def _set_of(entry: ListEntry) -> str:
+def set_of(entry: ListEntry) -> str:
+    """Return the set that a recording belongs to: the first word of its group."""
     return entry.group.split(" ")[0]
 
 

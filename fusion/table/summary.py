@@ -13,7 +13,7 @@ from stario.fusion.evaluation.pedestrian import NAME as PDR
 from stario.fusion.evaluation.tables import EKF, OWN_ATTITUDE, TRUE_ATTITUDE
 from stario.fusion.table.cells import Cell, read_cell
 from stario.fusion.table.ranks import Rank, Recordings, ranks
-from stario.fusion.table.sets import DataSet
+from stario.fusion.table.sets import DataSet, set_of
 from stario.network.architectures import ARCHITECTURES
 
 REFERENCE_NETWORK = "StarIO"
@@ -145,7 +145,7 @@ def set_table(dataset: DataSet, filled: Filled, learned: Mapping[str, frozenset[
     contents = [content for seeds in filled.values() for content in seeds.values()]
     poses = all(recording["kind"] == "poses" for c in contents for recording in c["recordings"])
     measure = "ate" if poses else "10"
-    blocks = {name: _blocks(seeds, measure) for name, seeds in filled.items()}
+    blocks = {name: _blocks(seeds, measure, dataset) for name, seeds in filled.items()}
     known = {name: runs for name, runs in blocks.items() if all(runs)}
     network_ranks = ranks(known, REFERENCE_NETWORK)
     order = [name for name in [PDR, *ARCHITECTURES] if name in filled]
@@ -219,10 +219,11 @@ def _over_seeds(values: Sequence[float]) -> Mean | None:
     return Mean(float(np.mean(finite)), error)
 
 
-def _blocks(seeds: Mapping[int, Content], measure: str) -> list[Recordings]:
+def _blocks(seeds: Mapping[int, Content], measure: str, dataset: DataSet) -> list[Recordings]:
+    known = {str(entry.path): (set_of(entry), entry.group) for entry in dataset.test}
     return [
         {
-            (recording["group"], recording["path"]): np.array(recording["blocks"][measure])
+            (*known[recording["path"]], recording["path"]): np.array(recording["blocks"][measure])
             for recording in content["recordings"]
             if recording["blocks"].get(measure)
         }

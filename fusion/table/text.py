@@ -167,7 +167,8 @@ def _words() -> str:
         "stretches of 20 s, each fitted, in % of the path. Training and validation error: mean "
         "squared displacement error of windows [m^2] in the last epoch and in the best one, whose "
         "weights are kept (in validation, legs count in m^2/s). +-: standard error over training "
-        "seeds, for one split. Intervals (95 %): bootstrap over recordings and blocks of 30 s, "
+        "seeds, for one split. Ranks and ratios: equal weights of sets and of the groups (people, "
+        "places) in a set. Intervals (95 %): bootstrap over groups, recordings and blocks of 30 s, "
         "with the same draws for all networks; seeds are averaged."
     )
 

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
 from time import process_time
-from typing import Any, cast
+from typing import Any
 
 from stario.fusion.table.sets import DataSet
 from stario.network.training.config import TrainingConfig, training_config
@@ -132,8 +132,9 @@ def train_cell(
 def _reports(log: Path) -> list[EpochReport]:
     """Return the reports of a run's epochs; in JSON, errors that are not finite are null."""
     rows: list[dict[str, Any]] = json.loads(log.read_text(encoding="utf-8"))
-    finite = [{key: math.nan if v is None else v for key, v in row.items()} for row in rows]
-    return [EpochReport(**values) for values in cast("list[dict[str, Any]]", finite)]
+    for row in rows:
+        row.update({name: math.nan for name, value in row.items() if value is None})
+    return [EpochReport(**row) for row in rows]
 
 
 def recipe_digest(recipe: TrainingConfig, dataset: DataSet) -> str:

@@ -163,14 +163,57 @@ def test_bytes_that_are_not_a_snapshot_are_refused(walk: ImuSequence, still_mode
         np.testing.assert_array_equal(navigator.state.p_W, before)
 
 
+def edited(data: bytes, change: Callable[[dict[str, Any]], None]) -> bytes:
+    with np.load(io.BytesIO(data)) as file:
+        members = dict(file)
+    change(members)
+    changed = io.BytesIO()
+    np.savez(changed, **members)
+    return changed.getvalue()
+
+
+def test_an_edited_snapshot_is_refused_with_the_remedy(walk: ImuSequence, still_model: Any) -> None:
+    """Its structure is valid: it would be restored, and fail or give other states later."""
+    navigator = Navigator(still_model, CONFIG)
+    push(navigator, walk, 0.0, 3.0)
+    data, before = navigator.snapshot(), navigator.state.p_W
+
+    def change_a_value(members: dict[str, Any]) -> None:
+        name = next(name for name in members if members[name].dtype == np.float64)
+        members[name] = members[name] + 1.0
+
+    def change_a_shape(members: dict[str, Any]) -> None:
+        members["a0"] = members["a0"][..., None]
+
+    def change_a_type(members: dict[str, Any]) -> None:
+        name = next(name for name in members if members[name].dtype == np.float64)
+        members[name] = members[name].astype(np.float32)
+
+    def change_the_tree(members: dict[str, Any]) -> None:
+        text = members["tree"].tobytes().replace(b"false", b"true ", 1)
+        members["tree"] = np.frombuffer(text, dtype=np.uint8)
+
+    def drop_a_member(members: dict[str, Any]) -> None:
+        del members["a0"]
+
+    unchanged = edited(data, lambda members: None)
+    Navigator(still_model, CONFIG).restore(unchanged)
+    for change in (change_a_value, change_a_shape, change_a_type, change_the_tree, drop_a_member):
+        with pytest.raises(InputError, match=r"snapshot: found edited.*begin a new stream"):
+            navigator.restore(edited(data, change))
+        np.testing.assert_array_equal(navigator.state.p_W, before)
+
+
 def test_a_snapshot_of_another_version_is_refused(walk: ImuSequence, still_model: Any) -> None:
     navigator = Navigator(still_model, CONFIG)
     data = pack(unpack(navigator.snapshot()) | {"version": 1})
-    with pytest.raises(InputError, match=f"version: found 1, expected {VERSION}"):
-        navigator.restore(data)
+    without_checksum = edited(data, lambda members: members.pop("sha256"))
+    for other in (data, without_checksum):
+        with pytest.raises(InputError, match=f"version: found 1, expected {VERSION}"):
+            navigator.restore(other)
 
 
-LAYOUTS = {23: "1477703a"}
+LAYOUTS = {24: "1477703a"}
 """CRC of the classes and attributes in a snapshot, by version."""
 
 

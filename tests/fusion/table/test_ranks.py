@@ -8,20 +8,20 @@ import pytest
 from stario.fusion.table.ranks import ranks
 from stario.fusion.table.text import published
 
+Errors = dict[tuple[str, str, str], np.ndarray]
 
-def errors(scale: float, noise: float = 0.0, seed: int = 0) -> dict[tuple[str, str], np.ndarray]:
+
+def errors(scale: float, noise: float = 0.0, seed: int = 0) -> Errors:
     """Errors on twelve recordings of two sets, easy and hard, with noise of a network's own."""
     common, rng = np.random.default_rng(9), np.random.default_rng(seed)
     found = {}
     for k in range(12):
         sums = common.lognormal(0.0, 1.5, 6) * scale**2 * np.exp(noise * rng.standard_normal(6))
-        found[f"set {k % 2}", str(k)] = np.stack([sums, np.full(6, 1.0)], axis=1)
+        found[f"set {k % 2}", "", str(k)] = np.stack([sums, np.full(6, 1.0)], axis=1)
     return found
 
 
-def part(
-    errors: dict[tuple[str, str], np.ndarray], recordings: slice
-) -> dict[tuple[str, str], np.ndarray]:
+def part(errors: Errors, recordings: slice) -> Errors:
     return {key: errors[key] for key in list(errors)[recordings]}
 
 
@@ -57,6 +57,18 @@ def test_sets_have_equal_weights_however_many_recordings_they_have() -> None:
     found = ranks({"StarIO": [errors(1.0)], "other": [other]}, "StarIO")["other"].ratio
     assert found is not None
     assert found.ratio == pytest.approx(np.sqrt(8.0))
+
+
+def test_groups_are_drawn_before_their_recordings() -> None:
+    """A network that is worse with one of two people may be worse or equal with the next ones."""
+    keys = [
+        ("set", person, f"{person} {k}") for person, n in (("a", 9), ("b", 3)) for k in range(n)
+    ]
+    one = {key: np.ones((4, 2)) for key in keys}
+    other = {key: np.array([[4.0 if key[1] == "a" else 1.0, 1.0]] * 4) for key in keys}
+    found = ranks({"StarIO": [one], "other": [other]}, "StarIO")["other"].ratio
+    assert found is not None
+    assert (found.ratio, found.low, found.high) == pytest.approx((np.sqrt(2.0), 1.0, 2.0))
 
 
 def test_published_figures_are_found_by_set_and_network() -> None:
