@@ -115,12 +115,17 @@
   };
 
   const post = async (id, command, content = {}) => {
-    const answer = await fetch(`devices/${encodeURIComponent(id)}/${command}`, {
-      method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(content) });
-    const error = answer.ok ? "" : (await answer.json()).error;
-    const device = devices.get(id);
-    device.card.querySelector(".error").textContent = error;
-    device.card.querySelector(".error").hidden = !error;
+    let error = "";
+    try {
+      const answer = await fetch(`devices/${encodeURIComponent(id)}/${command}`, {
+        method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(content) });
+      const found = answer.ok ? {} : await answer.json().catch(() => ({}));
+      error = answer.ok ? "" : found.error || `the server answers with status ${answer.status}`;
+    } catch {
+      error = "no connection to the server";
+    }
+    const shown = devices.get(id)?.card.querySelector(".error");
+    if (shown) Object.assign(shown, { textContent: error, hidden: !error });
   };
 
   let tapping = null;
