@@ -29,8 +29,8 @@ class DisplayedTrack:
     """Displayed track of one device.
 
     Attributes:
-        points: thinned beyond `MAX_POINTS`.
-        revision: counter, incremented when earlier points change.
+        points: thinned beyond `MAX_POINTS`. A list that only grows: when earlier points change,
+            another takes its place, as viewers read it while a thread adds points.
         origin: (3,) position displayed as zero [m].
         map_frame: `NavState.map_frame` of the newest states.
         since: index of the first point that fixes still move; points before a gap in which the
@@ -38,7 +38,6 @@ class DisplayedTrack:
     """
 
     points: list[Point] = field(default_factory=list)
-    revision: int = 0
     origin: FloatArray = field(default_factory=lambda: np.zeros(3))
     map_frame: int = 0
     since: int = 0
@@ -51,7 +50,6 @@ class DisplayedTrack:
         self.points.append(point_of(state))
         if len(self.points) > MAX_POINTS:
             self.points, self.since = self.points[::2], self.since // 2
-            self.revision += 1
 
     def move(self, before: NavState, after: NavState) -> None:
         """Transform earlier points by the map-frame change that turned `before` into `after`."""
@@ -66,7 +64,6 @@ class DisplayedTrack:
         P = table[:, [6, 7, 7, 8]].reshape(-1, 2, 2)
         table[:, 6:9] = (R @ P @ R.T).reshape(-1, 4)[:, [0, 1, 3]]
         self.points = self.points[: self.since] + table.tolist()
-        self.revision += 1
         self.map_frame = after.map_frame
 
 

@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from stario.fusion.live.drawn import Point
 from stario.fusion.live.payload import Batch
 from stario.fusion.live.session import Session
 from stario.fusion.navigator import Navigator
@@ -18,6 +19,9 @@ from stario.sequences.errors import InputError
 
 MAX_DEVICES = 16
 """Maximum number of devices at once; further ones are refused to bound memory."""
+
+SILENT_SECONDS = 60.0
+"""Time without data after which a device makes room for another."""
 
 MAX_SENT = 3000
 """Maximum number of points of a device in one message, as to a new viewer."""
@@ -96,20 +100,31 @@ class Hub:
     def close(self) -> None:
         """Close all recordings."""
         for session in self.sessions.values():
-            try:
-                session.close()
-            except (OSError, InputError) as error:  # of pushes that still waited
-                _log.error("%s: the end of its recording is lost: %s", session.device, error)
+            _close(session)
 
     def _session(self, device: str) -> Session:
         if device not in self.sessions:
             if len(self.sessions) >= MAX_DEVICES:
-                raise InputError(
-                    "device", f"a new one, {device!r}", f"at most {MAX_DEVICES} devices at once"
-                )
+                self._make_room(device)
             self.sessions[device] = Session(device, self._folder, self._new_navigator)
             self._locks[device] = asyncio.Lock()
         return self.sessions[device]
+
+    def _make_room(self, device: str) -> None:
+        """Close the session that has been silent longest.
+
+        A stopped one that still sends stays: its next batch would start it again.
+        """
+        idle = [
+            session for name, session in self.sessions.items() if not self._locks[name].locked()
+        ]
+        oldest = min(idle, key=lambda session: session.received, default=None)
+        if oldest is None or time.time() - oldest.received < SILENT_SECONDS:
+            expected = f"at most {MAX_DEVICES} devices at once"
+            fix = f"one that sends nothing for {SILENT_SECONDS:g} s makes room"
+            raise InputError("device", f"a new one, {device!r}", expected, fix)
+        del self.sessions[oldest.device], self._locks[oldest.device]
+        _close(oldest)
 
 
 class Viewer:
@@ -121,7 +136,7 @@ class Viewer:
 
     def __init__(self, hub: Hub) -> None:
         self._hub = hub
-        self._sent: dict[str, tuple[int, int]] = {}
+        self._sent: dict[str, tuple[list[Point], int]] = {}
 
     def message(self) -> dict[str, Any]:
         """Return every device's status and its points since the last message.
@@ -130,13 +145,20 @@ class Viewer:
         """
         devices = []
         for device, session in list(self._hub.sessions.items()):
-            points, revision = session.drawn.points, session.drawn.revision
-            sent_revision, sent = self._sent.get(device, (-1, 0))
-            fresh = revision != sent_revision
+            points = session.drawn.points
+            earlier, sent = self._sent.get(device, ([], 0))
+            fresh = points is not earlier
             count = len(points)
             new = points[0 if fresh else sent : count]
             if len(new) > MAX_SENT:
                 new = [*new[: -1 : -(-len(new) // MAX_SENT)], new[-1]]
-            self._sent[device] = (revision, count)
+            self._sent[device] = (points, count)
             devices.append(session.status() | {"fresh": fresh, "points": new})
         return {"time": time.time(), "devices": devices, "refused": dict(self._hub.refused)}
+
+
+def _close(session: Session) -> None:
+    try:
+        session.close()
+    except (OSError, InputError) as error:  # of pushes that still waited
+        _log.error("%s: the end of its recording is lost: %s", session.device, error)

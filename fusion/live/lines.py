@@ -2,7 +2,9 @@
 
 Each line is one sample (see `payload`); a UDP packet holds one or several. An invalid line is
 answered with `{"error": ...}` over TCP and counted over UDP. If the server has a token, a TCP
-connection and each UDP packet must begin with the line `{"token": "..."}`.
+connection and each UDP packet must begin with the line `{"token": "..."}`. A connection whose first
+line is invalid is closed: any web page can make a browser send HTTP to this port, with lines of
+JSON as its body.
 """
 
 from __future__ import annotations
@@ -22,6 +24,9 @@ MAX_LINE = 64 * 1024
 """Maximum length of a line [bytes]."""
 
 MAX_CONNECTIONS = 32
+TOKEN_SECONDS = 10.0
+"""Time [s] within which a connection must send the token, if there is one."""
+
 MAX_WAITING = 2000
 """Maximum number of queued UDP packets; further ones are dropped and counted."""
 
@@ -53,7 +58,7 @@ class LineServer:
             OSError: the port is in use.
         """
         loop = asyncio.get_running_loop()
-        server = await asyncio.start_server(self._connected, host, port)
+        server = await asyncio.start_server(self._connected, host, port, limit=MAX_LINE)
         self.port = server.sockets[0].getsockname()[1]
         transport, _ = await loop.create_datagram_endpoint(
             lambda: _Packets(self._packets, self._hub), local_addr=(host, self.port)
@@ -67,13 +72,14 @@ class LineServer:
             server.close()
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self._connections >= MAX_CONNECTIONS:
-            writer.close()
-            return
         self._connections += 1
         sender = f"tcp {writer.get_extra_info('peername')[0]}"
         try:
-            await self._read(reader, writer, sender)
+            if self._connections > MAX_CONNECTIONS:
+                found, expected = "one more", f"at most {MAX_CONNECTIONS} at once"
+                await self._answer(writer, [str(InputError("connection", found, expected))])
+            else:
+                await self._read(reader, writer, sender)
         except ConnectionError as error:
             _log.info("%s: %s", sender, error)
         except asyncio.CancelledError:
@@ -85,21 +91,44 @@ class LineServer:
     async def _read(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, sender: str
     ) -> None:
-        rest, trusted = b"", not self._token
+        try:
+            first = await self._first_line(reader, sender)
+        except InputError as error:
+            await self._answer(writer, [str(error)])
+            return
+        await self._answer(writer, await self._take([first], sender))
+        rest = b""
         while data := await reader.read(MAX_LINE):
             *lines, rest = (rest + data).split(b"\n")
-            if lines and not trusted:
-                trusted = self._is_token(lines.pop(0))
-                if not trusted:
-                    await self._answer(writer, ["token: missing or wrong"])
-                    return
             errors = await self._take(lines, sender)
             if len(rest) > MAX_LINE:
                 errors.append(f"line: found a longer line, expected at most {MAX_LINE} bytes")
                 rest = b""
             await self._answer(writer, errors)
-        if trusted and rest.strip():
-            await self._take([rest], sender)
+        await self._answer(writer, await self._take([rest], sender))
+
+    async def _first_line(self, reader: asyncio.StreamReader, sender: str) -> bytes:
+        """Return a connection's first line; empty instead of the token.
+
+        Raises:
+            InputError: it is invalid, too long, or not the token.
+        """
+        try:
+            async with asyncio.timeout(TOKEN_SECONDS if self._token else None):
+                line = await reader.readuntil(b"\n")
+        except asyncio.IncompleteReadError as error:
+            line = error.partial  # the connection ends with it
+        except asyncio.LimitOverrunError:
+            raise InputError("line", "a longer line", f"at most {MAX_LINE} bytes") from None
+        except TimeoutError:
+            raise InputError("token", f"none for {TOKEN_SECONDS:g} s", "it at once") from None
+        if self._token and line:
+            if not self._is_token(line):
+                raise InputError("token", "none or another", 'the line {"token": "..."} first')
+            return b""
+        if line.strip():
+            parse_line(line, sender)
+        return line
 
     async def _answer(self, writer: asyncio.StreamWriter, errors: Sequence[str]) -> None:
         for error in errors:

@@ -115,12 +115,17 @@
   };
 
   const post = async (id, command, content = {}) => {
-    const answer = await fetch(`devices/${encodeURIComponent(id)}/${command}`, {
-      method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(content) });
-    const error = answer.ok ? "" : (await answer.json()).error;
-    const device = devices.get(id);
-    device.card.querySelector(".error").textContent = error;
-    device.card.querySelector(".error").hidden = !error;
+    let error = "";
+    try {
+      const answer = await fetch(`devices/${encodeURIComponent(id)}/${command}`, {
+        method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(content) });
+      const found = answer.ok ? {} : await answer.json().catch(() => ({}));
+      error = answer.ok ? "" : found.error || `the server answers with status ${answer.status}`;
+    } catch {
+      error = "no connection to the server";
+    }
+    const shown = devices.get(id)?.card.querySelector(".error");
+    if (shown) Object.assign(shown, { textContent: error, hidden: !error });
   };
 
   let tapping = null;
@@ -159,13 +164,14 @@
     return made;
   };
   const newDevice = (id) => {
-    const n = devices.size;
+    const used = new Set([...devices.values()].map((device) => device.n));
+    const n = [...Array(used.size + 1).keys()].find((k) => !used.has(k));
     const card = document.createElement("article");
     card.className = "device";
     card.dataset.device = id;
     card.innerHTML = '<h2><svg width="30" height="10" aria-hidden="true"></svg><span class="name"></span><span class="state"></span></h2>' +
       '<div class="figures"></div><ul class="words"></ul><div class="tools"></div><p class="error" hidden></p><p class="file"></p>';
-    const device = { id, label: id.length > 24 ? `${id.slice(0, 22)}..` : id, colour: COLOURS[n % COLOURS.length],
+    const device = { id, n, label: id.length > 24 ? `${id.slice(0, 22)}..` : id, colour: COLOURS[n % COLOURS.length],
       dash: DASHES[Math.floor(n / COLOURS.length + n) % DASHES.length], symbol: SYMBOLS[n % SYMBOLS.length], beside: BESIDE[n % BESIDE.length],
       points: [], origin: [0, 0, 0], received: 0, running: true, card };
     const strokes = { solid: "none", dash: "7 4", dot: "2 3", dashdot: "7 3 2 3" };
@@ -217,7 +223,15 @@
       `${device.file}: ${device.samples} samples${dropped ? `, dropped: ${dropped}` : ""}${device.fixes ? `, ${device.fixes} fixes` : ""}` : "";
   };
 
+  const remove = (id) => {
+    if (tapping === id) tap(null);
+    devices.get(id).card.remove();
+    devices.delete(id);
+  };
+
   const take = (message) => {
+    const known = new Set(message.devices.map((news) => news.id));
+    [...devices.keys()].filter((id) => !known.has(id)).forEach(remove);  // the server made room for others
     for (const news of message.devices) {
       const device = devices.get(news.id) || newDevice(news.id);
       const { id, fresh, points, ...status } = news;

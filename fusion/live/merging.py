@@ -20,6 +20,7 @@ from stario.fusion.live.payload import (
     LINEAR,
     MAG,
     ORIENTATION,
+    SENSORS,
     TOTAL,
     Reading,
     Vector,
@@ -114,7 +115,7 @@ class Merger:
     def __init__(self) -> None:
         self.upward = 0.0
         self._fields: list[Field] = []
-        self._newest: dict[str, int] = {}
+        self._newest = dict.fromkeys((*SENSORS, ORIENTATION), -1)
         self._field_late = 0
         self._waiting: list[Reading] = []
         self._gyro = ""
@@ -143,9 +144,9 @@ class Merger:
     @property
     def silent(self) -> str:
         """Sensor of the track whose samples ended `MAX_WAIT` before the newest; empty if none."""
-        end = max(self._newest.values(), default=0) - MAX_WAIT
-        sensors = (self._gyro, *self._accel)
-        return next((name for name in sensors if self._newest.get(name, end) < end), "")
+        end = max(self._newest.values()) - MAX_WAIT
+        sensors = (self._gyro, *self._accel) if self._gyro else ()
+        return next((name for name in sensors if self._newest[name] < end), "")
 
     def add(self, readings: Iterable[Reading]) -> list[Sample]:
         """Add readings as they arrive; return the samples they complete."""
@@ -171,7 +172,7 @@ class Merger:
     def _take(self, reading: Reading) -> None:
         sensor, time, value = reading.sensor, reading.time_ns, reading.value
         if sensor == MAG:
-            if time > self._newest.get(MAG, -1):
+            if time > self._newest[MAG]:
                 self._fields.append((time, value))
             else:
                 self._field_late += 1
@@ -181,7 +182,7 @@ class Merger:
             self._gravity.add(self._accel.index(sensor), time, value)
         elif sensor in self._accel:
             self._join.add(1, time, value)
-        self._newest[sensor] = max(time, self._newest.get(sensor, -1))
+        self._newest[sensor] = max(time, self._newest[sensor])
 
     def _best(self) -> tuple[str, tuple[str, ...]]:
         """Return the best gyroscope and accelerometer of the readings so far; empty if none."""

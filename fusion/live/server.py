@@ -76,7 +76,7 @@ def live_app(hub: Hub, token: str = "") -> Starlette:
             Route("/plotly.js", _plotly),
             Route("/events", _events),
             Route("/data", _data, methods=["POST"]),
-            Route("/devices/{device}/{command}", _command, methods=["POST"]),
+            Route("/devices/{device:path}/{command}", _command, methods=["POST"]),
         ],
         middleware=[guard],
         exception_handlers={StarioError: _bad_request, OSError: _storage_error},

@@ -47,7 +47,7 @@ class Session:
     def __init__(self, device: str, folder: Path, new_navigator: Callable[[], Navigator]) -> None:
         self.device = device
         self._folder, self._new_navigator = folder, new_navigator
-        self.drawn, self.received, self._factor = DisplayedTrack(), 0.0, 1.0
+        self.received, self._factor = 0.0, 1.0
         self._file: LiveFile | None = None
         self._order = PushOrder()
         self._previous, self._opened_ns = "", 0  # recording before this, start of this
@@ -66,7 +66,7 @@ class Session:
         self._navigator, self._file = self._new_navigator(), None
         self._first_ns = self._newest_ns = -1
         self._health_time = -math.inf
-        self.drawn = DisplayedTrack(revision=self.drawn.revision + 1)
+        self.drawn = DisplayedTrack()
         self._push_error = self._write_error = ""
         self.words: list[dict[str, str]] = []
         self._unwritten: tuple[list[Sample], list[Field]] = [], []
@@ -166,7 +166,6 @@ class Session:
             InputError: there is no position yet.
         """
         self.drawn.origin = self._state().p_W.copy()
-        self.drawn.revision += 1
 
     def fix(self, x: float, y: float, sigma: float) -> None:
         """Apply a fix at x, y of the displayed map [m] with sigma [m]; the height is left free.

@@ -90,6 +90,29 @@ def test_buttons_for_zero_place_and_stop_reach_the_server(show, server, replay):
     assert shown.problems == []
 
 
+def test_a_command_without_an_answer_is_shown_and_any_name_can_be_commanded(show, server, replay):
+    url = f"http://127.0.0.1:{server.port}"
+    replay(demonstration(), f"{url}/data", 10.0, 4.0, "dora/2")
+    shown = show(url)
+    card = shown.page.locator("[data-device='dora/2']")
+    for answer, words in (
+        (lambda route: route.fulfill(status=404, body="Not Found"), "status 404"),
+        (lambda route: route.abort(), "no connection"),
+    ):
+        shown.page.route("**/stop", answer)
+        card.get_by_text("Stop").click()
+        card.locator(".error", has_text=words).wait_for()
+        shown.page.unroute("**/stop")
+    card.get_by_text("Stop").click()
+    shown.page.wait_for_function("() => !window.stario.devices.get('dora/2').running")
+    assert not server.hub.sessions["dora/2"].running
+    card.locator(".error").wait_for(state="hidden")
+    expected = ("Failed to load resource", "failed: ")  # both are the browser's own
+    assert all(problem.startswith(expected) for problem in shown.problems)
+    server.hub.sessions.pop("dora/2").close()  # as when it makes room for another
+    card.wait_for(state="detached")
+
+
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
 def test_page_of_a_server_that_requires_a_token_loads_with_it(show, tmp_path, size):
     server = LiveServer(lambda: None, tmp_path, host="0.0.0.0", port=0, lines_port=0)

@@ -1,5 +1,7 @@
 """Points of a drawn track: their values, and how a change of the map frame moves them."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -49,3 +51,22 @@ def test_a_new_viewer_gets_no_more_points_than_a_message_may_hold(hub, pushes, m
     assert min(len(points), most) / 2 < len(device["points"]) <= most + 1
     assert (device["points"][0], device["points"][-1]) == (points[0], points[-1])
     assert session.status()["rate"] == pytest.approx(100.0, rel=0.02)
+
+
+def test_points_that_a_thread_moves_while_they_are_read_are_sent_again(hub):
+    class Moving:
+        """A track that moves right after its points are first read."""
+
+        def __init__(self):
+            self.lists, self.revision = [[[1.0]], [[2.0]]], 0
+
+        @property
+        def points(self):
+            self.revision = 1
+            return self.lists.pop(0) if len(self.lists) > 1 else self.lists[0]
+
+    hub.sessions["phone"] = SimpleNamespace(drawn=Moving(), status=dict, close=lambda: None)
+    viewer = Viewer(hub)
+    messages = [viewer.message()["devices"][0] for _ in range(3)]
+    assert [message["points"] for message in messages] == [[[1.0]], [[2.0]], []]
+    assert [message["fresh"] for message in messages] == [True, True, False]

@@ -6,7 +6,10 @@ import time
 import urllib.request
 
 import numpy as np
+import pytest
 
+from stario.fusion.live import lines as lines_module
+from stario.fusion.live.lines import MAX_LINE
 from stario.fusion.live.run import LiveServer, is_loopback
 from stario.sequences import read_recording
 
@@ -63,6 +66,45 @@ def test_lines_without_the_token_are_refused(serve, walk):
             assert b"token" in device.makefile("rb").readline()
     with socket.create_connection(("127.0.0.1", server.lines_port)) as device:
         device.sendall(b'{"token": "secret"}\n' + b"".join(lines))
+        wait_for(lambda: samples(server, "d") == 100)
+
+
+REQUEST = b"POST /%s HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: text/plain\r\n\r\n"
+
+
+@pytest.mark.parametrize("path", [b"", b"a" * (MAX_LINE + 9)], ids=["short", "longer than a line"])
+def test_a_request_that_a_web_page_sends_by_a_browser_is_refused(serve, walk, path):
+    server = serve()
+    with socket.create_connection(("127.0.0.1", server.lines_port)) as browser:
+        browser.sendall(REQUEST % path + b"".join(lines_of(walk, 100)))
+        browser.settimeout(20.0)
+        received = b""
+        try:
+            while data := browser.recv(4096):
+                received += data
+        except ConnectionResetError:  # it sent more than was read
+            pass
+    assert received.count(b"error") <= 1
+    assert server.hub.refused["tcp"] == 1
+    assert server.hub.sessions == {}
+
+
+def test_idle_connections_without_the_token_are_closed_and_one_too_many_is_told(
+    serve, walk, monkeypatch
+):
+    monkeypatch.setattr(lines_module, "TOKEN_SECONDS", 0.5)
+    monkeypatch.setattr(lines_module, "MAX_CONNECTIONS", 2)
+    server = serve(token="secret")
+    address = ("127.0.0.1", server.lines_port)
+    idle = [socket.create_connection(address) for _ in range(2)]
+    with socket.create_connection(address) as third:
+        assert b"at most 2 at once" in third.makefile("rb").readline()
+    for connection in idle:
+        assert b"token" in connection.makefile("rb").readline()
+        connection.close()
+    wait_for(lambda: server._lines._connections == 0)
+    with socket.create_connection(address) as device:
+        device.sendall(b'{"token": "secret"}\n' + b"".join(lines_of(walk, 100, device="d")))
         wait_for(lambda: samples(server, "d") == 100)
 
 

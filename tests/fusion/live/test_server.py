@@ -114,6 +114,12 @@ def test_stop_ignores_samples_and_start_begins_a_new_track(client, hub, pushes):
     assert session.samples == 280
 
 
+def test_a_device_with_a_slash_in_its_name_can_be_stopped(client, hub, pushes):
+    send(client, pushes(device="a/b", seconds=1.0))
+    assert command(client, "a%2Fb", "stop").json() == {"done": "stop"}
+    assert not hub.sessions["a/b"].running
+
+
 def test_zero_moves_the_drawn_origin_and_not_the_estimate(client, hub, pushes, new_navigator):
     bodies = pushes(seconds=8.0)
     send(client, bodies[:30])
@@ -318,7 +324,6 @@ def test_long_tracks_are_thinned_so_that_memory_stays_small(hub, new_navigator, 
         if state is not None:
             drawn.add(state)
             assert len(drawn.points) <= 50
-    assert drawn.revision >= 1
     assert drawn.points[-1][0] == pytest.approx(navigator.state.time)
 
 
