@@ -62,10 +62,11 @@ def compare(
         refuse_unused(changed(reading), "without PATH", "use with a recording to read")
     if report:
         optional_package("plotly", "report")
-    settings, model = estimating.settings(), estimating.network_for(jobs)
+    settings, network = estimating.settings(), estimating.network()
+    model = estimating.for_processes(network, jobs)
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
     files, skipped = reading.recordings(paths or [])
-    origin = origin_of(BACKENDS, files, reading, estimating, fixes)
+    origin = origin_of(BACKENDS, files, reading, estimating, network, fixes)
     read: Callable[[Path], ImuSequence] = reading.read
     if not paths:
         typer.echo("demonstration: a simulated walk not used in training", err=True)

@@ -166,8 +166,9 @@ def _tracks(
     from stario.fusion.evaluation.summary import Scores, scores_of, summary, summary_table
     from stario.sequences.datasets.batch import without_skipped
 
-    settings, model = estimating.settings(), estimating.network_for(jobs)
-    origin = origin_of(BACKENDS, files, reading, estimating)
+    settings, network = estimating.settings(), estimating.network()
+    model = estimating.for_processes(network, jobs)
+    origin = origin_of(BACKENDS, files, reading, estimating, network)
     skipped: list[Skipped] = []
     recordings: list[Scores] = []
     with progress_bar("evaluate", 100 * len(files)) as progress:

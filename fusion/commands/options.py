@@ -208,9 +208,8 @@ class EstimatorOptions:
 
         return load_model(self.model)
 
-    def network_for(self, jobs: int) -> DisplacementModel | str:
+    def for_processes(self, network: DisplacementModel, jobs: int) -> DisplacementModel | str:
         """Return the network, or for several processes its name: each loads the weights once."""
-        network = self.network()  # fails at once if the weights cannot be loaded
         return network if jobs == 1 else self.model
 
 

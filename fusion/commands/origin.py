@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from stario.fusion.commands.options import EstimatorOptions, ReadingOptions
+
+if TYPE_CHECKING:
+    from stario.network.model import DisplacementModel
 
 
 def origin_of(
@@ -16,6 +19,7 @@ def origin_of(
     paths: Sequence[Path],
     reading: ReadingOptions,
     estimating: EstimatorOptions,
+    network: DisplacementModel,
     fixes: Path | None = None,
 ) -> dict[str, object]:
     """Return the content of `run.json`; the settings are in `config.json`.
@@ -25,14 +29,17 @@ def origin_of(
         paths: recordings, or the folders or list files that were given.
         reading: options for reading recordings; those that differ from the defaults are named.
         estimating: options of the estimator.
+        network: the network that they name.
         fixes: file of absolute fixes.
     """
+    from importlib.metadata import version
+
     default = asdict(ReadingOptions())
     return {
         "stario": version("stario"),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "model": estimating.model,
-        "weights_sha256": estimating.network().card.sha256 or None,
+        "weights_sha256": network.card.sha256 or None,
         "backends": list(backends),
         "inputs": [str(path.absolute()) for path in paths],
         "reading": {k: v for k, v in asdict(reading).items() if v != default[k]},

@@ -55,14 +55,15 @@ def run(
     if view:
         optional_package("rerun", "view")
     chosen = backend_named(backend)
-    navigator = Navigator(estimating.network(), estimating.settings(), backend=chosen)
+    network = estimating.network()
+    navigator = Navigator(network, estimating.settings(), backend=chosen)
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
     words: dict[str, str] = {}
     work = partial(
         _run,
         navigator=navigator,
         fixes=absolute_fixes,
-        origin=origin_of([chosen], paths, reading, estimating, fixes),
+        origin=origin_of([chosen], paths, reading, estimating, network, fixes),
         report=report,
         view=view,
         words=words,

@@ -297,7 +297,8 @@ def test_run_compare_and_evaluate_state_what_produced_their_results(
 
 def test_what_produced_a_run_names_fixes_and_changed_reading_options(tmp_path: Path) -> None:
     reading = ReadingOptions(gyro_unit="deg/s", where=["person=dan"])
-    origin = origin_of(["graph"], [], reading, EstimatorOptions(), tmp_path / "fixes.csv")
+    estimating, fixes = EstimatorOptions(), tmp_path / "fixes.csv"
+    origin = origin_of(["graph"], [], reading, estimating, estimating.network(), fixes)
     assert origin["reading"] == {"gyro_unit": "deg/s", "where": ["person=dan"]}
     assert origin["fixes"] == str(tmp_path / "fixes.csv")
 
