@@ -164,7 +164,6 @@ def track_recording(
             f"this navigator's {config.filter.update_rate}",
             "observe with the same update rate",
         )
-    check_type("fixes", fixes, Iterable, "a list of them")
     began = perf_counter()
     queue = FixQueue(fixes, most=math.inf)  # all fixes of a recording are known from the start
     filtered = _filtered(recording, config, prior, queue, progress)

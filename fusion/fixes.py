@@ -129,12 +129,8 @@ def fix_list(fixes: Iterable[Fix]) -> list[Fix]:
     check_type("fixes", fixes, Iterable, "a list of them")
     listed = list(fixes)
     for fix in listed:
-        _check_fix(fix)
+        check_type("fixes", fix, Fix, "position_fix, velocity_fix and yaw_fix create one")
     return listed
-
-
-def _check_fix(fix: object) -> None:
-    check_type("fixes", fix, Fix, "position_fix, velocity_fix and yaw_fix create one")
 
 
 def by_time(fix: Fix) -> tuple[float, str]:
@@ -158,12 +154,11 @@ class FixQueue:
         self._most = most
         self.waiting: list[Fix] = []
         self.refused: dict[str, int] = {}
-        for fix in fixes:
+        for fix in fix_list(fixes):
             self.add(fix)
 
     def add(self, fix: Fix) -> FixOutcome:
         """Keep a fix until it is due; invalid ones are refused and counted."""
-        _check_fix(fix)
         if reason := fix.fault():
             self.refuse(reason)
             return "refused"
