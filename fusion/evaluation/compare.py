@@ -20,13 +20,7 @@ from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.recording import Progress, silent
 from stario.fusion.state import Track
-from stario.sequences.accuracy.metrics import (
-    CONVENTIONS,
-    Alignment,
-    align,
-    evaluate_track,
-    pose_errors,
-)
+from stario.sequences.accuracy.metrics import CONVENTIONS, Alignment, align, evaluate_track
 from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
@@ -94,6 +88,9 @@ RECORDING_WORDS = {
     "path_m": CONVENTIONS["path_m"],
 }
 """Meaning of a recording's figures in the `metrics.json` of several."""
+
+FULL_COVERAGE = 0.98
+"""Share of a track below which the coverage by ground truth is reported as partial."""
 
 MIN_COMPARED_S = 10.0
 """Compared time [s] below which there is no RTE, which would be an extrapolation to a minute."""
@@ -201,16 +198,15 @@ def measured(
 
     If the truth is known at no time of the tracks, they are those of a recording without any.
     """
-    if sequence.truth is not None:
-        try:
-            for track in tracks.values():
-                pose_errors(track.trajectory, sequence.truth)
-        except InputError as error:
-            log.warning("%s: no errors are computed: %s", sequence.name, error)
-            sequence = replace(sequence, truth=None)
     # Where fixes define the frame, the first pose's yaw is the least certain one.
     alignment: Alignment = "yaw" if fixes else "first"
-    metrics = {name: measure(track, sequence, alignment) for name, track in tracks.items()}
+    try:
+        metrics = {name: measure(track, sequence, alignment) for name, track in tracks.items()}
+    except InputError as error:
+        if sequence.truth is None:
+            raise
+        log.warning("%s: no errors are computed: %s", sequence.name, error)
+        return measured(replace(sequence, truth=None), tracks, fixes)
     return Comparison(sequence, tracks, metrics, alignment)
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.fusion.evaluation.compare import (
+    FULL_COVERAGE,
     METRIC_WORDS,
     METRICS,
     RECORDING_WORDS,
@@ -32,9 +33,9 @@ _COLUMNS = (
 )
 
 
-_FULL_COVERAGE, _MIN_COVERAGE = 0.98, 0.5
-"""Share of a track at which the truth is known below which the table says so, and below which the
-recording does not count in medians and means."""
+_MIN_COVERAGE = 0.5
+"""Share of a track at which the truth is known below which a recording does not count in medians
+and means."""
 
 
 @dataclass(frozen=True)
@@ -73,11 +74,12 @@ def summary(recordings: Sequence[Scores]) -> dict[str, object]:
     """
     records = {scores.name: scores.record for scores in recordings}
     metrics = [metric for metric in METRICS if not metric.startswith("seconds_")]
+    counted = _counted(recordings)
     over = {
         track: {
             metric: {"median": float(np.median(values)), "mean": float(np.mean(values))}
             for metric in metrics
-            if len(values := _known_values(_counted(recordings), track, metric))
+            if len(values := _known_values(counted, track, metric))
         }
         for track in TRACKS
     }
@@ -114,7 +116,7 @@ def summary_table(recordings: Sequence[Scores]) -> str:
 
 def _name_with_coverage(scores: Scores) -> str:
     share = scores.coverage
-    return scores.name + (f" (truth of {share:.0%})" if share < _FULL_COVERAGE else "")
+    return scores.name + (f" (truth of {share:.0%})" if share < FULL_COVERAGE else "")
 
 
 def _counted(recordings: Sequence[Scores]) -> list[Scores]:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from stario.fusion.evaluation.compare import METRIC_TITLES, Comparison
+from stario.fusion.evaluation.compare import FULL_COVERAGE, METRIC_TITLES, Comparison
 from stario.sequences.drawing.text_table import aligned, figure
-
-_FULL_COVERAGE = 0.98
-"""Share of a track below which the coverage by ground truth is reported as partial."""
 
 _UNTRACKED = 1.5
 """Time at a recording's ends without a track [s] below which all of it counts as tracked: a track
@@ -29,7 +26,7 @@ def track_table(found: Comparison) -> str:
     if truth is None:
         return "\n".join(lines)
     covered = float(truth.covers(found.tracks[found.main].time).mean())
-    if covered < _FULL_COVERAGE:
+    if covered < FULL_COVERAGE:
         lines.append(f"The truth covers {covered:.0%} of the track; metrics refer to that part.")
     return "\n".join(lines)
 
