@@ -9,8 +9,9 @@ import math
 import os
 import secrets
 import shutil
+import time
 from collections.abc import Container, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import IO, Any, Literal
@@ -118,6 +119,20 @@ def _temporary(path: Path, kind: str) -> Iterator[Path]:
         found = f"{path}: {error.strerror or error}"
         fix = "choose another folder, fix its permissions or free disk space"
         raise InputError("path", found, "a writable location", fix) from error
+
+
+def remove_abandoned(folder: Path, seconds: float, name: str = "*") -> None:
+    """Remove temporary files that killed writers have left; younger ones may be in use.
+
+    Args:
+        folder: the folder of the files that were to be written.
+        seconds: age from which a temporary file counts as left behind [s].
+        name: name of the file that was to be written, or a pattern.
+    """
+    for temporary in folder.glob(f".{name}.*.tmp"):
+        with suppress(FileNotFoundError):  # its writer has just finished
+            if time.time() - temporary.stat().st_mtime > seconds:
+                temporary.unlink()
 
 
 def unused_name(name: str, taken: Container[str]) -> str:

@@ -23,7 +23,7 @@ from stario.fusion.table.training import (
     TEMPORARY_FILES,
     ReaderConfig,
     recipe_digest,
-    recording_stamps,
+    recording_state,
     train_cell,
 )
 from stario.network.architectures import ARCHITECTURES
@@ -65,7 +65,7 @@ class Cell:
     @property
     def digest(self) -> str:
         """Digest of everything that its results depend on except the code."""
-        test = [recording_stamps(entry.path) for entry in self.dataset.test]
+        test = [recording_state(entry.path) for entry in self.dataset.test]
         if self.recipe is None:
             learned = "" if self.network == PDR else _weights_sha256(self.network)
         else:

@@ -23,7 +23,7 @@ from stario.network.training.data import (
 from stario.network.training.history import EpochReport, History
 from stario.network.training.train import train
 from stario.sequences.datasets.batch import Skipped
-from stario.sequences.datasets.cache_files import recording_files
+from stario.sequences.datasets.cache_files import recording_stamps
 from stario.sequences.datasets.stream_cache import recorded
 from stario.sequences.files import write_json
 from stario.sequences.sequence import ImuSequence
@@ -141,18 +141,14 @@ def recipe_digest(recipe: TrainingConfig, dataset: DataSet) -> str:
     """Return the digest of everything that a cell's training depends on except the code."""
     inputs = [
         asdict(recipe),
-        [[*map(recording_stamps, part)] for part in (dataset.training, dataset.validation)],
+        [[*map(recording_state, part)] for part in (dataset.training, dataset.validation)],
     ]
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
 
 
-def recording_stamps(path: Path) -> list[object]:
-    """Return a recording's path, and name, size and modification time [ns] of each of its files.
-
-    They tell that it has changed, as in the cache of windows, without reading it.
-    """
-    stats = [(file.name, file.stat()) for file in recording_files(path)]
-    return [str(path), *((name, stat.st_size, stat.st_mtime_ns) for name, stat in stats)]
+def recording_state(path: Path) -> list[object]:
+    """Return a recording's path and the stamps of its files, which tell that it has changed."""
+    return [str(path), *recording_stamps(path)]
 
 
 @lru_cache(maxsize=2)  # training and validation part of the set that cells are filled for

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import errno
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
 from stario.sequences.errors import ConfigError, InputError
+from stario.sequences.files import remove_abandoned
 
 LOCK_FILE = ".lock"
 """Stays in the folder: removing it could let two runs lock two files of that name."""
 
 _ABANDONED_S = 600.0
+"""Age of temporary files that are removed [s]: without locks, younger ones may be in use."""
 _TAKEN = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
 
 
@@ -38,7 +39,7 @@ def exclusive(folder: Path) -> Iterator[None]:
         raise InputError("folder", found, "a writable folder", "choose another (--out)") from error
     with file:
         _lock(file, folder)
-        _remove_abandoned(folder)
+        remove_abandoned(folder, _ABANDONED_S)
         yield
 
 
@@ -58,11 +59,3 @@ def _lock(file: IO[bytes], folder: Path) -> None:
             "a folder for this run alone",
             "wait for that run or train into another folder (--out)",
         ) from error
-
-
-def _remove_abandoned(folder: Path) -> None:
-    """Remove old temporary files; a young one may be in use where there are no locks."""
-    for temporary in folder.glob(".*.tmp"):
-        with suppress(FileNotFoundError):
-            if time.time() - temporary.stat().st_mtime > _ABANDONED_S:
-                temporary.unlink()

@@ -56,13 +56,17 @@ def cache_file(folder: Path, key: Mapping[str, object], suffix: str) -> Path:
 
 def recording_file(folder: Path, path: Path, options: Mapping[str, object], suffix: str) -> Path:
     """Return the file of a recording; the options are all else that its content depends on."""
-    stamps = [
+    key = {"path": str(path.resolve()), "files": recording_stamps(path), "options": options}
+    return cache_file(folder, key, suffix)
+
+
+def recording_stamps(path: Path) -> list[tuple[str, int, int]]:
+    """Return name, size and modification time [ns] of a recording's files: they tell changes."""
+    return [
         (str(file), stat.st_size, stat.st_mtime_ns)
         for file in recording_files(path)
         for stat in (file.stat(),)
     ]
-    key = {"path": str(path.resolve()), "files": stamps, "options": options}
-    return cache_file(folder, key, suffix)
 
 
 def remove_unused(folder: Path) -> None:

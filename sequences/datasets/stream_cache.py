@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import logging
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -29,7 +28,7 @@ from stario.sequences.datasets.cache_files import (
     remove_unused,
 )
 from stario.sequences.errors import InputError, StarioError
-from stario.sequences.files import atomic_write
+from stario.sequences.files import atomic_write, remove_abandoned
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.legs import LegStream, leg_streams
 from stario.sequences.readers.archive import split_name
@@ -168,7 +167,7 @@ def _written(file: Path, streams: Sequence[Stream]) -> bool:
     )
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        _sweep(file)
+        remove_abandoned(file.parent, _ABANDONED_S, file.name)
         remove_unused(file.parent)
         with atomic_write(file, "wb") as target:
             target.write(content)
@@ -176,14 +175,6 @@ def _written(file: Path, streams: Sequence[Stream]) -> bool:
         log.warning("%s: windows are not kept for the next run: %s", file.parent, error)
         return False
     return True
-
-
-def _sweep(file: Path) -> None:
-    """Remove temporary files that killed writers of this file have left."""
-    for abandoned in file.parent.glob(f".{file.name}.*.tmp"):
-        with suppress(FileNotFoundError):  # its writer has just finished
-            if time.time() - abandoned.stat().st_mtime > _ABANDONED_S:
-                abandoned.unlink()
 
 
 def _opened(file: Path) -> list[Stream] | None:
