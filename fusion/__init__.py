@@ -2,4 +2,4 @@
 
 from stario.sequences.lazy import public_names
 
-__all__, __getattr__ = public_names("stario.fusion")
+__all__, __getattr__, __dir__ = public_names("stario.fusion")

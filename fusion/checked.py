@@ -38,6 +38,8 @@ def shaped(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
 def seconds(time: float) -> float:
     """Return a time [s] as a float; `InputError` if it is not a number."""
     try:
+        if isinstance(time, str):
+            raise ValueError
         return float(time)
     except (TypeError, ValueError, OverflowError):
         raise InputError("time", shown(time), "a number of seconds") from None
@@ -46,8 +48,8 @@ def seconds(time: float) -> float:
 def three(name: str, value: Vector) -> tuple[float, float, float]:
     """Return the three numbers of a vector; `InputError` if it holds anything else."""
     try:
-        if getattr(value, "shape", (3,)) != (3,):  # a table would yield its columns' names
-            raise ValueError
+        if isinstance(value, str | bytes) or getattr(value, "shape", (3,)) != (3,):
+            raise ValueError  # "123" would be 1, 2, 3; a table yields its columns' names
         x, y, z = map(float, value)
     except (TypeError, ValueError, OverflowError):
         raise InputError(name, shown(value), "three numbers in body axes") from None

@@ -108,6 +108,17 @@ def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
         raise InputError(name, shown(value), f"one of {', '.join(known)}")
 
 
+def generator(seed: int, *stream: int) -> np.random.Generator:
+    """Return the random generator of a seed, one of its own for each `stream`.
+
+    Raises:
+        InputError: the seed is not an integer >= 0.
+    """
+    if not (isinstance(seed, int | np.integer) and seed >= 0):
+        raise InputError("seed", shown(seed), "an integer >= 0")
+    return np.random.default_rng([int(seed), *stream] if stream else int(seed))
+
+
 def shown(value: object) -> str:
     """Return a value as text for an error's single line."""
     return f"{' '.join(repr(value).split()):.60}"

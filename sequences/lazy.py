@@ -16,10 +16,11 @@ from typing import Any
 from stario.sequences.errors import MissingPackageError
 
 
-def public_names(package: str) -> tuple[list[str], Callable[[str], Any]]:
-    """Return a package's `__all__` and its `__getattr__` (PEP 562), which imports on first use.
+def public_names(package: str) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
+    """Return a package's `__all__`, `__getattr__`, which imports on first use, and `__dir__`.
 
-    The names are those that the package's stub, `__init__.pyi`, imports for type checkers.
+    The names are those that the package's stub, `__init__.pyi`, imports for type checkers. Without
+    `__dir__`, completion in a shell would show none of them before its first use (PEP 562).
     """
     module = sys.modules[package]
     stub = Path(str(module.__file__)).with_suffix(".pyi").read_text(encoding="utf-8")
@@ -33,7 +34,8 @@ def public_names(package: str) -> tuple[list[str], Callable[[str], Any]]:
         setattr(module, name, value)
         return value
 
-    return sorted(sources), attribute
+    names = sorted(sources)
+    return names, attribute, lambda: names
 
 
 def optional_package(name: str, extra: str) -> Any:

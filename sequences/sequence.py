@@ -207,6 +207,7 @@ class ImuSequence:
     maybe_apple: bool = False
 
     def __post_init__(self) -> None:
+        check_type("name", self.name, str, 'such as ImuSequence("walk", time, gyro, accel)')
         for name, kind in _PARTS.items():
             remedy = f"create one with {kind.__name__}(...)"
             check_type(name, getattr(self, name), kind, remedy, optional=True)

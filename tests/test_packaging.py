@@ -34,6 +34,7 @@ def test_readme_names_every_public_name_and_each_can_be_imported(package):
     for name in module.__all__:
         assert getattr(module, name) is not None
         assert re.search(rf"`{name}\b", text), name
+    assert dir(module) == module.__all__
 
 
 def test_what_public_functions_return_is_public_too():

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import check_type
+from stario.sequences.arrays import check_type, generator
 from stario.sequences.errors import InputError
 from stario.sequences.noise import PHONE_NOISE, ImuNoise
 from stario.sequences.sequence import (
@@ -125,7 +125,7 @@ def simulate_imu(
 
     Raises:
         InputError: too few poses, a gap between valid poses longer than 0.1 s and 1.8 median
-            steps, a rate or gravity out of range, or an argument has the wrong type.
+            steps, a rate, gravity or seed out of range, or an argument has the wrong type.
     """
     check_type("trajectory", trajectory, Trajectory, "generate_walk(seed) returns one")
     check_type("errors", errors, ImuErrors, "such as PHONE_IMU; pass a seed by name: seed=7")
@@ -133,7 +133,7 @@ def simulate_imu(
     truth, gyro, acceleration_W = _sampled(trajectory, rate)
     up = np.array([0.0, 0.0, gravity])
     accel = truth.attitude_WB.apply(acceleration_W + up, inverse=True)
-    rng = np.random.default_rng(seed)
+    rng = generator(seed)
     noise = errors.noise
     gyro = _measured(
         gyro, rate, rng, (noise.gyro_noise, noise.gyro_walk), errors.gyro_turn_on,

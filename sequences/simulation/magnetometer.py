@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from stario.sequences.arrays import generator
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, Magnetometer, Trajectory
 
@@ -78,9 +79,9 @@ def simulate_magnetometer(
         seed: seed of every random draw.
 
     Raises:
-        InputError: there are fewer than two valid poses.
+        InputError: there are fewer than two valid poses, or the seed is not an integer >= 0.
     """
-    rng = np.random.default_rng([seed, _STREAM])
+    rng = generator(seed, _STREAM)
     count = int((truth.time[-1] - truth.time[0]) * magnetic_field.rate) + 1
     time = np.minimum(truth.time[0] + np.arange(count) / magnetic_field.rate, truth.time[-1])
     pose = truth.at(time)

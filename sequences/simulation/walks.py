@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import check_choice
+from stario.sequences.arrays import check_choice, generator
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, Trajectory
@@ -117,14 +117,14 @@ def generate_walk(
         Poses of the device in a world frame whose origin is the start on the floor.
 
     Raises:
-        InputError: duration or rate out of range, or more than `MAX_SAMPLES` poses.
+        InputError: duration, rate or seed out of range, or more than `MAX_SAMPLES` poses.
     """
     if not (math.isfinite(duration) and duration >= 1.0):
         raise InputError("duration", repr(duration), "a finite duration of at least 1 s")
     if not (math.isfinite(rate) and rate >= 50.0):
         raise InputError("rate", repr(rate), "a finite rate of at least 50 Hz")
     check_amount(duration, rate)
-    rng = np.random.default_rng(seed)
+    rng = generator(seed)
     style = WalkStyle.random(rng) if style is None else style
     count = round(duration * rate) + 1
     wheels = style.carry == "trolley"

@@ -49,6 +49,8 @@ LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
             lambda model: Navigator(model).update_yaw(np.datetime64("2024"), 0.0, 0.1),
             r"time: found values of type datetime64\[Y\], expected a number",
         ),
+        (lambda model: Navigator(model).push(0.0, "123", [0, 0, 9.8]), "gyro.*three numbers"),
+        (lambda model: Navigator(model).push("0.0", [0, 0, 0], [0, 0, 9.8]), "time: .*seconds"),
         (lambda model: Navigator(model).push(10**400, [0, 0, 0], [0, 0, 9.8]), "time: .*seconds"),
         (lambda model: Navigator(model).restore(b"xx" + Navigator(model).snapshot()), "else"),
         (lambda model: compare("walk.csv", model, NavigatorConfig()), "sequence.*read_recording"),

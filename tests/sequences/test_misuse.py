@@ -21,6 +21,7 @@ from stario.sequences import (
     align,
     check_units,
     evaluate_track,
+    generate_walk,
     inspect_recording,
     leg_streams,
     position_nees,
@@ -43,6 +44,10 @@ DATES = np.datetime64("2026-01-01") + (1e9 * TIME).astype("timedelta64[ns]")
 @pytest.mark.parametrize(
     ("make", "field", "text"),
     [
+        (lambda: ImuSequence(TIME, ROWS, ROWS, POSES), "name", 'ImuSequence("walk", time,'),
+        (lambda: generate_walk(-1), "seed", "an integer >= 0"),
+        (lambda: generate_walk(None), "seed", "an integer >= 0"),
+        (lambda: simulate_imu(POSES, seed=1.5), "seed", "an integer >= 0"),
         (lambda: replace(SEQUENCE, truth=ROWS), "truth", "Trajectory"),
         (lambda: replace(SEQUENCE, magnetometer=(TIME, ROWS)), "magnetometer", "Magnetometer(...)"),
         (lambda: replace(SEQUENCE, positions=ROWS), "positions", "PositionTrack"),
