@@ -95,7 +95,14 @@ class GyroIntegral:
 
 def _product(p: FloatArray, q: FloatArray) -> FloatArray:
     """Multiply quaternions (..., 4), xyzw; SciPy's composition is far slower."""
-    a, b = p[..., :3], q[..., :3]
-    vector = p[..., 3:] * b + q[..., 3:] * a + np.cross(a, b)
-    scalar = p[..., 3] * q[..., 3] - np.sum(a * b, axis=-1)
-    return np.concatenate([vector, scalar[..., None]], axis=-1)
+    return np.asarray(((p @ _LEFT).reshape(*p.shape[:-1], 4, 4) @ q[..., None])[..., 0])
+
+
+def _left_matrix(p: FloatArray) -> FloatArray:
+    """Return the matrix of q -> p q (Sola 2017, "Quaternion kinematics", eq. 19), in xyzw."""
+    x, y, z, w = p
+    return np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]])
+
+
+_LEFT = np.array([_left_matrix(p).ravel() for p in np.eye(4)])
+"""p @ _LEFT is the flattened matrix of p: one product for a whole stack, as in `so3.skew`."""
