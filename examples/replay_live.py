@@ -78,7 +78,7 @@ def main(speed: float = 5.0, seconds: float = 30.0) -> tuple[int, list[float], P
         url = f"http://127.0.0.1:{server.port}/data"
         accepted = replay(demonstration(), url, speed, seconds)
         session = server.hub.sessions["replay"]
-        return accepted, session.drawn.points[-1][1:4], session.path
+        return accepted, session.track.drawn.points[-1][1:4], session.track.path
     finally:
         server.stop()
         thread.join()

@@ -145,7 +145,7 @@ class Viewer:
         """
         devices = []
         for device, session in list(self._hub.sessions.items()):
-            points = session.drawn.points
+            points = session.track.drawn.points
             earlier, sent = self._sent.get(device, ([], 0))
             fresh = points is not earlier
             count = len(points)

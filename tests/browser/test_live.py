@@ -54,9 +54,9 @@ def test_page_draws_two_phones_and_ends_where_a_run_on_their_files_does(show, se
         phone.join()
     for name in ("anna <b>", "ben"):
         session = server.hub.sessions[name]
-        end = session.drawn.points[-1]
+        end = session.track.drawn.points[-1]
         shown.page.wait_for_function(f"([id, t]) => ({LAST})(id)?.[0] >= t", arg=[name, end[0]])
-        track = Navigator(load_model()).run(read_recording(session.path))
+        track = Navigator(load_model()).run(read_recording(session.track.path))
         drawn = shown.page.evaluate(LAST, name)
         np.testing.assert_allclose(drawn[1:4], track.trajectory.position_W[-1], atol=1e-4)
         assert shown.page.is_visible(f"[data-device='{name}'] .figures")
@@ -73,14 +73,16 @@ def test_buttons_for_zero_place_and_stop_reach_the_server(show, server, replay):
     card = shown.page.locator("[data-device=carla]")
     card.get_by_text("Zero here").click()
     shown.page.wait_for_function("() => window.stario.devices.get('carla').origin[0] !== 0")
-    np.testing.assert_allclose(session.drawn.origin, session.drawn.points[-1][1:4], atol=1e-3)
+    np.testing.assert_allclose(
+        session.track.drawn.origin, session.track.drawn.points[-1][1:4], atol=1e-3
+    )
     card.get_by_text("Place on map").click()
     assert shown.page.is_visible("#tap")
-    before = session.drawn.points[-1][1:3]
+    before = session.track.drawn.points[-1][1:3]
     box = shown.page.locator("#map .nsewdrag").first.bounding_box()
     shown.page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 0.25 * box["height"])
     shown.page.wait_for_function("() => window.stario.devices.get('carla').fixes === 1")
-    x, y = np.array(session.drawn.points[-1][1:3]) - before
+    x, y = np.array(session.track.drawn.points[-1][1:3]) - before
     assert x > 0.5
     assert y > 0.5
     card.get_by_text("Stop").click()

@@ -47,7 +47,7 @@ def test_a_new_viewer_gets_no_more_points_than_a_message_may_hold(hub, pushes, m
         session.take(parse_push(body), 0.0)
     monkeypatch.setattr(hub_module, "MAX_SENT", most)
     [device] = Viewer(hub).message()["devices"]
-    points = session.drawn.points
+    points = session.track.drawn.points
     assert min(len(points), most) / 2 < len(device["points"]) <= most + 1
     assert (device["points"][0], device["points"][-1]) == (points[0], points[-1])
     assert session.status()["rate"] == pytest.approx(100.0, rel=0.02)
@@ -65,7 +65,9 @@ def test_points_that_a_thread_moves_while_they_are_read_are_sent_again(hub):
             self.revision = 1
             return self.lists.pop(0) if len(self.lists) > 1 else self.lists[0]
 
-    hub.sessions["phone"] = SimpleNamespace(drawn=Moving(), status=dict, close=lambda: None)
+    hub.sessions["phone"] = SimpleNamespace(
+        track=SimpleNamespace(drawn=Moving()), status=dict, close=lambda: None
+    )
     viewer = Viewer(hub)
     messages = [viewer.message()["devices"][0] for _ in range(3)]
     assert [message["points"] for message in messages] == [[[1.0]], [[2.0]], []]

@@ -34,8 +34,8 @@ def test_the_device_silent_longest_makes_room_and_its_recording_is_closed(full):
     send("another")
     assert "phone5" not in hub.sessions
     assert len(hub.sessions) == MAX_DEVICES
-    assert evicted._file._file.closed
-    assert len(read_recording(evicted.path)) == 200
+    assert evicted.track._file._file.closed
+    assert len(read_recording(evicted.track.path)) == 200
     send("phone5")  # the other silent one makes room
     assert "phone3" not in hub.sessions
     sent = {device["id"]: device for device in viewer.message()["devices"]}

@@ -30,7 +30,7 @@ def wait_for(condition, seconds=20.0):
 
 def samples(server, device):
     session = server.hub.sessions.get(device)
-    return 0 if session is None else session.samples
+    return 0 if session is None else session.track.samples
 
 
 def test_lines_over_tcp_are_recorded_and_invalid_ones_get_an_error(serve, walk):
@@ -42,7 +42,7 @@ def test_lines_over_tcp_are_recorded_and_invalid_ones_get_an_error(serve, walk):
             device.sendall(content[begin : begin + 997])
         wait_for(lambda: samples(server, "tcp 127.0.0.1") == 300)
         assert json.loads(device.makefile().readline())["error"].startswith("t: found 'x'")
-    recording = read_recording(server.hub.sessions["tcp 127.0.0.1"].path)
+    recording = read_recording(server.hub.sessions["tcp 127.0.0.1"].track.path)
     np.testing.assert_array_equal(recording.gyro, walk.gyro[:300])
 
 

@@ -49,7 +49,7 @@ def test_shuffled_pushes_give_the_recording_of_ordered_ones(session, pushes, wal
     places = [k + 4 * random.Random(k).random() for k in range(len(bodies))]
     take(session, [body for _, body in sorted(zip(places, bodies, strict=True))])
     session.close()
-    assert session.samples == len(read_recording(session.path)) == len(walk)
+    assert session.track.samples == len(read_recording(session.track.path)) == len(walk)
     assert session.status()["dropped"] == {}
 
 
@@ -57,42 +57,42 @@ def test_a_push_that_comes_much_too_late_does_not_begin_a_new_track(session, pus
     bodies = pushes()
     delayed = bodies.pop(20)
     take(session, [*bodies[:60], delayed, *bodies[60:]])
-    assert session.samples == len(walk) - 20
+    assert session.track.samples == len(walk) - 20
     assert session.status()["dropped"] == {"late": 40}
     assert any("dropped (40 late)" in word["text"] for word in session.status()["health"])
-    assert len(list(session.path.parent.glob("*.csv"))) == 1
+    assert len(list(session.track.path.parent.glob("*.csv"))) == 1
 
 
 def test_a_delayed_push_does_not_bring_back_the_recording_before(session, pushes):
     first = pushes(seconds=3.0)
     second = pushes(session="two", offset_ns=10**18 + 10**10, seconds=3.0)
     take(session, [*first[:-1], second[0], first[-1], *second[1:]])
-    assert session.samples == 300
+    assert session.track.samples == 300
     assert session.status()["dropped"] == {"late": 40}
-    assert len(list(session.path.parent.glob("*.csv"))) == 2
+    assert len(list(session.track.path.parent.glob("*.csv"))) == 2
 
 
 def test_a_clock_that_was_set_back_within_a_recording_begins_a_new_track(session, pushes):
     bodies = pushes(seconds=6.0)
     take(session, [*bodies[:15], *pushes(seconds=6.0, offset_ns=10**18 - 10**11)[15:]])
-    assert session.samples == 300
+    assert session.track.samples == 300
     assert session.status()["dropped"] == {}
 
 
 def test_what_waits_is_processed_when_the_track_ends(session, pushes):
     bodies = pushes(seconds=4.0)
     take(session, [*bodies[:-2], bodies[-1]])
-    assert session.samples == 360
+    assert session.track.samples == 360
     session.stop()
-    assert session.samples == 380
+    assert session.track.samples == 380
 
 
 def test_a_recording_that_begins_with_an_empty_push_begins_a_new_track(session, pushes):
     empty = b'{"messageId": 0, "sessionId": "two", "deviceId": "phone", "payload": []}'
     second = pushes(session="two", offset_ns=10**18 + 10**10, seconds=4.0)[1:]
     take(session, [*pushes(seconds=3.0), empty, *second])
-    assert session.samples == 380
-    assert len(list(session.path.parent.glob("*.csv"))) == 2
+    assert session.track.samples == 380
+    assert len(list(session.track.path.parent.glob("*.csv"))) == 2
 
 
 @pytest.mark.parametrize("seconds", [30, -30, 500])
@@ -100,9 +100,9 @@ def test_a_reading_with_a_wild_time_is_dropped_alone(session, pushes, walk, seco
     bodies = [parse_push(body) for body in pushes()]
     readings = bodies[20].readings
     readings[3] = replace(readings[3], time_ns=readings[3].time_ns + seconds * 10**9)
-    track = session.drawn
+    track = session.track.drawn
     for k, batch in enumerate(bodies):
         session.take(batch, 0.2 * k)
-    assert session.drawn is track
+    assert session.track.drawn is track
     assert session.status()["dropped"] == {"wrong time": 1}
-    assert len(walk) - 2 <= session.samples <= len(walk)
+    assert len(walk) - 2 <= session.track.samples <= len(walk)

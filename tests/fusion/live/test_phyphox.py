@@ -89,10 +89,10 @@ def test_a_phone_is_polled_until_all_samples_are_recorded(serve, fake):
         server = serve(phones=[address])
         stop = time.monotonic() + 20.0
         sessions, device = server.hub.sessions, f"phyphox {address}"
-        while device not in sessions or sessions[device].samples < 200:
+        while device not in sessions or sessions[device].track.samples < 200:
             assert time.monotonic() < stop
             time.sleep(0.02)
-        recording = read_recording(sessions[device].path)
+        recording = read_recording(sessions[device].track.path)
         np.testing.assert_array_equal(recording.accel, fake.walk.accel[: len(recording)])
         listener.shutdown()
 

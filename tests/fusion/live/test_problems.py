@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from stario.fusion.live import session as session_module
 from stario.fusion.live import storage
+from stario.fusion.live import track as track_module
 from stario.fusion.live.payload import GYRO, parse_push
 from stario.fusion.live.session import Session
 from stario.fusion.live.storage import LiveFile
@@ -43,7 +43,7 @@ def test_a_full_disk_is_shown_until_it_has_space_and_what_is_lost_is_counted(
         attempts.append(len(samples))
         raise OSError("No space left on device")
 
-    monkeypatch.setattr(session_module, "_MAX_UNWRITTEN", 100)
+    monkeypatch.setattr(track_module, "_MAX_UNWRITTEN", 100)
     monkeypatch.setattr(LiveFile, "append", full)
     for batch in batches[:-1]:
         try:
@@ -54,8 +54,8 @@ def test_a_full_disk_is_shown_until_it_has_space_and_what_is_lost_is_counted(
     monkeypatch.setattr(LiveFile, "append", append)
     session.take(batches[-1], 1.7e9)
     assert session.status()["problem"] == ""
-    written = len(read_recording(session.path))
-    assert 100 < written == session.samples
+    written = len(read_recording(session.track.path))
+    assert 100 < written == session.track.samples
     assert session.status()["dropped"] == {"not written": 900 - written}
 
 

@@ -34,33 +34,33 @@ def command(client, device, name, **content):
 
 def rerun(session, new_navigator):
     """Run the navigator on the recording and the fixes that a session wrote."""
-    fixes = session._file.fixes_path
+    fixes = session.track._file.fixes_path
     known = read_fixes(fixes) if fixes.exists() else ()
-    return new_navigator().run(read_recording(session.path), fixes=known)
+    return new_navigator().run(read_recording(session.track.path), fixes=known)
 
 
 def test_drawn_track_ends_as_that_of_the_recording(client, hub, pushes, new_navigator, walk):
     taken = [answer.json()["samples"] for answer in send(client, pushes())]
     session = hub.sessions["phone"]
-    assert sum(taken) == session.samples == len(walk)
+    assert sum(taken) == session.track.samples == len(walk)
     track = rerun(session, new_navigator)
     np.testing.assert_allclose(
-        session.drawn.points[-1][1:4], track.trajectory.position_W[-1], atol=1e-5
+        session.track.drawn.points[-1][1:4], track.trajectory.position_W[-1], atol=1e-5
     )
-    assert session.drawn.points[-1][0] == pytest.approx(track.time[-1], abs=1e-4)
-    recording = read_recording(session.path)
+    assert session.track.drawn.points[-1][0] == pytest.approx(track.time[-1], abs=1e-4)
+    recording = read_recording(session.track.path)
     np.testing.assert_array_equal(recording.gyro, walk.gyro)
     np.testing.assert_allclose(recording.time, walk.time - walk.time[0], atol=1e-9)
 
 
 def test_a_push_of_another_recording_begins_a_new_track_and_file(client, hub, pushes):
     send(client, pushes(seconds=3.0))
-    first = hub.sessions["phone"].path
+    first = hub.sessions["phone"].track.path
     send(client, pushes(session="two", seconds=3.0))
     session = hub.sessions["phone"]
-    assert session.path != first
-    assert session.samples == 300
-    assert len(read_recording(first)) == len(read_recording(session.path)) == 300
+    assert session.track.path != first
+    assert session.track.samples == 300
+    assert len(read_recording(first)) == len(read_recording(session.track.path)) == 300
 
 
 def test_two_phones_of_one_name_are_told_apart_and_the_earlier_is_refused(client, hub, pushes):
@@ -69,8 +69,8 @@ def test_two_phones_of_one_name_are_told_apart_and_the_earlier_is_refused(client
     refused = [answer for answer in answers if answer.status_code != 200]
     assert len(refused) > len(one) - 5  # all but those before the first sample
     assert "two recordings in turn from 'phone'" in refused[0].json()["error"]
-    assert hub.sessions["phone"].samples > 240
-    assert len(list(hub.sessions["phone"].path.parent.iterdir())) <= 2
+    assert hub.sessions["phone"].track.samples > 240
+    assert len(list(hub.sessions["phone"].track.path.parent.iterdir())) <= 2
 
 
 def test_times_in_milliseconds_are_named_and_do_not_begin_tracks_without_end(client, hub, walk):
@@ -86,7 +86,7 @@ def test_times_in_milliseconds_are_named_and_do_not_begin_tracks_without_end(cli
         assert client.post("/data", content=body, headers=headers).status_code == 200
     session = hub.sessions["rig"]
     assert "give times in s" in session.status()["problem"]
-    assert len(list(session.path.parent.iterdir())) == 1
+    assert len(list(session.track.path.parent.iterdir())) == 1
 
 
 def test_a_compressed_body_is_refused_with_the_remedy(client, pushes, caplog):
@@ -99,7 +99,7 @@ def test_a_compressed_body_is_refused_with_the_remedy(client, pushes, caplog):
 def test_a_clock_that_jumps_back_begins_a_new_track(client, hub, pushes):
     for offset in (2 * 10**18, 10**18):
         send(client, pushes(session="", offset_ns=offset, seconds=3.0))
-    assert hub.sessions["phone"].samples == 300
+    assert hub.sessions["phone"].track.samples == 300
 
 
 def test_stop_ignores_samples_and_start_begins_a_new_track(client, hub, pushes):
@@ -108,10 +108,10 @@ def test_stop_ignores_samples_and_start_begins_a_new_track(client, hub, pushes):
     assert command(client, "phone", "stop").status_code == 200
     assert client.post("/data", content=bodies[15]).json() == {"samples": 0}
     session = hub.sessions["phone"]
-    assert session.samples == 300
+    assert session.track.samples == 300
     assert command(client, "phone", "start").status_code == 200
     send(client, bodies[16:])
-    assert session.samples == 280
+    assert session.track.samples == 280
 
 
 def test_a_device_with_a_slash_in_its_name_can_be_stopped(client, hub, pushes):
@@ -125,35 +125,35 @@ def test_zero_moves_the_drawn_origin_and_not_the_estimate(client, hub, pushes, n
     send(client, bodies[:30])
     session = hub.sessions["phone"]
     command(client, "phone", "zero")
-    at = session.drawn.points[-1][1:4]
+    at = session.track.drawn.points[-1][1:4]
     np.testing.assert_allclose(session.status()["origin"], at, atol=1e-3)
     send(client, bodies[30:])
     end = rerun(session, new_navigator).trajectory.position_W[-1]
-    np.testing.assert_allclose(session.drawn.points[-1][1:4], end, atol=1e-5)
+    np.testing.assert_allclose(session.track.drawn.points[-1][1:4], end, atol=1e-5)
 
 
 def test_tapped_fixes_move_and_rotate_the_whole_drawn_track(client, hub, pushes, new_navigator):
     bodies = pushes()
     send(client, bodies[:20])
     session = hub.sessions["phone"]
-    shape = np.array(session.drawn.points)[:, 1:3]
+    shape = np.array(session.track.drawn.points)[:, 1:3]
     assert command(client, "phone", "fix", x=50.0, y=-20.0, sigma=0.1).status_code == 200
-    moved = np.array(session.drawn.points)[: len(shape), 1:3]
-    np.testing.assert_allclose(session.drawn.points[-1][1:3], [50.0, -20.0], atol=0.2)
+    moved = np.array(session.track.drawn.points)[: len(shape), 1:3]
+    np.testing.assert_allclose(session.track.drawn.points[-1][1:3], [50.0, -20.0], atol=0.2)
     np.testing.assert_allclose(moved - moved[0], shape - shape[0], atol=1e-4)
     send(client, bodies[20:90])
-    walked = np.array(session.drawn.points[-1][1:3]) - [50.0, -20.0]
+    walked = np.array(session.track.drawn.points[-1][1:3]) - [50.0, -20.0]
     assert np.linalg.norm(walked) > 5.0
     turned = [50.0 - walked[1], -20.0 + walked[0]]  # a quarter turn to the left
     command(client, "phone", "fix", x=turned[0], y=turned[1], sigma=0.1)
-    np.testing.assert_allclose(session.drawn.points[-1][1:3], turned, atol=0.5)
-    start = np.array(session.drawn.points[len(shape) // 2][1:3])
+    np.testing.assert_allclose(session.track.drawn.points[-1][1:3], turned, atol=0.5)
+    start = np.array(session.track.drawn.points[len(shape) // 2][1:3])
     before = moved[len(shape) // 2] - [50.0, -20.0]
     np.testing.assert_allclose(start - [50.0, -20.0], [-before[1], before[0]], atol=0.6)
     send(client, bodies[90:])
     end = rerun(session, new_navigator).trajectory.position_W[-1]
-    np.testing.assert_allclose(session.drawn.points[-1][1:4], end, atol=1e-3)
-    assert session.fixes == 2
+    np.testing.assert_allclose(session.track.drawn.points[-1][1:4], end, atol=1e-3)
+    assert session.track.fixes == 2
 
 
 def test_apples_sign_and_g_are_converted_by_accel_unit_in_the_address(client, hub, pushes, walk):
@@ -163,7 +163,7 @@ def test_apples_sign_and_g_are_converted_by_accel_unit_in_the_address(client, hu
             if entry["name"] == "totalacceleration":
                 entry["values"] = {k: -v / 9.80665 for k, v in entry["values"].items()}
         client.post("/data?accel_unit=-g", content=json.dumps(message))
-    recording = read_recording(hub.sessions["phone"].path)
+    recording = read_recording(hub.sessions["phone"].track.path)
     np.testing.assert_allclose(recording.accel, walk.accel[:300], atol=1e-12)
 
 
@@ -172,7 +172,7 @@ def test_a_wrong_unit_is_shown_on_the_page_and_the_samples_are_kept(client, hub,
         client.post("/data?accel_unit=g", content=body)
     session = hub.sessions["phone"]
     assert "m/s^2" in session.status()["problem"]
-    assert len(read_recording(session.path)) == 300
+    assert len(read_recording(session.track.path)) == 300
 
 
 MALFORMED = st.one_of(
@@ -222,7 +222,7 @@ def test_two_hundred_malformed_pushes_do_not_affect_a_replay(client, hub, pushes
     undisturbed = hub._new_navigator()
     for row in zip(walk.time[:800] - walk.time[0], walk.gyro, walk.accel, strict=False):
         undisturbed.push(*row)
-    end = hub.sessions["phone"].drawn.points[-1][1:4]
+    end = hub.sessions["phone"].track.drawn.points[-1][1:4]
     np.testing.assert_allclose(end, undisturbed.state.p_W, atol=1e-5)
 
 
@@ -233,7 +233,7 @@ def test_a_full_disk_is_reported_and_affects_no_other(client, hub, pushes, monke
     def disk_full(*arguments):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(hub.sessions["full"]._file, "append", disk_full)
+    monkeypatch.setattr(hub.sessions["full"].track._file, "append", disk_full)
     bodies = [pushes(device=device, seconds=4.0)[10] for device in ("full", "phone")]
     full, phone = send(client, bodies)
     assert (full.status_code, "No space" in full.json()["error"]) == (507, True)
@@ -245,15 +245,15 @@ def test_fixes_after_a_gap_leave_the_track_before_it_unchanged(client, hub, push
     for part in (bodies[:20], bodies[20:60]):
         send(client, part)
         session = hub.sessions["phone"]
-        x, y = session.drawn.points[-1][1:3]
+        x, y = session.track.drawn.points[-1][1:3]
         command(client, "phone", "fix", x=x, y=y, sigma=0.1)
-    before = list(session.drawn.points)
+    before = list(session.track.drawn.points)
     for body in pushes(offset_ns=10**18 + 30 * 10**9)[60:90]:  # half a minute is missing
         client.post("/data", content=body)
-    assert session.drawn.points[-1][9] > 30.0  # yaw sigma [deg]: the direction is lost
+    assert session.track.drawn.points[-1][9] > 30.0  # yaw sigma [deg]: the direction is lost
     command(client, "phone", "fix", x=30.0, y=30.0, sigma=0.1)
-    assert session.drawn.points[: len(before)] == before
-    np.testing.assert_allclose(session.drawn.points[-1][1:3], [30.0, 30.0], atol=0.5)
+    assert session.track.drawn.points[: len(before)] == before
+    np.testing.assert_allclose(session.track.drawn.points[-1][1:3], [30.0, 30.0], atol=0.5)
 
 
 def test_oversized_pushes_surplus_devices_and_foreign_requests_are_refused(client, hub, pushes):
@@ -307,11 +307,11 @@ def test_viewers_get_new_points_and_after_a_change_the_whole_track(client, hub, 
     send(client, bodies[15:])
     (second,) = viewer.message()["devices"]
     assert not second["fresh"]
-    assert first["points"] + second["points"] == hub.sessions["phone"].drawn.points
+    assert first["points"] + second["points"] == hub.sessions["phone"].track.drawn.points
     command(client, "phone", "fix", x=5, y=5, sigma=1)
     (third,) = viewer.message()["devices"]
     assert third["fresh"]
-    assert third["points"] == hub.sessions["phone"].drawn.points
+    assert third["points"] == hub.sessions["phone"].track.drawn.points
 
 
 def test_long_tracks_are_thinned_so_that_memory_stays_small(hub, new_navigator, monkeypatch):
@@ -370,17 +370,19 @@ def test_a_magnetometer_is_recorded_and_used(client, hub, pushes, new_navigator,
         message["payload"] += entries[max(first, 20 * k - lag) : 20 * (k + 1) - lag]
         assert client.post("/data", json=message).status_code == 200
     session = hub.sessions["phone"]
-    recording = read_recording(session.path)
+    recording = read_recording(session.track.path)
     np.testing.assert_array_equal(recording.gyro, walk.gyro[:1200])
     np.testing.assert_array_equal(
         recording.magnetometer.field, field[first : first + len(recording.magnetometer)]
     )
     assert 1200 - first - len(recording.magnetometer) <= lag + 1
-    bearings = session._navigator.health.bearings
+    bearings = session.track._navigator.health.bearings
     assert bearings["applied"] > 10
     track = rerun(session, new_navigator)
     np.testing.assert_allclose(
-        session.drawn.points[-1][1:4], track.trajectory.position_W[-1], atol=1e-2 if lag else 1e-5
+        session.track.drawn.points[-1][1:4],
+        track.trajectory.position_W[-1],
+        atol=1e-2 if lag else 1e-5,
     )
 
 

@@ -137,5 +137,5 @@ def test_a_push_that_was_not_written_can_be_repeated(tmp_path, new_navigator, pu
         session.take(second, 1.7e9)
     monkeypatch.setattr(LiveFile, "append", append)
     assert session.take(second, 1.7e9) == failed[0] > 0
-    assert len(read_recording(session.path)) == session.samples
+    assert len(read_recording(session.track.path)) == session.track.samples
     session.close()

@@ -1,0 +1,222 @@
+"""One recording of a device: samples go to disk, to a navigator, and to the displayed track."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from stario.fusion.fixes import position_fix
+from stario.fusion.live.drawn import DisplayedTrack
+from stario.fusion.live.merging import MAX_WAIT, Field, Merger, Sample
+from stario.fusion.live.payload import Batch, Vector
+from stario.fusion.live.storage import LiveFile
+from stario.fusion.live.times import with_credible_time
+from stario.fusion.navigator import Navigator
+from stario.fusion.report.health import findings
+from stario.fusion.state import NavState
+from stario.sequences.errors import InputError
+
+_MAX_UNWRITTEN = 6000
+"""Maximum number of samples kept for the next attempt to write: a minute of a phone's."""
+
+_HEALTH_SECONDS = 1.0
+
+_CERTAIN = 0.7
+"""Cosine between the vertical and the force above which the force's sign is certain."""
+
+
+class LiveTrack:
+    """Recording and track of one device. Not thread-safe, like its session.
+
+    Args:
+        device: name of the device.
+        folder: folder for the recording, which is created with the first sample.
+        navigator: a new navigator.
+
+    Attributes:
+        drawn: displayed track.
+        words: what stands out in the navigator's health, in words.
+        samples: number of samples processed.
+        rate: their rate [Hz], smoothed over some batches.
+        fixes: number of fixes applied.
+        delayed: number of readings that came after a later recording had begun.
+    """
+
+    def __init__(self, device: str, folder: Path, navigator: Navigator) -> None:
+        self._device, self._folder, self._navigator = device, folder, navigator
+        self._merger, self._factor = Merger(), 1.0
+        self._file: LiveFile | None = None
+        self._unwritten: tuple[list[Sample], list[Field]] = [], []
+        self._first_ns = self._newest_ns = -1
+        self._push_error = self._write_error = ""
+        self._health_time = -math.inf
+        self._stray = self._lost = 0
+        self.drawn = DisplayedTrack()
+        self.words: list[dict[str, str]] = []
+        self.samples = self.fixes = self.delayed = 0
+        self.rate = 0.0
+
+    @property
+    def path(self) -> Path | None:
+        """Path of the recording; None before the first sample."""
+        return None if self._file is None else self._file.path
+
+    @property
+    def newest_ns(self) -> int:
+        """Time of the newest sample on the device's clock [ns]; -1 before the first."""
+        waiting = self._unwritten[0]
+        return waiting[-1][0] if waiting and self._newest_ns >= 0 else self._newest_ns
+
+    def process(self, batch: Batch, received: float, accel_factor: float) -> int:
+        """Write a batch to disk, then pass it to the navigator; return its number of samples.
+
+        Args:
+            batch: batch of this recording.
+            received: time of receipt [s since 1970].
+            accel_factor: factor from its accelerometer's unit to specific force in m/s^2.
+        """
+        readings = with_credible_time(batch)
+        self._stray += len(batch.readings) - len(readings)
+        self._factor = accel_factor
+        samples = [
+            (time, gyro, (accel_factor * a[0], accel_factor * a[1], accel_factor * a[2]))
+            for time, gyro, a in self._merger.add(readings)
+        ]
+        # Samples wait until they are on disk: when a failed push is repeated, they count as late.
+        samples = [*self._unwritten[0], *samples]
+        if not samples:
+            return 0
+        fields = [*self._unwritten[1], *self._merger.fields()]
+        self._write(samples, received, fields)
+        self._navigate(samples, fields)
+        self._count(samples[0][0], samples[-1][0], len(samples))
+        return len(samples)
+
+    def close(self) -> None:
+        """Close the recording."""
+        if self._file is not None:
+            self._file.close()
+
+    def zero(self) -> None:
+        """Display the newest position as the origin, without changing estimate or recording.
+
+        Raises:
+            InputError: there is no position yet.
+        """
+        self.drawn.origin = self._state().p_W.copy()
+
+    def fix(self, x: float, y: float, sigma: float) -> None:
+        """Apply a fix at x, y of the displayed map [m] with sigma [m]; the height is left free.
+
+        Raises:
+            InputError: there is no position yet.
+        """
+        before = self._state()
+        p_W = np.array([x, y, 0.0]) + self.drawn.origin
+        p_W[2] = before.p_W[2]
+        covariance = np.diag([sigma**2, sigma**2, 1e6])  # a tap says nothing about the height
+        self._navigator.update_position(before.time, p_W, covariance)
+        assert self._file is not None  # there is a state
+        self._file.append_fix(position_fix(before.time, p_W, covariance))
+        self.fixes += 1
+        after = self._state()
+        if after.map_frame != self.drawn.map_frame:
+            self.drawn.move(before, after)
+        self.drawn.add(after)
+        self._update_health(after.time)
+
+    def problem(self) -> str:
+        """Return what keeps the track from being right, in words; empty if nothing does."""
+        if self._write_error or self._push_error:
+            return self._write_error or self._push_error
+        if self._merger.missing:
+            return f"no samples of {self._merger.missing}: enable it in the logger"
+        if self._merger.silent:
+            return f"no samples of {self._merger.silent} for {MAX_WAIT / 1e9:g} s: the track waits"
+        if self._factor * self._merger.upward < -_CERTAIN:
+            other = "-m/s2" if self._factor > 0 else "m/s2"
+            return (
+                "the accelerometer points down where the phone's own attitude points up, as on an "
+                f"iPhone: send to the address with accel_unit={other}"
+            )
+        return ""
+
+    def dropped(self) -> dict[str, int]:
+        """Return the number of samples dropped, by reason."""
+        dropped = self._merger.dropped
+        late = dropped.get("late", 0) + self.delayed
+        counts = dropped | {"late": late, "wrong time": self._stray, "not written": self._lost}
+        return {reason: count for reason, count in counts.items() if count}
+
+    def _write(self, samples: list[Sample], received: float, fields: list[Field]) -> None:
+        """Write to disk, or keep for the next attempt as much as memory allows."""
+        try:
+            if self._file is None:
+                self._file = LiveFile(self._folder, self._device)
+            self._file.append(samples, received, fields)
+        except (OSError, InputError) as error:
+            self._write_error = f"the recording cannot be written: {error}"
+            self._lost += max(0, len(samples) - _MAX_UNWRITTEN)
+            self._unwritten = samples[-_MAX_UNWRITTEN:], fields[-_MAX_UNWRITTEN:]
+            raise
+        self._write_error, self._unwritten = "", ([], [])
+
+    def _navigate(self, samples: list[Sample], fields: Iterable[Field]) -> None:
+        """Pass samples and fields to the navigator in the order of their times."""
+        if self._first_ns < 0:
+            self._first_ns = samples[0][0]
+        pending = deque(fields)
+        for time_ns, gyro, accel in samples:
+            while pending and pending[0][0] <= time_ns:
+                self._push_field(*pending.popleft())
+            self._push(time_ns, gyro, accel)
+        for time_ns, field in pending:  # ahead of the samples, which wait for the accelerometer
+            self._push_field(time_ns, field)
+
+    def _push_field(self, time_ns: int, field: Vector) -> None:
+        self._navigator.push_magnetometer(self._seconds(time_ns), field)
+
+    def _push(self, time_ns: int, gyro: Vector, accel: Vector) -> None:
+        try:
+            state = self._navigator.push(self._seconds(time_ns), gyro, accel)
+        except InputError as error:
+            self._push_error = str(error)
+            return
+        if state is None:
+            return
+        self._push_error = ""
+        self.drawn.add(state)
+        self._update_health(state.time)
+
+    def _seconds(self, time_ns: int) -> float:
+        return (time_ns - self._first_ns) / 1e9
+
+    def _update_health(self, time: float) -> None:
+        if time - self._health_time < _HEALTH_SECONDS:
+            return
+        self._health_time = time
+        health, late = self._navigator.health, self.dropped().get("late", 0)
+        # The navigator never sees them; if the clock was set back a little, it sees no gap either.
+        health = replace(health, samples=health.samples | {"late": late})
+        self.words = [asdict(finding) for finding in findings(health)]
+
+    def _count(self, first_ns: int, last_ns: int, count: int) -> None:
+        """Update the number of samples and their rate, smoothed over some batches."""
+        since = self._newest_ns if self._newest_ns >= 0 else first_ns
+        self._newest_ns = max(self._newest_ns, last_ns)
+        self.samples += count
+        if last_ns > since:
+            rate = 1e9 * count / (last_ns - since)
+            weight = min(1.0, (last_ns - since) / 2e9) if self.rate else 1.0
+            self.rate += weight * (rate - self.rate)
+
+    def _state(self) -> NavState:
+        state = self._navigator.state
+        if state is None:
+            raise InputError(self._device, "no position yet", "a second of samples first")
+        return state
