@@ -129,7 +129,7 @@ class KeyframeGraph:
         covariance = np.array([[(1.0 - correlation**2) * sigma**2]])
         self.add(TurnProcess(i, j, correlation, covariance), gated=False)
 
-    def solve(self, max_rounds: int = 10) -> Solution:
+    def solve(self, max_rounds: int = 50) -> Solution:
         """Optimise the keyframes by Gauss-Newton steps.
 
         Args:

@@ -282,6 +282,23 @@ def test_a_heading_at_a_tilted_device_is_measured_at_the_tilt_that_the_graph_fin
     assert np.mean(off**2 / track.covariance[:, 2, 2]) < 3.0  # 1 expected
 
 
+def test_contradicting_fixes_are_weighed_until_the_track_has_converged(
+    make_walk: Make, make_oracle: Make
+) -> None:
+    """Headings off by 86 degrees, as from another axis: accurate positions outweigh them."""
+    walk, rng = make_walk(7, 20.0), np.random.default_rng(0)
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.05, sigma=0.05)
+    times = np.arange(3.03, 19.0)
+    places = walk.truth.at(times).position_W
+    places += 0.1 * rng.standard_normal(places.shape)
+    yaws = yaw_of(walk.truth.at(times + 0.25).attitude_WB) + 1.5
+    fixes = [position_fix(t, p, 0.01 * np.eye(3)) for t, p in zip(times, places, strict=True)]
+    fixes += [yaw_fix(t + 0.25, yaw, 0.1) for t, yaw in zip(times, yaws, strict=True)]
+    track = graph(oracle).run(walk, fixes=fixes)
+    end = walk.truth.at(walk.time[-1:]).position_W[0]
+    assert np.linalg.norm(track.trajectory.position_W[-1] - end) < 0.5
+
+
 def test_two_positions_place_and_turn_a_track_that_started_without_a_pose(
     make_walk: Make, make_oracle: Make
 ) -> None:
