@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support import GRAPH as CONFIG
-from support import Broken, ate
+from support import Broken, ate, stream
 
 from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig
@@ -131,7 +131,7 @@ def first_state(covariance: np.ndarray) -> NavState:
     return NavState(12.3, np.eye(3), zero, zero, zero, zero, covariance)
 
 
-@pytest.mark.parametrize(("first", "name"), [(3, "velocity"), (6, "pose"), (9, "bias")])
+@pytest.mark.parametrize(("first", "name"), [(3, "velocity"), (6, "position"), (9, "bias")])
 def test_an_undetermined_state_is_named(first: int, name: str) -> None:
     sigma = np.full(15, 0.1)
     sigma[first : first + 3] = 1e9
@@ -297,6 +297,27 @@ def test_contradicting_fixes_are_weighed_until_the_track_has_converged(
     track = graph(oracle).run(walk, fixes=fixes)
     end = walk.truth.at(walk.time[-1:]).position_W[0]
     assert np.linalg.norm(track.trajectory.position_W[-1] - end) < 0.5
+
+
+@pytest.mark.parametrize("height_sigma", [1e3, 1e6])
+def test_accurate_positions_with_an_unknown_height_need_no_fall_back(
+    walk: ImuSequence, make_oracle: Make, height_sigma: float
+) -> None:
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.05, sigma=0.05)
+    times = np.arange(2.03, 19.0)
+    flat = walk.truth.at(times).position_W * [1.0, 1.0, 0.0]
+    covariance = np.diag([1e-4, 1e-4, height_sigma**2])
+    fixes = [position_fix(t, p, covariance) for t, p in zip(times, flat, strict=True)]
+    track = graph(oracle).run(walk, fixes=fixes)
+    assert track.health.notes[-1].startswith("graph of 41 keyframes")
+    navigator = graph(oracle)
+    for fix in fixes:
+        navigator.update_position(fix.time, fix.value, fix.covariance)
+    states = stream(navigator, walk)
+    assert navigator.health.notes == []
+    for state, p_W in ((states[-1], states[-1].p_W), (track, track.trajectory.position_W[-1])):
+        true = walk.truth.at(np.array([min(np.atleast_1d(state.time)[-1], 20.0)])).position_W[0]
+        assert np.linalg.norm((p_W - true)[:2]) < 0.5
 
 
 def test_two_positions_place_and_turn_a_track_that_started_without_a_pose(
