@@ -37,6 +37,10 @@ MAX_WAITING = 10_000
 _MIN_SIGMA = 1e-4
 """Smallest standard deviation of a fix [m], [m/s], [rad]."""
 
+_MIN_EIGENVALUE = 1e-12
+"""Smallest eigenvalue of its correlation matrix: less is a singular matrix with its rounding, which
+some factorisations take for positive definite and others do not."""
+
 
 @dataclass(frozen=True, eq=False)
 class Fix:
@@ -66,7 +70,10 @@ class Fix:
         if self.kind == "yaw" and abs(self.value[0]) > MAX_YAW:
             return "yaw not in radians"
         C = self.covariance
-        if np.abs(C - C.T).max() > 1e-6 * np.abs(C).max() or np.linalg.eigvalsh(C).min() <= 0.0:
+        if np.abs(C - C.T).max() > 1e-6 * np.abs(C).max() or not C.diagonal().min() > 0.0:
+            return "covariance not positive definite"
+        sigma = np.sqrt(C.diagonal())
+        if np.linalg.eigvalsh(C / sigma / sigma[:, None]).min() < _MIN_EIGENVALUE:
             return "covariance not positive definite"
         return ""
 

@@ -20,7 +20,6 @@ from stario.fusion.imu.gap import gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval, split_at
 from stario.fusion.imu.preintegration import Segment, segment_of
 from stario.fusion.imu.stateful import WindowDisplacement
-from stario.fusion.lie import about_vertical, yaw_twist
 from stario.fusion.state import NavState
 from stario.sequences.attitude.so3 import exp_so3, log_so3
 from stario.sequences.sequence import FloatArray
@@ -237,8 +236,7 @@ class GraphBuilder:
             return Position(k, fix.value, covariance, dt, p - p_k - dt * v_k)
         if fix.kind == "velocity":
             return Velocity(k, fix.value, fix.covariance + drift, v - v_k)
-        turn = math.remainder(fix.value[0] - yaw_twist(R), 2.0 * math.pi)
-        return Yaw(k, about_vertical(turn) @ R_k, fix.covariance + turned)
+        return Yaw(k, float(fix.value[0]), fix.covariance + turned, R_k.T @ R)
 
 
 def _pose_between(start: Pose, end: Pose, fraction: float, duration: float) -> Pose:

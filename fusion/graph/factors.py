@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import numpy as np
 from gtsam.symbol_shorthand import B, T, V, X
 
-from stario.fusion.filter.jacobians import plain_covariance
+from stario.fusion.filter.jacobians import plain_covariance, yaw_jacobian
 from stario.fusion.filter.network_errors import TurnEstimate
 from stario.fusion.graph.covariances import root_information
 from stario.fusion.graph.keyframe_state import KeyframeState, turn_at
@@ -212,23 +212,28 @@ class Velocity(AtKeyframe):
 
 @dataclass(frozen=True, eq=False)
 class Yaw(AtKeyframe):
-    """A yaw some time after a keyframe, at any attitude of the device.
+    """A yaw some time after a keyframe: that of R_k `rotation`.
+
+    It changes with the tilt as well, at a tilt of 90 degrees by as much, as in the filter's
+    `update_yaw`.
 
     Attributes:
-        R_WB: (3, 3) attitude of the keyframe that explains the measurement: the estimate turned
-            about the vertical by measured minus estimated yaw.
+        yaw: yaw as defined by `yaw_twist` [rad].
         covariance: (1, 1) [rad^2].
+        rotation: (3, 3) from the body at that time to that at the keyframe, by the IMU.
     """
 
-    R_WB: FloatArray
+    yaw: float
     covariance: FloatArray
+    rotation: FloatArray
 
     def linearise(self, values: Any) -> Linearised:
-        """Linearise about the vertical."""
-        R, _ = _pose(values, self.k)
-        residual = math.atan2(*twist(self.R_WB @ R.T))
+        """Linearise in W."""
+        R_k, _ = _pose(values, self.k)
+        R = R_k @ self.rotation
+        residual = math.remainder(self.yaw - math.atan2(*twist(R)), 2.0 * math.pi)
         H = np.zeros((1, 6))
-        H[0, :3] = R[2]
+        H[:, :3] = yaw_jacobian(R)[0][1] @ R_k
         return np.array([residual]), [(X(self.k), H)]
 
 

@@ -135,8 +135,11 @@ class FixedLagEstimator:
             self._begin(self._builder.count)
             return accepted
         for applied in accepted:
-            if applied.fix is fix and self._builder.fix(self._in_graph_frame(applied)):
-                self._solve()
+            if applied.fix is fix:
+                if self._builder.fix(self._in_graph_frame(applied)):
+                    self._solve()
+                else:  # from before the graph began: only the filter's state contains it
+                    self._begin(self._builder.count)
         return accepted
 
     @property

@@ -21,10 +21,12 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from scipy.linalg import block_diag
 
+from stario.fusion.checked import check_covariance
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.network_errors import TURN_SECONDS, TurnEstimate
 from stario.fusion.graph.factors import Prior, Term
 from stario.fusion.graph.keyframe_state import KeyframeState
+from stario.fusion.graph.marginals import LinearSolution
 from stario.fusion.graph.processes import Coasting, TurnProcess
 from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_factor
 from stario.fusion.imu.gap import gap_covariance, gap_rotation, yaw_variance
@@ -32,6 +34,7 @@ from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.state import NavState
 from stario.sequences.accuracy.chi_square import chi2_quantile
+from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 
 _CONVERGED = 1e-3
@@ -73,13 +76,13 @@ class KeyframeGraph:
         self._time: dict[int, float] = {}
         self._segments: dict[int, Segment] = {}  # by the keyframe at which each begins
         self._terms: list[Whitened] = []
-        self._tree: Any = None  # of the last solution
+        self._solution: LinearSolution | None = None  # of the last round
         self.last = -1
         self.add_disconnected(first, turn)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return all but the solution: after restoring, call `solve` before `state`."""
-        return vars(self) | {"_tree": None}
+        return vars(self) | {"_solution": None}
 
     @property
     def keyframes(self) -> list[int]:
@@ -116,7 +119,7 @@ class KeyframeGraph:
         """Add a measurement with positive definite covariance, if `gated` as a possible outlier."""
         limit = chi2_quantile(self._gate, len(term.covariance)) if gated else math.inf
         self._terms.append(Whitened.of(term, limit))
-        self._tree = None
+        self._solution = None
 
     def add_turn(self, sigma: float) -> None:
         """Make the network's turn at the newest keyframe a state with a stationary sigma [rad]."""
@@ -129,7 +132,7 @@ class KeyframeGraph:
         covariance = np.array([[(1.0 - correlation**2) * sigma**2]])
         self.add(TurnProcess(i, j, correlation, covariance), gated=False)
 
-    def solve(self, max_rounds: int = 10) -> Solution:
+    def solve(self, max_rounds: int = 50) -> Solution:
         """Optimise the keyframes by Gauss-Newton steps.
 
         Args:
@@ -146,7 +149,7 @@ class KeyframeGraph:
             self._check_determined()
             down_weighted = sum(term.weighted(values)[2] < 1.0 for term in self._terms)
         except (RuntimeError, IndeterminateError) as error:
-            self._states, self._tree = start, None
+            self._states, self._solution = start, None
             if isinstance(error, IndeterminateError):
                 raise
             # gtsam's way to report it
@@ -160,7 +163,8 @@ class KeyframeGraph:
     def state(self, k: int) -> NavState:
         """Return a keyframe with its marginal covariance; call after `solve`."""
         R, v, p, b_g, b_a, _ = self.keyframe(k)
-        joint = self._tree.jointMarginalCovariance([X(k), V(k), B(k)]).fullMatrix()
+        assert self._solution is not None  # solved
+        joint = self._solution.covariance(k)
         to_world = KeyframeState(R, np.zeros(3), np.zeros(3), b_g, b_a).invariant_from_local()
         return NavState(self._time[k], R, v, p, b_g, b_a, to_world @ joint @ to_world.T)
 
@@ -190,7 +194,7 @@ class KeyframeGraph:
         for k in old:
             del self._time[k], self._states[k]
             self._segments.pop(k, None)
-        self._tree = None
+        self._solution = None
 
     def _values(self) -> Any:
         values = gtsam.Values()
@@ -221,7 +225,7 @@ class KeyframeGraph:
 
     def _insert(self, time: float, state: KeyframeState) -> None:
         self.last += 1
-        self._time[self.last], self._states[self.last], self._tree = time, state, None
+        self._time[self.last], self._states[self.last], self._solution = time, state, None
 
     def _optimise(self, max_rounds: int) -> tuple[int, Any]:
         """Take full Gauss-Newton steps, which follow the IMU's stiff factors as a filter does.
@@ -234,9 +238,9 @@ class KeyframeGraph:
             linear = factors.linearize(values)
             for term in self._terms:
                 linear.push_back(term.factor(values))
-            self._tree = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
+            self._solution = LinearSolution(linear, ordering)
             before = self._positions(values)
-            values = values.retract(self._tree.optimize())
+            values = values.retract(self._solution.step())
             change = float(np.abs(self._positions(values) - before).max())
             if not change > _CONVERGED:
                 break
@@ -257,12 +261,18 @@ class KeyframeGraph:
 
     def _check_determined(self) -> None:
         for k in (next(iter(self._time)), self.last):
-            sigma = np.sqrt(np.diag(self.state(k).covariance))
-            if not (sigma < _UNDETERMINED_SIGMA).all():
-                worst = int(np.argmax(np.where(np.isfinite(sigma), sigma, np.inf)))
+            covariance = self.state(k).covariance
+            variance = covariance.diagonal()
+            if not (variance < _UNDETERMINED_SIGMA**2).all():
+                worst = int(np.argmax(np.where(np.isfinite(variance), variance, np.inf)))
                 raise IndeterminateError(
                     f"{_GROUPS[worst // 3]} at {self._time[k]:.1f} s is undetermined"
                 )
+            try:
+                check_covariance(covariance)
+            except InputError as error:
+                message = f"the covariance at {self._time[k]:.1f} s has no digits left"
+                raise IndeterminateError(message) from error
 
     def _undetermined_state(self, message: str) -> str:
         """Return the name and time of the state that gtsam's message concerns."""

@@ -24,6 +24,7 @@ NOISE = ImuNoise(gyro_noise=1e-3, accel_noise=0.02, gyro_walk=3e-5, accel_walk=1
 ERRORS = ImuErrors(noise=NOISE, gyro_turn_on=3e-3, accel_turn_on=0.05)
 CONFIG = NavigatorConfig(noise=NOISE, filter=replace(support.FILTER, update_rate=1))
 EYE = np.eye(3)
+ROOT = np.array([[0.1, 0.1], [0.1, 0.3], [0.2, 0.7]])
 
 Make = Callable[..., Any]
 
@@ -307,6 +308,7 @@ def test_states_of_a_stream_carry_the_number_of_their_map_frame(
         ([0, 0, 0], -EYE, "covariance not positive definite"),
         ([0, 0, 0], np.ones((3, 3)), "covariance not positive definite"),
         ([0, 0, 0], np.triu(np.ones((3, 3))), "covariance not positive definite"),
+        ([0, 0, 0], ROOT @ ROOT.T, "covariance not positive definite"),  # singular but for rounding
     ],
 )
 def test_invalid_fixes_are_refused_and_counted(
@@ -318,6 +320,7 @@ def test_invalid_fixes_are_refused_and_counted(
     streamed(navigator, walk.slice(0.0, 6.0), [bad], 0.2)
     assert navigator.health.fixes == {reason: 1}
     assert np.isfinite(navigator.state.covariance).all()
+    assert navigator.state.map_frame == 0
 
 
 @pytest.mark.parametrize("degrees", [90.0, -90.0])

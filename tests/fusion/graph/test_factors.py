@@ -52,7 +52,7 @@ def terms(rng: np.random.Generator, values: Any) -> list[Term]:
         Displacement(0, 1, rng.normal(size=3), R_NB, EYE),
         Position(0, rng.normal(size=3), EYE, 0.4, rng.normal(size=3)),
         Velocity(0, rng.normal(size=3), EYE, rng.normal(size=3)),
-        Yaw(0, exp_so3(np.array([0.0, 0.0, 0.3])) @ state.R_WB, np.eye(1)),
+        Yaw(0, 0.7, np.eye(1), exp_so3(rng.normal(0.0, 0.3, 3))),
         GyroBias(0, rng.normal(size=3), EYE),
         Prior(0, (state, next_state), rng.normal(size=(20, 32)), rng.normal(size=20)),
         TurnProcess(0, 1, 0.6, np.eye(1)),

@@ -165,6 +165,22 @@ def test_a_late_fix_that_changes_the_gating_brings_a_stream_to_its_filter(
     assert late[0].max() < late[1].max() + 0.15
 
 
+def test_a_late_fix_from_before_the_graph_began_brings_a_stream_to_its_filter(
+    walk: ImuSequence, make_oracle: Make
+) -> None:
+    """The graph begins at the first position; a better and earlier one arrives after it."""
+    oracle = make_oracle(walk, walk.truth, CONFIG)
+    late: list[np.ndarray] = []
+    for backend in ("graph", "ekf"):
+        navigator = Navigator(oracle, CONFIG, backend=backend)
+        first, second = walk.truth.at(np.array([9.83, 10.03])).position_W
+        navigator.update_position(10.03, second + np.array([4.0, 3.0, 0.0]), 25.0 * np.eye(3))
+        stream(navigator, walk.slice(0.0, 10.45))
+        assert navigator.update_position(9.83, first, 1e-4 * np.eye(3)) == "applied"
+        late.append(navigator.state.p_W)
+    np.testing.assert_allclose(*late, atol=1e-6)
+
+
 def test_a_stream_equals_the_batch_within_the_lag(walk: ImuSequence, make_oracle: Make) -> None:
     """Until something leaves the lag, both use everything, with one or two windows a second."""
     short = walk.slice(0.0, 4.0)

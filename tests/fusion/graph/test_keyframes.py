@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support import GRAPH as CONFIG
-from support import Broken, ate
+from support import Broken, ate, stream
 
 from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig
@@ -21,6 +21,7 @@ from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.imu.preintegration import preintegrate
+from stario.fusion.lie import yaw_twist
 from stario.fusion.report.health import health_lines
 from stario.fusion.state import NavState
 from stario.sequences.accuracy.nees import position_nees
@@ -130,7 +131,7 @@ def first_state(covariance: np.ndarray) -> NavState:
     return NavState(12.3, np.eye(3), zero, zero, zero, zero, covariance)
 
 
-@pytest.mark.parametrize(("first", "name"), [(3, "velocity"), (6, "pose"), (9, "bias")])
+@pytest.mark.parametrize(("first", "name"), [(3, "velocity"), (6, "position"), (9, "bias")])
 def test_an_undetermined_state_is_named(first: int, name: str) -> None:
     sigma = np.full(15, 0.1)
     sigma[first : first + 3] = 1e9
@@ -261,6 +262,62 @@ def test_the_track_meets_heading_and_velocity_fixes(walk: ImuSequence, make_orac
     k = int(np.argmin(np.abs(track.time - 14.0)))
     assert np.linalg.norm(track.trajectory.velocity_W[k] - truth.velocity_W[1]) < 0.05
     assert track.covariance[k, 3, 3] < 2e-4
+
+
+def test_a_heading_at_a_tilted_device_is_measured_at_the_tilt_that_the_graph_finds(
+    make_walk: Make, make_oracle: Make
+) -> None:
+    """At 126 degrees, the start's error of the tilt enters a yaw fix twice as large."""
+    walk = make_walk(1, 15.0, mount_rotvec=(2.2, 0.0, 0.0))
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
+    first = Rotation.from_rotvec([0.1, -0.1, 0.0]) * walk.truth.attitude_WB[0]
+    start = first.as_matrix(), walk.truth.velocity_W[0], walk.truth.position_W[0]
+    times = np.arange(0.51, 14.0, 0.1)
+    yaws = [yaw_twist(R) for R in walk.truth.at(times).attitude_WB.as_matrix()]
+    fixes = [yaw_fix(t, yaw, 0.01) for t, yaw in zip(times, yaws, strict=True)]
+    prior = PriorPose(*start, tilt_sigma=0.1, yaw_sigma=0.3)
+    track = graph(oracle, prior=prior).run(walk, fixes=fixes)
+    true = walk.truth.at(np.clip(track.time, 0.0, walk.time[-1])).attitude_WB
+    off = (true * track.trajectory.attitude_WB.inv()).as_rotvec()[:, 2]
+    assert np.mean(off**2 / track.covariance[:, 2, 2]) < 3.0  # 1 expected
+
+
+def test_contradicting_fixes_are_weighed_until_the_track_has_converged(
+    make_walk: Make, make_oracle: Make
+) -> None:
+    """Headings off by 86 degrees, as from another axis: accurate positions outweigh them."""
+    walk, rng = make_walk(7, 20.0), np.random.default_rng(0)
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.05, sigma=0.05)
+    times = np.arange(3.03, 19.0)
+    places = walk.truth.at(times).position_W
+    places += 0.1 * rng.standard_normal(places.shape)
+    yaws = yaw_of(walk.truth.at(times + 0.25).attitude_WB) + 1.5
+    fixes = [position_fix(t, p, 0.01 * np.eye(3)) for t, p in zip(times, places, strict=True)]
+    fixes += [yaw_fix(t + 0.25, yaw, 0.1) for t, yaw in zip(times, yaws, strict=True)]
+    track = graph(oracle).run(walk, fixes=fixes)
+    end = walk.truth.at(walk.time[-1:]).position_W[0]
+    assert np.linalg.norm(track.trajectory.position_W[-1] - end) < 0.5
+
+
+@pytest.mark.parametrize("height_sigma", [1e3, 1e6])
+def test_accurate_positions_with_an_unknown_height_need_no_fall_back(
+    walk: ImuSequence, make_oracle: Make, height_sigma: float
+) -> None:
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.05, sigma=0.05)
+    times = np.arange(2.03, 19.0)
+    flat = walk.truth.at(times).position_W * [1.0, 1.0, 0.0]
+    covariance = np.diag([1e-4, 1e-4, height_sigma**2])
+    fixes = [position_fix(t, p, covariance) for t, p in zip(times, flat, strict=True)]
+    track = graph(oracle).run(walk, fixes=fixes)
+    assert track.health.notes[-1].startswith("graph of 41 keyframes")
+    navigator = graph(oracle)
+    for fix in fixes:
+        navigator.update_position(fix.time, fix.value, fix.covariance)
+    states = stream(navigator, walk)
+    assert navigator.health.notes == []
+    for state, p_W in ((states[-1], states[-1].p_W), (track, track.trajectory.position_W[-1])):
+        true = walk.truth.at(np.array([min(np.atleast_1d(state.time)[-1], 20.0)])).position_W[0]
+        assert np.linalg.norm((p_W - true)[:2]) < 0.5
 
 
 def test_two_positions_place_and_turn_a_track_that_started_without_a_pose(

@@ -1,0 +1,100 @@
+"""The solution of a linear graph, and marginal covariances from the triangular system of QR.
+
+gtsam's own marginals use Cholesky's algorithm, which calls a pose undetermined if its last axis is
+4096 times as uncertain as the one before, as with positions good to 5 cm and an unknown height.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+from scipy.linalg import solve_triangular
+
+from stario.fusion.filter.jacobians import symmetric
+from stario.sequences.sequence import FloatArray
+
+_KEYS = 3
+"""Number of successive variables of which the covariance is wanted: pose, velocity, biases."""
+
+
+class LinearSolution:
+    """Solution of a linear graph by multifrontal QR.
+
+    Args:
+        linear: gtsam's Gaussian factors.
+        ordering: their keys in order of time; those of a keyframe k are X(k), V(k), B(k) and
+            perhaps more.
+    """
+
+    def __init__(self, linear: Any, ordering: Any) -> None:
+        self._linear, self._ordering = linear, ordering
+        self._tree = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
+        self._covariances: dict[int, FloatArray] = {}
+
+    def step(self) -> Any:
+        """Return the solution as gtsam's vector values."""
+        return self._tree.optimize()
+
+    def covariance(self, k: int) -> FloatArray:
+        """Return the covariance (15, 15) of keyframe k's pose, velocity and biases.
+
+        Raises:
+            RuntimeError: they are not determined.
+        """
+        try:
+            joint = self._tree.jointMarginalCovariance([X(k), V(k), B(k)])
+            return np.asarray(joint.fullMatrix())
+        except RuntimeError as error:
+            if not self._covariances:
+                net = self._linear.eliminateSequential(self._ordering, gtsam.EliminateQR)
+                try:
+                    self._covariances = marginal_covariances(net)
+                except np.linalg.LinAlgError:
+                    raise error from None
+            return self._covariances[k]
+
+
+def marginal_covariances(net: Any) -> dict[int, FloatArray]:
+    """Return the covariance (15, 15) of pose, velocity and biases of every keyframe.
+
+    Its tangent is gtsam's. Variable x of the system R x + S y = d + n, with unit white noise n and
+    later variables y of covariance P, has the covariance R^-1 (I + S P S^T) R^-T, and -R^-1 S P
+    with y. So one pass back in time suffices, which keeps P for as long as earlier variables need
+    it.
+
+    Args:
+        net: gtsam's Bayes net, with one conditional per variable, in order of time.
+
+    Raises:
+        numpy.linalg.LinAlgError: a variable is not determined.
+    """
+    conditionals = [net.at(n) for n in range(net.size())]
+    place = {c.keys()[0]: n for n, c in enumerate(conditionals)}
+    parents = [[place[key] for key in c.keys()[1:]] for c in conditionals]
+    begin = np.cumsum([0, *(len(c.R()) for c in conditionals)])
+    # The last variable that this one or an earlier one needs.
+    last = np.maximum.accumulate([max([n + _KEYS, *p]) for n, p in enumerate(parents)])
+    covariances = {}
+    P = np.zeros((0, 0))
+    for n in reversed(range(len(conditionals))):
+        c, here = conditionals[n], begin[n + 1]
+        columns = [np.arange(begin[m], begin[m + 1]) - here for m in parents[n]]
+        S = np.zeros((here - begin[n], len(P)))
+        if columns:
+            S[:, np.concatenate(columns)] = c.S()
+        root = solve_triangular(c.R(), np.column_stack([np.eye(len(S)), S]))
+        by_noise, by_later = root[:, : len(S)], -root[:, len(S) :]
+        cross = by_later @ P
+        own = symmetric(by_noise @ by_noise.T + cross @ by_later.T)
+        P = np.block([[own, cross], [cross.T, P]])
+        symbol = gtsam.Symbol(c.keys()[0])
+        if chr(symbol.chr()) == "x":
+            size = begin[n + _KEYS] - begin[n]
+            covariances[symbol.index()] = P[:size, :size]
+        if n:
+            kept = begin[min(last[n - 1] + 1, len(conditionals))] - begin[n]
+            P = P[:kept, :kept]
+    return covariances
