@@ -86,11 +86,11 @@ class Column:
 
 @dataclass(frozen=True)
 class Header:
-    """Lines up to the header's end, cell separator, number of titles, columns by canonical name."""
+    """Lines up to the header's end, cell separator, titles, columns by canonical name."""
 
     lines: int
     separator: str
-    titles: int
+    titles: list[str]
     columns: dict[str, Column]
 
 
@@ -110,7 +110,7 @@ def read_header(path: Path, lines: list[str]) -> Header:
     titles, below = _titles(line), lines[number] if number < len(lines) else ""
     with_units = with_units_below(titles, below.split(_separator(line)))
     columns = _columns(path, number, with_units or titles)
-    return Header(number + (with_units is not None), _separator(line), len(titles), columns)
+    return Header(number + (with_units is not None), _separator(line), titles, columns)
 
 
 def _header_index(lines: list[str]) -> int | None:

@@ -26,10 +26,6 @@ from stario.sequences.sequence import FloatArray
 _CLOCK_FROM = 1e6
 """A second column that grows and exceeds this is another clock."""
 
-_INSTANCE = {"i", "instance", "imu", "imu_id", "imu id"}
-_MAX_IMUS = 9
-"""Titles of a column that numbers IMUs, and their maximum number."""
-
 _MOSTLY = 0.8
 """Share of a clock's steps that do not go back; loggers with a thread per sensor swap some rows."""
 
@@ -92,7 +88,7 @@ def by_header(titles: list[str], head: FloatArray) -> Layout | None:
         biases=tuple(biases[axis] for axis in "xyz") if raw else (),
         clocks={key: _finest(run, head) for key, run in before.items() if run},
         unused=choice.unused,
-        conflict=choice.conflict or _instances(titles, head),
+        conflict=choice.conflict,
     )
 
 
@@ -113,15 +109,6 @@ def _complete(
             x = replace(x, unit="g") if "gf" in words and not x.unit else x
             groups[words] = x, y, z
     return groups
-
-
-def _instances(titles: list[str], head: FloatArray) -> str:
-    """Describe a column that numbers the IMUs whose rows alternate, as `I` in ArduPilot's logs."""
-    for title, column in zip(titles, head.T, strict=False):
-        numbers = sorted(set(column.tolist()))
-        if title.lower() in _INSTANCE and 1 < len(numbers) <= _MAX_IMUS:
-            return f"{title} " + " and ".join(f"{number:.0f}" for number in numbers)
-    return ""
 
 
 def _clocks(titles: list[str], head: FloatArray) -> list[Column]:
