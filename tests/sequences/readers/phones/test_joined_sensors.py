@@ -64,3 +64,18 @@ def test_a_slow_accelerometer_is_reported(
 ) -> None:
     read_recording(written(tmp_path, walk, walk.time, walk.time[::6]))
     assert "accelerometer: found 16.7 samples/s, expected 50 to 1000" in caplog.text
+
+
+def test_sensors_that_start_late_keep_the_order_and_unit_of_their_titles(
+    tmp_path: Path, walk: ImuSequence
+) -> None:
+    for name, unit, values in (
+        ("Gyroscope", "deg/s", np.degrees(walk.gyro)), ("Accelerometer", "g", walk.accel / 9.80665)
+    ):  # fmt: skip
+        file = tmp_path / f"{name}.csv"
+        save(file, f"time,z ({unit}),y ({unit}),x ({unit})", walk.time, values[:, ::-1])
+        header, first, *rows = file.read_text(encoding="utf-8").splitlines()
+        file.write_text("\n".join([header, f"{first.split(',')[0]},,,", *rows]) + "\n")
+    read = read_recording(tmp_path)
+    np.testing.assert_allclose(read.gyro, walk.gyro[1:], atol=1e-9)
+    np.testing.assert_allclose(read.accel, walk.accel[1:], atol=1e-9)
