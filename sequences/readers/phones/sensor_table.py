@@ -76,7 +76,7 @@ def sensor_table(file: Path) -> SensorTable | None:
     for head in table_heads(file):
         if len(head.rows) < 2:
             continue
-        layout = by_header(head.titles, head.rows) or by_rows(head.rows)
+        layout = by_header(head.titles, head.rows) or by_rows(head.titles, head.rows)
         if layout is not None:
             clocks = {axes: head.clock(clock) for axes, clock in layout.clocks.items()}
             clock = head.clock(layout.clock)

@@ -79,3 +79,21 @@ def test_sensors_that_start_late_keep_the_order_and_unit_of_their_titles(
     read = read_recording(tmp_path)
     np.testing.assert_allclose(read.gyro, walk.gyro[1:], atol=1e-9)
     np.testing.assert_allclose(read.accel, walk.accel[1:], atol=1e-9)
+
+
+@pytest.mark.parametrize("titles", ["Uhrzeit,#", "ts,accuracy,#", "#,ticks"])
+def test_axes_are_those_of_the_titles_if_the_clocks_is_unknown(
+    titles: str, tmp_path: Path, walk: ImuSequence
+) -> None:
+    for name, unit, values in (
+        ("Gyroscope", "deg/s", np.degrees(walk.gyro)), ("Accelerometer", "m/s^2", walk.accel)
+    ):  # fmt: skip
+        axes = f"z ({unit}),y ({unit}),x ({unit})"
+        columns = [walk.time, values[:, ::-1]]
+        if "accuracy" in titles:
+            columns.insert(1, np.full(len(walk), 3))
+        columns = columns[::-1] if titles.startswith("#") else columns
+        save(tmp_path / f"{name}.csv", titles.replace("#", axes), *columns)
+    read = read_recording(tmp_path)
+    np.testing.assert_allclose(read.gyro, walk.gyro, atol=1e-9)
+    np.testing.assert_allclose(read.accel, walk.accel, atol=1e-9)
