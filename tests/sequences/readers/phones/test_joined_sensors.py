@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from phone_files import save
 
-from stario.sequences import ImuSequence, read_recording
+from stario.sequences import ImuSequence, ReadError, read_recording
 from stario.sequences.arrays import interpolated
 from stario.sequences.sequence import FloatArray
 
@@ -97,3 +97,15 @@ def test_axes_are_those_of_the_titles_if_the_clocks_is_unknown(
     read = read_recording(tmp_path)
     np.testing.assert_allclose(read.gyro, walk.gyro, atol=1e-9)
     np.testing.assert_allclose(read.accel, walk.accel, atol=1e-9)
+
+
+def test_copies_that_a_browser_numbers_are_another_recording(
+    tmp_path: Path, walk: ImuSequence
+) -> None:
+    folder = written(tmp_path, walk, walk.time, walk.time)
+    save(folder / "Gyroscope (1).csv", HEADER, walk.time, -walk.gyro)
+    np.testing.assert_allclose(read_recording(folder).gyro, walk.gyro)
+    save(folder / "Accelerometer (1).csv", HEADER, walk.time, walk.accel)
+    with pytest.raises(ReadError, match="a folder of 2 recordings"):
+        read_recording(folder)
+    np.testing.assert_allclose(read_recording(folder / "Gyroscope (1).csv").gyro, -walk.gyro)
