@@ -1,4 +1,4 @@
-"""Inference of unnamed time units, and sensors with separate sample times."""
+"""Inference of unnamed time units, and joining of sensors with separate sample times."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.arrays import interpolated
-from stario.sequences.clean_samples import MAX_RATE
+from stario.sequences.clean_samples import MAX_RATE, MIN_RATE
 from stario.sequences.errors import ReadError
+from stario.sequences.inspection.samples import disorder
 from stario.sequences.readers.phones.sensor_words import XSENS_CLOCK
 from stario.sequences.readers.text import IntArray, seconds
-from stario.sequences.sequence import MAX_TRUTH_GAP, FloatArray
+from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray
+from stario.sequences.time_order import MAX_IMU_GAP, increasing_mask
 from stario.sequences.units import TIME_UNITS
 
 _log = logging.getLogger(__name__)
@@ -34,18 +36,26 @@ _SINCE_1970_S = 1e8
 _FEW_LOST = 0.05
 """Share of samples before the start or after the end of another sensor that need no mention."""
 
+_MANY_SHARE = 1.5
+"""Number of different samples at each time, on average, above which most are lost."""
+
 _FEW_ROWS = 10
 """Number of rows below which a count may be a coincidence."""
 
 
 def resample_to_gyro(
-    path: Path, gyro_ns: IntArray, gyro: FloatArray, accel_ns: IntArray, accel: FloatArray
+    path: Path,
+    gyro_ns: IntArray,
+    gyro: FloatArray,
+    accel_ns: IntArray,
+    accel: FloatArray,
+    names: tuple[str, str] = ("gyroscope", "accelerometer"),
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Interpolate the accelerometer to the gyroscope's samples in their common time span.
 
     Samples in an accelerometer gap of more than 0.1 s are skipped, since the force there is
     unknown. Times are in ns from one origin: (N,) with samples (N, 3) of the gyroscope, (M,) with
-    samples (M, 3) of the accelerometer.
+    samples (M, 3) of the accelerometer; `names` are for messages if they are other sensors'.
 
     Returns:
         Time stamps (K,) [ns], gyroscope (K, 3) and accelerometer (K, 3).
@@ -53,14 +63,13 @@ def resample_to_gyro(
     Raises:
         ReadError: the two sensors do not overlap in time, or the accelerometer's rate is too low.
     """
-    order = np.unique(accel_ns, return_index=True)[1]
-    accel_ns, accel = accel_ns[order], accel[order]
+    accel_ns, accel = _sorted_samples(path, names[1], accel_ns, accel)
     kept = (gyro_ns >= accel_ns[0]) & (gyro_ns <= accel_ns[-1])
     if not kept.any():
         origin = min(gyro_ns.min(), accel_ns[0])
         spans = [
             f"{name} from {seconds(ns, origin).min():.3f} to {seconds(ns, origin).max():.3f} s"
-            for name, ns in (("gyroscope", gyro_ns), ("accelerometer", accel_ns))
+            for name, ns in zip(names, (gyro_ns, accel_ns), strict=True)
         ]
         raise ReadError(path, "time", ", ".join(spans), "overlapping times on one clock")
     right = np.clip(np.searchsorted(accel_ns, gyro_ns), 1, len(accel_ns) - 1)
@@ -78,6 +87,53 @@ def resample_to_gyro(
         )  # fmt: skip
     time, t = seconds(gyro_ns[kept], accel_ns[0]), seconds(accel_ns, accel_ns[0])
     return gyro_ns[kept], gyro[kept], interpolated(time, t, accel)
+
+
+def _sorted_samples(
+    path: Path, name: str, stamps_ns: IntArray, values: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """Return a sensor's samples by increasing time, one at each, for interpolation.
+
+    Rows late by milliseconds are sorted. Those of a clock that was set back are dropped: sorted,
+    they would alternate with samples from another time.
+    """
+    time = seconds(stamps_ns, stamps_ns[0])
+    set_back = float((np.maximum.accumulate(time) - time).max())
+    if set_back > MAX_IMU_GAP and not disorder(time):
+        kept = increasing_mask(time)
+        stamps_ns, values = stamps_ns[kept], values[kept]
+        _log.warning(
+            "%s: %s: dropped %d of %d samples whose times go back or jump ahead, by up to %.3g s: "
+            "split the recording there", path, name, (~kept).sum(), len(kept), set_back,
+        )  # fmt: skip
+    order = np.argsort(stamps_ns, kind="stable")
+    stamps_ns, values = stamps_ns[order], values[order]
+    fresh = np.append(True, np.diff(stamps_ns) > 0)
+    _warn_of_few_times(path, name, stamps_ns[fresh], fresh | _differing(values))
+    return stamps_ns[fresh], values[fresh]
+
+
+def _differing(values: FloatArray) -> BoolArray:
+    """Return which of the rows (N, 3) differ from the one above."""
+    return np.append(True, np.diff(values, axis=0).any(axis=1))
+
+
+def _warn_of_few_times(path: Path, name: str, stamps_ns: IntArray, samples: BoolArray) -> None:
+    """Warn if several samples share each of the times (M,), or these are too far apart."""
+    if len(stamps_ns) < 2:
+        return
+    shared = float(samples.sum()) / len(stamps_ns)
+    rate = 1e9 / float(np.median(np.diff(stamps_ns)))
+    if shared >= _MANY_SHARE:
+        _log.warning(
+            "%s: %s: found %.3g samples on average at each time, of which one is used, expected a "
+            "time for each: export them unrounded, and not in batches", path, name, shared,
+        )  # fmt: skip
+    elif rate < MIN_RATE:
+        _log.warning(
+            "%s: %s: found %.3g samples/s, expected 50 to 1000: set the app to 50 Hz or more",
+            path, name, rate,
+        )  # fmt: skip
 
 
 def refuse_row_numbers(file: Path, title: str, time: FloatArray) -> None:

@@ -86,11 +86,11 @@ class Column:
 
 @dataclass(frozen=True)
 class Header:
-    """Lines up to the header's end, cell separator, number of titles, columns by canonical name."""
+    """Lines up to the header's end, cell separator, titles, columns by canonical name."""
 
     lines: int
     separator: str
-    titles: int
+    titles: list[str]
     columns: dict[str, Column]
 
 
@@ -110,7 +110,7 @@ def read_header(path: Path, lines: list[str]) -> Header:
     titles, below = _titles(line), lines[number] if number < len(lines) else ""
     with_units = with_units_below(titles, below.split(_separator(line)))
     columns = _columns(path, number, with_units or titles)
-    return Header(number + (with_units is not None), _separator(line), len(titles), columns)
+    return Header(number + (with_units is not None), _separator(line), titles, columns)
 
 
 def _header_index(lines: list[str]) -> int | None:
@@ -126,7 +126,12 @@ def _header_index(lines: list[str]) -> int | None:
 def columns_named(lines: list[str]) -> set[str]:
     """Return the canonical names of the columns in a header, empty without one."""
     index = _header_index(lines)
-    return set() if index is None else {*_names(_titles(lines[index]))} - {""}
+    return set() if index is None else {*canonical_names(lines[index])} - {""}
+
+
+def canonical_names(header: str) -> list[str]:
+    """Return the canonical name of each column that a header names, empty for unknown ones."""
+    return _names(_titles(header))
 
 
 def with_units_below(titles: list[str], below: list[str]) -> list[str] | None:
@@ -202,7 +207,7 @@ def unit_factor(path: Path, column: Column, known: Mapping[str, Factor]) -> Fact
 
 def _names_columns(line: str) -> bool:
     """Return whether a line names any IMU column of this format."""
-    return bool(set(_names(_titles(line))) & set(IMU))
+    return bool(set(canonical_names(line)) & set(IMU))
 
 
 def _names(titles: list[str]) -> list[str]:

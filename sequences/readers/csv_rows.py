@@ -65,8 +65,8 @@ def _check_width(path: Path, lines: list[str], header: Header, decimal: str) -> 
     number, first = next(((k, line) for k, line in numbered if is_row(line)), (0, ""))
     cells = unquoted(first, header.separator, decimal).rstrip(f"{header.separator} ")
     count = cells.count(header.separator) + 1
-    if count > header.titles:
-        found, expected = f"{count} values", f"{header.titles} as in the header"
+    if count > len(header.titles):
+        found, expected = f"{count} values", f"{len(header.titles)} as in the header"
         fix = "name every column, and write decimal points"
         raise ReadError(path, f"line {number}", found, expected, fix)
 

@@ -15,7 +15,8 @@ _TIME = re.compile(
     r"(?<![\w:.])"
     r"(?:(?:(?P<date>\d{4}[-/]\d\d[-/]\d\d|\d\d-[a-z]{3}-\d{4})"
     r"|\d\d?[./]\d\d?[./]\d\d(?:\d\d)?)[t ])?"
-    r"(?P<clock>\d?\d:\d\d:\d\d)(?:(?:[.:]|,(?=\d+[;\t]))(?P<fraction>\d+))?"
+    r"(?P<clock>\d?\d:\d\d:\d\d)"
+    r"(?:(?::(?P<count>\d+))|(?:\.|,(?=\d+[;\t]))(?P<fraction>\d+))?"
     r"(?: ?(?P<half>am|pm)\b)?"
     r"(?: ?(?P<zone>z|(?:utc|gmt)?[+-]\d\d:?\d\d|utc|gmt))?"
     r"(?![\w:])",
@@ -23,14 +24,19 @@ _TIME = re.compile(
 )
 """A time of day, with a date before it or a zone after it if there is one."""
 
+_COUNT = re.compile(r"\d:\d\d:\d\d:(\d+)")
+
 
 def with_seconds(lines: Iterable[str]) -> list[str]:
     """Replace the dates and times of day in a file's lines by seconds.
 
     Dates become seconds since 1970, without a zone as if it were UTC. Times of day, and those with
     a date whose day and month may be either (`01/05/2024`), become seconds since a midnight; a step
-    of more than half a day from the line before is taken for one across midnight.
+    of more than half a day from the line before is taken for one across midnight. After a colon,
+    milliseconds may lack zeros at the left: `12:00:00:5`, if others have more digits.
     """
+    lines = list(lines)
+    digits = max((len(count) for line in lines for count in _COUNT.findall(line)), default=0)
     last: dict[int, int] = {}  # the time of day that comes first in a line, second, ...
 
     def replaced(line: str) -> str:
@@ -46,7 +52,7 @@ def with_seconds(lines: Iterable[str]) -> list[str]:
                 whole += _DAY_S * round((last.get(place, whole) - whole) / _DAY_S)
                 last[place] = whole
             place += 1
-            fraction = match["fraction"]
+            fraction = match["fraction"] or (match["count"] or "").rjust(digits, "0")
             return f"{whole}.{fraction}" if fraction else f"{whole}"  # its digits stay exact
 
         return _TIME.sub(seconds, line)

@@ -46,6 +46,7 @@ from stario.sequences.readers.columns import (
     unit_factor,
 )
 from stario.sequences.readers.csv_rows import Rows, read_rows
+from stario.sequences.readers.devices import refuse_several_devices
 from stario.sequences.readers.lines import first_lines, read_lines
 from stario.sequences.readers.text import seconds
 from stario.sequences.sequence import (
@@ -77,6 +78,8 @@ def read_generic_csv(path: Path) -> ImuSequence:
     """Read a generic CSV in the format that the module's docstring describes."""
     lines = read_lines(path)
     header = read_header(path, lines)
+    gx = header.columns["gx"].index
+    refuse_several_devices(path, header.titles, header.lines, header.separator, gx)
     rows = read_rows(path, lines, header)
     gyro, gyro_factors = _vectors(path, header, rows, "g", GYRO_UNITS)
     accel, accel_factors = _vectors(path, header, rows, "a", ACCEL_UNITS)

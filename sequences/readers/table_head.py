@@ -17,6 +17,8 @@ from stario.sequences.arrays import number_in
 from stario.sequences.readers.columns import Column, with_units_below
 from stario.sequences.readers.dates import with_seconds
 from stario.sequences.readers.lines import head_lines, unquoted
+from stario.sequences.readers.phones.sensor_words import axis_of, is_time
+from stario.sequences.readers.rows import is_missing
 from stario.sequences.readers.text import Table, read_table
 from stario.sequences.sequence import FloatArray
 
@@ -98,21 +100,37 @@ def _head(file: Path, numbers: list[int], lines: list[str], least: int) -> Table
     rows = [cells_of(line, delimiter, decimal) for line in lines[first:]]
     rows = (rows[:-1] if len(rows) > 2 else rows)[:_HEAD_ROWS]  # the last line may be cut
     width = max(set(map(len, rows)), key=list(map(len, rows)).count)
-    titles = _titles(lines[:first], delimiter, width)
+    above = lines[:first]
+    while above and _is_incomplete_row(cells_of(above[-1], delimiter, decimal)):
+        above.pop()
+    titles = _titles(above, delimiter, width)
     values = np.array([[number_of(cell) for cell in row] for row in rows if len(row) == width])
     return TableHead(file, numbers[first], delimiter, decimal, titles[:width], values)
 
 
 def _titles(above: list[str], delimiter: str | None, width: int) -> list[str]:
-    """Return the titles of `width` columns in the last line above the rows, or above their units.
+    """Return the titles of `width` columns in a line above the rows, or in one above their units.
 
-    They may be separated in another way than the rows, as NumPy's `savetxt` writes them.
+    They may be separated in another way than the rows, as NumPy's `savetxt` writes them, and lines
+    of other text may follow them.
     """
-    for separator in dict.fromkeys((delimiter, ",", ";", "\t")):
-        titles = _titles_at(above, separator)
-        if len(titles) == width:
-            return titles
+    separators = dict.fromkeys((delimiter, ",", ";", "\t"))
+    nearest = (above[:end] for end in range(len(above), 0, -1))
+    lines = [_titles_at(upto, separator) for upto in nearest for separator in separators]
+    found = [titles for titles in lines if len(titles) == width]
+    if found:
+        return next(filter(_names_columns, found), found[0])
     return [] if delimiter is None else _titles_at(above, delimiter)  # not the words of a comment
+
+
+def _is_incomplete_row(cells: list[str]) -> bool:
+    """Return whether cells are those of a row with few numbers: a sensor has not started yet."""
+    present = [cell for cell in cells if not is_missing(cell) and cell.strip().lower() != "nan"]
+    return bool(present) and all(math.isfinite(number_of(cell)) for cell in present)
+
+
+def _names_columns(titles: list[str]) -> bool:
+    return any(is_time(title) or axis_of(title) is not None for title in titles)
 
 
 def _titles_at(above: list[str], delimiter: str | None) -> list[str]:

@@ -116,8 +116,9 @@ def _force(
     in_two_parts = total is None and gravity is not None
     if total is None and gravity is not None:
         stamps, force, gravity_B = resample_to_gyro(
-            files.gyro.parent, accel.stamps_ns, accel.values, gravity.stamps_ns, gravity.values
-        )
+            files.gyro.parent, accel.stamps_ns, accel.values, gravity.stamps_ns, gravity.values,
+            ("linear acceleration", "gravity"),
+        )  # fmt: skip
         accel = replace(accel, stamps_ns=stamps, values=force + gravity_B)
         _log.info("%s: added gravity from its own columns or file", files.shown)
     in_g = not accel.unit and is_in_g(accel.values)

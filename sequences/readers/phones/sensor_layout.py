@@ -2,7 +2,7 @@
 
 With a header, columns are found by their names (`sensor_words`), in any order, among any others.
 Without one, a row is time and three values, or three values and time; a second clock between them
-is skipped.
+is skipped. The same holds if the titles name no known clock; axes are then those they name.
 """
 
 from __future__ import annotations
@@ -25,10 +25,6 @@ from stario.sequences.sequence import FloatArray
 
 _CLOCK_FROM = 1e6
 """A second column that grows and exceeds this is another clock."""
-
-_INSTANCE = {"i", "instance", "imu", "imu_id", "imu id"}
-_MAX_IMUS = 9
-"""Titles of a column that numbers IMUs, and their maximum number."""
 
 _MOSTLY = 0.8
 """Share of a clock's steps that do not go back; loggers with a thread per sensor swap some rows."""
@@ -92,7 +88,7 @@ def by_header(titles: list[str], head: FloatArray) -> Layout | None:
         biases=tuple(biases[axis] for axis in "xyz") if raw else (),
         clocks={key: _finest(run, head) for key, run in before.items() if run},
         unused=choice.unused,
-        conflict=choice.conflict or _instances(titles, head),
+        conflict=choice.conflict,
     )
 
 
@@ -113,15 +109,6 @@ def _complete(
             x = replace(x, unit="g") if "gf" in words and not x.unit else x
             groups[words] = x, y, z
     return groups
-
-
-def _instances(titles: list[str], head: FloatArray) -> str:
-    """Describe a column that numbers the IMUs whose rows alternate, as `I` in ArduPilot's logs."""
-    for title, column in zip(titles, head.T, strict=False):
-        numbers = sorted(set(column.tolist()))
-        if title.lower() in _INSTANCE and 1 < len(numbers) <= _MAX_IMUS:
-            return f"{title} " + " and ".join(f"{number:.0f}" for number in numbers)
-    return ""
 
 
 def _clocks(titles: list[str], head: FloatArray) -> list[Column]:
@@ -164,9 +151,12 @@ def _order(column: FloatArray) -> float:
     return float((np.diff(column) >= 0).mean())
 
 
-def by_rows(head: FloatArray) -> Layout | None:
-    """Return the layout of rows (N, K) without titles: time is first or fourth, and grows."""
-    width = head.shape[1]
+def by_rows(titles: list[str], head: FloatArray) -> Layout | None:
+    """Return the layout of rows (N, K) without titles, or whose titles name no clock.
+
+    Time is first or fourth, and grows.
+    """
+    width, named = head.shape[1], _named_axes(titles)
     places = [(time, start) for time, start in ((0, 1), (3, 0)) if time < width]
     for time, start in sorted(places, key=lambda place: -_order(head[:, place[0]])):
         if not _grows(head[:, time]):
@@ -175,9 +165,9 @@ def by_rows(head: FloatArray) -> Layout | None:
             start += 1
         if start + 3 > width or not np.isfinite(head[:, start : start + 3]).all():
             continue
-        if width > 4 and _is_code(head[:, start]):  # as in ADVIO's `imu-gyro.csv`
+        if width > 4 and named is None and _is_code(head[:, start]):  # as in ADVIO's `imu-gyro.csv`
             continue
-        x, y, z = (Column(start + k) for k in range(3))
+        axes = named or (Column(start), Column(start + 1), Column(start + 2))
         rest = width - start
         quaternion = tuple(Column(start + k) for k in range(4)) if start and rest >= 4 else ()
         biases: tuple[Column, ...] = ()
@@ -186,8 +176,17 @@ def by_rows(head: FloatArray) -> Layout | None:
         clock = (
             Column(start - 1) if start > 1 and head[0, start - 1] <= _CLOCK_FROM else Column(time)
         )
-        return Layout(clock=clock, axes={"": (x, y, z)}, quaternion=quaternion, biases=biases)
+        return Layout(clock=clock, axes={"": axes}, quaternion=quaternion, biases=biases)
     return None
+
+
+def _named_axes(titles: list[str]) -> Axes | None:
+    """Return the first columns whose titles name x, y and z; None if one is missing."""
+    named: dict[str, Column] = {}
+    for k, title in enumerate(titles):
+        if (axis := axis_of(title)) is not None:
+            named.setdefault(axis[0], Column(k, title, unit_of(title)))
+    return (named["x"], named["y"], named["z"]) if len(named) == 3 else None
 
 
 def _is_code(column: FloatArray) -> bool:

@@ -15,6 +15,7 @@ import numpy as np
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.clocks import assumed_unit, refuse_row_numbers, time_unit
 from stario.sequences.readers.columns import Column, unit_factor
+from stario.sequences.readers.devices import refuse_several_devices
 from stario.sequences.readers.phones.sensor_layout import Layout, by_header, by_rows
 from stario.sequences.readers.table_head import TableHead, table_heads
 from stario.sequences.readers.text import IntArray, Table
@@ -75,7 +76,7 @@ def sensor_table(file: Path) -> SensorTable | None:
     for head in table_heads(file):
         if len(head.rows) < 2:
             continue
-        layout = by_header(head.titles, head.rows) or by_rows(head.rows)
+        layout = by_header(head.titles, head.rows) or by_rows(head.titles, head.rows)
         if layout is not None:
             clocks = {axes: head.clock(clock) for axes, clock in layout.clocks.items()}
             clock = head.clock(layout.clock)
@@ -93,9 +94,11 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
             file holds several IMUs of which none can be chosen.
     """
     if table.conflict:
-        fix = "keep the columns and rows of one"
+        fix = "keep the columns of one"
         raise ReadError(table.file, "header", f"several IMUs ({table.conflict})", "one", fix)
     places, clock = table.axes[axes], table.clocks.get(axes, table.clock)
+    head = table.head
+    refuse_several_devices(table.file, head.titles, head.skip, head.delimiter, places[0].index)
     titles = ", ".join(p.title or f"column {p.index + 1}" for p in places)
     rows = table.read([clock, *places, *table.biases])
     kept = _complete_rows(table.file, sensor, titles, rows.values[:, 1:])

@@ -53,6 +53,7 @@ XSENS_CLOCK = "sampletimefine"
 """Clock of Xsens, whose unit `clocks.time_unit` determines."""
 
 _BRACKETS = re.compile(r"[\[(]\s*([^\])]*?)\s*[\])]")
+_NUMBER = re.compile(r"\((\d+)\)")
 _INDEX = re.compile(r"\[([012])\]\s*$")
 _UNIT_WORD = re.compile(
     r"[\s_.,-]+(m[/_ ]?s\^?2|m/s²|mps2|m/s/s|rad[/_ ]?s|radps|deg[/_ ]?s|°/s|m?dps|m?g|[unmµμ]t)"
@@ -63,8 +64,11 @@ _UNIT_WORD = re.compile(
 
 
 def words_of(name: str) -> list[str]:
-    """Return the words of a name in lower case, without text in brackets."""
-    plain = _G_FORCE.sub("gf ", _BRACKETS.sub(" ", name))
+    """Return the words of a name in lower case, without text in brackets but with numbers there.
+
+    The number of a copy, `Gyroscope (1).csv`, tells recordings apart.
+    """
+    plain = _G_FORCE.sub("gf ", _BRACKETS.sub(" ", _NUMBER.sub(r" \1 ", name)))
     plain = _WITHOUT_G.sub(" linear ", _WITH_G.sub(" ", plain)).replace("MetaWear", "Metawear")
     return [word.lower() for word in _WORD.findall(plain)]
 

@@ -16,7 +16,8 @@ import numpy as np
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import captured_rotations, pose_mask
-from stario.sequences.readers.lines import first_line
+from stario.sequences.readers.columns import IMU, canonical_names
+from stario.sequences.readers.lines import first_line, first_lines
 from stario.sequences.readers.text import read_table, seconds
 from stario.sequences.sequence import ImuSequence, Trajectory
 
@@ -32,6 +33,7 @@ def read_euroc(path: Path) -> ImuSequence:
     if imu is None:
         expected = "an EuRoC or TUM-VI folder with its IMU"
         raise ReadError(path, "mav0/imu0/data.csv", "no such file", expected, "unpack all of it")
+    _check_titles(imu)
     table = read_table(imu, columns=7)
     stamps = table.stamps_ns()
     truth_file = _truth_file(imu.parent.parent)
@@ -42,6 +44,20 @@ def read_euroc(path: Path) -> ImuSequence:
         accel=table.values[:, 4:7],
         truth=None if truth_file is None else _truth(truth_file, stamps[0]),
     )
+
+
+def _check_titles(imu: Path) -> None:
+    """Check that a header which names the IMU's columns has them in EuRoC's order.
+
+    Raises:
+        ReadError: it has another order.
+    """
+    header = next(iter(first_lines(imu, 1, comments=True)), "")
+    names = canonical_names(header)
+    if set(names) >= {"t", *IMU} and names[:7] != ["t", *IMU]:
+        expected = "time, gyroscope xyz and accelerometer xyz first"
+        fix = f"read {imu.name} itself with `--format csv`, by its titles"
+        raise ReadError(imu, "header", repr(header.strip()[:80]), expected, fix)
 
 
 def is_euroc(path: Path) -> bool:

@@ -69,6 +69,14 @@ def test_midnight_passes_in_every_column_of_times_and_for_late_rows() -> None:
     np.testing.assert_allclose(second - second[0], [0.0, 0.2, 1.2], atol=1e-9)
 
 
+def test_milliseconds_after_a_colon_may_lack_zeros() -> None:
+    lines = ["12:00:00:5", "12:00:00:15", "12:00:00:105", "12:00:01:0", "12:00:02"]
+    time = np.array(with_seconds(lines), dtype=np.float64)
+    np.testing.assert_allclose(time - time[0], [0.0, 0.01, 0.1, 0.995, 1.995], atol=1e-9)
+    hundredths = np.array(with_seconds(["12:00:00:05", "12:00:00:95"]), dtype=np.float64)
+    assert hundredths[1] - hundredths[0] == pytest.approx(0.9)
+
+
 @pytest.mark.parametrize("text", ["24:60:00", "2024-13-01 12:00:00", "01-Foo-2024 12:00:00"])
 def test_what_is_no_time_stays_as_it_is(text: str) -> None:
     assert with_seconds([text]) == [text]

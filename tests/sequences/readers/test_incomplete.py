@@ -115,3 +115,18 @@ def test_poses_of_imunet_that_go_back_in_time_are_counted(
     found = read_recording(path).truth
     assert found is not None
     assert f"pose.txt: dropped 2 of {len(poses)} poses: their times do not" in caplog.text
+
+
+def test_an_euroc_file_whose_titles_are_in_another_order_is_not_read_by_position(
+    tmp_path: Path, walk: ImuSequence
+) -> None:
+    imu, *_ = write_euroc(tmp_path / "V1", walk)
+    header, *rows = imu.read_text().splitlines()
+    titles = header.split(",")
+    swapped = [",".join([*titles[:1], *titles[3:0:-1], *titles[4:]])]
+    for cells in (row.split(",") for row in rows):
+        swapped.append(",".join([*cells[:1], *cells[3:0:-1], *cells[4:]]))
+    imu.write_text("\n".join(swapped) + "\n")
+    with pytest.raises(ReadError, match=r"header: found .*, expected time, gyroscope xyz and acc"):
+        read_recording(tmp_path / "V1")
+    np.testing.assert_allclose(read_recording(imu, format="csv").gyro, walk.gyro)

@@ -62,3 +62,27 @@ def test_columns_with_dates_become_seconds(tmp_path: Path, form: str) -> None:
     np.testing.assert_allclose(
         read.values[:, 0] - read.values[0, 0], 0.01 * np.arange(5), atol=1e-6
     )
+
+
+@pytest.mark.parametrize(
+    "between",
+    [
+        ("0,,,", "1,,,"),
+        ("0,NaN,NaN,NaN",),
+        ("0,null,,1",),
+        ("Started 12:00",),
+        ("# walk",),
+        ("int64,float,float,float",),
+    ],
+)
+def test_incomplete_rows_and_remarks_may_follow_the_titles(
+    tmp_path: Path, between: tuple[str, ...]
+) -> None:
+    """Without its titles, columns z, y, x would be read as x, y, z."""
+    head = head_of(tmp_path, "by a logger", "time,z,y,x", *between, "2,1,2,3", "3,1,2,3")
+    assert head.titles == ["time", "z", "y", "x"]
+    assert head.skip == 2 + len(between)
+
+
+def test_incomplete_rows_without_titles_are_none(tmp_path: Path) -> None:
+    assert head_of(tmp_path, "0,,,", "2,1,2,3", "3,1,2,3").titles == []

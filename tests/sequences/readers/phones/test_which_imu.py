@@ -91,5 +91,32 @@ def test_numbered_imus_in_alternating_rows_are_refused(walk: ImuSequence, tmp_pa
     two = [np.repeat(x, 2, axis=0) for x in (micros, walk.gyro, walk.accel, warmth)]
     number = np.tile([0, 1], len(walk))
     save(tmp_path / "two.csv", header, two[0], number, *two[1:])
-    with pytest.raises(ReadError, match=r"several IMUs \(I 0 and 1\), expected one"):
+    with pytest.raises(ReadError, match=r"I: found several devices \(0, 1\), expected one"):
         read_recording(tmp_path / "two.csv")
+
+
+@pytest.mark.parametrize("title", ["device", "Device ID", "mac_address", "side"])
+@pytest.mark.parametrize("sensors", ["gx,gy,gz,ax,ay,az", "Gyro X,Gyro Y,Gyro Z,Acc X,Acc Y,Acc Z"])
+def test_rows_of_named_devices_are_refused(
+    sensors: str, title: str, walk: ImuSequence, tmp_path: Path
+) -> None:
+    header = f"time [s],{title},{sensors}"
+    rows = walk.time, np.repeat("left", len(walk)), walk.gyro, walk.accel
+    save(tmp_path / "one.csv", header, *rows)
+    assert_same_samples(read_recording(tmp_path / "one.csv"), walk)
+    both = [np.repeat(x, 2, axis=0) for x in rows]
+    both[0][1::2] += 0.003  # so that no time repeats
+    both[1] = np.tile(["left", "right"], len(walk))
+    save(tmp_path / "two.csv", header, *both)
+    with pytest.raises(ReadError, match=rf"{title}: found several devices \(left, right\)"):
+        read_recording(tmp_path / "two.csv")
+
+
+def test_devices_of_rows_without_imu_samples_do_not_count(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
+    file = tmp_path / "own.csv"
+    save(file, "t [s],device,gx,gy,gz,ax,ay,az", walk.time, ["left"] * len(walk), walk.gyro,
+         walk.accel)  # fmt: skip
+    file.write_text(file.read_text() + "1.0,watch,,,,,,\n")
+    assert len(read_recording(file)) == len(walk)
