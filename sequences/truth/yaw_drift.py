@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stario.sequences.arrays import trapezoids
+from stario.sequences.attitude.levelling import BIAS_SIGMA
 from stario.sequences.clean_samples import clean_samples, longest_unbroken
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.truth.fit import TruthFit
@@ -27,6 +28,9 @@ from stario.sequences.truth.part import middle_part
 
 _MIN_TURNED_RAD = 0.3
 """Minimum deviation of the true yaw from an even rotation that separates scale from bias."""
+
+_RESIDUAL_RAD, _LASTING_S = math.radians(0.5), 5.0
+"""Typical residual of a recording [rad] and the time for which it lasts [s]."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,11 @@ def yaw_drift(sequence: ImuSequence, fit: TruthFit) -> YawDrift | None:
         return None
     upward = np.cumsum(trapezoids(time, up_B)[both], axis=0)
     columns = np.column_stack([even[:, 0], upward, psi])
-    fitted, *_ = np.linalg.lstsq(columns, psi_true - psi, rcond=None)
+    # Components of the bias that hardly show are held near zero: they would absorb anything else.
+    weight = math.sqrt(even[-1, 1] / _LASTING_S / len(psi)) / _RESIDUAL_RAD
+    rows = np.concatenate([weight * columns, np.eye(5)[1:4] / BIAS_SIGMA])
+    drift = np.append(weight * (psi_true - psi), np.zeros(3))
+    fitted, *_ = np.linalg.lstsq(rows, drift, rcond=None)
     residual_rms = math.sqrt(float(np.square(psi_true - psi - columns @ fitted).mean()))
     return YawDrift(
         scale=float(-fitted[4] / (1.0 + fitted[4])),

@@ -36,7 +36,7 @@ def test_scale_and_bias_are_recovered(walk: ImuSequence, scale: float, bias: flo
 @pytest.mark.parametrize("carry", ["pocket", "swinging", "rig"])
 def test_scale_is_recovered_from_a_device_that_tilts_with_a_bias(carry: str) -> None:
     """Neither its tilting nor a bias about its own axes is taken for a scale error."""
-    track = generate_walk(5, 60.0, style=WalkStyle(carry=carry))
+    track = generate_walk(5, 120.0, style=WalkStyle(carry=carry))
     tilting = simulate_imu(track, 100.0, PERFECT_IMU)
     off = replace(tilting, gyro=1.03 * tilting.gyro + [0.03, -0.02, 0.04])
     found = yaw_drift(off, fit_truth(off))
