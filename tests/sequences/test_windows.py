@@ -327,6 +327,15 @@ def test_windows_of_a_levelled_stream_reach_its_end(walk: ImuSequence) -> None:
     np.testing.assert_allclose(at_ticks, stream.facing_N[::100], atol=1e-6)
 
 
+def test_attitudes_at_the_ticks_of_a_slow_sensor_are_interpolated(walk: ImuSequence) -> None:
+    """At 73 Hz, most ticks lie between two samples."""
+    poses = Trajectory(walk.time, np.zeros((len(walk), 3)), about_z(2.0 * walk.time))
+    (stream,) = levelled_streams(simulate_imu(poses, 73.0, PERFECT_IMU))
+    yaw = yaw_of(Rotation.from_matrix(stream.R_NB))
+    turned = yaw - 2.0 * (stream.ticks - stream.start)
+    np.testing.assert_allclose(np.exp(1j * turned), 1.0, atol=1e-6)
+
+
 def test_rotating_a_window_rotates_its_vectors() -> None:
     rng = np.random.default_rng(0)
     windows = rng.normal(size=(3, 6, 200)).astype(np.float32)

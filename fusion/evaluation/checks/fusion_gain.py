@@ -43,8 +43,9 @@ class FusionGain(GroupedResult):
         nis: mean NIS of the first back end; 3 is expected.
         position_nees: median NEES of the first back end's position; 2.4 is expected for three axes,
             NaN without true attitude.
-        yaw_error: its yaw error at the end relative to the start [rad]; NaN without true attitude.
-        yaw_sigma: reported standard deviation of the yaw at the end [rad]; NaN likewise.
+        yaw_error: its yaw error at the end of the truth relative to its start [rad]; NaN without
+            true attitude.
+        yaw_sigma: reported standard deviation of the yaw there [rad]; NaN likewise.
     """
 
     network_m: float
@@ -83,10 +84,13 @@ def fusion_gain(
     first = backends[0]
     yaw_error = yaw_sigma = math.nan
     if truth is not None:
-        covariance = tracks[first].covariance
-        assert covariance is not None  # both back ends give it
-        yaw = np.unwrap(pose_errors(tracks[first].trajectory, truth).yaw)
-        yaw_error, yaw_sigma = float(yaw[-1] - yaw[0]), math.sqrt(covariance[-1, 2, 2])
+        track = tracks[first]
+        assert track.covariance is not None  # both back ends give it
+        errors = pose_errors(track.trajectory, truth)
+        yaw = np.unwrap(errors.yaw)
+        # The truth may end before the track, whose sigma grows further.
+        last = np.searchsorted(track.time, errors.estimate.time[-1])
+        yaw_error, yaw_sigma = float(yaw[-1] - yaw[0]), math.sqrt(track.covariance[last, 2, 2])
     return FusionGain(
         sequence.name,
         group,

@@ -22,7 +22,8 @@ BOUNDS = (50.0 * (1.0 - CONFIDENCE), 50.0 * (1.0 + CONFIDENCE))
 """Percentiles of the replicates that bound an interval."""
 
 _MIN_BLOCKS = 5
-"""Minimum number of blocks of a single recording for an interval: that of one has no width."""
+"""Minimum number of blocks for an interval: that of one has no width, and that of two recordings
+with a block each holds the true ratio only half of the time."""
 
 Blocks = tuple[FloatArray, FloatArray]
 """Sums of squared errors of a recording's blocks: evaluated network (B,) and baseline (B,)."""
@@ -60,7 +61,7 @@ def paired_ratio(strata: Mapping[str, Groups]) -> Interval | None:
     means, replicates = zip(*results, strict=True)
     found = interval(float(np.mean(means)), np.mean(replicates, axis=0))
     recordings = [one for groups in strata.values() for group in groups.values() for one in group]
-    if len(recordings) == 1 and len(recordings[0][0]) < _MIN_BLOCKS:
+    if sum(len(evaluated) for evaluated, _ in recordings) < _MIN_BLOCKS:
         return Interval(found.ratio, math.nan, math.nan)
     return found
 

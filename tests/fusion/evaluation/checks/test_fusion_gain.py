@@ -57,8 +57,12 @@ def test_the_yaw_error_is_that_since_the_start_next_to_the_sigma_of_yaw(
     )
     assert rotated.yaw_error == pytest.approx(found.yaw_error, abs=1e-9)
     assert abs(found.yaw_error) < 0.1
-    covariance = Navigator(oracle, CONFIG).run(walk).covariance
-    assert found.yaw_sigma == pytest.approx(np.sqrt(covariance[-1, 2, 2]))
+    track = Navigator(oracle, CONFIG).run(walk)
+    assert found.yaw_sigma == pytest.approx(np.sqrt(track.covariance[-1, 2, 2]))
+    half = truth.slice(truth.time[0], 0.5 * truth.time[-1])
+    shorter = fusion_gain(oracle, replace(walk, truth=half), CONFIG, "walks", ("ekf",))
+    at_its_end = np.flatnonzero(track.time <= half.time[-1])[-1]
+    assert shorter.yaw_sigma == pytest.approx(np.sqrt(track.covariance[at_its_end, 2, 2]))
 
 
 def test_too_little_truth_is_refused(walk: ImuSequence, still_model: Any) -> None:

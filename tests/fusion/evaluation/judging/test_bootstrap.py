@@ -59,6 +59,8 @@ def test_a_few_blocks_have_no_interval() -> None:
     assert few.ratio == pytest.approx(0.5)
     assert np.isnan([few.low, few.high]).all()
     assert f"{few:.3f}" == "0.500 [too few data]"
+    two_walks = interval_of(g=[(0.2 * np.ones(1), np.ones(1)), (0.3 * np.ones(1), np.ones(1))])
+    assert np.isnan([two_walks.low, two_walks.high]).all()
 
 
 BETTER = Interval(0.8, 0.7, 0.9)
