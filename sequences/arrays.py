@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from stario.sequences.errors import InputError
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+Choice = TypeVar("Choice", bound=str)
 
 
 def correlation(x: FloatArray, y: FloatArray) -> float:
@@ -97,8 +99,8 @@ def check_type(
         raise InputError(name, shown(value), expected, remedy)
 
 
-def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
-    """Check that an argument is one of the known names.
+def check_choice(name: str, value: object, choices: Iterable[Choice]) -> Choice:
+    """Return an argument, checked to be one of the known names.
 
     Raises:
         InputError: it is not; names the argument and the choices.
@@ -106,6 +108,7 @@ def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
     known = tuple(choices)
     if not (isinstance(value, str) and value in known):
         raise InputError(name, shown(value), f"one of {', '.join(known)}")
+    return known[known.index(value)]
 
 
 def generator(seed: int, *stream: int) -> np.random.Generator:

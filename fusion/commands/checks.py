@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
 
 import typer
 
@@ -34,7 +34,6 @@ from stario.fusion.commands.options import (
     refuse_unused,
     refuse_unused_sources,
 )
-from stario.fusion.commands.values import backend_named
 
 if TYPE_CHECKING:
     from stario.fusion.backends import BackendName
@@ -211,9 +210,12 @@ def fixes(
     as_json: JsonOption = False,
 ) -> None:
     """Supply periodic true positions; check that position and yaw errors match their sigmas."""
+    from stario.fusion.backends import BackendName
     from stario.fusion.evaluation.checks.with_fixes import fixes_table, track_with_fixes
+    from stario.sequences.arrays import check_choice
 
-    judge = partial(track_with_fixes, every=every, sigma=sigma, backend=backend_named(backend))
+    chosen: BackendName = check_choice("--backend", backend, get_args(BackendName))
+    judge = partial(track_with_fixes, every=every, sigma=sigma, backend=chosen)
     found, skipped = _judge_each("check fixes", reading, paths, estimating, by, judge)
     _print_table(found, skipped, fixes_table, as_json)
 
@@ -242,9 +244,10 @@ def _judge_each(
     judge: Callable[[Predictor, ImuSequence, NavigatorConfig, str], Result],
 ) -> tuple[list[Result], list[Skipped]]:
     """Judge each recording as one of its group; return the results and what was skipped."""
-    from stario.fusion.evaluation.judging.judge import check_by, labels
+    from stario.fusion.evaluation.judging.judge import By, labels
+    from stario.sequences.arrays import check_choice
 
-    grouping = check_by(by)
+    grouping: By = check_choice("--by", by, get_args(By))
     model, settings = estimating.network(), estimating.settings()
 
     def judged(path: Path, sequence: ImuSequence) -> Result:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
@@ -203,8 +203,10 @@ def _networks(
     from stario.fusion.evaluation.figures import write_table
     from stario.fusion.evaluation.tables import compare_networks, table_dict, table_text
     from stario.network.model import load_model, weights_named
-    from stario.sequences.accuracy.metrics import check_convention
+    from stario.sequences.accuracy.metrics import Convention
+    from stario.sequences.arrays import check_choice
 
+    averaging: Convention = check_choice("convention", convention, get_args(Convention))
     networks = {name: load_model(weights_named(name, runs)) for name in names}
     with progress_bar("evaluate", 100 * len(files)) as progress:
         table, skipped = compare_networks(
@@ -212,7 +214,7 @@ def _networks(
             list(networks.items()),
             settings,
             reading.read,
-            check_convention(convention),
+            averaging,
             jobs,
             progress=progress,
         )
@@ -235,7 +237,7 @@ def _groups(
     as_json: bool,
 ) -> list[Skipped]:
     """Write and print the table of groups; return the recordings that were skipped."""
-    from stario.fusion.evaluation.judging.judge import check_by, judge, rows_of
+    from stario.fusion.evaluation.judging.judge import By, judge, rows_of
     from stario.fusion.evaluation.judging.prepared import prepared_recordings
     from stario.fusion.evaluation.judging.table import (
         JudgingResult,
@@ -243,9 +245,10 @@ def _groups(
         judgement_text,
         write_judgement,
     )
+    from stario.sequences.arrays import check_choice
     from stario.sequences.datasets.cache_files import cache_folder
 
-    grouping = check_by(by)
+    grouping: By = check_choice("--by", by, get_args(By))
     names = [ours] if theirs is None else [ours, theirs]
     models = {name: partial(_for_group, name) for name in names}
     for name in names:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, get_args
 
 from stario.fusion.commands.common import process_each, progress_bar
 from stario.fusion.commands.options import (
@@ -21,7 +21,6 @@ from stario.fusion.commands.options import (
     flag,
 )
 from stario.fusion.commands.origin import origin_of
-from stario.fusion.commands.values import backend_named
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.compare import Comparison
@@ -46,15 +45,17 @@ def run(
     as_json: JsonOption = False,
 ) -> None:
     """Fuse each recording into a track with attitude, velocity, biases and covariance."""
+    from stario.fusion.backends import BackendName
     from stario.fusion.fix_file import read_fixes
     from stario.fusion.navigator import Navigator
+    from stario.sequences.arrays import check_choice
     from stario.sequences.lazy import optional_package
 
     if report:
         optional_package("plotly", "report")
     if view:
         optional_package("rerun", "view")
-    chosen = backend_named(backend)
+    chosen: BackendName = check_choice("--backend", backend, get_args(BackendName))
     network = estimating.network()
     navigator = Navigator(network, estimating.settings(), backend=chosen)
     absolute_fixes = [] if fixes is None else read_fixes(fixes)

@@ -4,25 +4,9 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 from stario.sequences.errors import ConfigError, InputError
-
-if TYPE_CHECKING:
-    from stario.fusion.backends import BackendName
-
-
-def backend_named(name: str) -> BackendName:
-    """Return the back end of this name.
-
-    Raises:
-        InputError: there is none.
-    """
-    from stario.fusion.backends import BACKENDS
-    from stario.sequences.arrays import check_choice
-
-    check_choice("--backend", name, BACKENDS)
-    return cast("BackendName", name)
 
 
 def recipe_values(path: Path) -> dict[str, Any]:

@@ -7,7 +7,7 @@ gap of the truth. `CONVENTIONS` defines each number in words.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, cast, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -249,13 +249,3 @@ def _moved(
 def _span(trajectory: Trajectory) -> str:
     time = trajectory.time[trajectory.valid]
     return f"{time[0]:.3f} to {time[-1]:.3f} s" if len(time) else "no valid pose"
-
-
-def check_convention(name: str) -> Convention:
-    """Return the averaging convention of that name.
-
-    Raises:
-        InputError: there is no such convention.
-    """
-    check_choice("convention", name, get_args(Convention))
-    return cast(Convention, name)

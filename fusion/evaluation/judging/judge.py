@@ -10,7 +10,7 @@ import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from stario.fusion.evaluation.judging.network_alone import RecordingPredictor, p
 from stario.fusion.evaluation.judging.prepared import Prepared
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
-from stario.sequences.arrays import check_choice
 from stario.sequences.datasets.batch import Skipped, without_skipped
 from stario.sequences.readers.archive import split_name
 from stario.sequences.sequence import ImuSequence
@@ -78,16 +77,6 @@ class Row:
     medians: dict[str, dict[str, float]]
     ratios: dict[str, Interval]
     pooled: bool = False
-
-
-def check_by(name: str) -> By:
-    """Check that a name is a known grouping, and return it.
-
-    Raises:
-        InputError: the name is not one of `By`.
-    """
-    check_choice("--by", name, get_args(By))
-    return cast(By, name)
 
 
 def judge(

@@ -115,6 +115,7 @@ def test_a_line_that_is_cut_short_is_named(stario, recording: Path, tmp_path: Pa
         (["train", "--data", ".", "--where", "person=dan"], ["--where: found use with --data"]),
         (["train", "--generated", "1", "--out", "RECORDING"], ["folder"]),
         (["evaluate", "RECORDING", "--convention", "ronin"], ["--convention", "--models"]),
+        (["evaluate", "RECORDING", "--models", "default", "--convention", "tlio"], ["convention"]),
     ],
 )
 def test_invalid_arguments_give_a_one_line_error(

@@ -20,8 +20,7 @@ from stario.fusion.evaluation.tables import (
     table_text,
 )
 from stario.network.model import weights_named
-from stario.sequences.accuracy.metrics import check_convention
-from stario.sequences.errors import InputError, WeightsError
+from stario.sequences.errors import WeightsError
 
 
 class ConstantDisplacement:
@@ -93,8 +92,6 @@ def test_the_ronin_convention_is_smaller_by_the_square_root_of_two(table, read) 
     ours = table.values("R-ResNet", "network", "ate_m")[0]
     assert ronin.values("R-ResNet", "network", "ate_m")[0] == pytest.approx(ours / np.sqrt(2))
     assert "convention ronin" in table_text(ronin)
-    with pytest.raises(InputError, match="convention"):
-        check_convention("tlio")
 
 
 def test_text_names_networks_recordings_convention_and_units(table) -> None:
