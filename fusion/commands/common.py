@@ -1,20 +1,24 @@
-"""Shared parts of the commands: iteration over recordings, what they skip, progress, JSON."""
+"""Shared parts of the commands: iteration over recordings, what they skip, progress, files."""
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import typer
 
-from stario.fusion.commands.options import ReadingOptions
-from stario.sequences.errors import InputError
+from stario.fusion.commands.options import EstimatorOptions, ReadingOptions
+from stario.sequences.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
     from stario.fusion.recording import Progress
+    from stario.network.model import DisplacementModel
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
 
@@ -156,3 +160,57 @@ def print_result(as_json: bool, record: object, text: str = "") -> None:
     from stario.sequences.files import json_text
 
     typer.echo(json_text(record) if as_json else text, nl=not as_json)
+
+
+def origin_of(
+    backends: Iterable[str],
+    paths: Sequence[Path],
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
+    network: DisplacementModel,
+    fixes: Path | None = None,
+) -> dict[str, object]:
+    """Return the content of `run.json`; the settings are in `config.json`.
+
+    Args:
+        backends: estimators that are run.
+        paths: recordings, or the folders or list files that were given.
+        reading: options for reading recordings; those that differ from the defaults are named.
+        estimating: options of the estimator.
+        network: the network that they name.
+        fixes: file of absolute fixes.
+    """
+    from importlib.metadata import version
+
+    default = asdict(ReadingOptions())
+    return {
+        "stario": version("stario"),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "model": estimating.model,
+        "weights_sha256": network.card.sha256 or None,
+        "backends": list(backends),
+        "inputs": [str(path.absolute()) for path in paths],
+        "reading": {k: v for k, v in asdict(reading).items() if v != default[k]},
+        "fixes": fixes and str(fixes.absolute()),
+    }
+
+
+def recipe_values(path: Path) -> dict[str, Any]:
+    """Read the settings of a training recipe from a JSON file.
+
+    Raises:
+        ConfigError: the file cannot be read, or is not a table of settings.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError) as error:
+        found = "no such file" if isinstance(error, FileNotFoundError) else str(error)
+        raise ConfigError(str(path), found, "a JSON file with settings") from error
+    if not isinstance(values, dict):
+        raise ConfigError(str(path), type(values).__name__, "a table of settings")
+    return values
+
+
+def names_in(text: str) -> list[str]:
+    """Return the names in a comma-separated list."""
+    return [name.strip() for name in text.split(",")]

@@ -11,6 +11,7 @@ import typer
 from stario.fusion.commands.common import (
     exit_if_skipped,
     explanations,
+    origin_of,
     print_result,
     progress_bar,
 )
@@ -27,7 +28,6 @@ from stario.fusion.commands.options import (
     expand_option_groups,
     refuse_unused,
 )
-from stario.fusion.commands.origin import origin_of
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:

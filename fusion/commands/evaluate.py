@@ -10,6 +10,8 @@ import typer
 
 from stario.fusion.commands.common import (
     exit_if_skipped,
+    names_in,
+    origin_of,
     print_result,
     progress_bar,
     with_bar,
@@ -29,8 +31,6 @@ from stario.fusion.commands.options import (
     refuse_unused,
     refuse_unused_sources,
 )
-from stario.fusion.commands.origin import origin_of
-from stario.fusion.commands.values import names_in
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stario.fusion.commands.values import assignment
 from stario.sequences.errors import InputError, StarioError
 
 if TYPE_CHECKING:
@@ -293,3 +292,15 @@ def _attributes(words: Iterable[str]) -> dict[str, list[str]]:
         key, pattern = assignment("--where", word, "attribute=value", "such as person=dan")
         chosen.setdefault(key, []).append(pattern)
     return chosen
+
+
+def assignment(option: str, word: str, expected: str, example: str) -> tuple[str, str]:
+    """Return what is left and right of the first `=` in the value of an option.
+
+    Raises:
+        InputError: there is no `=`, or nothing on one side of it.
+    """
+    key, _, value = word.partition("=")
+    if not (key and value):
+        raise InputError(option, repr(word), expected, example)
+    return key, value

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, get_args
 
-from stario.fusion.commands.common import process_each, progress_bar
+from stario.fusion.commands.common import origin_of, process_each, progress_bar
 from stario.fusion.commands.options import (
     BackendOption,
     EstimatorOptions,
@@ -20,7 +20,6 @@ from stario.fusion.commands.options import (
     expand_option_groups,
     flag,
 )
-from stario.fusion.commands.origin import origin_of
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.compare import Comparison

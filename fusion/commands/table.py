@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stario.fusion.commands.common import exit_if_skipped
+from stario.fusion.commands.common import exit_if_skipped, names_in, recipe_values
 from stario.fusion.commands.options import (
     CacheOption,
     ReadingOptions,
+    assignment,
     refuse_unused,
 )
-from stario.fusion.commands.values import assignment, names_in, recipe_values
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import list_skipped, progress_bar
+from stario.fusion.commands.common import list_skipped, progress_bar, recipe_values
 from stario.fusion.commands.options import (
     CacheOption,
     OptionalPathsArgument,
@@ -25,7 +25,6 @@ from stario.fusion.commands.training_data import (
     training_material,
     validation_material,
 )
-from stario.fusion.commands.values import recipe_values
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:

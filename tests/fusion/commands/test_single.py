@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from stario.fusion.commands.cli import app
+from stario.fusion.commands.common import origin_of
 from stario.fusion.commands.options import EstimatorOptions, ReadingOptions
-from stario.fusion.commands.origin import origin_of
 from stario.fusion.config import read_config
 from stario.network.architectures import build_network
 from stario.network.card import Card
