@@ -17,7 +17,7 @@ from stario.sequences.readers.clocks import unit_within
 from stario.sequences.readers.columns import Column
 from stario.sequences.readers.geodesy import east_north
 from stario.sequences.readers.phones.sensor_layout import clock_of
-from stario.sequences.readers.phones.sensor_words import sensor_of, words_of
+from stario.sequences.readers.phones.sensor_words import sensor_of, unit_of, words_of
 from stario.sequences.readers.table_head import TableHead, table_heads
 from stario.sequences.readers.text import IntArray, Table, seconds
 from stario.sequences.sequence import FloatArray, PositionTrack
@@ -31,6 +31,9 @@ _NAMES = {"location", "locations", "gps", "gnss"}
 
 _TITLES = {"latitude": {"latitude", "lat"}, "longitude": {"longitude", "lon", "long", "lng"}}
 """Words of which a column's title has one; next to a sensor's name they are directions."""
+
+_LARGEST_DEGREES = 90.0, 180.0
+"""Largest latitude and longitude."""
 
 _RADIUS_PER_SIGMA = 1.51
 """Radius that holds 68 % of a Gaussian in the plane, in standard deviations per axis."""
@@ -118,6 +121,7 @@ def _place_of(title: str) -> str:
 
 def _read(columns: _Columns, start_ns: np.int64, stop_ns: np.int64) -> PositionTrack | None:
     table = columns.head.read(columns.used)
+    _check_degrees(table, [columns.head.titles[place] for place in columns.used[1:3]])
     rows, time = _within(table, columns.clock, start_ns, stop_ns)
     if len(rows) < 2:
         return None
@@ -134,6 +138,23 @@ def _read(columns: _Columns, start_ns: np.int64, stop_ns: np.int64) -> PositionT
     return PositionTrack(time, xy, "positions", valid, radius / _RADIUS_PER_SIGMA)
 
 
+def _check_degrees(table: Table, titles: list[str]) -> None:
+    """Check that latitude and longitude are in degrees; a few cells may hold anything else.
+
+    Raises:
+        ReadError: their titles name another unit, or no row can be in degrees.
+    """
+    place = table.values[:, 1:3]
+    present = place[np.isfinite(place).all(axis=1) & place.any(axis=1)]
+    found = next((title for title in titles if unit_of(title).startswith("rad")), "")
+    if not found and len(present) > 1 and (np.abs(present) > _LARGEST_DEGREES).any(axis=1).all():
+        found = f"{present[0, 0]:.10g} and {present[0, 1]:.10g}"
+    if found:
+        raise ReadError(
+            table.path, "latitude, longitude", found, "degrees, as in 48.137 and 11.575"
+        )
+
+
 def _within(
     table: Table, clock: Column, start_ns: np.int64, stop_ns: np.int64
 ) -> tuple[IntArray, FloatArray]:
@@ -143,7 +164,7 @@ def _within(
         ReadError: all of several positions are at other times.
     """
     place = table.values[:, 1:3]
-    known = np.asarray((np.abs(place) <= [90.0, 180.0]).all(axis=1))  # not where NaN
+    known = np.asarray((np.abs(place) <= _LARGEST_DEGREES).all(axis=1))  # not where NaN
     known &= place.any(axis=1)  # some apps write zeros until there is a position
     known[1:] &= (np.diff(place, axis=0) != 0.0).any(axis=1)  # repeated until there is another
     rows = np.flatnonzero(known)

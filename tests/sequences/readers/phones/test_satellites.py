@@ -1,5 +1,6 @@
 """Satellite positions next to the sensors of a phone's recording."""
 
+import math
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
@@ -145,6 +146,29 @@ def test_positions_known_no_better_than_a_room_are_skipped_with_a_warning(
     save(tmp_path / "p/gps.csv", "time,lat,lon,accuracy", TIME, degrees(METRES), radius)
     assert read_recording(tmp_path / "p").positions is None
     assert "found 1 of 12 positions known to 30 m, expected at least two" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("titles", "factor", "found"),
+    [
+        ("lat,lon", 1e7, "found 449999955 and 70000152.19"),
+        ("lat,lon", 100.0, "found 4499.99"),  # degrees and minutes of NMEA
+        ("lat (rad),lon (rad)", math.radians(1.0), "found lat (rad)"),
+    ],
+)
+def test_positions_in_another_unit_than_degrees_are_skipped_with_a_warning(
+    walk: ImuSequence,
+    tmp_path: Path,
+    titles: str,
+    factor: float,
+    found: str,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    phyphox(tmp_path / "p", walk)
+    save(tmp_path / "p/gps.csv", f"time,{titles}", TIME, factor * degrees(METRES))
+    assert read_recording(tmp_path / "p").positions is None
+    assert found in caplog.text
+    assert "expected degrees, as in 48.137 and 11.575" in caplog.text
 
 
 @pytest.mark.parametrize(
