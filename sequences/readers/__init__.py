@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from stario.sequences.arrays import check_choice
+from stario.sequences.arrays import check_choice, shown
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.inspection.samples import in_order
 from stario.sequences.readers.archive import (
@@ -131,7 +131,7 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
         ReadError: the path does not exist, no format matches, or the content is malformed.
     """
     if not isinstance(path, str | Path):
-        raise InputError("path", f"{path!r:.60}", "the path of a recording")
+        raise InputError("path", shown(path), "the path of a recording")
     path = Path(path)
     check_choice("format", format, ("auto", *FORMATS))
     _check_readable(path, "a recording")
@@ -167,7 +167,13 @@ def find_recordings(
     Raises:
         ReadError: the path does not exist, a folder or archive holds no recording, no recording has
             the attributes, or a list entry is invalid.
+        InputError: `path` is not a path, or `where` has no list of patterns.
     """
+    if not isinstance(path, str | Path):
+        raise InputError("path", shown(path), "the path of recordings")
+    for key, patterns in (where or {}).items():
+        if isinstance(patterns, str):  # its letters would be the patterns
+            raise InputError("where", f"{key!r}: {patterns!r}", f"{key!r}: [{patterns!r}]")
     path = Path(path)
     _check_readable(path, "a recording or a folder of them")
     if is_archive(path):

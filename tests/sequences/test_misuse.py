@@ -21,6 +21,7 @@ from stario.sequences import (
     align,
     check_units,
     evaluate_track,
+    find_recordings,
     generate_walk,
     inspect_recording,
     leg_streams,
@@ -45,6 +46,8 @@ DATES = np.datetime64("2026-01-01") + (1e9 * TIME).astype("timedelta64[ns]")
     ("make", "field", "text"),
     [
         (lambda: ImuSequence(TIME, ROWS, ROWS, POSES), "name", 'ImuSequence("walk", time,'),
+        (lambda: find_recordings(["a.csv"]), "path", "the path of recordings"),
+        (lambda: find_recordings("a.h5", where={"person": "dan"}), "where", "'person': ['dan']"),
         (lambda: generate_walk(-1), "seed", "an integer >= 0"),
         (lambda: generate_walk(None), "seed", "an integer >= 0"),
         (lambda: simulate_imu(POSES, seed=1.5), "seed", "an integer >= 0"),
