@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -16,6 +17,37 @@ from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import WINDOW_SECONDS, rotated_windows
+
+
+class Windows(NamedTuple):
+    """The windows of a recording, as a network receives them.
+
+    Attributes:
+        stop: (n,) their ends [s].
+        R_NB: (n,) levelled attitudes at their starts.
+        heading: (n,) headings of the device in N [rad].
+        contents: their samples in axes without that heading, as bytes.
+    """
+
+    stop: np.ndarray
+    R_NB: Rotation
+    heading: np.ndarray
+    contents: list[bytes]
+
+
+@lru_cache(maxsize=16)
+def windows_of(sequence: ImuSequence, config: NavigatorConfig) -> Windows:
+    """Windows into which a navigator cuts a recording; many tests share a few recordings."""
+    intervals, _ = cut_recording(sequence, config)
+    complete = [e for e in intervals if e.window is not None]
+    heading = np.array([e.window.heading for e in complete])
+    windows = rotated_windows(np.stack([e.window.imu_N for e in complete]), -heading)
+    return Windows(
+        stop=np.array([e.stop for e in complete]),
+        R_NB=Rotation.from_matrix(np.stack([e.window.R_NB for e in complete])),
+        heading=heading,
+        contents=[window.tobytes() for window in windows],
+    )
 
 
 class Oracle:
@@ -36,19 +68,13 @@ class Oracle:
         seed: int = 0,
     ) -> None:
         rng = np.random.default_rng(seed)
-        intervals, _ = cut_recording(sequence, config)
-        complete = [e for e in intervals if e.window is not None]
-        stop = np.array([e.stop for e in complete])
-        first, last = truth.at(stop - WINDOW_SECONDS), truth.at(stop)
-        R_NB = Rotation.from_matrix(np.stack([e.window.R_NB for e in complete]))
-        turn = about_z(yaw_of(R_NB * first.attitude_WB.inv()))
+        windows = windows_of(sequence, config)
+        first, last = truth.at(windows.stop - WINDOW_SECONDS), truth.at(windows.stop)
+        turn = about_z(yaw_of(windows.R_NB * first.attitude_WB.inv()))
         displacement = turn.apply(last.position_W - first.position_W)
         displacement += noise * rng.standard_normal(displacement.shape)
-        heading = np.array([e.window.heading for e in complete])
-        displacement = about_z(-heading).apply(displacement)
-        windows = rotated_windows(np.stack([e.window.imu_N for e in complete]), -heading)
-        keys = [window.tobytes() for window in windows]
-        self._displacements = dict(zip(keys, displacement, strict=True))
+        displacement = about_z(-windows.heading).apply(displacement)
+        self._displacements = dict(zip(windows.contents, displacement, strict=True))
         self._covariance = sigma**2 * np.eye(3)
         self.calls = 0
 

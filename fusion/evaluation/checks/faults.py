@@ -108,12 +108,13 @@ def run_faults(
     """
     truth = true_poses(sequence)
     results: list[FaultResult] = []
+    whole = _observed(sequence, config, model, seed)
     for backend in backends:
-        unmodified = _run(Fault(""), sequence, config, model, seed, backend)
-        without = evaluate_track(unmodified.trajectory, truth).ate_m
+        navigator = Navigator(model or DummyPredictor(), config, backend=backend)
+        without = evaluate_track(navigator.track(whole).trajectory, truth).ate_m
         for fault in faults(sequence.duration) if only is None else only:
             try:
-                track = _run(fault, sequence, config, model, seed, backend)
+                track = navigator.track(_with_fault(fault, sequence, whole, config, model, seed))
             except InputError as refusal:
                 nothing = (math.nan,) * 3
                 words = f"refused: {refusal}"
@@ -144,23 +145,31 @@ def reported(health: Health) -> str:
     return ", ".join(words)
 
 
-def _run(
+def _observed(
+    sequence: ImuSequence, config: NavigatorConfig, model: Predictor | None, seed: int
+) -> PreprocessedRecording:
+    preprocessed = Navigator(model or DummyPredictor(), config).observe(sequence)
+    if model is None and sequence.truth is not None:
+        return with_true_displacements(preprocessed, sequence.truth, config, seed)
+    return preprocessed
+
+
+def _with_fault(
     fault: Fault,
     sequence: ImuSequence,
+    whole: PreprocessedRecording,
     config: NavigatorConfig,
     model: Predictor | None,
     seed: int,
-    backend: BackendName,
-) -> Track:
-    rng = np.random.default_rng(seed)
-    faulty = sequence if fault.modify_samples is None else fault.modify_samples(sequence, rng)
-    navigator = Navigator(model or DummyPredictor(), config, backend=backend)
-    preprocessed = navigator.observe(faulty)
-    if model is None and sequence.truth is not None:
-        preprocessed = with_true_displacements(preprocessed, sequence.truth, config, seed)
+) -> PreprocessedRecording:
+    """Preprocess a recording with a fault; without one in the samples, `whole` has been already."""
+    rng, preprocessed = np.random.default_rng(seed), whole
+    if fault.modify_samples is not None:
+        faulty = fault.modify_samples(sequence, rng)
+        preprocessed = _observed(faulty, config, model, seed)
     if fault.modify_predictions is not None:
         preprocessed = _corrupted(preprocessed, fault.modify_predictions, rng)
-    return navigator.track(preprocessed)
+    return preprocessed
 
 
 class DummyPredictor:
