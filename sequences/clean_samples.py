@@ -16,6 +16,9 @@ log = logging.getLogger(__name__)
 MIN_RATE, MAX_RATE = 40.0, 1200.0
 """Limits of accepted sampling rates [Hz] (50 Hz to 1 kHz, with a margin for jitter)."""
 
+SHARED_TIMES = 1.5
+"""Least number of samples that share a time on average if times are rounded or of batches."""
+
 
 def usable(sequence: ImuSequence) -> BoolArray:
     """Return which samples (N,) are numbers that a sensor can measure, whatever their time."""

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from stario.sequences.clean_samples import MAX_RATE, MIN_RATE
+from stario.sequences.clean_samples import MAX_RATE, MIN_RATE, SHARED_TIMES
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.samples import disorder
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.units import TIME_UNITS
-
-_ROUNDED_TIMES = 1.5
-"""Least number of samples that share a time on average if times are rounded too coarsely."""
 
 _INSIDE = 0.5
 """Share of the magnetometer's samples during the IMU's below which its clock is another."""
@@ -32,7 +29,7 @@ def check_time(sequence: ImuSequence) -> None:
         return
     times = sequence.time[np.isfinite(sequence.time)]
     shared = len(times) / len(np.unique(times))
-    if shared >= _ROUNDED_TIMES:
+    if shared >= SHARED_TIMES:
         raise InputError(
             f"{sequence.name}: time", f"{shared:.3g} samples on average at each time",
             "a time for each sample",

@@ -130,11 +130,8 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
         InputError: `path` is not a path, the format is unknown, or it does not take an option.
         ReadError: the path does not exist, no format matches, or the content is malformed.
     """
-    if not isinstance(path, str | Path):
-        raise InputError("path", shown(path), "the path of a recording")
-    path = Path(path)
     check_choice("format", format, ("auto", *FORMATS))
-    _check_readable(path, "a recording")
+    path = _readable(path, "a recording")
     name = _recognised(path) if format == "auto" else format
     if name is None:
         raise unrecognised(path, sorted(_below(path)), _KNOWN)
@@ -169,13 +166,10 @@ def find_recordings(
             the attributes, or a list entry is invalid.
         InputError: `path` is not a path, or `where` has no list of patterns.
     """
-    if not isinstance(path, str | Path):
-        raise InputError("path", shown(path), "the path of recordings")
     for key, patterns in (where or {}).items():
         if isinstance(patterns, str):  # its letters would be the patterns
             raise InputError("where", f"{key!r}: {patterns!r}", f"{key!r}: [{patterns!r}]")
-    path = Path(path)
-    _check_readable(path, "a recording or a folder of them")
+    path = _readable(path, "a recording or a folder of them")
     if is_archive(path):
         if members := archive_members(path, where):
             return members
@@ -192,12 +186,16 @@ def find_recordings(
     return _with_attributes(found, where)
 
 
-def _check_readable(path: Path, expected: str) -> None:
-    """Check that a path is a file or a folder that may be read.
+def _readable(path: str | Path, expected: str) -> Path:
+    """Return a path, checked to be that of a file or a folder that may be read.
 
     Raises:
+        InputError: it is not a path.
         ReadError: it does not exist, is a pipe or a device, or lacks permission.
     """
+    if not isinstance(path, str | Path):
+        raise InputError("path", shown(path), f"the path of {expected}")
+    path = Path(path)
     file = split_name(path)[0]
     if not file.exists():
         raise ReadError(path, "path", "no such file or folder", expected)
@@ -205,6 +203,7 @@ def _check_readable(path: Path, expected: str) -> None:
         raise ReadError(path, "path", "a pipe or device", expected, "save its content as a file")
     if not may_be_read(file):
         raise ReadError(path, "path", "no permission to read", expected, "fix its permissions")
+    return path
 
 
 def _with_attributes(found: list[Path], where: AttributeFilter | None) -> list[Path]:

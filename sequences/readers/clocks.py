@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.arrays import interpolated
-from stario.sequences.clean_samples import MAX_RATE, MIN_RATE
+from stario.sequences.clean_samples import MAX_RATE, MIN_RATE, SHARED_TIMES
 from stario.sequences.errors import ReadError
 from stario.sequences.inspection.samples import disorder
 from stario.sequences.readers.phones.sensor_words import XSENS_CLOCK
@@ -35,9 +35,6 @@ _SINCE_1970_S = 1e8
 
 _FEW_LOST = 0.05
 """Share of samples before the start or after the end of another sensor that need no mention."""
-
-_MANY_SHARE = 1.5
-"""Number of different samples at each time, on average, above which most are lost."""
 
 _FEW_ROWS = 10
 """Number of rows below which a count may be a coincidence."""
@@ -124,7 +121,7 @@ def _warn_of_few_times(path: Path, name: str, stamps_ns: IntArray, samples: Bool
         return
     shared = float(samples.sum()) / len(stamps_ns)
     rate = 1e9 / float(np.median(np.diff(stamps_ns)))
-    if shared >= _MANY_SHARE:
+    if shared >= SHARED_TIMES:
         _log.warning(
             "%s: %s: found %.3g samples on average at each time, of which one is used, expected a "
             "time for each: export them unrounded, and not in batches", path, name, shared,

@@ -46,7 +46,7 @@ DATES = np.datetime64("2026-01-01") + (1e9 * TIME).astype("timedelta64[ns]")
     ("make", "field", "text"),
     [
         (lambda: ImuSequence(TIME, ROWS, ROWS, POSES), "name", 'ImuSequence("walk", time,'),
-        (lambda: find_recordings(["a.csv"]), "path", "the path of recordings"),
+        (lambda: find_recordings(["a.csv"]), "path", "the path of a recording or a folder"),
         (lambda: find_recordings("a.h5", where={"person": "dan"}), "where", "'person': ['dan']"),
         (lambda: generate_walk(-1), "seed", "an integer >= 0"),
         (lambda: generate_walk(None), "seed", "an integer >= 0"),
