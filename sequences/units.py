@@ -44,12 +44,17 @@ _SPELLINGS = {
         "us": ("usec", "microsecond", "microseconds", "µs", "μs"),
         "ns": ("nsec", "nanosecond", "nanoseconds"),
         "rad/s": ("rads", "rads-1", "radps"),
-        "deg/s": ("dps", "°/s", "\ufffd/s", "degs", "degs-1"),
-        "m/s^2": ("m/s2", "m/s/s", "m/s²", "m/s\ufffd", "ms2", "ms-2", "mps2", "m/(s2)"),
+        "mdps": ("mdeg/s",),
+        "deg/s": ("dps", "°/s", "º/s", "\ufffd/s", "degs", "degs-1", "°s-1"),
+        "m/s^2": ("m/s2", "m/s/s", "m/s\ufffd", "ms2", "ms-2", "mps2", "m/(s2)"),
         "-m/s^2": ("-m/s2",),
+        "g": ("g's",),
     }.items()
     for spelling in spellings
 }
+
+_IGNORED = str.maketrans({" ": "", "^": "", "â": "", "·": "", "⁻": "-", "¹": "1", "²": "2"})
+"""Signs that make no difference; `â` begins those of a wrong encoding."""
 
 _WORDS = (
     ("squared", "2"),
@@ -70,7 +75,7 @@ def unit_named(text: str) -> str:
 
     Characters garbled by a wrong encoding (`m/sÂ²`, `\ufffdT`) are recognised as well.
     """
-    plain = text.lower().replace(" ", "").replace("^", "").replace("â", "").replace("_", "/")
+    plain = text.lower().translate(_IGNORED).replace("_", "/")
     if plain in _SPELLINGS:
         return _SPELLINGS[plain]
     for word, short in _WORDS:

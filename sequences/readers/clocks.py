@@ -39,6 +39,9 @@ _FEW_LOST = 0.05
 _FEW_ROWS = 10
 """Number of rows below which a count may be a coincidence."""
 
+_DATE_FIELDS = (1970, 2100), (1, 13), (1, 32), (0, 24), (0, 60), (0, 60)
+"""Smallest year, month, day, hour, minute and second of a date, and the limit of each."""
+
 
 def resample_to_gyro(
     path: Path,
@@ -133,21 +136,36 @@ def _warn_of_few_times(path: Path, name: str, stamps_ns: IntArray, samples: Bool
         )  # fmt: skip
 
 
-def refuse_row_numbers(file: Path, title: str, time: FloatArray) -> None:
-    """Refuse a column without a unit that only counts its rows, 0, 1, 2, ... or 1, 2, 3, ...
+def refuse_counts_and_dates(file: Path, title: str, time: FloatArray) -> None:
+    """Refuse a column without a unit that counts rows, or whose digits are dates.
 
-    In one of the units it would always be a plausible time.
+    Rows are counted as 0, 1, 2, ... or 1, 2, 3, ...; digits such as 20240501120059990 are a date
+    and a time of day to the millisecond. Taken for one of the units either would be plausible.
 
     Raises:
-        ReadError: the column counts rows; not raised for fewer than ten.
+        ReadError: the column holds either; not raised for fewer than ten rows.
     """
     count = len(time)
-    if count < _FEW_ROWS or not np.array_equal(time - time[0], np.arange(count)):
+    if count < _FEW_ROWS:
         return
-    if time[0] in (0.0, 1.0):
+    if np.array_equal(time - time[0], np.arange(count)) and time[0] in (0.0, 1.0):
         found = f"{time[0]:.0f}, {time[0] + 1:.0f}, {time[0] + 2:.0f}, ..., which counts the rows"
         fix = f"name a column of times `t [s]`; if these are times, name their unit: `{title} [ms]`"
         raise ReadError(file, title, found, "times", fix)
+    if _is_date(time) or _is_date(time // 1000.0):
+        expected = "seconds, or dates such as 2024-05-01 12:00:59.990"
+        raise ReadError(file, title, f"{time[0]:.0f}, a date without separators", expected)
+
+
+def _is_date(time: FloatArray) -> bool:
+    """Return whether the digits of all times are year, month, day, hour, minute and second."""
+    date, clock = np.divmod(time, 1e6)
+    year, day = np.divmod(date, 1e4)
+    fields = (year, day // 100, day % 100, clock // 1e4, clock // 100 % 100, clock % 100)
+    return all(
+        bool(((field >= least) & (field < limit)).all())
+        for field, (least, limit) in zip(fields, _DATE_FIELDS, strict=True)
+    )
 
 
 def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.int64) -> int:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.clocks import assumed_unit, refuse_row_numbers, time_unit
+from stario.sequences.readers.clocks import assumed_unit, refuse_counts_and_dates, time_unit
 from stario.sequences.readers.columns import IMU, QUANTITIES, Column, Header, unit_factor
 from stario.sequences.readers.dates import with_seconds
 from stario.sequences.readers.lines import decimal_mark, ends_within_a_row, is_row, unquoted
@@ -160,7 +160,7 @@ def _seconds(
 def _per_second(path: Path, column: Column, time: FloatArray) -> tuple[int, str]:
     """Return the units per second and the unit assumed if the header names none, by the rate."""
     if not column.unit:
-        refuse_row_numbers(path, column.title, time)
+        refuse_counts_and_dates(path, column.title, time)
         with suppress(ReadError):
             per_second = time_unit(path, time)
             return per_second, assumed_unit(per_second, float(time[0]))

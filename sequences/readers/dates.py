@@ -14,11 +14,11 @@ _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct",
 _TIME = re.compile(
     r"(?<![\w:.])"
     r"(?:(?:(?P<date>\d{4}[-/]\d\d[-/]\d\d|\d\d-[a-z]{3}-\d{4})"
-    r"|\d\d?[./]\d\d?[./]\d\d(?:\d\d)?)[t ])?"
+    r"|\d\d?[./]\d\d?[./]\d\d(?:\d\d)?)[t _])?"
     r"(?P<clock>\d?\d:\d\d:\d\d)"
     r"(?:(?::(?P<count>\d+))|(?:\.|,(?=\d+[;\t]))(?P<fraction>\d+))?"
     r"(?: ?(?P<half>am|pm)\b)?"
-    r"(?: ?(?P<zone>z|(?:utc|gmt)?[+-]\d\d:?\d\d|utc|gmt))?"
+    r"(?P<zone> ?(?:z|(?:utc|gmt)?[+-]\d\d:?\d\d|utc|gmt)|[+-]\d\d)?"
     r"(?![\w:])",
     flags=re.IGNORECASE,
 )

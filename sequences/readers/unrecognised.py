@@ -13,6 +13,7 @@ from stario.sequences.readers.phones.files import (
     incomplete_sensors,
     names_both_sensors,
     recording_with,
+    unmatched_files,
     unread_files,
 )
 from stario.sequences.readers.poses import pose_files
@@ -47,6 +48,10 @@ def unrecognised(path: Path, inside: list[Path], known: str) -> ReadError:
     elif names_both_sensors(path):
         found, fix = "no column of times that grow", "name one `t [s]`; a count of samples is none"
         return ReadError(path, "time", found, "one next to the sensors'", fix)
+    elif path.is_dir() and (files := unmatched_files(path)):
+        found = f"files of different devices or recordings ({_some([f.name for f in files])})"
+        expected, fix = "those of one", "name the files of one alike: gyro_a.csv and accel_a.csv"
+        return ReadError(path, "sensors", found, expected, fix)
     elif path.is_dir() and (poses := pose_files(path)):
         expected = "a gyroscope file and an accelerometer file"
         fix = "put the IMU files into the same folder"
@@ -84,14 +89,17 @@ def _subfolders(path: Path) -> list[Path]:
 def _folder(path: Path) -> tuple[str, str]:
     """Return what a folder holds and what is wrong with the first file that may be a recording."""
     entries = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
-    names = ", ".join(entries[:5]) or "nothing"
-    more = f" and {len(entries) - 5} more" if len(entries) > 5 else ""
-    found = f"a folder with {names}{more}"
+    found = f"a folder with {_some(entries) or 'nothing'}"
     files = [file for file in sorted(path.rglob("*")) if file.suffix.lower() in SUFFIXES]
     if not files:
         return found, "name a folder with a recording"
     words, fix = _file(files[0])
     return f"{found}; {files[0].relative_to(path)} holds {words}", fix
+
+
+def _some(names: list[str]) -> str:
+    """Return the first five of the names, and how many more there are."""
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 def _file(path: Path) -> tuple[str, str]:

@@ -27,6 +27,12 @@ SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")
 _MOTION = {"mot", "motion", "full"}
 """Words in names of Core Motion's files, `MotMagnFull.txt`, that identify no recording."""
 
+_DEVICES = {
+    *("phone", "watch", "wrist", "headphone", "headphones", "airpods", "glasses", "tag", "foot"),
+    *("left", "right", "head", "chest", "hip", "waist", "thigh", "ankle", "leg", "arm", "hand"),
+}
+"""Words in names of files that tell devices apart, whose sensors must not be mixed."""
+
 NO_SAMPLES = "no rows with a time that grows and three values"
 """What a file of `PhoneFiles.unread` has, if it may be read."""
 
@@ -125,6 +131,19 @@ def _groups(folder: Path) -> list[PhoneFiles]:
     return list(groups.values())
 
 
+def unmatched_files(folder: Path) -> list[Path]:
+    """Return the gyroscope and accelerometer files of a folder without a recording; never raises.
+
+    Empty if it lacks either: these are of different devices or recordings, by their names.
+    """
+    tables = [group.tables for group in _groups(folder)]
+    wanted = [
+        {table.file for one in tables for sensor in sensors for table in one.get(sensor, [])}
+        for sensors in (("gyro",), ("accel", "linear"))
+    ]
+    return sorted(set.union(*wanted)) if all(wanted) else []
+
+
 def is_complete(sensors: Collection[str | None]) -> bool:
     """Return whether sensors include a gyroscope and an accelerometer of either kind."""
     return "gyro" in sensors and bool({"accel", "linear"} & set(sensors))
@@ -174,8 +193,10 @@ def _preference(file: Path, words: list[str]) -> tuple[bool, bool, bool, Path]:
 
 
 def _merged_groups(groups: list[PhoneFiles]) -> PhoneFiles:
-    """Merge groups into one recording, which is empty if a sensor occurs in several of them."""
+    """Merge groups into one recording; it is empty if they have a sensor twice or other devices."""
     merged = PhoneFiles("")
+    if len({frozenset(_DEVICES.intersection(group.key.split())) for group in groups}) > 1:
+        return merged
     for group in groups:
         for sensor, tables in group.tables.items():
             if sensor in merged.tables:

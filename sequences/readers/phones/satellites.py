@@ -116,7 +116,8 @@ def _place_of(title: str) -> str:
         if names & words and sensor_of(words) is None:
             return place
     others = {"vertical", "speed", "bearing", "course", "heading", "altitude", "time", "magnetic"}
-    return "radius" if "accuracy" in words and not others & words else ""
+    stated = "accuracy" in words or {"h", "acc"} <= words or "hacc" in words
+    return "radius" if stated and not others & words else ""
 
 
 def _read(columns: _Columns, start_ns: np.int64, stop_ns: np.int64) -> PositionTrack | None:

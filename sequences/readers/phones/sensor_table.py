@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.clocks import assumed_unit, refuse_row_numbers, time_unit
+from stario.sequences.readers.clocks import assumed_unit, refuse_counts_and_dates, time_unit
 from stario.sequences.readers.columns import Column, unit_factor
 from stario.sequences.readers.devices import refuse_several_devices
 from stario.sequences.readers.phones.sensor_layout import Layout, by_header, by_rows
@@ -103,7 +103,7 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
     rows = table.read([clock, *places, *table.biases])
     kept = _complete_rows(table.file, sensor, titles, rows.values[:, 1:])
     if not clock.unit:
-        refuse_row_numbers(table.file, clock.title or "time", rows.values[:, 0])
+        refuse_counts_and_dates(table.file, clock.title or "time", rows.values[:, 0])
     time, values = rows.values[kept, 0], rows.values[kept, 1:4]
     if table.biases:
         values = values - rows.values[kept, 4:7]

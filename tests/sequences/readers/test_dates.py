@@ -38,6 +38,8 @@ def written(path: Path, header: str, form: str, start: datetime, count: int = 20
         "%I:%M:%S.%f %p",
         "%Y-%m-%d %H:%M:%S.%f UTC",
         "%Y-%m-%dT%H:%M:%S.%f+00:00",
+        "%Y-%m-%dT%H:%M:%S.%f+02",
+        "%Y-%m-%d_%H:%M:%S.%f",
         "%Y-%m-%d %H:%M:%S.%f GMT+02:00",
         "%Y-%m-%d %H:%M:%S.%f -0330",
         "%Y/%m/%d %H:%M:%S.%f",
@@ -58,8 +60,25 @@ def test_times_are_read_with_any_date_and_zone(
 def test_zones_and_names_of_months_give_the_same_instant() -> None:
     noon = "1714564800.5"
     for text in ("2024-05-01T12:00:00.5Z", "2024-05-01 14:00:00.5 +02:00", "2024/05/01 12:00:00.5",
-                 "2024-05-01 08:30:00.5 GMT-0330", "01-May-2024 12:00:00.5"):  # fmt: skip
+                 "2024-05-01 08:30:00.5 GMT-0330", "01-May-2024 12:00:00.5",
+                 "2024-05-01_14:00:00.5+02"):  # fmt: skip
         assert with_seconds([text]) == [noon]
+
+
+def test_a_cell_after_a_blank_is_no_zone() -> None:
+    assert with_seconds(["12:00:00.5 -12 3"])[0].endswith(".5 -12 3")
+
+
+@pytest.mark.parametrize("header", [GENERIC, WIDE])
+@pytest.mark.parametrize("digits", [14, 17])
+def test_dates_without_separators_are_refused(tmp_path: Path, header: str, digits: int) -> None:
+    """Taken for a number, the time would jump by 40 s at each full minute."""
+    path = written(tmp_path / "own.csv", header, "%Y%m%d%H%M%S%f", NOON)
+    lines = path.read_text().splitlines()
+    cut = [line[:digits] + line[20:] for line in lines[1:]]
+    write_lines(path, lines[0], *cut)
+    with pytest.raises(ReadError, match=r"found 20240501123456\d*, a date without separators"):
+        read_recording(path)
 
 
 def test_midnight_passes_in_every_column_of_times_and_for_late_rows() -> None:

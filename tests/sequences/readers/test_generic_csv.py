@@ -162,7 +162,9 @@ def test_units_are_converted_to_si(tmp_path: Path) -> None:
     header = "t,gx [degrees/s],gy [deg/second],gz [degrees per second],"
     header += "ax [m/sec^2],ay [meters per second squared],az [metres/s^2]"
     assert np.allclose(read(header), (np.radians(gyro), accel))
-    header = "t,gx [mdps],gy [mdps],gz [mdps],ax [mg],ay [mg],az [mg]"
+    header = "t,gx [º/s],gy [°·s⁻¹],gz [deg s-1],ax [m·s⁻²],ay [m/s²],az [m s^-2]"
+    assert np.allclose(read(header), (np.radians(gyro), accel))
+    header = "t,gx [mdps],gy [mdeg/s],gz [mdps],ax [mg],ay [mg],az [mg]"
     assert np.allclose(read(header), (1e-3 * np.radians(gyro), 1e-3 * STANDARD_GRAVITY * accel))
     header = "t,gx,gy,gz,ax [-g],ay [-g],az [-g]"
     assert np.allclose(read(header), (gyro, -STANDARD_GRAVITY * accel))

@@ -130,3 +130,24 @@ def test_an_euroc_file_whose_titles_are_in_another_order_is_not_read_by_position
     with pytest.raises(ReadError, match=r"header: found .*, expected time, gyroscope xyz and acc"):
         read_recording(tmp_path / "V1")
     np.testing.assert_allclose(read_recording(imu, format="csv").gyro, walk.gyro)
+
+
+@pytest.mark.parametrize(
+    ("gyro", "accel"), [("Gyroscope", "WatchAccelerometer"), ("left_gyro_1", "right_accel_2")]
+)
+def test_sensors_of_different_devices_are_not_mixed(
+    walk: ImuSequence, tmp_path: Path, gyro: str, accel: str
+) -> None:
+    save(tmp_path / "w" / f"{gyro}.csv", "time,x,y,z", walk.time, walk.gyro)
+    save(tmp_path / "w" / f"{accel}.csv", "time,x,y,z", walk.time, walk.accel)
+    message = rf"w: sensors: found files of different devices .*\({gyro}\.csv, {accel}\.csv\)"
+    with pytest.raises(ReadError, match=message):
+        read_recording(tmp_path / "w")
+
+
+def test_sensors_whose_files_differ_in_a_number_are_of_one_recording(
+    walk: ImuSequence, tmp_path: Path
+) -> None:
+    save(tmp_path / "w/left_gyro_1.csv", "time,x,y,z", walk.time, walk.gyro)
+    save(tmp_path / "w/left_accel_2.csv", "time,x,y,z", walk.time, walk.accel)
+    assert len(read_recording(tmp_path / "w")) == len(walk)

@@ -207,7 +207,7 @@ def write_sensor_files(folder, *names: str) -> None:
             ("walk1_acc.csv", "walk1_gyr.csv", "walk2_acc.csv", "walk2_gyr.csv"),
             r"a folder of 2 recordings, .*; name one, such as .*/walk1_gyr\.csv",
         ),
-        (("acc_1.csv", "acc_2.csv", "gyr_3.csv"), r"a folder with acc_1\.csv, acc_2\.csv, gyr_3"),
+        (("acc_1.csv", "acc_2.csv", "gyr_3.csv"), r"recordings \(acc_1\.csv, acc_2\.csv, gyr_3"),
     ],
 )
 def test_recordings_that_share_a_folder_are_not_mixed(tmp_path, names, message) -> None:

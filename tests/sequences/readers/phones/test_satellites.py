@@ -43,6 +43,16 @@ def test_a_degree_has_its_length_on_the_ellipsoid() -> None:
     np.testing.assert_allclose(east, [1e-3 * EAST, 0.0], atol=0.02)
 
 
+@pytest.mark.parametrize("title", ["accuracy", "hAcc (m)", "h_acc", "HACC"])
+def test_the_radius_may_be_named_briefly(walk: ImuSequence, tmp_path: Path, title: str) -> None:
+    phyphox(tmp_path / "p", walk)
+    radius = np.full(len(TIME), 4.53)
+    save(tmp_path / "p/gps.csv", f"time,lat,lon,{title}", TIME, degrees(METRES), radius)
+    sigma = positions_of(tmp_path / "p").sigma
+    assert sigma is not None
+    np.testing.assert_allclose(sigma, 3.0)
+
+
 def test_the_antimeridian_is_no_jump() -> None:
     _, there = east_north(np.array([[0.0, 179.999], [0.0, -179.999]]))
     np.testing.assert_allclose(there, [222.64, 0.0], atol=0.01)
