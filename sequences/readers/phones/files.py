@@ -136,12 +136,10 @@ def unmatched_files(folder: Path) -> list[Path]:
 
     Empty if it lacks either: these are of different devices or recordings, by their names.
     """
+    kinds: tuple[tuple[Sensor, ...], ...] = (("gyro",), ("accel", "linear"))
     tables = [group.tables for group in _groups(folder)]
-    wanted = [
-        {table.file for one in tables for sensor in sensors for table in one.get(sensor, [])}
-        for sensors in (("gyro",), ("accel", "linear"))
-    ]
-    return sorted(set.union(*wanted)) if all(wanted) else []
+    files = [{t.file for one in tables for s in kind for t in one.get(s, [])} for kind in kinds]
+    return sorted(set.union(*files)) if all(files) else []
 
 
 def is_complete(sensors: Collection[str | None]) -> bool:
