@@ -279,7 +279,7 @@ def _interval(
         attitudes = np.stack([attitude.R_NB, attitude.R_NB])
     else:
         attitudes = attitude.advance(time, gyro, accel)
-    bias = float(np.linalg.norm(attitude.b_g))
+    bias = math.sqrt(attitude.b_g @ attitude.b_g)
     return ImuInterval(
         *(time, gyro, accel, gap, attitudes, attitude.R_NB),
         levelled_bias=bias,

@@ -244,10 +244,10 @@ class FieldBuffer:
             self._fields.pop()
         newest = self._fields[-1][0] if self._fields else -math.inf
         newest = max(newest, self._last_query - _MAX_DELAY)
-        size = float(np.abs(field_B).sum())
+        value = tuple(field_B.tolist())
+        size = sum(map(abs, value))
         if not (math.isfinite(time) and time > newest and size < MAX_SENSOR_VALUE):
             return False
-        value = tuple(field_B.tolist())
         if value != self._value:
             self._value, self._since = value, time
         if time - self._since > _MAX_REPEATED:

@@ -111,14 +111,14 @@ def segment_of(
         b_a: (3,) accelerometer bias [m/s^2].
         config: noise and gravity.
     """
+    noise = [_widened_noise(config, e.accel_factor, e.flags) for e in intervals]
     first, *rest = intervals
+    if not rest:
+        return preintegrate(first.time, first.gyro, first.accel, b_g, b_a, noise[0], config.gravity)
     table = np.vstack([first.table, *(e.table[1:] for e in rest)])  # without the shared samples
-    noise = [
-        density
-        for e in intervals
-        for density in [_widened_noise(config, e.accel_factor, e.flags)] * (len(e.time) - 1)
-    ]
-    return preintegrate(table[:, 0], table[:, 1:4], table[:, 4:], b_g, b_a, noise, config.gravity)
+    time, gyro, accel = table[:, 0], table[:, 1:4], table[:, 4:]
+    steps = [d for e, d in zip(intervals, noise, strict=True) for _ in range(len(e.time) - 1)]
+    return preintegrate(time, gyro, accel, b_g, b_a, steps, config.gravity)
 
 
 @lru_cache(maxsize=64)  # successive intervals repeat it, and validating settings is slow

@@ -70,13 +70,11 @@ class Block:
     Attributes:
         imu_N: (6, n) gyroscope [rad/s] and specific force [m/s^2] in N.
         R_NB: (3, 3) levelled attitude at its start.
-        facing_N: (2,) direction that the device faces there, as given by `facing`.
         flagged: whether it contains faulty or missing samples.
     """
 
     imu_N: NDArray[np.float32]
     R_NB: FloatArray
-    facing_N: FloatArray
     flagged: bool
 
 
@@ -112,9 +110,8 @@ class WindowBuffer:
         # The first average reaches half a grid step back, into the tail.
         samples = rows if tail is None else np.concatenate([tail, rows])
         imu_N = resample(samples[:, 0], samples[:, 1:], interval.start + self._grid)
-        R_NB = attitudes[0]
         flagged = flags.gyro or flags.accel or flags.missing
-        self._blocks.append(Block(imu_N.astype(np.float32).T, R_NB, facing(R_NB), flagged))
+        self._blocks.append(Block(imu_N.astype(np.float32).T, attitudes[0], flagged))
 
     def window(self) -> Window | None:
         """Return the second that ends with the newest interval, once it is complete."""
@@ -124,7 +121,7 @@ class WindowBuffer:
         return Window(
             imu_N=np.concatenate([block.imu_N for block in blocks], axis=1),
             R_NB=blocks[0].R_NB,
-            heading=float(mean_heading(np.array([block.facing_N for block in blocks]))),
+            heading=float(mean_heading(facing(np.array([block.R_NB for block in blocks])))),
             flagged=any(block.flagged for block in blocks),
         )
 

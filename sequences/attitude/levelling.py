@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import numpy as np
 
@@ -51,6 +51,9 @@ _BIAS_WALK = 2e-5
 _TURN_NOISE, _FORCE_NOISE = 8.5e-3, 0.1
 """Noise densities of the tilt [rad/sqrt(s)] and of a pedestrian's force direction [rad sqrt(s)];
 their ratio is the rate at which the converged filter levels [1/s]."""
+
+_NOISE = np.diag([_TURN_NOISE**2, _TURN_NOISE**2, 0.0, *[_BIAS_WALK**2] * 3])
+_EYE = np.eye(6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,11 +115,7 @@ def integrate(R_NB: FloatArray, time: FloatArray, gyro: FloatArray) -> FloatArra
     """
     dt = (time[1:] - time[:-1])[:, None]
     turns = dt * (0.5 * (gyro[:-1] + gyro[1:]) + dt / 12.0 * cross(gyro[:-1], gyro[1:]))
-    attitudes = np.empty((len(time), 3, 3))
-    attitudes[0] = R_NB
-    for k, turn in enumerate(exp_so3(turns)):
-        np.matmul(attitudes[k], turn, out=attitudes[k + 1])
-    return attitudes
+    return np.array([*accumulate(exp_so3(turns), np.matmul, initial=R_NB)])
 
 
 def levelled_attitudes(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:
@@ -193,11 +192,10 @@ class LevelledAttitude:
         dt = float(time[-1] - time[0])
         force_N = (attitudes @ accel[:, :, None])[:, :, 0]
         up = (0.5 * (time[1:] - time[:-1])) @ (force_N[1:] + force_N[:-1]) / dt
-        up /= max(float(np.linalg.norm(up)), MIN_GRAVITY_FORCE)
-        F = np.eye(6)  # theta' = theta - dt R d_bg
-        F[:3, 3:] = -dt * attitudes.mean(axis=0)
-        turn, walk = dt * _TURN_NOISE**2, dt * _BIAS_WALK**2
-        P = F @ self._P @ F.T + np.diag([turn, turn, 0.0, walk, walk, walk])
+        up /= max(math.sqrt(up @ up), MIN_GRAVITY_FORCE)
+        F = _EYE.copy()  # theta' = theta - dt R d_bg
+        F[:3, 3:] = -dt * (attitudes.sum(axis=0) / len(attitudes))
+        P = F @ self._P @ F.T + dt * _NOISE
         gain = P[:, :2] @ _inverse(P[:2, :2], _FORCE_NOISE**2 / dt)
         P = P - gain @ P[:2]
         self._P = 0.5 * (P + P.T)
