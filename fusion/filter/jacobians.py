@@ -193,7 +193,7 @@ def propagated(
     bias_jacobian = np.empty((9, 6), order="F")
     R, v, p = segment.predict(R_WB, v_W, p_W, b_g, b_a, bias_jacobian)
     adjoint = invariant_from_local(R, v, p)
-    local = segment.pim.residualCovariance()
+    local = np.ascontiguousarray(segment.pim.residualCovariance())  # faster products
     noise = np.empty((2, CORE, CORE))
     noise[ASSUMED] = adjoint @ local @ adjoint.T
     actual = adjoint.copy()
