@@ -281,6 +281,22 @@ def test_weights_to_start_from_set_the_network(
     stario(*call, *first, "--model", "StarIO").assert_one_line_error("--start-from", other)
 
 
+@pytest.mark.usefixtures("narrow_network")
+def test_sigma_is_not_calibrated_on_a_few_seconds_where_initial_weights_have_a_calibration(
+    stario, recording: Path, tmp_path: Path, tiny: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def calibration(out: str, *options: str) -> object:
+        call = ("train", recording, "--recorded-only", "--config", tiny, *options, "--out", out)
+        assert stario(*call).code == 0
+        return json.loads((tmp_path / out / "model.json").read_text())["calibration"]
+
+    first = calibration("first")
+    tuned = ("--start-from", "first/model.safetensors")
+    assert calibration("tuned", *tuned) == first
+    monkeypatch.setattr("stario.fusion.commands.train._CALIBRATING_S", 1.0)
+    assert calibration("calibrated", *tuned) != first
+
+
 def test_fine_tuning_changes_weights_a_little_unless_a_recipe_says_otherwise(tiny: Path) -> None:
     first = load_model("default")
     assert _recipe(None, None).learned == _recipe(tiny, first).learned == 1.0
