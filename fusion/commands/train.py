@@ -126,6 +126,7 @@ def train(
     from stario.fusion.evaluation.folders import make_folder
     from stario.network.model import load_model
     from stario.network.training.parallel import is_leader
+    from stario.network.training.splits import warn_of_learned
     from stario.sequences.datasets.cache_files import cache_folder
 
     walks = _number_of_walks(generated, recorded_only)
@@ -136,12 +137,11 @@ def train(
     _check_sources(reading, paths, validation, data, generated)
     folder = cache or cache_folder()
     streams_of = partial(streams_of_files, reading, recipe.attitude, folder, jobs)
+    lists = packaged_lists(data, leave_out, learn_from)
+    if data is not None and (judged := last_stage or start_from):
+        warn_of_learned([judged], lists[1], data)
     recorded, held_out, skipped = recorded_streams(
-        reading,
-        paths or [],
-        validation or [],
-        packaged_lists(data, leave_out, learn_from),
-        streams_of,
+        reading, paths or [], validation or [], lists, streams_of
     )
     out = out or Path("runs") / recipe.architecture
     make_folder(out)
