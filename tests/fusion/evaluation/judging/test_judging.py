@@ -269,6 +269,15 @@ def test_pedestrian_dead_reckoning_is_judged_like_a_network(walk: ImuSequence) -
     assert 0.5 < found.figures["length_ratio"] < 1.6
 
 
+def test_the_share_of_the_path_is_that_of_the_pieces_between_gaps(walk: ImuSequence) -> None:
+    """Pieces are fitted one by one: a share of the whole path would shrink with every gap."""
+    kept = np.abs(walk.time - walk.time.mean()) > 0.5
+    samples = {name: getattr(walk, name)[kept] for name in ("time", "gyro", "accel")}
+    found = errors_of(replace(walk, **samples), PedestrianDeadReckoning())
+    share = 100.0 * found.figures["ate_fit_m"] / (0.5 * found.path_m)
+    assert found.figures["ate_fit_percent"] == pytest.approx(share, rel=0.1)
+
+
 @pytest.fixture(scope="module")
 def judged_pair(walk: ImuSequence) -> list[RecordingResult]:
     prepared = [
