@@ -112,6 +112,9 @@ def read_card(weights: Path) -> Card:
             differs.
     """
     path = card_path(weights)
+    if weights.is_dir():
+        fix = f"name the one in it: {weights / 'model.safetensors'}"
+        raise WeightsError(weights, "file", "a folder", "a file of weights", fix)
     for needed in (weights, path):
         if not needed.is_file():
             raise WeightsError(needed, "file", "nothing there", "weights and card in one folder")

@@ -93,6 +93,7 @@ def evaluate(
 ) -> None:
     """Evaluate accuracy and consistency over recordings with ground truth: medians and means."""
     from stario.fusion.evaluation.folders import check_folder
+    from stario.network.training.splits import warn_of_learned
 
     if out is not None:
         check_folder(out)
@@ -100,6 +101,9 @@ def evaluate(
     _refuse_unused(estimating, by, against, ekf, models, convention, runs)
     listed, skipped = _listed(reading, paths or [], data, split)
     files = [entry.path for entry in listed]
+    if data is not None:
+        names = [estimating.model, against or ""] if models is None else names_in(models)
+        warn_of_learned(names, files, data)
     if by is not None:
         skipped += _groups(listed, reading, by, estimating.model, against, ekf, jobs, out, as_json)
     elif models is not None:

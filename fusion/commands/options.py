@@ -115,7 +115,11 @@ class ReadingOptions:
         return {name: value for name, value in asdict(self).items() if name != "where"}
 
     def recordings(self, paths: Iterable[Path]) -> tuple[list[Path], list[Skipped]]:
-        """Return the recordings at the paths, in folders or list files, and the skipped paths."""
+        """Return the recordings at the paths, in folders or list files, and the skipped paths.
+
+        One that is named twice, such as by its folder and a list, is returned once: it would count
+        twice in training and in intervals.
+        """
         from stario.sequences.datasets.batch import skipped
         from stario.sequences.readers import find_recordings
 
@@ -132,7 +136,10 @@ class ReadingOptions:
                 files += find_recordings(path, errors.append, chosen)
             except StarioError as error:
                 errors.append(error)
-        return files, [skipped("", error) for error in errors]
+        distinct: dict[Path, Path] = {}
+        for path in files:
+            distinct.setdefault(path.resolve(), path)
+        return list(distinct.values()), [skipped("", error) for error in errors]
 
     def read(self, path: Path) -> ImuSequence:
         """Read a recording in rad/s, m/s^2 of specific force and the axes of its ground truth.

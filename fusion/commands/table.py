@@ -71,9 +71,9 @@ def table(
     from stario.fusion.table.files import known_costs, write_results
     from stario.fusion.table.filling import backend as on_backend
     from stario.fusion.table.filling import fill, table_cells
-    from stario.fusion.table.sets import learned_from
     from stario.fusion.table.training import ReaderConfig
     from stario.network.architectures import ARCHITECTURES
+    from stario.network.training.splits import learned_from
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.cache_files import cache_folder
 

@@ -25,7 +25,7 @@ from stario.network.model import DisplacementModel
 from stario.network.runtime.cost import table_cost
 from stario.sequences.accuracy.metrics import CONVENTIONS, Convention, align, evaluate_track
 from stario.sequences.datasets.batch import Skipped, each
-from stario.sequences.drawing.text_table import aligned
+from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.truth.problems import warn_of_truth
 
@@ -107,10 +107,13 @@ class NetworkTable:
     def mean_and_spread(
         self, network: str, protocol: str, metric: str, recording: str = ""
     ) -> tuple[float, float | None]:
-        """Return the mean over recordings, or of one, and its standard deviation over weights."""
+        """Return the mean over recordings, or of one, and its standard deviation over weights.
+
+        NaN if no recording has a value: at rest, there is no share of the path.
+        """
         chosen = [e for e in self._entries(network, protocol) if recording in ("", e.recording)]
         by_weights = [
-            np.nanmean([getattr(e, metric) for e in chosen if e.weights == weights])
+            _mean([getattr(e, metric) for e in chosen if e.weights == weights])
             for weights in dict.fromkeys(e.weights for e in chosen)
         ]
         spread = float(np.std(by_weights, ddof=1)) if len(by_weights) > 1 else None
@@ -196,7 +199,13 @@ def _words(table: NetworkTable) -> dict[str, str]:
 
 
 def _cell(mean: float, spread: float | None) -> str:
-    return f"{mean:.3f}" if spread is None else f"{mean:.3f}+-{spread:.3f}"
+    return figure(mean) if spread is None else f"{figure(mean)}+-{figure(spread)}"
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Return the mean of the values that are known; NaN if none is."""
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.mean(known)) if known else float("nan")
 
 
 def _tracks(

@@ -163,15 +163,3 @@ def _by(
 def _spread(members: Sequence[ListEntry], maximum: int) -> list[ListEntry]:
     """Return up to `maximum` of them, evenly spaced from the first to the last."""
     return [members[k] for k in evenly_spaced(len(members), maximum)]
-
-
-def learned_from(data: Path) -> dict[str, frozenset[Path]]:
-    """Return the recordings that the packaged weights were trained on, by the weights' name.
-
-    Raises:
-        InputError: a recording of the packaged lists is missing.
-    """
-    everything = read_packaged_list("all", data)
-    outside, _ = without_holdout(everything, data)
-    learned = {"default": everything, "first-stage": outside}
-    return {name: frozenset(e.path for e in entries) for name, entries in learned.items()}

@@ -15,6 +15,7 @@ from stario.sequences.arrays import rms
 from stario.sequences.datasets.batch import Skipped
 from stario.sequences.datasets.stream_cache import Stream, cached
 from stario.sequences.errors import ConfigError
+from stario.sequences.files import unused_name
 from stario.sequences.legs import LegStream
 from stario.sequences.readers.archive import archive_attributes, split_name
 from stario.sequences.sequence import STANDARD_GRAVITY
@@ -47,18 +48,28 @@ def recording_streams(
 ) -> tuple[list[RecordingStreams], list[Skipped]]:
     """Return the streams of each recording with its licence, and those that were skipped.
 
+    A second recording called `walk` becomes `walk-2`.
+
     Args:
         outcomes: paths, each with the outcome of `stario.sequences.datasets.stream_cache.recorded`.
     """
     recordings: list[RecordingStreams] = []
     skipped: list[Skipped] = []
+    names: set[str] = set()
     for path, outcome in outcomes:
         if isinstance(outcome, Skipped):
             skipped.append(outcome)
         else:
             licence = str(archive_attributes(path).get("licence", ""))
-            recordings.append(RecordingStreams(path, outcome, licence))
+            recordings.append(RecordingStreams(path, _distinct(outcome, names), licence))
     return recordings, skipped
+
+
+def _distinct(streams: Sequence[Stream], taken: set[str]) -> Sequence[Stream]:
+    """Return a recording's streams under a name of its own: validation averages over names."""
+    name = unused_name(streams[0].name, taken)
+    taken.add(name)
+    return streams if name == streams[0].name else [replace(s, name=name) for s in streams]
 
 
 @dataclass(frozen=True)

@@ -143,6 +143,11 @@ def test_tensors_of_another_network_are_refused(model: Path, change: str) -> Non
     assert found.get(change, "Missing") in refusal(model)
 
 
+def test_the_folder_of_a_run_is_refused_with_the_file_in_it(model: Path) -> None:
+    with pytest.raises(WeightsError, match=r"a folder, .*model\.safetensors"):
+        load_model(model.parent)
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_windows_with_a_value_that_is_not_finite_are_refused(value: float) -> None:
     windows = np.zeros((2, 6, 200))

@@ -36,6 +36,9 @@ By = Literal["set", "group", "person", "device", "place", "carry"]
 POOLED = "all"
 """Name of the row over all sets, equally weighted; a group may have this name, too."""
 
+_UNKNOWN = "unknown"
+"""Label of a recording whose person, device, place or carry is not known."""
+
 _NOT_COMPARED = (
     "not compared, because the ground truth moves by less than a metre, or has neither 2 s of "
     "known positions nor three waypoints within an unbroken stretch of samples"
@@ -176,13 +179,16 @@ def labels(path: Path, attributes: Mapping[str, object], group: str = "") -> dic
     """Return the labels that a recording can be grouped by, given its group in a list, if any.
 
     Its set is the first word of its group, or else the name of its archive or folder. OxIOD names
-    folders by the form of their data: `syn` counts as `oxiod`.
+    folders by the form of their data: `syn` counts as `oxiod`. Without a list, a group is all of
+    one person in a set, where the person is known: intervals tell how persons differ.
     """
     file, member = split_name(path)
-    folder = "oxiod" if file.parent.name == "syn" else file.parent.name
+    above = file.absolute().parent.name
+    folder = "oxiod" if above == "syn" else above
     set_name = group.split(" ")[0] if group else file.stem if member else folder
-    attribute_labels = {key: str(attributes.get(key) or "unknown") for key in get_args(By)[2:]}
-    return {"set": set_name, "group": group or set_name, **attribute_labels}
+    known = {key: str(attributes.get(key) or _UNKNOWN) for key in get_args(By)[2:]}
+    of_person = set_name if known["person"] == _UNKNOWN else f"{set_name} {known['person']}"
+    return {"set": set_name, "group": group or of_person, **known}
 
 
 def _median(values: Sequence[float]) -> float:

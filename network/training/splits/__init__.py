@@ -8,11 +8,14 @@ weights; `holdout` the people, devices and places used to evaluate weights train
 from __future__ import annotations
 
 import importlib.resources
+import logging
 from collections.abc import Iterable
 from pathlib import Path
 
 from stario.sequences.datasets.splits import ListEntry, read_list
 from stario.sequences.errors import InputError
+
+log = logging.getLogger(__name__)
 
 NAMES = ("test", "validation", "training", "holdout", "all", "open")
 
@@ -47,3 +50,41 @@ def without_holdout(
     held_out = {entry.path for entry in read_packaged_list("holdout", data)}
     outside = [entry for entry in known if entry.path not in held_out]
     return outside, [entry for entry in known if entry.path in held_out]
+
+
+def learned_from(data: Path) -> dict[str, frozenset[Path]]:
+    """Return the recordings that the packaged weights were trained on, by the weights' name.
+
+    Raises:
+        InputError: a recording of the packaged lists is missing.
+    """
+    everything, first = read_packaged_list("all", data), read_packaged_list("training", data)
+    learned = {
+        "default": everything,
+        "first-stage": without_holdout(everything, data)[0],
+        "open": without_holdout(read_packaged_list("open", data), data)[0],
+        "walks-36min": first + read_packaged_list("validation", data),
+    }
+    return {name: frozenset(e.path for e in entries) for name, entries in learned.items()}
+
+
+def warn_of_learned(weights: Iterable[str], judging: Iterable[Path], data: Path) -> None:
+    """Log a warning for packaged weights that were trained on recordings that are to judge them.
+
+    Args:
+        weights: names of weights; files are of unknown origin.
+        judging: recordings of a data folder that errors or sigma will be taken from.
+        data: that folder; without all recordings of the packaged lists, nothing is known.
+    """
+    try:
+        learned = learned_from(data)
+    except InputError:
+        return
+    known = frozenset(judging)
+    for name in weights:
+        if both := known & learned.get(name, frozenset()):
+            log.warning(
+                "%s: trained on %d of the %d recordings that judge it: its errors on others are "
+                "larger; first-stage and open were trained without the list holdout",
+                name, len(both), len(known),
+            )  # fmt: skip

@@ -37,7 +37,9 @@ def test_a_converted_recording_gives_the_same_track(
 def test_recordings_are_archived_and_selected_from_the_archive(
     stario, recording: Path, tmp_path: Path
 ) -> None:
-    done = stario("convert", recording, recording.parent, "all.h5")
+    (tmp_path / "again").mkdir()
+    (tmp_path / "again/walk.csv").write_bytes(recording.read_bytes())
+    done = stario("convert", recording, "again", "all.h5")
     assert done.code == 0, done.err
     assert "walk is stored as walk-2\nwritten: all.h5, 2 recordings" in done.out
     done = stario("run", "all.h5", "--where", "name=*-2", "--out", "two")

@@ -39,11 +39,14 @@ def test_compare_prints_a_row_per_track(stario, recording: Path) -> None:
     assert "covers" not in done.out
 
 
-def test_check_fusion_compares_the_fusion_with_its_network(stario, recording: Path) -> None:
-    done = stario("check", "fusion", recording, recording, "--json")
+def test_check_fusion_compares_the_fusion_with_its_network(
+    stario, recording: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "walk.csv").write_bytes(recording.read_bytes())
+    done = stario("check", "fusion", recording, "walk.csv", "--json")
     assert done.code == 0
     first, second = json.loads(done.out)
-    assert first == second
+    assert first["network_m"] == second["network_m"]
     assert first["network_m"] > 0.0
     refused = stario("check", "fusion", recording, "--by", "colour")
     assert refused.code == 1
@@ -157,8 +160,9 @@ def test_a_batch_continues_after_failures_and_reports_them(
     write_csv(tmp_path / "blind.csv", walk.without_truth())
     (tmp_path / "broken.csv").write_text("t,gx,gy,gz,ax,ay,az\n0,0,0,0,x,0,0\n")
     (tmp_path / "list.txt").write_text("deg.csv\nnosuch.csv\n\n,blind.csv\nblind.csv\nbroken.csv\n")
+    write_csv(tmp_path / "walk.csv", walk)
     done = stario(
-        "evaluate", recording, "list.txt", "missing", recording, "--jobs", jobs,
+        "evaluate", recording, "list.txt", "missing", "walk.csv", "--jobs", jobs,
         "--out", "out", "--json",
     )  # fmt: skip
     assert done.code == 1
@@ -265,7 +269,7 @@ def test_training_continues_after_failures_and_caches_its_windows(
     assert stario(*call, "--out", "b", "--cache", "kept").code == 1
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "kept").iterdir()} == kept
     first, second = ((tmp_path / out / "model.safetensors").read_bytes() for out in "ab")
-    assert first == second
+    assert first["network_m"] == second["network_m"]
 
 
 @pytest.mark.usefixtures("narrow_network")
@@ -281,6 +285,22 @@ def test_weights_to_start_from_set_the_network(
     stario(*call, *first, "--model", "StarIO").assert_one_line_error("--start-from", other)
 
 
+@pytest.mark.usefixtures("narrow_network")
+def test_sigma_is_not_calibrated_on_a_few_seconds_where_initial_weights_have_a_calibration(
+    stario, recording: Path, tmp_path: Path, tiny: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def calibration(out: str, *options: str) -> object:
+        call = ("train", recording, "--recorded-only", "--config", tiny, *options, "--out", out)
+        assert stario(*call).code == 0
+        return json.loads((tmp_path / out / "model.json").read_text())["calibration"]
+
+    first = calibration("first")
+    tuned = ("--start-from", "first/model.safetensors")
+    assert calibration("tuned", *tuned) == first
+    monkeypatch.setattr("stario.fusion.commands.train._CALIBRATING_S", 1.0)
+    assert calibration("calibrated", *tuned) != first
+
+
 def test_fine_tuning_changes_weights_a_little_unless_a_recipe_says_otherwise(tiny: Path) -> None:
     first = load_model("default")
     assert _recipe(None, None).learned == _recipe(tiny, first).learned == 1.0
@@ -294,7 +314,8 @@ def test_fine_tuning_changes_weights_a_little_unless_a_recipe_says_otherwise(tin
 def test_training_can_use_recordings_alone(
     stario, recording: Path, tmp_path: Path, tiny: Path
 ) -> None:
-    done = stario("train", recording, "--recorded-only", "--config", tiny, "--out", "alone")
+    twice = recording, recording.parent  # counts once
+    done = stario("train", *twice, "--recorded-only", "--config", tiny, "--out", "alone")
     assert done.code == 0, done.err
     trained_on = json.loads((tmp_path / "alone/model.json").read_text())["trained_on"]
     assert trained_on == ["recorded, others: 10 s"]  # nothing simulated, no licence known

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from stario.fusion.evaluation.folders import fresh_folder
 from stario.fusion.evaluation.tables import (
     METRICS,
     PROTOCOLS,
+    Entry,
+    NetworkTable,
     compare_networks,
     table_dict,
     table_text,
@@ -83,6 +86,13 @@ def test_mean_and_spread_are_taken_over_weights_of_recording_means(table) -> Non
     single, no_spread = table.mean_and_spread("R-ResNet", "network", "ate_m")
     assert no_spread is None
     assert single == pytest.approx(table.values("R-ResNet", "network", "ate_m").mean())
+
+
+def test_a_recording_at_rest_has_no_share_of_its_path_and_no_warning() -> None:
+    resting = Entry("rest", "StarIO", "a", "network", ate_m=0.1, rte_m=0.1, pde=np.nan)
+    known = NetworkTable("rms", {"StarIO": 1}, [replace(resting, protocol=p) for p in PROTOCOLS])
+    rows = {tuple(line.split()) for line in table_text(known).splitlines()}
+    assert {("rest", "0.100"), ("rest", "-"), ("mean", "-")} < rows
 
 
 def test_the_ronin_convention_is_smaller_by_the_square_root_of_two(table, read) -> None:

@@ -8,8 +8,9 @@ import pytest
 from recorded import DATA
 
 from stario.fusion.table import sets
-from stario.fusion.table.sets import ALL, FIRST, development_sets, learned_from
+from stario.fusion.table.sets import ALL, FIRST, development_sets
 from stario.network.training import splits
+from stario.network.training.splits import learned_from
 from stario.sequences.datasets.splits import ListEntry
 from stario.sequences.errors import InputError
 

@@ -143,6 +143,14 @@ def test_streams_come_with_the_licence_of_their_archive(tmp_path: Path) -> None:
     assert mix_sources(found, []).words[-1] == "walks.h5, licence CC BY 4.0: 1 recordings, 10 s"
 
 
+def test_recordings_of_one_name_are_told_apart_in_validation() -> None:
+    """Their errors would be averaged as those of one recording."""
+    outcomes = [[moving("walk", speed)] for speed in (1.0, 2.0, 3.0)]
+    paths = [Path(f"{k}/walk.csv") for k in range(3)]
+    found, _ = recording_streams(zip(paths, outcomes, strict=True))
+    assert [one.streams[0].name for one in found] == ["walk", "walk-2", "walk-3"]
+
+
 def recordings_of(*recordings: list[WorldStream]) -> list[RecordingStreams]:
     return [RecordingStreams(Path(str(k)), streams) for k, streams in enumerate(recordings)]
 

@@ -21,7 +21,13 @@ from stario.fusion.evaluation.judging.displacement_error import (
     _Sums,
     recording_errors,
 )
-from stario.fusion.evaluation.judging.judge import POOLED, RecordingResult, judge, rows_of
+from stario.fusion.evaluation.judging.judge import (
+    POOLED,
+    RecordingResult,
+    judge,
+    labels,
+    rows_of,
+)
 from stario.fusion.evaluation.judging.network_alone import Predictions, predictions
 from stario.fusion.evaluation.judging.prepared import Prepared, prepare, prepared_recordings
 from stario.fusion.evaluation.judging.table import (
@@ -263,6 +269,15 @@ def test_pedestrian_dead_reckoning_is_judged_like_a_network(walk: ImuSequence) -
     assert 0.5 < found.figures["length_ratio"] < 1.6
 
 
+def test_the_share_of_the_path_is_that_of_the_pieces_between_gaps(walk: ImuSequence) -> None:
+    """Pieces are fitted one by one: a share of the whole path would shrink with every gap."""
+    kept = np.abs(walk.time - walk.time.mean()) > 0.5
+    samples = {name: getattr(walk, name)[kept] for name in ("time", "gyro", "accel")}
+    found = errors_of(replace(walk, **samples), PedestrianDeadReckoning())
+    share = 100.0 * found.figures["ate_fit_m"] / (0.5 * found.path_m)
+    assert found.figures["ate_fit_percent"] == pytest.approx(share, rel=0.1)
+
+
 @pytest.fixture(scope="module")
 def judged_pair(walk: ImuSequence) -> list[RecordingResult]:
     prepared = [
@@ -320,6 +335,32 @@ def test_rows_compare_weights_by_group_and_pooled(
     assert rows["all"].ratios["rms_10s_m"].ratio == pytest.approx(np.sqrt(0.25 * 0.5), abs=0.04)
     assert rows["a"].path_km == pytest.approx(1e-3 * horizontal_path(walk), rel=0.05)
     assert rows["a"].medians["theirs"]["length_ratio"] == pytest.approx(0.8, abs=0.02)
+
+
+def test_without_a_list_intervals_are_drawn_over_the_persons_of_an_archive(
+    walk: ImuSequence,
+) -> None:
+    """Over recordings alone, those of one person would pass for those of many."""
+    scales = {"r.h5:1": ("a", 0.95), "r.h5:2": ("b", 0.9), "r.h5:3": ("b", 0.9)}
+    prepared = [
+        replace(prepare(walk, Path(name)), attributes={"person": person})
+        for name, (person, _) in scales.items()
+    ]
+    by_group = {f"r {person}": scale for person, scale in scales.values()}
+    models = {
+        "ours": lambda group: Stub(walk, by_group[group]),
+        "theirs": lambda group: Stub(walk, 0.8),
+    }
+    judged, _ = judge(prepared, models, {})
+    ratio = rows_of(judged, "person", "ours", "theirs")[-1].ratios["rms_1s_m"].ratio
+    assert ratio == pytest.approx(np.sqrt(0.25 * 0.5), rel=0.01)  # persons have equal weights
+
+
+def test_a_file_named_without_its_folder_belongs_to_the_set_of_that_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert labels(Path("walk.csv"), {})["set"] == tmp_path.name
 
 
 def test_stretches_at_rest_have_no_error_relative_to_their_path() -> None:
