@@ -213,7 +213,7 @@ def test_a_snapshot_of_another_version_is_refused(walk: ImuSequence, still_model
             navigator.restore(other)
 
 
-LAYOUTS = {25: "9a7dc007"}
+LAYOUTS = {26: "b4cc7acb"}
 """CRC of the classes and attributes in a snapshot, by version."""
 
 
