@@ -26,6 +26,7 @@ from stario.sequences.readers.generic_csv import is_generic_csv, read_generic_cs
 from stario.sequences.readers.lines import may_be_read
 from stario.sequences.readers.lists import is_list, list_entries
 from stario.sequences.readers.phones.event_lines import is_event_lines, read_event_lines
+from stario.sequences.readers.phones.files import unmatched_files
 from stario.sequences.readers.phones.json_export import is_json_export, unpack_json
 from stario.sequences.readers.phones.long_form import is_long_form, unpack_long_form
 from stario.sequences.readers.phones.phone import is_phone, is_wide, read_phone, read_wide
@@ -180,7 +181,7 @@ def find_recordings(
         return _listed(path, on_error, where)
     found = [path] if path.is_file() else sorted(_below(path))
     if not found:
-        if pose_files(path) or has_some_sensors(path):
+        if pose_files(path) or has_some_sensors(path) or unmatched_files(path):
             raise unrecognised(path, [], _KNOWN)
         raise ReadError(path, "folder", "no recording", f"recordings in {_KNOWN}")
     return _with_attributes(found, where)

@@ -141,8 +141,9 @@ def test_sensors_of_different_devices_are_not_mixed(
     save(tmp_path / "w" / f"{gyro}.csv", "time,x,y,z", walk.time, walk.gyro)
     save(tmp_path / "w" / f"{accel}.csv", "time,x,y,z", walk.time, walk.accel)
     message = rf"w: sensors: found files of different devices .*\({gyro}\.csv, {accel}\.csv\)"
-    with pytest.raises(ReadError, match=message):
-        read_recording(tmp_path / "w")
+    for read in (read_recording, find_recordings):
+        with pytest.raises(ReadError, match=message):
+            read(tmp_path / "w")
 
 
 def test_sensors_whose_files_differ_in_a_number_are_of_one_recording(
