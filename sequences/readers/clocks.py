@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from pathlib import Path
 
 import numpy as np
@@ -39,8 +40,12 @@ _FEW_LOST = 0.05
 _FEW_ROWS = 10
 """Number of rows below which a count may be a coincidence."""
 
-_DATE_FIELDS = (1970, 2100), (1, 13), (1, 32), (0, 24), (0, 60), (0, 60)
-"""Smallest year, month, day, hour, minute and second of a date, and the limit of each."""
+_DATE_FIELDS = (
+    *((1e10, math.inf, 1970, 2100), (1e8, 100, 1, 13), (1e6, 100, 1, 32)),
+    *((1e4, 100, 0, 24), (1e2, 100, 0, 60), (1, 100, 0, 60)),
+)
+"""Year, month, day, hour, minute and second in the digits of a date: unit and number of values of
+each field, its smallest value and its limit. The year alone rules out nearly all other numbers."""
 
 
 def resample_to_gyro(
@@ -152,19 +157,17 @@ def refuse_counts_and_dates(file: Path, title: str, time: FloatArray) -> None:
         found = f"{time[0]:.0f}, {time[0] + 1:.0f}, {time[0] + 2:.0f}, ..., which counts the rows"
         fix = f"name a column of times `t [s]`; if these are times, name their unit: `{title} [ms]`"
         raise ReadError(file, title, found, "times", fix)
-    if _is_date(time) or _is_date(time // 1000.0):
+    known = time[np.isfinite(time)]
+    if _is_date(known) or _is_date(known // 1000.0):
         expected = "seconds, or dates such as 2024-05-01 12:00:59.990"
         raise ReadError(file, title, f"{time[0]:.0f}, a date without separators", expected)
 
 
 def _is_date(time: FloatArray) -> bool:
     """Return whether the digits of all times are year, month, day, hour, minute and second."""
-    date, clock = np.divmod(time, 1e6)
-    year, day = np.divmod(date, 1e4)
-    fields = (year, day // 100, day % 100, clock // 1e4, clock // 100 % 100, clock % 100)
-    return all(
-        bool(((field >= least) & (field < limit)).all())
-        for field, (least, limit) in zip(fields, _DATE_FIELDS, strict=True)
+    return len(time) > 0 and all(
+        bool(((time // unit % size >= least) & (time // unit % size < limit)).all())
+        for unit, size, least, limit in _DATE_FIELDS
     )
 
 

@@ -77,7 +77,11 @@ def test_dates_without_separators_are_refused(tmp_path: Path, header: str, digit
     lines = path.read_text().splitlines()
     cut = [line[:digits] + line[20:] for line in lines[1:]]
     write_lines(path, lines[0], *cut)
-    with pytest.raises(ReadError, match=r"found 20240501123456\d*, a date without separators"):
+    message = r"found 20240501123456\d*, a date without separators"
+    with pytest.raises(ReadError, match=message):
+        read_recording(path)
+    write_lines(path, lines[0], *cut, "inf" + cut[5][digits:])
+    with pytest.raises(ReadError, match=message):
         read_recording(path)
 
 
