@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -125,6 +125,12 @@ def generator(seed: int, *stream: int) -> np.random.Generator:
 def shown(value: object) -> str:
     """Return a value as text for an error's single line."""
     return f"{' '.join(repr(value).split()):.60}"
+
+
+def first_of(names: Sequence[str], most: int = 5) -> str:
+    """Return the first of the names for an error, and how many more there are."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def numbers(name: str, value: object) -> FloatArray:

@@ -125,6 +125,7 @@ def train(
     """
     from stario.fusion.evaluation.folders import make_folder
     from stario.network.model import load_model
+    from stario.network.training.data import seconds_of
     from stario.network.training.parallel import is_leader
     from stario.network.training.splits import warn_of_learned
     from stario.sequences.datasets.cache_files import cache_folder
@@ -148,7 +149,9 @@ def train(
     learned = recorded + held_out if last_stage is not None else recorded
     material = training_material(learned, walks, recipe, folder)
     held = validation_material(held_out, required=bool(recorded))
-    calibrated_by = last_stage or (start_from if _seconds(held) < _CALIBRATING_S else None)
+    calibrated_by = last_stage or (
+        start_from if seconds_of(held.streams) < _CALIBRATING_S else None
+    )
     calibration = load_model(calibrated_by).card.calibration if calibrated_by else None
     if is_leader():
         list_skipped(skipped)  # before hours of training
@@ -159,13 +162,6 @@ def train(
         typer.echo(str(path))
         if skipped:
             raise typer.Exit(1)
-
-
-def _seconds(held: TrainingData) -> float:
-    """Return the length of the stretches with poses [s]."""
-    from stario.sequences.windows import WINDOW_RATE
-
-    return sum(len(stream) for stream in held.streams) / WINDOW_RATE
 
 
 def _number_of_walks(generated: int | None, recorded_only: bool) -> int:

@@ -173,8 +173,13 @@ def _is_in(path: Path, source: str) -> bool:
     return any(f"/{source.strip('/')}/" in f"/{place}/" for place in places)
 
 
+def seconds_of(streams: Iterable[Stream]) -> float:
+    """Return the total length of streams [s]."""
+    return sum(map(len, streams)) / WINDOW_RATE
+
+
 def _length(streams: Sequence[Stream]) -> str:
-    seconds = sum(len(stream) for stream in streams) / WINDOW_RATE
+    seconds = seconds_of(streams)
     return f"{seconds / 60.0:.0f} min" if seconds >= 120.0 else f"{seconds:.0f} s"
 
 

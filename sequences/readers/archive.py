@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from stario.sequences.arrays import first_of
 from stario.sequences.errors import ReadError
 from stario.sequences.lazy import optional_package
 from stario.sequences.readers.checked import checked, pose_mask, rotations
@@ -130,7 +131,7 @@ def _none_chosen(
     )
     key = next(none_match, next(iter(where)))
     values = sorted({_text(attributes.get(key, "")) for attributes in known} - {""})
-    listed = ", ".join(values[:6]) + (f" and {len(values) - 6} more" if len(values) > 6 else "")
+    listed = first_of(values, 6)
     expected = f"{key} to be one of {listed}" if listed else f"another attribute: none has {key}"
     return ReadError(path, f"recordings with {filter_words(where)}", "none", expected)
 

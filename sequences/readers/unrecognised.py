@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from stario.sequences.arrays import first_of
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.columns import HEADER
 from stario.sequences.readers.lines import first_bytes, first_line, may_be_read
@@ -49,7 +50,7 @@ def unrecognised(path: Path, inside: list[Path], known: str) -> ReadError:
         found, fix = "no column of times that grow", "name one `t [s]`; a count of samples is none"
         return ReadError(path, "time", found, "one next to the sensors'", fix)
     elif path.is_dir() and (files := unmatched_files(path)):
-        found = f"files of different devices or recordings ({_some([f.name for f in files])})"
+        found = f"files of different devices or recordings ({first_of([f.name for f in files])})"
         expected, fix = "those of one", "name the files of one alike: gyro_a.csv and accel_a.csv"
         return ReadError(path, "sensors", found, expected, fix)
     elif path.is_dir() and (poses := pose_files(path)):
@@ -89,17 +90,12 @@ def _subfolders(path: Path) -> list[Path]:
 def _folder(path: Path) -> tuple[str, str]:
     """Return what a folder holds and what is wrong with the first file that may be a recording."""
     entries = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
-    found = f"a folder with {_some(entries) or 'nothing'}"
+    found = f"a folder with {first_of(entries) or 'nothing'}"
     files = [file for file in sorted(path.rglob("*")) if file.suffix.lower() in SUFFIXES]
     if not files:
         return found, "name a folder with a recording"
     words, fix = _file(files[0])
     return f"{found}; {files[0].relative_to(path)} holds {words}", fix
-
-
-def _some(names: list[str]) -> str:
-    """Return the first five of the names, and how many more there are."""
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 
 def _file(path: Path) -> tuple[str, str]:

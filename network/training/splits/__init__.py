@@ -58,12 +58,12 @@ def learned_from(data: Path) -> dict[str, frozenset[Path]]:
     Raises:
         InputError: a recording of the packaged lists is missing.
     """
-    everything, first = read_packaged_list("all", data), read_packaged_list("training", data)
+    everything = read_packaged_list("all", data)
     learned = {
         "default": everything,
         "first-stage": without_holdout(everything, data)[0],
         "open": without_holdout(read_packaged_list("open", data), data)[0],
-        "walks-36min": first + read_packaged_list("validation", data),
+        "walks-36min": [e for n in ("training", "validation") for e in read_packaged_list(n, data)],
     }
     return {name: frozenset(e.path for e in entries) for name, entries in learned.items()}
 
