@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.levelling import levelled_attitudes
+from stario.sequences.attitude.stacks import slerp
 from stario.sequences.clean_samples import clean_samples, unbroken
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.windows import (
@@ -98,7 +99,7 @@ def levelled_streams(sequence: ImuSequence, min_seconds: float = 2.0) -> list[Le
         grid = np.arange(time[begin], time[end - 1], 1.0 / WINDOW_RATE)
         # Rounding may place the grid's last time beyond the last sample.
         ticks = np.minimum(grid[::TICK_SAMPLES], time[end - 1])
-        at_ticks = Slerp(time[part], Rotation.from_matrix(R_NB))(ticks)
+        at_ticks = slerp(time[part], Rotation.from_matrix(R_NB), ticks)
         even = resample(time[part], values, grid).astype(np.float32)
         imu_N, facing_N = (np.ascontiguousarray(part) for part in np.split(even, [6], axis=1))
         streams.append(LevelledStream(float(time[begin]), imu_N, facing_N, at_ticks.as_matrix()))

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import BoolArray as BoolArray
 from stario.sequences.arrays import FloatArray as FloatArray
@@ -26,6 +26,7 @@ from stario.sequences.arrays import (
     numbers,
     some_times,
 )
+from stario.sequences.attitude.stacks import slerp
 from stario.sequences.auxiliary import DeviceAttitude as DeviceAttitude
 from stario.sequences.auxiliary import Magnetometer as Magnetometer
 from stario.sequences.auxiliary import PositionTrack as PositionTrack
@@ -114,7 +115,7 @@ class Trajectory(Timed):
         return Trajectory(
             time=time,
             position_W=interpolated(clipped, t, self.position_W[known]),
-            attitude_WB=Slerp(t, self.attitude_WB[known])(clipped),
+            attitude_WB=slerp(t, self.attitude_WB[known], clipped),
             velocity_W=velocity,
             position_covariance_W=covariance,
             valid=covered,

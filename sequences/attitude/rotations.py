@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import integral, interpolated, trapezoids
+from stario.sequences.attitude.stacks import composed
 from stario.sequences.sequence import FloatArray
 
 NORM_TOLERANCE = 1e-2
@@ -78,7 +79,8 @@ class GyroIntegral:
         clipped = np.clip(time, self.time[0], self.time[-1])
         left = np.clip(np.searchsorted(self.time, clipped, side="right") - 1, 0, len(self.time) - 2)
         tau = clipped - self.time[left]
-        return self._attitude[left] * Rotation.from_rotvec(self._rate[left] * tau[:, None])
+        turn = Rotation.from_rotvec(self._rate[left] * tau[:, None])
+        return composed(self._attitude[left], turn)
 
     def has_long_gap(self, start: float, stop: float) -> bool:
         """Return whether the samples between two times have a gap too long to integrate across."""

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import check_choice, generator
 from stario.sequences.attitude.rotations import about_z
+from stario.sequences.attitude.stacks import composed
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, Trajectory
 from stario.sequences.settings import check_number
@@ -132,11 +133,11 @@ def generate_walk(
     gait = _gait(rng, rate, route, style)
     motion = _carried(gait, style)
     R_WH = about_z(route.heading)
-    R_HD = Rotation.from_rotvec(motion.turn_H) * Rotation.from_rotvec(style.mount_rotvec)
+    R_HD = composed(Rotation.from_rotvec(motion.turn_H), Rotation.from_rotvec(style.mount_rotvec))
     return Trajectory(
         time=np.arange(count) / rate,
         position_W=route.position_W + R_WH.apply(motion.offset_H),
-        attitude_WB=R_WH * R_HD,
+        attitude_WB=composed(R_WH, R_HD),
     )
 
 

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.arrays import correlation, interpolated, peak_offset, samples_in
 from stario.sequences.attitude.levelling import MIN_GRAVITY_FORCE
 from stario.sequences.attitude.rotations import GyroIntegral, tilt_aligning
+from stario.sequences.attitude.stacks import composed
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray
 from stario.sequences.truth.mount_heading import heading_turn
@@ -110,7 +111,7 @@ def align_tracked_body(
         mounts = [mount * turn for mount in mounts]
         attitude_WB, leveling = _level(_mounted(attitude_WV, pieces, mounts), force_B, kept)
     # With the mount known, glitches about another axis than the motion's are detected as well.
-    drift = attitude_WB * gyro_B.attitude(time).inv()
+    drift = composed(attitude_WB, gyro_B.attitude(time).inv())
     kept &= ~disagreeing(time, drift, Rotation.identity(len(drift)))
     return BodyAlignment(
         lag=lag,
@@ -132,7 +133,7 @@ def _mounted(
     """Return the IMU's attitude in the capture system's world, each piece with its mount."""
     quat_WB = attitude_WV.as_quat()
     for (start, stop), mount in zip(pieces, mounts, strict=True):
-        quat_WB[start:stop] = (attitude_WV[start:stop] * mount).as_quat()
+        quat_WB[start:stop] = composed(attitude_WV[start:stop], mount).as_quat()
     return Rotation.from_quat(quat_WB)
 
 
@@ -145,7 +146,7 @@ def _level(
         found = f"a mean force of {np.linalg.norm(up):.3g} m/s^2"
         raise InputError("accelerometer", found, "gravity, to level the truth with")
     leveling = tilt_aligning(up)
-    return leveling * attitude_WB, leveling
+    return composed(leveling, attitude_WB), leveling
 
 
 def _check_length(what: str, time: FloatArray) -> None:
@@ -168,7 +169,7 @@ def _agreement(
     not differ grossly are compared.
     """
     stride = samples_in(span, time)
-    rates = (attitude[:-stride].inv() * attitude[stride:]).as_rotvec()
+    rates = composed(attitude[:-stride].inv(), attitude[stride:]).as_rotvec()
     rates = rates / (time[stride:] - time[:-stride])[:, None]
     good = valid[:-stride] & valid[stride:] & (np.linalg.norm(rates, axis=1) < 12.0)
     if sizes_only:

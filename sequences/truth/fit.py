@@ -13,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import interpolated
+from stario.sequences.attitude.stacks import composed
 from stario.sequences.conventions import SAME_AXES, axes_matrix, axes_named
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
@@ -159,7 +160,7 @@ def _speed(attitude: Rotation, valid: BoolArray) -> FloatArray:
     speed = np.full(len(valid), np.nan)
     if len(valid) > stride:
         half = stride // 2
-        angle = (attitude[:-stride].inv() * attitude[stride:]).magnitude()
+        angle = composed(attitude[:-stride].inv(), attitude[stride:]).magnitude()
         known = valid[:-stride] & valid[stride:]
         speed[half : half + len(angle)] = np.where(known, angle * _RATE / stride, np.nan)
     return speed

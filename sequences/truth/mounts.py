@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import samples_in
 from stario.sequences.attitude.rotations import GyroIntegral
+from stario.sequences.attitude.stacks import composed
 from stario.sequences.sequence import BoolArray, FloatArray
 
 MIN_FIT_S = 10.0
@@ -105,8 +106,8 @@ def _fit(
     stride = samples_in(0.1, time)
     # Rotations that overlap by more than two thirds add little information.
     before = np.arange(start, stop - stride, max(1, stride // 3))
-    phi_V = (attitude_WV[before].inv() * attitude_WV[before + stride]).as_rotvec()
-    phi_B = (attitude_B[before].inv() * attitude_B[before + stride]).as_rotvec()
+    phi_V = composed(attitude_WV[before].inv(), attitude_WV[before + stride]).as_rotvec()
+    phi_B = composed(attitude_B[before].inv(), attitude_B[before + stride]).as_rotvec()
     weights = np.ones(len(phi_V))
     mount = Rotation.identity()
     for _ in range(5):

@@ -21,6 +21,7 @@ import numpy as np
 
 from stario.sequences.arrays import trapezoids
 from stario.sequences.attitude.levelling import BIAS_SIGMA
+from stario.sequences.attitude.stacks import composed
 from stario.sequences.clean_samples import clean_samples, longest_unbroken
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.truth.fit import TruthFit
@@ -67,13 +68,13 @@ def yaw_drift(sequence: ImuSequence, fit: TruthFit) -> YawDrift | None:
     time, gyro = time[part], gyro[part]
     truth = replace(sequence.truth, time=sequence.truth.time + fit.time_offset)
     pose = truth.at(time)
-    attitude_WB = pose.attitude_WB * fit.R_TB
+    attitude_WB = composed(pose.attitude_WB, fit.R_TB)
     both = pose.valid[1:] & pose.valid[:-1]
     if both.sum() < 3:
         return None
     up_B = attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)
     turns = trapezoids(time, np.sum(gyro * up_B, axis=1, keepdims=True))[both]
-    true_turns = (attitude_WB[1:] * attitude_WB[:-1].inv()).as_rotvec()[both, 2]
+    true_turns = composed(attitude_WB[1:], attitude_WB[:-1].inv()).as_rotvec()[both, 2]
     psi_true, psi = np.cumsum(true_turns), np.cumsum(turns)
     even = np.column_stack([np.ones(len(psi)), np.cumsum(np.diff(time)[both])])
     # The true turn is tested, so that a gyroscope that measures only a fiftieth is reported too.
