@@ -30,6 +30,8 @@ def increasing_mask(time: FloatArray) -> BoolArray:
     of those after them: otherwise all times after a single wrong one would be dropped.
     """
     steps = np.diff(time)
+    if (steps > 0.0).all():
+        return np.ones(len(time), dtype=np.bool_)
     breaks = np.flatnonzero((steps < 0.0) | (steps > MAX_IMU_GAP)) + 1
     parts: list[tuple[int, int]] = []  # [start, stop) of the runs kept so far
     for start, stop in pairwise([0, *breaks.tolist(), len(time)]):
