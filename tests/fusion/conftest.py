@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from copy import deepcopy
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -11,6 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.imu.front_end import FrontEnd
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.recording import cut_recording
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence, Trajectory
@@ -35,10 +38,32 @@ class Windows(NamedTuple):
     contents: list[bytes]
 
 
+cut_once = lru_cache(maxsize=8)(cut_recording)
+"""`cut_recording`; its results must not be changed."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _cut_once() -> Iterator[None]:
+    """Cut each recording once per settings: for the oracle and for the tracks of every back end.
+
+    The front end is copied, since its counts are changed later.
+    """
+
+    def copied(
+        sequence: ImuSequence, config: NavigatorConfig
+    ) -> tuple[list[ImuInterval], FrontEnd]:
+        intervals, front_end = cut_once(sequence, config)
+        return list(intervals), deepcopy(front_end)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("stario.fusion.recording.cut_recording", copied)
+        yield
+
+
 @lru_cache(maxsize=16)
 def windows_of(sequence: ImuSequence, config: NavigatorConfig) -> Windows:
     """Windows into which a navigator cuts a recording; many tests share a few recordings."""
-    intervals, _ = cut_recording(sequence, config)
+    intervals, _ = cut_once(sequence, config)
     complete = [e for e in intervals if e.window is not None]
     heading = np.array([e.window.heading for e in complete])
     windows = rotated_windows(np.stack([e.window.imu_N for e in complete]), -heading)
