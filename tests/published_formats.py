@@ -81,7 +81,7 @@ def text(*columns: list[int] | list[str] | FloatArray, sep: str = ",") -> list[s
     parts = [
         [str(x) for x in column]
         if isinstance(column, list)
-        else [sep.join(map(repr, np.atleast_1d(row).tolist())) for row in column]
+        else [sep.join(map(repr, row)) for row in column.reshape(len(column), -1).tolist()]
         for column in columns
     ]
     return [sep.join(row) for row in zip(*parts, strict=True)]
