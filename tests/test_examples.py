@@ -4,20 +4,19 @@ import importlib.util
 import json
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from recorded import DATA
+from training_runs import narrow
 
 from stario.fusion import Navigator, demonstration
-from stario.network import DisplacementModel, load_model
-from stario.network.architectures import build_network
-from stario.network.card import Card
-from stario.network.displacement import DisplacementNetwork
-from stario.network.runtime.engines import TorchEngine
+from stario.network import load_model
+from stario.network.card import Card, dump_card
+from stario.network.runtime.onnx_file import CARD_KEY
 from stario.sequences import InputError, read_recording
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -48,9 +47,11 @@ def test_every_example_is_tested_here():
 
 
 def test_run_recording_gives_a_finite_track_without_truth():
-    track = load("run_recording").main()
+    example = load("run_recording")
+    example.demonstration = lambda: demonstration().slice(0.0, 30.0)
+    track = example.main()
     assert np.isfinite(track.trajectory.position_W).all()
-    assert track.time[-1] - track.time[0] > 100.0
+    assert track.time[-1] - track.time[0] > 28.0
 
 
 def test_compare_tracks_ranks_the_filter_above_the_imu_alone():
@@ -66,7 +67,8 @@ def test_streaming_yields_states_ten_times_a_second():
     np.testing.assert_allclose(np.diff(times), np.diff(times)[0], atol=1e-6)
 
 
-def test_train_own_produces_a_model_that_predicts(tmp_path):
+def test_train_own_produces_a_model_that_predicts(tmp_path, monkeypatch):
+    narrow(monkeypatch)
     model = load("train_own").main(tmp_path, epochs=1)
     mean, covariance = model.predict(np.zeros((2, 6, 200)))
     assert mean.shape == (2, 3)
@@ -88,8 +90,14 @@ def test_fine_tune_learns_from_waypoints_and_keeps_the_calibration(tmp_path):
     assert np.isfinite(mean).all()
 
 
-def test_cluster_distributes_recordings_among_workers_and_skips_a_broken_one(tmp_path):
-    scores, skipped, workers = load("cluster").main(tmp_path, seconds=8.0)
+@pytest.mark.parametrize(
+    "processes", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["threads", "processes"]
+)
+def test_cluster_distributes_recordings_among_workers_and_skips_a_broken_one(processes, tmp_path):
+    """Processes, as in the example itself, take seconds to start."""
+    example = load("cluster")
+    example.LocalCluster = partial(example.LocalCluster, processes=processes)
+    scores, skipped, workers = example.main(tmp_path, seconds=8.0)
     assert [recording.name for recording in scores] == ["walk-0", "walk-1", "walk-3"]
     for recording in scores:
         assert recording.metrics["ekf"]["ate_m"] > 0.0
@@ -106,23 +114,56 @@ def test_replay_live_ends_where_a_run_on_the_saved_recording_ends():
     np.testing.assert_allclose(track.trajectory.position_W[-1], end, atol=1e-4)
 
 
-def test_streaming_onnx_gives_the_torch_track_without_importing_torch(tmp_path, monkeypatch):
-    pytest.importorskip("onnxscript", reason="pip install 'stario[onnx]'")
-    pytest.importorskip("onnxruntime", reason="pip install 'stario[onnx]'")
-    from stario.network.runtime.export import export_onnx
+class MeanForce:
+    """A network that predicts a displacement along the mean force, with a sigma of 0.5 m."""
 
-    # Tracing takes a second per block: one block of each kind here, all of them in `.ci/run`.
-    monkeypatch.setattr("stario.network.stario.BLOCKS", (1, 0, 0, 1))
-    torch.manual_seed(0)
-    network = DisplacementNetwork(build_network("StarIO"))
-    model, path = DisplacementModel(TorchEngine(network), Card("StarIO")), tmp_path / "small.onnx"
-    export_onnx(model, path)
+    def predict(self, windows):
+        mean = np.asarray(windows, np.float32)[:, 3:].mean(axis=2) * np.float32(0.1)
+        variance = np.full(3, 0.5**2 + 0.005**2)  # with the floor of a card's calibration
+        return mean.astype(float), np.tile(np.diag(variance), (len(mean), 1, 1))
+
+
+def write_mean_force(path):
+    """Write that network as `export_onnx` would, which takes seconds."""
+    onnx = pytest.importorskip("onnx", reason="pip install 'stario[onnx]'")
+    from onnx import TensorProto, helper, numpy_helper
+
+    constants = {
+        "rows": np.array([3, 4, 5]),
+        "time": np.array([2]),
+        "tenth": np.float32(0.1),
+        "none": np.float32(0.0),
+        "half": np.float32(np.log(0.5)),
+    }
+    nodes = [
+        helper.make_node("Gather", ["windows", "rows"], ["force"], axis=1),
+        helper.make_node("ReduceMean", ["force", "time"], ["mean"], keepdims=0),
+        helper.make_node("Mul", ["mean", "tenth"], ["displacement"]),
+        helper.make_node("Mul", ["mean", "none"], ["zero"]),
+        helper.make_node("Add", ["zero", "half"], ["log_sigma"]),
+    ]
+    given, *results = (
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", *shape])
+        for name, shape in (("windows", [6, 200]), ("displacement", [3]), ("log_sigma", [3]))
+    )
+    weights = [numpy_helper.from_array(np.asarray(v), name) for name, v in constants.items()]
+    graph = helper.make_graph(nodes, "mean force", [given], results, weights)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    model.metadata_props.add(key=CARD_KEY, value=dump_card(Card("StarIO")))
+    onnx.save(model, path)
+
+
+def test_streaming_onnx_gives_the_networks_track_without_importing_torch(tmp_path):
+    """`.ci/run` streams the default weights, `test_export.py` compares exported networks."""
+    pytest.importorskip("onnxruntime", reason="pip install 'stario[onnx]'")
+    path = tmp_path / "small.onnx"
+    write_mean_force(path)
     code = f"import json, runpy; m = runpy.run_path({str(FOLDER / 'streaming_onnx.py')!r})\n"
     code += f"from pathlib import Path; print(json.dumps(m['main'](Path({str(path)!r}), 10.0)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     printed = json.loads(done.stdout)
     assert not printed["torch_imported"]
-    navigator, walk = Navigator(model), demonstration()
+    navigator, walk = Navigator(MeanForce()), demonstration()
     rows = zip(walk.time, walk.gyro, walk.accel, strict=True)
     states = [s for row in rows if row[0] <= 10.0 and (s := navigator.push(*row)) is not None]
     assert printed["states"] == len(states)
