@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from stario.fusion.commands.cli import app, main
+from stario.network.model import DisplacementModel, load_model
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,21 @@ class CommandResult:
         assert lines[0].startswith("stario: ")
         for word in words:
             assert word in lines[0]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _prepared_once() -> Iterator[None]:
+    """Load the packaged weights and build the command once, not at every call."""
+
+    default = cache(load_model)
+
+    def loaded(name_or_path: str | Path = "default") -> DisplacementModel:
+        return default() if name_or_path == "default" else load_model(name_or_path)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("stario.network.model.load_model", loaded)
+        patch.setattr("typer.main.get_command", cache(typer.main.get_command))
+        yield
 
 
 @pytest.fixture
