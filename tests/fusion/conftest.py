@@ -153,4 +153,8 @@ def walk() -> ImuSequence:
 @pytest.fixture(scope="session")
 def without() -> Callable[[ImuSequence, np.ndarray], ImuSequence]:
     """Function that removes the marked samples of a recording; its ground truth is kept whole."""
-    return lambda sequence, gone: sequence.select(~gone)
+    # The same object for the same samples, so that the tests of both back ends share its windows.
+    kept = lru_cache(maxsize=16)(
+        lambda sequence, gone: sequence.select(~np.frombuffer(gone, dtype=np.bool_))
+    )
+    return lambda sequence, gone: kept(sequence, gone.tobytes())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -218,7 +219,7 @@ def test_a_streams_graph_follows_the_fixes_where_the_filter_does(
     make_walk: Make, make_oracle: Make, jump: tuple[float, float, float]
 ) -> None:
     """A lift, or a positioning system whose origin has moved."""
-    walk = make_walk(2, 50.0)
+    walk = make_walk(2, 42.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     navigator = Navigator(oracle, CONFIG, true_start(walk), "graph")
     for fix in true_fixes(walk.truth, 2.0, 0.3, 0):
@@ -266,6 +267,7 @@ def true_start(walk: ImuSequence) -> PriorPose:
     return PriorPose(truth.attitude_WB[0].as_matrix(), truth.velocity_W[0], truth.position_W[0])
 
 
+@lru_cache(maxsize=4)
 def turned(walk: ImuSequence, at: float, angle: float) -> ImuSequence:
     """Return a walk that turns at once by an angle [rad], which its samples do not show."""
     truth = walk.truth
