@@ -75,6 +75,7 @@ def test_train_own_produces_a_model_that_predicts(tmp_path, monkeypatch):
     assert (np.linalg.eigvalsh(covariance) > 0).all()
 
 
+@pytest.mark.slow
 def test_live_latency_receives_positions_within_a_second(monkeypatch):
     monkeypatch.syspath_prepend(str(FOLDER))
     measured = load("live_latency").main(phones=2, seconds=3.0)
@@ -83,6 +84,7 @@ def test_live_latency_receives_positions_within_a_second(monkeypatch):
     assert measured.memory_mb > 50.0
 
 
+@pytest.mark.slow
 def test_fine_tune_learns_from_waypoints_and_keeps_the_calibration(tmp_path):
     model = load("fine_tune").main(tmp_path)
     assert model.card.calibration == load_model("default").card.calibration

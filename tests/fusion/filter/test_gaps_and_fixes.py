@@ -160,11 +160,14 @@ def test_fixes_after_a_gap_do_not_determine_the_yaw_before_it(
     assert position_nees(track, walk, len(track.time) - 2) < 12.0
 
 
-@pytest.mark.parametrize("gap", [1.5, 3.0, 7.0])
+@pytest.mark.parametrize(
+    "gap",
+    [pytest.param(1.5, marks=pytest.mark.slow), 3.0, pytest.param(7.0, marks=pytest.mark.slow)],
+)
 def test_the_graph_is_no_more_certain_of_the_turn_in_a_gap_than_the_filter(
     make_walk: Make, make_oracle: Make, without: Make, gap: float
 ) -> None:
-    walk = make_walk(1, 40.0)
+    walk = make_walk(1, 30.0)
     holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
     oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     after = 20.0 + gap + 0.2

@@ -313,7 +313,7 @@ def test_if_the_graph_fails_the_stream_continues_from_the_filter(
     )
 
 
-@pytest.mark.parametrize("stop", [3.0, 11.37])
+@pytest.mark.parametrize("stop", [pytest.param(3.0, marks=pytest.mark.slow), 11.37])
 def test_another_navigator_can_continue_a_stream(
     walk: ImuSequence, make_oracle: Make, stop: float
 ) -> None:

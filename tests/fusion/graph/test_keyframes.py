@@ -299,7 +299,7 @@ def test_contradicting_fixes_are_weighed_until_the_track_has_converged(
     assert np.linalg.norm(track.trajectory.position_W[-1] - end) < 0.5
 
 
-@pytest.mark.parametrize("height_sigma", [1e3, 1e6])
+@pytest.mark.parametrize("height_sigma", [pytest.param(1e3, marks=pytest.mark.slow), 1e6])
 def test_accurate_positions_with_an_unknown_height_need_no_fall_back(
     walk: ImuSequence, make_oracle: Make, height_sigma: float
 ) -> None:

@@ -149,7 +149,7 @@ def assert_valid(state: NavState) -> None:
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-@pytest.mark.parametrize("examples", [20, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("examples", [10, pytest.param(200, marks=pytest.mark.slow)])
 def test_no_sequence_of_faults_breaks_a_stream(backend: str, examples: int) -> None:
     @settings(
         max_examples=examples,
