@@ -166,3 +166,5 @@ def test_positions_count_for_less_once_the_track_has_drifted() -> None:
     last = np.array([1.0, 1.0]), np.array([2.0, 2.0])
     kept, drifted = (steady.with_position(*last, 0.09, drift) for drift in (0.0, 5.0))
     assert drifted.turn[1] > 2.0 * kept.turn[1]
+    # The eight before it now have the drift's variance as well.
+    assert drifted.sums[0] == pytest.approx(8.0 / (0.09 + 5.0) + 1.0 / 0.09)

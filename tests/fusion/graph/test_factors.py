@@ -22,6 +22,7 @@ from stario.fusion.graph.factors import (
 )
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.processes import Coasting, TurnProcess
+from stario.fusion.graph.whitening import Whitened
 from stario.sequences.attitude.so3 import exp_so3
 
 EYE = np.eye(3)
@@ -83,6 +84,20 @@ def test_jacobians_agree_with_finite_differences(which: int) -> None:
                 expected = given[key][:, column] if key in given else np.zeros(len(residual))
                 # The residual is measured minus predicted.
                 np.testing.assert_allclose(-(ahead - behind) / 2e-5, expected, atol=2e-6)
+
+
+def test_a_linear_factor_weighs_a_residual_by_the_inverse_of_its_correlated_covariance() -> None:
+    rng = np.random.default_rng(8)
+    values, root = random_values(rng), rng.normal(size=(3, 3))
+    term = Position(0, rng.normal(size=3), root @ root.T, 0.4, rng.normal(size=3))
+    factor = Whitened.of(term, np.inf).factor(values)
+    residual, blocks = term.linearise(values)
+    H = np.hstack([block for _, block in blocks])
+    information = np.linalg.inv(term.covariance)
+    A, b = factor.jacobian()
+    assert list(factor.keys()) == [key for key, _ in blocks]
+    np.testing.assert_allclose(A.T @ A, H.T @ information @ H, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(A.T @ b, H.T @ information @ residual, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 2.5])

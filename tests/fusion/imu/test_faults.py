@@ -41,6 +41,17 @@ def test_a_clipped_sine_is_saturated_at_its_limit() -> None:
     assert stuck - 2 <= count_saturated(clipped) <= stuck
 
 
+# --- spikes ----------------------------------------------------------------------------------
+
+
+def test_a_spike_is_replaced_by_its_neighbours_mean_and_the_last_sample_by_the_one_before() -> None:
+    rows = np.zeros((7, 7))
+    rows[:, 0], rows[:, 1] = 0.01 * np.arange(7), np.arange(7.0)
+    rows[[3, 6], 1] = 500.0, -500.0
+    assert OutlierDetector().detect(rows).spikes == 2
+    np.testing.assert_array_equal(rows[:, 1], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 5.0])
+
+
 # --- a clock that is set back ----------------------------------------------------------------
 
 
