@@ -46,7 +46,10 @@ def compare(
     report: ReportOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare tracks: inertial, pdr (steps), network, EKF, graph. Without PATH: simulated walk."""
+    """Compare tracks: inertial, pdr (from steps), network, EKF and graph.
+
+    Without PATH, those of a simulated walk.
+    """
     from stario.fusion.backends import BACKENDS
     from stario.fusion.evaluation.compare import demonstration
     from stario.fusion.evaluation.folders import check_folder

@@ -45,7 +45,7 @@ ConfigOption = Annotated[
 _RESULTS = "Folder for the results; replaces those of an earlier run. Default: "
 RunOutOption = Annotated[Path | None, typer.Option(help=f"{_RESULTS}runs/NAME.")]
 CompareOutOption = Annotated[Path | None, typer.Option(help=f"{_RESULTS}runs/compare.")]
-EvaluateOutOption = Annotated[Path | None, typer.Option(help=f"{_RESULTS}none, only printed.")]
+EvaluateOutOption = Annotated[Path | None, typer.Option(help=f"{_RESULTS}none is written.")]
 FixesOption = Annotated[
     Path | None,
     typer.Option(
