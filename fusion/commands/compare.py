@@ -16,12 +16,12 @@ from stario.fusion.commands.common import (
     progress_bar,
 )
 from stario.fusion.commands.options import (
+    CompareOutOption,
     EstimatorOptions,
     FixesOption,
     JobsOption,
     JsonOption,
     OptionalPathsArgument,
-    OutOption,
     ReadingOptions,
     ReportOption,
     changed,
@@ -42,11 +42,14 @@ def compare(
     paths: OptionalPathsArgument = None,
     fixes: FixesOption = None,
     jobs: JobsOption = 1,
-    out: OutOption = None,
+    out: CompareOutOption = None,
     report: ReportOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare tracks: inertial only, network only, EKF, graph. Without PATH: a simulated walk."""
+    """Compare tracks: inertial, pdr (from steps), network, EKF and graph.
+
+    Without PATH, those of a simulated walk.
+    """
     from stario.fusion.backends import BACKENDS
     from stario.fusion.evaluation.compare import demonstration
     from stario.fusion.evaluation.folders import check_folder

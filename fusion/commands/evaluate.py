@@ -19,10 +19,10 @@ from stario.fusion.commands.common import (
 from stario.fusion.commands.options import (
     DataOption,
     EstimatorOptions,
+    EvaluateOutOption,
     JobsOption,
     JsonOption,
     OptionalPathsArgument,
-    OutOption,
     ReadingOptions,
     RunsOption,
     changed,
@@ -88,7 +88,7 @@ def evaluate(
         typer.Option(help="How --models averages position errors: rms (default), ronin or mean."),
     ] = None,
     jobs: JobsOption = 1,
-    out: OutOption = None,
+    out: EvaluateOutOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Evaluate accuracy and consistency over recordings with ground truth: medians and means."""

@@ -12,7 +12,6 @@ import typer
 from stario.fusion.commands.common import process_each
 from stario.fusion.commands.options import (
     JsonOption,
-    OutOption,
     PathsArgument,
     ReadingOptions,
     expand_option_groups,
@@ -31,7 +30,9 @@ def inspect(
     model: Annotated[
         str, typer.Option(help="Compare the motion with these weights' training.")
     ] = "default",
-    out: OutOption = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for figure and findings. Default: runs/NAME.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Inspect recordings: timing, noise, units, signs, magnetometer, truth, kind of motion."""

@@ -32,7 +32,8 @@ RunsOption = Annotated[
     Path, typer.Option(help="Folder of training runs in which named networks are found.")
 ]
 CacheOption = Annotated[
-    Path | None, typer.Option(help="Folder for cached windows. Default: STARIO_CACHE or ~/.cache.")
+    Path | None,
+    typer.Option(help="Folder for cached windows. Default: STARIO_CACHE or ~/.cache/stario."),
 ]
 DataOption = Annotated[
     Path | None, typer.Option(help="Folder of the development recordings, used without PATH.")
@@ -41,9 +42,10 @@ ConfigOption = Annotated[
     Path | None,
     _estimation(help="TOML or JSON file with settings: gravity, tables noise, filter, graph."),
 ]
-OutOption = Annotated[
-    Path | None, typer.Option(help="Folder for the results; replaces those of an earlier run.")
-]
+_RESULTS = "Folder for the results; replaces those of an earlier run. Default: "
+RunOutOption = Annotated[Path | None, typer.Option(help=f"{_RESULTS}runs/NAME.")]
+CompareOutOption = Annotated[Path | None, typer.Option(help=f"{_RESULTS}runs/compare.")]
+EvaluateOutOption = Annotated[Path | None, typer.Option(help=f"{_RESULTS}none is written.")]
 FixesOption = Annotated[
     Path | None,
     typer.Option(
@@ -88,7 +90,8 @@ class ReadingOptions:
     axes: Annotated[
         str,
         _reading(
-            help="Axes of the ground truth in the file's axes, such as y,-x,z (or --axes=-y,x,z)."
+            help="New x, y, z in the file's axes: y,-x,z makes its y the new x (or --axes=-y,x,z). "
+            "They are those whose attitude the ground truth describes; without one, any will do."
         ),
     ] = "x,y,z"
     imu_topic: Annotated[str | None, _reading(help="IMU topic of a bag with several IMUs.")] = None

@@ -13,10 +13,10 @@ from stario.fusion.commands.options import (
     EstimatorOptions,
     FixesOption,
     JsonOption,
-    OutOption,
     PathsArgument,
     ReadingOptions,
     ReportOption,
+    RunOutOption,
     expand_option_groups,
     flag,
 )
@@ -36,7 +36,7 @@ def run(
     estimating: EstimatorOptions,
     fixes: FixesOption = None,
     backend: BackendOption = "ekf",
-    out: OutOption = None,
+    out: RunOutOption = None,
     report: ReportOption = False,
     view: Annotated[
         bool, flag("--view", help="Open the rerun 3-D viewer; its file is kept in --out.")

@@ -2,7 +2,8 @@
 
 README.md, "Magnetometer". The field's direction in the world is unknown, and indoors it wanders:
 
-    azimuth = c + g,   c constant and unknown at first, g Gauss-Markov over metres and seconds
+    azimuth = c + wander,   c constant and unknown at first
+                            wander Gauss-Markov over metres and seconds
 
 The bearing of R_WB (m_B - h), with the sensor's hard iron h, measures it. A field of unusual size
 or dip for the place has less weight, as does one that the device has extrapolated by its own
@@ -33,15 +34,15 @@ from stario.sequences.inspection.magnetic import HELD_CHANGE
 from stario.sequences.sequence import FloatArray
 
 WANDER_METRES, WANDER_SECONDS = 5.0, 60.0
-"""Distance [m] and time [s] over which g decorrelates: the reach of a beam or a radiator, and the
-duration of other changes."""
+"""Distance [m] and time [s] over which the wander decorrelates: the reach of a beam or a
+radiator, and the duration of other changes."""
 
 HARD_IRON_SIGMA = 10.0
 """Sigma of the hard iron that a phone's calibration leaves, per axis [uT]."""
 
 BEARING_SIGMA = 0.3
-"""White noise of one bearing [rad] if the sigma of g is `WANDER_SIGMA`, else in proportion: steel
-within a step's length, late samples while the device turns."""
+"""White noise of one bearing [rad] if the wander's sigma is `WANDER_SIGMA`, else in proportion:
+steel within a step's length, late samples while the device turns."""
 
 _FIRST_AZIMUTH_SIGMA = math.pi
 """Initial standard deviation of c [rad]."""
@@ -71,14 +72,15 @@ _PERIOD = 0.5
 """Time between two bearings [s]."""
 
 WANDER_SIGMA = 0.4
-"""Maximum sigma of g, the azimuth about its mean [rad]: buildings turn it by 5 to 30 degrees."""
+"""Maximum sigma of the wander, the azimuth about its mean [rad]: buildings turn it by 5 to 30
+degrees."""
 
 _MIN_WANDER_SIGMA = 0.1
-"""Minimum sigma of g, in a field that hardly varies [rad]."""
+"""Minimum sigma of the wander, in a field that hardly varies [rad]."""
 
 _WANDER_PER_SPREAD = 2.0
-"""Sigma of g per unit of `MagneticReference.spread` [rad]: 1 to 2 according to the true attitude of
-OxIOD, RIDI, KIPD and tyrex."""
+"""Sigma of the wander per unit of `MagneticReference.spread` [rad]: 1 to 2 according to the true
+attitude of OxIOD, RIDI, KIPD and tyrex."""
 
 _SIZE_TOLERANCE, _DIP_TOLERANCE = 0.05, 0.05
 """Deviations from the place's usual size (fraction) and dip [rad] that double the variance."""
