@@ -400,6 +400,14 @@ def test_a_magnetometer_is_recorded_and_used(client, hub, pushes, new_navigator,
     )
 
 
+def test_the_content_type_of_lines_may_be_in_capitals_and_is_named_where_it_is_missing(client):
+    line = json.dumps({"device": "rig", "t": 1, "gyro": [0, 0, 0], "accel": [0, 0, 9.8]})
+    headers = {"content-type": "Application/X-NDJSON; charset=utf-8"}
+    assert client.post("/data", content=line, headers=headers).status_code == 200
+    answer = client.post("/data", content=line, headers={"content-type": "application/json"})
+    assert "application/x-ndjson" in answer.json()["error"]
+
+
 def test_an_invalid_line_is_reported_with_its_number(client):
     lines = [{"device": "rig", "t": t, "gyro": [0, 0, 0], "accel": [0, 0, 9.8]} for t in (1, 2)]
     lines[1]["gyro"] = [0, 0]
