@@ -34,6 +34,11 @@ KINDS: dict[str, int] = {"position": 3, "velocity": 3, "yaw": 1}
 MAX_WAITING = 10_000
 """Maximum number of fixes of a stream that wait for their time, to bound memory."""
 
+_MAX_VALUE, _MAX_VARIANCE = 1e9, 1e100
+"""Largest number in the value of a fix and in its covariance. More stands for "unknown" in the
+output of receivers: it would place the track where 64 bits have no digits for metres, and the
+squares that an update needs are not finite."""
+
 _MIN_SIGMA = 1e-4
 """Smallest standard deviation of a fix [m], [m/s], [rad]."""
 
@@ -70,6 +75,8 @@ class Fix:
         if self.kind == "yaw" and abs(self.value[0]) > MAX_YAW:
             return "yaw not in radians"
         C = self.covariance
+        if np.abs(self.value).max() > _MAX_VALUE or np.abs(C).max() > _MAX_VARIANCE:
+            return "value too large"
         if np.abs(C - C.T).max() > 1e-6 * np.abs(C).max() or not C.diagonal().min() > 0.0:
             return "covariance not positive definite"
         sigma = np.sqrt(C.diagonal())
@@ -126,8 +133,9 @@ def yaw_fix(time: float, yaw: Any, sigma: Any) -> Fix:
         InputError: a value is not a number.
     """
     sigma = shaped("sigma", sigma, ())
-    # Squaring would hide a wrong sign from `fault`.
-    variance = np.reshape(sigma * np.abs(sigma), (1, 1))
+    with np.errstate(over="ignore"):  # `fault` refuses what is not finite
+        # Squaring would hide a wrong sign from `fault`.
+        variance = np.reshape(sigma * np.abs(sigma), (1, 1))
     return make_fix(time, "yaw", np.atleast_1d(shaped("yaw", yaw, ())), variance)
 
 

@@ -53,8 +53,9 @@ _GATE = 0.95
 _MIN_HORIZONTAL = 4.0
 """Horizontal field [uT] below which its bearing is meaningless."""
 
-_WEAKEST = 2.0
-"""Field [uT] that only one in another unit falls below: the Earth's has at least 22."""
+_WEAKEST, _STRONGEST = 2.0, 1e4
+"""Fields [uT] that only one in another unit falls below or exceeds: the Earth's has 22 to 67, and
+each axis of a phone's sensor at most 4900."""
 
 NORTH_SIGMA = 0.1
 """Sigma of magnetic north's mean direction along a pedestrian's path [rad]."""
@@ -239,6 +240,8 @@ def update_bearing(
         The outcome, and the reference after this field.
     """
     now, measured = ekf.state.time, float(np.linalg.norm(m_B))
+    if measured > _STRONGEST:
+        return UpdateResult("too strong to be in uT"), changed(reference, time=now)
     if ekf.state.field is None:
         ekf.state = with_field(ekf.state, m_B)
     elif math.isfinite(reference.time):

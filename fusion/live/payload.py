@@ -96,7 +96,9 @@ def parse_push(body: bytes) -> Batch:
     message = object_from("body", body)
     payload = message.get("payload")
     if not isinstance(payload, list):
-        raise InputError("payload", _describe(payload), "a list of samples")
+        lines = "send lines of JSON with the content type application/x-ndjson"
+        fix = lines if payload is None else ""
+        raise InputError("payload", _describe(payload), "a list of samples", fix)
     if len(payload) > MAX_ENTRIES:
         found = f"{len(payload)} samples"
         raise InputError("payload", found, f"at most {MAX_ENTRIES}", "choose a shorter period")

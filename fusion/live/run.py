@@ -138,6 +138,7 @@ def _bound(host: str, port: int) -> socket.socket:
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))
+        listener.listen()  # or the lines could listen on the same port
     except OSError as error:
         listener.close()
         if isinstance(error, socket.gaierror):

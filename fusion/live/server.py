@@ -51,6 +51,7 @@ _MIN_PERIOD = 0.05
 _MAX_PERIOD = 1.0
 _COOKIE = "stario_token"
 _MAX_COORDINATE, _SIGMA_RANGE = 1e6, (0.01, 1e3)
+_LINES = "application/x-ndjson"
 _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 
 _log = logging.getLogger(__name__)
@@ -136,7 +137,7 @@ async def _data(request: Request) -> Response:
         if coding != "identity":
             raise InputError("content-encoding", coding, "identity", "send it uncompressed")
         body = await _body(request)
-        lines = request.headers.get("content-type", "").startswith("application/x-ndjson")
+        lines = request.headers.get("content-type", "").lower().startswith(_LINES)
         sender = f"http {request.client.host if request.client else ''}"
         # In a thread, so that a large body does not block other requests.
         batches = await asyncio.to_thread(_parsed, body, sender if lines else "")

@@ -115,14 +115,16 @@ class LiveTrack:
 
         Raises:
             InputError: there is no position yet.
+            OSError: it cannot be written; it is then not applied.
         """
         before = self._state()
         p_W = np.array([x, y, 0.0]) + self.drawn.origin
         p_W[2] = before.p_W[2]
         covariance = np.diag([sigma**2, sigma**2, 1e6])  # a tap says nothing about the height
-        self._navigator.update_position(before.time, p_W, covariance)
         assert self._file is not None  # there is a state
+        # First to disk, as samples: a fix that is not written moves nothing.
         self._file.append_fix(position_fix(before.time, p_W, covariance))
+        self._navigator.update_position(before.time, p_W, covariance)
         self.fixes += 1
         after = self._state()
         if after.map_frame != self.drawn.map_frame:

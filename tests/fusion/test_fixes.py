@@ -309,6 +309,8 @@ def test_states_of_a_stream_carry_the_number_of_their_map_frame(
         ([0, 0, 0], np.ones((3, 3)), "covariance not positive definite"),
         ([0, 0, 0], np.triu(np.ones((3, 3))), "covariance not positive definite"),
         ([0, 0, 0], ROOT @ ROOT.T, "covariance not positive definite"),  # singular but for rounding
+        ([0, 0, 0], np.diag([1.0, 1.0, 1e300]), "value too large"),
+        ([1e20, 0, 0], EYE, "value too large"),
     ],
 )
 def test_invalid_fixes_are_refused_and_counted(
@@ -347,6 +349,7 @@ def test_fixes_with_a_time_or_value_that_is_not_finite_are_refused(
         (-0.1, "covariance not positive definite"),
         (0.0, "covariance not positive definite"),
         (np.inf, "value that is not finite"),
+        (1e200, "value that is not finite"),
         (-np.inf, "value that is not finite"),
     ],
 )

@@ -253,16 +253,19 @@ def test_repeated_and_invalid_fields_are_dropped_and_counted(still_model: Any) -
     assert "magnetometer samples dropped: 2" in navigator.health.lines()
 
 
-@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e-2])  # T, mT, gauss
+@pytest.mark.parametrize(
+    ("scale", "named"),
+    [(1e-6, "weak"), (1e-3, "weak"), (1e-2, "weak"), (1e3, "strong")],  # T, mT, gauss, nT
+)
 def test_a_field_in_another_unit_is_named_as_such(
-    biased_walk: ImuSequence, make_oracle: Make, scale: float
+    biased_walk: ImuSequence, make_oracle: Make, scale: float, named: str
 ) -> None:
     walk = biased_walk.slice(0.0, 20.0)
     assert walk.magnetometer is not None
     field = replace(walk.magnetometer, field=scale * walk.magnetometer.field)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
     bearings = Navigator(oracle, CONFIG).run(replace(walk, magnetometer=field)).health.bearings
-    assert set(bearings) == {"too weak to be in uT"}
+    assert set(bearings) == {f"too {named} to be in uT"}
 
 
 def test_a_disabled_magnetometer_has_no_effect(biased_walk: ImuSequence, make_oracle: Make) -> None:

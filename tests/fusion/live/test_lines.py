@@ -11,7 +11,7 @@ import pytest
 from stario.fusion.live import lines as lines_module
 from stario.fusion.live.lines import MAX_LINE
 from stario.fusion.live.run import LiveServer, is_loopback
-from stario.sequences import read_recording
+from stario.sequences import InputError, read_recording
 
 
 def lines_of(walk, count, **extra):
@@ -136,6 +136,15 @@ def test_only_loopback_needs_no_token(tmp_path, new_navigator):
     assert len(server.token) >= 16
     assert server.token in "\n".join(server.addresses())
     server._socket.close()
+
+
+def test_lines_cannot_have_the_port_of_the_page(tmp_path, new_navigator):
+    server = LiveServer(new_navigator, tmp_path, port=0, lines_port=0)
+    server._lines_port = server.port
+    started = []
+    with pytest.raises(InputError, match="lines-port"):
+        server.run(lambda: (started.append(True), server.stop()))
+    assert not started
 
 
 def test_an_invalid_packet_does_not_stop_the_server_from_listening(serve, walk):

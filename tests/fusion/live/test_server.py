@@ -240,6 +240,20 @@ def test_a_full_disk_is_reported_and_affects_no_other(client, hub, pushes, monke
     assert phone.json() == {"samples": 20}
 
 
+def test_a_fix_that_cannot_be_written_moves_nothing(client, hub, pushes, monkeypatch):
+    send(client, pushes(seconds=4.0))
+    track = hub.sessions["phone"].track
+    before, points = track._navigator.state, list(track.drawn.points)
+
+    def disk_full(*arguments):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(track._file, "append_fix", disk_full)
+    assert command(client, "phone", "fix", x=50.0, y=-20.0, sigma=0.1).status_code == 507
+    assert track.drawn.points == points
+    np.testing.assert_array_equal(track._navigator.state.p_W, before.p_W)
+
+
 def test_fixes_after_a_gap_leave_the_track_before_it_unchanged(client, hub, pushes):
     bodies = pushes()
     for part in (bodies[:20], bodies[20:60]):
@@ -384,6 +398,14 @@ def test_a_magnetometer_is_recorded_and_used(client, hub, pushes, new_navigator,
         track.trajectory.position_W[-1],
         atol=1e-2 if lag else 1e-5,
     )
+
+
+def test_the_content_type_of_lines_may_be_in_capitals_and_is_named_where_it_is_missing(client):
+    line = json.dumps({"device": "rig", "t": 1, "gyro": [0, 0, 0], "accel": [0, 0, 9.8]})
+    headers = {"content-type": "Application/X-NDJSON; charset=utf-8"}
+    assert client.post("/data", content=line, headers=headers).status_code == 200
+    answer = client.post("/data", content=line, headers={"content-type": "application/json"})
+    assert "application/x-ndjson" in answer.json()["error"]
 
 
 def test_an_invalid_line_is_reported_with_its_number(client):
