@@ -84,11 +84,11 @@ class Navigator:
             InputError: time is not a number, or every sample is far from the previous one (time not
                 in seconds), or a thousand have the same time (time in 32 bits); gyro or accel does
                 not hold three numbers; the mean force of the first second cannot be gravity in
-                m/s^2, or the rate is not about 50 Hz to 1 kHz; gyro cannot be in rad/s or one
-                sensor's values never change, which shows once the device turns; or the clock was
-                set back by at least five seconds (after less, samples are late until it has caught
-                up). After the last five the stream starts again; after a clock that was set back,
-                without prior and fixes.
+                m/s^2 or contradicts the prior's attitude, or the rate is not about 50 Hz to 1 kHz;
+                gyro cannot be in rad/s or one sensor's values never change, which shows once the
+                device turns; or the clock was set back by at least five seconds (after less,
+                samples are late until it has caught up). After the last six the stream starts
+                again; after a clock that was set back, without prior and fixes.
         """
         return self._stream.push((seconds(time), *three("gyro", gyro), *three("accel", accel)))
 
@@ -218,7 +218,8 @@ class Navigator:
                 recording are refused and counted. The whole track is given in its final map frame.
 
         Raises:
-            InputError: the recording is shorter than 1.5 s, or its units or rate are wrong.
+            InputError: the recording is shorter than 1.5 s, its units or rate are wrong, or gravity
+                contradicts the prior's attitude.
         """
         return self.track(self.observe(sequence, progress), progress, fixes)
 
@@ -239,7 +240,8 @@ class Navigator:
         """Estimate the track of a preprocessed recording; fixes as for `run`.
 
         Raises:
-            InputError: it was preprocessed for another update rate.
+            InputError: it was preprocessed for another update rate, or gravity contradicts the
+                prior's attitude.
         """
         backend = BACKENDS[self.backend]
         return track_recording(backend, preprocessed, self.config, self.prior, fixes, progress)

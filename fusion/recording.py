@@ -132,6 +132,9 @@ def cut_recording(
             front_end.counts.set_back = error.by
             break
     front_end.finish()
+    unused = config.filter.magnetometer and all(e.field_B is None for e in intervals)
+    if magnetometer is not None and unused:  # it has another clock
+        front_end.counts.field_dropped = len(magnetometer.time)
     return intervals, front_end
 
 

@@ -88,12 +88,11 @@ class Stream:
             self.front_end.sensors.check(interval)
             if self.estimator is None:
                 check_start(start, self._config.gravity)
+                self.estimator = self._backend.stream(self._config, start, self.prior)
+                self._fixes.start(start.time)
         except InputError:
             self._begin()
             raise
-        if self.estimator is None:
-            self.estimator = self._backend.stream(self._config, start, self.prior)
-            self._fixes.start(start.time)
         if interval.gap:
             self._network.restart()
         displacement = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.lie import UNKNOWN_YAW, yaw_rotation
 from stario.fusion.state import NavState
+from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 from stario.sequences.settings import check_number
 
@@ -21,6 +23,14 @@ STILL_TILT_SIGMA = 0.01
 
 GAP_VELOCITY_SIGMA = 1.5
 """Standard deviation of a pedestrian's mean velocity over a long gap, per axis [m/s]."""
+
+_MAX_PRIOR_TILT = 1.0
+"""Angle [rad] between a prior's vertical and that of the first second, beyond three sigmas of the
+prior: more than a swinging device's own acceleration causes."""
+
+_MAX_PRIOR_SIGMA = 1e5
+"""Largest standard deviation of a prior [rad], [m/s], [m], beyond which the covariance keeps no
+digits for the rest."""
 
 MAX_GAP_DISTANCE = 1e4
 """Maximum distance assumed to be covered in a gap [m]: the covariance must keep its digits."""
@@ -41,7 +51,7 @@ class PriorPose:
 
     Raises:
         InputError: a value has the wrong shape or is not finite, `R_WB` is not a rotation, or a
-            sigma is negative.
+            sigma is negative or above 1e5.
     """
 
     R_WB: FloatArray
@@ -58,7 +68,7 @@ class PriorPose:
         object.__setattr__(self, "R_WB", checked_rotation(self.R_WB))
         for name in ("tilt_sigma", "yaw_sigma", "velocity_sigma", "position_sigma"):
             object.__setattr__(self, name, float(checked(name, getattr(self, name), ())))
-            check_number(self, name)
+            check_number(self, name, high=_MAX_PRIOR_SIGMA)
 
 
 def tilt_sigma(start: Start, config: NavigatorConfig) -> float:
@@ -69,7 +79,13 @@ def tilt_sigma(start: Start, config: NavigatorConfig) -> float:
 def initialise(
     ekf: StateCloningEkf, start: Start, prior: PriorPose | None, config: NavigatorConfig
 ) -> None:
-    """Set the first state: the prior if given, else levelled by gravity, at rest, at the origin."""
+    """Set the first state: the prior if given, else levelled by gravity, at rest, at the origin.
+
+    Raises:
+        InputError: gravity contradicts the prior's attitude.
+    """
+    if prior is not None:
+        _check_tilt(prior, start)
     f = config.filter
     tilt = tilt_sigma(start, config)
     zero = np.zeros(3)
@@ -80,6 +96,20 @@ def initialise(
     covariance = np.diag(np.square(np.maximum(sigma, MIN_PRIOR_SIGMA)))
     state = NavState(start.time, pose.R_WB, pose.v_W, pose.p_W, zero, zero, covariance)
     ekf.initialise(state)
+
+
+def _check_tilt(prior: PriorPose, start: Start) -> None:
+    """Check a prior's vertical by gravity: the transposed attitude is easily given.
+
+    Raises:
+        InputError: they are too far apart.
+    """
+    off = math.acos(min(max(float(prior.R_WB[2] @ start.up_B), -1.0), 1.0))
+    allowed = _MAX_PRIOR_TILT + 3.0 * prior.tilt_sigma
+    if off > allowed:
+        found = f"a vertical {math.degrees(off):.0f} degrees from that of gravity"
+        expected = f"at most {math.degrees(allowed):.0f} at this tilt_sigma"
+        raise InputError("prior: R_WB", found, expected, "R_WB maps vectors from B to W")
 
 
 def reinitialise(ekf: StateCloningEkf, interval: ImuInterval, config: NavigatorConfig) -> None:

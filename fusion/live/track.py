@@ -26,6 +26,10 @@ _MAX_UNWRITTEN = 6000
 
 _HEALTH_SECONDS = 1.0
 
+_ERROR_SECONDS = 20.0
+"""Time for which an error of the navigator is shown [s]: it begins again, and takes 13 s to see
+that a gyroscope is not in rad/s."""
+
 _CERTAIN = 0.7
 """Cosine between the vertical and the force above which the force's sign is certain."""
 
@@ -54,7 +58,7 @@ class LiveTrack:
         self._unwritten: tuple[list[Sample], list[Field]] = [], []
         self._first_ns = self._newest_ns = -1
         self._push_error = self._write_error = ""
-        self._health_time = -math.inf
+        self._health_time = self._error_time = -math.inf
         self._stray = self._lost = 0
         self.drawn = DisplayedTrack()
         self.words: list[dict[str, str]] = []
@@ -187,11 +191,12 @@ class LiveTrack:
         try:
             state = self._navigator.push(self._seconds(time_ns), gyro, accel)
         except InputError as error:
-            self._push_error = str(error)
+            self._push_error, self._error_time = str(error), self._seconds(time_ns)
             return
         if state is None:
             return
-        self._push_error = ""
+        if state.time - self._error_time > _ERROR_SECONDS:
+            self._push_error = ""
         self.drawn.add(state)
         self._update_health(state.time)
 

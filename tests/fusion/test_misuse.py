@@ -66,6 +66,7 @@ LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
         (lambda model: NavigatorConfig(noise=(1e-3, 1e-2)), "noise"),
         (lambda model: PriorPose(*LEVEL, yaw_sigma=-0.5), "yaw_sigma"),
         (lambda model: PriorPose(*LEVEL, tilt_sigma="a"), "tilt_sigma"),
+        (lambda model: PriorPose(*LEVEL, position_sigma=1e9), "position_sigma"),
         (lambda model: PriorPose(2.0 * np.eye(3), *LEVEL[1:]), "R_WB"),
         (lambda model: PriorPose(np.diag([1.0, 1.0, -1.0]), *LEVEL[1:]), "R_WB"),
         (lambda model: PriorPose(LEVEL[0], [0.0, 0.0], LEVEL[2]), "v_W"),
@@ -173,3 +174,24 @@ def test_misplaced_arguments_are_named(still_model: Any, make_walk: Make) -> Non
             read_recording(wrong)  # type: ignore[arg-type]
         with pytest.raises(InputError, match="name_or_path"):
             load_model(wrong)  # type: ignore[arg-type]
+
+
+def test_a_prior_attitude_that_gravity_contradicts_is_refused(
+    walk: ImuSequence, still_model: Any
+) -> None:
+    """As the transposed attitude of a phone that is held upright."""
+    on_its_side = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    first = walk.truth.at(walk.time[:1]).attitude_WB[0].as_matrix()
+    wrong = Navigator(still_model, prior=PriorPose(on_its_side @ first, *LEVEL[1:]))
+    with pytest.raises(InputError, match=r"prior: R_WB: found a vertical \d+ degrees.*B to W"):
+        wrong.run(walk)
+    refused_at = []
+    for time, gyro, accel in zip(walk.time[:250], walk.gyro, walk.accel, strict=False):
+        try:
+            wrong.push(time, gyro, accel)
+        except InputError:
+            refused_at.append(time)
+    np.testing.assert_allclose(refused_at, [1.0, 2.01], atol=0.02)
+    assert wrong.state is None
+    unknown = PriorPose(on_its_side @ first, *LEVEL[1:], tilt_sigma=1.0)
+    assert Navigator(still_model, prior=unknown).run(walk).health is not None

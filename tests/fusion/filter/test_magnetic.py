@@ -253,6 +253,17 @@ def test_repeated_and_invalid_fields_are_dropped_and_counted(still_model: Any) -
     assert "magnetometer samples dropped: 2" in navigator.health.lines()
 
 
+@pytest.mark.parametrize("seconds", [-1e4, 1e4])
+def test_a_field_on_another_clock_is_reported(
+    biased_walk: ImuSequence, still_model: Any, seconds: float
+) -> None:
+    walk = biased_walk.slice(0.0, 6.0)
+    field = replace(walk.magnetometer, time=walk.magnetometer.time + seconds)
+    health = Navigator(still_model, CONFIG).run(replace(walk, magnetometer=field)).health
+    assert health.fields_dropped == len(field.time) > 50
+    assert any("magnetic fields were dropped" in note for note in health.notes)
+
+
 @pytest.mark.parametrize(
     ("scale", "named"),
     [(1e-6, "weak"), (1e-3, "weak"), (1e-2, "weak"), (1e3, "strong")],  # T, mT, gauss, nT

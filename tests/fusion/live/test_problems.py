@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from stario.fusion.live import storage
@@ -32,6 +33,20 @@ def test_a_gyroscope_that_stops_is_shown(session, batches):
         others = [reading for reading in batch.readings if reading.sensor != GYRO]
         session.take(replace(batch, readings=others), 1.7e9)
     assert "no samples of gyroscope for 5 s" in session.status()["problem"]
+
+
+def test_a_gyroscope_in_another_unit_is_shown_though_the_track_begins_again(session, pushes):
+    batches = [parse_push(body) for body in pushes()]
+    shown = []
+    for batch in batches:
+        degrees = [
+            replace(r, value=tuple(np.degrees(r.value))) if r.sensor == GYRO else r
+            for r in batch.readings
+        ]
+        session.take(replace(batch, readings=degrees), 1.7e9)
+        shown.append(session.status()["problem"])
+    first = next(k for k, problem in enumerate(shown) if problem)
+    assert all(shown[first:])
 
 
 def test_a_full_disk_is_shown_until_it_has_space_and_what_is_lost_is_counted(
