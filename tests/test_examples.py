@@ -92,9 +92,8 @@ def test_fine_tune_learns_from_waypoints_and_keeps_the_calibration(tmp_path):
     assert np.isfinite(mean).all()
 
 
-@pytest.mark.parametrize(
-    "processes", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["threads", "processes"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("processes", [False, True], ids=["threads", "processes"])
 def test_cluster_distributes_recordings_among_workers_and_skips_a_broken_one(processes, tmp_path):
     """Processes, as in the example itself, take seconds to start."""
     example = load("cluster")
@@ -155,6 +154,7 @@ def write_mean_force(path):
     onnx.save(model, path)
 
 
+@pytest.mark.slow
 def test_streaming_onnx_gives_the_networks_track_without_importing_torch(tmp_path):
     """`.ci/run` streams the default weights, `test_export.py` compares exported networks."""
     pytest.importorskip("onnxruntime", reason="pip install 'stario[onnx]'")

@@ -44,7 +44,11 @@ def test_five_seconds_of_false_displacements_leave_no_lasting_error(seed: int) -
 # alternative drops the false displacements instead of taking a constant error from them.
 @pytest.mark.parametrize(
     ("seed", "backend", "limit"),
-    [pytest.param(1, "ekf", 0.75, marks=pytest.mark.slow), (2, "ekf", 0.75), (2, "graph", 0.35)],
+    [
+        pytest.param(1, "ekf", 0.75, marks=pytest.mark.slow),
+        (2, "ekf", 0.75),
+        pytest.param(2, "graph", 0.35, marks=pytest.mark.slow),
+    ],
 )
 def test_five_false_seconds_leave_no_lasting_error_with_the_default_noise(
     seed: int, backend: str, limit: float

@@ -217,7 +217,9 @@ def test_a_yaw_within_a_short_gap_of_a_turning_device_is_that_of_its_time(
     assert abs(error) < 3.0 * np.sqrt(track.covariance[before, 2, 2]) < 2.0
 
 
-@pytest.mark.parametrize("jump", [(0.0, 0.0, 8.0), (20.0, 0.0, 0.0)])
+@pytest.mark.parametrize(
+    "jump", [(0.0, 0.0, 8.0), pytest.param((20.0, 0.0, 0.0), marks=pytest.mark.slow)]
+)
 def test_a_streams_graph_follows_the_fixes_where_the_filter_does(
     make_walk: Make, make_oracle: Make, jump: tuple[float, float, float]
 ) -> None:

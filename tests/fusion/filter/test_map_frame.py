@@ -170,7 +170,9 @@ def yaw_error(walk: ImuSequence, states: list[NavState]) -> tuple[np.ndarray, np
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("off", [[200.0, 0.0, 0.0], [0.0, -60.0, 0.0]])
+@pytest.mark.parametrize(
+    "off", [[200.0, 0.0, 0.0], pytest.param([0.0, -60.0, 0.0], marks=pytest.mark.slow)]
+)
 def test_a_wrong_first_position_does_not_turn_the_track(
     make_walk: Make, make_oracle: Make, backend: Any, off: list[float]
 ) -> None:

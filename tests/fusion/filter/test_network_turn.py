@@ -67,7 +67,7 @@ def test_a_turned_network_does_not_make_the_yaw_overconfident(
     backend: BackendName, make_walk: Make, make_oracle: Make
 ) -> None:
     """Fixes determine the track's direction, but cannot separate the yaw's error from the turn."""
-    walk = make_walk(11, 80.0)
+    walk = make_walk(11, 60.0)
     model = Turned(make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03))
     estimated, ignored = (
         track_with_fixes(model, walk, with_turn(sigma), "walks", 3.0, 0.1, backend=backend)

@@ -39,7 +39,7 @@ def assert_consistent(result: Consistency) -> None:
 
 
 def test_nees_of_a_short_walk_is_within_its_bounds() -> None:
-    assert_consistent(consistency(CONFIG, runs=10, seconds=30.0))
+    assert_consistent(consistency(CONFIG, runs=7, seconds=30.0))
 
 
 @pytest.mark.slow

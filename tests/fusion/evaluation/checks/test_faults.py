@@ -19,7 +19,7 @@ from stario.fusion.evaluation.checks.faults import (
 from stario.fusion.navigator import Navigator
 from stario.sequences.errors import InputError
 
-SECONDS = 20.0
+SECONDS = 14.0
 SAMPLES = ("time", "gyro", "accel")
 
 
