@@ -5,10 +5,12 @@ import threading
 
 import numpy as np
 import pytest
+from starlette.testclient import TestClient
 
 from stario.fusion import Navigator
 from stario.fusion.live.hub import Hub
 from stario.fusion.live.run import LiveServer
+from stario.fusion.live.server import live_app
 
 
 class SteadyWalk:
@@ -74,3 +76,9 @@ def serve(tmp_path, new_navigator):
     for server, thread in running:
         server.stop()
         thread.join(20.0)
+
+
+@pytest.fixture
+def client(hub):
+    with TestClient(live_app(hub), base_url="http://localhost") as client:
+        yield client

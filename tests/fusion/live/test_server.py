@@ -17,12 +17,6 @@ from stario.sequences import read_recording
 JSON = {"content-type": "application/json"}
 
 
-@pytest.fixture
-def client(hub):
-    with TestClient(live_app(hub), base_url="http://localhost") as client:
-        yield client
-
-
 def send(client, bodies):
     return [client.post("/data", content=body) for body in bodies]
 
@@ -359,16 +353,6 @@ def test_undeclared_apple_sign_is_detected_by_the_attitude_of_the_phone(
     assert ("accel_unit=-m/s2" in problem) == detected
 
 
-def test_posted_lines_are_accepted_all_or_none(client, hub, walk):
-    rows = zip(walk.time[:150].tolist(), walk.gyro.tolist(), walk.accel.tolist(), strict=False)
-    lines = [json.dumps({"device": "rig", "t": t, "gyro": g, "accel": a}) for t, g, a in rows]
-    ndjson = {"content-type": "application/x-ndjson"}
-    broken = client.post("/data", content="\n".join([*lines[:50], "{}"]), headers=ndjson)
-    assert (broken.status_code, hub.sessions) == (400, {})
-    assert client.post("/data", content="\n".join(lines), headers=ndjson).json() == {"samples": 150}
-    assert hub.refused["http"] == 1
-
-
 @pytest.mark.parametrize(("lag", "first"), [(0, 0), (2, 0), (0, 150)])
 def test_a_magnetometer_is_recorded_and_used(client, hub, pushes, new_navigator, walk, lag, first):
     """Its samples may arrive slightly later than the gyroscope's, and its first much later."""
@@ -398,20 +382,3 @@ def test_a_magnetometer_is_recorded_and_used(client, hub, pushes, new_navigator,
         track.trajectory.position_W[-1],
         atol=1e-2 if lag else 1e-5,
     )
-
-
-def test_the_content_type_of_lines_may_be_in_capitals_and_is_named_where_it_is_missing(client):
-    line = json.dumps({"device": "rig", "t": 1, "gyro": [0, 0, 0], "accel": [0, 0, 9.8]})
-    headers = {"content-type": "Application/X-NDJSON; charset=utf-8"}
-    assert client.post("/data", content=line, headers=headers).status_code == 200
-    answer = client.post("/data", content=line, headers={"content-type": "application/json"})
-    assert "application/x-ndjson" in answer.json()["error"]
-
-
-def test_an_invalid_line_is_reported_with_its_number(client):
-    lines = [{"device": "rig", "t": t, "gyro": [0, 0, 0], "accel": [0, 0, 9.8]} for t in (1, 2)]
-    lines[1]["gyro"] = [0, 0]
-    body = "\n".join(map(json.dumps, lines))
-    answer = client.post("/data", content=body, headers={"content-type": "application/x-ndjson"})
-    assert answer.status_code == 400
-    assert answer.json()["error"].startswith("line 2, gyro: found a list")

@@ -1,0 +1,30 @@
+"""Lines of JSON, posted to the server."""
+
+import json
+
+
+def test_posted_lines_are_accepted_all_or_none(client, hub, walk):
+    rows = zip(walk.time[:150].tolist(), walk.gyro.tolist(), walk.accel.tolist(), strict=False)
+    lines = [json.dumps({"device": "rig", "t": t, "gyro": g, "accel": a}) for t, g, a in rows]
+    ndjson = {"content-type": "application/x-ndjson"}
+    broken = client.post("/data", content="\n".join([*lines[:50], "{}"]), headers=ndjson)
+    assert (broken.status_code, hub.sessions) == (400, {})
+    assert client.post("/data", content="\n".join(lines), headers=ndjson).json() == {"samples": 150}
+    assert hub.refused["http"] == 1
+
+
+def test_the_content_type_of_lines_may_be_in_capitals_and_is_named_where_it_is_missing(client):
+    line = json.dumps({"device": "rig", "t": 1, "gyro": [0, 0, 0], "accel": [0, 0, 9.8]})
+    headers = {"content-type": "Application/X-NDJSON; charset=utf-8"}
+    assert client.post("/data", content=line, headers=headers).status_code == 200
+    answer = client.post("/data", content=line, headers={"content-type": "application/json"})
+    assert "application/x-ndjson" in answer.json()["error"]
+
+
+def test_an_invalid_line_is_reported_with_its_number(client):
+    lines = [{"device": "rig", "t": t, "gyro": [0, 0, 0], "accel": [0, 0, 9.8]} for t in (1, 2)]
+    lines[1]["gyro"] = [0, 0]
+    body = "\n".join(map(json.dumps, lines))
+    answer = client.post("/data", content=body, headers={"content-type": "application/x-ndjson"})
+    assert answer.status_code == 400
+    assert answer.json()["error"].startswith("line 2, gyro: found a list")
