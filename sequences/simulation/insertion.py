@@ -37,6 +37,9 @@ _POSE_RATE = 500.0
 _HALT_SECONDS, _STILL_SECONDS = 2.0, 0.5
 """Time in which a walking device comes to rest, and in which its rotation does [s]."""
 
+_BIAS_STRIDE = 0.2
+"""Time over which gyroscope and poses are compared for the bias [s]."""
+
 _ERRORS = ImuErrors(
     noise=PHONE_NOISE, gyro_range=PHONE_IMU.gyro_range, accel_range=PHONE_IMU.accel_range
 )
@@ -125,14 +128,14 @@ def _sensor_offsets(
     """Return the gyroscope's bias (3,) [rad/s] and gravity as the accelerometer measures it."""
     known = poses.covers(time)
     force_L = poses.at(time[known]).attitude_WB.apply(accel[known])
-    seconds = np.arange(time[0], time[-1], 1.0)
-    seconds = seconds[poses.covers(seconds)]
-    known_pairs = np.diff(seconds) < 1.5
-    true, measured = poses.at(seconds).attitude_WB, GyroIntegral(time, gyro).attitude(seconds)
-    turns = [
-        composed(attitude[:-1].inv(), attitude[1:])[known_pairs] for attitude in (true, measured)
-    ]
-    excess = composed(turns[0].inv(), turns[1]).as_rotvec()
+    ticks = np.arange(time[0], time[-1], _BIAS_STRIDE)
+    ticks = ticks[poses.covers(ticks)]
+    neighbours = np.diff(ticks) < 1.5 * _BIAS_STRIDE
+    true, measured = (
+        composed(attitude[:-1].inv(), attitude[1:])[neighbours]
+        for attitude in (poses.at(ticks).attitude_WB, GyroIntegral(time, gyro).attitude(ticks))
+    )
+    excess = composed(true.inv(), measured).as_rotvec() / _BIAS_STRIDE
     return np.median(excess, axis=0), float(np.linalg.norm(force_L.mean(axis=0)))
 
 

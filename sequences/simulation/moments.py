@@ -104,7 +104,7 @@ def _shake(rng: np.random.Generator, time: FloatArray, attitude_LB: Rotation) ->
 
 def _drop(rng: np.random.Generator, time: FloatArray, attitude_LB: Rotation) -> MomentMotion:
     """Fall and tumble once, bounce on the floor, lie there, be taken up again."""
-    dropped = 1.0
+    dropped = 2.5
     fall = math.sqrt(2.0 * _DROP_HEIGHT / STANDARD_GRAVITY)
     height = np.where(time < dropped, _DROP_HEIGHT, 0.0)
     falling = (time >= dropped) & (time < dropped + fall)
@@ -123,7 +123,8 @@ def _drop(rng: np.random.Generator, time: FloatArray, attitude_LB: Rotation) -> 
     lying = landed - taken
     height += _DROP_HEIGHT * (taken - 1.0)
     away = about_z(rng.uniform(0.0, 2.0 * np.pi)).apply([1.0, 0.0, 0.0])
-    offset = 0.3 * lying[:, None] * away + height[:, None] * [0.0, 0.0, 1.0]
+    slid = 0.3 * (ramp((time - dropped - fall) / 0.6) - taken)
+    offset = slid[:, None] * away + height[:, None] * [0.0, 0.0, 1.0]
     tumble = Rotation.from_rotvec(2.0 * np.pi * landed[:, None] * away)
     turn = tumble * Rotation.from_rotvec(lying[:, None] * _to_flat(rng, attitude_LB))
     return _in_same_field(offset, turn.as_rotvec())
@@ -183,7 +184,7 @@ def _climb(time: FloatArray) -> FloatArray:
 MOMENTS = (
     Moment("shake 10 s", 10.0, _shake),
     Moment("shake 25 s", 25.0, _shake),
-    Moment("drop", 8.0, _drop),
+    Moment("drop", 10.0, _drop),
     Moment("table", 20.0, _laid_down),
     Moment("standing", 60.0, _standing),
     Moment("lift", 24.0, _lift),
