@@ -48,6 +48,9 @@ MAX_SECONDS = 180.0
 _BEFORE_WAYPOINTS = 4.0
 """Time before the first known position from which a recording without poses is used [s]."""
 
+_FIRST_SECONDS = 1.05
+"""Time until the first window has been applied [s]: it is a second long."""
+
 _MIN_KNOWN = 3
 """Minimum number of known positions in a part of the track for its error to count."""
 
@@ -231,7 +234,8 @@ def largest_correction(sequence: ImuSequence, track: Track) -> tuple[float, floa
     """Return a track's largest unexplained steps between two outputs, [m] and [deg].
 
     The position should advance by the mean of the two velocities, the attitude by the gyroscope
-    less the estimated bias. Steps across gaps are left out.
+    less the estimated bias. Steps across gaps are left out, and that of the first window, which
+    makes the velocity known.
     """
     trajectory, b_g = track.trajectory, track.b_g
     assert trajectory.velocity_W is not None  # both back ends give them
@@ -247,5 +251,5 @@ def largest_correction(sequence: ImuSequence, track: Track) -> tuple[float, floa
     )
     bias = Rotation.from_rotvec(-dt * b_g[1:])
     rest = composed(composed(expected, bias).inv(), turns).magnitude()
-    unbroken = trajectory.valid[1:]
-    return float(steps[unbroken].max()), float(np.degrees(rest[unbroken].max()))
+    counts = trajectory.valid[1:] & (trajectory.time[1:] > trajectory.time[0] + _FIRST_SECONDS)
+    return float(steps[counts].max()), float(np.degrees(rest[counts].max()))
