@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ConfigError
-from stario.sequences.noise import ImuNoise
+from stario.sequences.noise import GYRO_SCALE_ERROR, ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.settings import check_number, with_settings
 from stario.sequences.windows import WINDOW_SECONDS
@@ -159,7 +159,11 @@ class NavigatorConfig:
 
     noise: ImuNoise = field(
         default_factory=lambda: ImuNoise(
-            gyro_noise=6e-3, accel_noise=0.2, gyro_walk=1e-5, accel_walk=3e-4
+            gyro_noise=6e-3,
+            accel_noise=0.2,
+            gyro_walk=1e-5,
+            accel_walk=3e-4,
+            gyro_scale=GYRO_SCALE_ERROR,
         )
     )
     filter: FilterConfig = field(default_factory=FilterConfig)

@@ -36,6 +36,8 @@ _H_VELOCITY = np.eye(6, 3)
 _H_BIAS = np.eye(6, 3, k=-3)
 
 
+SWAY = 10.0
+
 class ZeroVelocity(NamedTuple):
     """Measurement at rest: the velocity is zero, the gyroscope reads its bias."""
 
@@ -85,7 +87,8 @@ class StillnessDetector:
         n = len(rates)
         hidden_variance = _HIDDEN_MOTION_NOISE**2 * WINDOW_SECONDS
         white_variance = PHONE_NOISE.gyro_noise**2 / float(table[:, 1].mean())
-        rate_variance = np.maximum(rates.var(axis=0), white_variance)
+        excess = max(float(rates.var(axis=0).sum()) - 3.0 * white_variance, 0.0)
+        rate_variance = np.full(3, white_variance + SWAY * excess)
         variances = [*[n * hidden_variance] * 3, *(n * rate_variance)]
         return ZeroVelocity(rates[n // 2], np.diag(variances))
 
@@ -144,16 +147,12 @@ class ZeroVelocityUpdates:
         """Update if the second that ends with an interval was still; None if the device moved."""
         hypotheses, bias = self._hypotheses, self._bias
         if not self.detector.is_still(interval):
-            bias.note_refused_rest(0.0)
             return None
         measured, ekf = self.detector.measurement(), hypotheses.ekf
         before = ekf.state, bias.prior, hypotheses.alternative
-        bias.widen_for_rest()
         result = update_zero_velocity(ekf, measured, self._gate)
         if result.accepted:
-            bias.note_refused_rest(0.0)
             hypotheses.alternative = None
         else:
             ekf.state, bias.prior, hypotheses.alternative = before
-            bias.note_refused_rest(interval.stop - interval.start)
         return result, measured

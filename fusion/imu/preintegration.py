@@ -25,6 +25,7 @@ import numpy as np
 
 from stario.fusion.config import MIN_WALK, NavigatorConfig
 from stario.fusion.imu.intervals import Flags, ImuInterval
+from stario.sequences.arrays import rms
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray
@@ -36,6 +37,10 @@ the graph and is far below any sensor's."""
 _MISSING_GYRO, _MISSING_ACCEL = 0.1, 1.0
 """Noise densities where up to a fifth of a second is missing and was interpolated [rad/s/sqrt(Hz),
 m/s^2/sqrt(Hz)]: a pedestrian's rates change by some tenths of a rad/s in that time."""
+
+_RATE_STEP = 0.05
+"""Resolution of rate x sqrt(duration) [rad/sqrt(s)], so that few noise models are created: its
+product with `gyro_scale` is far below the noise without rotation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +116,7 @@ def segment_of(
         b_a: (3,) accelerometer bias [m/s^2].
         config: noise and gravity.
     """
-    noise = [_widened_noise(config, e.accel_factor, e.flags) for e in intervals]
+    noise = [_noise_of(e, config) for e in intervals]
     first, *rest = intervals
     if not rest:
         return preintegrate(first.time, first.gyro, first.accel, b_g, b_a, noise[0], config.gravity)
@@ -121,11 +126,25 @@ def segment_of(
     return preintegrate(time, gyro, accel, b_g, b_a, steps, config.gravity)
 
 
-@lru_cache(maxsize=64)  # successive intervals repeat it, and validating settings is slow
-def _widened_noise(config: NavigatorConfig, accel_factor: float, flags: Flags) -> ImuNoise:
-    """Return the white noise, widened where a sensor was saturated or samples are missing."""
+def _noise_of(interval: ImuInterval, config: NavigatorConfig) -> ImuNoise:
+    """Return the white noise of an interval, which grows with its rate.
+
+    A rotation that is off by `gyro_scale` of what was turned over a duration t is that of white
+    noise with density gyro_scale * rate * sqrt(t).
+    """
+    rate = rms(interval.gyro) * math.sqrt(interval.duration)
+    steps = round(rate / _RATE_STEP) if config.noise.gyro_scale else 0
+    return _widened_noise(config, interval.accel_factor, interval.flags, steps)
+
+
+@lru_cache(maxsize=256)  # successive intervals repeat it, and validating settings is slow
+def _widened_noise(
+    config: NavigatorConfig, accel_factor: float, flags: Flags, rate_steps: int
+) -> ImuNoise:
+    """Return the white noise, widened by rates, saturated sensors and missing samples."""
     noise = config.noise
-    gyro, accel = noise.gyro_noise, accel_factor * noise.accel_noise
+    gyro = math.hypot(noise.gyro_noise, noise.gyro_scale * _RATE_STEP * rate_steps)
+    accel = accel_factor * noise.accel_noise
     # What a saturated sensor missed is as unknown as the motion in a gap.
     if flags.gyro:
         gyro = max(gyro, config.filter.gap_gyro_noise)

@@ -6,7 +6,10 @@ prepared before any filter runs and are the same in streaming and batch, in trai
 
 A small Kalman filter over the attitude error and the gyroscope bias corrects the tilt: the specific
 force, averaged over an update period and rotated into N, should point up, because a pedestrian's
-mean acceleration vanishes over the filter's time constant of twelve seconds. The bias is estimated
+mean acceleration vanishes over the filter's time constant of twelve seconds. Both are worth less
+while the device is shaken: the gyroscope's errors grow with its rate, and the force is gravity only
+as far as nothing accelerates. A shake then costs certainty, and the calm seconds after it tell what
+is right. The bias is estimated
 in body axes, so that it stays valid when the device turns: phones that report raw rates are off by
 up to 0.1 rad/s. The yaw is not observable here.
 """
@@ -22,7 +25,8 @@ import numpy as np
 from stario.sequences.arrays import rms, scatter
 from stario.sequences.attitude.rotations import tilt_aligning
 from stario.sequences.attitude.so3 import cross, exp_so3
-from stario.sequences.sequence import FloatArray
+from stario.sequences.noise import GYRO_SCALE_ERROR
+from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 
 PERIOD = 0.1
 """Time between corrections of the tilt [s]."""
@@ -51,6 +55,9 @@ _BIAS_WALK = 2e-5
 _TURN_NOISE, _FORCE_NOISE = 8.5e-3, 0.1
 """Noise densities of the tilt [rad/sqrt(s)] and of a pedestrian's force direction [rad sqrt(s)];
 their ratio is the rate at which the converged filter levels [1/s]."""
+
+_PEDESTRIAN_ACCEL = _FORCE_NOISE / math.sqrt(PERIOD) * STANDARD_GRAVITY
+"""Horizontal acceleration over an update period that `_FORCE_NOISE` stands for [m/s^2]."""
 
 _NOISE = np.diag([_TURN_NOISE**2, _TURN_NOISE**2, 0.0, *[_BIAS_WALK**2] * 3])
 _EYE = np.eye(6)
@@ -167,7 +174,7 @@ class LevelledAttitude:
             accel: (n + 1, 3) [m/s^2] in B.
         """
         attitudes = integrate(self.R_NB, time, gyro - self.b_g)
-        self.R_NB = self._levelled(attitudes, time, accel)
+        self.R_NB = self._levelled(attitudes, time, accel, GYRO_SCALE_ERROR * rms(gyro))
         return attitudes
 
     @property
@@ -188,15 +195,22 @@ class LevelledAttitude:
         self._P[:3], self._P[:, :3] = 0.0, 0.0
         self._P[:2, :2] = (start.liveliness * _TILT_SIGMA) ** 2 * np.eye(2)
 
-    def _levelled(self, attitudes: FloatArray, time: FloatArray, accel: FloatArray) -> FloatArray:
+    def _levelled(
+        self, attitudes: FloatArray, time: FloatArray, accel: FloatArray, rate_error: float
+    ) -> FloatArray:
         dt = float(time[-1] - time[0])
         force_N = (attitudes @ accel[:, :, None])[:, :, 0]
         up = (0.5 * (time[1:] - time[:-1])) @ (force_N[1:] + force_N[:-1]) / dt
-        up /= max(math.sqrt(up @ up), MIN_GRAVITY_FORCE)
+        force = math.sqrt(up @ up)
+        # Acceleration shows as unrest, and as a mean force that is not gravity's.
+        accel2 = scatter(force_N) ** 2 + (force - STANDARD_GRAVITY) ** 2
+        force_variance = _FORCE_NOISE**2 / dt * (1.0 + accel2 / _PEDESTRIAN_ACCEL**2)
+        up /= max(force, MIN_GRAVITY_FORCE)
         F = _EYE.copy()  # theta' = theta - dt R d_bg
         F[:3, 3:] = -dt * (attitudes.sum(axis=0) / len(attitudes))
         P = F @ self._P @ F.T + dt * _NOISE
-        gain = P[:, :2] @ _inverse(P[:2, :2], _FORCE_NOISE**2 / dt)
+        P[:2, :2] += (rate_error * dt) ** 2 * _EYE[:2, :2]
+        gain = P[:, :2] @ _inverse(P[:2, :2], force_variance)
         P = P - gain @ P[:2]
         self._P = 0.5 * (P + P.T)
         # The smallest rotation that takes `up` to the vertical, to first order; none about it.
