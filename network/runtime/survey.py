@@ -87,8 +87,8 @@ def survey(
 
     Args:
         names: names of architectures.
-        cache: folder that keeps exported graphs, each of which takes up to half a minute to make;
-            None skips ONNX Runtime.
+        cache: folder that keeps exported graphs, as tracing takes up to half a minute; None skips
+            ONNX Runtime.
         progress: called with the fraction of the work done.
 
     Raises:
@@ -96,9 +96,7 @@ def survey(
     """
     engines: list[Engine] = [_engine(name) for name in names]
     times = {"torch": _times(engines), "onnxruntime": None}
-    if cache is not None and all(
-        importlib.util.find_spec(name) for name in ("onnx", "onnxruntime", "onnxscript")
-    ):
+    if cache is not None and all(importlib.util.find_spec(name) for name in ("onnx", "onnxscript")):
         graphs: list[Engine] = []
         for name, engine in zip(names, engines, strict=True):
             graphs.append(_graph_engine(name, engine, cache))
