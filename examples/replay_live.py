@@ -69,7 +69,7 @@ def main(speed: float = 5.0, seconds: float = 30.0) -> tuple[int, list[float], P
     """
     model = load_model("default")
     folder = Path(tempfile.mkdtemp(prefix="stario-live-"))
-    server = LiveServer(lambda: Navigator(model), folder, port=0, lines_port=0)
+    server = LiveServer(lambda: Navigator(model), folder, port=0)
     listening = threading.Event()
     thread = threading.Thread(target=server.run, args=(listening.set,))
     thread.start()

@@ -30,7 +30,7 @@ def replay():
 def server(tmp_path_factory):
     model = load_model()
     folder = tmp_path_factory.mktemp("live")
-    server = LiveServer(lambda: Navigator(model), folder, port=0, lines_port=0)
+    server = LiveServer(lambda: Navigator(model), folder, port=0)
     listening = threading.Event()
     thread = threading.Thread(target=server.run, args=(listening.set,))
     thread.start()
@@ -117,7 +117,7 @@ def test_a_command_without_an_answer_is_shown_and_any_name_can_be_commanded(show
 
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
 def test_page_of_a_server_that_requires_a_token_loads_with_it(show, tmp_path, size):
-    server = LiveServer(lambda: None, tmp_path, host="0.0.0.0", port=0, lines_port=0)
+    server = LiveServer(lambda: None, tmp_path, host="0.0.0.0", port=0)
     listening = threading.Event()
     thread = threading.Thread(target=server.run, args=(listening.set,))
     thread.start()
