@@ -98,8 +98,9 @@ class Hub:
         now = time.time()
         due = [session for session in self.sessions.values() if session.is_due(now)]
         tasks = (self._in_thread(session, session.release, now) for session in due)
-        for problem in filter(None, await asyncio.gather(*tasks, return_exceptions=True)):
-            _log.error("a push that waited is lost: %s", problem)
+        for result in await asyncio.gather(*tasks, return_exceptions=True):
+            if isinstance(result, Exception):
+                _log.error("a push that waited is lost: %s", result)
 
     def announce(self) -> None:
         """Wake all tasks that wait for news."""

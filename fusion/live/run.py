@@ -28,7 +28,7 @@ from stario.sequences.sequence import ImuSequence
 _POLL_SECONDS = 0.1
 """Interval between checks for a signal to stop, and for what has waited too long [s]."""
 
-_MAX_CONNECTIONS = 256
+_MAX_CONNECTIONS = 800
 """Maximum number of connections; those that wait for their clients are fewer (`connections`)."""
 
 
@@ -72,6 +72,7 @@ class LiveServer:
         config = uvicorn.Config(
             live_app(self.hub, self.token, self._netloc if self.token else ""),
             http=Connection,
+            log_config=None,
             log_level="warning",
             lifespan="off",
             timeout_graceful_shutdown=1,

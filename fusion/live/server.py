@@ -264,7 +264,7 @@ async def _page_code(request: Request) -> Response:
 
 
 def _url_for_phones(request: Request, path: str) -> str:
-    """Return an address with the token; of this computer alone if the server listens to no other."""
+    """Return an address of this server as phones know it, with the token."""
     state = request.app.state
     # A browser elsewhere knows a host that works; one on this computer may know it as localhost.
     known = not state.host or request.url.hostname not in (*LOOPBACK, "::1")
