@@ -333,7 +333,7 @@ def test_long_tracks_are_thinned_so_that_memory_stays_small(hub, new_navigator, 
     for k in range(800):
         state = navigator.push(0.01 * k, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))
         if state is not None:
-            drawn.add(state)
+            drawn.add(state, state.p_W)
             assert len(drawn.points) <= 50
     assert drawn.points[-1][0] == pytest.approx(navigator.state.time)
 
