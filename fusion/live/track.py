@@ -27,6 +27,9 @@ _MAX_UNWRITTEN = 6000
 
 _HEALTH_SECONDS = 1.0
 
+_MANY_ALONE = 100
+"""Number of readings of the gyroscope without acceleration that is a problem, if it is most."""
+
 _START_SECONDS = 5.0
 """Time of samples [s] after which it is a problem that there is no position."""
 
@@ -149,7 +152,8 @@ class LiveTrack:
             return f"no samples of {self._merger.missing}: enable it in the logger"
         if self._merger.silent:
             return f"no samples of {self._merger.silent} for {MAX_WAIT / 1e9:g} s: the track waits"
-        if not self.samples and (alone := self._merger.dropped.get("without acceleration")):
+        alone = self._merger.dropped.get("without acceleration", 0)
+        if alone > max(_MANY_ALONE, self.samples):
             return (
                 f"{alone} readings of the gyroscope have none of the acceleration within "
                 f"{MAX_IMU_GAP:g} s before and after: log both at 50 Hz or more, on one clock"

@@ -105,10 +105,10 @@ def test_a_command_without_an_answer_is_shown_and_any_name_can_be_commanded(show
         (lambda route: route.fulfill(status=404, body="Not Found"), "status 404"),
         (lambda route: route.abort(), "no connection"),
     ):
-        shown.page.route("**/stop", answer)
+        shown.page.route("**/command", answer)
         card.get_by_text("Stop").click()
         card.locator(".error", has_text=words).wait_for()
-        shown.page.unroute("**/stop")
+        shown.page.unroute("**/command")
     card.get_by_text("Stop").click()
     shown.page.wait_for_function("() => !window.stario.devices.get('dora/2').running")
     assert not server.hub.sessions["dora/2"].running

@@ -282,8 +282,11 @@ def test_oversized_pushes_surplus_devices_and_foreign_requests_are_refused(clien
     assert command(client, "nobody", "stop").status_code == 400
     assert command(client, "phone1", "explode").status_code == 400
     assert command(client, "phone1", "zero").status_code == 400  # no position yet
-    for values in ({}, {"x": 1, "y": None, "sigma": 1}, {"x": 1, "y": 1, "sigma": 0}):
-        assert command(client, "phone1", "fix", **values).status_code == 400
+    assert "frame-ancestors 'none'" in client.get("/").headers["content-security-policy"]
+    wrong = [{"x": 1, "y": None, "sigma": 1}, {"x": True, "y": 1, "sigma": 1}]
+    for values in ({}, *wrong, {"x": 1, "y": 1, "sigma": 0}):
+        answer = command(client, "phone1", "fix", **values)
+        assert (answer.status_code, "position" in answer.json()["error"]) == (400, False)
 
 
 def test_every_request_off_loopback_needs_the_token(hub, pushes):
