@@ -1,8 +1,8 @@
 """Replay a recording against the live server, as a phone with Sensor Logger would send it.
 
 Without --url it starts a server, replays half a minute at five times the true speed, and prints
-where the track ended. `stario live --demo` shows a simulated walk; to watch a recording of your own,
-start the server first, open its page, and replay at true speed:
+where the track ended. `stario live --demo` shows a simulated walk. To watch a recording of your
+own, start the server first, open its page, and replay at true speed:
 
     stario live
     python examples/replay_live.py --url http://127.0.0.1:8000/data [RECORDING]

@@ -146,18 +146,20 @@ class LiveTrack:
 
     def problem(self) -> str:
         """Return what keeps the track from being right, in words; empty if nothing does."""
-        if self._write_error or self._push_error:
-            return self._write_error or self._push_error
-        if self._merger.missing:
-            return f"no samples of {self._merger.missing}: enable it in the logger"
-        if self._merger.silent:
-            return f"no samples of {self._merger.silent} for {MAX_WAIT / 1e9:g} s: the track waits"
+        if self._write_error:
+            return self._write_error
         alone = self._merger.dropped.get("without acceleration", 0)
         if alone > max(_MANY_ALONE, self.samples):
             return (
                 f"{alone} readings of the gyroscope have none of the acceleration within "
                 f"{MAX_IMU_GAP:g} s before and after: log both at 50 Hz or more, on one clock"
             )
+        if self._push_error:
+            return self._push_error
+        if self._merger.missing:
+            return f"no samples of {self._merger.missing}: enable it in the logger"
+        if self._merger.silent:
+            return f"no samples of {self._merger.silent} for {MAX_WAIT / 1e9:g} s: the track waits"
         if self._navigator.state is None and self._seconds(self._newest_ns) > _START_SECONDS:
             return "no position so far: it takes a second of samples of both sensors without a gap"
         if self._factor * self._merger.upward < -_CERTAIN:
