@@ -73,9 +73,9 @@
       const line = { color: d.colour, width: 2 };
       const place = (p) => [p[1] - d.origin[0], p[2] - d.origin[1]];
       const words = (p) => `<b>${plain(d.label)}</b> at ${p[0].toFixed(1)} s<br>sigma ${sigmaOf(p).toFixed(2)} m<br>speed ${p[4].toFixed(2)} m/s`;
-      mapTraces.push({ x: points.map((p) => p[10] - d.origin[0]), y: points.map((p) => p[11] - d.origin[1]), mode: "lines", line,
-        text: points.map(words), hovertemplate: "%{text}<extra></extra>" });
       const last = points[points.length - 1];
+      const way = [...points.map((p) => [p[10] - d.origin[0], p[11] - d.origin[1]]), ...(last ? [place(last)] : [])];
+      mapTraces.push({ x: way.map((xy) => xy[0]), y: way.map((xy) => xy[1]), mode: "lines", line, text: points.map(words), hovertemplate: "%{text}<extra></extra>" });
       mapTraces.push({ x: last ? [place(last)[0]] : [], y: last ? [place(last)[1]] : [], mode: "markers+text", text: [plain(d.label)],
         textposition: d.beside, hoverinfo: "skip", marker: { color: d.colour, symbol: d.symbol, size: 13, line: { color: "white", width: 2 } } });
       if (last) shapes.push({ type: "path", path: ellipse(last, d.origin), line: { color: d.colour, width: 1 }, fillcolor: d.colour + "22" });
