@@ -195,7 +195,7 @@ class StateCloningEkf(ErrorStateEngine):
         Raises:
             InputError: the slot holds no clone.
         """
-        s = self.state
+        before = s = self.state
         s.time_of_clone(slot)
         p_i, p_j = s.X[1 + slot, :, 4], s.X[0, :, 4]
         blocks = displacement_jacobian(p_i, p_j, slot)
@@ -208,7 +208,10 @@ class StateCloningEkf(ErrorStateEngine):
             self.state = s = with_considered_propagated(s)
             blocks.append((s.considered_rows.start, errors.considered))
         residual = d_W - (p_j - p_i)
-        return self.update_linear(residual, blocks, covariance, gate, inflation, noise)
+        result = self.update_linear(residual, blocks, covariance, gate, inflation, noise)
+        if not result.accepted:
+            self.state = before
+        return result
 
     def update_mean_velocity(
         self,

@@ -32,6 +32,9 @@ CONSIDERED_SECONDS = np.array([1.2, 1.2, 1.2, math.inf, math.inf, 10.0])
 drift, along W's axes; those that last, along and across the displacement; the floor's slope
 (README.md, "Correlated errors")."""
 
+LOST_YAW = 1.0
+"""Sigma of the yaw [rad] beyond which no update may turn or move the track through it."""
+
 _MAX_ORIGIN_DISTANCE = 1e3
 """Positions farther than this from the origin [m] are expressed relative to a nearby point: in the
 right-invariant error they multiply the attitude error, which leaves no digits for centimetres when
@@ -268,6 +271,29 @@ class EkfState:
         if self.field is not None:
             N[self.field_row, 0] = 1.0
         return changed(self, covariances=self.covariances + sigma**2 * (N @ N.T))
+
+    def with_lost_yaw_forgotten(self) -> EkfState:
+        """Return the state without correlation of where it lies and points with all the rest.
+
+        Once the yaw is known to no more than `LOST_YAW`, its error is no small angle: what an
+        update tells about other errors must neither turn nor move the track through it. With c the
+        error of the current yaw and position, x = N c + (I - N C) x splits off the motion N c of
+        all poses and of the field with them, and the covariance between both parts is dropped.
+        """
+        if self.P[2, 2] < LOST_YAW**2:
+            return self
+        n = self.covariances.shape[1]
+        C, N = np.zeros((4, n)), np.zeros((n, 4))
+        C[0, 2] = 1.0
+        C[1:, 6:9] = np.eye(3)
+        for first, rho in self._poses():
+            N[first + 2, 0] = 1.0
+            N[rho : rho + 3, 1:] = np.eye(3)
+        if self.field is not None:
+            N[self.field_row, 0] = 1.0
+        rest = np.eye(n) - N @ C
+        common = N @ (C @ self.covariances @ C.T) @ N.T
+        return changed(self, covariances=common + symmetric(rest @ self.covariances @ rest.T))
 
     def with_position_inflated(self, sigma: float) -> EkfState:
         """Return the state with its covariances inflated by a shift, `sigma` [m] per axis."""

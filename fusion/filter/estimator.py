@@ -77,7 +77,6 @@ class Estimator:
         self._history: History = ()
         self.released: Estimate | None = None
         initialise(self.ekf, start, prior, config)
-        self.bias.begin()
         self._clone()
 
     # --- one interval ----------------------------------------------------------------------------
@@ -240,7 +239,11 @@ class Estimator:
         if len(slots) == self.ekf.slots:
             oldest = slots[0]
             self.released = self.ekf.state.clone_estimate(oldest, len(self.frame.state.transforms))
-        self._hypotheses.apply_to_both(lambda: self.ekf.clone(instead_of=oldest))
+        self._hypotheses.apply_to_both(lambda: self._clone_instead_of(oldest))
+
+    def _clone_instead_of(self, oldest: int | None) -> None:
+        self.ekf.clone(instead_of=oldest)
+        self.ekf.state = self.ekf.state.with_lost_yaw_forgotten()
 
     # --- state and results -----------------------------------------------------------------------
 

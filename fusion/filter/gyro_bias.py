@@ -1,9 +1,9 @@
 """Width of the gyroscope bias's prior, adapted to what is known about the bias.
 
 README.md, "Noise and the gyroscope's bias". Most devices correct their bias to 0.001 rad/s, some to
-0.005 rad/s and some not at all, and no single Gaussian fits all of them. The prior's width
-therefore adapts (empirical Bayes: Carlin and Louis 2000), without a threshold at which it could
-flip.
+0.005 rad/s and some not at all. No Gaussian fits all of them; a Student-t distribution does, which
+is a Gaussian of unknown variance (Lange et al. 1989). That variance follows the estimated bias, and
+forgets one that the data no longer show.
 """
 
 from __future__ import annotations
@@ -20,11 +20,15 @@ from stario.fusion.filter.hypotheses import HypothesisPair
 from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, GYRO_BIAS
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
 from stario.fusion.state import changed
-from stario.sequences.attitude.levelling import BIAS_SIGMA
 from stario.sequences.sequence import FloatArray
 
-DEGREES_OF_FREEDOM = 2.0
-"""Of the Student-t distribution of biases about zero: about as heavy-tailed as between phones."""
+_DEGREES_OF_FREEDOM = 3.0
+"""Of the t distribution. Fewer let slow errors of network and field into the bias (KIPD with the
+field: 1.25 of the error with 1, 1.07 with 2, 1.02 with 4), more keep that of a raw gyroscope out."""
+
+_LONG_STILLNESS = 30.0
+"""Apparent stillness rejected for this long [s] is rest with a bias about the vertical, which
+gravity cannot reveal: nobody turns so evenly for so long."""
 
 _PRIOR_TOLERANCE = 1e-6
 """Relative difference up to which two variances count as equal."""
@@ -37,23 +41,40 @@ class GyroBiasPrior:
     Attributes:
         sigma: scale of the t distribution [rad/s].
         variance: variance per axis of the normal prior, as currently applied [rad^2/s^2].
+        refused_seconds: duration for which apparent stillness has been rejected [s].
     """
 
     sigma: float
     variance: float
+    refused_seconds: float = 0.0
 
     def updated(self, b_g: FloatArray, P: FloatArray, wander: float) -> GyroBiasPrior:
-        """Return the prior with the variance that the estimated bias makes likely.
+        """Return the prior with its variance's mean given the estimated bias.
+
+        (nu sigma^2 + E|b|^2) / (nu + 1): the inverse gamma distribution that makes b a t variable
+        of nu degrees of freedom, after the three axes, which share it: a device corrects all or
+        none.
 
         Args:
             b_g: (3,) bias as estimated by the filter [rad/s].
             P: (3, 3) its covariance [rad^2/s^2].
             wander: variance by which the bias may have changed since the start [rad^2/s^2].
         """
-        nu = DEGREES_OF_FREEDOM
-        squared = float(b_g @ b_g + np.trace(P)) - 3.0 * wander
-        variance = (nu * self.sigma**2 + max(squared, 0.0)) / (nu + 1.0)
-        return changed(self, variance=max(variance, self.sigma**2))
+        return changed(self, variance=self._mean(float(b_g @ b_g + np.trace(P)) - 3.0 * wander))
+
+    def at_rest(self, rate: FloatArray) -> GyroBiasPrior:
+        """Return the prior for an update at rest, where the gyroscope reads a rate (3,) [rad/s].
+
+        It is unchanged, so that a glide that turns is not taken for rest, until apparent rest has
+        been rejected for so long that only a bias can be so even.
+        """
+        if self.refused_seconds < _LONG_STILLNESS:
+            return self
+        return changed(self, variance=max(self.variance, self._mean(float(rate @ rate))))
+
+    def _mean(self, squared: float) -> float:
+        nu = _DEGREES_OF_FREEDOM
+        return max((nu * self.sigma**2 + squared) / (nu + 1.0), self.sigma**2)
 
 
 class AdaptiveBiasPrior:
@@ -73,13 +94,8 @@ class AdaptiveBiasPrior:
         sigma = max(config.filter.gyro_bias_sigma, MIN_PRIOR_SIGMA)
         self.prior = GyroBiasPrior(sigma, sigma**2)
 
-    def begin(self) -> None:
-        """Widen the prior for the time before gravity provides information."""
-        if self._config.filter.adaptive:
-            pass
-
     def update(self, interval: ImuInterval) -> None:
-        """Adapt the prior after an interval to what gravity and the data show about the bias."""
+        """Adapt the prior after an interval to what the data show about the bias."""
         if not self._config.filter.adaptive:
             return
         if not interval.gap and self._half_seconds(interval.stop) == self._half_seconds(
@@ -87,9 +103,19 @@ class AdaptiveBiasPrior:
         ):
             return
         s = self._hypotheses.ekf.state
-        self._replace_prior(
-            self.prior.updated(s.b_g, s.P[GYRO_BIAS, GYRO_BIAS], self._wander)
-        )
+        P = s.P[GYRO_BIAS, GYRO_BIAS]
+        self._replace_prior(self.prior.updated(s.b_g, P, self._wander))
+
+    def prepare_for_rest(self, rate: FloatArray) -> None:
+        """Adapt the prior to an update at rest, where the gyroscope reads a rate (3,) [rad/s]."""
+        if self._config.filter.adaptive:
+            self._replace_prior(self.prior.at_rest(rate))
+
+    def note_refused_rest(self, seconds: float) -> None:
+        """Add to the time of rejected apparent stillness [s]; 0 resets it (accepted, or moving)."""
+        refused_seconds = self.prior.refused_seconds + seconds if seconds else 0.0
+        if refused_seconds != self.prior.refused_seconds:
+            self.prior = changed(self.prior, refused_seconds=refused_seconds)
 
     def _replace_prior(self, updated: GyroBiasPrior) -> None:
         """Replace the prior in both filters as if the new one had been used from the start."""

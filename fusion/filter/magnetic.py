@@ -72,6 +72,9 @@ _MIN_SPEED = 0.3
 _PERIOD = 0.5
 """Time between two bearings [s]."""
 
+_NEW_PLACE, _NEW_TURN = 0.3, 0.2
+"""Distance [m] or rotation [rad] since the last bearing from which on the next one is used."""
+
 WANDER_SIGMA = 0.4
 """Maximum sigma of the wander, the azimuth about its mean [rad]: buildings turn it by 5 to 30
 degrees."""
@@ -106,6 +109,7 @@ class MagneticReference:
         moving_count: number of bearings averaged in `spread`.
         measured: size of the last measured field, including hard iron [uT].
         rotation: how the field has changed while the device rotated.
+        pose: attitude R_WB (3, 3) and position p_W (3,) [m] at the last bearing.
     """
 
     time: float = -math.inf
@@ -116,6 +120,7 @@ class MagneticReference:
     moving_count: int = 0
     measured: float = 0.0
     rotation: FieldRotation = field(default_factory=FieldRotation)
+    pose: tuple[FloatArray, FloatArray] | None = None
 
     @property
     def wander_sigma(self) -> float:
@@ -128,9 +133,20 @@ class MagneticReference:
             (size / self.size - 1.0) / _SIZE_TOLERANCE, (dip - self.dip) / _DIP_TOLERANCE
         )
 
-    def is_due(self, time: float) -> bool:
-        """Return whether a bearing may be applied at a time [s]."""
-        return time - self.time > _PERIOD - SAME_TIME
+    def is_due(self, time: float, s: EkfState) -> bool:
+        """Return whether a bearing may be applied at a time [s] to a state.
+
+        Where the device neither travels nor turns, a bearing tells nothing new about the way: what
+        changes there is the field, as in a lift of steel.
+        """
+        if time - self.time < _PERIOD - SAME_TIME:
+            return False
+        if self.pose is None:
+            return True
+        R_WB, p_W = self.pose
+        x, y, _ = s.p_W - p_W
+        turned = s.R_WB @ R_WB.T
+        return math.hypot(x, y) > _NEW_PLACE or np.trace(turned) < 1.0 + 2.0 * math.cos(_NEW_TURN)
 
     def updated(self, time: float, size: float, dip: float, new_place: bool) -> MagneticReference:
         """Return the reference after one more bearing: clipped means, as robust as medians.
@@ -177,11 +193,13 @@ class MagneticUpdates:
     def update(self, interval: ImuInterval) -> UpdateResult | None:
         """Update with the interval's field; return None if it has none, or none is due."""
         field_B, ekf = interval.field_B, self._hypotheses.ekf
-        if field_B is None or not self.reference.is_due(interval.stop):
+        if field_B is None or not self.reference.is_due(interval.stop, ekf.state):
             return None
         result, self.reference = self._hypotheses.apply_to_both(
             lambda: update_bearing(ekf, self.reference, field_B)
         )
+        s = ekf.state
+        self.reference = changed(self.reference, pose=(s.R_WB, s.p_W))
         return result
 
 

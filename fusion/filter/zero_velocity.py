@@ -32,11 +32,13 @@ from stario.sequences.windows import WINDOW_SECONDS
 _HIDDEN_MOTION_NOISE = 10.0 * PHONE_NOISE.accel_noise
 """Ten times a phone's white noise: slow motion of a device that only looks still [m/s^1.5]."""
 
+_SWAY = 10.0
+"""Variance of a person's sway about its mean over a second, relative to the variance within it: who
+stands turns the device at 1 to 2 deg/s, of which a second shows a third."""
+
 _H_VELOCITY = np.eye(6, 3)
 _H_BIAS = np.eye(6, 3, k=-3)
 
-
-SWAY = 10.0
 
 class ZeroVelocity(NamedTuple):
     """Measurement at rest: the velocity is zero, the gyroscope reads its bias."""
@@ -88,7 +90,7 @@ class StillnessDetector:
         hidden_variance = _HIDDEN_MOTION_NOISE**2 * WINDOW_SECONDS
         white_variance = PHONE_NOISE.gyro_noise**2 / float(table[:, 1].mean())
         excess = max(float(rates.var(axis=0).sum()) - 3.0 * white_variance, 0.0)
-        rate_variance = np.full(3, white_variance + SWAY * excess)
+        rate_variance = np.full(3, white_variance + _SWAY * excess)
         variances = [*[n * hidden_variance] * 3, *(n * rate_variance)]
         return ZeroVelocity(rates[n // 2], np.diag(variances))
 
@@ -147,12 +149,16 @@ class ZeroVelocityUpdates:
         """Update if the second that ends with an interval was still; None if the device moved."""
         hypotheses, bias = self._hypotheses, self._bias
         if not self.detector.is_still(interval):
+            bias.note_refused_rest(0.0)
             return None
         measured, ekf = self.detector.measurement(), hypotheses.ekf
         before = ekf.state, bias.prior, hypotheses.alternative
+        bias.prepare_for_rest(measured.b_g)
         result = update_zero_velocity(ekf, measured, self._gate)
         if result.accepted:
+            bias.note_refused_rest(0.0)
             hypotheses.alternative = None
         else:
             ekf.state, bias.prior, hypotheses.alternative = before
+            bias.note_refused_rest(interval.stop - interval.start)
         return result, measured

@@ -9,6 +9,7 @@ has changed the filter's gating.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -80,6 +81,14 @@ class FixedLagState:
     fallbacks: tuple[int, str]
 
 
+def copied(builder: GraphBuilder) -> GraphBuilder:
+    """Return a copy of a graph, which `step` changes in place, solved like the original."""
+    copy = deepcopy(builder)
+    if builder.graph.is_solved:
+        copy.graph.solve(1)
+    return copy
+
+
 class FixedLagEstimator:
     """An `Estimator` whose states are those of a fixed-lag graph.
 
@@ -144,10 +153,10 @@ class FixedLagEstimator:
 
     @property
     def state(self) -> FixedLagState:
-        """Complete state, which can be assigned back."""
+        """Complete state, which can be assigned back; the graph in it is a copy."""
         return FixedLagState(
             self._filter.state,
-            self._builder,
+            copied(self._builder),
             self._ahead.state,
             self._start,
             self._fallbacks,
@@ -155,7 +164,8 @@ class FixedLagEstimator:
 
     @state.setter
     def state(self, s: FixedLagState) -> None:
-        self._filter.state, self._builder, self._ahead.state = s.estimator, s.builder, s.ahead
+        self._filter.state, self._ahead.state = s.estimator, s.ahead
+        self._builder = copied(s.builder)  # `s` may be assigned again
         self._start, self._fallbacks = s.start, s.fallbacks
 
     @property

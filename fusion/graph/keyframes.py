@@ -89,6 +89,11 @@ class KeyframeGraph:
         """Numbers of the keyframes held, in order."""
         return list(self._time)
 
+    @property
+    def is_solved(self) -> bool:
+        """Whether `solve` has been called since the last change."""
+        return self._solution is not None
+
     def time(self, k: int) -> float:
         """Return the time of a keyframe [s]."""
         return self._time[k]

@@ -318,7 +318,6 @@ def test_outliers_can_be_rejected(driven: StateCloningEkf) -> None:
     np.testing.assert_array_equal(driven.state.p_W, p)
 
 
-@pytest.mark.xfail(strict=True, reason="the considered errors are propagated before the gate")
 def test_a_rejected_displacement_with_lasting_errors_leaves_the_state_unchanged(
     driven: StateCloningEkf,
 ) -> None:

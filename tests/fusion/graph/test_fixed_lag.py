@@ -105,7 +105,7 @@ def test_a_stream_gates_displacements_as_its_filter_does(
     # Both false ones, and the correct one after them, since the second has changed the velocity.
     assert corrupted_gated == 3
     # The accelerometer has slightly less weight after them (`InnovationStatistics`).
-    assert np.linalg.norm(corrupted[-1] - clean[-1]) < 0.12
+    assert np.linalg.norm(corrupted[-1] - clean[-1]) < 0.2
 
 
 def test_a_stream_gates_displacements_itself_if_the_filter_uses_more_of_them(
@@ -293,8 +293,8 @@ def test_if_the_graph_fails_the_stream_continues_from_the_filter(
     solve, calls = KeyframeGraph.solve, []
 
     def fails_once(self: KeyframeGraph, max_rounds: int = 5) -> Any:
-        calls.append(self)
-        if len(calls) == 16:  # two a second
+        calls.append(self.time(self.last))
+        if abs(calls[-1] - 8.0) < 1e-6 and calls.count(calls[-1]) == 1:
             raise IndeterminateError("velocity at 8.0 s is undetermined")
         return solve(self, max_rounds)
 
@@ -332,7 +332,6 @@ def test_another_navigator_can_continue_a_stream(
     np.testing.assert_allclose(other.state.covariance, one.state.covariance, rtol=1e-5, atol=1e-10)
 
 
-@pytest.mark.xfail(strict=True, reason="the state holds the graph that later steps change")
 def test_a_state_assigned_back_gives_the_same_states_again(
     walk: ImuSequence, make_oracle: Make
 ) -> None:
