@@ -6,11 +6,14 @@ joblib runs the work: in processes of this machine by default, on a Dask or Ray 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import TypeVar
 
 from stario.sequences.errors import MissingPackageError, StarioError
+
+_log = logging.getLogger(__name__)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -46,7 +49,8 @@ def each(
     """Yield the result of `work` for each item, in order and as soon as it is ready.
 
     With Ray all results come at the end. An item for which `work` raises a `StarioError` comes back
-    as `Skipped`; a missing package or any other exception ends the batch.
+    as `Skipped`, as does one for which it raises any other exception, whose traceback is logged: a
+    fault of ours costs one recording, not all. A missing package ends the batch.
 
     Args:
         work: function to apply; it must be picklable if there is more than one process.
@@ -78,3 +82,6 @@ def _attempt(work: Callable[[Item], Result], item: Item) -> Result | Skipped:
         return work(item)
     except StarioError as error:
         return skipped(item, error)
+    except Exception as error:
+        _log.exception("%s: not foreseen, please report it:", item)
+        return Skipped(str(item), f"{type(error).__name__}: {error}")

@@ -16,7 +16,13 @@ from stario.sequences.readers.clocks import assumed_unit, refuse_counts_and_date
 from stario.sequences.readers.columns import IMU, QUANTITIES, Column, Header, unit_factor
 from stario.sequences.readers.dates import with_seconds
 from stario.sequences.readers.lines import decimal_mark, ends_within_a_row, is_row, unquoted
-from stario.sequences.readers.rows import NumberedLine, is_missing, parsed_rows, rows_below
+from stario.sequences.readers.rows import (
+    NumberedLine,
+    check_width,
+    is_missing,
+    parsed_rows,
+    rows_below,
+)
 from stario.sequences.readers.text import read_quickly
 from stario.sequences.sequence import BoolArray, FloatArray
 from stario.sequences.units import TIME_UNITS
@@ -101,6 +107,9 @@ def _rows_carefully(path: Path, lines: list[str], header: Header, decimal: str) 
     columns = header.columns
     below = rows_below(path, lines, header.lines)
     numbered = [(number, unquoted(line, header.separator, decimal)) for number, line in below]
+    needed = 1 + max(column.index for column in columns.values())
+    for row in numbered:
+        check_width(path, row, header.separator, needed)
     if _is_dated(numbered[0][1], header):
         lines = with_seconds(line for _, line in numbered)
         numbered = [(number, line) for (number, _), line in zip(numbered, lines, strict=True)]
