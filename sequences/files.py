@@ -56,7 +56,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
             there.
     """
     path = Path(path)
-    with _temporary(path, "a file") as temporary:
+    with temporary_path(path, "a file") as temporary:
         if path.is_dir():
             raise InputError("path", f"the folder {path}", "a file")
         yield temporary
@@ -79,7 +79,7 @@ def atomic_folder(path: Path | str, replaced: Container[str] = ()) -> Iterator[P
             system refuses to write there.
     """
     path = Path(path)
-    with _temporary(path, "a folder") as temporary:
+    with temporary_path(path, "a folder") as temporary:
         if path.exists():
             _check_replaceable(path, replaced)
         temporary.mkdir()
@@ -100,7 +100,7 @@ def _check_replaceable(path: Path, replaced: Container[str]) -> None:
 
 
 @contextmanager
-def _temporary(path: Path, kind: str) -> Iterator[Path]:
+def temporary_path(path: Path, kind: str) -> Iterator[Path]:
     """Yield a path next to `path`, removed after an exception; `OSError`s get a remedy."""
     temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}.tmp"
     try:
