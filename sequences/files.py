@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import itertools
 import json
 import math
@@ -20,6 +21,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stario.sequences.errors import InputError
+
+
+def opened(path: Path) -> IO[bytes]:
+    """Open a file for reading its bytes.
+
+    Raises:
+        OSError: it cannot be read, or is a pipe or a device, for whose content a reader would wait.
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OSError(errno.EINVAL, "A pipe or device", str(path))
+    return path.open("rb")
+
+
+def opened_text(path: Path) -> str:
+    """Return a file's text in UTF-8, without its mark; raises what `opened` does, or ValueError."""
+    with opened(path) as file:
+        return file.read().decode("utf-8-sig")
 
 
 @contextmanager
