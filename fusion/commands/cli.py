@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections import deque
 from typing import Annotated
 
 import typer
@@ -56,23 +57,27 @@ for command in (run, live, compare, evaluate, inspect, convert, train, simulate,
 check = typer.Typer(no_args_is_help=True, help="Check estimators and networks on this machine.")
 for command in (
     *(checks.models, table, checks.fusion, checks.backends, checks.faults),
-    *(checks.gaps, checks.fixes, checks.consistency, checks.benchmark),
+    *(checks.gaps, checks.moments, checks.fixes, checks.consistency, checks.benchmark),
 ):
     check.command()(command)
 app.add_typer(check, name="check")
 
 
 class _Once(logging.Filter):
-    """Filter that passes each message once: a command may look at a recording several times."""
+    """Filter that passes each message once: a command may look at a recording several times.
+
+    It remembers the newest thousand: a server that runs for months may see any number.
+    """
 
     def __init__(self) -> None:
         super().__init__()
-        self._seen: set[str] = set()
+        self._seen: deque[str] = deque(maxlen=1000)
 
     def filter(self, record: logging.LogRecord) -> bool:
         text = record.getMessage()
         new = text not in self._seen
-        self._seen.add(text)
+        if new:
+            self._seen.append(text)
         return new
 
 
