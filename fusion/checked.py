@@ -31,7 +31,8 @@ def shaped(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
         expected = f"numbers of shape {shape}" if shape else "a number"
         raise InputError(name, error.found, expected) from None
     if array.shape != shape:
-        raise InputError(name, f"shape {array.shape}", f"{shape}" if shape else "a number")
+        fix = f"np.diag({name})" if len(shape) == 2 and array.shape == shape[:1] else ""
+        raise InputError(name, f"shape {array.shape}", f"{shape}" if shape else "a number", fix)
     return array.copy()
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ConfigError
+from stario.sequences.files import opened_text
 from stario.sequences.noise import GYRO_SCALE_ERROR, ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.settings import check_number, with_settings
@@ -186,7 +187,7 @@ def read_config(path: Path | str) -> NavigatorConfig:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = opened_text(path)
         values = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
     except FileNotFoundError:
         raise ConfigError(str(path), "no such file", "a TOML or JSON file") from None

@@ -50,6 +50,15 @@ def runs(flags: BoolArray) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
+def even_grid(start: float, stop: float, step: float) -> FloatArray:
+    """Return the times start, start + step, ... before `stop`, none of them at or beyond it.
+
+    `np.arange` alone may end beyond `stop`: it rounds the number of steps up, and then each time.
+    """
+    grid = np.arange(start, stop, step, dtype=np.float64)
+    return grid[grid < stop]
+
+
 def evenly_spaced(count: int, most: int) -> NDArray[np.intp]:
     """Return up to `most` of `count` indices, evenly spaced from the first to the last."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.intp))

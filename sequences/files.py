@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import itertools
 import json
 import math
@@ -20,6 +21,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stario.sequences.errors import InputError
+
+
+def opened(path: Path) -> IO[bytes]:
+    """Open a file for reading its bytes.
+
+    Raises:
+        OSError: it cannot be read, or is a pipe or a device, for whose content a reader would wait.
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OSError(errno.EINVAL, "A pipe or device", str(path))
+    return path.open("rb")
+
+
+def opened_text(path: Path) -> str:
+    """Return a file's text in UTF-8, without its mark; raises what `opened` does, or ValueError."""
+    with opened(path) as file:
+        return file.read().decode("utf-8-sig")
 
 
 @contextmanager
@@ -56,7 +74,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
             there.
     """
     path = Path(path)
-    with _temporary(path, "a file") as temporary:
+    with temporary_path(path, "a file") as temporary:
         if path.is_dir():
             raise InputError("path", f"the folder {path}", "a file")
         yield temporary
@@ -79,7 +97,7 @@ def atomic_folder(path: Path | str, replaced: Container[str] = ()) -> Iterator[P
             system refuses to write there.
     """
     path = Path(path)
-    with _temporary(path, "a folder") as temporary:
+    with temporary_path(path, "a folder") as temporary:
         if path.exists():
             _check_replaceable(path, replaced)
         temporary.mkdir()
@@ -100,7 +118,7 @@ def _check_replaceable(path: Path, replaced: Container[str]) -> None:
 
 
 @contextmanager
-def _temporary(path: Path, kind: str) -> Iterator[Path]:
+def temporary_path(path: Path, kind: str) -> Iterator[Path]:
     """Yield a path next to `path`, removed after an exception; `OSError`s get a remedy."""
     temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}.tmp"
     try:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.arrays import even_grid
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.stacks import slerp
 from stario.sequences.clean_samples import clean_samples, unbroken
@@ -96,10 +97,8 @@ def levelled_streams(sequence: ImuSequence, min_seconds: float = 2.0) -> list[Le
         vectors = np.stack([gyro[part], accel[part]], axis=1)
         imu = (vectors @ R_NB.transpose(0, 2, 1)).reshape(-1, 6)
         values = np.concatenate([imu, facing(R_NB)], axis=1)
-        grid = np.arange(time[begin], time[end - 1], 1.0 / WINDOW_RATE)
-        # Rounding may place the grid's last time beyond the last sample.
-        ticks = np.minimum(grid[::TICK_SAMPLES], time[end - 1])
-        at_ticks = slerp(time[part], Rotation.from_matrix(R_NB), ticks)
+        grid = even_grid(time[begin], time[end - 1], 1.0 / WINDOW_RATE)
+        at_ticks = slerp(time[part], Rotation.from_matrix(R_NB), grid[::TICK_SAMPLES])
         even = resample(time[part], values, grid).astype(np.float32)
         imu_N, facing_N = (np.ascontiguousarray(part) for part in np.split(even, [6], axis=1))
         streams.append(LevelledStream(float(time[begin]), imu_N, facing_N, at_ticks.as_matrix()))

@@ -121,8 +121,10 @@ class Trajectory(Timed):
             valid=covered,
         )
 
-    def covers(self, time: FloatArray) -> BoolArray:
+    def covers(self, time: FloatArray, longest: float = MAX_TRUTH_GAP) -> BoolArray:
         """Return whether the pose is known at each time (M,): `valid` of `at`, but faster.
+
+        Poses more than `longest` [s] apart have a gap between them.
 
         Raises:
             InputError: as for `at`.
@@ -134,7 +136,7 @@ class Trajectory(Timed):
         right = np.clip(np.searchsorted(t, time), 1, len(t) - 1)
         tolerance = max(1e-9, 4.0 * float(np.spacing(np.abs(t[[0, -1]]).max())))
         inside = (time >= t[0] - tolerance) & (time <= t[-1] + tolerance)
-        bracketed = ~is_gap(t[right] - t[right - 1])
+        bracketed = ~is_gap(t[right] - t[right - 1], longest)
         exact = np.minimum(np.abs(time - t[right]), np.abs(time - t[right - 1])) <= tolerance
         return np.asarray(inside & (bracketed | exact))
 

@@ -14,6 +14,12 @@ from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 TIME_UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
 """Units per second: whole numbers, so that nanoseconds since 1970 can be read exactly."""
 
+FILETIME_PER_SECOND = 10**7
+"""Windows and HoloLens count ticks of 100 ns since 1601."""
+
+FILETIME_1970 = 116_444_736_000_000_000
+"""Number of these ticks at the beginning of 1970."""
+
 GYRO_UNITS = {"rad/s": 1.0, "deg/s": math.pi / 180.0, "mdps": math.pi / 180e3}
 
 ACCEL_UNITS = {
@@ -40,9 +46,9 @@ _SPELLINGS = {
         "mT": ("mt",),
         "T": ("t", "tesla"),
         "mg": ("milligauss",),
-        "ms": ("msec", "millisecond", "milliseconds"),
-        "us": ("usec", "microsecond", "microseconds", "µs", "μs"),
-        "ns": ("nsec", "nanosecond", "nanoseconds"),
+        "ms": ("msec", "millisec", "millisecond", "milliseconds"),
+        "us": ("usec", "microsec", "microsecond", "microseconds", "µs", "μs"),
+        "ns": ("nsec", "nanosec", "nanosecond", "nanoseconds"),
         "rad/s": ("rads", "rads-1", "radps"),
         "mdps": ("mdeg/s",),
         "deg/s": ("dps", "°/s", "º/s", "\ufffd/s", "degs", "degs-1", "°s-1"),

@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.arrays import (
     check_choice,
     check_type,
+    even_grid,
     integral,
     interpolated,
     runs,
@@ -194,7 +195,7 @@ def imu_in_world(sequence: ImuSequence, truth: Trajectory, attitude: Attitude) -
         attitude_WB = _levelled(time, gyro, accel, attitude_WB, pose.valid)
     omitted = np.cumsum(np.maximum(np.floor(np.diff(time, prepend=time[0])) - 1.0, 0.0))
     even_time = time - omitted
-    even = np.arange(even_time[0], even_time[-1], 1.0 / WINDOW_RATE)
+    even = even_grid(even_time[0], even_time[-1], 1.0 / WINDOW_RATE)
     grid = even + omitted[np.searchsorted(even_time, even, side="right") - 1]
     columns = [attitude_WB.apply(gyro), attitude_WB.apply(accel), facing(attitude_WB.as_matrix())]
     values = resample(even_time, np.concatenate(columns, axis=1), even).astype(np.float32)

@@ -201,8 +201,10 @@ def recipe_values(path: Path) -> dict[str, Any]:
     Raises:
         ConfigError: the file cannot be read, or is not a table of settings.
     """
+    from stario.sequences.files import opened_text
+
     try:
-        values = json.loads(path.read_text(encoding="utf-8-sig"))
+        values = json.loads(opened_text(path))
     except (OSError, ValueError) as error:
         found = "no such file" if isinstance(error, FileNotFoundError) else str(error)
         raise ConfigError(str(path), found, "a JSON file with settings") from error

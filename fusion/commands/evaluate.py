@@ -164,7 +164,6 @@ def _tracks(
 ) -> list[Skipped]:
     """Write and print the table of recordings; return those that were skipped."""
     from stario.fusion.backends import BACKENDS
-    from stario.fusion.evaluation.folders import fresh_folder
     from stario.fusion.evaluation.many import compare_recordings
     from stario.fusion.evaluation.results import write_recording, write_summary
     from stario.fusion.evaluation.summary import Scores, scores_of, summary, summary_table
@@ -181,8 +180,6 @@ def _tracks(
         )
         for comparison in without_skipped(outcomes, skipped):
             if out is not None:
-                if not recordings:
-                    fresh_folder(out)
                 write_recording(out, comparison)
             recordings.append(scores_of(comparison))
     if recordings:

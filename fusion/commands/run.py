@@ -7,6 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, get_args
 
+import typer
+
 from stario.fusion.commands.common import origin_of, process_each, progress_bar
 from stario.fusion.commands.options import (
     BackendOption,
@@ -86,11 +88,14 @@ def _run(
     from stario.fusion.evaluation.results import write_run
     from stario.fusion.evaluation.track_table import column_words
     from stario.fusion.fix_file import check_within
+    from stario.sequences.inspection.gyro_axes import compare_gyro_axes
     from stario.sequences.truth.problems import warn_of_truth
 
     check_within(fixes, sequence)
     with progress_bar(f"run {sequence.name}") as progress:
         track = navigator.run(sequence, progress, fixes)
+    for line in compare_gyro_axes(sequence).problems(sequence.name):
+        typer.echo(f"stario: {line}", err=True)
     warn_of_truth(sequence)
     found = measured(sequence, {navigator.backend: track}, fixes)
     written = write_run(folder, found, navigator.config, origin)

@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from itertools import product
 from pathlib import Path
 
 from stario.fusion.evaluation.compare import TRACKS
 from stario.sequences.errors import InputError
+from stario.sequences.files import temporary_path
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 _FIGURES = ("plan.png", "error.png", "innovations.png", "report.html")
 
@@ -58,6 +67,73 @@ def make_folder(folder: Path) -> None:
         ) from error
 
 
+@contextmanager
+def results_folder(folder: Path) -> Iterator[Path]:
+    """Yield a new folder for a set of results, which takes the place of an earlier one when whole.
+
+    The block fills a temporary folder. At its end the files move into `folder`,
+    and the `RESULTS` of an earlier run that have no successor are removed, there and in the
+    sub-folders that were written; other files stay. After an exception, or if the process ends,
+    the earlier results are as they were. Of two runs the later one to end stays, whole.
+
+    Raises:
+        InputError: the folder cannot be created, or a file in it cannot be replaced.
+    """
+    check_folder(folder)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(str(folder), error.strerror or "an error", "a writable folder") from error
+    with _moved_into(folder) as new:
+        yield new
+
+
+@contextmanager
+def _moved_into(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder whose files move into `folder`; `OSError`s get a remedy."""
+    # Within a folder that exists: it may be a mount, to which no file of another one can move.
+    place = folder / "results" if folder.is_dir() else folder
+    with temporary_path(place, "a folder") as new:
+        new.mkdir()
+        yield new
+        inner = [new, *(path for path in new.rglob("*") if path.is_dir())]
+        folder.mkdir(exist_ok=True)
+        with _locked(folder):
+            for source in inner:
+                target = folder / source.relative_to(new)
+                target.mkdir(exist_ok=True)
+                files = [path for path in source.iterdir() if path.is_file()]
+                stale = _results_in(target)
+                for path in files:
+                    path.replace(target / path.name)
+                for path in stale:
+                    if path.name not in {file.name for file in files}:
+                        _remove(path)
+        shutil.rmtree(new)
+
+
+def _results_in(folder: Path) -> list[Path]:
+    """Return the results of earlier runs in a folder, the files that mark them last."""
+    marks = [mark for mark in RESULTS if (folder / mark).exists()]
+    names = dict.fromkeys(name for mark in marks for name in RESULTS[mark] if name not in marks)
+    return [folder / name for name in (*names, *marks) if (folder / name).exists()]
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Wait until no other process moves results into a folder; a lock ends with its process."""
+    if fcntl is None:
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # some network file systems have no locks
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
+
+
 def fresh_folder(folder: Path) -> None:
     """Create a folder, or remove the `RESULTS` of an earlier run from it; other files stay.
 
@@ -67,12 +143,8 @@ def fresh_folder(folder: Path) -> None:
         InputError: the folder cannot be created, or a file in it cannot be removed.
     """
     make_folder(folder)
-    for mark, others in RESULTS.items():
-        if (folder / mark).exists():
-            for name in others:
-                if name != mark:  # which goes last: a removal that fails can be repeated
-                    _remove(folder / name)
-            _remove(folder / mark)
+    for path in _results_in(folder):
+        _remove(path)
 
 
 def _remove(path: Path) -> None:

@@ -8,7 +8,7 @@ from stario.fusion.evaluation.judging.displacement_error import fit_yaw_and_posi
 from stario.fusion.state import Track
 from stario.sequences.arrays import interpolated
 from stario.sequences.legs import jumps
-from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
+from stario.sequences.sequence import MAX_TRUTH_GAP, FloatArray, ImuSequence, PositionTrack
 
 MIN_POSITIONS = 2
 """Minimum number of positions: a shift alone fits one; with two, their distance is compared."""
@@ -33,7 +33,9 @@ def placed(track: Track, known: PositionTrack) -> PositionTrack | None:
     They are rotated about the vertical and shifted to fit the track best, in its frame; a single
     one lies exactly on it. None if there is none within its time.
     """
-    inside = known.valid & track.trajectory.covers(known.time)
+    # A track of steps has two poses per second: none of its intervals is a gap.
+    longest = max(MAX_TRUTH_GAP, 1.5 * float(np.median(np.diff(track.time))))
+    inside = known.valid & track.trajectory.covers(known.time, longest)
     time, truth = known.time[inside], known.position_W[inside]
     if not len(time):
         return None

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import METRIC_WORDS, RECORDING_WORDS, Comparison
-from stario.fusion.evaluation.folders import fresh_folder
+from stario.fusion.evaluation.folders import results_folder
 from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.evaluation.summary import Scores, scores_of
 from stario.sequences.drawing.figures import save_figure
@@ -31,19 +31,17 @@ def write_run(
     Raises:
         InputError: the folder cannot be created.
     """
-    fresh_folder(folder)
     [track] = run.tracks.values()
-    written = _track_files(folder, run)
-    metrics = {"recording": run.sequence.name, **run.metrics, "conventions": run.words}
-    for file, content in (
-        ("metrics.json", metrics),
-        ("config.json", asdict(config)),
-        ("run.json", origin),
-        ("health.json", asdict(track.health) if track.health else None),
-    ):
-        write_json(folder / file, content)
-        written.append(folder / file)
-    return written + _figures(folder, run)
+    contents = {
+        "metrics.json": {"recording": run.sequence.name, **run.metrics, "conventions": run.words},
+        "config.json": asdict(config),
+        "run.json": origin,
+        "health.json": asdict(track.health) if track.health else None,
+    }
+    with results_folder(folder) as new:
+        written = _track_files(new, run)
+        written += [*_json_files(new, contents), *_figures(new, run)]
+    return [folder / path.relative_to(new) for path in written]
 
 
 def write_comparison(
@@ -59,11 +57,11 @@ def write_comparison(
     Raises:
         InputError: a folder cannot be created.
     """
-    fresh_folder(folder)
-    written = write_summary(folder, [scores_of(c) for c in comparisons], config, origin)
-    for comparison in comparisons:
-        written += write_recording(folder, comparison)
-    return written
+    with results_folder(folder) as new:
+        written = write_summary(new, [scores_of(c) for c in comparisons], config, origin)
+        for comparison in comparisons:
+            written += write_recording(new, comparison)
+    return [folder / path.relative_to(new) for path in written]
 
 
 def write_summary(
@@ -72,12 +70,22 @@ def write_summary(
     config: NavigatorConfig,
     origin: Mapping[str, object],
 ) -> list[Path]:
-    """Write `metrics.json`, `config.json` and `run.json` of recordings into an existing folder."""
+    """Write `metrics.json`, `config.json` and `run.json` of recordings, in place of earlier ones.
+
+    Raises:
+        InputError: the folder cannot be created.
+    """
     contents = {
         "metrics.json": scores_dict(recordings),
         "config.json": asdict(config),
         "run.json": origin,
     }
+    with results_folder(folder) as new:
+        _json_files(new, contents)
+    return [folder / file for file in contents]
+
+
+def _json_files(folder: Path, contents: Mapping[str, object]) -> list[Path]:
     for file, content in contents.items():
         write_json(folder / file, content)
     return [folder / file for file in contents]
@@ -90,13 +98,14 @@ def write_recording(folder: Path, comparison: Comparison) -> list[Path]:
         InputError: a folder cannot be created.
     """
     inner = folder / comparison.sequence.name
-    fresh_folder(inner)
-    written = _track_files(inner, comparison)
     truth = comparison.sequence.truth
-    if truth is not None:
-        write_tum(inner / "truth.tum", truth)
-        written.append(inner / "truth.tum")
-    return written + _figures(inner, comparison)
+    with results_folder(inner) as new:
+        written = _track_files(new, comparison)
+        if truth is not None:
+            write_tum(new / "truth.tum", truth)
+            written.append(new / "truth.tum")
+        written += _figures(new, comparison)
+    return [inner / path.relative_to(new) for path in written]
 
 
 def scores_dict(recordings: Sequence[Scores]) -> dict[str, object]:

@@ -22,7 +22,7 @@ from itertools import accumulate, pairwise
 
 import numpy as np
 
-from stario.sequences.arrays import rms, scatter
+from stario.sequences.arrays import even_grid, rms, scatter
 from stario.sequences.attitude.rotations import tilt_aligning
 from stario.sequences.attitude.so3 import cross, exp_so3
 from stario.sequences.noise import GYRO_SCALE_ERROR
@@ -136,9 +136,8 @@ def levelled_attitudes(time: FloatArray, gyro: FloatArray, accel: FloatArray) ->
     first = np.searchsorted(time, time[0] + START_SECONDS, side="right")
     start = start_from_gravity(time[:first], gyro[:first], accel[:first])
     loop = LevelledAttitude(start)
-    grid = np.arange(time[0] + PERIOD, time[-1], PERIOD)
-    # Without the last sample, which rounding may place before the grid's last time.
-    ends = np.unique([0, *np.searchsorted(time[:-1], grid), len(time) - 1])
+    grid = even_grid(time[0] + PERIOD, time[-1], PERIOD)
+    ends = np.unique([0, *np.searchsorted(time, grid), len(time) - 1])
     attitudes = np.empty((len(time), 3, 3))
     attitudes[0] = start.R_WB
     for begin, end in pairwise(ends.tolist()):

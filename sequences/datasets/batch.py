@@ -6,11 +6,14 @@ joblib runs the work: in processes of this machine by default, on a Dask or Ray 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import TypeVar
 
 from stario.sequences.errors import MissingPackageError, StarioError
+
+_log = logging.getLogger(__name__)
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -46,7 +49,8 @@ def each(
     """Yield the result of `work` for each item, in order and as soon as it is ready.
 
     With Ray all results come at the end. An item for which `work` raises a `StarioError` comes back
-    as `Skipped`; a missing package or any other exception ends the batch.
+    as `Skipped`, as does one of several for which it raises any other exception, whose traceback is
+    logged: a fault of ours costs one recording, not all. A missing package ends the batch.
 
     Args:
         work: function to apply; it must be picklable if there is more than one process.
@@ -59,7 +63,9 @@ def each(
 
     one_by_one = get_active_backend()[0].supports_return_generator
     parallel = Parallel(n_jobs=jobs, return_as="generator" if one_by_one else "list")
-    yield from parallel(delayed(_attempt)(work, item) for item in items)
+    items = list(items)
+    alone = len(items) == 1
+    yield from parallel(delayed(_attempt)(work, item, alone) for item in items)
 
 
 def without_skipped(
@@ -73,8 +79,13 @@ def without_skipped(
             yield outcome
 
 
-def _attempt(work: Callable[[Item], Result], item: Item) -> Result | Skipped:
+def _attempt(work: Callable[[Item], Result], item: Item, alone: bool) -> Result | Skipped:
     try:
         return work(item)
     except StarioError as error:
         return skipped(item, error)
+    except Exception as error:
+        if alone:
+            raise
+        _log.exception("%s: not foreseen, please report it:", item)
+        return Skipped(str(item), f"{type(error).__name__}: {error}")

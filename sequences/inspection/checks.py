@@ -61,6 +61,10 @@ _FORCE_RANGE = (6.4, 12.5)
 """Average force of a recording in g and in m/s^2. Sensors are off by a few percent; in the hand of
 a runner they saturate, and the average is as low as 7.4 m/s^2."""
 
+_SUSTAINED_RAD_S, _UNDECIDED = 3.0, 0.005
+"""Rate that a twentieth of the samples exceed above which the unit is asked for, if the average
+force in both units differs by less than this share of it: the device turns about the vertical."""
+
 _UNIT_NAMED = "its unit is the one named in the file: is that right?"
 """Remedy if `with_units` accepts no other unit."""
 
@@ -163,6 +167,13 @@ def check_gyro(
     if off > _OFF_GRAVITY and lost > max(_OFF_GRAVITY * force, _MIN_LOSS_RATIO * lost_in_degrees):
         found += " that contradict the accelerometer"
     elif speed <= FAST_RAD_S:
+        undecided = abs(force - in_degrees - lost) < _UNDECIDED * force
+        if speed > _SUSTAINED_RAD_S and undecided and not unit_known:
+            log.warning(
+                "%s: gyroscope: found rotations of %.3g rad/s, all about the vertical, of which "
+                "the accelerometer tells nothing: if in deg/s, pass `--gyro-unit deg/s`",
+                name, speed,
+            )  # fmt: skip
         return force, average
     fix = "if it is in deg/s, pass `--gyro-unit deg/s` or write `gx [deg/s]` in the CSV's header"
     if speed <= FAST_RAD_S:  # plausible by hand; in deg/s, a stationary device

@@ -20,6 +20,7 @@ import numpy as np
 
 from stario.sequences.arrays import (
     correlation,
+    even_grid,
     integral,
     interpolated,
     peak_offset,
@@ -109,7 +110,7 @@ def _against_gyro(
     A lag at the edge of the search is not the best one and corrupts the hard iron: both are None.
     """
     edge = _SPAN_S + float(np.abs(LAGS_S).max())
-    grid = np.arange(max(time[0], stamps[0]) + edge, min(time[-1], stamps[-1]) - edge, _STEP_S)
+    grid = even_grid(max(time[0], stamps[0]) + edge, min(time[-1], stamps[-1]) - edge, _STEP_S)
     if len(grid) < 20:
         return None, None, None, None
     angle = integral(time, gyro)
@@ -167,7 +168,7 @@ def _steadiness(time: FloatArray, level: FloatArray) -> tuple[float, float]:
     smooth = np.convolve(field, np.ones(count) / count, mode="same")
     spreads, slopes = [], []
     last = max(float(time[-1]) - 0.5 * WINDOW_S, float(time[0]) + 1e-9)
-    for edge in np.arange(time[0], last, WINDOW_S):
+    for edge in even_grid(time[0], last, WINDOW_S):
         part = (time >= edge) & (time < edge + WINDOW_S)
         if part.sum() > count:
             clock = time[part] - edge

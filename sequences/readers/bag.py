@@ -21,6 +21,7 @@ import numpy as np
 from stario.sequences.errors import ReadError
 from stario.sequences.lazy import optional_package
 from stario.sequences.readers.checked import finite_rows, magnetometer, rotations, trajectory
+from stario.sequences.readers.clocks import resample_to_gyro
 from stario.sequences.readers.lines import first_bytes
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -28,6 +29,8 @@ from stario.sequences.units import MAGNETIC_UNITS
 
 _IMU = "sensor_msgs/msg/Imu"
 _MAGNETIC = "sensor_msgs/msg/MagneticField"
+_APART = "accelerometer"
+"""Key of a force that has a topic of its own, as RealSense writes it."""
 _DOUBLES = {
     _IMU: 37,  # orientation, gyroscope and accelerometer, each with its covariance
     _MAGNETIC: 12,  # the field [T] and its covariance
@@ -63,8 +66,12 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
     """
     messages = _messages(path, imu_topic, truth_topic)
     imu = messages[_IMU]
-    stamps = imu.stamps_ns
-    truth = next((m for kind, m in messages.items() if kind not in (_IMU, _MAGNETIC)), None)
+    stamps, gyro, accel = imu.stamps_ns, imu.values[:, _GYRO], imu.values[:, _ACCEL]
+    if (force := messages.get(_APART)) is not None:
+        stamps, gyro, accel = resample_to_gyro(
+            path, stamps, gyro, force.stamps_ns, force.values[:, _ACCEL]
+        )
+    truth = next((m for kind, m in messages.items() if kind not in (_IMU, _APART, _MAGNETIC)), None)
     magnetic = None
     if (field := messages.get(_MAGNETIC)) is not None:
         tesla = field.values[:, :3]
@@ -72,8 +79,8 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
     return ImuSequence(
         name=path.resolve().stem,
         time=seconds(stamps, stamps[0]),
-        gyro=imu.values[:, _GYRO],
-        accel=imu.values[:, _ACCEL],
+        gyro=gyro,
+        accel=accel,
         truth=None if truth is None else _truth(path, truth, stamps[0]),
         magnetometer=magnetic,
     )
@@ -105,7 +112,8 @@ def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messag
     try:
         with reader_type(path) as reader:
             topics = {c.topic: c.msgtype for c in reader.connections if c.msgcount}
-            chosen = [_imu_topic(path, topics, imu_topic)]
+            pair = [] if imu_topic else _sensor_topics(topics)
+            chosen = pair or [_imu_topic(path, topics, imu_topic)]
             chosen += _truth_topic(path, topics, truth_topic)
             chosen += _magnetic_topic(topics, chosen[0])
             connections = [c for c in reader.connections if c.topic in chosen]
@@ -113,7 +121,9 @@ def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messag
             for connection, time, raw in reader.messages(connections):
                 received[connection.topic].append((time, bytes(raw)))
         little_endian = version == "1"
-        return {topics[t]: _decoded(path, t, topics[t], received[t], little_endian) for t in chosen}
+        decoded = [_decoded(path, t, topics[t], received[t], little_endian) for t in chosen]
+        kinds = [_APART if pair[1:] == [topic] else topics[topic] for topic in chosen]
+        return dict(zip(kinds, decoded, strict=True))
     except ReadError:
         raise
     except Exception as error:  # any error of the library means a damaged file
@@ -131,6 +141,13 @@ def _imu_topic(path: Path, topics: dict[str, str], wanted: str) -> str:
         fix = f"name one: --imu-topic {candidates[0]}" if candidates else ""
         raise ReadError(path, "topics", found or "none", "one topic with sensor_msgs/Imu", fix)
     return candidates[0]
+
+
+def _sensor_topics(topics: dict[str, str]) -> list[str]:
+    """Return the topics of gyroscope and accelerometer if the only two IMUs are one of each."""
+    candidates = [topic for topic, kind in topics.items() if kind == _IMU]
+    pair = [next((t for t in candidates if word in t.lower()), "") for word in ("gyro", "accel")]
+    return pair if len(candidates) == 2 and all(pair) and pair[0] != pair[1] else []
 
 
 def _truth_topic(path: Path, topics: dict[str, str], wanted: str) -> list[str]:

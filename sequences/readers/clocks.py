@@ -16,7 +16,7 @@ from stario.sequences.readers.phones.sensor_words import XSENS_CLOCK
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray
 from stario.sequences.time_order import MAX_IMU_GAP, increasing_mask
-from stario.sequences.units import TIME_UNITS
+from stario.sequences.units import FILETIME_1970, FILETIME_PER_SECOND, TIME_UNITS
 
 _log = logging.getLogger(__name__)
 
@@ -30,6 +30,9 @@ _CLOCKS = {XSENS_CLOCK: {"ticks of 100 us": 10**4, "us": 10**6}}
 
 _MARGIN_S = 60.0
 """Maximum time [s] by which rare rows may precede or follow their recording."""
+
+LATEST_S = 4.1e9
+"""Seconds from 1970 to 2100: a unit that makes times later is not theirs."""
 
 _SINCE_1970_S = 1e8
 """Times beyond this [s] are counted from 1970 rather than from a start."""
@@ -233,8 +236,11 @@ def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:
     steps = np.diff(time)
     forward = steps[steps > 0]
     step = float(np.median(forward)) * len(forward) / len(steps) if len(forward) else 0.0
+    first = float(time[np.isfinite(time)][:1].sum())
+    if not unit and 0.0 < first / FILETIME_PER_SECOND - FILETIME_1970 * 1e-7 < LATEST_S:
+        return FILETIME_PER_SECOND
     for name, per_second in candidates.items():
-        if step and _RATES[0] <= per_second / step <= _RATES[1]:
+        if first / per_second < LATEST_S and step and _RATES[0] <= per_second / step <= _RATES[1]:
             _log.info("%s: its times name no unit, their rate fits %s", file, name)
             return per_second
     expected = f"10 to {MAX_RATE:.0f} samples per second in one of {', '.join(candidates)}"

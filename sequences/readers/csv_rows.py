@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -12,11 +11,22 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.clocks import assumed_unit, refuse_counts_and_dates, time_unit
+from stario.sequences.readers.clocks import (
+    LATEST_S,
+    assumed_unit,
+    refuse_counts_and_dates,
+    time_unit,
+)
 from stario.sequences.readers.columns import IMU, QUANTITIES, Column, Header, unit_factor
 from stario.sequences.readers.dates import with_seconds
 from stario.sequences.readers.lines import decimal_mark, ends_within_a_row, is_row, unquoted
-from stario.sequences.readers.rows import NumberedLine, is_missing, parsed_rows, rows_below
+from stario.sequences.readers.rows import (
+    NumberedLine,
+    check_width,
+    is_missing,
+    parsed_rows,
+    rows_below,
+)
 from stario.sequences.readers.text import read_quickly
 from stario.sequences.sequence import BoolArray, FloatArray
 from stario.sequences.units import TIME_UNITS
@@ -101,6 +111,9 @@ def _rows_carefully(path: Path, lines: list[str], header: Header, decimal: str) 
     columns = header.columns
     below = rows_below(path, lines, header.lines)
     numbered = [(number, unquoted(line, header.separator, decimal)) for number, line in below]
+    needed = 1 + max(column.index for column in columns.values())
+    for row in numbered:
+        check_width(path, row, header.separator, needed)
     if _is_dated(numbered[0][1], header):
         lines = with_seconds(line for _, line in numbered)
         numbered = [(number, line) for (number, _), line in zip(numbered, lines, strict=True)]
@@ -161,7 +174,10 @@ def _per_second(path: Path, column: Column, time: FloatArray) -> tuple[int, str]
     """Return the units per second and the unit assumed if the header names none, by the rate."""
     if not column.unit:
         refuse_counts_and_dates(path, column.title, time)
-        with suppress(ReadError):
+        try:
             per_second = time_unit(path, time)
             return per_second, assumed_unit(per_second, float(time[0]))
+        except ReadError:
+            if len(time) and abs(float(time[0])) > LATEST_S:
+                raise
     return unit_factor(path, column, TIME_UNITS), ""

@@ -70,6 +70,10 @@ _SHARED_ROWS = 0.75
 _ALTERNATING = 0.1
 """Share of neighbouring rows of which one holds it, above which the rows alternate."""
 
+_ZERO_ROWS, _EITHER = 0.05, 0.9
+"""Share of rows of zeros of each sensor, and of rows with just one sensor, from which they are
+separate rows: neither sensor at rest reads exactly 0, 0, 0."""
+
 _HEAD_LINES = 200
 """Number of lines within which the header must be for a file to be recognised."""
 
@@ -126,6 +130,7 @@ def _samples(
     gyroscope, and the time of all rows starts at the first one at which both are known.
     """
     known = rows.is_imu & np.isfinite(rows.time)
+    gyro, accel = _without_zeros(path, gyro, accel)
     with_gyro, with_accel = (known & ~np.isnan(values).any(axis=1) for values in (gyro, accel))
     if with_accel.sum() < 2 or not _in_separate_rows(with_accel[with_gyro]):
         return rows, rows.time[rows.is_imu], gyro[rows.is_imu], accel[rows.is_imu]
@@ -135,6 +140,17 @@ def _samples(
     )
     rows = replace(rows, time=rows.time - float(stamps[0]) * 1e-9)
     return rows, seconds(stamps, stamps[0]), rate, force
+
+
+def _without_zeros(
+    path: Path, gyro: FloatArray, accel: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return both sensors (N, 3) with NaN for zeros that stand for the one that was not read."""
+    no_gyro, no_accel = ((values == 0.0).all(axis=1) for values in (gyro, accel))
+    if min(no_gyro.mean(), no_accel.mean()) < _ZERO_ROWS or (no_gyro != no_accel).mean() < _EITHER:
+        return gyro, accel
+    _log.warning("%s: rows of zeros are those of the other sensor: both are joined by time", path)
+    return np.where(no_gyro[:, None], np.nan, gyro), np.where(no_accel[:, None], np.nan, accel)
 
 
 def _in_separate_rows(shared: BoolArray) -> bool:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from stario.sequences.errors import ReadError
+from stario.sequences.files import opened_text
 
 
 def read_json(path: Path) -> Any:
@@ -16,7 +17,7 @@ def read_json(path: Path) -> Any:
         ReadError: the file is missing or not JSON.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
+        return json.loads(opened_text(path))
     except FileNotFoundError:
         raise ReadError(path, "file", "no such file", "a JSON file") from None
     except (OSError, ValueError, RecursionError) as error:

@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from stario.sequences.errors import ReadError
+from stario.sequences.files import opened
 
 _log = logging.getLogger(__name__)
 
@@ -30,7 +31,8 @@ def read_lines(path: Path) -> list[str]:
         ReadError: the file is missing, empty or not text.
     """
     try:
-        content = path.read_bytes()
+        with opened(path) as file:
+            content = file.read()
     except FileNotFoundError:
         raise ReadError(path, "file", "no such file", "a readable file") from None
     except OSError as error:
@@ -82,7 +84,7 @@ def first_lines(path: Path, count: int, comments: bool = False) -> list[str]:
 def head_lines(path: Path) -> list[str]:
     """Return the lines at the start of a text file, the last possibly cut; never raises."""
     try:
-        with path.open("rb") as file:
+        with opened(path) as file:
             head = file.read(_HEAD_BYTES)
     except OSError:
         return []
@@ -99,7 +101,7 @@ def head_lines(path: Path) -> list[str]:
 def first_bytes(path: Path, count: int = 16) -> bytes:
     """Return the first bytes of a file, empty if it does not exist; never raises."""
     try:
-        with path.open("rb") as file:
+        with opened(path) as file:
             return file.read(count)
     except OSError:
         return b""
@@ -164,7 +166,7 @@ def ends_within_a_row(path: Path, delimiter: str | None) -> bool:
     shorter than that of every other row near the end.
     """
     try:
-        with path.open("rb") as file:
+        with opened(path) as file:
             start = max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES)
             file.seek(start)
             tail = file.read()

@@ -75,14 +75,9 @@ def _row(
     titles: Sequence[str],
 ) -> list[float]:
     """Parse one row slowly, to raise an error that names its line and column."""
+    check_width(path, numbered, delimiter, 1 + max(columns))
     number, line = numbered
-    cells, needed = line.split(delimiter), 1 + max(columns)
-    if len(cells) < needed:
-        fix = "is the file cut short?"
-        if len(cells) == 1 and delimiter is not None:
-            fix = f"separate the values by {delimiter!r} as in the other lines, or remove the line"
-        raise ReadError(path, f"line {number}", f"{len(cells)} values", f"{needed}", fix)
-    row = []
+    cells, row = line.split(delimiter), []
     for column, title in zip(columns, titles, strict=True):
         cell = cells[column].strip()
         try:
@@ -92,6 +87,21 @@ def _row(
             where = f"line {number}, {title}"
             raise ReadError(path, where, repr(cell), "a number", fix) from None
     return row
+
+
+def check_width(path: Path, numbered: NumberedLine, delimiter: str | None, needed: int) -> None:
+    """Check that a row has the cells that are needed.
+
+    Raises:
+        ReadError: it is cut short.
+    """
+    number, line = numbered
+    count = len(line.split(delimiter))
+    if count < needed:
+        fix = "is the file cut short?"
+        if count == 1 and delimiter is not None:
+            fix = f"separate the values by {delimiter!r} as in the other lines, or remove the line"
+        raise ReadError(path, f"line {number}", f"{count} values", f"{needed}", fix)
 
 
 def is_missing(cell: str) -> bool:

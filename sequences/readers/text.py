@@ -18,6 +18,7 @@ from stario.sequences.readers.dates import with_seconds
 from stario.sequences.readers.lines import ends_within_a_row, read_lines, unquoted
 from stario.sequences.readers.rows import NumberedLine, parsed_rows, rows_below
 from stario.sequences.sequence import FloatArray
+from stario.sequences.units import FILETIME_1970, FILETIME_PER_SECOND
 
 _log = logging.getLogger(__name__)
 
@@ -62,16 +63,21 @@ class Table:
             ReadError: a cell is not a time.
         """
         unit_ns = 10**9 // per_second
+        since_1970 = FILETIME_1970 if per_second == FILETIME_PER_SECOND else 0
         rows = np.arange(len(self.values)) if rows is None else rows
         numbers = self.numbers(column)
         numbers = None if numbers is None else numbers[rows]
         if numbers is not None and numbers.dtype.kind == "i":
-            return np.asarray(numbers.astype(np.int64) * unit_ns, dtype=np.int64)
-        if numbers is not None and np.spacing(np.abs(numbers).max()) * unit_ns < 0.5:
+            return np.asarray((numbers.astype(np.int64) - since_1970) * unit_ns, dtype=np.int64)
+        if (
+            not since_1970
+            and numbers is not None
+            and np.spacing(np.abs(numbers).max()) * unit_ns < 0.5
+        ):
             return np.asarray(np.rint(numbers * unit_ns), dtype=np.int64)
         cells = self.cells(column)
         try:
-            stamps = [int(cells[k]) * unit_ns for k in rows]
+            stamps = [(int(cells[k]) - since_1970) * unit_ns for k in rows]
         except ValueError:
             stamps = [self._stamp(k, cells[k], unit_ns) for k in rows.tolist()]
         try:

@@ -7,7 +7,7 @@ from pathlib import Path
 from stario.sequences.arrays import first_of
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.columns import HEADER
-from stario.sequences.readers.lines import first_bytes, first_line, may_be_read
+from stario.sequences.readers.lines import first_bytes, first_line, first_lines, may_be_read
 from stario.sequences.readers.phones.files import (
     NO_SAMPLES,
     SUFFIXES,
@@ -17,6 +17,7 @@ from stario.sequences.readers.phones.files import (
     unmatched_files,
     unread_files,
 )
+from stario.sequences.readers.phones.long_form import is_echo
 from stario.sequences.readers.poses import pose_files
 
 _EXPORT = "export as CSV, or as the zip or folder that the app writes"
@@ -39,7 +40,9 @@ def unrecognised(path: Path, inside: list[Path], known: str) -> ReadError:
         inside: the recordings below it.
         known: what would have been a recording.
     """
-    if inside:
+    if is_echo(first_lines(path, 1)):
+        found, fix = "text of `rostopic echo`", "name the bag, or write it with `rostopic echo -p`"
+    elif inside:
         found, fix = f"a folder of {len(inside)} recordings", f"name one, such as {inside[0]}"
     elif has_some_sensors(path):
         return _incomplete(path)

@@ -16,6 +16,9 @@ _SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".json", ".properties", ".zip")
 _MAX_BYTES = 4 * 2**30
 """Maximum unpacked text [bytes], more than any recording has; guards against zip bombs."""
 
+_MAX_FILES = 5000
+"""Maximum number of text files, far more than any export has; unpacking 70,000 takes long."""
+
 
 def is_zip(path: Path) -> bool:
     """Return whether a file is a zip with text files in it; never raises."""
@@ -55,6 +58,8 @@ def _extract(path: Path, inner: Path, folder: Path, max_bytes: int) -> int:
     """Unpack the wanted files of a zip in `path`; return how many more bytes are allowed."""
     with zipfile.ZipFile(inner) as file:
         wanted = [info for info in file.infolist() if _is_wanted(info)]
+        if len(wanted) > _MAX_FILES:
+            raise ReadError(path, "zip", f"{len(wanted)} files", "those of one recording")
         left = max_bytes - sum(info.file_size for info in wanted)
         if left < 0:
             found = f"more than {_MAX_BYTES / 2**30:.0f} GiB of text"

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import interpolated
+from stario.sequences.arrays import even_grid, interpolated
 from stario.sequences.attitude.stacks import composed
 from stario.sequences.conventions import SAME_AXES, axes_matrix, axes_named
 from stario.sequences.errors import InputError
@@ -151,7 +151,7 @@ def _accel_against(force_B: FloatArray, attitude_WT: Rotation, R_TB: Rotation) -
 
 
 def _grid(start: float, stop: float) -> FloatArray:
-    return np.arange(start, max(stop, start + 2.0 / _RATE), 1.0 / _RATE)
+    return even_grid(start, max(stop, start + 2.0 / _RATE), 1.0 / _RATE)
 
 
 def _speed(attitude: Rotation, valid: BoolArray) -> FloatArray:

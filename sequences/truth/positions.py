@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import correlation, integral, interpolated
+from stario.sequences.arrays import correlation, even_grid, integral, interpolated
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 from stario.sequences.time_order import MAX_IMU_GAP
 from stario.sequences.truth.part import compared_samples
@@ -119,8 +119,8 @@ def _accelerations(
     steps = np.diff(time)
     gap = (steps > MAX_IMU_GAP) | ~(pose.valid[1:] & pose.valid[:-1])
     gaps = np.append(0, np.cumsum(gap))
-    ticks = np.arange(time[0] + _H_S, time[-1] - _H_S, 0.5 * _H_S)
-    first = np.searchsorted(time, ticks - _H_S, side="right") - 1
+    ticks = even_grid(time[0] + _H_S, time[-1] - _H_S, 0.5 * _H_S)
+    first = np.searchsorted(time[1:], ticks - _H_S, side="right")  # 0 too if rounded to before it
     ticks = ticks[gaps[first] == gaps[np.searchsorted(time, ticks + _H_S)]]
     fallen = integral(time, integral(time, force_W - force_W[pose.valid].mean(axis=0)))
     known = truth.valid

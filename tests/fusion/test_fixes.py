@@ -387,3 +387,8 @@ def test_beyond_the_most_that_wait_those_furthest_ahead_are_refused() -> None:
     queue = FixQueue((position_fix(time, np.zeros(3), eye) for time in (3.0, 1.0, 2.0)), most=2)
     assert [fix.time for fix in queue.waiting] == [1.0, 2.0]
     assert queue.refused == {"too many waiting": 1}
+
+
+def test_variances_instead_of_a_covariance_are_refused_with_the_matrix_to_pass() -> None:
+    with pytest.raises(InputError, match=r"np\.diag"):
+        position_fix(0.0, [1.0, 2.0, 3.0], [0.1, 0.1, 0.2])

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from stario.sequences.arrays import interpolated
+from stario.sequences.arrays import even_grid, interpolated
 from stario.sequences.sequence import FloatArray, ImuSequence
 
 Rng = np.random.Generator
@@ -90,7 +90,7 @@ def drops(share: float) -> ModifySamples:
 
 
 def _resampled(sequence: ImuSequence, rng: Rng, rate: float) -> ImuSequence:
-    time = np.arange(sequence.time[0], sequence.time[-1], 1.0 / rate)
+    time = even_grid(sequence.time[0], sequence.time[-1], 1.0 / rate)
     gyro, accel = (
         interpolated(time, sequence.time, values) for values in (sequence.gyro, sequence.accel)
     )

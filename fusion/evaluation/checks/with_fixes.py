@@ -21,6 +21,7 @@ from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.sequences.accuracy.metrics import pose_errors
 from stario.sequences.accuracy.nees import nees
+from stario.sequences.arrays import even_grid
 from stario.sequences.drawing.text_table import aligned
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, Trajectory
@@ -52,7 +53,7 @@ class FixConsistency(GroupedResult):
 
 def true_fixes(truth: Trajectory, every: float, sigma: float, seed: int) -> list[Fix]:
     """Return a true position every `every` seconds, with errors of `sigma` [m] per axis."""
-    at = truth.at(np.arange(truth.time[0], truth.time[-1], every))
+    at = truth.at(even_grid(truth.time[0], truth.time[-1], every))
     positions = at.position_W + np.random.default_rng(seed).normal(0.0, sigma, (len(at), 3))
     covariance = sigma**2 * np.eye(3)
     return [

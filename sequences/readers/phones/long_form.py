@@ -40,7 +40,13 @@ def is_long_form(path: Path) -> bool:
     """Return whether a file's rows name their sensors; never raises."""
     if path.suffix.lower() not in SUFFIXES or not path.is_file():
         return False
-    return _layout([line for line in head_lines(path)[:-1] if is_row(line)]) is not None
+    lines = [line for line in head_lines(path)[:-1] if is_row(line)]
+    return not is_echo(lines) and _layout(lines) is not None
+
+
+def is_echo(lines: list[str]) -> bool:
+    """Return whether lines are the text of `rostopic echo`, which names sensors as well."""
+    return lines[:1] != [] and lines[0].rstrip() == "header:"
 
 
 @contextmanager

@@ -19,6 +19,7 @@ _WORD = re.compile(r"[A-Z]{2,}(?![a-z])|[A-Z]?[a-z]+|[A-Z]|\d+|[^\W\d_]+")
 _G_FORCE = re.compile(r"(?<![a-z])g[-_ ]?f(orce)?(?=[\W_xyz]|$)", flags=re.IGNORECASE)
 _WITH_G = re.compile(r"\bwith[-_ ]g\b", flags=re.IGNORECASE)
 _WITHOUT_G = re.compile(r"\bwithout[-_ ]g\b", flags=re.IGNORECASE)
+_ANG_VEL = re.compile(r"(?<![a-z])ang[-_ ]?vel(?![a-z])", flags=re.IGNORECASE)
 _GLUED = re.compile(r"(?P<stem>[a-z]*?)(?P<axis>[xyz])")
 
 _BEGINNINGS: dict[Sensor, tuple[str, ...]] = {
@@ -69,6 +70,7 @@ def words_of(name: str) -> list[str]:
     The number of a copy, `Gyroscope (1).csv`, tells recordings apart.
     """
     plain = _G_FORCE.sub("gf ", _BRACKETS.sub(" ", _NUMBER.sub(r" \1 ", name)))
+    plain = _ANG_VEL.sub("angular", plain)
     plain = _WITHOUT_G.sub(" linear ", _WITH_G.sub(" ", plain)).replace("MetaWear", "Metawear")
     return [word.lower() for word in _WORD.findall(plain)]
 

@@ -18,8 +18,10 @@ from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import captured_rotations, pose_mask
 from stario.sequences.readers.columns import IMU, canonical_names
 from stario.sequences.readers.lines import first_line, first_lines
+from stario.sequences.readers.phones.sensor_words import time_unit_of
 from stario.sequences.readers.text import read_table, seconds
 from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.units import TIME_UNITS
 
 _log = logging.getLogger(__name__)
 
@@ -35,7 +37,7 @@ def read_euroc(path: Path) -> ImuSequence:
         raise ReadError(path, "mav0/imu0/data.csv", "no such file", expected, "unpack all of it")
     _check_titles(imu)
     table = read_table(imu, columns=7)
-    stamps = table.stamps_ns()
+    stamps = table.stamps_ns(0, _per_second(imu))
     truth_file = _truth_file(imu.parent.parent)
     return ImuSequence(
         name=_name(imu),
@@ -58,6 +60,12 @@ def _check_titles(imu: Path) -> None:
         expected = "time, gyroscope xyz and accelerometer xyz first"
         fix = f"read {imu.name} itself with `--format csv`, by its titles"
         raise ReadError(imu, "header", repr(header.strip()[:80]), expected, fix)
+
+
+def _per_second(path: Path) -> int:
+    """Return the units per second of a file's times, nanoseconds unless its title names another."""
+    title = next(iter(first_lines(path, 1, comments=True)), "").split(",")[0]
+    return TIME_UNITS.get(time_unit_of(title), TIME_UNITS["ns"])
 
 
 def is_euroc(path: Path) -> bool:
@@ -88,7 +96,7 @@ def _truth(path: Path, start_ns: np.int64) -> Trajectory:
     estimated = path.parent.name.startswith("state_groundtruth")
     columns = 11 if estimated and (first_line(path) or "").count(",") >= 10 else 8
     rows = read_table(path, columns=columns)
-    table, time = rows.values, seconds(rows.stamps_ns(), start_ns)
+    table, time = rows.values, seconds(rows.stamps_ns(0, _per_second(path)), start_ns)
     keep = pose_mask(path, time)
     table, time = table[keep], time[keep]
     attitude_WB, valid = captured_rotations(table[:, [5, 6, 7, 4]])

@@ -64,6 +64,14 @@ def test_positions_in_a_gap_of_the_track_are_excluded():
     assert position_error(gapped, around) == (pytest.approx(0.0, abs=1e-9), 6)
 
 
+def test_a_track_with_two_poses_per_second_has_no_gaps():
+    """As that of detected steps, from which most positions were left out."""
+    sparse = Trajectory(TIME[::5], PATH[::5], Rotation.identity(len(TIME[::5])))
+    walked = SimpleNamespace(time=TIME[::5], trajectory=sparse)
+    error, count = position_error(walked, waypoints(PATH, every=4))
+    assert (count, error) == (51, pytest.approx(0.0, abs=0.02))
+
+
 @pytest.mark.parametrize(("sigma", "jump"), [(8.0, 90.0), (8.0, 12.0), (30.0, 90.0)])
 def test_jumps_far_beyond_the_stated_accuracy_are_named(sigma, jump):
     path = PATH[::10, :2] + np.outer(TIME[::10] >= 9.0, [jump, 0.0])

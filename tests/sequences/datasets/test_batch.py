@@ -50,9 +50,11 @@ def test_a_backend_that_returns_nothing_before_the_end_works_too() -> None:
         assert list(each(double, [1, 2, 3], 2)) == [2, 4, 6]
 
 
-def test_an_unexpected_exception_ends_the_batch() -> None:
-    with pytest.raises(ZeroDivisionError):
-        list(each(lambda number: 1 // number, [1, 0]))
+def test_an_unexpected_exception_costs_one_item_and_its_traceback_is_logged(caplog) -> None:
+    outcomes = list(each(lambda number: 1 // number, [1, 0, -1]))
+    assert outcomes[::2] == [1, -1]
+    assert outcomes[1].reason.startswith("ZeroDivisionError")
+    assert "Traceback" in caplog.text
 
 
 def test_several_jobs_run_in_separate_processes() -> None:

@@ -367,3 +367,19 @@ def test_one_spike_does_not_turn_the_average_force(walk: ImuSequence) -> None:
     accel = walk.accel.copy()
     accel[100] = [9e4, 0.0, 0.0]
     check_units(replace(walk, accel=accel))
+
+
+@pytest.mark.parametrize(("axis", "asked"), [(2, True), (0, False)])
+def test_the_unit_of_a_vehicle_that_turns_about_the_vertical_is_asked_for(
+    caplog: pytest.LogCaptureFixture, axis: int, asked: bool
+) -> None:
+    """A quarter of a turn per second for half a minute, as deg/s; another axis moves gravity."""
+    time = np.arange(3000) / 100.0
+    rate = np.zeros((len(time), 3))
+    rate[:, axis] = 5.0 * np.sign(np.sin(0.4 * time))
+    angle = np.cumsum(rate[:, axis]) / 100.0
+    level = np.zeros((len(time), 3))
+    level[:, 2] = 9.81
+    tilted = 9.81 * np.column_stack([np.zeros(len(time)), np.sin(angle), np.cos(angle)])
+    check_units(ImuSequence("robot", time, rate, level if axis == 2 else tilted))
+    assert ("--gyro-unit deg/s" in caplog.text) == asked

@@ -46,7 +46,7 @@ def test_folders_without_permission_are_passed_over(
 @needs_data
 def test_every_recording_is_found() -> None:
     assert sum(len(find_recordings(DATA / name)) for name in ("oxiod", "tumvi", "euroc")) == 18
-    assert len(find_recordings(DATA / "archives")) == 1149
+    assert len(find_recordings(DATA / "archives")) == 1180
 
 
 def test_a_text_file_with_rows_of_numbers_is_not_a_list(tmp_path: Path) -> None:

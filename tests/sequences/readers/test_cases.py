@@ -1,0 +1,93 @@
+"""Layouts of other people's files that were once refused or read wrongly.
+
+Their samples are simulated; the folder beside the project says what each is and what is right.
+"""
+
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recorded import CASES
+
+from stario.fusion.config import read_config
+from stario.fusion.fix_file import read_fixes
+from stario.sequences.errors import StarioError
+from stario.sequences.readers import find_recordings, read_recording
+
+
+def case(name: str) -> Path:
+    path = CASES / name
+    if not path.exists():
+        pytest.skip(f"{path} is missing")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "seconds", "rate"),
+    [
+        ("filetime_100ns/hololens.csv", 15.0, 1000.0),
+        ("mars_logger/gyro_accel.csv", 15.0, 100.0),
+        ("uzh_fpv_imu_txt/imu.txt", 15.0, 100.0),
+        ("euroc_float_seconds", 15.0, 100.0),
+        ("realsense_split_topics/realsense_split.bag", 60.0, 100.0),
+        ("zeros_of_other_sensor/zr300_like.csv", 15.0, 100.0),
+        ("zeros_of_other_sensor/accel_333_gyro_100.csv", 15.0, 100.0),
+        ("crash_ten_minutes/first_three_samples_lost_30s.csv", 30.0, 100.0),
+        ("compare_pdr_positions/walk.csv", None, None),
+    ],
+)
+def test_a_layout_is_read_at_its_rate(name: str, seconds: float | None, rate: float | None) -> None:
+    path = case(name)
+    if path.suffix == ".bag":
+        pytest.importorskip("rosbags")
+    sequence = read_recording(path)
+    assert 5.0 < np.median(np.linalg.norm(sequence.accel, axis=1)) < 15.0
+    assert not (sequence.gyro == 0.0).all(axis=1).any()
+    if seconds is not None and rate is not None:
+        assert sequence.duration == pytest.approx(seconds, abs=0.15)
+        assert 1.0 / np.median(np.diff(sequence.time)) == pytest.approx(rate, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("crash_first_row_short/first_row_cut.csv", "line 2: found 6 values, expected 7"),
+        ("crash_first_row_short/middle_row_cut.csv", "line 302: found 6 values, expected 7"),
+        ("crash_first_row_short/both_ends_cut.csv", "line 2: found 6 values, expected 7"),
+        ("rostopic_echo_text/echo.txt", "rostopic echo -p"),
+    ],
+)
+def test_a_file_is_refused_with_what_to_do(name: str, words: str) -> None:
+    with pytest.raises(StarioError, match=words):
+        read_recording(case(name))
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
+def test_no_entrance_waits_for_a_pipe(tmp_path: Path) -> None:
+    for name in ("walk.csv", "gyro.csv", "walk.json", "walk.h5", "walk.zip", "walk.toml"):
+        os.mkfifo(tmp_path / name)
+    with pytest.raises(StarioError):
+        find_recordings(tmp_path)
+    for read in (read_recording, read_fixes, read_config):
+        with pytest.raises(StarioError, match=r"(?i)pipe or device"):
+            read(tmp_path / ("walk.toml" if read is read_config else "walk.csv"))
+
+
+def test_a_zip_of_very_many_files_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "many.zip"
+    with zipfile.ZipFile(path, "w") as file:
+        for k in range(5001):
+            file.writestr(f"{k}.csv", "")
+    with pytest.raises(StarioError, match="5001 files"):
+        read_recording(path)
+
+
+def test_times_of_no_possible_year_are_refused(tmp_path: Path) -> None:
+    """Steps of 10 us in a unit of which the first time lies after the year 2100."""
+    rows = [f"{9 * 10**18 + 10**4 * k},0,0,0,0,0,9.8" for k in range(100)]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(["t,gx,gy,gz,ax,ay,az", *rows]))
+    with pytest.raises(StarioError, match="time"):
+        read_recording(path)
