@@ -263,8 +263,10 @@ def _devices_on(clip: Path, seed: tuple[int, int]) -> list[WorldStream]:
     motion = read_body(clip)
     rng = np.random.default_rng(seed)
     known = places_on(motion)
+    drawn = list(rng.permutation(known))
+    drawn.sort(key=lambda place: place != "in-front")  # where most phones are: on every clip
     streams = []
-    for place in rng.choice(known, min(_DEVICES, len(known)), replace=False):
+    for place in drawn[:_DEVICES]:
         device = virtual_imu(motion, str(place), 200.0, PHONE_IMU, int(rng.integers(2**31)))
         streams += world_streams(device, attitude="true")
     return streams

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.fft import irfft, rfft, rfftfreq
 from scipy.interpolate import make_interp_spline
-from scipy.signal import butter, find_peaks, sosfiltfilt
+from scipy.signal import bilinear, butter, find_peaks, lfilter, lfilter_zi, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import check_choice, check_type, generator
@@ -146,6 +146,8 @@ def carried_on(motion: BodyMotion, place: str, seed: int = 0) -> Trajectory:
     turned = Rotation.from_quat(make_interp_spline(t, sosfiltfilt(low_pass, quat, axis=0))(time))
     strength = where.shaken * float(make_interp_spline(t, hips, k=5)(time, 2).std())
     strength *= rng.lognormal(0.0, 0.4)
+    if place == "in-front":
+        known = _on_an_arm(rng, known)
     offset, turn = _oscillation(rng, time, _landings(motion), strength, where.resonance)
     if place in ("ear", "in-front"):  # an arm is not the trunk
         turn += rng.uniform(0.03, 0.1) * drift(rng, len(time), _RATE, 0.4, 3)
@@ -181,6 +183,20 @@ def _ahead(motion: BodyMotion) -> FloatArray:
     left = motion.position_W["l_thigh"] - motion.position_W["r_thigh"]
     ahead = np.cross(left, [0.0, 0.0, 1.0])
     return np.asarray(ahead / np.linalg.norm(ahead, axis=1, keepdims=True))
+
+
+def _on_an_arm(rng: np.random.Generator, position: FloatArray) -> FloatArray:
+    """Return where a device is whose hand follows positions (N, 3) as a damped spring does.
+
+    The arm swings up at the frequency of the steps, and passes little above its resonance.
+    """
+    omega, damping = 2.0 * np.pi * rng.uniform(2.5, 5.0), rng.uniform(0.2, 0.6)
+    spring = [2.0 * damping * omega, omega**2]
+    numerator, denominator = bilinear(spring, [1.0, *spring], fs=_RATE)
+    # A spring follows a steady walk without lag: only what deviates from it is filtered.
+    steady = np.linspace(position[0], position[-1], len(position))
+    state = lfilter_zi(numerator, denominator)[:, None] * (position - steady)[0]
+    return np.asarray(steady + lfilter(numerator, denominator, position - steady, 0, state)[0])
 
 
 def _landings(motion: BodyMotion) -> FloatArray:
