@@ -235,6 +235,44 @@ def gaps(
     _print_table([shift for each in shifts for shift in each], skipped, end_shift_table, as_json)
 
 
+@expand_option_groups
+def moments(
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
+    paths: OptionalPathsArgument = None,
+    graph: Annotated[bool, flag("--graph", help="Also run the graph (slower).")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the moments.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Insert bad moments (shake, drop, table, standing, lift); report what the rest of tracks pays.
+
+    Without PATH, use simulated walks in a building.
+    """
+    from stario.fusion.evaluation.checks.moments import (
+        MomentCost,
+        moment_costs,
+        moment_table,
+        simulated_walks,
+    )
+
+    backends: tuple[BackendName, ...] = ("ekf", "graph") if graph else ("ekf",)
+    model, settings = estimating.network(), estimating.settings()
+    costs: list[MomentCost] = []
+    skipped: list[Skipped] = []
+    judge = partial(moment_costs, model, config=settings, backends=backends, seed=seed)
+    if paths:
+        found, skipped = map_recordings(
+            "check moments", reading, paths, lambda path, sequence: judge(sequence)
+        )
+        costs = [cost for each in found for cost in each]
+    else:
+        refuse_unused(changed(reading), "with simulated walks", "use with PATH")
+        walks = simulated_walks()
+        for walk in with_bar("check moments", walks, len(walks)):
+            costs += judge(walk)
+    _print_table(costs, skipped, moment_table, as_json)
+
+
 def _judge_each(
     title: str,
     reading: ReadingOptions,

@@ -1,0 +1,255 @@
+"""Cost of bad moments: a recording run with and without each, inserted at three places.
+
+What counts is the rest of the track, before and after the moment. Its horizontal error is compared
+after fits of yaw and position: of each of the two parts by itself, which shows what the moment did
+to the estimator, and of both together, which adds what the track lost within the moment.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stario.fusion.backends import BackendName
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.checks.groups import GroupedResult, by_group
+from stario.fusion.evaluation.judging.displacement_error import fit_yaw_and_position
+from stario.fusion.evaluation.judging.prepared import Complex
+from stario.fusion.evaluation.tracks import network_track
+from stario.fusion.imu.stateful import Predictor
+from stario.fusion.navigator import Navigator
+from stario.fusion.state import Track
+from stario.sequences.arrays import interpolated
+from stario.sequences.attitude.rotations import GyroIntegral
+from stario.sequences.attitude.stacks import composed
+from stario.sequences.clean_samples import clean_samples
+from stario.sequences.drawing.text_table import aligned
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence
+from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
+from stario.sequences.simulation.insertion import Inserted, insert_moment
+from stario.sequences.simulation.magnetometer import INDOOR_FIELD
+from stario.sequences.simulation.moments import MOMENTS
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
+
+PLACES = {"start": 0.0, "middle": 0.5, "end": 0.85}
+"""Instants of a moment, as shares of the recording."""
+
+MAX_RATIO, MAX_STEP, MAX_TURN = 1.2, 1.0, 10.0
+"""Largest acceptable ratio of the errors, and corrections without a fix [m], [deg]."""
+
+MAX_SECONDS = 180.0
+"""A longer recording is cut after this time [s]: it is run again for every moment and place."""
+
+_BEFORE_WAYPOINTS = 4.0
+"""Time before the first known position from which a recording without poses is used [s]."""
+
+_FIRST_SECONDS = 1.05
+"""Time until the first window has been applied [s]: it is a second long."""
+
+_MIN_KNOWN = 3
+"""Minimum number of known positions in a part of the track for its error to count."""
+
+_CARRIES = ("handheld", "pocket", "swinging", "bag")
+"""How the device is carried in the simulated walks, one each."""
+
+
+@dataclass(frozen=True)
+class MomentCost(GroupedResult):
+    """Cost of one moment at one place in one recording, for one back end.
+
+    Attributes:
+        backend: "ekf" or "graph".
+        error_without: error of the rest, its parts fitted separately, without the moment [m].
+        error_with: with it [m].
+        joined_without: error of the rest fitted as a whole, without the moment [m].
+        joined_with: with it [m].
+        step: largest correction of the position between two outputs [m].
+        turn: largest correction of the attitude likewise [deg].
+        step_without: largest correction of the position without the moment [m].
+        turn_without: largest correction of the attitude without it [deg].
+    """
+
+    backend: str
+    error_without: float
+    error_with: float
+    joined_without: float
+    joined_with: float
+    step: float
+    turn: float
+    step_without: float
+    turn_without: float
+
+
+def simulated_walks(seconds: float = 120.0, seed: int = 0) -> list[ImuSequence]:
+    """Simulate a walk of each carrying mode, with a phone's sensors in a building."""
+    walks = []
+    for k, carry in enumerate(_CARRIES, seed):
+        walk = generate_walk(k, seconds, style=WalkStyle(carry=carry))
+        imu = simulate_imu(walk, 100.0, PHONE_IMU, k, name=carry, magnetic_field=INDOOR_FIELD)
+        walks.append(imu)
+    return walks
+
+
+def moment_costs(
+    model: Predictor,
+    sequence: ImuSequence,
+    config: NavigatorConfig,
+    backends: Sequence[BackendName] = ("ekf",),
+    seed: int = 0,
+) -> list[MomentCost]:
+    """Run a recording without and with each moment at each place.
+
+    Raises:
+        InputError: it has no ground truth, or cannot be run.
+    """
+    sequence = _with_truth(sequence)
+    navigators = {name: Navigator(model, config, backend=name) for name in backends}
+    first = navigators[backends[0]]
+    observed = first.observe(sequence)
+    poses = sequence.truth or network_track(observed).trajectory
+    without = {name: each.track(observed) for name, each in navigators.items()}
+    costs = []
+    for moment in MOMENTS:
+        for place, share in PLACES.items():
+            inserted = insert_moment(sequence, poses, moment, share, seed)
+            observed = first.observe(inserted.sequence)
+            for name, navigator in navigators.items():
+                tracks = without[name], navigator.track(observed)
+                title = f"{moment.name}, {place}"
+                costs.append(_cost(sequence, inserted, *tracks, title, name))
+    return costs
+
+
+def moment_table(found: Sequence[MomentCost]) -> str:
+    """Return a row for each moment, place and back end: ratios of errors, largest corrections."""
+    head = ["moment", "back end", "n", "without [m]", "rest: mean", "worst", "joined: mean"]
+    rows = [[*head, "worst", f"ratio < {MAX_RATIO:g}", "step [m]", "turn [deg]", "both small"]]
+    for backend in dict.fromkeys(cost.backend for cost in found):
+        chosen = [cost for cost in found if cost.backend == backend]
+        rows += [_row(group, backend, part) for group, part in by_group(chosen)]
+    without = [(cost.step_without, cost.turn_without) for cost in found]
+    step, turn = np.max(without, axis=0) if without else (math.nan, math.nan)
+    notes = [
+        "without: median error [m] of the parts before and after, each fitted in yaw and position;",
+        "ratio of that error with the moment to that without: geometric mean, worst; joined: both "
+        "parts fitted as one; share of recordings whose rest is below the limit",
+        f"step, turn: largest correction between two outputs (without moments {step:.2f} m, "
+        f"{turn:.1f} deg); share with at most {MAX_STEP:g} m and {MAX_TURN:g} deg",
+    ]
+    return "\n".join([*aligned(rows), *notes])
+
+
+def _row(group: str, backend: str, part: Sequence[MomentCost]) -> list[str]:
+    rest = np.array([cost.error_with / cost.error_without for cost in part])
+    joined = np.array([cost.joined_with / cost.joined_without for cost in part])
+    known, steps = rest[np.isfinite(rest)], np.array([(cost.step, cost.turn) for cost in part])
+    small = (steps <= (MAX_STEP, MAX_TURN)).all(axis=1)
+    return [
+        *(group, backend, str(len(part))),
+        f"{np.nanmedian([cost.error_without for cost in part]):.2f}",
+        *(f"{value:.2f}" for value in (*_mean_and_worst(rest), *_mean_and_worst(joined))),
+        f"{(known < MAX_RATIO).mean():.0%}",
+        *(f"{value:.1f}" for value in steps.max(axis=0)),
+        f"{small.mean():.0%}",
+    ]
+
+
+def _mean_and_worst(ratio: FloatArray) -> tuple[float, float]:
+    return float(np.exp(np.nanmean(np.log(ratio)))), float(np.nanmax(ratio))
+
+
+def _with_truth(sequence: ImuSequence) -> ImuSequence:
+    """Return the recording from its first known position on, cut if it is long."""
+    known = sequence.truth or sequence.positions
+    if known is None:
+        raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
+    earlier = 0.0 if sequence.truth is not None else _BEFORE_WAYPOINTS
+    start = max(float(sequence.time[0]), float(known.time[known.valid][0]) - earlier)
+    return sequence.slice(start, start + MAX_SECONDS)
+
+
+def _cost(
+    sequence: ImuSequence,
+    inserted: Inserted,
+    without: Track,
+    track: Track,
+    group: str,
+    backend: str,
+) -> MomentCost:
+    split = inserted.start
+    errors = []
+    for each, start, stop, recording in (
+        (without, split, split, sequence),
+        (track, split, inserted.stop, inserted.sequence),
+    ):
+        time, truth, estimate = _known(recording, each)
+        rest = (time < start) | (time >= stop)
+        errors.append(_errors(truth[rest], estimate[rest], time[rest] < start))
+    step, turn = largest_correction(inserted.sequence, track)
+    usual = largest_correction(sequence, without)
+    (apart, joined), (apart_with, joined_with) = errors
+    return MomentCost(
+        sequence.name, group, backend, apart, apart_with, joined, joined_with, step, turn, *usual
+    )
+
+
+def _known(sequence: ImuSequence, track: Track) -> tuple[FloatArray, Complex, Complex]:
+    """Return times (n,) of known positions within the track, and both horizontally as complex."""
+    if sequence.truth is not None:
+        inside = track.trajectory.valid & sequence.truth.covers(track.time)
+        time = track.time[inside]
+        position = sequence.truth.at(time).position_W
+    else:
+        assert sequence.positions is not None
+        inside = sequence.positions.valid & track.trajectory.covers(sequence.positions.time)
+        time, position = sequence.positions.time[inside], sequence.positions.position_W[inside]
+    estimate = interpolated(time, track.time, track.trajectory.position_W)
+    return time, _horizontal(position), _horizontal(estimate)
+
+
+def _horizontal(position_W: FloatArray) -> Complex:
+    return np.asarray(position_W[:, 0] + 1j * position_W[:, 1])
+
+
+def _errors(truth: Complex, estimate: Complex, before: BoolArray) -> tuple[float, float]:
+    """Return the root mean square errors [m] of both parts fitted by themselves, and as one."""
+    squares = [
+        np.abs(fit_yaw_and_position(estimate[part], truth[part]) - truth[part]) ** 2
+        for part in (before, ~before)
+        if part.sum() >= _MIN_KNOWN
+    ]
+    if not squares:
+        return math.nan, math.nan
+    joined = np.abs(fit_yaw_and_position(estimate, truth) - truth) ** 2
+    apart = np.concatenate(squares)
+    return math.sqrt(apart.mean()), math.sqrt(joined.mean())
+
+
+def largest_correction(sequence: ImuSequence, track: Track) -> tuple[float, float]:
+    """Return a track's largest unexplained steps between two outputs, [m] and [deg].
+
+    The position should advance by the mean of the two velocities, the attitude by the gyroscope
+    less the estimated bias. Steps across gaps are left out, and that of the first window, which
+    makes the velocity known.
+    """
+    trajectory, b_g = track.trajectory, track.b_g
+    assert trajectory.velocity_W is not None  # both back ends give them
+    assert b_g is not None
+    dt = np.diff(trajectory.time)[:, None]
+    velocity = 0.5 * (trajectory.velocity_W[:-1] + trajectory.velocity_W[1:])
+    steps = np.linalg.norm(np.diff(trajectory.position_W, axis=0) - dt * velocity, axis=1)
+    time, gyro, _ = clean_samples(sequence)
+    measured = GyroIntegral(time, gyro).attitude(trajectory.time)
+    expected, turns = (
+        composed(attitude[:-1].inv(), attitude[1:])
+        for attitude in (measured, trajectory.attitude_WB)
+    )
+    bias = Rotation.from_rotvec(-dt * b_g[1:])
+    rest = composed(composed(expected, bias).inv(), turns).magnitude()
+    counts = trajectory.valid[1:] & (trajectory.time[1:] > trajectory.time[0] + _FIRST_SECONDS)
+    return float(steps[counts].max()), float(np.degrees(rest[counts].max()))
