@@ -141,14 +141,14 @@ def _from_skeleton(path: Path, skeleton: Skeleton) -> BodyMotion:
 
 
 _BVH_WORDS = {
-    "hips": ("hips", "hip", "pelvis", "root"),
+    "hips": ("hips", "hip", "centerhip", "pelvis", "root"),
     "chest": ("spine2", "spine1", "chest", "thorax", "spine"),
     "head": ("head",),
     "thigh": ("upleg", "upperleg", "thigh", "femur", "hip"),
-    "shin": ("lowerleg", "leg", "knee", "shin", "tibia", "calf"),
+    "shin": ("lowerleg", "lowleg", "leg", "knee", "shin", "tibia", "calf"),
     "foot": ("foot", "ankle"),
-    "upperarm": ("upperarm", "arm", "humerus", "shoulder"),
-    "forearm": ("forearm", "lowerarm", "elbow", "radius"),
+    "upperarm": ("upperarm", "uparm", "arm", "humerus", "shoulder"),
+    "forearm": ("forearm", "lowerarm", "lowarm", "elbow", "radius"),
     "hand": ("hand", "wrist"),
 }
 """Names of joints in BVH files, by preference."""
