@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.splits import ListEntry
 
-_GROUP = "{group}"
+_GROUP, _SET = "{group}", "{set}"
 _SPLIT, _RUNS = "test", Path("runs")
 
 
@@ -68,8 +68,8 @@ def evaluate(
         str | None,
         typer.Option(
             help="With --by: weights to compare with, or pdr (pedestrian dead reckoning without a "
-            "network), by paired error ratios with 95 % intervals. {group} in a weights name "
-            "stands for each recording's group: leave-one-group-out."
+            "network), by paired error ratios with 95 % intervals. {group} or {set} in a weights "
+            "name stands for each recording's group, or its first word: leave-one-out."
         ),
     ] = None,
     ekf: Annotated[
@@ -253,7 +253,7 @@ def _groups(
     names = [ours] if theirs is None else [ours, theirs]
     models = {name: partial(_for_group, name) for name in names}
     for name in names:
-        if _GROUP not in name:
+        if _GROUP not in name and _SET not in name:
             _for_group(name, "")  # fail on unloadable weights before preparing anything
     paths = [entry.path for entry in recordings]
     prepared = prepared_recordings(paths, reading.read, reading.as_read(), cache_folder(), jobs)
@@ -280,5 +280,9 @@ def _loaded(name: str) -> DisplacementModel | PedestrianDeadReckoning:
 
 
 def _for_group(name: str, group: str) -> DisplacementModel | PedestrianDeadReckoning:
-    """Load weights by name; `{group}` in it stands for the group, with underscores for blanks."""
+    """Load weights by name; `{group}` in it stands for the group, with underscores for blanks.
+
+    `{set}` stands for the group's first word.
+    """
+    name = name.replace(_SET, group.partition(" ")[0])
     return _loaded(name.replace(_GROUP, group.replace(" ", "_")))

@@ -81,8 +81,11 @@ def train(
         ),
     ] = "all",
     leave_out: Annotated[
-        str | None,
-        typer.Option(help="With --data: hold out this group instead, such as 'tyrex Thibaud'."),
+        list[str] | None,
+        typer.Option(
+            help="With --data: neither learn from this set or group nor select on it: tyrex, or "
+            "'ridi dan'. Repeatable."
+        ),
     ] = None,
     generated: Annotated[
         int | None, typer.Option(min=0, help=f"Simulated walks of 60 s. Default: {_GENERATED}.")
@@ -90,6 +93,13 @@ def train(
     recorded_only: Annotated[
         bool, flag("--recorded-only", help="Train without simulated walks.")
     ] = False,
+    body: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Motion capture (HDF5 or BVH) to learn from virtual devices on; a share of the "
+            "recipe may name the file. Repeatable."
+        ),
+    ] = None,
     config: Annotated[Path | None, typer.Option(help="JSON file with recipe settings.")] = None,
     epochs: Annotated[int | None, typer.Option(min=1, help="Epochs; overrides --config.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed; overrides --config.")] = None,
@@ -125,7 +135,7 @@ def train(
     """
     from stario.fusion.evaluation.folders import make_folder
     from stario.network.model import load_model
-    from stario.network.training.data import seconds_of
+    from stario.network.training.data import seconds_of, virtual_recordings
     from stario.network.training.parallel import is_leader
     from stario.network.training.splits import warn_of_learned
     from stario.sequences.datasets.cache_files import cache_folder
@@ -138,7 +148,7 @@ def train(
     _check_sources(reading, paths, validation, data, generated)
     folder = cache or cache_folder()
     streams_of = partial(streams_of_files, reading, recipe.attitude, folder, jobs)
-    lists = packaged_lists(data, leave_out, learn_from)
+    lists = packaged_lists(data, leave_out or [], learn_from)
     if data is not None and (judged := last_stage or start_from):
         warn_of_learned([judged], lists[1], data)
     recorded, held_out, skipped = recorded_streams(
@@ -146,7 +156,8 @@ def train(
     )
     out = out or Path("runs") / recipe.architecture
     make_folder(out)
-    learned = recorded + held_out if last_stage is not None else recorded
+    virtual = virtual_recordings(body or [], recipe.seed, folder)
+    learned = recorded + virtual + (held_out if last_stage is not None else [])
     material = training_material(learned, walks, recipe, folder)
     held = validation_material(held_out, required=bool(recorded))
     calibrated_by = last_stage or (

@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 
 def packaged_lists(
-    data: Path | None, group: str | None, name: str
+    data: Path | None, left_out: list[str], name: str
 ) -> tuple[list[Path], list[Path]]:
     """Return the training and held-out recordings from the lists in the package.
 
     Args:
         data: folder of the development recordings; None for no recordings at all.
-        group: group to hold out instead of the list `holdout`.
+        left_out: sets or groups that are neither learned from nor selected on.
         name: all, open or few.
 
     Raises:
@@ -35,7 +35,7 @@ def packaged_lists(
     from stario.sequences.datasets.splits import hold_out_group
 
     if data is None:
-        unused = {"--leave-out": group is not None, "--learn-from": name != "all"}
+        unused = {"--leave-out": bool(left_out), "--learn-from": name != "all"}
         refuse_unused(unused, "without --data", "use with the development recordings")
         return [], []
     check_choice("--learn-from", name, ("all", "open", "few"))
@@ -44,10 +44,9 @@ def packaged_lists(
         if name == "few"
         else read_packaged_list(name, data)
     )
-    if group is not None:
-        outside, inside = hold_out_group(everything, group)
-    else:
-        outside, inside = without_holdout(everything, data)
+    for group in left_out:
+        everything, _ = hold_out_group(everything, group)
+    outside, inside = without_holdout(everything, data)
     return [entry.path for entry in outside], [entry.path for entry in inside]
 
 

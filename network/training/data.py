@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -13,13 +14,16 @@ import numpy as np
 from stario.network.training.config import SIMULATED
 from stario.sequences.arrays import rms
 from stario.sequences.datasets.batch import Skipped
+from stario.sequences.datasets.cache_files import recording_stamps
 from stario.sequences.datasets.stream_cache import Stream, cached
-from stario.sequences.errors import ConfigError
+from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.files import unused_name
 from stario.sequences.legs import LegStream
 from stario.sequences.readers.archive import archive_attributes, split_name
 from stario.sequences.sequence import STANDARD_GRAVITY
+from stario.sequences.simulation.body import places_on, virtual_imu
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
+from stario.sequences.simulation.motion_capture import body_clips, read_body
 from stario.sequences.simulation.walks import generate_walk
 from stario.sequences.windows import WINDOW_RATE, Attitude, WorldStream, world_streams
 
@@ -29,6 +33,9 @@ _SIMULATED_SHARE = 0.4
 """Default share of simulated walks among all windows."""
 
 _WALK_SECONDS = 60.0
+
+_DEVICES = 4
+"""Virtual devices on each clip of motion capture."""
 
 _SHORTEST = 400
 """Minimum number of samples of a stretch, 2 s; shorter ones are dropped."""
@@ -227,3 +234,39 @@ def cached_walks(count: int, seed: int, folder: Path, attitude: Attitude) -> lis
     module = Path(__file__).read_text(encoding="utf-8")
     key = {"kind": "generated", "values": [count, seed, attitude], "module": module}
     return [s for s in cached(key, build, folder) if isinstance(s, WorldStream)]
+
+
+def virtual_recordings(files: Iterable[Path], seed: int, folder: Path) -> list[RecordingStreams]:
+    """Return streams of virtual devices at random places on each clip of motion capture.
+
+    They are along the true attitude: a clip of a few seconds is too short to be levelled. Clips
+    below two seconds are left out. Streams are cached in `folder`.
+
+    Raises:
+        ReadError: a file cannot be read.
+    """
+    recordings: list[RecordingStreams] = []
+    for index, clip in enumerate(clip for file in files for clip in body_clips(file)):
+        stamps = recording_stamps(clip)
+        key = {"kind": "virtual", "values": [str(clip), stamps, seed, index, _DEVICES]}
+        try:
+            found = cached(key, partial(_devices_on, clip, (seed, index)), folder)
+        except InputError as error:
+            log.info("%s: %s", clip, error)
+            continue
+        licence = str(archive_attributes(clip).get("licence", ""))
+        recordings.append(RecordingStreams(clip, found, licence))
+    return recordings
+
+
+def _devices_on(clip: Path, seed: tuple[int, int]) -> list[WorldStream]:
+    motion = read_body(clip)
+    rng = np.random.default_rng(seed)
+    known = places_on(motion)
+    drawn = list(rng.permutation(known))
+    drawn.sort(key=lambda place: place != "in-front")  # where most phones are: on every clip
+    streams = []
+    for place in drawn[:_DEVICES]:
+        device = virtual_imu(motion, str(place), 200.0, PHONE_IMU, int(rng.integers(2**31)))
+        streams += world_streams(device, attitude="true")
+    return streams

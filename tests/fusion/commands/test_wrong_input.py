@@ -154,6 +154,7 @@ def test_invalid_arguments_give_a_one_line_error(
         ("train RECORDING --recorded-only --generated 5", "--generated with --recorded-only"),
         ("train --generated 1 --gyro-unit deg/s", "--gyro-unit without recordings"),
         ("train RECORDING --leave-out ridi", "--leave-out without --data"),
+        ("simulate a.csv --body RECORDING --seconds 5", "--seconds with --body"),
         ("train RECORDING --learn-from few", "--learn-from without --data"),
     ],
 )

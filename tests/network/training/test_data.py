@@ -4,6 +4,7 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -14,6 +15,7 @@ from stario.network.training.data import (
     mix_sources,
     recording_streams,
     split_off,
+    virtual_recordings,
 )
 from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.datasets.batch import Skipped
@@ -166,3 +168,36 @@ def moving(name: str, acceleration: float) -> WorldStream:
     imu_W = np.zeros((2000, 6), np.float32)
     imu_W[:, 3], imu_W[:, 5] = acceleration, STANDARD_GRAVITY
     return WorldStream(name, imu_W, np.zeros((2000, 3), np.float32), np.ones((2000, 2), np.float32))
+
+
+def test_every_clip_of_motion_capture_has_devices_with_a_share_and_a_licence(
+    tmp_path: Path,
+) -> None:
+    file = tmp_path / "capture.h5"
+    with h5py.File(file, "w") as written:
+        for name, frames in (("long", 150), ("short", 40)):
+            group = written.create_group(name)
+            group.attrs.update({"rate": 50.0, "licence": "CC BY 4.0"})
+            group.attrs["joints"] = ["hips", "l_thigh", "r_thigh", "l_foot", "r_foot"]
+            ahead = np.array([0, 250, 0])  # in 0.1 mm per frame: 1.25 m/s
+            group["position_first"] = 10 * np.array(
+                [[0, 0, 950], [-100, 0, 900], [100, 0, 900], [-100, 0, 80], [100, 0, 80]], np.int32
+            )
+            group["position_step"] = np.tile(ahead, (frames, 5, 1)).astype(np.int16)
+            group["quaternion"] = np.tile([0, 0, 0, 32767], (frames, 5, 1)).astype(np.int16)
+
+    found = virtual_recordings([file], 1, tmp_path / "cache")
+
+    assert [recording.path.name for recording in found] == ["capture.h5:long"]  # 0.8 s is too short
+    assert len({s.name for s in found[0].streams}) == 2  # belt and back pocket: no other joints
+    for one in found[0].streams:
+        moved = np.hypot(*one.position_W[-1, :2])
+        assert moved == pytest.approx(1.25 * len(one) / 200, abs=0.1)
+    drawn = drawn_shares(
+        mix_sources(
+            [*recordings_of([stream("a", 900)]), *found], [], {"capture.h5": 0.3, SIMULATED: 0.0}
+        )
+    )
+    assert drawn["a"] == pytest.approx(0.7)
+    words = mix_sources(found, [], {"capture.h5": 0.3}).words
+    assert any("capture.h5, licence CC BY 4.0" in word for word in words)
