@@ -247,7 +247,7 @@ def _judge_each(
     judge: Callable[[Predictor, ImuSequence, NavigatorConfig, str], pd.DataFrame],
 ) -> tuple[list[pd.DataFrame], list[Skipped]]:
     """Score each recording as one of its group; return the scores and what was skipped."""
-    from stario.fusion.evaluation.judging.judge import By, labels
+    from stario.fusion.evaluation.benchmark.groups import By, labels
     from stario.fusion.evaluation.many import distinct_name
     from stario.sequences.arrays import check_choice
 

@@ -241,14 +241,10 @@ def _groups(
     as_json: bool,
 ) -> list[Skipped]:
     """Write and print the table of groups; return the recordings that were skipped."""
-    from stario.fusion.evaluation.judging.judge import By, judge, rows_of
-    from stario.fusion.evaluation.judging.prepared import prepared_recordings
-    from stario.fusion.evaluation.judging.table import (
-        JudgingResult,
-        judgement_dict,
-        judgement_text,
-        write_judgement,
-    )
+    from stario.fusion.evaluation.benchmark.aligned import aligned_recordings
+    from stario.fusion.evaluation.benchmark.groups import By, benchmark, benchmark_dict
+    from stario.fusion.evaluation.figures import write_benchmark
+    from stario.fusion.evaluation.text import benchmark_text
     from stario.sequences.arrays import check_choice
     from stario.sequences.datasets.cache_files import cache_folder
 
@@ -259,16 +255,16 @@ def _groups(
         if _GROUP not in name:
             _for_group(name, "")  # fail on unloadable weights before preparing anything
     paths = [entry.path for entry in recordings]
-    prepared = prepared_recordings(paths, reading.read, reading.as_read(), cache_folder(), jobs)
+    aligned = aligned_recordings(paths, reading.read, reading.as_read(), cache_folder(), jobs)
     groups = {entry.path: entry.group for entry in recordings}
-    shown = with_bar("judge", prepared, len(recordings))
-    judged, skipped = judge(shown, models, groups, reading.read if ekf else None)
-    if not judged:
-        return skipped
-    found = JudgingResult(ours, theirs, rows_of(judged, grouping, ours, theirs), judged)
-    if out is not None:
-        write_judgement(out, found)
-    print_result(as_json, judgement_dict(found), judgement_text(found))
+    shown = with_bar("benchmark", aligned, len(recordings))
+    found, skipped = benchmark(shown, models, groups, reading.read if ekf else None)
+    if found is not None:
+        rows = found.rows(grouping, ours, theirs)
+        if out is not None:
+            write_benchmark(out, found, rows, ours, theirs)
+        record = benchmark_dict(found, rows, ours, theirs)
+        print_result(as_json, record, benchmark_text(rows, ours, theirs))
     return skipped
 
 

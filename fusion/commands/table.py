@@ -18,7 +18,7 @@ from stario.fusion.commands.options import (
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
-    from stario.fusion.table.sets import DataSet
+    from stario.fusion.paper_table.sets import DataSet
 
 
 _PER_GROUP = 2
@@ -68,10 +68,10 @@ def table(
     The paper's protocol: 8:1:1 by recordings, true attitude, same recipe and steps for all.
     """
     from stario.fusion.evaluation.folders import make_folder
-    from stario.fusion.table.files import known_costs, write_results
-    from stario.fusion.table.filling import backend as on_backend
-    from stario.fusion.table.filling import fill, table_cells
-    from stario.fusion.table.training import ReaderConfig
+    from stario.fusion.paper_table.files import known_costs, write_results
+    from stario.fusion.paper_table.filling import backend as on_backend
+    from stario.fusion.paper_table.filling import fill, table_cells
+    from stario.fusion.paper_table.training import ReaderConfig
     from stario.network.architectures import ARCHITECTURES
     from stario.network.training.splits import learned_from
     from stario.sequences.datasets.batch import Skipped
@@ -104,7 +104,7 @@ def table(
 def _data_sets(
     data: Path | None, sets: str | None, published: list[str], seed: int, per_group: int
 ) -> list[DataSet]:
-    from stario.fusion.table.sets import development_sets, folder_set
+    from stario.fusion.paper_table.sets import development_sets, folder_set
 
     if data is None and not published:
         raise InputError("data", "none", "recordings", "pass --data or --set NAME=FOLDER")

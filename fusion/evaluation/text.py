@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
-from stario.sequences.drawing.text_table import aligned
+from stario.sequences.drawing.text_table import aligned, figure
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from stario.fusion.evaluation.benchmark.groups import Row
     from stario.fusion.evaluation.scores import Column
 
 
@@ -29,3 +30,43 @@ def table(
 ) -> str:
     """Return a table with a row for each part of the scores, and notes below it."""
     return "\n".join([*aligned(rows_of(parts, columns, corner)), *notes])
+
+
+_BENCHMARK = {
+    "ate_fit_m": ("fit [m]", ".2f"),
+    "ate_fit_percent": ("fit [%]", ".2f"),
+    "ate_first_m": ("first [m]", ".2f"),
+    "stretch_percent": ("20 s [%]", ".2f"),
+    "length_ratio": ("length", ".3f"),
+    "rms_1s_m": ("1 s [m]", ".3f"),
+    "rms_10s_m": ("10 s [m]", ".2f"),
+    "rms_30s_m": ("30 s [m]", ".2f"),
+    "direction_deg": ("direction [deg]", ".0f"),
+    "nis": ("NIS", ".2f"),
+    "nis_ekf": ("EKF NIS", ".2f"),
+}
+
+"""Titles and formats of the figures of a benchmark."""
+
+
+def benchmark_text(rows: Sequence[Row], ours: str, theirs: str | None) -> str:
+    """Return for every group rows "theirs" and "ours", then the ratios, the verdict, the words."""
+    from stario.fusion.evaluation.benchmark.groups import WORDS, verdict
+
+    named = {"theirs": theirs, "ours": ours} if theirs else {"ours": ours}
+    cells = [["", "", "n", "km", *(title for title, _ in _BENCHMARK.values())]]
+    for row in rows:
+        for label, name in named.items():
+            found = [figure(row.medians[name][key], form) for key, (_, form) in _BENCHMARK.items()]
+            cells.append([row.name, label, str(row.recordings), f"{row.path_km:.2f}", *found])
+    head, *body = aligned(cells)
+    lines = [head]
+    for k, row in enumerate(rows):
+        lines += body[k * len(named) : (k + 1) * len(named)]
+        for key, interval in row.ratios.items():
+            title = _BENCHMARK[key][0].split(" [")[0]
+            lines.append(f"{row.name}: ratio over {title}: {interval:.3f}")
+    if conclusion := verdict(rows):
+        lines.append(conclusion)
+    lines += [f"{label}: {name}" for label, name in reversed(named.items())]
+    return "\n".join([*lines, *(f"{key}: {words}." for key, words in WORDS.items())])

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from stario.fusion.evaluation.judging.prepared import Complex
+from stario.fusion.evaluation.benchmark.aligned import Complex
 from stario.sequences.levelled_stream import TICK_SECONDS, LevelledStream
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import VELOCITY_WEIGHTS, WINDOW_SECONDS

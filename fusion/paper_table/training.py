@@ -12,7 +12,7 @@ from pathlib import Path
 from time import process_time
 from typing import Any
 
-from stario.fusion.table.sets import DataSet
+from stario.fusion.paper_table.sets import DataSet
 from stario.network.training.config import TrainingConfig, training_config
 from stario.network.training.data import (
     RecordingStreams,

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stario.fusion.table import training
-from stario.fusion.table.sets import DataSet
-from stario.fusion.table.training import ReaderConfig, cell_recipe, train_cell
+from stario.fusion.paper_table import training
+from stario.fusion.paper_table.sets import DataSet
+from stario.fusion.paper_table.training import ReaderConfig, cell_recipe, train_cell
 from stario.network.training.history import EpochReport
 from stario.sequences.files import write_json
 from stario.sequences.readers import read_recording

@@ -11,7 +11,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from stario.fusion.evaluation.judging.prepared import Complex, Prepared
+from stario.fusion.evaluation.benchmark.aligned import Aligned, Complex
 from stario.fusion.imu.stateful import Predictor, StatefulInference
 from stario.sequences.levelled_stream import TICK_SECONDS, LevelledStream
 from stario.sequences.sequence import FloatArray
@@ -47,21 +47,21 @@ class Predictions:
 class RecordingPredictor(Protocol):
     """Predictor of a whole recording that needs no network."""
 
-    def predictions(self, prepared: Prepared) -> list[Predictions]:
+    def predictions(self, recording: Aligned) -> list[Predictions]:
         """Return a predictor's predictions for every piece, in N; a network begins each anew."""
         ...
 
 
-def predictions(model: Predictor | RecordingPredictor, prepared: Prepared) -> list[Predictions]:
+def predictions(model: Predictor | RecordingPredictor, recording: Aligned) -> list[Predictions]:
     """Return a network's predictions for every piece of a recording, in frame N.
 
     Args:
         model: network, its memory reset at every piece; or another predictor.
-        prepared: the recording.
+        recording: the recording, aligned with its truth.
     """
     if isinstance(model, RecordingPredictor):
-        return model.predictions(prepared)
-    return [predict_stream(model, piece.stream) for piece in prepared.pieces]
+        return model.predictions(recording)
+    return [predict_stream(model, piece.stream) for piece in recording.pieces]
 
 
 def predict_stream(model: Predictor, stream: LevelledStream) -> Predictions:

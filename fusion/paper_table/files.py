@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.figures import write_table
 from stario.fusion.evaluation.tables import METRICS, TRUE_ATTITUDE, Entry, NetworkTable, Sample
-from stario.fusion.table.cells import Cell, read_tracks
-from stario.fusion.table.errors import CONVENTION
-from stario.fusion.table.summary import (
+from stario.fusion.paper_table.cells import Cell, read_tracks
+from stario.fusion.paper_table.errors import CONVENTION
+from stario.fusion.paper_table.summary import (
     COLUMNS,
     Filled,
     SetTable,
@@ -21,7 +21,7 @@ from stario.fusion.table.summary import (
     seconds_by_network,
     set_table,
 )
-from stario.fusion.table.text import table_dict, table_text
+from stario.fusion.paper_table.text import table_dict, table_text
 from stario.network.architectures import ARCHITECTURES
 from stario.network.runtime.cost import table_cost
 from stario.network.runtime.survey import ModelRow, survey

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from stario.fusion.table.sets import DataSet
-from stario.fusion.table.summary import Content, seconds_by_network, set_table
-from stario.fusion.table.text import table_text
+from stario.fusion.paper_table.sets import DataSet
+from stario.fusion.paper_table.summary import Content, seconds_by_network, set_table
+from stario.fusion.paper_table.text import published, table_text
 from stario.network.runtime.survey import ModelRow
 from stario.network.training.config import TrainingConfig
 from stario.sequences.datasets.splits import ListEntry
@@ -59,3 +59,10 @@ def test_work_is_told_in_core_hours_and_windows_per_second() -> None:
     text = table_text([set_table(DATASET, filled, {})], costs, work, TrainingConfig())
     assert "| StarIO | 2.762 (2.762) | 25.124 (25.122) | 11.2 | 1.00 | 0.50 | 5.00 | 200 |" in text
     assert "Total: 5.00 core hours, 4.00 for training and 1.00 for evaluation" in text
+
+
+def test_published_figures_are_found_by_set_and_network() -> None:
+    assert published("ridi", "StarIO") == (2.033, 2.274)
+    assert published("oxiod", "R-ResNet") == (4.336, 1.595)
+    assert published("ridi", "pdr") is None
+    assert published("tyrex", "StarIO") is None

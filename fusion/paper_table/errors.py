@@ -1,7 +1,7 @@
 """Errors of a network on its test recordings, for every kind of ground truth.
 
 With poses: the paper's protocol, own attitude and EKF. With any truth: the network alone along its
-own attitude, by `stario.fusion.evaluation.judging.displacement_error`.
+own attitude, by `stario.fusion.evaluation.benchmark.displacement_error`.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.judging.displacement_error import block_sums, recording_errors
-from stario.fusion.evaluation.judging.network_alone import predictions
-from stario.fusion.evaluation.judging.prepared import Prepared, prepared_recordings
+from stario.fusion.evaluation.benchmark.aligned import Aligned, aligned_recordings
+from stario.fusion.evaluation.benchmark.displacement_error import block_sums, recording_errors
+from stario.fusion.evaluation.benchmark.network_alone import predictions
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning, pedestrian_track
 from stario.fusion.evaluation.tables import (
     MAX_DRAWN,
@@ -21,7 +21,7 @@ from stario.fusion.evaluation.tables import (
     metrics_of,
     protocol_tracks,
 )
-from stario.fusion.table.training import ReaderConfig
+from stario.fusion.paper_table.training import ReaderConfig
 from stario.network.model import DisplacementModel
 from stario.sequences.accuracy.metrics import Convention, align, pose_errors
 from stario.sequences.datasets.batch import Skipped, skipped, without_skipped
@@ -60,37 +60,37 @@ def test_errors(
     shown: dict[str, Shown] = {}
     left_out: list[Skipped] = []
     paths = [entry.path for entry in test]
-    outcomes = prepared_recordings(paths, reading.read, reading.options, reading.cache, 1)
+    outcomes = aligned_recordings(paths, reading.read, reading.options, reading.cache, 1)
     groups = {entry.path: entry.group for entry in test}
-    for prepared in without_skipped(outcomes, left_out):
-        path = prepared.path
+    for aligned in without_skipped(outcomes, left_out):
+        path = aligned.path
         try:
-            row, track = _recording(model, prepared, reading)
+            row, track = _recording(model, aligned, reading)
         except StarioError as error:
             left_out.append(skipped(path, error))
             continue
         found.append({"path": str(path), "group": groups[path], **row})
         if track is not None and len(shown) < MAX_DRAWN:
-            shown[prepared.name] = track
+            shown[aligned.name] = track
     return found, shown, left_out
 
 
 def _recording(
-    model: Model, prepared: Prepared, reading: ReaderConfig
+    model: Model, aligned: Aligned, reading: ReaderConfig
 ) -> tuple[dict[str, object], Shown | None]:
-    alone = recording_errors(prepared, predictions(model, prepared))
+    alone = recording_errors(aligned, predictions(model, aligned))
     blocks = {"10": alone.blocks["10"].tolist()} if "10" in alone.blocks else {}
     row: dict[str, object] = {
-        "recording": prepared.name,
-        "kind": prepared.kind,
+        "recording": aligned.name,
+        "kind": aligned.kind,
         "path_m": alone.path_m,
         "figures": alone.figures,
         "blocks": blocks,
         "tracks": {},
     }
-    if prepared.kind != "poses":
+    if aligned.kind != "poses":
         return row, None
-    sequence = reading.read(prepared.path)
+    sequence = reading.read(aligned.path)
     truth = sequence.truth
     assert truth is not None  # guaranteed by its kind
     tracks = _tracks(model, sequence)

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stario.fusion.evaluation.judging.direction import Direction, direction
+from stario.fusion.evaluation.benchmark.direction import Direction, direction
 from stario.sequences import PHONE_IMU, generate_walk, simulate_imu
 from stario.sequences.levelled_stream import TICK_SAMPLES, levelled_streams
 from stario.sequences.simulation.imu import PERFECT_IMU

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from recorded import DATA
 
-from stario.fusion.table import sets
-from stario.fusion.table.sets import ALL, FIRST, development_sets
+from stario.fusion.paper_table import sets
+from stario.fusion.paper_table.sets import ALL, FIRST, development_sets
 from stario.network.training import splits
 from stario.network.training.splits import learned_from
 from stario.sequences.datasets.splits import ListEntry

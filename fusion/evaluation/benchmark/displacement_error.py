@@ -19,9 +19,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stario.fusion.evaluation.judging.direction import Direction, direction
-from stario.fusion.evaluation.judging.network_alone import Predictions
-from stario.fusion.evaluation.judging.prepared import Complex, Kind, Prepared, PreparedPiece
+from stario.fusion.evaluation.benchmark.aligned import Aligned, AlignedPiece, Complex
+from stario.fusion.evaluation.benchmark.direction import Direction, direction
+from stario.fusion.evaluation.benchmark.network_alone import Predictions
 from stario.sequences.levelled_stream import TICK_SECONDS
 from stario.sequences.sequence import BoolArray, FloatArray
 
@@ -66,13 +66,10 @@ _MIN_PATH_M = 1.0
 """Length of the true path [m] below which a recording is not compared."""
 
 
-@dataclass(frozen=True, eq=False)
-class RecordingErrors:
+class RecordingErrors(NamedTuple):
     """Errors of one network on one recording.
 
     Attributes:
-        name: name of the recording.
-        kind: kind of its ground truth.
         path_m: length of the true path that was compared [m]; 0 if the device hardly moved: errors
             at rest are related to nothing, and would count in means of ratios like those of a walk.
         figures: figures by name, see `FIGURES`.
@@ -80,8 +77,6 @@ class RecordingErrors:
             of errors in each block of 30 s. For waypoints, their residuals are listed under "10".
     """
 
-    name: str
-    kind: Kind
     path_m: float
     figures: dict[str, float]
     blocks: dict[str, FloatArray]
@@ -143,20 +138,20 @@ class _Sums:
             self.blocks.setdefault(measure, []).append(sums)
 
 
-def recording_errors(prepared: Prepared, found: Sequence[Predictions]) -> RecordingErrors:
+def recording_errors(aligned: Aligned, found: Sequence[Predictions]) -> RecordingErrors:
     """Compute the errors of a network's predictions on each piece of a recording."""
     sums = _Sums()
-    add_errors = {"poses": _poses, "positions": _positions, "waypoints": _waypoints}[prepared.kind]
+    add_errors = {"poses": _poses, "positions": _positions, "waypoints": _waypoints}[aligned.kind]
     total_direction = Direction()
     paths = []
-    for piece, predictions in zip(prepared.pieces, found, strict=True):
+    for piece, predictions in zip(aligned.pieces, found, strict=True):
         before = sums.path
         add_errors(piece, predictions, sums)
         paths.append(sums.path - before)
         total_direction += direction(piece.stream, predictions.displacement_N)
     if sums.path < _MIN_PATH_M:
         unknown = dict.fromkeys(FIGURES, float("nan"))
-        return RecordingErrors(prepared.name, prepared.kind, 0.0, unknown, {})
+        return RecordingErrors(0.0, unknown, {})
     fitted = sums.rms("fit")
     usual_path = float(np.square(paths).sum()) / sums.path  # of a piece, weighted by their lengths
     figures = {
@@ -171,10 +166,10 @@ def recording_errors(prepared: Prepared, found: Sequence[Predictions]) -> Record
         "nis_ekf": float("nan"),
     }
     blocks = {name: np.concatenate(parts) for name, parts in sums.blocks.items()}
-    return RecordingErrors(prepared.name, prepared.kind, sums.path, figures, blocks)
+    return RecordingErrors(sums.path, figures, blocks)
 
 
-def _poses(piece: PreparedPiece, predictions: Predictions, sums: _Sums) -> None:
+def _poses(piece: AlignedPiece, predictions: Predictions, sums: _Sums) -> None:
     at = _at_ticks(piece, predictions)
     track, truth = at.track, at.truth
     finite = np.isfinite(truth)
@@ -189,7 +184,7 @@ def _poses(piece: PreparedPiece, predictions: Predictions, sums: _Sums) -> None:
     _along_the_path(at, predictions, dict.fromkeys(HORIZONS, turn), sums)
 
 
-def _positions(piece: PreparedPiece, predictions: Predictions, sums: _Sums) -> None:
+def _positions(piece: AlignedPiece, predictions: Predictions, sums: _Sums) -> None:
     at = _at_ticks(piece, predictions)
     turns = {h: at.turn_of_stretches(max(h, STRETCH_SECONDS)) for h in HORIZONS}
     _along_the_path(at, predictions, turns, sums)
@@ -213,7 +208,7 @@ def _along_the_path(
     _stretches(at, sums)
 
 
-def _waypoints(piece: PreparedPiece, predictions: Predictions, sums: _Sums) -> None:
+def _waypoints(piece: AlignedPiece, predictions: Predictions, sums: _Sums) -> None:
     track = predictions.track()[: len(piece.position_W)]
     ticks = piece.stream.ticks[: len(track)]
     inside = piece.waypoint_time <= ticks[-1]
@@ -235,7 +230,7 @@ def block_sums(seconds: FloatArray, squares: FloatArray) -> FloatArray:
     return np.asarray(rows[rows[:, 1] > 0])
 
 
-def _at_ticks(piece: PreparedPiece, predictions: Predictions) -> _AtTicks:
+def _at_ticks(piece: AlignedPiece, predictions: Predictions) -> _AtTicks:
     """Return track, truth and its breaks at the ticks common to all."""
     track = predictions.track()
     count = min(len(track), len(piece.position_W))

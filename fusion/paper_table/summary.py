@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
+from stario.fusion.evaluation.bootstrap import Rank, block_rows, ranks
 from stario.fusion.evaluation.pedestrian import NAME as PDR
+from stario.fusion.evaluation.scores import joined
 from stario.fusion.evaluation.tables import EKF, OWN_ATTITUDE, TRUE_ATTITUDE
-from stario.fusion.table.cells import Cell, read_cell
-from stario.fusion.table.ranks import Rank, Recordings, ranks
-from stario.fusion.table.sets import DataSet, set_of
+from stario.fusion.paper_table.cells import Cell, read_cell
+from stario.fusion.paper_table.sets import DataSet, set_of
 from stario.network.architectures import ARCHITECTURES
 
 REFERENCE_NETWORK = "StarIO"
@@ -145,9 +147,8 @@ def set_table(dataset: DataSet, filled: Filled, learned: Mapping[str, frozenset[
     contents = [content for seeds in filled.values() for content in seeds.values()]
     poses = all(recording["kind"] == "poses" for c in contents for recording in c["recordings"])
     measure = "ate" if poses else "10"
-    blocks = {name: _blocks(seeds, measure, dataset) for name, seeds in filled.items()}
-    known = {name: runs for name, runs in blocks.items() if all(runs)}
-    network_ranks = ranks(known, REFERENCE_NETWORK)
+    blocks = _blocks(filled, measure, dataset)
+    network_ranks = ranks(joined(blocks), REFERENCE_NETWORK) if blocks else {}
     order = [name for name in [PDR, *ARCHITECTURES] if name in filled]
     order += [name for name in filled if name not in order]
     test = {entry.path for entry in dataset.test}
@@ -219,13 +220,22 @@ def _over_seeds(values: Sequence[float]) -> Mean | None:
     return Mean(float(np.mean(finite)), error)
 
 
-def _blocks(seeds: Mapping[int, Content], measure: str, dataset: DataSet) -> list[Recordings]:
-    known = {str(entry.path): (set_of(entry), entry.group) for entry in dataset.test}
-    return [
-        {
-            (*known[recording["path"]], recording["path"]): np.array(recording["blocks"][measure])
-            for recording in content["recordings"]
-            if recording["blocks"].get(measure)
-        }
-        for content in seeds.values()
-    ]
+def _blocks(filled: Filled, measure: str, dataset: DataSet) -> list[pd.DataFrame]:
+    """Return the blocks of squared errors of networks that have some with every seed."""
+    units = {
+        str(entry.path): {"set": set_of(entry), "group": entry.group} for entry in dataset.test
+    }
+    found = []
+    for network, seeds in filled.items():
+        runs = [
+            [
+                block_rows(sums, **units[path], recording=path, network=network, seed=seed)
+                for one in content["recordings"]
+                for path in [one["path"]]
+                if (sums := one["blocks"].get(measure))
+            ]
+            for seed, content in seeds.items()
+        ]
+        if all(runs):
+            found += [table for run in runs for table in run]
+    return found

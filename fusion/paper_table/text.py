@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
+from stario.fusion.evaluation.bootstrap import Rank
 from stario.fusion.evaluation.pedestrian import NAME as PDR
-from stario.fusion.table.ranks import Rank
-from stario.fusion.table.summary import COLUMNS, REFERENCE_NETWORK, Mean, Row, SetTable
+from stario.fusion.paper_table.summary import COLUMNS, REFERENCE_NETWORK, Mean, Row, SetTable
 from stario.network.architectures import ARCHITECTURES
 from stario.network.runtime.survey import BATCHES, ModelRow
 from stario.network.training.config import TrainingConfig
 from stario.sequences.accuracy.metrics import CONVENTIONS
 
 Work = Mapping[str, tuple[float, float, float]]
-"""Result of `stario.fusion.table.summary.seconds_by_network`."""
+"""Result of `stario.fusion.paper_table.summary.seconds_by_network`."""
 
 
 def table_text(

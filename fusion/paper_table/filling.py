@@ -10,9 +10,9 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 
-from stario.fusion.table.cells import LEADING, Cell, fill_cell, reference_rows
-from stario.fusion.table.sets import FIRST, DataSet
-from stario.fusion.table.training import ReaderConfig, cell_recipe
+from stario.fusion.paper_table.cells import LEADING, Cell, fill_cell, reference_rows
+from stario.fusion.paper_table.sets import FIRST, DataSet
+from stario.fusion.paper_table.training import ReaderConfig, cell_recipe
 from stario.network.architectures import ARCHITECTURES, architecture
 from stario.sequences.arrays import check_choice
 from stario.sequences.datasets.batch import Skipped, each

@@ -17,13 +17,13 @@ from training_runs import narrow
 from typer.testing import CliRunner
 
 from stario.fusion.commands.cli import app
-from stario.fusion.table import cells as cells_module
-from stario.fusion.table import training
-from stario.fusion.table.cells import LEADING, Cell, fill_cell
-from stario.fusion.table.filling import backend, fill, table_cells
-from stario.fusion.table.sets import DataSet, folder_set
-from stario.fusion.table.summary import filled_cells, set_table
-from stario.fusion.table.training import ReaderConfig, cell_recipe
+from stario.fusion.paper_table import cells as cells_module
+from stario.fusion.paper_table import training
+from stario.fusion.paper_table.cells import LEADING, Cell, fill_cell
+from stario.fusion.paper_table.filling import backend, fill, table_cells
+from stario.fusion.paper_table.sets import DataSet, folder_set
+from stario.fusion.paper_table.summary import filled_cells, set_table
+from stario.fusion.paper_table.training import ReaderConfig, cell_recipe
 from stario.network.architectures import ARCHITECTURES
 from stario.sequences.datasets.batch import Skipped
 from stario.sequences.errors import ConfigError, InputError, WeightsError

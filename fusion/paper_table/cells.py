@@ -17,9 +17,9 @@ import numpy as np
 
 from stario.fusion.evaluation.pedestrian import NAME as PDR
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
-from stario.fusion.table.errors import Model, Shown, test_errors
-from stario.fusion.table.sets import ALL, DataSet
-from stario.fusion.table.training import (
+from stario.fusion.paper_table.errors import Model, Shown, test_errors
+from stario.fusion.paper_table.sets import ALL, DataSet
+from stario.fusion.paper_table.training import (
     TEMPORARY_FILES,
     ReaderConfig,
     recipe_digest,

@@ -1,4 +1,4 @@
-"""Recordings prepared for judging networks: windows and ground truth at ticks, cached on disk.
+"""Recordings aligned with their truth, at ticks, for the benchmark of networks; cached on disk.
 
 Everything here depends on the recording alone, so several sets of weights share it, and later calls
 read it from the cache.
@@ -51,7 +51,7 @@ _TRUTH = ("position_W", "breaks", "yaw_WN", "waypoint_time", "waypoint_W")
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedPiece:
+class AlignedPiece:
     """An unbroken stretch of a recording with its ground truth at the stream's K ticks.
 
     Attributes:
@@ -73,8 +73,8 @@ class PreparedPiece:
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared:
-    """A recording prepared for judging networks.
+class Aligned:
+    """A recording aligned with its truth, for the benchmark of networks.
 
     Attributes:
         path: path as given.
@@ -89,11 +89,11 @@ class Prepared:
     name: str
     kind: Kind
     attributes: dict[str, str]
-    pieces: list[PreparedPiece]
+    pieces: list[AlignedPiece]
     problems: tuple[str, ...]
 
 
-def prepare(sequence: ImuSequence, path: Path) -> Prepared:
+def aligned_recording(sequence: ImuSequence, path: Path) -> Aligned:
     """Level a recording and resample its truth at the ticks.
 
     Raises:
@@ -123,17 +123,17 @@ def prepare(sequence: ImuSequence, path: Path) -> Prepared:
         raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
     attributes = {name: str(value) for name, value in sequence.attributes.items()}
     problems = tuple(problem.line(sequence.name) for problem in truth_problems(sequence))
-    return Prepared(path, sequence.name, kind, attributes, pieces, problems)
+    return Aligned(path, sequence.name, kind, attributes, pieces, problems)
 
 
-def prepared_recordings(
+def aligned_recordings(
     paths: Sequence[Path],
     read: Callable[[Path], ImuSequence],
     options: dict[str, object],
     folder: Path,
     jobs: int | None = 1,
-) -> Iterator[Prepared | Skipped]:
-    """Yield each recording prepared, from the cache or newly read, in the order of the paths.
+) -> Iterator[Aligned | Skipped]:
+    """Yield each recording aligned, from the cache or newly read, in the order of the paths.
 
     Args:
         paths: paths of the recordings.
@@ -148,17 +148,17 @@ def prepared_recordings(
 
 def _cached(
     path: Path, read: Callable[[Path], ImuSequence], options: dict[str, object], folder: Path
-) -> Prepared:
+) -> Aligned:
     file = recording_file(folder, path, {**options, "preparation": _code()}, JUDGED)
     found = _load(file, path)
     if found is None:
-        found = prepare(read(path), path)
+        found = aligned_recording(read(path), path)
         _store(file, found)
     warn_of_problems(found.problems)
     return found
 
 
-def _with_poses(stream: LevelledStream, truth: Trajectory) -> PreparedPiece:
+def _with_poses(stream: LevelledStream, truth: Trajectory) -> AlignedPiece:
     time, position_W = truth.time[truth.valid], truth.position_W[truth.valid]
     piece = _with_known(stream, time, position_W, is_gap(np.diff(time)))
     attitude = truth.at(stream.ticks).attitude_WB
@@ -169,7 +169,7 @@ def _with_poses(stream: LevelledStream, truth: Trajectory) -> PreparedPiece:
 
 def _with_known(
     stream: LevelledStream, time: FloatArray, position_W: FloatArray, bad: BoolArray
-) -> PreparedPiece:
+) -> AlignedPiece:
     """Interpolate positions (n, 2 or 3) to the ticks, except across bad steps (n - 1,)."""
     ticks = stream.ticks
     before = np.searchsorted(time, ticks, side="right") - 1
@@ -180,13 +180,13 @@ def _with_known(
     none = np.empty(0)
     unknown = np.full(len(ticks), np.nan)
     position = np.where(inside, xy, complex(np.nan, np.nan))
-    return PreparedPiece(stream, position, breaks, unknown, none, none.astype(complex))
+    return AlignedPiece(stream, position, breaks, unknown, none, none.astype(complex))
 
 
-def _with_waypoints(stream: LevelledStream, track: PositionTrack) -> PreparedPiece:
+def _with_waypoints(stream: LevelledStream, track: PositionTrack) -> AlignedPiece:
     inside = track.valid & (track.time >= stream.ticks[0]) & (track.time <= stream.ticks[-1])
     count = len(stream.R_NB)
-    return PreparedPiece(
+    return AlignedPiece(
         stream,
         np.full(count, complex(np.nan, np.nan)),
         np.zeros(count, dtype=np.int64),
@@ -202,19 +202,19 @@ def _code() -> str:
     return hashlib.blake2b(Path(__file__).read_bytes(), digest_size=20).hexdigest()
 
 
-def _store(file: Path, prepared: Prepared) -> None:
+def _store(file: Path, aligned: Aligned) -> None:
     arrays = {}
-    for k, piece in enumerate(prepared.pieces):
+    for k, piece in enumerate(aligned.pieces):
         values = {name: getattr(piece.stream, name) for name in _STREAM}
         values |= {name: getattr(piece, name) for name in _TRUTH}
         for name, value in values.items():  # the format knows no complex numbers
             arrays[f"{k}.{name}"] = value.view(np.float64) if np.iscomplexobj(value) else value
     description = {
-        "name": prepared.name,
-        "kind": prepared.kind,
-        "attributes": prepared.attributes,
-        "starts": [piece.stream.start for piece in prepared.pieces],
-        "problems": prepared.problems,
+        "name": aligned.name,
+        "kind": aligned.kind,
+        "attributes": aligned.attributes,
+        "starts": [piece.stream.start for piece in aligned.pieces],
+        "problems": aligned.problems,
     }
     content = safetensors.numpy.save(arrays, metadata={"recording": json.dumps(description)})
     try:
@@ -223,10 +223,10 @@ def _store(file: Path, prepared: Prepared) -> None:
         with atomic_write(file, "wb") as target:
             target.write(content)
     except (OSError, InputError) as error:
-        log.warning("%s: prepared recordings cannot be cached: %s", file.parent, error)
+        log.warning("%s: aligned recordings cannot be cached: %s", file.parent, error)
 
 
-def _load(file: Path, path: Path) -> Prepared | None:
+def _load(file: Path, path: Path) -> Aligned | None:
     if not file.exists():
         return None
     try:
@@ -238,9 +238,9 @@ def _load(file: Path, path: Path) -> Prepared | None:
                 for name in ("position_W", "waypoint_W"):
                     found[name] = found[name].view(np.complex128)
                 stream = LevelledStream(start, *(found[name] for name in _STREAM))
-                pieces.append(PreparedPiece(stream, *(found[name] for name in _TRUTH)))
+                pieces.append(AlignedPiece(stream, *(found[name] for name in _TRUTH)))
     except (OSError, KeyError, ValueError, safetensors.SafetensorError) as error:
-        log.warning("%s: unreadable, prepared again: %s", file, error)
+        log.warning("%s: unreadable, aligned again: %s", file, error)
         return None
     name, kind, attributes = (description[key] for key in ("name", "kind", "attributes"))
-    return Prepared(path, name, kind, attributes, pieces, tuple(description["problems"]))
+    return Aligned(path, name, kind, attributes, pieces, tuple(description["problems"]))
