@@ -248,7 +248,7 @@ def _judge_each(
 ) -> tuple[list[pd.DataFrame], list[Skipped]]:
     """Score each recording as one of its group; return the scores and what was skipped."""
     from stario.fusion.evaluation.benchmark.groups import By, labels
-    from stario.fusion.evaluation.many import distinct_name
+    from stario.fusion.evaluation.compare import distinct_name
     from stario.sequences.arrays import check_choice
 
     grouping: By = check_choice("--by", by, get_args(By))

@@ -51,9 +51,8 @@ def compare(
     Without PATH, those of a simulated walk.
     """
     from stario.fusion.backends import BACKENDS
-    from stario.fusion.evaluation.compare import demonstration
+    from stario.fusion.evaluation.compare import compare_recordings, demonstration
     from stario.fusion.evaluation.folders import check_folder
-    from stario.fusion.evaluation.many import compare_recordings
     from stario.fusion.evaluation.results import scores_dict, write_comparison
     from stario.fusion.evaluation.summary import scores_of
     from stario.fusion.evaluation.track_table import column_words

@@ -164,8 +164,8 @@ def _tracks(
 ) -> list[Skipped]:
     """Write and print the table of recordings; return those that were skipped."""
     from stario.fusion.backends import BACKENDS
+    from stario.fusion.evaluation.compare import compare_recordings
     from stario.fusion.evaluation.folders import fresh_folder
-    from stario.fusion.evaluation.many import compare_recordings
     from stario.fusion.evaluation.results import write_recording, write_summary
     from stario.fusion.evaluation.summary import Scores, scores_of, summary, summary_table
     from stario.sequences.datasets.batch import without_skipped
@@ -205,7 +205,8 @@ def _networks(
 ) -> list[Skipped]:
     """Write and print the table of networks; return the recordings that were skipped."""
     from stario.fusion.evaluation.figures import write_table
-    from stario.fusion.evaluation.tables import compare_networks, table_dict, table_text
+    from stario.fusion.evaluation.networks import compare_networks, table_dict
+    from stario.fusion.evaluation.text import networks_text
     from stario.network.model import load_model, weights_named
     from stario.sequences.accuracy.metrics import Convention
     from stario.sequences.arrays import check_choice
@@ -222,10 +223,10 @@ def _networks(
             jobs,
             progress=progress,
         )
-    if table.entries:
+    if table is not None:
         if out is not None:
             write_table(out, table)
-        print_result(as_json, table_dict(table), table_text(table))
+        print_result(as_json, table_dict(table), networks_text(table))
     return skipped
 
 

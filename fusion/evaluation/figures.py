@@ -15,8 +15,15 @@ import numpy as np
 
 from stario.fusion.evaluation.benchmark.groups import Benchmark, Row, benchmark_dict
 from stario.fusion.evaluation.folders import fresh_folder
-from stario.fusion.evaluation.scores import records
-from stario.fusion.evaluation.tables import PROTOCOLS, NetworkTable, Sample, table_dict
+from stario.fusion.evaluation.networks import (
+    PROTOCOLS,
+    TRUE_ATTITUDE,
+    NetworkTable,
+    Sample,
+    entries,
+    table_dict,
+)
+from stario.fusion.evaluation.scores import records, values
 from stario.sequences.drawing.figures import (
     BLUE,
     INK,
@@ -43,7 +50,7 @@ _BASELINE = "R-ResNet"
 def write_table(folder: Path, table: NetworkTable) -> None:
     """Write `networks.csv`, `networks.json` and the figures; raises what `fresh_folder` does."""
     fresh_folder(folder)
-    write_rows(folder / "networks.csv", [asdict(entry) for entry in table.entries])
+    write_rows(folder / "networks.csv", entries(table))
     write_json(folder / "networks.json", table_dict(table))
     for name, figure in figures(table).items():
         save_figure(figure, folder / name)
@@ -66,7 +73,7 @@ def _ate_against_parameters(table: NetworkTable) -> Figure:
     fig = new_figure(8.0, 5.5, "Mean ATE against parameters, true attitude")
     axes = fig.subplots()
     for k, (network, parameters) in enumerate(table.parameters.items()):
-        mean, spread = table.mean_and_spread(network, "network_true_attitude", "ate_m")
+        mean, spread = table.column(network, TRUE_ATTITUDE, "ate_m").mean_and_spread(table.scores)
         axes.errorbar(
             parameters / 1e6, mean, yerr=spread, fmt=_MARKERS[k % len(_MARKERS)], ms=9, capsize=4,
             color=_colour(k), label=network,
@@ -90,8 +97,7 @@ def _distributions(table: NetworkTable) -> Figure:
     panels = fig.subplots(1, 2, sharey=True)
     for axes, metric, title in zip(panels, ("ate_m", "rte_m"), ("ATE [m]", "RTE [m]"), strict=True):
         for k, network in enumerate(table.parameters):
-            values = table.values(network, "network_true_attitude", metric)
-            error = np.sort(values[np.isfinite(values)])
+            error = np.sort(values(table.scores, metric, network=network, track=TRUE_ATTITUDE))
             share = np.arange(len(error) + 1) / max(len(error), 1)
             axes.plot(
                 np.append(0.0, error), share, _STYLES[k % 3], drawstyle="steps-post",
@@ -110,14 +116,14 @@ def _pde_boxes(table: NetworkTable) -> Figure:
     panels = fig.subplots(1, len(PROTOCOLS), sharey=True)
     names = list(table.parameters)
     for axes, (protocol, words) in zip(panels, PROTOCOLS.items(), strict=True):
-        values = [100.0 * table.values(name, protocol, "pde") for name in names]
-        boxes = axes.boxplot(
-            [v[np.isfinite(v)] for v in values], widths=0.6, patch_artist=True, showfliers=False
-        )
+        drift = [
+            100.0 * values(table.scores, "pde", network=name, track=protocol) for name in names
+        ]
+        boxes = axes.boxplot(drift, widths=0.6, patch_artist=True, showfliers=False)
         for k, (box, median) in enumerate(zip(boxes["boxes"], boxes["medians"], strict=True)):
             box.set(facecolor=_colour(k), alpha=0.35, edgecolor=_colour(k))
             median.set(color=INK, lw=1.6)
-            axes.plot(np.full(len(values[k]), k + 1), values[k], ".", color=_colour(k), ms=6)
+            axes.plot(np.full(len(drift[k]), k + 1), drift[k], ".", color=_colour(k), ms=6)
         axes.set_xticks(range(1, len(names) + 1), names, rotation=60, ha="right", fontsize=8)
         axes.set_title(words, loc="left", fontsize=10)
         apply_style(axes)

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from stario.fusion.evaluation.benchmark.groups import Row
+    from stario.fusion.evaluation.networks import NetworkTable
     from stario.fusion.evaluation.scores import Column
 
 
@@ -70,3 +71,16 @@ def benchmark_text(rows: Sequence[Row], ours: str, theirs: str | None) -> str:
         lines.append(conclusion)
     lines += [f"{label}: {name}" for label, name in reversed(named.items())]
     return "\n".join([*lines, *(f"{key}: {words}." for key, words in WORDS.items())])
+
+
+def networks_text(table: NetworkTable) -> str:
+    """Return a block for each protocol and metric, recordings by networks."""
+    from stario.fusion.evaluation.networks import METRICS, PROTOCOLS, table_words
+
+    rows = [*table.scores.groupby("recording", sort=False), ("mean", table.scores)]
+    lines = []
+    for protocol, words in PROTOCOLS.items():
+        for metric, title in METRICS.items():
+            columns = [table.column(name, protocol, metric) for name in table.parameters]
+            lines += [f"{words}: {title}", *aligned(rows_of(rows, columns)), ""]
+    return "\n".join([*lines, *(f"{key}: {words}." for key, words in table_words(table).items())])

@@ -13,21 +13,21 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.benchmark.aligned import Aligned, aligned_recordings
 from stario.fusion.evaluation.benchmark.displacement_error import block_sums, recording_errors
 from stario.fusion.evaluation.benchmark.network_alone import predictions
-from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning, pedestrian_track
-from stario.fusion.evaluation.tables import (
+from stario.fusion.evaluation.networks import (
     MAX_DRAWN,
     OWN_ATTITUDE,
-    TRUE_ATTITUDE,
     metrics_of,
-    protocol_tracks,
+    protocol_figures,
 )
+from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning, pedestrian_track
+from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.paper_table.training import ReaderConfig
 from stario.network.model import DisplacementModel
-from stario.sequences.accuracy.metrics import Convention, align, pose_errors
+from stario.sequences.accuracy.metrics import Convention
 from stario.sequences.datasets.batch import Skipped, skipped, without_skipped
 from stario.sequences.datasets.splits import ListEntry
 from stario.sequences.errors import StarioError
-from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.sequence import FloatArray
 
 CONVENTION: Convention = "ronin"
 """How errors are averaged: as in the paper."""
@@ -91,20 +91,12 @@ def _recording(
     if aligned.kind != "poses":
         return row, None
     sequence = reading.read(aligned.path)
-    truth = sequence.truth
-    assert truth is not None  # guaranteed by its kind
-    tracks = _tracks(model, sequence)
-    row["tracks"] = {name: metrics_of(track, truth, CONVENTION) for name, track in tracks.items()}
-    if TRUE_ATTITUDE not in tracks:
+    if isinstance(model, PedestrianDeadReckoning):
+        track = pedestrian_track(sequence).trajectory
+        row["tracks"] = {OWN_ATTITUDE: metrics_of(track, true_poses(sequence), CONVENTION)}
         return row, None
-    errors = pose_errors(align(tracks[TRUE_ATTITUDE], truth, "first"), truth)
+    row["tracks"], errors = protocol_figures(model, sequence, NavigatorConfig(), CONVENTION)
     time, squares = errors.estimate.time, (errors.position_W[:, :2] ** 2).sum(axis=1)
     blocks["ate"] = block_sums(time - time[0], squares).tolist()
     positions = errors.estimate.position_W[:, :2], errors.truth.position_W[:, :2]
     return row, Shown(time, *positions)
-
-
-def _tracks(model: Model, sequence: ImuSequence) -> dict[str, Trajectory]:
-    if isinstance(model, PedestrianDeadReckoning):
-        return {OWN_ATTITUDE: pedestrian_track(sequence).trajectory}
-    return protocol_tracks(model, sequence, NavigatorConfig())

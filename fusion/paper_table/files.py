@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.figures import write_table
-from stario.fusion.evaluation.tables import METRICS, TRUE_ATTITUDE, Entry, NetworkTable, Sample
+from stario.fusion.evaluation.networks import (
+    METRICS,
+    PROTOCOLS,
+    TRUE_ATTITUDE,
+    NetworkTable,
+    Sample,
+    add_track,
+)
 from stario.fusion.paper_table.cells import Cell, read_tracks
-from stario.fusion.paper_table.errors import CONVENTION
+from stario.fusion.paper_table.errors import CONVENTION, Shown
 from stario.fusion.paper_table.summary import (
     COLUMNS,
     Filled,
     SetTable,
     filled_cells,
+    scores_of,
     seconds_by_network,
     set_table,
 )
@@ -67,7 +75,7 @@ def write_results(
     for name, found in filled.items() if drawn else ():
         samples = _samples([cell for cell in cells if cell.dataset.name == name], found, out)
         table = _network_table(found, samples)
-        if table.entries:
+        if table is not None:
             write_table(out / name / "figures", table)
     return text
 
@@ -83,17 +91,17 @@ def _rows(tables: Sequence[SetTable]) -> list[dict[str, object]]:
     ]
 
 
-def _network_table(filled: Filled, samples: list[Sample]) -> NetworkTable:
-    """Return the networks' errors on recordings with poses, for the figures."""
+def _network_table(filled: Filled, samples: list[Sample]) -> NetworkTable | None:
+    """Return the networks' errors on recordings with poses, for the figures; None without any."""
     parameters = {name: table_cost(name).parameters for name in ARCHITECTURES if name in filled}
-    entries = [
-        Entry(one["recording"], name, f"seed {seed}", protocol, *_numbers(errors, METRICS))
-        for name in parameters
-        for seed, content in filled[name].items()
-        for one in content["recordings"]
-        for protocol, errors in one["tracks"].items()
-    ]
-    return NetworkTable(CONVENTION, parameters, entries, samples)
+    scores = scores_of(filled)
+    chosen = scores["network"].isin(parameters) & scores["track"].isin(PROTOCOLS)
+    chosen &= scores["metric"].isin(METRICS)
+    if not chosen.any():
+        return None
+    found = scores[chosen].rename(columns={"seed": "weights"})
+    found["weights"] = "seed " + found["weights"].astype(str)
+    return NetworkTable(CONVENTION, parameters, found, samples)
 
 
 def _samples(cells: Sequence[Cell], filled: Filled, out: Path) -> list[Sample]:
@@ -105,20 +113,12 @@ def _samples(cells: Sequence[Cell], filled: Filled, out: Path) -> list[Sample]:
             continue
         found = {recording["recording"]: recording["tracks"] for recording in content["recordings"]}
         for name, shown in read_tracks(cell, out).items():
-            track = _level(shown.time, shown.position_W)
-            truth = _level(shown.time, shown.truth_W)
-            ate_m, rte_m = _numbers(found[name][TRUE_ATTITUDE], ("ate_m", "rte_m"))
-            sample = samples.setdefault(name, Sample(name, truth, {}, {}))
-            sample.tracks[cell.network] = track
-            sample.errors[cell.network] = ate_m, rte_m
+            sample = samples.setdefault(name, Sample(name, _level(shown, shown.truth_W), {}, {}))
+            track = _level(shown, shown.position_W)
+            add_track(sample, cell.network, track, found[name][TRUE_ATTITUDE])
     return list(samples.values())
 
 
-def _numbers(values: Mapping[str, float | None], names: Iterable[str]) -> list[float]:
-    """Return values by name, with NaN for None, which stands for it in JSON."""
-    return [float(value) for value in np.array([values[name] for name in names], np.float64)]
-
-
-def _level(time: FloatArray, xy: FloatArray) -> Trajectory:
+def _level(shown: Shown, xy: FloatArray) -> Trajectory:
     flat = np.column_stack([xy, np.zeros(len(xy))])
-    return Trajectory(time, flat, Rotation.identity(len(time)))
+    return Trajectory(shown.time, flat, Rotation.identity(len(xy)))

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from stario.fusion.evaluation.bootstrap import Rank, block_rows, ranks
+from stario.fusion.evaluation.networks import EKF, OWN_ATTITUDE, TRUE_ATTITUDE
 from stario.fusion.evaluation.pedestrian import NAME as PDR
-from stario.fusion.evaluation.scores import joined
-from stario.fusion.evaluation.tables import EKF, OWN_ATTITUDE, TRUE_ATTITUDE
+from stario.fusion.evaluation.scores import Spread, joined, scored
 from stario.fusion.paper_table.cells import Cell, read_cell
 from stario.fusion.paper_table.sets import DataSet, set_of
 from stario.network.architectures import ARCHITECTURES
@@ -24,45 +24,25 @@ REFERENCE_NETWORK = "StarIO"
 Content = Mapping[str, Any]
 """Result of `read_cell`."""
 
-Recording = Mapping[str, Any]
 
-
-class Column(NamedTuple):
-    """A quantity of each recording, averaged over recordings.
-
-    Attributes:
-        title: title of the column.
-        source: track that it is an error of, or kind of ground truth whose figure it is.
-        name: name of the error or figure.
-        scale: factor of the error.
-    """
-
-    title: str
-    source: str
-    name: str
-    scale: float = 1.0
-
-    def value(self, recording: Recording) -> float:
-        """Return a recording's value; NaN if it has none."""
-        if recording["kind"] == self.source:
-            found = recording["figures"].get(self.name)
-        else:
-            found = recording["tracks"].get(self.source, {}).get(self.name)
-        return float("nan") if found is None else self.scale * float(found)
+def _column(title: str, source: str, name: str, scale: float = 1.0) -> Spread:
+    """Return a column of an error of a track, or of a figure of recordings with a kind of truth."""
+    where = {"track": source}
+    return Spread(title, name, ".3f", where=where, standard_error=True, scale=scale)
 
 
 COLUMNS = {
-    "ate": Column("ATE [m]", TRUE_ATTITUDE, "ate_m"),
-    "rte": Column("RTE [m]", TRUE_ATTITUDE, "rte_m"),
-    "pde": Column("PDE [%]", TRUE_ATTITUDE, "pde", 100.0),
-    "own_ate": Column("own attitude: ATE [m]", OWN_ATTITUDE, "ate_m"),
-    "own_rte": Column("own attitude: RTE [m]", OWN_ATTITUDE, "rte_m"),
-    "ekf_ate": Column("EKF: ATE [m]", EKF, "ate_m"),
-    "ekf_rte": Column("EKF: RTE [m]", EKF, "rte_m"),
-    "waypoints_m": Column("waypoints [m]", "waypoints", "ate_fit_m"),
-    "waypoints_percent": Column("waypoints [%]", "waypoints", "ate_fit_percent"),
-    "waypoints_length": Column("length ratio", "waypoints", "length_ratio"),
-    "positions_percent": Column("positions, 20 s [%]", "positions", "stretch_percent"),
+    "ate": _column("ATE [m]", TRUE_ATTITUDE, "ate_m"),
+    "rte": _column("RTE [m]", TRUE_ATTITUDE, "rte_m"),
+    "pde": _column("PDE [%]", TRUE_ATTITUDE, "pde", 100.0),
+    "own_ate": _column("own attitude: ATE [m]", OWN_ATTITUDE, "ate_m"),
+    "own_rte": _column("own attitude: RTE [m]", OWN_ATTITUDE, "rte_m"),
+    "ekf_ate": _column("EKF: ATE [m]", EKF, "ate_m"),
+    "ekf_rte": _column("EKF: RTE [m]", EKF, "rte_m"),
+    "waypoints_m": _column("waypoints [m]", "waypoints", "ate_fit_m"),
+    "waypoints_percent": _column("waypoints [%]", "waypoints", "ate_fit_percent"),
+    "waypoints_length": _column("length ratio", "waypoints", "length_ratio"),
+    "positions_percent": _column("positions, 20 s [%]", "positions", "stretch_percent"),
 }
 """Columns of the table, in order; a column without any value on a set is omitted there."""
 
@@ -152,8 +132,15 @@ def set_table(dataset: DataSet, filled: Filled, learned: Mapping[str, frozenset[
     order = [name for name in [PDR, *ARCHITECTURES] if name in filled]
     order += [name for name in filled if name not in order]
     test = {entry.path for entry in dataset.test}
+    scores = scores_of(filled)
     rows = [
-        _row(name, filled[name], network_ranks.get(name), len(test & learned.get(name, set())))
+        _row(
+            name,
+            filled[name],
+            scores[scores["network"] == name],
+            network_ranks.get(name),
+            len(test & learned.get(name, set())),
+        )
         for name in order
     ]
     recordings = contents[0]["recordings"]
@@ -191,33 +178,50 @@ def seconds_by_network(tables: Iterable[Filled]) -> dict[str, tuple[float, float
     return work
 
 
-def _row(name: str, seeds: Mapping[int, Content], rank: Rank | None, learned: int) -> Row:
-    figures = {}
-    for key, column in COLUMNS.items():
-        found = _over_seeds(
-            [_mean([column.value(one) for one in c["recordings"]]) for c in seeds.values()]
+def scores_of(filled: Filled) -> pd.DataFrame:
+    """Return the errors of every run on a set, with labels `path`, `network` and `seed`.
+
+    The figures of the network alone are those of a track that is called by the kind of truth.
+    """
+    found = [scored("", {}, path="", network="", seed=0)]
+    found += [
+        scored(
+            one["recording"],
+            {**one["tracks"], one["kind"]: one["figures"]},
+            one["group"],
+            path=one["path"],
+            network=network,
+            seed=seed,
         )
-        if found is not None:
-            figures[key] = found
-    trained = [c["trained"] for c in seeds.values() if "trained" in c]
+        for network, seeds in filled.items()
+        for seed, content in seeds.items()
+        for one in content["recordings"]
+    ]
+    return joined(found)
+
+
+def _row(
+    name: str, seeds: Mapping[int, Content], scores: pd.DataFrame, rank: Rank | None, learned: int
+) -> Row:
+    figures = {key: _mean(column, scores) for key, column in COLUMNS.items()}
+    trained = [
+        scored("", {"": {key: c["trained"][key] for key in _TRAINED}}, seed=seed)
+        for seed, c in seeds.items()
+        if "trained" in c
+    ]
     training, validation = (
-        _over_seeds([one[key] for one in trained])
-        for key in ("training_error_m2", "validation_error_m2")
+        _mean(_column("", "", key), joined(trained)) if trained else None for key in _TRAINED
     )
-    return Row(name, sorted(seeds), figures, training, validation, rank, learned)
+    known = {key: mean for key, mean in figures.items() if mean is not None}
+    return Row(name, sorted(seeds), known, training, validation, rank, learned)
 
 
-def _mean(values: Sequence[float]) -> float:
-    found = _over_seeds(values)
-    return float("nan") if found is None else found.value
+_TRAINED = ("training_error_m2", "validation_error_m2")
 
 
-def _over_seeds(values: Sequence[float]) -> Mean | None:
-    finite = [value for value in values if np.isfinite(value)]
-    if not finite:
-        return None
-    error = float(np.std(finite, ddof=1) / np.sqrt(len(finite))) if len(finite) > 1 else None
-    return Mean(float(np.mean(finite)), error)
+def _mean(column: Spread, scores: pd.DataFrame) -> Mean | None:
+    mean, error = column.mean_and_spread(scores)
+    return None if np.isnan(mean) else Mean(mean, error)
 
 
 def _blocks(filled: Filled, measure: str, dataset: DataSet) -> list[pd.DataFrame]:

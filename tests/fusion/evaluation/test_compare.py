@@ -18,10 +18,10 @@ from stario.fusion.evaluation.compare import (
     Comparison,
     compare,
     demonstration,
+    distinct_name,
     measure,
 )
 from stario.fusion.evaluation.folders import fresh_folder
-from stario.fusion.evaluation.many import distinct_name
 from stario.fusion.evaluation.results import write_comparison, write_run
 from stario.fusion.evaluation.summary import scores_of, summary, summary_table
 from stario.fusion.fixes import position_fix

@@ -24,7 +24,8 @@ def content(ate_m: float, seconds: float = 0.0) -> Content:
         for pde in (0.03, None)
     ]
     recordings = [
-        {"path": str(entry.path), "group": "ridi", "kind": "poses", "path_m": 50.0, "figures": {}}
+        {"recording": entry.path.name, "path": str(entry.path), "group": "ridi", "kind": "poses"}
+        | {"path_m": 50.0, "figures": {}}
         | {"tracks": found, "blocks": {"ate": [[ate_m**2, 1.0]]}}
         for entry, found in zip(TESTED, tracks, strict=True)
     ]

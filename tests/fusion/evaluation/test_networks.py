@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +13,15 @@ import pytest
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.figures import figures, write_table
 from stario.fusion.evaluation.folders import fresh_folder
-from stario.fusion.evaluation.tables import (
+from stario.fusion.evaluation.networks import (
     METRICS,
     PROTOCOLS,
-    Entry,
     NetworkTable,
     compare_networks,
     table_dict,
-    table_text,
 )
+from stario.fusion.evaluation.scores import scored, values
+from stario.fusion.evaluation.text import networks_text
 from stario.network.model import weights_named
 from stario.sequences.errors import WeightsError
 
@@ -64,34 +64,39 @@ def table(read):
 def test_every_network_has_every_track_of_every_recording(table) -> None:
     assert list(table.parameters) == ["StarIO", "R-ResNet"]
     assert table.parameters["R-ResNet"] == 4_634_882
-    assert len(table.entries) == 2 * 3 * 3
-    assert [entry.weights for entry in table.entries].count("a") == 2 * 3
-    for protocol in PROTOCOLS:
-        assert table.values("StarIO", protocol, "ate_m").shape == (4,)
+    for protocol, (weights, count) in product(PROTOCOLS, {"a": 2, "b": 2, "c": 2}.items()):
+        found = values(table.scores, "ate_m", track=protocol, weights=weights)
+        assert found.shape == (count,)
 
 
 def test_recordings_with_the_same_name_are_distinguished(read) -> None:
     twice, _ = compare_networks(
         [Path("1.walk"), Path("1.walk")], MODELS[:1], NavigatorConfig(), read, jobs=1
     )
-    assert {entry.recording for entry in twice.entries} == {"walk-1", "walk-1-2"}
+    assert set(twice.scores["recording"]) == {"walk-1", "walk-1-2"}
     assert [sample.recording for sample in twice.samples] == ["walk-1", "walk-1-2"]
 
 
 def test_mean_and_spread_are_taken_over_weights_of_recording_means(table) -> None:
-    a, b = table.values("StarIO", "network", "ate_m").reshape(2, 2).mean(axis=0)
-    mean, spread = table.mean_and_spread("StarIO", "network", "ate_m")
+    a, b = (
+        values(table.scores, "ate_m", track="network", weights=weights).mean() for weights in "ab"
+    )
+    mean, spread = table.column("StarIO", "network", "ate_m").mean_and_spread(table.scores)
     assert mean == pytest.approx((a + b) / 2)
     assert spread == pytest.approx(abs(a - b) / np.sqrt(2))
-    single, no_spread = table.mean_and_spread("R-ResNet", "network", "ate_m")
+    other = table.column("R-ResNet", "network", "ate_m")
+    single, no_spread = other.mean_and_spread(table.scores)
     assert no_spread is None
-    assert single == pytest.approx(table.values("R-ResNet", "network", "ate_m").mean())
+    assert single == pytest.approx(
+        values(table.scores, "ate_m", track="network", weights="c").mean()
+    )
 
 
 def test_a_recording_at_rest_has_no_share_of_its_path_and_no_warning() -> None:
-    resting = Entry("rest", "StarIO", "a", "network", ate_m=0.1, rte_m=0.1, pde=np.nan)
-    known = NetworkTable("rms", {"StarIO": 1}, [replace(resting, protocol=p) for p in PROTOCOLS])
-    rows = {tuple(line.split()) for line in table_text(known).splitlines()}
+    figures = {"ate_m": 0.1, "rte_m": 0.1, "pde": None}
+    scores = scored("rest", dict.fromkeys(PROTOCOLS, figures), network="StarIO", weights="a")
+    known = NetworkTable("rms", {"StarIO": 1}, scores, [])
+    rows = {tuple(line.split()) for line in networks_text(known).splitlines()}
     assert {("rest", "0.100"), ("rest", "-"), ("mean", "-")} < rows
 
 
@@ -99,13 +104,16 @@ def test_the_ronin_convention_is_smaller_by_the_square_root_of_two(table, read) 
     ronin, _ = compare_networks(
         [Path("1.walk")], MODELS[2:], NavigatorConfig(), read, "ronin", jobs=1
     )
-    ours = table.values("R-ResNet", "network", "ate_m")[0]
-    assert ronin.values("R-ResNet", "network", "ate_m")[0] == pytest.approx(ours / np.sqrt(2))
-    assert "convention ronin" in table_text(ronin)
+    ours, theirs = (
+        values(found.scores, "ate_m", track="network", network="R-ResNet")[0]
+        for found in (table, ronin)
+    )
+    assert theirs == pytest.approx(ours / np.sqrt(2))
+    assert "convention ronin" in networks_text(ronin)
 
 
 def test_text_names_networks_recordings_convention_and_units(table) -> None:
-    text = table_text(table)
+    text = networks_text(table)
     for word in ("StarIO", "R-ResNet", "walk-1", "walk-2", "+-", "convention rms", "RTE [m]"):
         assert word in text
 
