@@ -31,6 +31,7 @@ from stario.fusion.fixes import Accepted, Fix, FixQueue
 from stario.fusion.graph.batch import smooth
 from stario.fusion.graph.covariances import with_actual_covariances
 from stario.fusion.graph.fixed_lag import FixedLagEstimator
+from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.health import Health, SampleCounts
 from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.imu.stateful import WindowDisplacement
@@ -126,9 +127,13 @@ def _graph_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solut
     first = replace(states[0], covariance=covariance)
     final = to_final_frame(states, frame.transforms)
     has_turn = estimator.ekf.state.has_turn
-    solved, note = smooth(
-        final, first, filtered.measurements, frame.transforms, config, bias, has_turn
-    )
+    try:
+        solved, note = smooth(
+            final, first, filtered.measurements, frame.transforms, config, bias, has_turn
+        )
+    except IndeterminateError as error:
+        note = f"graph fell back to the filter's track: {error}"
+        return _filter_states(filtered, config)._replace(notes=(note,))
     turns = [
         frame_rotation(after.R_WB @ before.R_WB.T)
         for before, after in zip(states, final, strict=True)

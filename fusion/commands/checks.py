@@ -98,7 +98,7 @@ def backends(
     skipped: list[Skipped] = []
     if paths or data is not None:
         settings, network = estimating.settings(), estimating.network()
-        scores, skipped = map_recordings(
+        scores, skipped = _score_each(
             "backends",
             reading,
             paths or [entry.path for entry in read_packaged_list(split, data or Path())],
@@ -238,6 +238,40 @@ def gaps(
     _print_table(found, skipped, end_shift_table, as_json)
 
 
+@expand_option_groups
+def moments(
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
+    paths: OptionalPathsArgument = None,
+    graph: Annotated[bool, flag("--graph", help="Also run the graph (slower).")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the moments.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Insert bad moments (shake, drop, table, standing, lift); report what the rest of tracks pays.
+
+    Without PATH, use simulated walks in a building.
+    """
+    from stario.fusion.evaluation.checks.moments import (
+        moment_costs,
+        moment_table,
+        simulated_walks,
+    )
+
+    backends: tuple[BackendName, ...] = ("ekf", "graph") if graph else ("ekf",)
+    model, settings = estimating.network(), estimating.settings()
+    skipped: list[Skipped] = []
+    judge = partial(moment_costs, model, config=settings, backends=backends, seed=seed)
+    if paths:
+        found, skipped = _score_each(
+            "check moments", reading, paths, lambda path, sequence: judge(sequence)
+        )
+    else:
+        refuse_unused(changed(reading), "with simulated walks", "use with PATH")
+        walks = simulated_walks()
+        found = [judge(walk) for walk in with_bar("check moments", walks, len(walks))]
+    _print_table(found, skipped, moment_table, as_json)
+
+
 def _judge_each(
     title: str,
     reading: ReadingOptions,
@@ -248,19 +282,32 @@ def _judge_each(
 ) -> tuple[list[pd.DataFrame], list[Skipped]]:
     """Score each recording as one of its group; return the scores and what was skipped."""
     from stario.fusion.evaluation.benchmark.groups import By, labels
-    from stario.fusion.evaluation.compare import distinct_name
     from stario.sequences.arrays import check_choice
 
     grouping: By = check_choice("--by", by, get_args(By))
     model, settings = estimating.network(), estimating.settings()
-    names: set[str] = set()
 
     def judged(path: Path, sequence: ImuSequence) -> pd.DataFrame:
-        group = labels(path, sequence.attributes)[grouping]
-        named = replace(sequence, name=distinct_name(sequence.name, names))
-        return judge(model, named, settings, group)
+        return judge(model, sequence, settings, labels(path, sequence.attributes)[grouping])
 
-    return map_recordings(title, reading, paths, judged)
+    return _score_each(title, reading, paths, judged)
+
+
+def _score_each(
+    title: str,
+    reading: ReadingOptions,
+    paths: Sequence[Path],
+    score: Callable[[Path, ImuSequence], pd.DataFrame],
+) -> tuple[list[pd.DataFrame], list[Skipped]]:
+    """Score each recording, under a name of its own; return the scores and what was skipped."""
+    from stario.fusion.evaluation.compare import distinct_name
+
+    names: set[str] = set()
+
+    def named(path: Path, sequence: ImuSequence) -> pd.DataFrame:
+        return score(path, replace(sequence, name=distinct_name(sequence.name, names)))
+
+    return map_recordings(title, reading, paths, named)
 
 
 def _print_table(

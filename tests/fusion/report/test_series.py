@@ -68,7 +68,7 @@ def test_an_ellipse_reaches_three_sigma_along_its_axes() -> None:
     R = about_z(0.4).as_matrix()[:2, :2]
     outline = ellipse(R @ np.diag([4.0, 0.25]) @ R.T) @ R  # in the ellipse's own axes
     np.testing.assert_allclose(np.abs(outline).max(axis=0), [6.0, 1.5], rtol=0.01)
-    np.testing.assert_allclose(outline[0], outline[-1], atol=1e-12)
+    np.testing.assert_allclose(outline[0], outline[-1], atol=1e-10)
 
 
 def test_yaws_on_both_sides_of_half_a_turn_are_drawn_next_to_each_other() -> None:

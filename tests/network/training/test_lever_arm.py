@@ -69,8 +69,8 @@ def test_windows_without_a_swing_are_unchanged() -> None:
     imu = torch.randn(16, 200, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     displacement = torch.ones(16, 1, 3, dtype=torch.float64)
     after, moved = apply_swing(imu, displacement, draw_swing(16, share=0.0))
-    assert torch.allclose(after, imu, atol=1e-12)
-    assert torch.equal(moved, displacement)
+    assert torch.allclose(after, imu, atol=1e-10)
+    assert torch.allclose(moved, displacement, atol=1e-10)
 
 
 @pytest.mark.parametrize("share", [0.25, 0.75])

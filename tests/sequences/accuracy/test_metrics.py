@@ -119,10 +119,10 @@ def test_alignment_never_changes_the_tilt(mode):
     tilted = replace(estimate, attitude_WB=Rotation.from_rotvec([0.2, 0, 0]) * estimate.attitude_WB)
     aligned = align(tilted, truth, mode)
     np.testing.assert_allclose(
-        aligned.attitude_WB.as_matrix()[:, 2], tilted.attitude_WB.as_matrix()[:, 2], atol=1e-12
+        aligned.attitude_WB.as_matrix()[:, 2], tilted.attitude_WB.as_matrix()[:, 2], atol=1e-10
     )
     np.testing.assert_allclose(
-        np.diff(aligned.position_W[:, 2]), np.diff(tilted.position_W[:, 2]), atol=1e-12
+        np.diff(aligned.position_W[:, 2]), np.diff(tilted.position_W[:, 2]), atol=1e-10
     )
 
 
@@ -134,9 +134,9 @@ def test_first_alignment_matches_the_first_pose_and_rotates_velocity_and_covaria
     turned = moved(estimate, -np.pi / 2, (5.0, 0.0, 0.0))  # does not rotate velocity and covariance
     aligned = align(turned, truth, "first")
     np.testing.assert_allclose(aligned.position_W, truth.position_W, atol=1e-9)
-    np.testing.assert_allclose(aligned.velocity_W[0], [0.0, 1.0, 0.5], atol=1e-12)
+    np.testing.assert_allclose(aligned.velocity_W[0], [0.0, 1.0, 0.5], atol=1e-10)
     np.testing.assert_allclose(
-        aligned.position_covariance_W[0], np.diag([1.0, 4.0, 9.0]), atol=1e-12
+        aligned.position_covariance_W[0], np.diag([1.0, 4.0, 9.0]), atol=1e-10
     )
 
 
@@ -188,7 +188,7 @@ def test_a_constant_velocity_error_gives_the_analytic_errors(duration, scaled):
     assert found.pde == pytest.approx(0.05 / 1.5)
     assert found.path_m == pytest.approx(1.5 * duration)
     assert found.ate_m == pytest.approx(0.05 * duration / np.sqrt(3), rel=0.01)
-    assert found.aye_rad == pytest.approx(0.0, abs=1e-12)
+    assert found.aye_rad == pytest.approx(0.0, abs=1e-9)
     in_3d = evaluate_track(with_velocity_error(truth, (0.03, 0.04, 0.12)), truth, horizontal=False)
     assert in_3d.rte_m == pytest.approx(0.13 * 60.0)
 

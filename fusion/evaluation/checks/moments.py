@@ -1,0 +1,240 @@
+"""Cost of bad moments: a recording run with and without each, inserted at three places.
+
+What counts is the rest of the track, before and after the moment. Its horizontal error is compared
+after fits of yaw and position: of each of the two parts by itself, which shows what the moment did
+to the estimator, and of both together, which adds what the track lost within the moment.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from scipy.spatial.transform import Rotation
+
+from stario.fusion.backends import BackendName
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.benchmark.aligned import Complex
+from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position
+from stario.fusion.evaluation.scores import Column, geometric_mean, joined, parts, scored
+from stario.fusion.evaluation.text import rows_of
+from stario.fusion.evaluation.tracks import network_track
+from stario.fusion.imu.stateful import Predictor
+from stario.fusion.navigator import Navigator
+from stario.fusion.state import Track
+from stario.sequences.arrays import interpolated
+from stario.sequences.attitude.rotations import GyroIntegral
+from stario.sequences.attitude.stacks import composed
+from stario.sequences.clean_samples import clean_samples
+from stario.sequences.drawing.text_table import aligned
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence
+from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
+from stario.sequences.simulation.insertion import Inserted, insert_moment
+from stario.sequences.simulation.magnetometer import INDOOR_FIELD
+from stario.sequences.simulation.moments import MOMENTS
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
+
+PLACES = {"start": 0.0, "middle": 0.5, "end": 0.85}
+"""Instants of a moment, as shares of the recording."""
+
+MAX_RATIO, MAX_STEP, MAX_TURN = 1.2, 1.0, 10.0
+"""Largest acceptable ratio of the errors, and corrections without a fix [m], [deg]."""
+
+MAX_SECONDS = 180.0
+"""A longer recording is cut after this time [s]: it is run again for every moment and place."""
+
+_BEFORE_WAYPOINTS = 4.0
+"""Time before the first known position from which a recording without poses is used [s]."""
+
+_FIRST_SECONDS = 1.05
+"""Time until the first window has been applied [s]: it is a second long."""
+
+_MIN_KNOWN = 3
+"""Minimum number of known positions in a part of the track for its error to count."""
+
+_CARRIES = ("handheld", "pocket", "swinging", "bag")
+"""How the device is carried in the simulated walks, one each."""
+
+
+def _small_share(ratio: FloatArray) -> float:
+    return float((ratio < MAX_RATIO).mean())
+
+
+_COLUMNS = (
+    Column("n", "step", ".0f", len),
+    Column("without [m]", "error_without"),
+    Column("rest: mean", "ratio", over=geometric_mean),
+    Column("worst", "ratio", over=np.max),
+    Column("joined: mean", "joined_ratio", over=geometric_mean),
+    Column("worst", "joined_ratio", over=np.max),
+    Column(f"ratio < {MAX_RATIO:g}", "ratio", ".0%", _small_share),
+    Column("step [m]", "step", ".1f", np.max),
+    Column("turn [deg]", "turn", ".1f", np.max),
+    Column("both small", "small", ".0%", np.mean),
+)
+
+
+def simulated_walks(seconds: float = 120.0, seed: int = 0) -> list[ImuSequence]:
+    """Simulate a walk of each carrying mode, with a phone's sensors in a building."""
+    walks = []
+    for k, carry in enumerate(_CARRIES, seed):
+        walk = generate_walk(k, seconds, style=WalkStyle(carry=carry))
+        imu = simulate_imu(walk, 100.0, PHONE_IMU, k, name=carry, magnetic_field=INDOOR_FIELD)
+        walks.append(imu)
+    return walks
+
+
+def moment_costs(
+    model: Predictor,
+    sequence: ImuSequence,
+    config: NavigatorConfig,
+    backends: Sequence[BackendName] = ("ekf",),
+    seed: int = 0,
+) -> pd.DataFrame:
+    """Score a recording without and with each moment and place, the rows' group, by back end.
+
+    Figures: error of the rest [m], its parts fitted separately (`error_without`, `error_with`,
+    their `ratio`) or as a whole (`joined_...`); largest correction of position [m] and attitude
+    [deg] between two outputs (`step`, `turn`, whether both are `small`, and without the moment).
+
+    Raises:
+        InputError: it has no ground truth, or cannot be run.
+    """
+    sequence = _with_truth(sequence)
+    navigators = {name: Navigator(model, config, backend=name) for name in backends}
+    first = navigators[backends[0]]
+    observed = first.observe(sequence)
+    poses = sequence.truth or network_track(observed).trajectory
+    without = {name: each.track(observed) for name, each in navigators.items()}
+    found = []
+    for moment in MOMENTS:
+        for place, share in PLACES.items():
+            inserted = insert_moment(sequence, poses, moment, share, seed)
+            observed = first.observe(inserted.sequence)
+            figures = {
+                str(name): _cost(sequence, inserted, without[name], navigator.track(observed))
+                for name, navigator in navigators.items()
+            }
+            found.append(scored(sequence.name, figures, f"{moment.name}, {place}"))
+    return joined(found)
+
+
+def moment_table(scores: pd.DataFrame) -> str:
+    """Return a row for each moment, place and back end: ratios of errors, largest corrections."""
+    rows = [
+        (group, backend, part)
+        for backend, chosen in scores.groupby("track", sort=False)
+        for group, part in parts(chosen)
+    ]
+    cells = rows_of([(group, part) for group, _, part in rows], _COLUMNS, "moment")
+    backends = ["back end", *(str(backend) for _, backend, _ in rows)]
+    lines = aligned([[row[0], name, *row[1:]] for row, name in zip(cells, backends, strict=True)])
+    step, turn = (Column("", f"{m}_without", over=np.max).value(scores) for m in ("step", "turn"))
+    notes = [
+        "without: median error [m] of the parts before and after, each fitted in yaw and position;",
+        "ratio of that error with the moment to that without: geometric mean, worst; joined: both "
+        "parts fitted as one; share of recordings whose rest is below the limit",
+        f"step, turn: largest correction between two outputs (without moments {step:.2f} m, "
+        f"{turn:.1f} deg); share with at most {MAX_STEP:g} m and {MAX_TURN:g} deg",
+    ]
+    return "\n".join([*lines, *notes])
+
+
+def _with_truth(sequence: ImuSequence) -> ImuSequence:
+    """Return the recording from its first known position on, cut if it is long."""
+    known = sequence.truth or sequence.positions
+    if known is None:
+        raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
+    earlier = 0.0 if sequence.truth is not None else _BEFORE_WAYPOINTS
+    start = max(float(sequence.time[0]), float(known.time[known.valid][0]) - earlier)
+    return sequence.slice(start, start + MAX_SECONDS)
+
+
+def _cost(
+    sequence: ImuSequence, inserted: Inserted, without: Track, track: Track
+) -> dict[str, float]:
+    split = inserted.start
+    errors = []
+    for each, start, stop, recording in (
+        (without, split, split, sequence),
+        (track, split, inserted.stop, inserted.sequence),
+    ):
+        time, truth, estimate = _known(recording, each)
+        rest = (time < start) | (time >= stop)
+        errors.append(_errors(truth[rest], estimate[rest], time[rest] < start))
+    step, turn = largest_correction(inserted.sequence, track)
+    usual = largest_correction(sequence, without)
+    (apart, as_one), (apart_with, as_one_with) = errors
+    return {
+        "error_without": apart,
+        "error_with": apart_with,
+        "ratio": apart_with / apart,
+        "joined_without": as_one,
+        "joined_with": as_one_with,
+        "joined_ratio": as_one_with / as_one,
+        "step": step,
+        "turn": turn,
+        "small": float(step <= MAX_STEP and turn <= MAX_TURN),
+        "step_without": usual[0],
+        "turn_without": usual[1],
+    }
+
+
+def _known(sequence: ImuSequence, track: Track) -> tuple[FloatArray, Complex, Complex]:
+    """Return times (n,) of known positions within the track, and both horizontally as complex."""
+    if sequence.truth is not None:
+        inside = track.trajectory.valid & sequence.truth.covers(track.time)
+        time = track.time[inside]
+        position = sequence.truth.at(time).position_W
+    else:
+        assert sequence.positions is not None
+        inside = sequence.positions.valid & track.trajectory.covers(sequence.positions.time)
+        time, position = sequence.positions.time[inside], sequence.positions.position_W[inside]
+    estimate = interpolated(time, track.time, track.trajectory.position_W)
+    return time, _horizontal(position), _horizontal(estimate)
+
+
+def _horizontal(position_W: FloatArray) -> Complex:
+    return np.asarray(position_W[:, 0] + 1j * position_W[:, 1])
+
+
+def _errors(truth: Complex, estimate: Complex, before: BoolArray) -> tuple[float, float]:
+    """Return the root mean square errors [m] of both parts fitted by themselves, and as one."""
+    squares = [
+        np.abs(fit_yaw_and_position(estimate[part], truth[part]) - truth[part]) ** 2
+        for part in (before, ~before)
+        if part.sum() >= _MIN_KNOWN
+    ]
+    if not squares:
+        return math.nan, math.nan
+    joined = np.abs(fit_yaw_and_position(estimate, truth) - truth) ** 2
+    apart = np.concatenate(squares)
+    return math.sqrt(apart.mean()), math.sqrt(joined.mean())
+
+
+def largest_correction(sequence: ImuSequence, track: Track) -> tuple[float, float]:
+    """Return a track's largest unexplained steps between two outputs, [m] and [deg].
+
+    The position should advance by the mean of the two velocities, the attitude by the gyroscope
+    less the estimated bias. Steps across gaps are left out, and that of the first window, which
+    makes the velocity known.
+    """
+    trajectory, b_g = track.trajectory, track.b_g
+    assert trajectory.velocity_W is not None  # both back ends give them
+    assert b_g is not None
+    dt = np.diff(trajectory.time)[:, None]
+    velocity = 0.5 * (trajectory.velocity_W[:-1] + trajectory.velocity_W[1:])
+    steps = np.linalg.norm(np.diff(trajectory.position_W, axis=0) - dt * velocity, axis=1)
+    time, gyro, _ = clean_samples(sequence)
+    measured = GyroIntegral(time, gyro).attitude(trajectory.time)
+    expected, turns = (
+        composed(attitude[:-1].inv(), attitude[1:])
+        for attitude in (measured, trajectory.attitude_WB)
+    )
+    bias = Rotation.from_rotvec(-dt * b_g[1:])
+    rest = composed(composed(expected, bias).inv(), turns).magnitude()
+    counts = trajectory.valid[1:] & (trajectory.time[1:] > trajectory.time[0] + _FIRST_SECONDS)
+    return float(steps[counts].max()), float(np.degrees(rest[counts].max()))
