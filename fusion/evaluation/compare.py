@@ -221,14 +221,15 @@ def measure(track: Track, sequence: ImuSequence, alignment: Alignment = "first")
     figures: Metrics = dict.fromkeys(METRICS)
     truth = sequence.truth
     if truth is not None:
-        result = evaluate_track(track.trajectory, truth, alignment=alignment)
+        moved = align(track.trajectory, truth, alignment)
+        result = evaluate_track(moved, truth, alignment="none")
         names = ("ate_m", "rte_m", "pde", "aye_rad", "coverage")
         figures |= {name: getattr(result, name) for name in names}
         if result.duration_s < MIN_COMPARED_S:
             figures["rte_m"] = None
         figures["ate_fit_m"] = evaluate_track(track.trajectory, truth, alignment="yaw").ate_m
-        if track.trajectory.position_covariance_W is not None:
-            figures["nees_median"] = position_nees(track.trajectory, truth, alignment).median
+        if moved.position_covariance_W is not None:
+            figures["nees_median"] = position_nees(moved, truth, "none").median
     elif sequence.positions is not None:
         error, count = position_error(track, sequence.positions)
         figures["known_positions_m"] = error if count >= MIN_POSITIONS else None
