@@ -1,1 +1,1 @@
-"""The paper's table: every network on every data set, cell by cell."""
+"""The paper's table: every network on every data set, run by run."""

@@ -1,4 +1,4 @@
-"""Tables and figures written next to the cells."""
+"""Tables and figures written next to the runs."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from stario.fusion.evaluation.networks import (
     Sample,
     add_track,
 )
-from stario.fusion.paper_table.cells import Cell, read_tracks
 from stario.fusion.paper_table.errors import CONVENTION, Shown
+from stario.fusion.paper_table.runs import Run, read_tracks
 from stario.fusion.paper_table.summary import (
     COLUMNS,
-    Filled,
+    Completed,
     SetTable,
-    filled_cells,
+    completed_runs,
     scores_of,
     seconds_by_network,
     set_table,
@@ -52,7 +52,7 @@ def known_costs(names: Sequence[str], out: Path) -> list[ModelRow]:
 
 
 def write_results(
-    cells: Sequence[Cell],
+    runs: Sequence[Run],
     out: Path,
     costs: Sequence[ModelRow],
     learned: Mapping[str, frozenset[Path]],
@@ -60,20 +60,20 @@ def write_results(
 ) -> str:
     """Write `table.md`, `table.json`, `table.csv` and the figures of each set; return the text.
 
-    Cells need not be filled; `learned` is as for `set_table`; figures are slow (`drawn`).
+    Runs need not be completed; `learned` is as for `set_table`; figures are slow (`drawn`).
     """
-    filled = filled_cells(cells, out)
-    datasets = {cell.dataset.name: cell.dataset for cell in cells}
-    tables = [set_table(datasets[name], found, learned) for name, found in filled.items()]
-    recipe = next(cell.recipe for cell in cells if cell.recipe is not None)
-    work = seconds_by_network(filled.values())
+    completed = completed_runs(runs, out)
+    datasets = {run.dataset.name: run.dataset for run in runs}
+    tables = [set_table(datasets[name], found, learned) for name, found in completed.items()]
+    recipe = next(run.recipe for run in runs if run.recipe is not None)
+    work = seconds_by_network(completed.values())
     text = table_text(tables, costs, work, recipe)
     with atomic_write(out / "table.md") as file:
         file.write(text)
     write_json(out / "table.json", table_dict(tables, costs, work, recipe))
     write_rows(out / "table.csv", _rows(tables))
-    for name, found in filled.items() if drawn else ():
-        samples = _samples([cell for cell in cells if cell.dataset.name == name], found, out)
+    for name, found in completed.items() if drawn else ():
+        samples = _samples([run for run in runs if run.dataset.name == name], found, out)
         table = _network_table(found, samples)
         if table is not None:
             write_table(out / name / "figures", table)
@@ -91,10 +91,10 @@ def _rows(tables: Sequence[SetTable]) -> list[dict[str, object]]:
     ]
 
 
-def _network_table(filled: Filled, samples: list[Sample]) -> NetworkTable | None:
+def _network_table(completed: Completed, samples: list[Sample]) -> NetworkTable | None:
     """Return the networks' errors on recordings with poses, for the figures; None without any."""
-    parameters = {name: table_cost(name).parameters for name in ARCHITECTURES if name in filled}
-    scores = scores_of(filled)
+    parameters = {name: table_cost(name).parameters for name in ARCHITECTURES if name in completed}
+    scores = scores_of(completed)
     chosen = scores["network"].isin(parameters) & scores["track"].isin(PROTOCOLS)
     chosen &= scores["metric"].isin(METRICS)
     if not chosen.any():
@@ -104,18 +104,18 @@ def _network_table(filled: Filled, samples: list[Sample]) -> NetworkTable | None
     return NetworkTable(CONVENTION, parameters, found, samples)
 
 
-def _samples(cells: Sequence[Cell], filled: Filled, out: Path) -> list[Sample]:
+def _samples(runs: Sequence[Run], completed: Completed, out: Path) -> list[Sample]:
     """Return tracks of some recordings, by each network's first seed."""
     samples: dict[str, Sample] = {}
-    for cell in cells:
-        content = filled.get(cell.network, {}).get(cell.seed)
-        if cell.recipe is None or cell.seed != 0 or content is None:
+    for run in runs:
+        content = completed.get(run.network, {}).get(run.seed)
+        if run.recipe is None or run.seed != 0 or content is None:
             continue
         found = {recording["recording"]: recording["tracks"] for recording in content["recordings"]}
-        for name, shown in read_tracks(cell, out).items():
+        for name, shown in read_tracks(run, out).items():
             sample = samples.setdefault(name, Sample(name, _level(shown, shown.truth_W), {}, {}))
             track = _level(shown, shown.position_W)
-            add_track(sample, cell.network, track, found[name][TRUE_ATTITUDE])
+            add_track(sample, run.network, track, found[name][TRUE_ATTITUDE])
     return list(samples.values())
 
 

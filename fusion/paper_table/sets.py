@@ -19,7 +19,7 @@ ALL = "all"
 """All development recordings together, with the groups of the list `holdout` held out."""
 
 FIRST = ("oxiod", "ridi", ALL)
-"""The sets that are filled first."""
+"""The sets that are completed first."""
 
 _SETS: dict[str, tuple[str, tuple[str, ...]]] = {
     "oxiod": ("OxIOD", ("oxiod",)),

@@ -1,4 +1,4 @@
-"""The rows of the table, computed from its cells: means, standard errors, ranks."""
+"""The rows of the table, computed from its runs: means, standard errors, ranks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stario.fusion.evaluation.bootstrap import Rank, block_rows, ranks
 from stario.fusion.evaluation.networks import EKF, OWN_ATTITUDE, TRUE_ATTITUDE
 from stario.fusion.evaluation.pedestrian import NAME as PDR
 from stario.fusion.evaluation.scores import Spread, joined, scored
-from stario.fusion.paper_table.cells import Cell, read_cell
+from stario.fusion.paper_table.runs import Run, read_run
 from stario.fusion.paper_table.sets import DataSet, set_of
 from stario.network.architectures import ARCHITECTURES
 
@@ -22,7 +22,7 @@ REFERENCE_NETWORK = "StarIO"
 """Reference network that the others' errors are compared with."""
 
 Content = Mapping[str, Any]
-"""Result of `read_cell`."""
+"""Result of `read_run`."""
 
 
 def _column(title: str, source: str, name: str, scale: float = 1.0) -> Spread:
@@ -61,7 +61,7 @@ class Row:
 
     Attributes:
         network: name of the network or of the weights.
-        seeds: filled seeds.
+        seeds: completed seeds.
         figures: means by column key.
         training_error: mean squared error of the last epoch's windows [m^2]; None for weights.
         validation_error: that of the best epoch, whose weights are kept, on the validation
@@ -87,7 +87,7 @@ class SetTable:
         dataset: name, recordings and split.
         tested: number of tested recordings.
         path_m: total length of their true paths [m].
-        rows: networks with at least one filled seed.
+        rows: networks with at least one completed seed.
         measure: the error that networks are ranked by, in words.
         skipped: reasons why recordings were skipped, each once.
     """
@@ -100,43 +100,45 @@ class SetTable:
     skipped: list[str] = field(default_factory=list)
 
 
-Filled = dict[str, dict[int, Content]]
-"""Contents of a set's cells, by network and seed."""
+Completed = dict[str, dict[int, Content]]
+"""Contents of a set's runs, by network and seed."""
 
 
-def filled_cells(cells: Iterable[Cell], out: Path) -> dict[str, Filled]:
-    """Return the contents of the filled cells, by set.
+def completed_runs(runs: Iterable[Run], out: Path) -> dict[str, Completed]:
+    """Return the contents of the completed runs, by set.
 
     Raises:
-        ConfigError: a cell was filled with another recipe, other weights or other recordings.
+        ConfigError: a run was completed with another recipe, other weights or other recordings.
     """
-    found: dict[str, Filled] = {}
-    for cell in cells:
-        content = read_cell(cell, out)
+    found: dict[str, Completed] = {}
+    for run in runs:
+        content = read_run(run, out)
         if content is not None:
-            networks = found.setdefault(cell.dataset.name, {})
-            networks.setdefault(cell.network, {})[cell.seed] = content
+            networks = found.setdefault(run.dataset.name, {})
+            networks.setdefault(run.network, {})[run.seed] = content
     return found
 
 
-def set_table(dataset: DataSet, filled: Filled, learned: Mapping[str, frozenset[Path]]) -> SetTable:
+def set_table(
+    dataset: DataSet, completed: Completed, learned: Mapping[str, frozenset[Path]]
+) -> SetTable:
     """Return the table of a set.
 
     `learned` has the recordings that packaged weights were trained on, by the weights' name.
     """
-    contents = [content for seeds in filled.values() for content in seeds.values()]
+    contents = [content for seeds in completed.values() for content in seeds.values()]
     poses = all(recording["kind"] == "poses" for c in contents for recording in c["recordings"])
     measure = "ate" if poses else "10"
-    blocks = _blocks(filled, measure, dataset)
+    blocks = _blocks(completed, measure, dataset)
     network_ranks = ranks(joined(blocks), REFERENCE_NETWORK) if blocks else {}
-    order = [name for name in [PDR, *ARCHITECTURES] if name in filled]
-    order += [name for name in filled if name not in order]
+    order = [name for name in [PDR, *ARCHITECTURES] if name in completed]
+    order += [name for name in completed if name not in order]
     test = {entry.path for entry in dataset.test}
-    scores = scores_of(filled)
+    scores = scores_of(completed)
     rows = [
         _row(
             name,
-            filled[name],
+            completed[name],
             scores[scores["network"] == name],
             network_ranks.get(name),
             len(test & learned.get(name, set())),
@@ -162,11 +164,11 @@ def set_table(dataset: DataSet, filled: Filled, learned: Mapping[str, frozenset[
     )
 
 
-def seconds_by_network(tables: Iterable[Filled]) -> dict[str, tuple[float, float, float]]:
+def seconds_by_network(tables: Iterable[Completed]) -> dict[str, tuple[float, float, float]]:
     """Return seconds of training and of evaluation, and training windows per second, by network."""
     contents: dict[str, list[Content]] = {}
-    for filled in tables:
-        for name, seeds in filled.items():
+    for completed in tables:
+        for name, seeds in completed.items():
             contents.setdefault(name, []).extend(seeds.values())
     work = {}
     for name, found in contents.items():
@@ -178,7 +180,7 @@ def seconds_by_network(tables: Iterable[Filled]) -> dict[str, tuple[float, float
     return work
 
 
-def scores_of(filled: Filled) -> pd.DataFrame:
+def scores_of(completed: Completed) -> pd.DataFrame:
     """Return the errors of every run on a set, with labels `path`, `network` and `seed`.
 
     The figures of the network alone are those of a track that is called by the kind of truth.
@@ -193,7 +195,7 @@ def scores_of(filled: Filled) -> pd.DataFrame:
             network=network,
             seed=seed,
         )
-        for network, seeds in filled.items()
+        for network, seeds in completed.items()
         for seed, content in seeds.items()
         for one in content["recordings"]
     ]
@@ -224,13 +226,13 @@ def _mean(column: Spread, scores: pd.DataFrame) -> Mean | None:
     return None if np.isnan(mean) else Mean(mean, error)
 
 
-def _blocks(filled: Filled, measure: str, dataset: DataSet) -> list[pd.DataFrame]:
+def _blocks(completed: Completed, measure: str, dataset: DataSet) -> list[pd.DataFrame]:
     """Return the blocks of squared errors of networks that have some with every seed."""
     units = {
         str(entry.path): {"set": set_of(entry), "group": entry.group} for entry in dataset.test
     }
     found = []
-    for network, seeds in filled.items():
+    for network, seeds in completed.items():
         runs = [
             [
                 block_rows(sums, **units[path], recording=path, network=network, seed=seed)

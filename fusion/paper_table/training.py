@@ -1,4 +1,4 @@
-"""Training of a cell: one recipe and number of steps for all networks, resumable."""
+"""Training of a run: one recipe and number of steps for all networks, resumable."""
 
 from __future__ import annotations
 
@@ -40,17 +40,17 @@ TEMPORARY_FILES = ("checkpoint.safetensors", "clock.json")
 
 _WALKS, _VALIDATION_WALKS = 40, 8
 """Simulated walks for training and validation windows where no recording has poses: the same for
-every cell, so that only the networks differ."""
+every run, so that only the networks differ."""
 
 
 @dataclass(frozen=True)
 class ReaderConfig:
-    """How recordings are read, on any machine that fills a cell; told apart by the cache alone.
+    """How recordings are read, on any machine that works on a run; told apart by the cache alone.
 
     Attributes:
         read: function that reads the recording at a path; must be picklable.
         options: what `read` depends on besides the path, as plain values.
-        cache: folder that caches windows for later cells.
+        cache: folder that caches windows for later runs.
     """
 
     read: Callable[[Path], ImuSequence] = field(compare=False)
@@ -58,10 +58,10 @@ class ReaderConfig:
     cache: Path
 
 
-def cell_recipe(
+def run_recipe(
     values: dict[str, object], network: str, seed: int, steps: int | None
 ) -> TrainingConfig:
-    """Return the recipe of a cell: the common one with a network, a seed and a number of steps.
+    """Return the recipe of a run: the common one with a network, a seed and a number of steps.
 
     Args:
         values: common settings, such as from a parsed JSON file.
@@ -80,10 +80,10 @@ def cell_recipe(
     return training_config({**values, "architecture": network, "seed": seed, **lengths})
 
 
-def train_cell(
+def train_run(
     dataset: DataSet, recipe: TrainingConfig, folder: Path, reading: ReaderConfig
 ) -> dict[str, object]:
-    """Train a cell's network, resuming from its checkpoint; write the model and `TEMPORARY_FILES`.
+    """Train a run's network, resuming from its checkpoint; write the model and `TEMPORARY_FILES`.
 
     Returns:
         Plain values: training error of the last epoch and validation error of the best one, whose
@@ -138,7 +138,7 @@ def _reports(log: Path) -> list[EpochReport]:
 
 
 def recipe_digest(recipe: TrainingConfig, dataset: DataSet) -> str:
-    """Return the digest of everything that a cell's training depends on except the code."""
+    """Return the digest of everything that a run's training depends on except the code."""
     inputs = [
         asdict(recipe),
         [[*map(recording_state, part)] for part in (dataset.training, dataset.validation)],
@@ -151,11 +151,11 @@ def recording_state(path: Path) -> list[object]:
     return [str(path), *recording_stamps(path)]
 
 
-@lru_cache(maxsize=2)  # training and validation part of the set that cells are filled for
+@lru_cache(maxsize=2)  # training and validation part of the set that runs are completed for
 def _streams(
     files: tuple[Path, ...], attitude: Attitude, reading: ReaderConfig
 ) -> tuple[list[RecordingStreams], list[Skipped]]:
-    """Return the streams of each recording; later cells of the same set reuse them."""
+    """Return the streams of each recording; later runs of the same set reuse them."""
     outcomes = recorded(files, reading.read, reading.options, reading.cache, 1, attitude)
     return recording_streams(zip(files, outcomes, strict=True))
 

@@ -1,1 +1,1 @@
-"""Judging: evaluation of networks alone, by groups of recordings."""
+"""Benchmark of networks alone, by groups of recordings."""

@@ -1,4 +1,4 @@
-"""What a cell's training passes on: the recipe's shares, the error of the epoch that is kept."""
+"""What a run's training passes on: the recipe's shares, the error of the epoch that is kept."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from stario.fusion.paper_table import training
 from stario.fusion.paper_table.sets import DataSet
-from stario.fusion.paper_table.training import ReaderConfig, cell_recipe, train_cell
+from stario.fusion.paper_table.training import ReaderConfig, run_recipe, train_run
 from stario.network.training.history import EpochReport
 from stario.sequences.files import write_json
 from stario.sequences.readers import read_recording
@@ -46,8 +46,8 @@ def weights(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
 
 
 def trained_cell(dataset: DataSet, folder: Path, **values: object) -> dict[str, object]:
-    recipe = cell_recipe({"likelihood_from": 0.0, "epochs": 3, **values}, "StarIO", 0, None)
-    return train_cell(dataset, recipe, folder, ReaderConfig(read_recording, {}, folder / "cache"))
+    recipe = run_recipe({"likelihood_from": 0.0, "epochs": 3, **values}, "StarIO", 0, None)
+    return train_run(dataset, recipe, folder, ReaderConfig(read_recording, {}, folder / "cache"))
 
 
 def test_the_validation_error_is_that_of_the_epoch_whose_weights_are_kept(

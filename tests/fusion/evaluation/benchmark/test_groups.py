@@ -1,4 +1,4 @@
-"""Judging of networks alone by groups, with a stub that predicts a known share of the truth."""
+"""Benchmark of networks alone by groups, with a stub that predicts a known share of the truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cells of the table: filled once, resumed after a kill, and only new ones are filled later."""
+"""Runs of the table: completed once, resumed after a kill; only new ones are completed later."""
 
 from __future__ import annotations
 
@@ -17,13 +17,12 @@ from training_runs import narrow
 from typer.testing import CliRunner
 
 from stario.fusion.commands.cli import app
-from stario.fusion.paper_table import cells as cells_module
+from stario.fusion.paper_table import runs as runs_module
 from stario.fusion.paper_table import training
-from stario.fusion.paper_table.cells import LEADING, Cell, fill_cell
-from stario.fusion.paper_table.filling import backend, fill, table_cells
+from stario.fusion.paper_table.runs import LEADING, Run, backend, complete, complete_run, table_runs
 from stario.fusion.paper_table.sets import DataSet, folder_set
-from stario.fusion.paper_table.summary import filled_cells, set_table
-from stario.fusion.paper_table.training import ReaderConfig, cell_recipe
+from stario.fusion.paper_table.summary import completed_runs, set_table
+from stario.fusion.paper_table.training import ReaderConfig, run_recipe
 from stario.network.architectures import ARCHITECTURES
 from stario.sequences.datasets.batch import Skipped
 from stario.sequences.errors import ConfigError, InputError, WeightsError
@@ -49,20 +48,20 @@ def reading(tmp_path_factory: pytest.TempPathFactory) -> ReaderConfig:
 
 @pytest.fixture
 def narrow_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Train a small StarIO, by default the network of the cells here."""
+    """Train a small StarIO, by default the network of the runs here."""
     narrow(monkeypatch)
 
 
-def cell(dataset: DataSet, network: str = "StarIO", seed: int = 0, steps: int = 4) -> Cell:
-    return Cell(dataset, network, seed, cell_recipe(RECIPE, network, seed, steps))
+def run(dataset: DataSet, network: str = "StarIO", seed: int = 0, steps: int = 4) -> Run:
+    return Run(dataset, network, seed, run_recipe(RECIPE, network, seed, steps))
 
 
 @pytest.mark.usefixtures("narrow_network")
 def test_a_filled_cell_writes_model_errors_and_tracks(
     dataset: DataSet, reading: ReaderConfig, tmp_path: Path
 ) -> None:
-    done = cell(dataset, steps=2)
-    fill_cell(done, tmp_path, reading)
+    done = run(dataset, steps=2)
+    complete_run(done, tmp_path, reading)
     folder = tmp_path / "own/StarIO/2-steps/seed-0"
     names = {"errors.json", "log.json", "model.json", "model.safetensors", "tracks.npz"}
     assert {path.name for path in folder.glob("[!.]*")} == {*names, "trained.json"}
@@ -99,11 +98,11 @@ def test_without_recorded_poses_the_legs_alone_select_the_weights(
         write_csv(path, make_walk(seed=seed, seconds=16.0))
     monkeypatch.setattr(training, "train", trained)
     monkeypatch.setattr(training, "cached_walks", lambda *arguments, **rest: [])
-    recipe = cell_recipe(RECIPE, "StarIO", 0, 1)
+    recipe = run_recipe(RECIPE, "StarIO", 0, 1)
     for files, read in ((long, waypoints), (long, read_recording)):
         alone = replace(dataset, training=tuple(files[:1]), validation=tuple(files[1:]))
         with pytest.raises(InputError, match="stop"):
-            training.train_cell(
+            training.train_run(
                 alone, recipe, tmp_path, ReaderConfig(read, {}, tmp_path / read.__name__)
             )
     assert chosen == [True, False]
@@ -114,8 +113,8 @@ def test_a_killed_cell_resumes_and_gives_the_same_model(
     dataset: DataSet, reading: ReaderConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(training, "_EPOCH_STEPS", 2)
-    whole, killed = cell(dataset), cell(dataset)
-    fill_cell(whole, tmp_path / "whole", reading)
+    whole, killed = run(dataset), run(dataset)
+    complete_run(whole, tmp_path / "whole", reading)
     with monkeypatch.context() as during:
 
         def kill(clock: object) -> None:
@@ -123,11 +122,11 @@ def test_a_killed_cell_resumes_and_gives_the_same_model(
 
         during.setattr(training._Clock, "keep", kill)
         with pytest.raises(KeyboardInterrupt):
-            fill_cell(killed, tmp_path / "killed", reading)
+            complete_run(killed, tmp_path / "killed", reading)
     folder = killed.folder(tmp_path / "killed")
     assert (folder / "checkpoint.safetensors").exists()
     assert not (folder / "trained.json").exists()
-    fill_cell(killed, tmp_path / "killed", reading)
+    complete_run(killed, tmp_path / "killed", reading)
     model = whole.folder(tmp_path / "whole") / "model.safetensors"
     assert (folder / "model.safetensors").read_bytes() == model.read_bytes()
     assert len(json.loads((folder / "log.json").read_text())) == 2
@@ -138,22 +137,22 @@ def test_filled_cells_are_kept_and_only_new_networks_and_seeds_are_trained(
     dataset: DataSet, reading: ReaderConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained: list[str] = []
-    original = cells_module.train_cell
+    original = runs_module.train_run
 
     def counted(dataset: DataSet, recipe: Any, *rest: Any) -> dict[str, object]:
         trained.append(f"{recipe.architecture} {recipe.seed}")
         return original(dataset, recipe, *rest)
 
-    monkeypatch.setattr(cells_module, "train_cell", counted)
-    first = [cell(dataset, steps=1), Cell(dataset, "pdr", 0, None)]
-    assert list(fill(first, tmp_path, reading)) == first
+    monkeypatch.setattr(runs_module, "train_run", counted)
+    first = [run(dataset, steps=1), Run(dataset, "pdr", 0, None)]
+    assert list(complete(first, tmp_path, reading)) == first
     errors = first[0].folder(tmp_path) / "errors.json"
     written = errors.stat().st_mtime_ns
-    more = [*first, cell(dataset, "StarIO without MSGCU", steps=1), cell(dataset, seed=1, steps=1)]
-    assert list(fill(more, tmp_path, reading)) == more
+    more = [*first, run(dataset, "StarIO without MSGCU", steps=1), run(dataset, seed=1, steps=1)]
+    assert list(complete(more, tmp_path, reading)) == more
     assert trained == ["StarIO 0", "StarIO without MSGCU 0", "StarIO 1"]
     assert errors.stat().st_mtime_ns == written
-    table = set_table(dataset, filled_cells(more, tmp_path)["own"], {})
+    table = set_table(dataset, completed_runs(more, tmp_path)["own"], {})
     assert [row.network for row in table.rows] == ["pdr", "StarIO without MSGCU", "StarIO"]
     mean = table.rows[2].figures["ate"]
     values = [
@@ -173,63 +172,63 @@ def test_filled_cells_are_kept_and_only_new_networks_and_seeds_are_trained(
 def test_cells_of_another_recipe_are_refused_and_other_step_counts_are_separate(
     dataset: DataSet, reading: ReaderConfig, tmp_path: Path
 ) -> None:
-    done = cell(dataset, steps=1)
-    fill_cell(done, tmp_path, reading)
-    other = Cell(dataset, "StarIO", 0, cell_recipe({**RECIPE, "rate": 1e-2}, "StarIO", 0, 1))
+    done = run(dataset, steps=1)
+    complete_run(done, tmp_path, reading)
+    other = Run(dataset, "StarIO", 0, run_recipe({**RECIPE, "rate": 1e-2}, "StarIO", 0, 1))
     with pytest.raises(ConfigError, match=r"errors\.json.*another recipe"):
-        fill_cell(other, tmp_path, reading)
-    [outcome] = fill([other], tmp_path, reading)
+        complete_run(other, tmp_path, reading)
+    [outcome] = complete([other], tmp_path, reading)
     assert isinstance(outcome, Skipped)
-    assert filled_cells([cell(dataset, steps=2)], tmp_path) == {}
+    assert completed_runs([run(dataset, steps=2)], tmp_path) == {}
 
 
 def test_the_most_important_cells_come_first_and_all_have_equal_steps(dataset: DataSet) -> None:
     names = ("tyrex", "oxiod", "all")
     sets = [DataSet(n, dataset.training, dataset.validation, dataset.test, "") for n in names]
-    cells = table_cells(sets, {**RECIPE, "batch": 10}, steps=600, seeds=2)
-    order = [(c.dataset.name, c.seed) for c in cells if c.recipe]
+    runs = table_runs(sets, {**RECIPE, "batch": 10}, steps=600, seeds=2)
+    order = [(c.dataset.name, c.seed) for c in runs if c.recipe]
     assert list(dict.fromkeys(order)) == [
         ("oxiod", 0), ("all", 0), ("oxiod", 1), ("all", 1), ("tyrex", 0), ("tyrex", 1),
     ]  # fmt: skip
     assert order.count(("all", 0)) == len(ARCHITECTURES)
-    assert [c.network for c in cells if (c.dataset.name, c.seed) == ("all", 1)] == list(LEADING)
-    recipes = [c.recipe for c in cells if c.recipe]
+    assert [c.network for c in runs if (c.dataset.name, c.seed) == ("all", 1)] == list(LEADING)
+    recipes = [c.recipe for c in runs if c.recipe]
     assert {(r.steps, r.batch, r.patience >= r.epochs) for r in recipes} == {(600, 10, True)}
-    assert [c.network for c in cells[:2]] == ["pdr", "default"]
+    assert [c.network for c in runs[:2]] == ["pdr", "default"]
     with pytest.raises(InputError, match="Nobody"):
-        table_cells(sets, RECIPE, networks=["Nobody"])
+        table_runs(sets, RECIPE, networks=["Nobody"])
 
 
 def test_a_cell_can_be_pickled_for_other_machines(dataset: DataSet, reading: ReaderConfig) -> None:
-    work = partial(fill_cell, out=Path("out"), reading=reading)
-    sent = pickle.loads(pickle.dumps((work, cell(dataset))))
-    assert sent[1] == cell(dataset)
-    assert sent[1].digest == cell(dataset).digest
+    work = partial(complete_run, out=Path("out"), reading=reading)
+    sent = pickle.loads(pickle.dumps((work, run(dataset))))
+    assert sent[1] == run(dataset)
+    assert sent[1].digest == run(dataset).digest
 
 
 def test_results_belong_to_a_network_a_recipe_and_all_recordings_of_their_set(
     dataset: DataSet,
 ) -> None:
     sets = [replace(dataset, **{part: ()}) for part in ("training", "validation", "test")]
-    others = [*map(cell, sets), cell(dataset, "R-ResNet"), cell(dataset, seed=1)]
-    assert len({cell(dataset).digest, *(other.digest for other in others)}) == 6
+    others = [*map(run, sets), run(dataset, "R-ResNet"), run(dataset, seed=1)]
+    assert len({run(dataset).digest, *(other.digest for other in others)}) == 6
 
 
 def test_new_weights_or_changed_recordings_do_not_keep_old_results(
     dataset: DataSet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    given = Cell(dataset, "default", 0, None)
-    before = given.digest, cell(dataset).digest
+    given = Run(dataset, "default", 0, None)
+    before = given.digest, run(dataset).digest
     with monkeypatch.context() as patch:
-        patch.setattr(cells_module, "_weights_sha256", lambda name: "new")
+        patch.setattr(runs_module, "_weights_sha256", lambda name: "new")
         assert given.digest != before[0]
-        assert cell(dataset).digest == before[1]
+        assert run(dataset).digest == before[1]
     os.utime(dataset.training[0])  # as if it were written again
-    assert (given.digest, cell(dataset).digest != before[1]) == (before[0], True)
+    assert (given.digest, run(dataset).digest != before[1]) == (before[0], True)
     os.utime(dataset.test[0].path)
     assert given.digest != before[0]
     with pytest.raises(WeightsError, match="no such file"):
-        _ = Cell(dataset, "missing", 0, None).digest
+        _ = Run(dataset, "missing", 0, None).digest
 
 
 def test_an_unknown_backend_is_refused() -> None:
