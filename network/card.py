@@ -104,8 +104,11 @@ def dump_card(card: Card) -> str:
     return json.dumps({k: v for k, v in content.items() if v is not None}, indent=2) + "\n"
 
 
-def read_card(weights: Path) -> Card:
-    """Read and check the card of a weights file.
+def read_weights(weights: Path) -> tuple[bytes, Card]:
+    """Read a weights file and its card, and check that they belong together.
+
+    Returns:
+        content of the safetensors file, and the card.
 
     Raises:
         WeightsError: card or weights are missing, malformed, of another kind, or the checksum
@@ -123,7 +126,8 @@ def read_card(weights: Path) -> Card:
     except UnicodeDecodeError as error:
         raise WeightsError(path, "card", str(error), "a StarIO weights card") from error
     card = parse_card(text, path)
-    digest = hashlib.sha256(weights.read_bytes()).hexdigest()
+    content = weights.read_bytes()
+    digest = hashlib.sha256(content).hexdigest()
     if digest != card.sha256:
         raise WeightsError(
             weights,
@@ -132,7 +136,7 @@ def read_card(weights: Path) -> Card:
             f"{card.sha256[:12]} as on the card",
             "the file is truncated or belongs to another card",
         )
-    return card
+    return content, card
 
 
 def parse_card(text: str, path: Path) -> Card:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from stario.sequences.sequence import STANDARD_GRAVITY
 
-_LOG_SIGMA_RANGE = (-6.0, 3.0)
+LOG_SIGMA_RANGE = (-6.0, 3.0)
 
 
 class DisplacementNetwork(nn.Module):
@@ -56,4 +56,4 @@ class DisplacementNetwork(nn.Module):
 
 def _split_output(output: Tensor) -> tuple[Tensor, Tensor]:
     output = output.float()
-    return output[..., :3], output[..., 3:].clamp(*_LOG_SIGMA_RANGE)
+    return output[..., :3], output[..., 3:].clamp(*LOG_SIGMA_RANGE)

@@ -14,15 +14,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stario.network.architectures import ARCHITECTURES, build_network
-from stario.network.card import Card, card_path, dump_card, read_card
-from stario.network.runtime.engines import Engine, Float32Array, TorchEngine
+from stario.network.architectures import ARCHITECTURES
+from stario.network.card import Card, card_path, dump_card, read_weights
+from stario.network.runtime.engines import Engine, Float32Array
+from stario.network.runtime.onnx_engine import load_onnx, weights_engine
 from stario.sequences.errors import InputError, WeightsError
 from stario.sequences.files import atomic_write
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SAMPLES
 
-if TYPE_CHECKING:  # an exported graph needs no PyTorch
+if TYPE_CHECKING:  # PyTorch is imported only by what needs it
     from stario.network.displacement import DisplacementNetwork
 
 
@@ -32,11 +33,14 @@ class DisplacementModel:
     Args:
         engine: engine that runs the network.
         card: description of its weights.
+
+    Attributes:
+        engine: that engine.
+        card: that card.
     """
 
     def __init__(self, engine: Engine, card: Card) -> None:
-        self.card = card
-        self._engine = engine
+        self.engine, self.card = engine, card
 
     def __repr__(self) -> str:
         return f"DisplacementModel({self.name}, sha256 {self.card.sha256[:12] or 'unknown'})"
@@ -53,7 +57,7 @@ class DisplacementModel:
         Raises:
             InputError: the model is an exported graph.
         """
-        return self._engine.training_form
+        return self.engine.training_form
 
     def stateful_inference(self, updates: int = 1) -> DisplacementModel | StatefulModel:
         """Return a model that predicts the windows of one unbroken track, in order of time.
@@ -65,7 +69,7 @@ class DisplacementModel:
         Returns:
             The model itself, or a `StatefulModel` if the network is recurrent.
         """
-        return StatefulModel(self, self._engine, updates) if self._engine.is_recurrent else self
+        return StatefulModel(self, self.engine, updates) if self.engine.is_recurrent else self
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Predict the displacement over each window, from its start to one second later.
@@ -86,7 +90,7 @@ class DisplacementModel:
         batch = _checked_windows(windows)
         if len(batch) == 0:
             return np.zeros((0, 3)), np.zeros((0, 3, 3))
-        mean, log_sigma, _ = self._engine.run(batch)
+        mean, log_sigma, _ = self.engine.run(batch)
         return self.calibrated(batch, mean, log_sigma)
 
     def calibrated(
@@ -168,19 +172,17 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     Args:
         name_or_path: name of packaged weights ("default"; "open", whose sources allow any use;
             "first-stage", trained without the held-out groups; "walks-36min", the earlier ones), a
-            safetensors file with its card next to it, or an ONNX file written by `export_onnx`,
-            which runs in ONNX Runtime.
+            safetensors file with its card next to it, or an ONNX file written by `export_onnx`.
+            StarIO and ONNX files run in ONNX Runtime, other networks in PyTorch.
 
     Raises:
         WeightsError: the file or its card is missing or truncated, or they do not match.
-        InputError: neither a name nor a path, or an ONNX file without onnxruntime installed.
+        InputError: neither a name nor a path.
     """
     if not isinstance(name_or_path, str | Path):
         raise InputError("name_or_path", f"{name_or_path!r:.60}", f"{packaged_names()}, or a file")
     path = Path(name_or_path)
     if path.suffix == ".onnx":
-        from stario.network.runtime.onnx_file import load_onnx
-
         return DisplacementModel(*load_onnx(path))
     packaged = Path(str(importlib.resources.files("stario.network.weights")), f"{path}.safetensors")
     is_name = path.parent == Path() and not path.suffix
@@ -188,21 +190,24 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
         path = packaged
     elif is_name and not path.exists():
         raise WeightsError(path, "weights", "no such file", f"a file, or {packaged_names()}")
-    card = read_card(path)
+    content, card = read_weights(path)
     if card.architecture not in ARCHITECTURES:
         known = f"one of {', '.join(ARCHITECTURES)}"
         raise WeightsError(card_path(path), "architecture", repr(card.architecture), known)
+    engine = weights_engine(card.architecture, content)
+    return DisplacementModel(engine or _torch_engine(card.architecture, content, path), card)
+
+
+def _torch_engine(architecture: str, content: bytes, path: Path) -> Engine:
     import safetensors.torch
 
-    from stario.network.displacement import DisplacementNetwork
+    from stario.network.runtime.torch_engine import TorchEngine, trainable
 
-    network = DisplacementNetwork(build_network(card.architecture))
     try:
-        network.network.load_state_dict(safetensors.torch.load_file(path))
+        return TorchEngine(trainable(architecture, safetensors.torch.load(content)))
     except (safetensors.SafetensorError, RuntimeError) as error:
-        expected = f"tensors of {card.architecture}"
+        expected = f"tensors of {architecture}"
         raise WeightsError(path, "weights", first_mismatch(error), expected) from error
-    return DisplacementModel(TorchEngine(network), card)
 
 
 def first_mismatch(error: Exception) -> str:

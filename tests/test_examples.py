@@ -1,8 +1,6 @@
 """Every example runs and returns the documented result."""
 
 import importlib.util
-import json
-import subprocess
 import sys
 from functools import partial
 from pathlib import Path
@@ -15,8 +13,6 @@ from training_runs import narrow
 
 from stario.fusion import Navigator, demonstration
 from stario.network import load_model
-from stario.network.card import Card, dump_card
-from stario.network.runtime.onnx_file import CARD_KEY
 from stario.sequences import InputError, read_recording
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -40,7 +36,6 @@ def test_every_example_is_tested_here():
         "replay_live",
         "live_latency",
         "fine_tune",
-        "streaming_onnx",
         "ros2_node",
     }
     assert {p.stem for p in FOLDER.glob("*.py")} == tested
@@ -113,63 +108,6 @@ def test_replay_live_ends_where_a_run_on_the_saved_recording_ends():
     assert sample_count == len(recording) == 1200
     track = Navigator(load_model("default")).run(recording)
     np.testing.assert_allclose(track.trajectory.position_W[-1], end, atol=1e-4)
-
-
-class MeanForce:
-    """A network that predicts a displacement along the mean force, with a sigma of 0.5 m."""
-
-    def predict(self, windows):
-        mean = np.asarray(windows, np.float32)[:, 3:].mean(axis=2) * np.float32(0.1)
-        variance = np.full(3, 0.5**2 + 0.005**2)  # with the floor of a card's calibration
-        return mean.astype(float), np.tile(np.diag(variance), (len(mean), 1, 1))
-
-
-def write_mean_force(path):
-    """Write that network as `export_onnx` would, which takes seconds."""
-    onnx = pytest.importorskip("onnx", reason="pip install 'stario[onnx]'")
-    from onnx import TensorProto, helper, numpy_helper
-
-    constants = {
-        "rows": np.array([3, 4, 5]),
-        "time": np.array([2]),
-        "tenth": np.float32(0.1),
-        "none": np.float32(0.0),
-        "half": np.float32(np.log(0.5)),
-    }
-    nodes = [
-        helper.make_node("Gather", ["windows", "rows"], ["force"], axis=1),
-        helper.make_node("ReduceMean", ["force", "time"], ["mean"], keepdims=0),
-        helper.make_node("Mul", ["mean", "tenth"], ["displacement"]),
-        helper.make_node("Mul", ["mean", "none"], ["zero"]),
-        helper.make_node("Add", ["zero", "half"], ["log_sigma"]),
-    ]
-    given, *results = (
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", *shape])
-        for name, shape in (("windows", [6, 200]), ("displacement", [3]), ("log_sigma", [3]))
-    )
-    weights = [numpy_helper.from_array(np.asarray(v), name) for name, v in constants.items()]
-    graph = helper.make_graph(nodes, "mean force", [given], results, weights)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
-    model.metadata_props.add(key=CARD_KEY, value=dump_card(Card("StarIO")))
-    onnx.save(model, path)
-
-
-@pytest.mark.slow
-def test_streaming_onnx_gives_the_networks_track_without_importing_torch(tmp_path):
-    """`.ci/run` streams the default weights, `test_export.py` compares exported networks."""
-    pytest.importorskip("onnxruntime", reason="pip install 'stario[onnx]'")
-    path = tmp_path / "small.onnx"
-    write_mean_force(path)
-    code = f"import json, runpy; m = runpy.run_path({str(FOLDER / 'streaming_onnx.py')!r})\n"
-    code += f"from pathlib import Path; print(json.dumps(m['main'](Path({str(path)!r}), 10.0)))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    printed = json.loads(done.stdout)
-    assert not printed["torch_imported"]
-    navigator, walk = Navigator(MeanForce()), demonstration()
-    rows = zip(walk.time, walk.gyro, walk.accel, strict=True)
-    states = [s for row in rows if row[0] <= 10.0 and (s := navigator.push(*row)) is not None]
-    assert printed["states"] == len(states)
-    np.testing.assert_allclose(printed["p_W"], states[-1].p_W, atol=1e-3)
 
 
 def check_odometry(outputs, largest_step=0.3):

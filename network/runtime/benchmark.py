@@ -1,18 +1,17 @@
-"""Time per window of networks on the CPU, and of both forms of one network."""
+"""Time per window of networks on the CPU, and of one network in both engines."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from stario.network.displacement import DisplacementNetwork
-from stario.network.runtime.inference import inference_form
+from stario.network.model import DisplacementModel
+from stario.network.runtime.engines import Engine
+from stario.network.runtime.torch_engine import TorchEngine
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 from stario.sequences.windows import WINDOW_SAMPLES
 
@@ -25,41 +24,30 @@ class NetworkSpeed:
 
     Attributes:
         batch: number of windows per call.
-        training_form: median for the training form, in evaluation mode [ms].
-        inference_form: median for the inference form [ms].
-        training_form_least: the same for its fastest call [ms], which other jobs disturb least.
-        inference_form_least: fastest call of the inference form [ms].
-        threads: number of threads that PyTorch used.
+        model: median for the model as it runs [ms].
+        torch: median for its network in PyTorch [ms].
     """
 
     batch: int
-    training_form: float
-    inference_form: float
-    training_form_least: float
-    inference_form_least: float
-    threads: int
+    model: float
+    torch: float
 
 
 def network_speed(
-    network: DisplacementNetwork, batches: Sequence[int] = (1, 64), runs: int = 30
+    model: DisplacementModel, batches: Sequence[int] = (1, 64), runs: int = 30
 ) -> list[NetworkSpeed]:
-    """Time both forms of a network in alternating calls.
+    """Time a model, and the same network in PyTorch, in alternating calls.
 
     Args:
-        network: network on the CPU; it is left in evaluation mode.
+        model: model with trainable weights.
         batches: numbers of windows per call; the result has one entry for each.
-        runs: number of calls of each form per batch.
+        runs: number of calls of each per batch.
     """
-    forms = [network.eval(), inference_form(network)]
-    speeds = []
-    for batch in batches:
-        windows = torch.from_numpy(random_windows(batch))
-        with torch.inference_mode():
-            times = milliseconds_in_turn(forms, windows, runs)
-        median, least = np.median(times, axis=0).tolist(), times.min(axis=0).tolist()
-        threads = torch.get_num_threads()
-        speeds.append(NetworkSpeed(batch, median[0], median[1], least[0], least[1], threads))
-    return speeds
+    engines = [model.engine, TorchEngine(model.training_form)]
+    return [
+        NetworkSpeed(batch, *median_milliseconds(engines, batch, runs).tolist())
+        for batch in batches
+    ]
 
 
 def random_windows(batch: int) -> NDArray[np.float32]:
@@ -69,18 +57,17 @@ def random_windows(batch: int) -> NDArray[np.float32]:
     return windows.astype(np.float32)
 
 
-def milliseconds_in_turn(
-    networks: Sequence[Callable[[Any], object]], windows: Any, runs: int
-) -> FloatArray:
-    """Return the time per window (runs, networks) [ms] of calls with windows (B, 6, 200).
+def median_milliseconds(engines: Sequence[Engine], batch: int, runs: int) -> FloatArray:
+    """Return the median time per window (engines,) [ms].
 
-    Every run calls all networks in turn, so that all are timed under the same load; a few runs
+    Every run calls all engines in turn, so that all are timed under the same load; a few runs
     before them are not timed.
     """
-    seconds = np.zeros((_WARM_UP + runs, len(networks)))
+    windows = random_windows(batch)
+    seconds = np.zeros((_WARM_UP + runs, len(engines)))
     for row in seconds:
-        for column, network in enumerate(networks):
+        for column, engine in enumerate(engines):
             began = perf_counter()
-            network(windows)
+            engine.run(windows)
             row[column] = perf_counter() - began
-    return 1e3 / len(windows) * seconds[_WARM_UP:]
+    return np.asarray(np.median(1e3 / batch * seconds[_WARM_UP:], axis=0))

@@ -1,9 +1,10 @@
-"""Export to ONNX; `onnx_file` loads the files.
+"""Export to ONNX; `onnx_engine` loads the files.
 
 The graph maps `windows` (batch, 6, 200), as in `DisplacementModel.predict`, to `displacement`
 (batch, 3) [m] and `log_sigma` (batch, 3); that of a recurrent network also takes `state`
 (2, batch, H) and returns `next_state`. Its metadata hold the card: window, rate, frame, units and
-the calibration of the covariance.
+the calibration of the covariance. StarIO's graph is that of `stario_graph`, others are traced by
+PyTorch.
 """
 
 from __future__ import annotations
@@ -13,14 +14,15 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from stario.network.card import dump_card
 from stario.network.displacement import DisplacementNetwork
-from stario.network.runtime.onnx_file import CARD_KEY
+from stario.network.runtime.onnx_engine import CARD_KEY
+from stario.network.stario import StarIO
 from stario.sequences.files import atomic_write
 from stario.sequences.lazy import optional_package
 from stario.sequences.windows import WINDOW_SAMPLES
@@ -46,9 +48,24 @@ def export_onnx(model: DisplacementModel, path: Path) -> None:
         InputError: the extra `onnx` is not installed, the model is itself an exported graph, or
             the folder does not exist.
     """
-    for package in ("onnx", "onnxscript"):
-        optional_package(package, "onnx")
+    optional_package("onnx", "onnx")
     network = model.training_form
+    if isinstance(network.network, StarIO):
+        from stario.network.runtime.stario_graph import stario_graph, with_weights
+
+        state = {name: tensor.numpy() for name, tensor in network.network.state_dict().items()}
+        graph = with_weights(stario_graph(network.network), state)
+    else:
+        graph = _traced(network)
+    card = {"frame": model.card.frame, CARD_KEY: dump_card(model.card)}
+    for key, text in {**_UNITS, **card}.items():
+        graph.metadata_props.add(key=key, value=text)
+    with atomic_write(path, "wb") as file:
+        file.write(graph.SerializeToString())
+
+
+def _traced(network: DisplacementNetwork) -> Any:
+    optional_package("onnxscript", "onnx")
     recurrent, batch = network.is_recurrent, torch.export.Dim("batch")
     inputs = {"windows": torch.zeros(2, 6, WINDOW_SAMPLES)}
     if recurrent:
@@ -65,12 +82,7 @@ def export_onnx(model: DisplacementModel, path: Path) -> None:
             dynamic_shapes=({0: batch}, {1: batch})[: len(inputs)],
         )
     assert program is not None
-    graph = program.model_proto
-    card = {"frame": model.card.frame, CARD_KEY: dump_card(model.card)}
-    for key, text in {**_UNITS, **card}.items():
-        graph.metadata_props.add(key=key, value=text)
-    with atomic_write(path, "wb") as file:
-        file.write(graph.SerializeToString())
+    return program.model_proto
 
 
 class _Step(nn.Module):

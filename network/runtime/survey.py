@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -19,11 +18,10 @@ from stario.network.architectures import ARCHITECTURES, architecture, build_netw
 from stario.network.card import Card
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import DisplacementModel
-from stario.network.runtime.benchmark import milliseconds_in_turn, random_windows
+from stario.network.runtime.benchmark import median_milliseconds
 from stario.network.runtime.cost import cost
-from stario.network.runtime.engines import Engine, TorchEngine
-from stario.network.runtime.fast_stario import FastStarIO
-from stario.network.runtime.inference import inference_form
+from stario.network.runtime.engines import Engine
+from stario.network.runtime.torch_engine import TorchEngine
 from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.windows import WINDOW_SAMPLES
 
@@ -70,12 +68,12 @@ def measured() -> dict[str, str]:
         "head (stario.network.runtime.cost); here in millions, the paper's figure in parentheses",
         "flops": "by the same rules, for one window; in millions, likewise",
         "numel": "number of elements of all parameters of the same network; in millions",
-        "milliseconds": "per window with six outputs, in the inference form, with random weights: "
+        "milliseconds": "per window with six outputs, with random weights: "
         "median over calls in turn with all other networks, "
         + ", ".join(f"{runs} calls at batch {batch}" for batch, runs in _RUNS.items())
-        + f"; {threads} threads in PyTorch and in ONNX Runtime",
-        "peak_memory_mb": "weights of the inference form, and the peak size of the results of "
-        "PyTorch's operations in the first inference of one window; memory that libraries take "
+        + f"; {threads} threads in PyTorch, one in ONNX Runtime",
+        "peak_memory_mb": "weights, and the peak size of the results of "
+        "PyTorch's operations in the inference of one window; memory that libraries take "
         "within an operation is not counted",
     }
 
@@ -89,8 +87,8 @@ def survey(
 
     Args:
         names: names of architectures.
-        cache: folder that keeps exported graphs, each of which takes up to half a minute to make;
-            None skips ONNX Runtime.
+        cache: folder that keeps exported graphs, as tracing takes up to half a minute; None skips
+            ONNX Runtime.
         progress: called with the fraction of the work done.
 
     Raises:
@@ -98,9 +96,7 @@ def survey(
     """
     engines: list[Engine] = [_engine(name) for name in names]
     times = {"torch": _times(engines), "onnxruntime": None}
-    if cache is not None and all(
-        importlib.util.find_spec(name) for name in ("onnx", "onnxruntime", "onnxscript")
-    ):
+    if cache is not None and all(importlib.util.find_spec(name) for name in ("onnx", "onnxscript")):
         graphs: list[Engine] = []
         for name, engine in zip(names, engines, strict=True):
             graphs.append(_graph_engine(name, engine, cache))
@@ -150,7 +146,7 @@ def _engine(name: str) -> TorchEngine:
 def _graph_engine(name: str, engine: Engine, cache: Path) -> Engine:
     """Return the exported graph, from the cache if the code that makes it is unchanged."""
     from stario.network.runtime.export import export_onnx
-    from stario.network.runtime.onnx_file import load_onnx
+    from stario.network.runtime.onnx_engine import load_onnx
 
     sources = b"".join(
         path.read_bytes() for path in sorted(Path(__file__).parents[1].rglob("*.py"))
@@ -166,22 +162,15 @@ def _graph_engine(name: str, engine: Engine, cache: Path) -> Engine:
 def _times(engines: Sequence[Engine]) -> dict[str, list[float]]:
     """Return the time per window [ms] of each engine, by batch size."""
     return {
-        str(batch): np.median(
-            milliseconds_in_turn([e.run for e in engines], random_windows(batch), _RUNS[batch]),
-            axis=0,
-        ).tolist()
-        for batch in BATCHES
+        str(batch): median_milliseconds(engines, batch, _RUNS[batch]).tolist() for batch in BATCHES
     }
 
 
 def _peak_memory(network: DisplacementNetwork) -> int:
-    form = inference_form(network)
-    known = [*form.parameters(), *form.buffers()]
-    if isinstance(form.network, FastStarIO):
-        known += form.network.weights()
+    known = [*network.parameters(), *network.buffers()]
     weights = sum(t.numel() * t.element_size() for t in known)
     window = torch.zeros(1, 6, WINDOW_SAMPLES)
-    return weights + peak_bytes(lambda: form(window))
+    return weights + peak_bytes(lambda: network(window))
 
 
 def peak_bytes(work: Callable[[], object]) -> int:

@@ -145,8 +145,8 @@ def test_known_motion_is_stored_on_the_card(known: KnownMotion) -> None:
 
 def test_a_model_widens_its_covariance_for_unfamiliar_motion(known: KnownMotion) -> None:
     plain = load_model("default")
-    plain = DisplacementModel(plain._engine, replace(plain.card, known_motion=None))
-    aware = DisplacementModel(plain._engine, replace(plain.card, known_motion=known))
+    plain = DisplacementModel(plain.engine, replace(plain.card, known_motion=None))
+    aware = DisplacementModel(plain.engine, replace(plain.card, known_motion=known))
     unfamiliar = windows(walking_stream(1, size=4.0))
     mean, covariance = plain.predict(unfamiliar)
     same, wider = aware.predict(unfamiliar)

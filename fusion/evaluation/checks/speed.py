@@ -123,7 +123,7 @@ def speed_report(model: DisplacementModel) -> dict[str, Any]:
         **push_speed(model),
         "update_rate_hz": default.config.filter.update_rate,
         **windows_speed(),
-        "network": [asdict(speed) for speed in network_speed(model.training_form)],
+        "network": [asdict(speed) for speed in network_speed(model)],
     }
 
 
@@ -180,10 +180,7 @@ def speed_table(report: dict[str, Any]) -> str:
         "push: {push_us_median:.1f} us (median), "
         "{push_ms:.1f} ms with a network update (99th percentile)",
     ]
-    network = (
-        "network, batch {batch}: {inference_form:.3f} ms/window "
-        "(as trained: {training_form:.3f}), {threads} threads"
-    )
+    network = "network, batch {batch}: {model:.3f} ms/window (in PyTorch: {torch:.3f})"
     push_ms = report["push_us_with_update_p99"] / 1e3
     return "\n".join(
         [

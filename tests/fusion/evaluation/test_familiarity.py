@@ -34,7 +34,7 @@ def model() -> DisplacementModel:
 
 def model_with(known: KnownMotion) -> DisplacementModel:
     plain = load_model("default")
-    return DisplacementModel(plain._engine, replace(plain.card, known_motion=known))
+    return DisplacementModel(plain.engine, replace(plain.card, known_motion=known))
 
 
 def with_vibration(sequence: ImuSequence) -> ImuSequence:
@@ -82,7 +82,7 @@ class ReversedModel(DisplacementModel):
 def test_a_model_with_reversed_displacements_is_reported(model: DisplacementModel) -> None:
     walk = simulated(60.0)
     normal = familiarity(model, walk)
-    opposite = familiarity(ReversedModel(model._engine, model.card), walk)
+    opposite = familiarity(ReversedModel(model.engine, model.card), walk)
     assert not [line for line in normal.lines() if "direction differs" in line]
     [line] = [line for line in opposite.lines() if "direction differs" in line]
     assert line.startswith("!")

@@ -10,7 +10,7 @@ from stario.network.card import Calibration, Card
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import DisplacementModel, load_model, save_model
 from stario.network.runtime.benchmark import random_windows
-from stario.network.runtime.engines import TorchEngine
+from stario.network.runtime.torch_engine import TorchEngine
 from stario.sequences.errors import InputError, WeightsError
 from stario.sequences.sequence import FloatArray
 
@@ -57,14 +57,11 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_an_exported_stario_network_gives_the_same_predictions(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Tracing takes a second per block: two different ones here, all of them in slow tests.
-    monkeypatch.setattr("stario.network.stario.BLOCKS", (1, 0, 0, 1))
-    exported = assert_parity(untrained("StarIO"), tmp_path / "star.onnx")
+@pytest.mark.parametrize("name", ["StarIO", "StarIO without MSGCU"])
+def test_an_exported_stario_network_gives_the_same_predictions(name: str, tmp_path: Path) -> None:
+    exported = assert_parity(untrained(name), tmp_path / "star.onnx")
     assert exported.card.calibration == CALIBRATION
-    assert exported.name == "StarIO"
+    assert exported.name == name
 
 
 @pytest.mark.slow

@@ -1,0 +1,186 @@
+"""ONNX Runtime: files written by `export_onnx`, and graphs that take a weights file's tensors.
+
+PyTorch is not imported.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stario.network.card import Card, parse_card
+from stario.network.runtime.engines import BATCH, Answer, Float32Array
+from stario.sequences.errors import InputError, WeightsError
+from stario.sequences.windows import WINDOW_SAMPLES
+
+if TYPE_CHECKING:
+    from stario.network.displacement import DisplacementNetwork
+
+CARD_KEY = "stario_card"
+"""Metadata key of the card, stored as JSON."""
+
+GRAPHS = {"StarIO": "stario.onnx"}
+"""Files in this folder with the graphs of networks, without weights."""
+
+
+class OnnxEngine:
+    """ONNX Runtime on the CPU.
+
+    Args:
+        graph: content of an ONNX file.
+        tensors: tensors of the weights, if the graph does not contain them, by name.
+        architecture: name of the network that they belong to.
+
+    Raises:
+        Exception: ONNX Runtime's own, which have no common base: graph or tensors do not fit.
+    """
+
+    def __init__(
+        self,
+        graph: bytes,
+        tensors: Mapping[str, NDArray[Any]] | None = None,
+        architecture: str = "",
+    ) -> None:
+        self._graph, self._tensors, self._architecture = graph, tensors or {}, architecture
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        # A second thread gains little on windows this small, and waits for a busy core.
+        granted = os.environ.get("OMP_NUM_THREADS", "")
+        options.intra_op_num_threads = int(granted) if granted.isdecimal() else 1
+        options.enable_cpu_mem_arena = False  # as fast, with 14 MB less
+        options.log_severity_level = 3
+        # ONNX Runtime reads them in place, so they stay. Batch norms' counters, integers, are in
+        # no graph.
+        self._given = {
+            name: onnxruntime.OrtValue.ortvalue_from_numpy(tensor)
+            for name, tensor in self._tensors.items()
+            if tensor.dtype == np.float32
+        }
+        options.add_external_initializers(list(self._given), list(self._given.values()))
+        self._session = onnxruntime.InferenceSession(
+            graph, options, providers=["CPUExecutionProvider"]
+        )
+        shapes = {node.name: node.shape for node in self._session.get_inputs()}
+        self._state_size = int(shapes["state"][2]) if "state" in shapes else 0
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Send graph and weights to another process, which makes its own session."""
+        return OnnxEngine, (self._graph, self._tensors, self._architecture)
+
+    @property
+    def is_recurrent(self) -> bool:
+        """Whether the network is recurrent: it carries a state from window to window."""
+        return self._state_size > 0
+
+    def first_state(self) -> Float32Array:
+        """Return the state (2, 1, H) of a recurrent network before the first window."""
+        return np.zeros((2, 1, self._state_size), np.float32)
+
+    @cached_property
+    def training_form(self) -> DisplacementNetwork:
+        """Network with trainable weights, made in PyTorch when it is first needed.
+
+        Raises:
+            InputError: an exported graph does not contain it.
+        """
+        if not self._architecture:
+            raise InputError("model", "an exported graph", "a safetensors file of weights")
+        import torch
+
+        from stario.network.runtime.torch_engine import trainable
+
+        state = {name: torch.tensor(tensor) for name, tensor in self._tensors.items()}
+        return trainable(self._architecture, state)
+
+    def run(self, windows: Float32Array, state: Float32Array | None = None) -> Answer:
+        """Run windows (B, 6, 200), each from its own state, or from zero if `state` is None."""
+        if state is not None:
+            mean, log_sigma, after = self._session.run(None, {"windows": windows, "state": state})
+            return mean, log_sigma, after
+        parts = []
+        for begin in range(0, len(windows), BATCH):
+            feed = {"windows": windows[begin : begin + BATCH]}
+            if self.is_recurrent:
+                shape = (2, len(feed["windows"]), self._state_size)
+                feed["state"] = np.zeros(shape, np.float32)
+            parts.append(self._session.run(["displacement", "log_sigma"], feed))
+        mean, log_sigma = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return mean, log_sigma, None
+
+    def described(self, path: Path) -> Card:
+        """Return the card in an exported graph, after checking the graph.
+
+        Args:
+            path: file that the graph is from, for the error.
+
+        Raises:
+            WeightsError: the graph was not written by `export_onnx`, or was changed since.
+        """
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        if CARD_KEY not in metadata:
+            raise WeightsError(path, CARD_KEY, "no such metadata", "a file from `stario export`")
+        _check_graph(self._session, path)
+        return parse_card(metadata[CARD_KEY], path)
+
+
+def load_onnx(path: Path) -> tuple[OnnxEngine, Card]:
+    """Load the engine and the card of an exported file.
+
+    Args:
+        path: file written by `export_onnx`.
+
+    Raises:
+        WeightsError: the file is missing, truncated, not written by `export_onnx`, or its graph was
+            changed since.
+    """
+    if not path.is_file():
+        raise WeightsError(path, "file", "no such file", "an exported model")
+    try:
+        engine = OnnxEngine(path.read_bytes())
+    # ONNX Runtime's errors have no common base of their own.
+    except Exception as error:
+        import onnxruntime
+
+        found = str(error).splitlines()[0]
+        expected = f"a complete ONNX file that ONNX Runtime {onnxruntime.__version__} can read"
+        raise WeightsError(path, "graph", found, expected) from error
+    return engine, engine.described(path)
+
+
+def weights_engine(architecture: str, content: bytes) -> OnnxEngine | None:
+    """Return an engine for a weights file; None if there is no graph that its tensors fit.
+
+    Args:
+        architecture: name of the network.
+        content: content of the safetensors file.
+    """
+    if architecture not in GRAPHS:
+        return None
+    import safetensors.numpy
+
+    graph = Path(__file__).with_name(GRAPHS[architecture]).read_bytes()
+    try:
+        return OnnxEngine(graph, safetensors.numpy.load(content), architecture)
+    # Of either library: PyTorch converts other number formats, or names the tensor that is wrong.
+    except Exception:
+        return None
+
+
+def _check_graph(session: Any, path: Path) -> None:
+    """Refuse a graph converted by other tools, for example to half precision or a fixed batch."""
+    nodes = {node.name: node for node in (*session.get_inputs(), *session.get_outputs())}
+    for name, tail in (("windows", [6, WINDOW_SAMPLES]), ("displacement", [3]), ("log_sigma", [3])):
+        expected, found = f"tensor(float) of shape {['batch', *tail]}", "none"
+        if name in nodes:
+            (batch, *rest), kind = nodes[name].shape, nodes[name].type
+            if isinstance(batch, str) and rest == tail and kind == "tensor(float)":
+                continue
+            found = f"{kind} of shape {[batch, *rest]}"
+        raise WeightsError(path, name, found, expected, "export the weights again")

@@ -1,0 +1,207 @@
+"""Both engines give what the network in training gives, on any windows, in any process."""
+
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+from cut_windows import windows_of
+from torch import nn
+
+from stario.network.architectures import ARCHITECTURES, build_network
+from stario.network.card import Card
+from stario.network.displacement import DisplacementNetwork
+from stario.network.model import load_model, save_model
+from stario.network.runtime import onnx_engine
+from stario.network.runtime.benchmark import network_speed, random_windows
+from stario.network.runtime.engines import Engine, Float32Array
+from stario.network.runtime.onnx_engine import GRAPHS, OnnxEngine, weights_engine
+from stario.network.runtime.torch_engine import TorchEngine
+from stario.network.stario import StarIO
+from stario.sequences.sequence import STANDARD_GRAVITY
+from stario.sequences.simulation.imu import simulate_imu
+from stario.sequences.simulation.walks import generate_walk
+from stario.sequences.windows import world_streams
+
+
+def randomise_norms(network: nn.Module) -> None:
+    """Replace the initial parameters and statistics of every norm by random ones."""
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm1d):
+            nn.init.uniform_(module.weight, 0.5, 1.5)
+            nn.init.normal_(module.bias, 0.0, 0.5)
+            assert module.running_mean is not None
+            assert module.running_var is not None
+            module.running_mean.normal_(0.0, 0.5)
+            module.running_var.uniform_(0.3, 2.0)
+
+
+def randomised_network(seed: int = 0) -> DisplacementNetwork:
+    """A StarIO whose norms, mu and xi all differ from their initial values."""
+    torch.manual_seed(seed)
+    network = DisplacementNetwork(StarIO())
+    randomise_norms(network)
+    for name, parameter in network.named_parameters():
+        if name.endswith((".mu", ".xi")):
+            nn.init.uniform_(parameter, -1.5, 1.5)
+    return network.eval()
+
+
+def engine_of(network: DisplacementNetwork) -> OnnxEngine:
+    engine = weights_engine("StarIO", safetensors.torch.save(network.network.state_dict()))
+    assert engine is not None
+    return engine
+
+
+@pytest.fixture(scope="module")
+def network() -> DisplacementNetwork:
+    return randomised_network()
+
+
+@pytest.fixture(scope="module")
+def engine(network: DisplacementNetwork) -> OnnxEngine:
+    return engine_of(network)
+
+
+def assert_same(engine: Engine, network: DisplacementNetwork, windows: Float32Array) -> None:
+    with torch.inference_mode():
+        expected = network(torch.from_numpy(windows))
+    for a, b in zip(engine.run(windows)[:2], expected, strict=True):
+        np.testing.assert_allclose(a, b.numpy(), rtol=0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("batch", [1, 2, 70])
+def test_the_graph_gives_what_the_network_gives(
+    engine: OnnxEngine, network: DisplacementNetwork, batch: int
+) -> None:
+    assert_same(engine, network, random_windows(batch))
+
+
+def test_the_graph_serves_any_weights_on_walks() -> None:
+    (stream,) = world_streams(simulate_imu(generate_walk(3, duration=8.0), seed=3))
+    network = randomised_network(seed=1)
+    assert_same(engine_of(network), network, windows_of(stream, 20)[0])
+
+
+def test_engines_agree_at_rest_and_under_violent_motion(
+    engine: OnnxEngine, network: DisplacementNetwork
+) -> None:
+    rest = np.zeros((2, 6, 200), np.float32)
+    rest[0, 5] = STANDARD_GRAVITY
+    assert_same(engine, network, np.concatenate([rest, 30.0 * random_windows(2)]))
+
+
+def test_log_sigma_is_limited(network: DisplacementNetwork) -> None:
+    network = randomised_network()
+    head = network.network.head[-1]  # type: ignore[index, union-attr]
+    assert isinstance(head, nn.Linear)
+    with torch.no_grad():
+        head.bias[3:] = torch.tensor([-50.0, 0.0, 50.0])
+    log_sigma = engine_of(network).run(random_windows(2))[1]
+    assert (log_sigma[:, 0] == -6.0).all()
+    assert (log_sigma[:, 2] == 3.0).all()
+
+
+def test_the_packaged_graph_is_that_of_the_network() -> None:
+    """The files that it serves are compared above; here its structure, after a change of either."""
+    onnx = pytest.importorskip("onnx")
+    from stario.network.runtime.stario_graph import stario_graph
+
+    path = Path(onnx_engine.__file__).with_name(GRAPHS["StarIO"])
+    packaged = onnx.load(path, load_external_data=False).graph
+    built = stario_graph(StarIO()).graph
+    assert list(packaged.node) == list(built.node)
+    assert list(packaged.initializer) == list(built.initializer)
+    external = [t for t in packaged.initializer if t.data_location == onnx.TensorProto.EXTERNAL]
+    assert all(not t.raw_data for t in external)  # weights are stored once
+
+
+@pytest.mark.parametrize("name", [name for name in ARCHITECTURES if name != "StarIO"])
+def test_other_networks_run_in_pytorch_with_their_norms_folded(name: str) -> None:
+    torch.manual_seed(0)
+    network = DisplacementNetwork(build_network(name))
+    with torch.no_grad():
+        randomise_norms(network)
+    assert_same(TorchEngine(network.eval()), network, random_windows(3))
+
+
+def test_later_training_does_not_affect_an_engine() -> None:
+    torch.manual_seed(0)
+    network, windows = DisplacementNetwork(build_network("I-MobileNet")), random_windows(2)
+    engine = TorchEngine(network)
+    before = engine.run(windows)[0]
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.mul_(0.0)
+    assert np.array_equal(engine.run(windows)[0], before)
+
+
+def test_results_do_not_depend_on_the_size_of_batches(engine: OnnxEngine) -> None:
+    windows = random_windows(7)
+    whole = engine.run(windows)[0]
+    for sizes in ([1, 1, 1, 4], [2, 5], [1, 6]):
+        parts = [engine.run(part)[0] for part in np.split(windows, np.cumsum(sizes)[:-1])]
+        np.testing.assert_allclose(np.concatenate(parts), whole, rtol=0.0, atol=1e-5)
+
+
+def test_threads_do_not_affect_each_other(engine: OnnxEngine) -> None:
+    batches = [random_windows(2) * np.float32(scale) for scale in (0.5, 1.0, 2.0, 3.0)]
+    alone = [engine.run(batch)[0] for batch in batches]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda k: engine.run(batches[k % 4])[0], range(40)))
+    assert all(np.array_equal(together[k], alone[k % 4]) for k in range(40))
+
+
+def test_a_model_can_be_sent_to_another_process_and_trained_there() -> None:
+    model, windows = load_model("default"), random_windows(2)
+    sent = pickle.loads(pickle.dumps(model))
+    assert np.array_equal(sent.predict(windows)[0], model.predict(windows)[0])
+    assert_same(sent.engine, sent.training_form, windows)
+
+
+@pytest.mark.parametrize("convert", [torch.Tensor.half, torch.Tensor.bfloat16])
+def test_weights_in_another_number_format_run_in_pytorch(
+    tmp_path: Path, network: DisplacementNetwork, convert: Callable[[torch.Tensor], torch.Tensor]
+) -> None:
+    small = randomised_network()
+    for parameter in small.parameters():
+        parameter.data = convert(parameter.data)
+    save_model(tmp_path / "small.safetensors", small, Card("StarIO"))
+    found = load_model(tmp_path / "small.safetensors").engine.run(random_windows(2))[0]
+    expected = engine_of(network).run(random_windows(2))[0]
+    np.testing.assert_allclose(found, expected, atol=0.05)
+
+
+def test_weights_and_commands_need_no_pytorch(tmp_path: Path) -> None:
+    """Importing it takes seconds and 200 MB."""
+    code = (
+        "import sys\n"
+        "from pathlib import Path\n"
+        "from stario.fusion import demonstration\n"
+        "from stario.fusion.commands.cli import main\n"
+        "from stario.sequences.readers import write_csv\n"
+        f"path = Path({str(tmp_path / 'walk.csv')!r})\n"
+        "write_csv(path, demonstration().slice(0.0, 8.0))\n"
+        "for command in ('run', 'inspect', 'compare'):\n"
+        f"    sys.argv = ['stario', command, str(path), '--out', {str(tmp_path / 'out')!r}]\n"
+        "    try:\n"
+        "        main()\n"
+        "    except SystemExit as end:\n"
+        "        assert not end.code, (command, end.code)\n"
+        "import stario.fusion.live.run\n"
+        "sys.exit('imported torch' if 'torch' in sys.modules else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_speed_is_measured_for_each_batch() -> None:
+    speeds = network_speed(load_model("default"), batches=(1, 4), runs=2)
+    assert [speed.batch for speed in speeds] == [1, 4]
+    assert min(min(speed.model, speed.torch) for speed in speeds) > 0.0
