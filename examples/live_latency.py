@@ -53,7 +53,7 @@ def main(phones: int = 4, seconds: float = 10.0) -> Measured:
     )
     with tempfile.TemporaryDirectory() as folder:
         stario = str(Path(sys.executable).with_name("stario"))
-        command = [stario, "live", "--port", "0", "--lines-port", "0", "--out", folder]
+        command = [stario, "live", "--port", "0", "--out", folder]
         with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
             try:
                 return _measure(server, recording, phones, seconds)

@@ -1,7 +1,8 @@
 """Replay a recording against the live server, as a phone with Sensor Logger would send it.
 
 Without --url it starts a server, replays half a minute at five times the true speed, and prints
-where the track ended. To watch, start the server first, open its page, and replay at true speed:
+where the track ended. `stario live --demo` shows a simulated walk. To watch a recording of your
+own, start the server first, open its page, and replay at true speed:
 
     stario live
     python examples/replay_live.py --url http://127.0.0.1:8000/data [RECORDING]
@@ -69,7 +70,7 @@ def main(speed: float = 5.0, seconds: float = 30.0) -> tuple[int, list[float], P
     """
     model = load_model("default")
     folder = Path(tempfile.mkdtemp(prefix="stario-live-"))
-    server = LiveServer(lambda: Navigator(model), folder, port=0, lines_port=0)
+    server = LiveServer(lambda: Navigator(model), folder, port=0)
     listening = threading.Event()
     thread = threading.Thread(target=server.run, args=(listening.set,))
     thread.start()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections import deque
 from typing import Annotated
 
 import typer
@@ -63,16 +64,20 @@ app.add_typer(check, name="check")
 
 
 class _Once(logging.Filter):
-    """Filter that passes each message once: a command may look at a recording several times."""
+    """Filter that passes each message once: a command may look at a recording several times.
+
+    It remembers the newest thousand: a server that runs for months may see any number.
+    """
 
     def __init__(self) -> None:
         super().__init__()
-        self._seen: set[str] = set()
+        self._seen: deque[str] = deque(maxlen=1000)
 
     def filter(self, record: logging.LogRecord) -> bool:
         text = record.getMessage()
         new = text not in self._seen
-        self._seen.add(text)
+        if new:
+            self._seen.append(text)
         return new
 
 

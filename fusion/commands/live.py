@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from stario.fusion.commands.options import EstimatorOptions, expand_option_groups
+from stario.fusion.commands.options import EstimatorOptions, expand_option_groups, flag
 
 
 @expand_option_groups
@@ -17,31 +17,26 @@ def live(
     host: Annotated[
         str, typer.Option(help="Address to listen on; 0.0.0.0 admits phones, with a token.")
     ] = "127.0.0.1",
-    lines_port: Annotated[
-        int | None,
-        typer.Option(
-            min=0, max=65535, help="Port for lines of JSON over TCP and UDP. Default: --port + 1."
-        ),
-    ] = None,
     phyphox: Annotated[
         list[str] | None, typer.Option(help="Address of a phone running phyphox; repeatable.")
     ] = None,
+    demo: Annotated[bool, flag("--demo", help="Let a simulated phone walk.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for the recordings.")] = Path("runs/live"),
 ) -> None:
-    """Show live tracks on a web page, from Sensor Logger, phyphox or lines of JSON."""
+    """Show live tracks on a web page, from Sensor Logger, phyphox or any device that posts JSON."""
     from stario.sequences.lazy import optional_package
 
-    for package in ("starlette", "uvicorn", "plotly"):
+    for package in ("starlette", "uvicorn", "plotly", "segno"):
         optional_package(package, "live")
+    from stario.fusion import demonstration
     from stario.fusion.evaluation.folders import check_folder
     from stario.fusion.live.run import LiveServer
     from stario.fusion.navigator import Navigator
 
     model, settings = estimating.network(), estimating.settings()
     check_folder(out)
-    if lines_port is None:
-        lines_port = port + 1 if 0 < port < 65535 else 0
+    simulated = demonstration() if demo else None
     server = LiveServer(
-        lambda: Navigator(model, settings), out, host, port, lines_port, phyphox or []
+        lambda: Navigator(model, settings), out, host, port, phyphox or [], simulated
     )
     server.run(started=lambda: typer.echo("\n".join(server.addresses()), err=True))

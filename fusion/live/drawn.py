@@ -14,8 +14,8 @@ from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.sequence import FloatArray
 
 Point = list[float]
-"""t [s], x, y, z [m], speed [m/s], yaw [deg], the horizontal covariance's xx, xy, yy [m^2], and
-the standard deviation of yaw [deg]."""
+"""t [s], x, y, z [m], speed [m/s], yaw [deg], the horizontal covariance's xx, xy, yy [m^2], the
+standard deviation of yaw [deg], and x, y [m] of the line: the position without steps at updates."""
 
 MAX_POINTS = 20_000
 """Maximum number of points of a track; beyond it every second one is dropped to bound memory."""
@@ -42,12 +42,12 @@ class DisplayedTrack:
     map_frame: int = 0
     since: int = 0
 
-    def add(self, state: NavState) -> None:
-        """Append the newest state."""
+    def add(self, state: NavState, p_W: FloatArray) -> None:
+        """Append the newest state, with its (3,) position without steps at updates [m]."""
         after_gap = bool(self.points) and state.time - self.points[-1][0] > _GAP_SECONDS
         if after_gap and state.covariance[2, 2] > MAX_PRIOR_YAW_SIGMA**2:
             self.since = len(self.points)
-        self.points.append(point_of(state))
+        self.points.append(point_of(state, p_W))
         if len(self.points) > MAX_POINTS:
             self.points, self.since = self.points[::2], self.since // 2
 
@@ -57,8 +57,9 @@ class DisplayedTrack:
         R = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
         shift = after.p_W[:2] - R @ before.p_W[:2]
         rise = after.p_W[2] - before.p_W[2]
-        table = np.array(self.points[self.since :]).reshape(-1, 10)
-        table[:, 1:3] = table[:, 1:3] @ R.T + shift
+        table = np.array(self.points[self.since :]).reshape(-1, 12)
+        for xy in (slice(1, 3), slice(10, 12)):
+            table[:, xy] = table[:, xy] @ R.T + shift
         table[:, 3] += rise
         table[:, 5] = (table[:, 5] + math.degrees(turn) + 180.0) % 360.0 - 180.0
         P = table[:, [6, 7, 7, 8]].reshape(-1, 2, 2)
@@ -67,8 +68,8 @@ class DisplayedTrack:
         self.map_frame = after.map_frame
 
 
-def point_of(state: NavState) -> Point:
-    """Return the point of a state, rounded to screen precision."""
+def point_of(state: NavState, p_W: FloatArray) -> Point:
+    """Return the point of a state, and of its position without steps, rounded for the screen."""
     P = state.covariance
     values = (
         *state.p_W,
@@ -78,5 +79,6 @@ def point_of(state: NavState) -> Point:
         P[6, 7],
         P[7, 7],
         math.degrees(math.sqrt(P[2, 2])),
+        *p_W[:2],
     )
     return [round(state.time, 4), *(round(float(value), 5) for value in values)]

@@ -6,10 +6,12 @@ import asyncio
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Set
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from stario.fusion.live.drawn import Point
 from stario.fusion.live.payload import Batch
@@ -26,14 +28,16 @@ SILENT_SECONDS = 60.0
 MAX_SENT = 3000
 """Maximum number of points of a device in one message, as to a new viewer."""
 
+T = TypeVar("T")
+
 _log = logging.getLogger(__name__)
 
 
 class Hub:
     """Sessions by device, with notifications for viewers.
 
-    Each device has a lock: its batches are processed one after the other, in a thread, so that
-    neither a slow displacement network nor another device's batch blocks the server.
+    Each device has a thread, in which its batches are processed one after the other: neither a slow
+    displacement network nor another device's batch blocks the server.
 
     Args:
         folder: folder for recordings.
@@ -42,6 +46,7 @@ class Hub:
     Attributes:
         sessions: sessions by device.
         refused: number of refused messages by transport.
+        viewers: number of pages that watch.
         ending: whether the server is stopping and viewers must be disconnected.
     """
 
@@ -49,23 +54,31 @@ class Hub:
         self._folder, self._new_navigator = folder, new_navigator
         self.sessions: dict[str, Session] = {}
         self.refused: Counter[str] = Counter()
-        self.ending = False
-        self._locks: dict[str, asyncio.Lock] = {}
+        self.viewers, self.ending = 0, False
+        self._threads: dict[str, ThreadPoolExecutor] = {}
+        self._tasks: Counter[str] = Counter()
         self._news = asyncio.Event()
 
-    async def take(self, batch: Batch, accel_factor: float = 1.0) -> int:
-        """Process a batch; return the number of samples it completed.
+    async def take(self, *batches: Batch, accel_factor: float = 1.0) -> int:
+        """Process the batches of a message; return the number of samples they completed.
 
         Raises:
-            InputError: there are too many devices, or the recording cannot be written.
+            InputError: there are too many devices, or two of one name; nothing is then processed.
+                Or a recording cannot be written.
         """
         received = time.time()
-        if not batch.readings and batch.device not in self.sessions:
-            return 0  # an empty push that tests the connection
-        session = self._session(batch.device)
-        async with self._locks[batch.device]:
-            count = await asyncio.to_thread(session.take, batch, received, accel_factor)
-        self.announce()
+        # A push without readings tests the connection: it makes no device known.
+        known = [b for b in batches if b.readings or b.device in self.sessions]
+        for batch in known:
+            if batch.device in self.sessions:
+                self.sessions[batch.device].check(batch)
+        self._make_room({batch.device for batch in known})
+        for batch in known:
+            self._session(batch.device).received = received
+        count = 0
+        for batch in known:
+            session = self.sessions[batch.device]
+            count += await self._in_thread(session, session.take, batch, received, accel_factor)
         return count
 
     async def command(self, device: str, name: str, **values: float) -> None:
@@ -77,10 +90,17 @@ class Hub:
         if device not in self.sessions:
             devices = ", ".join(self.sessions) or "none yet"
             raise InputError("device", repr(device), f"a device that has sent data: {devices}")
-        action = getattr(self.sessions[device], name)
-        async with self._locks[device]:
-            await asyncio.to_thread(action, **values)
-        self.announce()
+        session = self.sessions[device]
+        await self._in_thread(session, partial(getattr(session, name), **values))
+
+    async def release(self) -> None:
+        """Process the pushes that have waited long enough for one before them."""
+        now = time.time()
+        due = [session for session in self.sessions.values() if session.is_due(now)]
+        tasks = (self._in_thread(session, session.release, now) for session in due)
+        for result in await asyncio.gather(*tasks, return_exceptions=True):
+            if isinstance(result, Exception):
+                _log.error("a push that waited is lost: %s", result)
 
     def announce(self) -> None:
         """Wake all tasks that wait for news."""
@@ -100,31 +120,56 @@ class Hub:
     def close(self) -> None:
         """Close all recordings."""
         for session in self.sessions.values():
-            _close(session)
+            self._close(session)
 
     def _session(self, device: str) -> Session:
         if device not in self.sessions:
-            if len(self.sessions) >= MAX_DEVICES:
-                self._make_room(device)
             self.sessions[device] = Session(device, self._folder, self._new_navigator)
-            self._locks[device] = asyncio.Lock()
+            self._threads[device] = ThreadPoolExecutor(1)
         return self.sessions[device]
 
-    def _make_room(self, device: str) -> None:
-        """Close the session that has been silent longest.
+    async def _in_thread(self, session: Session, action: Callable[..., T], *arguments: Any) -> T:
+        """Run an action of a session after those before it, and tell the viewers."""
+        self._tasks[session.device] += 1
+        try:
+            thread = self._threads[session.device]
+            return await asyncio.get_running_loop().run_in_executor(thread, action, *arguments)
+        finally:
+            self._tasks[session.device] -= 1
+            self.announce()
+
+    def _make_room(self, devices: Set[str]) -> None:
+        """Close the sessions that have been silent longest, as many as new devices need.
 
         A stopped one that still sends stays: its next batch would start it again.
         """
-        idle = [
-            session for name, session in self.sessions.items() if not self._locks[name].locked()
+        new = devices - set(self.sessions)
+        surplus = len(self.sessions) + len(new) - MAX_DEVICES
+        if surplus <= 0:
+            return
+        silent = [
+            session
+            for name, session in self.sessions.items()
+            if not (name in devices or self._tasks[name])
+            and time.time() - session.received > SILENT_SECONDS
         ]
-        oldest = min(idle, key=lambda session: session.received, default=None)
-        if oldest is None or time.time() - oldest.received < SILENT_SECONDS:
+        if len(silent) < surplus:
+            found = f"{len(new)} new: {', '.join(sorted(new))[:80]}"
             expected = f"at most {MAX_DEVICES} devices at once"
             fix = f"one that sends nothing for {SILENT_SECONDS:g} s makes room"
-            raise InputError("device", f"a new one, {device!r}", expected, fix)
-        del self.sessions[oldest.device], self._locks[oldest.device]
-        _close(oldest)
+            raise InputError("device", found, expected, fix)
+        for session in sorted(silent, key=lambda session: session.received)[:surplus]:
+            self._close(session)
+            del self.sessions[session.device], self._tasks[session.device]
+
+    def _close(self, session: Session) -> None:
+        """Close a recording after all that was to be processed before."""
+        thread = self._threads.pop(session.device)
+        try:
+            thread.submit(session.close).result()
+        except (OSError, InputError) as error:  # of pushes that still waited
+            _log.error("%s: the end of its recording is lost: %s", session.device, error)
+        thread.shutdown()
 
 
 class Viewer:
@@ -155,10 +200,3 @@ class Viewer:
             self._sent[device] = (points, count)
             devices.append(session.status() | {"fresh": fresh, "points": new})
         return {"time": time.time(), "devices": devices, "refused": dict(self._hub.refused)}
-
-
-def _close(session: Session) -> None:
-    try:
-        session.close()
-    except (OSError, InputError) as error:  # of pushes that still waited
-        _log.error("%s: the end of its recording is lost: %s", session.device, error)

@@ -4,7 +4,6 @@
   const element = (id) => document.getElementById(id);
   const [map, time, connection] = [element("map"), element("time"), element("connection")];
   const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00", "#56B4E9", "#7F5539"];
-  const DASHES = ["solid", "dash", "dot", "dashdot"];
   const SYMBOLS = ["circle", "square", "diamond", "triangle-up"];
   const BESIDE = ["top center", "bottom center", "middle right", "middle left"];
   const MOST_DRAWN = 1200;
@@ -12,7 +11,9 @@
   const devices = new Map();
   window.stario = { devices };
 
-  // All devices share one map frame. Points are [t, x, y, z, speed, yaw, xx, xy, yy, sigma of yaw].
+  // All devices share one map frame. Points are [t, x, y, z, speed, yaw, xx, xy, yy, sigma of yaw, x, y of the line].
+  const plain = (text) => text.replaceAll("&", "&amp;").replaceAll("<", "&lt;");  // plotly reads HTML
+  const several = (n, one) => `${n} ${one}${n === 1 ? "" : one.endsWith("x") ? "es" : "s"}`;
   const sigmaOf = (p) => Math.sqrt((p[6] + p[8]) / 2 + Math.hypot((p[6] - p[8]) / 2, p[7]));
   const thinned = (points) => {
     const step = Math.ceil(points.length / MOST_DRAWN);
@@ -49,10 +50,11 @@
   let following = true;
   const fitted = () => {
     const known = [...devices.values()].flatMap((d) => {
-      const points = thinned(d.points).map((p) => [p[1] - d.origin[0], p[2] - d.origin[1]]);
-      const last = points[points.length - 1];
-      if (!last) return [];
-      const reach = Math.min(50, 3 * sigmaOf(d.points[d.points.length - 1]));
+      const points = thinned(d.points).map((p) => [p[10] - d.origin[0], p[11] - d.origin[1]]);
+      if (!points.length) return [];
+      const newest = d.points[d.points.length - 1];
+      const last = [newest[1] - d.origin[0], newest[2] - d.origin[1]];
+      const reach = Math.min(50, 3 * sigmaOf(newest));
       return [...points, [last[0] - reach, last[1] - reach], [last[0] + reach, last[1] + reach]];
     });
     const [xs, ys] = [0, 1].map((k) => known.map((p) => p[k]));
@@ -68,13 +70,13 @@
     const [mapTraces, timeTraces, shapes] = [[], [], []];
     for (const d of devices.values()) {
       const points = thinned(d.points);
-      const line = { color: d.colour, dash: d.dash, width: 2 };
+      const line = { color: d.colour, width: 2 };
       const place = (p) => [p[1] - d.origin[0], p[2] - d.origin[1]];
-      const words = (p) => `<b>${d.label}</b> at ${p[0].toFixed(1)} s<br>sigma ${sigmaOf(p).toFixed(2)} m<br>speed ${p[4].toFixed(2)} m/s`;
-      mapTraces.push({ x: points.map((p) => place(p)[0]), y: points.map((p) => place(p)[1]), mode: "lines", line,
-        text: points.map(words), hovertemplate: "%{text}<extra></extra>" });
+      const words = (p) => `<b>${plain(d.label)}</b> at ${p[0].toFixed(1)} s<br>sigma ${sigmaOf(p).toFixed(2)} m<br>speed ${p[4].toFixed(2)} m/s`;
       const last = points[points.length - 1];
-      mapTraces.push({ x: last ? [place(last)[0]] : [], y: last ? [place(last)[1]] : [], mode: "markers+text", text: [d.label],
+      const way = [...points.map((p) => [p[10] - d.origin[0], p[11] - d.origin[1]]), ...(last ? [place(last)] : [])];
+      mapTraces.push({ x: way.map((xy) => xy[0]), y: way.map((xy) => xy[1]), mode: "lines", line, text: points.map(words), hovertemplate: "%{text}<extra></extra>" });
+      mapTraces.push({ x: last ? [place(last)[0]] : [], y: last ? [place(last)[1]] : [], mode: "markers+text", text: [plain(d.label)],
         textposition: d.beside, hoverinfo: "skip", marker: { color: d.colour, symbol: d.symbol, size: 13, line: { color: "white", width: 2 } } });
       if (last) shapes.push({ type: "path", path: ellipse(last, d.origin), line: { color: d.colour, width: 1 }, fillcolor: d.colour + "22" });
       rows.forEach(([, value], k) => {
@@ -86,7 +88,7 @@
           return jumps ? null : y;
         });
         timeTraces.push({ x: points.map((p) => p[0]), y: ys, mode: "lines", line, xaxis: `x${k ? k + 1 : ""}`,
-          yaxis: `y${k ? k + 1 : ""}`, hovertemplate: `${d.label} %{y:.2f}<extra></extra>` });
+          yaxis: `y${k ? k + 1 : ""}`, hovertemplate: `${plain(d.label)} %{y:.2f}<extra></extra>` });
       });
     }
     if (following && mapTraces.length) {
@@ -96,7 +98,9 @@
       mapLayout.uirevision += 1;
     }
     mapLayout.shapes = shapes;
-    await Promise.all([Plotly.react(map, mapTraces, mapLayout, config), Plotly.react(time, timeTraces, timeLayout, config)]);
+    await Plotly.react(map, mapTraces, mapLayout, config);
+    time.parentElement.hidden = !shapes.length;  // no empty plots
+    if (shapes.length) await Plotly.react(time, timeTraces, timeLayout, config);
   };
 
   // A slow browser draws less often: it spends at most half of its time drawing.
@@ -117,8 +121,8 @@
   const post = async (id, command, content = {}) => {
     let error = "";
     try {
-      const answer = await fetch(`devices/${encodeURIComponent(id)}/${command}`, {
-        method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(content) });
+      const answer = await fetch("command", { method: "POST", headers: { "content-type": "application/json" },
+        body: JSON.stringify({ device: id, command, ...content }) });
       const found = answer.ok ? {} : await answer.json().catch(() => ({}));
       error = answer.ok ? "" : found.error || `the server answers with status ${answer.status}`;
     } catch {
@@ -169,13 +173,13 @@
     const card = document.createElement("article");
     card.className = "device";
     card.dataset.device = id;
-    card.innerHTML = '<h2><svg width="30" height="10" aria-hidden="true"></svg><span class="name"></span><span class="state"></span></h2>' +
+    card.innerHTML = '<h2><svg width="20" height="20" aria-hidden="true"></svg><span class="name"></span><span class="state"></span></h2>' +
       '<div class="figures"></div><ul class="words"></ul><div class="tools"></div><p class="error" hidden></p><p class="file"></p>';
     const device = { id, n, label: id.length > 24 ? `${id.slice(0, 22)}..` : id, colour: COLOURS[n % COLOURS.length],
-      dash: DASHES[Math.floor(n / COLOURS.length + n) % DASHES.length], symbol: SYMBOLS[n % SYMBOLS.length], beside: BESIDE[n % BESIDE.length],
+      symbol: SYMBOLS[n % SYMBOLS.length], beside: BESIDE[n % BESIDE.length],
       points: [], origin: [0, 0, 0], received: 0, running: true, card };
-    const strokes = { solid: "none", dash: "7 4", dot: "2 3", dashdot: "7 3 2 3" };
-    card.querySelector("svg").innerHTML = `<line x1="0" y1="5" x2="30" y2="5" stroke="${device.colour}" stroke-width="3" stroke-dasharray="${strokes[device.dash]}"/>`;
+    const corners = { circle: "", square: "4,4 16,4 16,16 4,16", diamond: "10,2 18,10 10,18 2,10", "triangle-up": "10,3 18,17 2,17" }[device.symbol];
+    card.querySelector("svg").innerHTML = (corners ? `<polygon points="${corners}"` : '<circle cx="10" cy="10" r="7"') + ` fill="${device.colour}"/>`;
     card.querySelector(".name").textContent = id;
     device.toggle = button("Stop", "End this track, or start a new one", () => post(id, device.running ? "stop" : "start"));
     device.zero = button("Zero here", "Show the current position as x = y = 0", () => post(id, "zero"));
@@ -219,8 +223,8 @@
     device.toggle.textContent = device.running ? "Stop" : "Start a new track";
     device.zero.disabled = device.fix.disabled = !p || !device.running;
     const dropped = Object.entries(device.dropped).map(([reason, n]) => `${n} ${reason}`).join(", ");
-    device.card.querySelector(".file").textContent = device.file ?
-      `${device.file}: ${device.samples} samples${dropped ? `, dropped: ${dropped}` : ""}${device.fixes ? `, ${device.fixes} fixes` : ""}` : "";
+    device.card.querySelector(".file").textContent = [`${device.file ? `${device.file}: ` : ""}${several(device.samples, "sample")}`,
+      dropped && `dropped: ${dropped}`, device.fixes && several(device.fixes, "fix")].filter(Boolean).join(", ");
   };
 
   const remove = (id) => {
@@ -229,6 +233,7 @@
     devices.delete(id);
   };
 
+  let waiting = true;
   const take = (message) => {
     const known = new Set(message.devices.map((news) => news.id));
     [...devices.keys()].filter((id) => !known.has(id)).forEach(remove);  // the server made room for others
@@ -240,14 +245,17 @@
       if (device.points.length > MOST_KEPT) device.points = device.points.filter((_, k) => k % 2 === 0);
       show(device, message.time);
     }
-    element("empty").hidden = devices.size > 0;
+    if (!devices.size !== waiting) element("add").open = waiting = !devices.size;
     const refused = Object.values(message.refused).reduce((sum, n) => sum + n, 0);
-    connection.textContent = `${devices.size} device${devices.size === 1 ? "" : "s"}${refused ? `, ${refused} messages rejected` : ""}`;
+    connection.textContent = several(devices.size, "device") + (refused ? `, ${several(refused, "message")} rejected` : "");
     connection.className = "";
     redraw();
   };
 
-  element("push-url").textContent = new URL("data", location.href).href + location.search;
+  const forPhones = element("push-url").textContent.includes("?token=");
+  element("local").hidden = forPhones;
+  element("network").hidden = !forPhones;
+  if (forPhones) element("code").src = "page.svg";
   if (window.innerWidth <= 900) mapLayout.dragmode = "pan";
   draw().then(() => {
     watchMap();

@@ -12,8 +12,9 @@ from collections.abc import Iterator
 
 from stario.fusion.live.payload import Batch
 
-MAX_DELAY = 2.0
-"""Maximum time for which pushes wait for a missing one before them [s]."""
+MAX_DELAY = 0.8
+"""Maximum time for which pushes wait for a missing one before them [s]; if the program is killed
+they are lost, with the second before that."""
 
 
 class PushOrder:
@@ -31,6 +32,10 @@ class PushOrder:
             self._recordings += 1
         entry = (self._recordings, batch.number, next(self._arrivals), received, batch)
         heapq.heappush(self._waiting, entry)
+
+    def is_due(self, now: float) -> bool:
+        """Return whether a batch has waited for the maximum time; may be called by any thread."""
+        return any(now - entry[3] >= MAX_DELAY for entry in list(self._waiting))
 
     def ready(self, now: float) -> Iterator[tuple[Batch, float]]:
         """Yield the batches whose turn it is, each with the time of its receipt.

@@ -153,7 +153,7 @@ def parse_line(line: bytes, sender: str) -> Batch:
     if "t_ns" in message:
         time_ns = _nanoseconds("t_ns", message["t_ns"])
     else:
-        time_ns = _nanoseconds("t", 1e9 * _number("t", message.get("t")))
+        time_ns = _nanoseconds("t", 1e9 * number_from("t", message.get("t")))
     readings = [
         Reading(sensor, time_ns, _three(key, message[key]))
         for key, sensor in (("gyro", GYRO), ("accel", TOTAL), ("mag", MAG))
@@ -215,7 +215,7 @@ def _pushed(where: str, entry: Mapping[str, Any]) -> Reading | None:
 def _vertical(time: Any, values: Any) -> Reading | None:
     """Return the vertical from the phone's attitude; None if invalid, since no track needs it."""
     try:
-        x, y, z, w = (_number("q", values.get(f"q{axis}")) for axis in "xyzw")
+        x, y, z, w = (number_from("q", values.get(f"q{axis}")) for axis in "xyzw")
         time_ns = _nanoseconds("time", time)
     except (InputError, AttributeError):
         return None
@@ -234,10 +234,13 @@ def _object(where: str, value: Any) -> Mapping[str, Any]:
 def _name(where: str, value: Any, needed: bool = True) -> str:
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         value = str(value)
-    if not isinstance(value, str) or (needed and not value.strip()):
+    if not isinstance(value, str):
         raise InputError(where, _describe(value), "a name")
-    # A lone surrogate is not a character: neither the page nor a response could contain it.
-    return value.strip()[:_MAX_NAME_LENGTH].encode("utf-8", "replace").decode()
+    # Neither the page nor a response could contain a lone surrogate or a control character.
+    shown = "".join(character if character.isprintable() else " " for character in value).strip()
+    if needed and not shown:
+        raise InputError(where, _describe(value), "a name")
+    return shown[:_MAX_NAME_LENGTH]
 
 
 def _nanoseconds(where: str, value: Any) -> int:
@@ -261,7 +264,7 @@ def _vector(values: Iterable[tuple[str, Any]]) -> Vector:
     """Return three readings, each given with its place in the message."""
     numbers = []
     for where, value in values:
-        numbers.append(_number(where, value))
+        numbers.append(number_from(where, value))
         if abs(numbers[-1]) > MAX_READING:
             found = f"{numbers[-1]:.3g}"
             raise InputError(where, found, f"at most {MAX_READING:g} rad/s, m/s^2 or uT")
@@ -269,7 +272,12 @@ def _vector(values: Iterable[tuple[str, Any]]) -> Vector:
     return x, y, z
 
 
-def _number(where: str, value: Any) -> float:
+def number_from(where: str, value: Any) -> float:
+    """Return a finite number of a message.
+
+    Raises:
+        InputError: it is none; the error names `where`.
+    """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(where, _describe(value), "a number")
     try:

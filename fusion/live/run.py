@@ -1,26 +1,35 @@
-"""The complete live server: page, pushes, lines and polled phones in one event loop."""
+"""The complete live server: page, pushes and polled phones in one event loop."""
 
 from __future__ import annotations
 
 import asyncio
 import ipaddress
 import secrets
+import signal
 import socket
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from types import FrameType
 
 import uvicorn
+from uvicorn.server import HANDLED_SIGNALS
 
+from stario.fusion.live.connections import Connection, close_overdue
+from stario.fusion.live.demo import walk
 from stario.fusion.live.hub import Hub
-from stario.fusion.live.lines import LineServer
 from stario.fusion.live.phyphox import Phyphox, follow
 from stario.fusion.live.server import live_app
 from stario.fusion.navigator import Navigator
 from stario.sequences.errors import InputError
+from stario.sequences.sequence import ImuSequence
 
 _POLL_SECONDS = 0.1
-"""Interval between checks for a signal to stop [s]."""
+"""Interval between checks for a signal to stop, and for what has waited too long [s]."""
+
+_MAX_CONNECTIONS = 800
+"""Maximum number of connections; those that wait for their clients are fewer (`connections`)."""
 
 
 class LiveServer:
@@ -31,10 +40,12 @@ class LiveServer:
         out: folder for recordings.
         host: address to listen on; unless it is loopback, there is a token.
         port: port of the page; 0 for a free one.
-        lines_port: port of the lines of JSON; 0 for a free one.
         phones: addresses of phones running phyphox.
+        demo: recording that a simulated phone sends, at its own speed; None for no such phone.
 
     Attributes:
+        hub: hub of the devices.
+        port: port of the page.
         token: access token; empty on loopback.
 
     Raises:
@@ -47,33 +58,31 @@ class LiveServer:
         out: Path,
         host: str = "127.0.0.1",
         port: int = 8000,
-        lines_port: int = 8001,
         phones: Iterable[str] = (),
+        demo: ImuSequence | None = None,
     ) -> None:
         self.token = "" if is_loopback(host) else secrets.token_urlsafe(12)
         self.hub = Hub(out, new_navigator)
-        self._out, self._host, self._lines_port = out, host, lines_port
+        self._out, self._demo = out, demo
         self._phones = [Phyphox(address) for address in phones]
-        self._lines = LineServer(self.hub, self.token)
         self._socket = _bound(host, port)
         self.port = int(self._socket.getsockname()[1])
+        own = host if host not in ("0.0.0.0", "::") else _own_address()
+        self._netloc = f"[{own}]:{self.port}" if ":" in own else f"{own}:{self.port}"
         config = uvicorn.Config(
-            live_app(self.hub, self.token),
+            live_app(self.hub, self.token, self._netloc if self.token else ""),
+            http=Connection,
+            log_config=None,
             log_level="warning",
             lifespan="off",
             timeout_graceful_shutdown=1,
-            limit_concurrency=200,
+            limit_concurrency=_MAX_CONNECTIONS,
         )
-        self._server = uvicorn.Server(config)
-
-    @property
-    def lines_port(self) -> int:
-        """Port of the lines of JSON."""
-        return self._lines.port
+        self._server = _Server(config)
 
     def run(self, started: Callable[[], None] = lambda: None) -> None:
-        """Serve until stopped by a signal or `stop`; `started` is called once all are listening."""
-        with suppress(KeyboardInterrupt):
+        """Serve until stopped by a signal or `stop`; `started` is called once it is listening."""
+        with self._stopped_by_signals():
             asyncio.run(self._run(started))
 
     def stop(self) -> None:
@@ -83,43 +92,72 @@ class LiveServer:
     def addresses(self) -> list[str]:
         """Return lines of text with the addresses to open and to send to."""
         end = f"?token={self.token}" if self.token else ""
-        host = self._host if self._host not in ("0.0.0.0", "::") else _own_address()
-        url_host = f"[{host}]" if ":" in host else host
-        page = f"http://{url_host}:{self.port}"
         lines = [
-            f"page:           {page}/{end}",
-            f"Sensor Logger:  {page}/data{end}",
-            f"lines of JSON:  {url_host} port {self.lines_port}, TCP or UDP",
+            f"page:           http://{self._netloc}/{end}",
+            f"Sensor Logger:  http://{self._netloc}/data{end}",
             f"recordings:     {self._out}",
         ]
-        if self.token:
-            lines.append(f'token:          {self.token} (lines begin with {{"token": "..."}})')
-        else:
+        if not self.token:
             lines.append("only this computer can connect; use --host 0.0.0.0 for phones")
         return lines
 
     async def _run(self, started: Callable[[], None]) -> None:
-        phones: list[asyncio.Task[None]] = []
+        tasks = [asyncio.create_task(follow(self.hub, phone)) for phone in self._phones]
+        tasks.append(asyncio.create_task(self._watch()))
         try:
-            async with self._lines.listening(self._host, self._lines_port):
-                phones += [asyncio.create_task(follow(self.hub, phone)) for phone in self._phones]
-                web = asyncio.create_task(self._server.serve(sockets=[self._socket]))
-                while not self._server.started and not web.done():
-                    await asyncio.sleep(0.01)
-                started()
-                while not self._server.should_exit:
-                    await asyncio.sleep(_POLL_SECONDS)
-                self.hub.end()
-                await web
-        except OSError as error:
-            found = f"{self._lines_port}: {error.strerror or error}"
-            raise InputError("lines-port", found, "a free port", "--lines-port N") from error
+            web = asyncio.create_task(self._server.serve(sockets=[self._socket]))
+            while not self._server.started and not web.done():
+                await asyncio.sleep(0.01)
+            started()
+            if self._demo is not None:
+                tasks.append(asyncio.create_task(walk(self.hub, self._demo)))
+            while not self._server.should_exit:
+                await asyncio.sleep(_POLL_SECONDS)
+            self.hub.end()
+            await web
         finally:
-            for phone in phones:
-                phone.cancel()
-            await asyncio.gather(*phones, return_exceptions=True)
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
             self._socket.close()
             self.hub.close()
+
+    async def _watch(self) -> None:
+        """Close connections, and process pushes, that have waited long enough."""
+        while True:
+            await asyncio.sleep(_POLL_SECONDS)
+            now = asyncio.get_running_loop().time()
+            close_overdue(self._server.server_state.connections, now)
+            await self.hub.release()
+
+    @contextmanager
+    def _stopped_by_signals(self) -> Iterator[None]:
+        """Let the first signal stop the server, and the next one end the program as usual."""
+        if threading.current_thread() is not threading.main_thread():
+            yield  # signals go to the main thread only
+            return
+        usual = {number: signal.getsignal(number) for number in HANDLED_SIGNALS}
+
+        def restore() -> None:
+            for number, handler in usual.items():
+                signal.signal(number, handler)
+
+        def stop(number: int, frame: FrameType | None) -> None:
+            restore()
+            self.stop()
+
+        for number in HANDLED_SIGNALS:
+            signal.signal(number, stop)
+        try:
+            yield
+        finally:
+            restore()
+
+
+class _Server(uvicorn.Server):
+    def capture_signals(self) -> nullcontext[None]:  # type: ignore[override]
+        """Leave the signals to `LiveServer`: uvicorn raises them before recordings are closed."""
+        return nullcontext()
 
 
 def is_loopback(host: str) -> bool:
@@ -134,11 +172,12 @@ def is_loopback(host: str) -> bool:
 
 def _bound(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
+    # Only with the protocol named does asyncio switch off Nagle's delay of 40 ms.
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))
-        listener.listen()  # or the lines could listen on the same port
+        listener.listen()  # or another program could listen on the same port
     except OSError as error:
         listener.close()
         if isinstance(error, socket.gaierror):

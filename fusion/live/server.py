@@ -1,9 +1,9 @@
 """HTTP side of the live server: receives pushes, serves one page.
 
-    GET  /                       the page
-    GET  /events                 updates for the page, as server-sent events
-    POST /data                   a push of Sensor Logger, or lines of JSON (application/x-ndjson)
-    POST /devices/{id}/{command} start, stop, zero, or fix with {"x": m, "y": m, "sigma": m}
+    GET  /        the page
+    GET  /events  updates for the page, as server-sent events
+    POST /data    a push of Sensor Logger, or lines of JSON (application/x-ndjson)
+    POST /command {"device": name, "command": start, stop, zero, or fix with x, y, sigma [m]}
 
 `/data?accel_unit=g` (or -g, -m/s2) gives the unit of a device's accelerometer; the minus is Apple's
 sign. An invalid request gets a 4xx with the reason and changes nothing.
@@ -20,10 +20,12 @@ import asyncio
 import gzip
 import hmac
 import importlib.resources
+import io
 import json
 import logging
 from collections.abc import AsyncIterator, Mapping
 from functools import cache
+from html import escape
 from typing import Any
 
 from starlette.applications import Starlette
@@ -35,7 +37,14 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from stario.fusion.live.hub import Hub, Viewer
-from stario.fusion.live.payload import Batch, joined, object_from, parse_line, parse_push
+from stario.fusion.live.payload import (
+    Batch,
+    joined,
+    number_from,
+    object_from,
+    parse_line,
+    parse_push,
+)
 from stario.sequences.arrays import check_choice
 from stario.sequences.errors import InputError, StarioError
 from stario.sequences.units import ACCEL_UNITS, known_unit
@@ -47,22 +56,30 @@ LOOPBACK = ["localhost", "127.0.0.1", "[::1]"]
 
 COMMANDS = ("start", "stop", "zero", "fix")
 
+MAX_VIEWERS = 50
+"""Maximum number of pages that watch at once."""
+
 _MIN_PERIOD = 0.05
 _MAX_PERIOD = 1.0
 _COOKIE = "stario_token"
 _MAX_COORDINATE, _SIGMA_RANGE = 1e6, (0.01, 1e3)
 _LINES = "application/x-ndjson"
-_TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
+_HEADERS = {
+    "cache-control": "no-cache",
+    "content-security-policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
+}
 
 _log = logging.getLogger(__name__)
 
 
-def live_app(hub: Hub, token: str = "") -> Starlette:
+def live_app(hub: Hub, token: str = "", host: str = "") -> Starlette:
     """Return the web application.
 
     Args:
         hub: hub of the devices.
         token: token that every request must carry; empty for a server on loopback only.
+        host: this computer's name or address and port in its network; empty on loopback.
     """
     guard = (
         Middleware(TokenMiddleware, token=token)
@@ -71,18 +88,19 @@ def live_app(hub: Hub, token: str = "") -> Starlette:
     )
     app = Starlette(
         routes=[
-            Route("/", _asset("live.html")),
-            Route("/live.css", _asset("live.css")),
-            Route("/live.js", _asset("live.js")),
+            Route("/", _page),
+            Route("/live.css", _asset("live.css", "text/css")),
+            Route("/live.js", _asset("live.js", "text/javascript")),
             Route("/plotly.js", _plotly),
+            Route("/page.svg", _page_code),
             Route("/events", _events),
             Route("/data", _data, methods=["POST"]),
-            Route("/devices/{device:path}/{command}", _command, methods=["POST"]),
+            Route("/command", _command, methods=["POST"]),
         ],
         middleware=[guard],
         exception_handlers={StarioError: _bad_request, OSError: _storage_error},
     )
-    app.state.hub = hub
+    app.state.hub, app.state.token, app.state.host = hub, token, host
     return app
 
 
@@ -110,7 +128,9 @@ class TokenMiddleware:
             reason = (
                 "token: missing or wrong; add ?token=..., as the server printed when it started"
             )
-            await JSONResponse({"error": reason}, 401)(scope, receive, send)
+            # Without a token nobody keeps a connection.
+            refusal = JSONResponse({"error": reason}, 401, {"connection": "close"})
+            await refusal(scope, receive, send)
             return
 
         async def with_cookie(message: Any) -> None:
@@ -145,10 +165,7 @@ async def _data(request: Request) -> Response:
         hub.refused["http"] += 1
         _log.warning("a message is refused: %s", error)  # few apps show the response
         raise
-    count = 0
-    for batch in batches:
-        count += await hub.take(batch, ACCEL_UNITS[name])
-    return JSONResponse({"samples": count})
+    return JSONResponse({"samples": await hub.take(*batches, accel_factor=ACCEL_UNITS[name])})
 
 
 def _parsed(body: bytes, sender_of_lines: str) -> list[Batch]:
@@ -191,20 +208,18 @@ async def _body(request: Request) -> bytes:
 async def _command(request: Request) -> Response:
     hub: Hub = request.app.state.hub
     _check_origin(request)
-    device, command = request.path_params["device"], request.path_params["command"]
+    message = object_from("body", await _body(request))
+    device, command = (str(message.get(key, "")) for key in ("device", "command"))
     check_choice("command", command, COMMANDS)
-    values = {} if command != "fix" else _fix_values(object_from("body", await _body(request)))
-    await hub.command(device, command, **values)
+    await hub.command(device, command, **(_fix_values(message) if command == "fix" else {}))
     return JSONResponse({"done": command})
 
 
 def _fix_values(message: Mapping[str, Any]) -> dict[str, float]:
-    values = {}
-    for name in ("x", "y", "sigma"):
-        value = message.get(name)
-        if not isinstance(value, (int, float)) or not abs(value) <= _MAX_COORDINATE:
-            raise InputError(name, "nothing, or no number", f"a number up to {_MAX_COORDINATE:g} m")
-        values[name] = float(value)
+    values = {name: number_from(name, message.get(name)) for name in ("x", "y", "sigma")}
+    for name in ("x", "y"):
+        if abs(values[name]) > _MAX_COORDINATE:
+            raise InputError(name, f"{values[name]:g}", f"up to {_MAX_COORDINATE:g} m")
     low, high = _SIGMA_RANGE
     if not low <= values["sigma"] <= high:
         raise InputError("sigma", f"{values['sigma']:g}", f"{low:g} to {high:g} m")
@@ -213,29 +228,61 @@ def _fix_values(message: Mapping[str, Any]) -> dict[str, float]:
 
 async def _events(request: Request) -> Response:
     hub: Hub = request.app.state.hub
+    if hub.viewers >= MAX_VIEWERS:
+        raise InputError("page", "one more", f"at most {MAX_VIEWERS} at once", "close others")
 
     async def messages() -> AsyncIterator[str]:
         viewer = Viewer(hub)
-        while not hub.ending:
-            waiting = asyncio.create_task(hub.news(_MAX_PERIOD))
-            yield f"data: {json.dumps(viewer.message(), separators=(',', ':'))}\n\n"
-            await waiting
-            await asyncio.sleep(_MIN_PERIOD)
+        hub.viewers += 1
+        try:
+            while not hub.ending:
+                waiting = asyncio.create_task(hub.news(_MAX_PERIOD))
+                yield f"data: {json.dumps(viewer.message(), separators=(',', ':'))}\n\n"
+                await waiting
+                await asyncio.sleep(_MIN_PERIOD)
+        finally:
+            hub.viewers -= 1
 
     headers = {"cache-control": "no-store", "x-accel-buffering": "no"}
     return StreamingResponse(messages(), media_type="text/event-stream", headers=headers)
 
 
-def _asset(name: str) -> Any:
-    content = importlib.resources.files("stario.fusion.live").joinpath(name).read_bytes()
-    media = _TYPES[name.rpartition(".")[2]]
-    policy = "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:"
-    headers = {"cache-control": "no-cache", "content-security-policy": policy}
+async def _page(request: Request) -> Response:
+    text = (
+        _content("live.html").decode().replace("PUSH_URL", escape(_url_for_phones(request, "data")))
+    )
+    return Response(text, media_type="text/html", headers=_HEADERS)
+
+
+async def _page_code(request: Request) -> Response:
+    """Return the page's address for phones as a QR code."""
+    import segno
+
+    image = io.BytesIO()
+    segno.make(_url_for_phones(request, ""), micro=False).save(image, kind="svg", scale=4)
+    return Response(image.getvalue(), media_type="image/svg+xml", headers=_HEADERS)
+
+
+def _url_for_phones(request: Request, path: str) -> str:
+    """Return an address of this server as phones know it, with the token."""
+    state = request.app.state
+    # A browser elsewhere knows a host that works; one on this computer may know it as localhost.
+    known = not state.host or request.url.hostname not in (*LOOPBACK, "::1")
+    query = f"?token={state.token}" if state.token else ""
+    return f"http://{request.url.netloc if known else state.host}/{path}{query}"
+
+
+def _asset(name: str, media: str) -> Any:
+    content = _content(name)
 
     async def answer(request: Request) -> Response:
-        return Response(content, media_type=media, headers=headers)
+        return Response(content, media_type=media, headers=_HEADERS)
 
     return answer
+
+
+def _content(name: str) -> bytes:
+    return importlib.resources.files("stario.fusion.live").joinpath(name).read_bytes()
 
 
 async def _plotly(request: Request) -> Response:

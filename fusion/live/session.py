@@ -63,24 +63,36 @@ class Session:
             Number of samples processed.
 
         Raises:
-            InputError: the batch continues the recording before this: two devices have one name.
-                Or the recording cannot be written.
+            InputError: as `check`.
+            OSError: the recording cannot be written.
         """
         self.received, self._factor = received, accel_factor
         if not self.running:
             return 0
+        self.check(batch)
         if self._is_of_previous(batch):
-            if batch.number >= 0 and middle_time(batch) < self._opened_ns:
-                self.track.delayed += len(batch.readings)
-                return 0
-            if batch.recording:
-                found = f"samples of two recordings in turn from {self.device!r}"
-                fix = "give each phone a name of its own"
-                raise InputError("device", found, "one at a time", fix)
+            self.track.delayed += len(batch.readings)
+            return 0
         self._order.add(batch, received)
-        return self._process_ready(received)
+        return self.release(received)
 
-    def _process_ready(self, now: float) -> int:
+    def check(self, batch: Batch) -> None:
+        """Check that a batch does not continue the recording before this, unless it comes late.
+
+        Raises:
+            InputError: it does: two devices have one name.
+        """
+        if self.running and self._is_of_previous(batch) and not self._is_late(batch):
+            found = f"samples of two recordings in turn from {self.device!r}"
+            fix = "give each phone a name of its own"
+            raise InputError("device", found, "one at a time", fix)
+
+    def is_due(self, now: float) -> bool:
+        """Return whether a push has waited long enough for one before it, at a time [s]."""
+        return self._order.is_due(now)
+
+    def release(self, now: float) -> int:
+        """Process the pushes whose turn it is at a time [s]; return their number of samples."""
         return sum(self._process(*each) for each in self._order.ready(now))
 
     def _process(self, batch: Batch, received: float) -> int:
@@ -95,7 +107,7 @@ class Session:
 
     def stop(self) -> None:
         """End the track; ignore data until `start`."""
-        self._process_ready(math.inf)
+        self.release(math.inf)
         self.running = False
 
     def zero(self) -> None:
@@ -109,7 +121,7 @@ class Session:
     def close(self) -> None:
         """Process what still waits, and close the recording."""
         try:
-            self._process_ready(math.inf)
+            self.release(math.inf)
         finally:
             self.track.close()
 
@@ -144,5 +156,8 @@ class Session:
 
     def _is_of_previous(self, batch: Batch) -> bool:
         """Return whether a batch is one of the recording before this."""
-        of_this = not batch.readings or batch.recording == self._recording
-        return batch.recording == self._previous and not of_this
+        named = batch.recording and batch.recording == self._previous != self._recording
+        return bool(named and batch.readings)
+
+    def _is_late(self, batch: Batch) -> bool:
+        return batch.number >= 0 and middle_time(batch) < self._opened_ns

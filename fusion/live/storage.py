@@ -37,7 +37,7 @@ class LiveFile:
 
     Attributes:
         path: path of the recording.
-        fixes_path: path of the fixes; the file exists once there is a fix.
+        fixes_path: path of the fixes; the file exists once one was given.
 
     Raises:
         InputError: the folder or file cannot be created.
@@ -72,10 +72,10 @@ class LiveFile:
         """Append a position fix for `stario run --fixes`; its time counts from the first sample."""
         (x, y, z), sigma = fix.value.tolist(), fix.covariance.diagonal() ** 0.5
         sx, sy, sz = sigma.tolist()
-        new = not self.fixes_path.exists()
+        line = f"{fix.time!r},position,{x!r},{y!r},{z!r},{sx!r},{sy!r},{sz!r}\n"
         with self.fixes_path.open("ab", buffering=0) as file:
-            line = f"{fix.time!r},position,{x!r},{y!r},{z!r},{sx!r},{sy!r},{sz!r}\n"
-            _write_whole(file, ((FIXES_HEADER if new else "") + line).encode())
+            # An attempt on a full disk may have left an empty file.
+            _write_whole(file, (line if file.tell() else FIXES_HEADER + line).encode())
 
     def close(self) -> None:
         """Close the file."""

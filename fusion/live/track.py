@@ -20,11 +20,18 @@ from stario.fusion.navigator import Navigator
 from stario.fusion.report.health import findings
 from stario.fusion.state import NavState
 from stario.sequences.errors import InputError
+from stario.sequences.time_order import MAX_IMU_GAP
 
 _MAX_UNWRITTEN = 6000
 """Maximum number of samples kept for the next attempt to write: a minute of a phone's."""
 
 _HEALTH_SECONDS = 1.0
+
+_MANY_ALONE = 100
+"""Number of readings of the gyroscope without acceleration that is a problem, if it is most."""
+
+_START_SECONDS = 5.0
+"""Time of samples [s] after which it is a problem that there is no position."""
 
 _ERROR_SECONDS = 20.0
 """Time for which an error of the navigator is shown [s]: it begins again, and takes 13 s to see
@@ -133,17 +140,28 @@ class LiveTrack:
         after = self._state()
         if after.map_frame != self.drawn.map_frame:
             self.drawn.move(before, after)
-        self.drawn.add(after)
+        self._draw(after)
+        self._health_time = -math.inf
         self._update_health(after.time)
 
     def problem(self) -> str:
         """Return what keeps the track from being right, in words; empty if nothing does."""
-        if self._write_error or self._push_error:
-            return self._write_error or self._push_error
+        if self._write_error:
+            return self._write_error
+        alone = self._merger.dropped.get("without acceleration", 0)
+        if alone > max(_MANY_ALONE, self.samples):
+            return (
+                f"{alone} readings of the gyroscope have none of the acceleration within "
+                f"{MAX_IMU_GAP:g} s before and after: log both at 50 Hz or more, on one clock"
+            )
+        if self._push_error:
+            return self._push_error
         if self._merger.missing:
             return f"no samples of {self._merger.missing}: enable it in the logger"
         if self._merger.silent:
             return f"no samples of {self._merger.silent} for {MAX_WAIT / 1e9:g} s: the track waits"
+        if self._navigator.state is None and self._seconds(self._newest_ns) > _START_SECONDS:
+            return "no position so far: it takes a second of samples of both sensors without a gap"
         if self._factor * self._merger.upward < -_CERTAIN:
             other = "-m/s2" if self._factor > 0 else "m/s2"
             return (
@@ -183,6 +201,7 @@ class LiveTrack:
             self._push(time_ns, gyro, accel)
         for time_ns, field in pending:  # ahead of the samples, which wait for the accelerometer
             self._push_field(time_ns, field)
+        self._update_health(self._seconds(samples[-1][0]))  # with or without a position
 
     def _push_field(self, time_ns: int, field: Vector) -> None:
         self._navigator.push_magnetometer(self._seconds(time_ns), field)
@@ -197,8 +216,12 @@ class LiveTrack:
             return
         if state.time - self._error_time > _ERROR_SECONDS:
             self._push_error = ""
-        self.drawn.add(state)
-        self._update_health(state.time)
+        self._draw(state)
+
+    def _draw(self, state: NavState) -> None:
+        pose = self._navigator.continuous
+        assert pose is not None  # there is a state
+        self.drawn.add(state, pose.p_W)
 
     def _seconds(self, time_ns: int) -> float:
         return (time_ns - self._first_ns) / 1e9

@@ -29,6 +29,13 @@ FLAGGED_SHARE = 1e-3
 GATED_SHARE = 0.1
 """Share of updates treated as outliers above which to warn."""
 
+MIN_UPDATES = 20
+"""Number of the network's displacements below which nothing is said about network and motion: ten
+seconds of them."""
+
+_RESTING = 100
+"""Number of zero-velocity updates that are as good: ten seconds of rest."""
+
 NIS_RATIO = 2.0
 """Factor between mean NIS and expectation, in either direction, above which to report it."""
 
@@ -60,14 +67,19 @@ class Finding:
 
 def findings(health: Health) -> list[Finding]:
     """Return what stands out in a run so far, warnings first; never empty."""
-    if _is_invalid(health):
+    early = health.updates < MIN_UPDATES
+    notes = health.notes
+    if early or _is_invalid(health):
+        notes = [note for note in notes if not _is_unfamiliar(note)]
+    if not early and _is_invalid(health):
         reasons = [_invalid_data(health), *_samples(health), *_gaps(health)]
-        notes = [note for note in health.notes if not _is_unfamiliar(note)]
     else:
-        reasons = [*_samples(health), *_flagged(health), *_gaps(health), *_updates(health)]
-        notes = health.notes
+        reasons = [*_samples(health), *_flagged(health), *_gaps(health)]
+        reasons += [*([] if early else _updates(health)), *_field(health)]
     found = [*reasons, *_fixes(health), *_direction(health), *map(_noted, notes)]
-    if not health.notes and not any(finding.level == "warning" for finding in found):
+    if early and health.zero_velocity.get("applied", 0) < _RESTING:
+        found.append(Finding("note", "Too early to judge the motion: it takes ten seconds of it."))
+    elif not notes and not any(finding.level == "warning" for finding in found):
         found.insert(0, Finding("good", "Sensors, filter and network agree; nothing to do."))
     order = ("warning", "good", "note")
     return sorted(found, key=lambda finding: order.index(finding.level))
@@ -194,7 +206,7 @@ def _updates(health: Health) -> Iterator[Finding]:
         )
         yield Finding("warning", text, advice)
     ratio = health.mean_nis / health.nis_expected
-    nis = f"mean NIS {health.mean_nis:.1f}, expected {health.nis_expected:.0f}"
+    nis = f"mean NIS {health.mean_nis:.2g}, expected {health.nis_expected:.0f}"
     if ratio > NIS_RATIO:
         text = f"The network and the IMU disagree by more than their sigmas allow ({nis})."
         advice = (
@@ -209,6 +221,9 @@ def _updates(health: Health) -> Iterator[Finding]:
             "track do not show here."
         )
         yield Finding("note", text)
+
+
+def _field(health: Health) -> Iterator[Finding]:
     bearings = sum(n for name, n in health.bearings.items() if name != "gated")
     useless = bearings - health.bearings.get("applied", 0)
     if useless > 0.5 * bearings:

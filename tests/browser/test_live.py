@@ -30,7 +30,7 @@ def replay():
 def server(tmp_path_factory):
     model = load_model()
     folder = tmp_path_factory.mktemp("live")
-    server = LiveServer(lambda: Navigator(model), folder, port=0, lines_port=0)
+    server = LiveServer(lambda: Navigator(model), folder, port=0)
     listening = threading.Event()
     thread = threading.Thread(target=server.run, args=(listening.set,))
     thread.start()
@@ -43,16 +43,17 @@ def server(tmp_path_factory):
 def test_page_draws_two_phones_and_ends_where_a_run_on_their_files_does(show, server, replay):
     url = f"http://127.0.0.1:{server.port}"
     shown = show(url)
-    assert shown.page.is_visible("#empty")
+    assert shown.page.is_visible("#local")
+    assert not shown.page.is_visible("#time")
     phones = [
         threading.Thread(target=replay, args=(demonstration(), f"{url}/data", 10.0, 6.0, name))
-        for name in ("anna <b>", "ben")
+        for name in ("anna <a href=x>b</a>", "ben")
     ]
     for phone in phones:
         phone.start()
     for phone in phones:
         phone.join()
-    for name in ("anna <b>", "ben"):
+    for name in ("anna <a href=x>b</a>", "ben"):
         session = server.hub.sessions[name]
         end = session.track.drawn.points[-1]
         shown.page.wait_for_function(f"([id, t]) => ({LAST})(id)?.[0] >= t", arg=[name, end[0]])
@@ -60,7 +61,9 @@ def test_page_draws_two_phones_and_ends_where_a_run_on_their_files_does(show, se
         drawn = shown.page.evaluate(LAST, name)
         np.testing.assert_allclose(drawn[1:4], track.trajectory.position_W[-1], atol=1e-4)
         assert shown.page.is_visible(f"[data-device='{name}'] .figures")
-    assert not shown.page.is_visible("#empty")
+    assert shown.page.is_visible("#time")
+    assert not shown.page.is_visible("#local")
+    assert shown.page.locator("#map a[href=x]").count() == 0
     assert not shown.overflows()
     assert shown.problems == []
 
@@ -85,6 +88,7 @@ def test_buttons_for_zero_place_and_stop_reach_the_server(show, server, replay):
     x, y = np.array(session.track.drawn.points[-1][1:3]) - before
     assert x > 0.5
     assert y > 0.5
+    assert card.locator(".file").inner_text().endswith(", 1 fix")
     card.get_by_text("Stop").click()
     shown.page.wait_for_function("() => !window.stario.devices.get('carla').running")
     assert not session.running
@@ -101,30 +105,34 @@ def test_a_command_without_an_answer_is_shown_and_any_name_can_be_commanded(show
         (lambda route: route.fulfill(status=404, body="Not Found"), "status 404"),
         (lambda route: route.abort(), "no connection"),
     ):
-        shown.page.route("**/stop", answer)
+        shown.page.route("**/command", answer)
         card.get_by_text("Stop").click()
         card.locator(".error", has_text=words).wait_for()
-        shown.page.unroute("**/stop")
+        shown.page.unroute("**/command")
     card.get_by_text("Stop").click()
     shown.page.wait_for_function("() => !window.stario.devices.get('dora/2').running")
     assert not server.hub.sessions["dora/2"].running
     card.locator(".error").wait_for(state="hidden")
     expected = ("Failed to load resource", "failed: ")  # both are the browser's own
     assert all(problem.startswith(expected) for problem in shown.problems)
-    server.hub.sessions.pop("dora/2").close()  # as when it makes room for another
+    server.hub.sessions["dora/2"].close()
+    del server.hub.sessions["dora/2"]  # as when it makes room for another
     card.wait_for(state="detached")
 
 
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
 def test_page_of_a_server_that_requires_a_token_loads_with_it(show, tmp_path, size):
-    server = LiveServer(lambda: None, tmp_path, host="0.0.0.0", port=0, lines_port=0)
+    server = LiveServer(lambda: None, tmp_path, host="0.0.0.0", port=0)
     listening = threading.Event()
     thread = threading.Thread(target=server.run, args=(listening.set,))
     thread.start()
     assert listening.wait(60.0)
     try:
         shown = show(f"http://127.0.0.1:{server.port}/?token={server.token}", size)
-        assert server.token in shown.page.inner_text("#push-url")
+        address = shown.page.inner_text("#push-url")
+        assert "127.0.0.1" not in address
+        assert address.endswith(f":{server.port}/data?token={server.token}")
+        shown.page.wait_for_function("document.getElementById('code').naturalWidth > 50")
         assert not shown.overflows()
         assert shown.problems == []
     finally:

@@ -83,8 +83,6 @@ def test_live_refuses_a_port_in_use(stario):
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         stario("live", "--port", port).assert_one_line_error("port", "--port")
-        done = stario("live", "--port", 0, "--lines-port", port)
-        done.assert_one_line_error("lines-port", "--lines-port")
 
 
 def test_live_refuses_an_invalid_address_of_a_phone(stario):

@@ -59,12 +59,11 @@ def pushes(walk):
 
 @pytest.fixture
 def serve(tmp_path, new_navigator):
-    """Start a server, with a token as if it were not on loopback, or without one."""
+    """Start a server on loopback."""
     running = []
 
-    def start(token="", phones=()):
-        server = LiveServer(new_navigator, tmp_path, port=0, lines_port=0, phones=phones)
-        server._lines._token = token
+    def start(**options):
+        server = LiveServer(new_navigator, tmp_path, port=0, **options)
         listening = threading.Event()
         thread = threading.Thread(target=server.run, args=(listening.set,))
         thread.start()

@@ -21,18 +21,19 @@ def state(time=0.0, yaw=0.2, p_W=(1.0, 2.0, 3.0)):
 
 def test_a_point_holds_position_speed_yaw_covariance_and_sigma_of_yaw():
     yaw, sigma = np.degrees([0.2, 0.2])
-    expected = [0.0, 1.0, 2.0, 3.0, 1.0, yaw, 4.0, 0.0, 1.0, sigma]
-    np.testing.assert_allclose(point_of(state()), expected, atol=1e-5)
+    expected = [0.0, 1.0, 2.0, 3.0, 1.0, yaw, 4.0, 0.0, 1.0, sigma, 0.5, 2.5]
+    np.testing.assert_allclose(point_of(state(), np.array([0.5, 2.5, 3.0])), expected, atol=1e-5)
 
 
 def test_a_new_map_frame_rotates_position_yaw_and_covariance_together():
     track, turn, shift = DisplayedTrack(), about_z(0.5), np.array([5.0, -3.0, 1.0])
-    track.add(state())
+    track.add(state(), np.array([0.5, 2.5, 3.0]))
     before, after = state(1.0, 0.9, (7.0, 7.0, 3.0)), state(1.0, 1.4)
     after.p_W[:] = turn.apply(before.p_W) + shift
     track.move(before, after)
     [point] = track.points
     np.testing.assert_allclose(point[1:4], turn.apply([1.0, 2.0, 3.0]) + shift, atol=1e-4)
+    np.testing.assert_allclose(point[10:], (turn.apply([0.5, 2.5, 3.0]) + shift)[:2], atol=1e-4)
     assert point[5] == pytest.approx(np.degrees(0.2 + 0.5), abs=1e-3)
     R = turn.as_matrix()[:2, :2]
     np.testing.assert_allclose(
@@ -65,10 +66,9 @@ def test_points_that_a_thread_moves_while_they_are_read_are_sent_again(hub):
             self.revision = 1
             return self.lists.pop(0) if len(self.lists) > 1 else self.lists[0]
 
-    hub.sessions["phone"] = SimpleNamespace(
-        track=SimpleNamespace(drawn=Moving()), status=dict, close=lambda: None
-    )
+    hub.sessions["phone"] = SimpleNamespace(track=SimpleNamespace(drawn=Moving()), status=dict)
     viewer = Viewer(hub)
     messages = [viewer.message()["devices"][0] for _ in range(3)]
     assert [message["points"] for message in messages] == [[[1.0]], [[2.0]], []]
     assert [message["fresh"] for message in messages] == [True, True, False]
+    hub.sessions.clear()

@@ -30,10 +30,12 @@ def numbers(ready):
 
 def test_a_push_waits_for_those_before_it_and_no_longer_than_allowed():
     order, taken = PushOrder(), []
-    for number, received in ((4, 0.0), (6, 0.1), (7, 0.2), (5, 0.3), (9, 0.4), (10, 2.3)):
+    for number, received in ((4, 0.0), (6, 0.1), (7, 0.2), (5, 0.3), (9, 0.4), (10, 1.1)):
         order.add(Batch("phone", "one", [], number), received)
         taken.append(numbers(order.ready(received)))
     assert taken == [[4], [], [], [5, 6, 7], [], []]
+    assert not order.is_due(1.1)
+    assert order.is_due(0.4 + MAX_DELAY)
     assert numbers(order.ready(0.4 + MAX_DELAY)) == [9, 10]
 
 

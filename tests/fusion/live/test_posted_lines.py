@@ -28,3 +28,16 @@ def test_an_invalid_line_is_reported_with_its_number(client):
     answer = client.post("/data", content=body, headers={"content-type": "application/x-ndjson"})
     assert answer.status_code == 400
     assert answer.json()["error"].startswith("line 2, gyro: found a list")
+
+
+def test_a_body_of_too_many_devices_is_refused_before_any_is_taken(client, hub):
+    lines = [
+        {"device": f"rig {k}", "t": 1, "gyro": [0, 0, 0], "accel": [0, 0, 9.8]} for k in range(17)
+    ]
+    headers = {"content-type": "application/x-ndjson"}
+    answer = client.post("/data", content="\n".join(map(json.dumps, lines)), headers=headers)
+    assert (answer.status_code, "at most 16" in answer.json()["error"]) == (400, True)
+    assert hub.sessions == {}
+    sixteen = "\n".join(map(json.dumps, lines[:16]))
+    assert client.post("/data", content=sixteen, headers=headers).status_code == 200
+    assert len(hub.sessions) == 16

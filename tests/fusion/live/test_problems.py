@@ -74,6 +74,26 @@ def test_a_full_disk_is_shown_until_it_has_space_and_what_is_lost_is_counted(
     assert session.status()["dropped"] == {"not written": 900 - written}
 
 
+def test_a_recording_that_never_gives_a_position_says_why(session, batches):
+    """Bursts of 0.8 s every 1.4 s: no second of samples from which to level the attitude."""
+    for k in range(0, 44, 4):
+        for n, batch in enumerate(batches[k : k + 4]):
+            late = 600_000_000 * (k // 4)
+            readings = [replace(r, time_ns=r.time_ns + late) for r in batch.readings]
+            session.take(replace(batch, readings=readings, number=k + n), 1.7e9)
+    assert session.track.drawn.points == []
+    assert session.status()["problem"].startswith("no position so far")
+    assert any("gaps in the samples" in word["text"] for word in session.status()["health"])
+
+
+def test_an_accelerometer_too_slow_to_interpolate_is_named(session, batches):
+    for batch in batches[:25]:
+        accel = [r for r in batch.readings if r.sensor != GYRO][:1]  # 5 Hz
+        gyro = [r for r in batch.readings if r.sensor == GYRO]
+        session.take(replace(batch, readings=gyro + accel), 1.7e9)
+    assert "log both at 50 Hz" in session.status()["problem"]
+
+
 def test_an_unwritable_folder_is_shown(tmp_path, new_navigator, batches):
     (tmp_path / "file").touch()
     session = Session("phone", tmp_path / "file", new_navigator)

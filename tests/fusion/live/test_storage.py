@@ -13,6 +13,9 @@ import urllib.request
 import numpy as np
 import pytest
 
+from stario.fusion import read_fixes
+from stario.fusion.fixes import position_fix
+from stario.fusion.live import storage
 from stario.fusion.live.payload import parse_push
 from stario.fusion.live.session import Session
 from stario.fusion.live.storage import LiveFile
@@ -118,6 +121,23 @@ def test_a_partial_write_on_a_full_disk_is_undone(tmp_path):
     file.append(SAMPLES[10:], 1.7e9)
     recording = read_recording(file.path)
     np.testing.assert_array_equal(recording.accel, [a for _, _, a in SAMPLES])
+    file.close()
+
+
+def test_a_fix_after_one_that_failed_on_a_full_disk_has_its_header(tmp_path, monkeypatch):
+    file, write = LiveFile(tmp_path, "phone"), storage._write_whole
+
+    def full(file, data):
+        raise OSError("No space left on device")
+
+    fix = position_fix(1.0, np.zeros(3), np.eye(3))
+    monkeypatch.setattr(storage, "_write_whole", full)
+    with pytest.raises(OSError, match="space"):
+        file.append_fix(fix)
+    monkeypatch.setattr(storage, "_write_whole", write)
+    file.append_fix(fix)
+    file.append_fix(fix)
+    assert len(read_fixes(file.fixes_path)) == 2
     file.close()
 
 

@@ -22,7 +22,7 @@ UNFAMILIAR = "60% of the windows move unlike anything the weights were trained o
 def test_every_warning_comes_with_advice() -> None:
     good = findings(Health(samples={"used": 1000}, updates=100, mean_nis=3.0))
     assert [finding.level for finding in good] == ["good"]
-    noted = findings(Health(mean_nis=3.0, notes=[UNFAMILIAR]))
+    noted = findings(Health(updates=100, mean_nis=3.0, notes=[UNFAMILIAR]))
     assert [finding.level for finding in noted] == ["warning"]
     assert "stario train" in noted[0].advice
     bad = findings(
@@ -39,6 +39,13 @@ def test_every_warning_comes_with_advice() -> None:
     assert [finding.level for finding in bad] == ["warning"] * 5
     assert all(finding.advice for finding in bad)
     assert "4.00 s" in " ".join(finding.text for finding in bad)
+
+
+def test_nothing_is_said_about_the_motion_after_a_few_windows() -> None:
+    early = Health(updates=2, gated=2, mean_nis=0.04, notes=[UNFAMILIAR])
+    assert [(f.level, "Too early" in f.text) for f in findings(early)] == [("note", True)]
+    resting = findings(Health(zero_velocity={"applied": 300}))
+    assert [finding.level for finding in resting] == ["good"]
 
 
 SHAKEN = Health(
@@ -114,7 +121,7 @@ def test_small_innovations_are_not_reported_as_small_errors() -> None:
 def test_standing_still_is_advised_only_where_the_yaw_drifts(
     gap: float, yaw_sigma: float, helps: bool
 ) -> None:
-    health = Health(mean_nis=3.0, longest_gap=gap, final_sigma={"yaw_rad": yaw_sigma})
+    health = Health(updates=100, mean_nis=3.0, longest_gap=gap, final_sigma={"yaw_rad": yaw_sigma})
     advice = findings(health)[-1].advice
     assert "yaw fix" in advice
     assert "six times their sigma apart" in advice

@@ -1,0 +1,161 @@
+"""No connection keeps phones from the server, and no end of it loses what it took."""
+
+import asyncio
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from contextlib import suppress
+from urllib.parse import urlsplit
+
+import pytest
+
+from stario.fusion.live import connections
+from stario.fusion.live.run import LiveServer, is_loopback
+from stario.sequences import read_recording
+
+HEAD = b"POST /data HTTP/1.1\r\nHost: localhost\r\nContent-Length: 99\r\nX-Filler: abcdefgh\r\n\r\n"
+
+
+def push(url, body):
+    with urllib.request.urlopen(urllib.request.Request(url, body), timeout=10) as answer:
+        return json.load(answer)["samples"]
+
+
+async def hold_up(port, already, rest, stop):
+    """Hold a connection, sending a byte at a time; connect again as soon as it is closed."""
+    while not stop.is_set():
+        try:
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.write(already)
+            for k in range(1000):
+                writer.write(rest[k : k + 1])
+                await writer.drain()
+                try:
+                    async with asyncio.timeout(0.3):
+                        if not await reader.read(1000):
+                            break
+                except TimeoutError:
+                    pass
+                if stop.is_set():
+                    break
+            writer.close()
+        except OSError:
+            await asyncio.sleep(0.1)
+
+
+async def crowd(port, stop):
+    kinds = [(b"", b"")] * 200 + [(b"", HEAD)] * 100 + [(HEAD, b" " * 98)] * 100
+    await asyncio.gather(*(hold_up(port, *kind, stop) for kind in kinds))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="select takes 512 sockets there")
+def test_four_hundred_silent_and_slow_connections_keep_no_push_out(serve, pushes):
+    server, stop = serve(), threading.Event()
+    attack = threading.Thread(target=lambda: asyncio.run(crowd(server.port, stop)))
+    attack.start()
+    try:
+        time.sleep(2.0)
+        url = f"http://127.0.0.1:{server.port}/data"
+        assert sum(push(url, body) for body in pushes(seconds=6.0)) == 600
+    finally:
+        stop.set()
+        attack.join()
+
+
+def test_a_connection_without_a_whole_request_is_closed_in_time(serve, monkeypatch):
+    monkeypatch.setattr(connections, "REQUEST_SECONDS", 0.5)
+    server = serve()
+    for sent in (b"", HEAD[:20], HEAD + b"{"):
+        with socket.create_connection(("127.0.0.1", server.port), timeout=10.0) as client:
+            client.sendall(sent)
+            with suppress(ConnectionResetError):
+                assert client.recv(100) == b""
+
+
+def test_a_stranger_keeps_no_connection(serve, monkeypatch):
+    monkeypatch.setattr("stario.fusion.live.run.is_loopback", lambda host: False)
+    server = serve()
+    with socket.create_connection(("127.0.0.1", server.port), timeout=3.0) as client:
+        client.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert client.makefile("rb").read().startswith(b"HTTP/1.1 401")  # to its end
+
+
+def test_answers_are_not_delayed(serve):
+    server = serve()
+    with socket.create_connection(("127.0.0.1", server.port)) as client:
+        client.sendall(b"GET /live.css HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        client.recv(100)
+        [served] = server._server.server_state.connections
+        accepted = served.transport.get_extra_info("socket")
+        assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+
+
+def test_a_push_waits_no_longer_for_a_missing_one_though_no_other_comes(serve, pushes):
+    server = serve()
+    url = f"http://127.0.0.1:{server.port}/data"
+    bodies = pushes(seconds=4.0)
+    taken = sum(push(url, body) for body in [*bodies[:10], *bodies[11:14]])
+    stop = time.monotonic() + 10.0
+    while server.hub.sessions["phone"].track.samples < taken + 60:
+        assert time.monotonic() < stop
+        time.sleep(0.05)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no SIGTERM on this system")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_loses_nothing_that_was_acknowledged(tmp_path, pushes, number):
+    command = "from stario.fusion.commands.cli import main; main()"
+    options = ["live", "--port", "0", "--out", str(tmp_path)]
+    with subprocess.Popen(
+        [sys.executable, "-c", command, *options], stderr=subprocess.PIPE, text=True
+    ) as server:
+        watchdog = threading.Timer(120.0, server.kill)
+        watchdog.start()
+        lines = [server.stderr.readline() for _ in range(2)]
+        url = lines[1].split()[-1]
+        for k, body in enumerate(pushes(seconds=4.0)):
+            if k != 17:  # the last two wait for it
+                push(url, body)
+        server.send_signal(number)
+        assert server.wait() == 0
+        watchdog.cancel()
+    (path,) = tmp_path.glob("*.csv")
+    assert len(read_recording(path)) == 380
+
+
+def test_a_stopping_server_closes_the_connections_of_its_viewers(serve, caplog):
+    server = serve()
+    with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/events", timeout=20) as viewer:
+        assert viewer.readline().startswith(b"data: ")
+        server.stop()
+        rest = viewer.read()
+    assert rest.endswith(b"\n")
+    assert caplog.records == []
+
+
+def test_only_loopback_needs_no_token(tmp_path, new_navigator):
+    assert is_loopback("127.0.0.1")
+    assert is_loopback("::1")
+    assert not is_loopback("0.0.0.0")
+    server = LiveServer(new_navigator, tmp_path, host="0.0.0.0", port=0)
+    assert len(server.token) >= 16
+    page = re.search(r"http://\S+", server.addresses()[0])[0]
+    assert urlsplit(page).query == f"token={server.token}"
+    server._socket.close()
+
+
+def test_a_simulated_phone_walks_to_its_end(serve, walk):
+    server = serve(demo=walk.slice(0.0, 3.0))
+    stop = time.monotonic() + 20.0
+    while not (sessions := server.hub.sessions) or sessions["simulated phone"].running:
+        assert time.monotonic() < stop
+        time.sleep(0.05)
+    track = sessions["simulated phone"].track
+    assert track.samples == len(walk.slice(0.0, 3.0)) == len(read_recording(track.path))
