@@ -7,8 +7,8 @@ from stario.fusion.config import NavigatorConfig as NavigatorConfig
 from stario.fusion.config import read_config as read_config
 from stario.fusion.evaluation.compare import Comparison as Comparison
 from stario.fusion.evaluation.compare import compare as compare
+from stario.fusion.evaluation.compare import compare_recordings as compare_recordings
 from stario.fusion.evaluation.compare import demonstration as demonstration
-from stario.fusion.evaluation.many import compare_recordings as compare_recordings
 from stario.fusion.evaluation.summary import Scores as Scores
 from stario.fusion.evaluation.summary import scores_of as scores_of
 from stario.fusion.evaluation.summary import summary_table as summary_table

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
@@ -36,14 +36,13 @@ from stario.fusion.commands.options import (
 )
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from stario.fusion.backends import BackendName
     from stario.fusion.config import NavigatorConfig
-    from stario.fusion.evaluation.checks.backends import Score
     from stario.fusion.imu.stateful import Predictor
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
-
-Result = TypeVar("Result")
 
 _WALKS, _SECONDS, _SPLIT = 20, 120.0, "validation"
 
@@ -85,6 +84,7 @@ def backends(
         score_walk,
         summary,
     )
+    from stario.fusion.evaluation.scores import joined, records
     from stario.network.training.splits import read_packaged_list
 
     refuse_unused_sources(reading, paths, data, split != _SPLIT)
@@ -94,11 +94,11 @@ def backends(
     else:
         unused = changed(reading) | changed(estimating)
         refuse_unused(unused, "with simulated walks", "use with PATH or --data")
-    scores: list[Score] = []
+    scores: list[pd.DataFrame] = []
     skipped: list[Skipped] = []
     if paths or data is not None:
         settings, network = estimating.settings(), estimating.network()
-        scores, skipped = map_recordings(
+        scores, skipped = _score_each(
             "backends",
             reading,
             paths or [entry.path for entry in read_packaged_list(split, data or Path())],
@@ -108,8 +108,9 @@ def backends(
         for seed in with_bar("backends", range(walks), walks):
             scores.append(score_walk(seed, seconds))
     if scores:
-        record = {"summary": summary(scores), "scores": [asdict(score) for score in scores]}
-        print_result(as_json, record, score_table(scores))
+        found = joined(scores)
+        record = {"summary": summary(found), "scores": records(found)}
+        print_result(as_json, record, score_table(found))
     exit_if_skipped(skipped)
 
 
@@ -135,6 +136,7 @@ def faults(
 ) -> None:
     """Inject faults into a recording one at a time; print the resulting error and the report."""
     from stario.fusion.evaluation.checks.faults import fault_table, matched_walk, run_faults
+    from stario.fusion.evaluation.scores import records
 
     if not network:
         refuse_unused(changed(estimating, "model"), "without --network", "use with --network")
@@ -147,10 +149,10 @@ def faults(
         refuse_unused(unused, "with the simulated walk", "use with PATH")
         sequence, matched = matched_walk(seed=seed)
         settings = matched if estimating.config is None else settings
-    results = run_faults(sequence, settings, estimating.network() if network else None, seed)
-    record = {"recording": sequence.name, "faults": [asdict(result) for result in results]}
+    scores = run_faults(sequence, settings, estimating.network() if network else None, seed)
+    named = scores.rename(columns={"group": "fault", "track": "backend"})
     title = f"{sequence.name}: {sequence.duration:.1f} s"
-    print_result(as_json, record, f"{title}\n{fault_table(results)}")
+    print_result(as_json, records(named), f"{title}\n{fault_table(scores)}")
 
 
 def consistency(
@@ -164,11 +166,12 @@ def consistency(
     """Run a Monte Carlo test on simulated walks: are NEES, NIS and yaw error consistent?"""
     from stario.fusion.config import NavigatorConfig, read_config
     from stario.fusion.evaluation.checks.consistency import consistency as monte_carlo
+    from stario.fusion.evaluation.checks.consistency import consistency_text, summary
 
     checked = read_config(config) if config else NavigatorConfig()
     with progress_bar("consistency") as progress:
-        result = monte_carlo(checked, max(math.radians(yaw), 1e-6), runs, seconds, seed, progress)
-    print_result(as_json, asdict(result), "\n".join(result.lines()))
+        scores = monte_carlo(checked, max(math.radians(yaw), 1e-6), runs, seconds, seed, progress)
+    print_result(as_json, summary(scores, seconds), consistency_text(scores, seconds))
 
 
 def benchmark(as_json: JsonOption = False) -> None:
@@ -231,8 +234,8 @@ def gaps(
     """Remove 0.1 s at one of six instants or 5 % of the samples; report how far the end moves."""
     from stario.fusion.evaluation.checks.sample_loss import end_shift_table, end_shifts
 
-    shifts, skipped = _judge_each("check gaps", reading, paths, estimating, by, end_shifts)
-    _print_table([shift for each in shifts for shift in each], skipped, end_shift_table, as_json)
+    found, skipped = _judge_each("check gaps", reading, paths, estimating, by, end_shifts)
+    _print_table(found, skipped, end_shift_table, as_json)
 
 
 @expand_option_groups
@@ -249,7 +252,6 @@ def moments(
     Without PATH, use simulated walks in a building.
     """
     from stario.fusion.evaluation.checks.moments import (
-        MomentCost,
         moment_costs,
         moment_table,
         simulated_walks,
@@ -257,20 +259,17 @@ def moments(
 
     backends: tuple[BackendName, ...] = ("ekf", "graph") if graph else ("ekf",)
     model, settings = estimating.network(), estimating.settings()
-    costs: list[MomentCost] = []
     skipped: list[Skipped] = []
     judge = partial(moment_costs, model, config=settings, backends=backends, seed=seed)
     if paths:
-        found, skipped = map_recordings(
+        found, skipped = _score_each(
             "check moments", reading, paths, lambda path, sequence: judge(sequence)
         )
-        costs = [cost for each in found for cost in each]
     else:
         refuse_unused(changed(reading), "with simulated walks", "use with PATH")
         walks = simulated_walks()
-        for walk in with_bar("check moments", walks, len(walks)):
-            costs += judge(walk)
-    _print_table(costs, skipped, moment_table, as_json)
+        found = [judge(walk) for walk in with_bar("check moments", walks, len(walks))]
+    _print_table(found, skipped, moment_table, as_json)
 
 
 def _judge_each(
@@ -279,28 +278,50 @@ def _judge_each(
     paths: Sequence[Path],
     estimating: EstimatorOptions,
     by: str,
-    judge: Callable[[Predictor, ImuSequence, NavigatorConfig, str], Result],
-) -> tuple[list[Result], list[Skipped]]:
-    """Judge each recording as one of its group; return the results and what was skipped."""
-    from stario.fusion.evaluation.judging.judge import By, labels
+    judge: Callable[[Predictor, ImuSequence, NavigatorConfig, str], pd.DataFrame],
+) -> tuple[list[pd.DataFrame], list[Skipped]]:
+    """Score each recording as one of its group; return the scores and what was skipped."""
+    from stario.fusion.evaluation.benchmark.groups import By, labels
     from stario.sequences.arrays import check_choice
 
     grouping: By = check_choice("--by", by, get_args(By))
     model, settings = estimating.network(), estimating.settings()
 
-    def judged(path: Path, sequence: ImuSequence) -> Result:
+    def judged(path: Path, sequence: ImuSequence) -> pd.DataFrame:
         return judge(model, sequence, settings, labels(path, sequence.attributes)[grouping])
 
-    return map_recordings(title, reading, paths, judged)
+    return _score_each(title, reading, paths, judged)
+
+
+def _score_each(
+    title: str,
+    reading: ReadingOptions,
+    paths: Sequence[Path],
+    score: Callable[[Path, ImuSequence], pd.DataFrame],
+) -> tuple[list[pd.DataFrame], list[Skipped]]:
+    """Score each recording, under a name of its own; return the scores and what was skipped."""
+    from stario.fusion.evaluation.compare import distinct_name
+
+    names: set[str] = set()
+
+    def named(path: Path, sequence: ImuSequence) -> pd.DataFrame:
+        return score(path, replace(sequence, name=distinct_name(sequence.name, names)))
+
+    return map_recordings(title, reading, paths, named)
 
 
 def _print_table(
-    found: Sequence[Any],
+    found: Sequence[pd.DataFrame],
     skipped: Sequence[Skipped],
-    table: Callable[[Sequence[Any]], str],
+    table: Callable[[pd.DataFrame], str],
     as_json: bool,
 ) -> None:
-    """Print results as a table or JSON, and exit with 1 if any recording was skipped."""
-    if as_json or found:
-        print_result(as_json, [asdict(result) for result in found], table(found) if found else "")
+    """Print scores as a table or JSON, and exit with 1 if any recording was skipped."""
+    from stario.fusion.evaluation.scores import joined, records
+
+    if found:
+        scores = joined(found)
+        print_result(as_json, records(scores), table(scores))
+    elif as_json:
+        print_result(as_json, [])
     exit_if_skipped(skipped)

@@ -62,8 +62,8 @@ def process_each(
         single: name of an option in use that allows only one recording; empty if none.
         explained: meaning of words in the texts, which `work` may fill; printed once, at the end.
     """
+    from stario.fusion.evaluation.compare import distinct_name
     from stario.fusion.evaluation.folders import check_folder
-    from stario.fusion.evaluation.many import distinct_name
     from stario.sequences.datasets.batch import each, without_skipped
 
     files, skipped = reading.recordings(paths)

@@ -51,12 +51,11 @@ def compare(
     Without PATH, those of a simulated walk.
     """
     from stario.fusion.backends import BACKENDS
-    from stario.fusion.evaluation.compare import demonstration
+    from stario.fusion.evaluation.compare import compare_recordings, demonstration
     from stario.fusion.evaluation.folders import check_folder
-    from stario.fusion.evaluation.many import compare_recordings
     from stario.fusion.evaluation.results import scores_dict, write_comparison
     from stario.fusion.evaluation.summary import scores_of
-    from stario.fusion.evaluation.track_table import column_words
+    from stario.fusion.evaluation.text import column_words
     from stario.fusion.fix_file import read_fixes
     from stario.sequences.datasets.batch import without_skipped
     from stario.sequences.lazy import optional_package
@@ -101,7 +100,7 @@ def compare(
 
 
 def _lines(comparison: Comparison) -> list[str]:
-    from stario.fusion.evaluation.track_table import track_table, tracked_words
+    from stario.fusion.evaluation.text import track_table, tracked_words
 
     sequence, path = comparison.sequence, comparison.path_m
     length = f"truth: {sequence.truth_summary()}" if path is None else f"{path:.1f} m"

@@ -164,7 +164,7 @@ def _tracks(
 ) -> list[Skipped]:
     """Write and print the table of recordings; return those that were skipped."""
     from stario.fusion.backends import BACKENDS
-    from stario.fusion.evaluation.many import compare_recordings
+    from stario.fusion.evaluation.compare import compare_recordings
     from stario.fusion.evaluation.results import write_recording, write_summary
     from stario.fusion.evaluation.summary import Scores, scores_of, summary, summary_table
     from stario.sequences.datasets.batch import without_skipped
@@ -202,7 +202,8 @@ def _networks(
 ) -> list[Skipped]:
     """Write and print the table of networks; return the recordings that were skipped."""
     from stario.fusion.evaluation.figures import write_table
-    from stario.fusion.evaluation.tables import compare_networks, table_dict, table_text
+    from stario.fusion.evaluation.networks import compare_networks, table_dict
+    from stario.fusion.evaluation.text import networks_text
     from stario.network.model import load_model, weights_named
     from stario.sequences.accuracy.metrics import Convention
     from stario.sequences.arrays import check_choice
@@ -219,10 +220,10 @@ def _networks(
             jobs,
             progress=progress,
         )
-    if table.entries:
+    if table is not None:
         if out is not None:
             write_table(out, table)
-        print_result(as_json, table_dict(table), table_text(table))
+        print_result(as_json, table_dict(table), networks_text(table))
     return skipped
 
 
@@ -238,14 +239,10 @@ def _groups(
     as_json: bool,
 ) -> list[Skipped]:
     """Write and print the table of groups; return the recordings that were skipped."""
-    from stario.fusion.evaluation.judging.judge import By, judge, rows_of
-    from stario.fusion.evaluation.judging.prepared import prepared_recordings
-    from stario.fusion.evaluation.judging.table import (
-        JudgingResult,
-        judgement_dict,
-        judgement_text,
-        write_judgement,
-    )
+    from stario.fusion.evaluation.benchmark.aligned import aligned_recordings
+    from stario.fusion.evaluation.benchmark.groups import By, benchmark, benchmark_dict
+    from stario.fusion.evaluation.figures import write_benchmark
+    from stario.fusion.evaluation.text import benchmark_text
     from stario.sequences.arrays import check_choice
     from stario.sequences.datasets.cache_files import cache_folder
 
@@ -256,16 +253,16 @@ def _groups(
         if _GROUP not in name and _SET not in name:
             _for_group(name, "")  # fail on unloadable weights before preparing anything
     paths = [entry.path for entry in recordings]
-    prepared = prepared_recordings(paths, reading.read, reading.as_read(), cache_folder(), jobs)
+    aligned = aligned_recordings(paths, reading.read, reading.as_read(), cache_folder(), jobs)
     groups = {entry.path: entry.group for entry in recordings}
-    shown = with_bar("judge", prepared, len(recordings))
-    judged, skipped = judge(shown, models, groups, reading.read if ekf else None)
-    if not judged:
-        return skipped
-    found = JudgingResult(ours, theirs, rows_of(judged, grouping, ours, theirs), judged)
-    if out is not None:
-        write_judgement(out, found)
-    print_result(as_json, judgement_dict(found), judgement_text(found))
+    shown = with_bar("benchmark", aligned, len(recordings))
+    found, skipped = benchmark(shown, models, groups, reading.read if ekf else None)
+    if found is not None:
+        rows = found.rows(grouping, ours, theirs)
+        if out is not None:
+            write_benchmark(out, found, rows, ours, theirs)
+        record = benchmark_dict(found, rows, ours, theirs)
+        print_result(as_json, record, benchmark_text(rows, ours, theirs))
     return skipped
 
 

@@ -86,7 +86,7 @@ def _run(
     """Write one recording's track; return its record and a summary; `words` explain its columns."""
     from stario.fusion.evaluation.compare import measured
     from stario.fusion.evaluation.results import write_run
-    from stario.fusion.evaluation.track_table import column_words
+    from stario.fusion.evaluation.text import column_words
     from stario.fusion.fix_file import check_within
     from stario.sequences.inspection.gyro_axes import compare_gyro_axes
     from stario.sequences.truth.problems import warn_of_truth
@@ -120,7 +120,7 @@ def _lines(found: Comparison, track: Track) -> list[str]:
     import numpy as np
 
     from stario.fusion.evaluation.known_positions import position_error_words
-    from stario.fusion.evaluation.track_table import track_table, tracked_words
+    from stario.fusion.evaluation.text import track_table, tracked_words
     from stario.fusion.report.health import health_lines
 
     sequence = found.sequence

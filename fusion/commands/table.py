@@ -18,14 +18,16 @@ from stario.fusion.commands.options import (
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
-    from stario.fusion.table.sets import DataSet
+    from stario.fusion.paper_table.sets import DataSet
 
 
 _PER_GROUP = 2
 
 
 def table(
-    out: Annotated[Path, typer.Option(help="Folder of the finished cells; a rerun resumes there.")],
+    out: Annotated[
+        Path, typer.Option(help="Folder of the finished runs; a repetition resumes there.")
+    ],
     data: Annotated[Path | None, typer.Option(help="Folder of the development recordings.")] = None,
     sets: Annotated[
         str | None,
@@ -57,21 +59,21 @@ def table(
     ] = None,
     cache: CacheOption = None,
     jobs: Annotated[
-        int | None, typer.Option(help="Cells to run in parallel; -1 for as many as possible.")
+        int | None, typer.Option(help="Runs to run in parallel; -1 for as many as possible.")
     ] = None,
     backend: Annotated[
-        str, typer.Option(help="Where cells run: loky (this machine), dask or ray.")
+        str, typer.Option(help="Where runs run: loky (this machine), dask or ray.")
     ] = "loky",
 ) -> None:
-    """Train and test every network on every data set; a rerun adds only missing cells.
+    """Train and test every network on every data set; a rerun adds only missing runs.
 
     The paper's protocol: 8:1:1 by recordings, true attitude, same recipe and steps for all.
     """
     from stario.fusion.evaluation.folders import make_folder
-    from stario.fusion.table.files import known_costs, write_results
-    from stario.fusion.table.filling import backend as on_backend
-    from stario.fusion.table.filling import fill, table_cells
-    from stario.fusion.table.training import ReaderConfig
+    from stario.fusion.paper_table.files import known_costs, write_results
+    from stario.fusion.paper_table.runs import backend as on_backend
+    from stario.fusion.paper_table.runs import complete, table_runs
+    from stario.fusion.paper_table.training import ReaderConfig
     from stario.network.architectures import ARCHITECTURES
     from stario.network.training.splits import learned_from
     from stario.sequences.datasets.batch import Skipped
@@ -79,9 +81,9 @@ def table(
 
     datasets = _data_sets(data, sets, published or [], split_seed, per_group)
     chosen = None if networks is None else names_in(networks)
-    cells = table_cells(datasets, _recipe(config), steps, chosen, seeds)
+    runs = table_runs(datasets, _recipe(config), steps, chosen, seeds)
     make_folder(out)
-    requested = {cell.network for cell in cells}
+    requested = {run.network for run in runs}
     costs = known_costs([name for name in ARCHITECTURES if name in requested], out)
     learned = {} if data is None else learned_from(data)
     options = ReadingOptions()
@@ -90,21 +92,21 @@ def table(
     with on_backend(backend):
         if jobs is None and backend != "loky":
             jobs = -1
-        for done, outcome in enumerate(fill(cells, out, reading, jobs), 1):
-            cell, status = str(outcome), "done"
+        for done, outcome in enumerate(complete(runs, out, reading, jobs), 1):
+            run, status = str(outcome), "done"
             if isinstance(outcome, Skipped):
                 skipped.append(outcome)
-                cell, status = outcome.item, "not filled"
-            typer.echo(f"{done} of {len(cells)}: {cell}: {status}", err=True)
-            write_results(cells, out, costs, learned, drawn=False)
-    typer.echo(write_results(cells, out, costs, learned), nl=False)
+                run, status = outcome.item, "not done"
+            typer.echo(f"{done} of {len(runs)}: {run}: {status}", err=True)
+            write_results(runs, out, costs, learned, drawn=False)
+    typer.echo(write_results(runs, out, costs, learned), nl=False)
     exit_if_skipped(skipped)
 
 
 def _data_sets(
     data: Path | None, sets: str | None, published: list[str], seed: int, per_group: int
 ) -> list[DataSet]:
-    from stario.fusion.table.sets import development_sets, folder_set
+    from stario.fusion.paper_table.sets import development_sets, folder_set
 
     if data is None and not published:
         raise InputError("data", "none", "recordings", "pass --data or --set NAME=FOLDER")

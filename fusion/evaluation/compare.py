@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.known_positions import MIN_POSITIONS, position_error
@@ -13,6 +15,7 @@ from stario.fusion.evaluation.tracks import (
     inertial_track,
     network_track,
     network_track_true_attitude,
+    true_poses,
 )
 from stario.fusion.fix_file import check_within
 from stario.fusion.fixes import Fix, fix_list
@@ -22,8 +25,11 @@ from stario.fusion.recording import Progress, silent
 from stario.fusion.state import Track
 from stario.sequences.accuracy.metrics import CONVENTIONS, Alignment, align, evaluate_track
 from stario.sequences.accuracy.nees import position_nees
-from stario.sequences.arrays import check_type
+from stario.sequences.arrays import check_type, shown
+from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.errors import InputError
+from stario.sequences.files import unused_name
+from stario.sequences.readers import read_recording
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
@@ -215,14 +221,15 @@ def measure(track: Track, sequence: ImuSequence, alignment: Alignment = "first")
     figures: Metrics = dict.fromkeys(METRICS)
     truth = sequence.truth
     if truth is not None:
-        result = evaluate_track(track.trajectory, truth, alignment=alignment)
+        moved = align(track.trajectory, truth, alignment)
+        result = evaluate_track(moved, truth, alignment="none")
         names = ("ate_m", "rte_m", "pde", "aye_rad", "coverage")
         figures |= {name: getattr(result, name) for name in names}
         if result.duration_s < MIN_COMPARED_S:
             figures["rte_m"] = None
         figures["ate_fit_m"] = evaluate_track(track.trajectory, truth, alignment="yaw").ate_m
-        if track.trajectory.position_covariance_W is not None:
-            figures["nees_median"] = position_nees(track.trajectory, truth, alignment).median
+        if moved.position_covariance_W is not None:
+            figures["nees_median"] = position_nees(moved, truth, "none").median
     elif sequence.positions is not None:
         error, count = position_error(track, sequence.positions)
         figures["known_positions_m"] = error if count >= MIN_POSITIONS else None
@@ -230,6 +237,96 @@ def measure(track: Track, sequence: ImuSequence, alignment: Alignment = "first")
     figures["seconds_network"] = track.seconds_network
     figures["seconds_filter"] = track.seconds_filter
     return figures
+
+
+def compare_recordings(
+    paths: Iterable[Path],
+    model: Predictor | str,
+    config: NavigatorConfig | None = None,
+    read: Callable[[Path], ImuSequence] = read_recording,
+    jobs: int | None = None,
+    fixes: Iterable[Fix] = (),
+    truth_needed: bool = False,
+    progress: Progress = silent,
+) -> Iterator[Comparison | Skipped]:
+    """Compare the tracks of each recording, in the order of the paths.
+
+    Comparisons are yielded one by one, so that they need not all be in memory, under distinct
+    names: a second `walk` is `walk-2`.
+
+    Args:
+        paths: paths of the recordings.
+        model: network, or name of weights, which each process loads once: faster than passing the
+            network with every recording.
+        config: configuration of the navigator; None has its defaults.
+        read: function that reads a path; must be picklable.
+        jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
+        fixes: fixes given to EKF and graph for every recording.
+        truth_needed: whether to skip recordings without ground truth.
+        progress: called with the share of the work done; with a single process also within a
+            recording.
+
+    Raises:
+        InputError: `paths` is a single path, or an argument has the wrong type.
+    """
+    if isinstance(paths, str | Path):
+        remedy = "find_recordings(path) returns one"
+        raise InputError("paths", shown(paths), "a list of paths", remedy)
+    paths, done = list(paths), 0
+
+    def report_share(share: float) -> None:
+        progress((done + share) / len(paths))
+
+    work = partial(
+        _compare,
+        model=model,
+        config=config,
+        read=read,
+        fixes=fix_list(fixes),
+        truth_needed=truth_needed,
+        progress=report_share if jobs == 1 else silent,
+    )
+    names: set[str] = set()
+    for outcome in each(work, paths, jobs):
+        done += 1
+        report_share(0.0)
+        if isinstance(outcome, Comparison):
+            name = distinct_name(outcome.sequence.name, names)
+            outcome = replace(outcome, sequence=replace(outcome.sequence, name=name))
+        yield outcome
+
+
+def distinct_name(name: str, taken: set[str]) -> str:
+    """Return the name, or the first of name-2, name-3, ... not in `taken`, and add it there.
+
+    It is also the name of a folder: an archive's `..` would be the one above.
+    """
+    found = unused_name(name if name.strip(".") else "recording", taken)
+    taken.add(found)
+    return found
+
+
+def _compare(
+    path: Path,
+    model: Predictor | str,
+    config: NavigatorConfig | None,
+    read: Callable[[Path], ImuSequence],
+    fixes: Sequence[Fix],
+    truth_needed: bool,
+    progress: Progress,
+) -> Comparison:
+    sequence = read(path)
+    if truth_needed:
+        true_poses(sequence)
+    network = _loaded(model) if isinstance(model, str) else model
+    return compare(network, sequence, config, progress, fixes)
+
+
+@cache
+def _loaded(name: str) -> Predictor:
+    from stario.network.model import load_model
+
+    return load_model(name)
 
 
 def demonstration() -> ImuSequence:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.evaluation.judging.direction import Direction, direction
-from stario.fusion.evaluation.judging.network_alone import predict_stream
+from stario.fusion.evaluation.benchmark.direction import Direction, direction
+from stario.fusion.evaluation.benchmark.network_alone import predict_stream
 from stario.fusion.health import UNFAMILIAR_SHARE
 from stario.network.known_motion import FEATURES, features, step_rates
 from stario.network.model import DisplacementModel

@@ -1,4 +1,4 @@
-"""Figures of networks side by side: cost against error, distributions, sample tracks.
+"""Figures of scores: networks side by side, and groups of recordings.
 
 Drawn without pyplot, like those of `stario.sequences.drawing.plots`.
 """
@@ -6,15 +6,26 @@ Drawn without pyplot, like those of `stario.sequences.drawing.plots`.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stario.fusion.evaluation.folders import fresh_folder
-from stario.fusion.evaluation.tables import PROTOCOLS, NetworkTable, Sample, table_dict
+from stario.fusion.evaluation.benchmark.groups import Benchmark, Row, benchmark_dict
+from stario.fusion.evaluation.folders import results_folder
+from stario.fusion.evaluation.networks import (
+    PROTOCOLS,
+    TRUE_ATTITUDE,
+    NetworkTable,
+    Sample,
+    entries,
+    table_dict,
+)
+from stario.fusion.evaluation.scores import records, values
 from stario.sequences.drawing.figures import (
+    BLUE,
     INK,
     apply_style,
     new_figure,
@@ -37,12 +48,12 @@ _BASELINE = "R-ResNet"
 
 
 def write_table(folder: Path, table: NetworkTable) -> None:
-    """Write `networks.csv`, `networks.json` and the figures; raises what `fresh_folder` does."""
-    fresh_folder(folder)
-    write_rows(folder / "networks.csv", [asdict(entry) for entry in table.entries])
-    write_json(folder / "networks.json", table_dict(table))
-    for name, figure in figures(table).items():
-        save_figure(figure, folder / name)
+    """Write `networks.csv`, `networks.json` and the figures; raises what `results_folder` does."""
+    with results_folder(folder) as new:
+        write_rows(new / "networks.csv", entries(table))
+        write_json(new / "networks.json", table_dict(table))
+        for name, figure in figures(table).items():
+            save_figure(figure, new / name)
 
 
 def figures(table: NetworkTable) -> dict[str, Figure]:
@@ -62,7 +73,7 @@ def _ate_against_parameters(table: NetworkTable) -> Figure:
     fig = new_figure(8.0, 5.5, "Mean ATE against parameters, true attitude")
     axes = fig.subplots()
     for k, (network, parameters) in enumerate(table.parameters.items()):
-        mean, spread = table.mean_and_spread(network, "network_true_attitude", "ate_m")
+        mean, spread = table.column(network, TRUE_ATTITUDE, "ate_m").mean_and_spread(table.scores)
         axes.errorbar(
             parameters / 1e6, mean, yerr=spread, fmt=_MARKERS[k % len(_MARKERS)], ms=9, capsize=4,
             color=_colour(k), label=network,
@@ -86,8 +97,7 @@ def _distributions(table: NetworkTable) -> Figure:
     panels = fig.subplots(1, 2, sharey=True)
     for axes, metric, title in zip(panels, ("ate_m", "rte_m"), ("ATE [m]", "RTE [m]"), strict=True):
         for k, network in enumerate(table.parameters):
-            values = table.values(network, "network_true_attitude", metric)
-            error = np.sort(values[np.isfinite(values)])
+            error = np.sort(values(table.scores, metric, network=network, track=TRUE_ATTITUDE))
             share = np.arange(len(error) + 1) / max(len(error), 1)
             axes.plot(
                 np.append(0.0, error), share, _STYLES[k % 3], drawstyle="steps-post",
@@ -106,14 +116,14 @@ def _pde_boxes(table: NetworkTable) -> Figure:
     panels = fig.subplots(1, len(PROTOCOLS), sharey=True)
     names = list(table.parameters)
     for axes, (protocol, words) in zip(panels, PROTOCOLS.items(), strict=True):
-        values = [100.0 * table.values(name, protocol, "pde") for name in names]
-        boxes = axes.boxplot(
-            [v[np.isfinite(v)] for v in values], widths=0.6, patch_artist=True, showfliers=False
-        )
+        drift = [
+            100.0 * values(table.scores, "pde", network=name, track=protocol) for name in names
+        ]
+        boxes = axes.boxplot(drift, widths=0.6, patch_artist=True, showfliers=False)
         for k, (box, median) in enumerate(zip(boxes["boxes"], boxes["medians"], strict=True)):
             box.set(facecolor=_colour(k), alpha=0.35, edgecolor=_colour(k))
             median.set(color=INK, lw=1.6)
-            axes.plot(np.full(len(values[k]), k + 1), values[k], ".", color=_colour(k), ms=6)
+            axes.plot(np.full(len(drift[k]), k + 1), drift[k], ".", color=_colour(k), ms=6)
         axes.set_xticks(range(1, len(names) + 1), names, rotation=60, ha="right", fontsize=8)
         axes.set_title(words, loc="left", fontsize=10)
         apply_style(axes)
@@ -163,3 +173,107 @@ def _draw_sample(axes: Axes, sample: Sample, colours: dict[str, str]) -> None:
 
 def _colour(index: int) -> str:
     return _COLOURS[index % len(_COLOURS)]
+
+
+def write_benchmark(
+    folder: Path, found: Benchmark, rows: Sequence[Row], ours: str, theirs: str | None
+) -> None:
+    """Write `groups.csv`, `recordings.csv`, `groups.json` and `groups.png` into a folder.
+
+    Raises:
+        InputError: as `results_folder`.
+    """
+    by_group = [
+        {"group": row.name, "weights": name, "recordings": row.recordings, "path_km": row.path_km}
+        | figures
+        | (_ratios(row) if name == ours else {})
+        for row in rows
+        for name, figures in row.medians.items()
+    ]
+    single = records(found.scores.rename(columns={"track": "weights"}))
+    with results_folder(folder) as new:
+        write_rows(new / "groups.csv", by_group)
+        write_rows(new / "recordings.csv", single)
+        write_json(new / "groups.json", benchmark_dict(found, rows, ours, theirs))
+        save_figure(groups_figure(rows, ours, theirs), new / "groups.png")
+
+
+def _ratios(row: Row) -> dict[str, float]:
+    return {
+        f"{key}_{part}": value
+        for key, interval in row.ratios.items()
+        for part, value in asdict(interval).items()
+    }
+
+
+_BEFORE, _AFTER = "#8C8C8C", BLUE
+
+_PANELS = (
+    (
+        "error after a yaw fit [% of the path]\n(position truth: within 20 s)",
+        ("ate_fit_percent", "stretch_percent"),
+    ),
+    ("length of the track\nover that of the truth", ("length_ratio",)),
+)
+
+
+def groups_figure(rows: Sequence[Row], ours: str, theirs: str | None) -> Figure:
+    """Draw a line for each group: medians of both weights, paired ratio with its interval."""
+    groups = [row for row in rows if not row.pooled]
+    fig = new_figure(12.0 if theirs else 9.0, 1.8 + 0.55 * len(rows), "")
+    panels = fig.subplots(1, 3 if theirs else 2, sharey=True)
+    for axes, (title, keys) in zip(panels, _PANELS, strict=False):
+        _draw_medians(axes, groups, keys, ours, theirs)
+        axes.set_title(title, loc="left", fontsize=10)
+    panels[0].set_xlim(left=0.0)
+    panels[1].axvline(1.0, color=INK, lw=1.0)
+    shown = groups
+    if theirs:
+        shown = [*groups, *(row for row in rows if row.pooled)]
+        _draw_ratios(panels[2], shown)
+    panels[0].set_yticks(range(len(shown)), [f"{row.name} ({row.recordings})" for row in shown])
+    panels[0].set_ylim(len(shown) - 0.5, -0.5)
+    handles, labels = panels[0].get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+    return fig
+
+
+def _draw_medians(
+    axes: Axes, rows: Sequence[Row], keys: tuple[str, ...], ours: str, theirs: str | None
+) -> None:
+    for k, row in enumerate(rows):
+        after, before = (_first_known(row, name, keys) for name in (ours, theirs or ours))
+        axes.plot([before, after], [k, k], color="#CCCCCC", lw=3.0, zorder=1)
+        if theirs:
+            label = f"before: {theirs}" if k == 0 else None
+            axes.plot(before, k, "o", color=_BEFORE, ms=8, label=label)
+        label = (f"after: {ours}" if theirs else ours) if k == 0 else None
+        axes.plot(after, k, "o", color=_AFTER, ms=8, label=label)
+        axes.annotate(f"{after:.2f}", (after, k), (0, 8), textcoords="offset points",
+                      ha="center", fontsize=8, color=_AFTER)  # fmt: skip
+    axes.margins(x=0.12)
+    apply_style(axes)
+
+
+def _draw_ratios(axes: Axes, rows: Sequence[Row]) -> None:
+    for k, row in enumerate(rows):
+        ratio = row.ratios.get("rms_10s_m")
+        if ratio is not None:
+            axes.plot([ratio.low, ratio.high], [k, k], color=_AFTER, lw=2.0)
+            axes.plot(ratio.ratio, k, "o", color=_AFTER, ms=8)
+    axes.axvline(1.0, color=INK, lw=1.0)
+    axes.set_xscale("log")
+    found = [row.ratios["rms_10s_m"] for row in rows if "rms_10s_m" in row.ratios]
+    limits = [x for r in found for x in (r.low, r.ratio, r.high) if np.isfinite(x)]
+    ticks = [t for t in (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)
+             if min([0.7, *limits]) <= t <= max([1.5, *limits])]  # fmt: skip
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.set_xticks([], minor=True)
+    title = "error over 10 s, after / before, 95 % interval\n(waypoints: residuals)"
+    axes.set_title(title, loc="left", fontsize=10)
+    apply_style(axes)
+
+
+def _first_known(row: Row, weights: str, keys: tuple[str, ...]) -> float:
+    values = (row.medians[weights][key] for key in keys)
+    return next((value for value in values if np.isfinite(value)), float("nan"))

@@ -134,19 +134,6 @@ def _locked(folder: Path) -> Iterator[None]:
         os.close(handle)
 
 
-def fresh_folder(folder: Path) -> None:
-    """Create a folder, or remove the `RESULTS` of an earlier run from it; other files stay.
-
-    Otherwise a report or another back end's track, left by that run, would pass for this one's.
-
-    Raises:
-        InputError: the folder cannot be created, or a file in it cannot be removed.
-    """
-    make_folder(folder)
-    for path in _results_in(folder):
-        _remove(path)
-
-
 def _remove(path: Path) -> None:
     try:
         path.unlink(missing_ok=True)

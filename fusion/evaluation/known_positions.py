@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stario.fusion.evaluation.judging.displacement_error import fit_yaw_and_position
+from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position
 from stario.fusion.state import Track
 from stario.sequences.arrays import interpolated
 from stario.sequences.legs import jumps

@@ -20,8 +20,8 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, find_peaks, hilbert, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.judging.network_alone import UPDATES, Predictions
-from stario.fusion.evaluation.judging.prepared import Complex, Prepared
+from stario.fusion.evaluation.benchmark.aligned import Aligned, Complex
+from stario.fusion.evaluation.benchmark.network_alone import UPDATES, Predictions
 from stario.fusion.state import Track
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
@@ -55,9 +55,9 @@ Indices = np.ndarray[tuple[int], np.dtype[np.int64]]
 class PedestrianDeadReckoning:
     """Baseline judged like a network: predicts the displacement over the second from each tick."""
 
-    def predictions(self, prepared: Prepared) -> list[Predictions]:
+    def predictions(self, recording: Aligned) -> list[Predictions]:
         """Return predictions for each piece of a recording, in N."""
-        return [_predictions(piece.stream) for piece in prepared.pieces]
+        return [_predictions(piece.stream) for piece in recording.pieces]
 
 
 def pedestrian_track(sequence: ImuSequence) -> Track:

@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import METRIC_WORDS, RECORDING_WORDS, Comparison
 from stario.fusion.evaluation.folders import results_folder
 from stario.fusion.evaluation.known_positions import shown_positions
-from stario.fusion.evaluation.summary import Scores, scores_of
 from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.plan import plan_view
 from stario.sequences.drawing.plots import error_over_time, innovations
 from stario.sequences.files import write_json, write_npz
 from stario.sequences.readers.tum import write_tum
+
+if TYPE_CHECKING:
+    from stario.fusion.evaluation.summary import Scores
 
 
 def write_run(
@@ -57,6 +60,8 @@ def write_comparison(
     Raises:
         InputError: a folder cannot be created.
     """
+    from stario.fusion.evaluation.summary import scores_of  # pandas, which a run does not need
+
     with results_folder(folder) as new:
         written = write_summary(new, [scores_of(c) for c in comparisons], config, origin)
         for comparison in comparisons:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from stario.fusion.evaluation.compare import (
     FULL_COVERAGE,
@@ -17,20 +18,37 @@ from stario.fusion.evaluation.compare import (
     Comparison,
     Metrics,
 )
+from stario.fusion.evaluation.scores import Column, joined, scored, values
+from stario.fusion.evaluation.text import rows_of
 from stario.sequences.arrays import check_type
 from stario.sequences.drawing.text_table import aligned, figure
-from stario.sequences.sequence import FloatArray
 
-_COLUMNS = (
-    ("pdr", "ate_m", "steps (PDR)"),
-    ("network_true_attitude", "ate_m", "network, true attitude"),
-    ("network", "ate_m", "network, own attitude"),
-    ("ekf", "ate_m", "EKF"),
-    ("graph", "ate_m", "graph"),
-    ("ekf", "nis_mean", "EKF NIS"),
-    ("ekf", "nees_median", "EKF NEES"),
-    ("graph", "nees_median", "graph NEES"),
-)
+
+@dataclass(frozen=True)
+class _WithFit(Column):
+    """A column of ATEs, with those after a yaw fit in parentheses."""
+
+    def text(self, scores: pd.DataFrame) -> str:
+        fitted = replace(self, metric="ate_fit_m").value(scores)
+        return f"{super().text(scores)} ({figure(fitted, self.form)})"
+
+
+def _columns(over: Callable[..., Any]) -> list[Column]:
+    errors = {
+        "pdr": "steps (PDR)",
+        "network_true_attitude": "network, true attitude",
+        "network": "network, own attitude",
+        "ekf": "EKF",
+        "graph": "graph",
+    }
+    others = (("ekf", "nis_mean", "EKF NIS"), ("ekf", "nees_median", "EKF NEES"))
+    return [
+        *(_WithFit(title, "ate_m", ".2f", over, {"track": t}) for t, title in errors.items()),
+        *(
+            Column(title, metric, ".2f", over, {"track": track})
+            for track, metric, title in (*others, ("graph", "nees_median", "graph NEES"))
+        ),
+    ]
 
 
 _MIN_COVERAGE = 0.5
@@ -55,10 +73,14 @@ class Scores:
     words: dict[str, str]
 
     @property
+    def table(self) -> pd.DataFrame:
+        """The figures as rows of recording, group, track, metric and value."""
+        return scored(self.name, self.metrics)
+
+    @property
     def coverage(self) -> float:
         """Smallest share of a track at which the truth is known; 1 without truth."""
-        shares = [track.get("coverage") for track in self.metrics.values()]
-        return min((share for share in shares if share is not None), default=1.0)
+        return float(min(values(self.table, "coverage"), default=1.0))
 
 
 def scores_of(comparison: Comparison) -> Scores:
@@ -74,12 +96,12 @@ def summary(recordings: Sequence[Scores]) -> dict[str, object]:
     """
     records = {scores.name: scores.record for scores in recordings}
     metrics = [metric for metric in METRICS if not metric.startswith("seconds_")]
-    counted = _counted(recordings)
+    counted = _together(_counted(recordings))
     over = {
         track: {
-            metric: {"median": float(np.median(values)), "mean": float(np.mean(values))}
+            metric: {"median": float(np.median(known)), "mean": float(np.mean(known))}
             for metric in metrics
-            if len(values := _known_values(counted, track, metric))
+            if len(known := values(counted, metric, track=track))
         }
         for track in TRACKS
     }
@@ -95,14 +117,11 @@ def summary_table(recordings: Sequence[Scores]) -> str:
     """
     for scores in recordings:
         check_type("recordings", scores, Scores, "scores_of(comparison) returns one")
-    rows = [
-        [_name_with_coverage(r), *(_cell([r], t, m, np.mean) for t, m, _ in _COLUMNS)]
-        for r in recordings
-    ]
+    rows = rows_of(((_name_with_coverage(r), r.table) for r in recordings), _columns(np.mean))
     counted = _counted(recordings)
     for name, over in (("median", np.median), ("mean", np.mean)):
-        rows.append([name, *(_cell(counted, t, m, over) for t, m, _ in _COLUMNS)])
-    lines = aligned([["", *(title for _, _, title in _COLUMNS)], *rows])
+        rows += rows_of([(name, _together(counted))], _columns(over))[1:]
+    lines = aligned(rows)
     if len(counted) < len(recordings):
         least = f"{_MIN_COVERAGE:.0%}"
         lines.append(f"median and mean without recordings whose truth covers less than {least};")
@@ -123,16 +142,5 @@ def _counted(recordings: Sequence[Scores]) -> list[Scores]:
     return [scores for scores in recordings if scores.coverage >= _MIN_COVERAGE]
 
 
-def _cell(
-    recordings: Sequence[Scores], track: str, metric: str, over: Callable[[FloatArray], float]
-) -> str:
-    """Return a figure over recordings; an ATE with that after a yaw fit in parentheses."""
-    names = ("ate_m", "ate_fit_m") if metric == "ate_m" else (metric,)
-    columns = [_known_values(recordings, track, name) for name in names]
-    texts = [figure(float(over(values)) if len(values) else None, ".2f") for values in columns]
-    return texts[0] + "".join(f" ({text})" for text in texts[1:])
-
-
-def _known_values(recordings: Sequence[Scores], track: str, metric: str) -> FloatArray:
-    values = [scores.metrics.get(track, {}).get(metric) for scores in recordings]
-    return np.array([value for value in values if value is not None and math.isfinite(value)])
+def _together(recordings: Sequence[Scores]) -> pd.DataFrame:
+    return joined([scored("", {}), *(scores.table for scores in recordings)])

@@ -24,7 +24,7 @@ from stario.sequences.sequence import FloatArray
 
 _DEGREES_OF_FREEDOM = 3.0
 """Of the t distribution. Fewer let slow errors of network and field into the bias (KIPD with the
-field: 1.25 of the error with 1, 1.07 with 2, 1.02 with 4), more keep that of a raw gyroscope out."""
+field: 1.25 of the error with 1, 1.07 with 2, 1.02 with 4), more keep a raw gyroscope's out."""
 
 _LONG_STILLNESS = 30.0
 """Apparent stillness rejected for this long [s] is rest with a bias about the vertical, which

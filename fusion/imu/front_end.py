@@ -279,10 +279,4 @@ def _interval(
         attitudes = np.stack([attitude.R_NB, attitude.R_NB])
     else:
         attitudes = attitude.advance(time, gyro, accel)
-    bias = math.sqrt(attitude.b_g @ attitude.b_g)
-    return ImuInterval(
-        *(time, gyro, accel, gap, attitudes, attitude.R_NB),
-        levelled_bias=bias,
-        levelled_bias_sigma=attitude.bias_sigma,
-        **measured,
-    )
+    return ImuInterval(time, gyro, accel, gap, attitudes, attitude.R_NB, **measured)

@@ -88,8 +88,6 @@ class ImuInterval:
         R_NB: (3, 3) levelled attitude at the end, after its correction by gravity.
         update: whether windows begin and end at this interval's end.
         window: the window that ends here; None if there is none.
-        levelled_bias: magnitude of the gyroscope's bias as estimated from gravity [rad/s].
-        levelled_bias_sigma: its standard deviation per level axis [rad/s].
         field_B: (3,) magnetic field at its end [uT]; None if none was measured.
         accel_factor: factor on the accelerometer's noise density, estimated by the filter.
         levelled: attitude from gravity after a gap, estimated as at the first sample; None
@@ -105,8 +103,6 @@ class ImuInterval:
     R_NB: FloatArray
     update: bool = False
     window: Window | None = None
-    levelled_bias: float = 0.0
-    levelled_bias_sigma: float = 0.0
     field_B: FloatArray | None = None
     accel_factor: float = 1.0
     levelled: Start | None = None

@@ -176,12 +176,6 @@ class LevelledAttitude:
         self.R_NB = self._levelled(attitudes, time, accel, GYRO_SCALE_ERROR * rms(gyro))
         return attitudes
 
-    @property
-    def bias_sigma(self) -> float:
-        """Sigma of the bias per horizontal axis [rad/s]; the third is unobservable from gravity."""
-        level = self.R_NB[:2]
-        return math.sqrt(0.5 * float(np.vdot(level, level @ self._P[3:, 3:])))
-
     def level(self, turn: FloatArray, start: GravityStart) -> None:
         """Set the attitude after a gap: turned as expected, then levelled by the smallest rotation.
 

@@ -1,4 +1,4 @@
-"""Recordings prepared for judging, and a predictor of a known share of their true displacements."""
+"""Recordings aligned for judging, and a predictor of a known share of their true displacements."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from stario.fusion.evaluation.judging.displacement_error import (
+from stario.fusion.evaluation.benchmark.aligned import Aligned, aligned_recording
+from stario.fusion.evaluation.benchmark.displacement_error import (
     RecordingErrors,
     recording_errors,
 )
-from stario.fusion.evaluation.judging.network_alone import predictions
-from stario.fusion.evaluation.judging.prepared import Prepared, prepare
+from stario.fusion.evaluation.benchmark.network_alone import predictions
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
 from stario.sequences.sequence import ImuSequence, PositionTrack
 
@@ -27,15 +27,15 @@ def with_waypoints(walk: ImuSequence, every: float = 8.0) -> ImuSequence:
 
 
 @cache
-def prepared_once(recording: ImuSequence) -> Prepared:
-    return prepare(recording, Path("walk"))
+def aligned_once(recording: ImuSequence) -> Aligned:
+    return aligned_recording(recording, Path("walk"))
 
 
 class Stub:
     """Predictor of the true displacements of successive windows, scaled and rotated."""
 
     def __init__(self, walk: ImuSequence, scale: float = 1.0, yaw: float = 0.0) -> None:
-        [piece] = prepared_once(walk).pieces
+        [piece] = aligned_once(walk).pieces
         known = piece.position_W
         steps = np.exp(-1j * piece.yaw_WN[:-2]) * (known[2:] - known[:-2])
         steps = scale * np.exp(1j * yaw) * steps[: piece.stream.window_count]
@@ -51,8 +51,8 @@ class Stub:
 
 
 def errors_of(recording: ImuSequence, stub: Stub | PedestrianDeadReckoning) -> RecordingErrors:
-    prepared = prepared_once(recording)
-    return recording_errors(prepared, predictions(stub, prepared))
+    aligned = aligned_once(recording)
+    return recording_errors(aligned, predictions(stub, aligned))
 
 
 def horizontal_path(walk: ImuSequence) -> float:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import process_time
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
+import pandas as pd
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
@@ -17,6 +17,8 @@ from stario.fusion.evaluation.checks.faults import (
     matched_config,
     with_true_displacements,
 )
+from stario.fusion.evaluation.scores import Column, parts, scored
+from stario.fusion.evaluation.text import table
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.filter.estimator_state import innovations_of
 from stario.fusion.graph.fixed_lag import FixedLagEstimator
@@ -26,41 +28,35 @@ from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.state import Track, track_from_states
 from stario.sequences.accuracy.metrics import evaluate_track
 from stario.sequences.accuracy.nees import position_nees
-from stario.sequences.drawing.text_table import aligned
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, ImuErrors, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
 
-ESTIMATORS = ("ekf", "graph", "fixed_lag")
+ESTIMATORS = {"ekf": "EKF", "graph": "graph", "fixed_lag": "fixed-lag"}
 """The filter, the graph of the whole recording, and the newest states of the fixed-lag graph."""
 
 DISPLACEMENT_NOISE = 0.03
 """White noise of the simulated displacements, per axis [m]."""
 
 
-@dataclass(frozen=True)
-class Score:
-    """Results of the estimators on one recording.
+_FIELDS = {"ate_m": "ATE [m]", "nees": "NEES", "s_per_min": "s/min"}
+"""Figures of a recording: error as `compare` measures it, median position NEES (expected: 2.4), and
+processor time [s] per minute of data without the network."""
 
-    Attributes:
-        name: name of the recording.
-        duration_s: its length [s].
-        ate_m: absolute trajectory error [m] by estimator, as `compare` measures it.
-        nees: median position NEES (expected: 2.4) by estimator.
-        s_per_min: processor time [s] per minute of data by estimator, without the network.
-        slowest_ms: processor time of the fixed-lag graph's slowest update [ms].
-    """
+_SLOWEST = Column("slowest [ms]", "slowest_ms", ".1f")
 
-    name: str
-    duration_s: float
-    ate_m: dict[str, float]
-    nees: dict[str, float]
-    s_per_min: dict[str, float]
-    slowest_ms: float
+_COLUMNS = (
+    *(
+        Column(f"{title} {words}", metric, ".3f", np.median, {"track": name})
+        for metric, words in _FIELDS.items()
+        for name, title in ESTIMATORS.items()
+    ),
+    _SLOWEST,
+)
 
 
-def score_walk(seed: int, seconds: float) -> Score:
+def score_walk(seed: int, seconds: float) -> pd.DataFrame:
     """Score a simulated walk, measured once a second by its displacements with white noise.
 
     The sensor has the white noise of `ImuNoise` and a phone's biases, no other errors; the
@@ -80,7 +76,9 @@ def score_walk(seed: int, seconds: float) -> Score:
     return _scored(sequence.name, preprocessed, walk, config)
 
 
-def score_recording(model: Predictor, sequence: ImuSequence, config: NavigatorConfig) -> Score:
+def score_recording(
+    model: Predictor, sequence: ImuSequence, config: NavigatorConfig
+) -> pd.DataFrame:
     """Score a recording, measured by a network.
 
     Raises:
@@ -91,53 +89,50 @@ def score_recording(model: Predictor, sequence: ImuSequence, config: NavigatorCo
     return _scored(sequence.name, preprocessed, truth, config)
 
 
-def summary(scores: Sequence[Score]) -> dict[str, object]:
+def summary(scores: pd.DataFrame) -> dict[str, object]:
     """Return medians over recordings, and errors relative to the filter's, as plain values."""
 
     def by_name(values: FloatArray) -> dict[str, float]:
         return dict(zip(ESTIMATORS, values.tolist(), strict=True))
 
-    ate, nees, seconds = (_table(scores, field) for field in _FIELDS)
-    medians, (ratios, errors) = np.median(ate, axis=0), _mean_ratios(ate)
+    errors, nees, seconds = (_by_estimator(scores, metric) for metric in _FIELDS)
+    medians, (ratios, deviations) = np.median(errors, axis=0), _mean_ratios(errors)
     return {
-        "recordings": len(scores),
+        "recordings": len(errors),
         "median_ate_m": by_name(medians),
         "median_ate_to_ekf": by_name(medians / medians[0]),
         "mean_ratio_to_ekf": by_name(ratios),
-        "mean_ratio_error": by_name(errors),
+        "mean_ratio_error": by_name(deviations),
         "median_nees": by_name(np.median(nees, axis=0)),
         "s_per_min": by_name(np.median(seconds, axis=0)),
-        "slowest_update_ms": max(score.slowest_ms for score in scores),
+        "slowest_update_ms": replace(_SLOWEST, over=np.max).value(scores),
     }
 
 
-def score_table(scores: Sequence[Score]) -> str:
+def score_table(scores: pd.DataFrame) -> str:
     """Return the scores as text."""
-    titles = ("EKF", "graph", "fixed-lag")
-    head = [f"{title} {group}" for group in ("ATE [m]", "NEES", "s/min") for title in titles]
-    slowest = [[score.slowest_ms] for score in scores]
-    figures = np.hstack([*(_table(scores, field) for field in _FIELDS), slowest])
-    rows = [(s.name, row) for s, row in zip(scores, figures, strict=True)]
-    rows.append(("median", np.median(figures, axis=0)))
-    cells = [[name, *(f"{v:.3f}" for v in row[:-1]), f"{row[-1]:.1f}"] for name, row in rows]
-    medians, (each, error) = np.median(figures[:, :3], axis=0), _mean_ratios(figures[:, :3])
-    ratio, speed = medians / medians[0], 60.0 / np.median(figures[:, 8])
-    return "\n".join(
-        [
-            *aligned([["", *head, "slowest [ms]"], *cells]),
-            f"median ATE relative to the EKF's: graph {ratio[1]:.2f}, fixed-lag {ratio[2]:.2f}; "
-            f"geometric mean over recordings: graph {each[1]:.2f} +- {error[1]:.2f}, "
-            f"fixed-lag {each[2]:.2f} +- {error[2]:.2f}",
-            f"fixed-lag {speed:.0f} times real time, slowest update {figures[:, -1].max():.1f} ms",
-        ]
+    found: Any = summary(scores)
+    to_ekf, mean, error = (
+        found[name] for name in ("median_ate_to_ekf", "mean_ratio_to_ekf", "mean_ratio_error")
     )
+    notes = (
+        f"median ATE relative to the EKF's: graph {to_ekf['graph']:.2f}, fixed-lag "
+        f"{to_ekf['fixed_lag']:.2f}; geometric mean over recordings: "
+        + ", ".join(
+            f"{ESTIMATORS[name]} {mean[name]:.2f} +- {error[name]:.2f}"
+            for name in ("graph", "fixed_lag")
+        ),
+        f"fixed-lag {60.0 / found['s_per_min']['fixed_lag']:.0f} times real time, slowest update "
+        f"{found['slowest_update_ms']:.1f} ms",
+    )
+    rows = [*parts(scores, "recording", whole=None), ("median", scores)]
+    return table(rows, _COLUMNS, "", notes)
 
 
-_FIELDS = ("ate_m", "nees", "s_per_min")
-
-
-def _table(scores: Sequence[Score], field: str) -> FloatArray:
-    return np.array([[getattr(score, field)[name] for name in ESTIMATORS] for score in scores])
+def _by_estimator(scores: pd.DataFrame, metric: str) -> FloatArray:
+    """Return a metric (recordings, estimators)."""
+    found = scores[scores["metric"] == metric].pivot(index="recording", columns="track")["value"]
+    return np.asarray(found[list(ESTIMATORS)])
 
 
 def _mean_ratios(ate: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -153,7 +148,7 @@ def _mean_ratios(ate: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _scored(
     name: str, preprocessed: PreprocessedRecording, truth: Trajectory, config: NavigatorConfig
-) -> Score:
+) -> pd.DataFrame:
     tracks: dict[str, Track] = {}
     seconds: dict[str, float] = {}
     for backend in get_args(BackendName):
@@ -164,14 +159,17 @@ def _scored(
     tracks["fixed_lag"], times = _streamed(preprocessed, config)
     seconds["fixed_lag"] = float(times.sum())
     duration = float(tracks["ekf"].time[-1] - tracks["ekf"].time[0])
-    return Score(
-        name=name,
-        duration_s=duration,
-        ate_m={k: evaluate_track(t.trajectory, truth).ate_m for k, t in tracks.items()},
-        nees={k: position_nees(t.trajectory, truth).median for k, t in tracks.items()},
-        s_per_min={k: 60.0 * s / duration for k, s in seconds.items()},
-        slowest_ms=1e3 * float(times.max()),
-    )
+    figures = {
+        name: {
+            "ate_m": evaluate_track(track.trajectory, truth).ate_m,
+            "nees": position_nees(track.trajectory, truth).median,
+            "s_per_min": 60.0 * seconds[name] / duration,
+            "duration_s": duration,
+        }
+        for name, track in tracks.items()
+    }
+    figures["fixed_lag"]["slowest_ms"] = 1e3 * float(times.max())
+    return scored(name, figures)
 
 
 def _streamed(

@@ -11,10 +11,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.scores import Column, joined, scored
 from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
 from stario.fusion.filter.estimates import Estimate
 from stario.fusion.filter.estimator import Estimator
@@ -46,43 +49,44 @@ reveal that an unknown initial speed and an unknown yaw interact beyond first or
 NEES of the first minute is 19 instead of 16."""
 
 
-@dataclass(frozen=True)
-class Consistency:
-    """Averages over the runs, and bounds that a consistent filter meets in 95 of 100 trials.
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
-    Attributes:
-        runs: number of runs.
-        seconds: length of each run [s].
-        nees: NEES of the 15 states over all times; expected 15.
-        nees_end: NEES of the 15 states at the end.
-        nees_bounds: bounds of `nees_end`, close to those of `nees` since times are correlated.
-        yaw: NEES of yaw over all times; expected 1.
-        nis: NIS of the measurements; expected 3.
-        yaw_sigma: yaw sigma that the filter reports at the end, root mean square [rad].
-        yaw_error: true yaw error at the end, root mean square [rad].
+
+_SUMMARY = (
+    Column("", "nees", over=np.mean),
+    Column("", "nees_end", over=np.mean),
+    Column("", "yaw", over=np.mean),
+    Column("", "nis", over=np.mean),
+    Column("", "yaw_sigma", over=_rms),
+    Column("", "yaw_error", over=_rms),
+)
+
+
+def summary(scores: pd.DataFrame, seconds: float) -> dict[str, Any]:
+    """Return averages over the runs, each of so many seconds.
+
+    `nees_bounds` are met by `nees_end` of a consistent filter in 95 of 100 trials, and nearly so by
+    `nees`, since times are correlated.
     """
+    runs = scores["recording"].nunique()
+    averages = {column.metric: column.value(scores) for column in _SUMMARY}
+    return {"runs": runs, "seconds": seconds, **averages, "nees_bounds": nees_bounds(CORE, runs)}
 
-    runs: int
-    seconds: float
-    nees: float
-    nees_end: float
-    nees_bounds: tuple[float, float]
-    yaw: float
-    nis: float
-    yaw_sigma: float
-    yaw_error: float
 
-    def lines(self) -> list[str]:
-        """Return the result as lines of text."""
-        low, high = self.nees_bounds
-        return [
-            f"{self.runs} runs of {self.seconds:g} s",
-            f"NEES of 15 states {self.nees:.2f}, at the end {self.nees_end:.2f} "
-            f"(expected 15; {low:.1f} to {high:.1f} in 95 of 100 trials)",
-            f"NEES of yaw {self.yaw:.2f} (expected 1); error at the end "
-            f"{np.degrees(self.yaw_error):.2f} deg, reported {np.degrees(self.yaw_sigma):.2f} deg",
-            f"NIS {self.nis:.2f} (expected 3)",
-        ]
+def consistency_text(scores: pd.DataFrame, seconds: float) -> str:
+    """Return the result as lines of text."""
+    found = summary(scores, seconds)
+    low, high = found["nees_bounds"]
+    error, sigma = (math.degrees(found[name]) for name in ("yaw_error", "yaw_sigma"))
+    return (
+        f"{found['runs']} runs of {seconds:g} s\n"
+        f"NEES of 15 states {found['nees']:.2f}, at the end {found['nees_end']:.2f} "
+        f"(expected 15; {low:.1f} to {high:.1f} in 95 of 100 trials)\n"
+        f"NEES of yaw {found['yaw']:.2f} (expected 1); error at the end "
+        f"{error:.2f} deg, reported {sigma:.2f} deg\n"
+        f"NIS {found['nis']:.2f} (expected 3)"
+    )
 
 
 def consistency(
@@ -92,8 +96,12 @@ def consistency(
     seconds: float = 300.0,
     seed: int = 0,
     progress: Progress = silent,
-) -> Consistency:
-    """Run the filter on simulated walks with errors drawn from its configured standard deviations.
+) -> pd.DataFrame:
+    """Score the filter on simulated walks with errors drawn from its configured deviations.
+
+    Figures of each run: NEES of the 15 states over all times (`nees`, expected: 15) and at the end
+    (`nees_end`); NEES of `yaw` (1); `nis` of the measurements (3); at the end, the yaw's reported
+    standard deviation `yaw_sigma` and its error `yaw_error` [rad].
 
     Args:
         config: configuration of the filter and noise of the simulated IMU.
@@ -110,23 +118,13 @@ def consistency(
         raise InputError("runs, seconds", f"{runs}, {seconds:g}", "at least 1 run of 2 s")
     # The errors are drawn as configured: there is nothing to adapt to.
     config = replace(config, filter=replace(config.filter, adaptive=False))
-    results = []
+    found = []
     for k in range(runs):
-        results.append(_run(config, yaw_sigma, seconds, seed + k))
+        found.append(
+            scored(f"walk {seed + k}", {"ekf": _run(config, yaw_sigma, seconds, seed + k)})
+        )
         progress((k + 1) / runs)
-    tables, nis = zip(*results, strict=True)
-    table = np.stack(tables)  # runs, seconds, (nees, yaw error^2, yaw variance)
-    return Consistency(
-        runs=runs,
-        seconds=seconds,
-        nees=float(table[:, :, 0].mean()),
-        nees_end=float(table[:, -1, 0].mean()),
-        nees_bounds=nees_bounds(CORE, runs),
-        yaw=float((table[:, :, 1] / table[:, :, 2]).mean()),
-        nis=float(np.mean(nis)),
-        yaw_sigma=float(np.sqrt(table[:, -1, 2].mean())),
-        yaw_error=float(np.sqrt(table[:, -1, 1].mean())),
-    )
+    return joined(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,10 +190,8 @@ def _attitude(t: FloatArray, phase: FloatArray) -> FloatArray:
 _VERTICAL = np.array([0.0, 0.0, 1.0])
 
 
-def _run(
-    config: NavigatorConfig, yaw_sigma: float, seconds: float, seed: int
-) -> tuple[FloatArray, float]:
-    """Return NEES, squared yaw error and yaw variance (M, 3) at every second, and the mean NIS."""
+def _run(config: NavigatorConfig, yaw_sigma: float, seconds: float, seed: int) -> dict[str, float]:
+    """Return the figures of a run, of the errors at every second."""
     rng = np.random.default_rng(seed)
     walk = analytic_walk(seconds, rng, config.gravity)
     prior, b_g, b_a = _drawn_start(walk, config, yaw_sigma, rng)
@@ -217,7 +213,15 @@ def _run(
         if count % config.filter.output_rate == 0:
             k = round(interval.stop * RATE)
             rows.append(_errors(estimator.estimate(), walk, k, b_g[k], b_a[k]))
-    return np.array(rows), float(innovations_of(steps).nis.mean())
+    nees, yaw_square, yaw_variance = np.array(rows).T
+    return {
+        "nees": float(nees.mean()),
+        "nees_end": float(nees[-1]),
+        "yaw": float((yaw_square / yaw_variance).mean()),
+        "nis": float(innovations_of(steps).nis.mean()),
+        "yaw_sigma": math.sqrt(yaw_variance[-1]),
+        "yaw_error": math.sqrt(yaw_square[-1]),
+    }
 
 
 def _drawn_start(
@@ -284,12 +288,9 @@ class _DrawnNetwork:
 
 
 def _errors(
-    now: Estimate,
-    walk: AnalyticWalk,
-    k: int,
-    b_g: FloatArray,
-    b_a: FloatArray,
+    now: Estimate, walk: AnalyticWalk, k: int, b_g: FloatArray, b_a: FloatArray
 ) -> tuple[float, float, float]:
+    """Return the NEES, the squared yaw error and the yaw's variance at sample k."""
     X, P = now.X, now.covariances[ACTUAL]
     R = walk.R_WB[k] @ X[:, :3].T
     pose = log_se23(R, walk.velocity_W[k] - R @ X[:, 3], walk.position_W[k] - R @ X[:, 4])

@@ -9,16 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.checks.corruption import Fault, ModifyPredictions, faults
+from stario.fusion.evaluation.scores import Column, joined, scored
+from stario.fusion.evaluation.text import rows_of
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.health import Health
 from stario.fusion.imu.stateful import Predictor, WindowDisplacement
@@ -27,7 +30,7 @@ from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.state import Track
 from stario.sequences.accuracy.metrics import align, evaluate_track
 from stario.sequences.attitude.rotations import about_z, yaw_of
-from stario.sequences.drawing.text_table import aligned, figure
+from stario.sequences.drawing.text_table import aligned
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -39,29 +42,12 @@ WHITE_NOISE = 0.05
 """White noise of the true displacements used without a network, per axis [m]."""
 
 
-@dataclass(frozen=True)
-class FaultResult:
-    """Cost of a fault; figures are NaN if the recording with it is refused.
-
-    Attributes:
-        fault: name of the fault.
-        backend: "ekf" or "graph".
-        error_without: absolute trajectory error without the fault [m].
-        error_with: absolute trajectory error with it [m].
-        end_error: distance from the ground truth at the end [m].
-        end_sigma: its standard deviation as reported, root of the covariance's trace [m].
-        finite: whether every state, covariance included, is finite.
-        reported: faults counted in the health report, in words, or why the recording is refused.
-    """
-
-    fault: str
-    backend: str
-    error_without: float
-    error_with: float
-    end_error: float
-    end_sigma: float
-    finite: bool
-    reported: str
+_COLUMNS = (
+    Column("ATE without [m]", "error_without", ".3f"),
+    Column("with [m]", "error_with", ".3f"),
+    Column("end [m]", "end_error", ".3f"),
+    Column("sigma [m]", "end_sigma", ".3f"),
+)
 
 
 def matched_walk(seconds: float = 120.0, seed: int = 0) -> tuple[ImuSequence, NavigatorConfig]:
@@ -92,8 +78,14 @@ def run_faults(
     seed: int = 0,
     backends: Sequence[BackendName] = get_args(BackendName),
     only: Sequence[Fault] | None = None,
-) -> list[FaultResult]:
-    """Run a recording with each fault through each back end.
+) -> pd.DataFrame:
+    """Score a recording with each fault, the rows' group, through each back end, their track.
+
+    Figures: absolute trajectory error [m] without and with the fault (`error_without`,
+    `error_with`); distance from the truth at the end (`end_error`) and its reported standard
+    deviation (`end_sigma`), the root of the covariance's trace [m]; whether every state is finite
+    (`finite`). The label `reported` has the faults counted in the health report, in words, or why
+    the recording is refused.
 
     Args:
         sequence: a recording with true poses.
@@ -107,7 +99,7 @@ def run_faults(
         InputError: the recording has no true poses, or is too short.
     """
     truth = true_poses(sequence)
-    results: list[FaultResult] = []
+    found: list[pd.DataFrame] = []
     whole = _observed(sequence, config, model, seed)
     for backend in backends:
         navigator = Navigator(model or DummyPredictor(), config, backend=backend)
@@ -116,23 +108,32 @@ def run_faults(
             try:
                 track = navigator.track(_with_fault(fault, sequence, whole, config, model, seed))
             except InputError as refusal:
-                nothing = (math.nan,) * 3
-                words = f"refused: {refusal}"
-                results.append(FaultResult(fault.name, backend, without, *nothing, True, words))
+                figures, words = (
+                    dict.fromkeys(_FIGURES, math.nan) | {"finite": 1.0},
+                    f"refused: {refusal}",
+                )
             else:
-                results.append(_result(fault, backend, track, truth, without))
-    return results
+                assert track.health is not None
+                figures, words = _figures(track, truth), reported(track.health)
+            figures = {"error_without": without, **figures}
+            found.append(scored(sequence.name, {backend: figures}, fault.name, reported=words))
+    return joined(found)
 
 
-def fault_table(results: Sequence[FaultResult]) -> str:
+def fault_table(scores: pd.DataFrame) -> str:
     """Return the results as text."""
-    rows = [["fault", "back end", "ATE without [m]", "with [m]", "end [m]", "sigma [m]"]]
-    for r in results:
-        figures = (r.error_without, r.error_with, r.end_error, r.end_sigma)
-        rows.append([r.fault, r.backend, *map(figure, figures)])
-    reports = [("" if r.finite else "NOT FINITE, ") + r.reported for r in results]
-    lines = zip(aligned(rows), ["reported", *reports], strict=True)
-    return "\n".join(f"{line}   {words}" for line, words in lines)
+    rows = list(scores.groupby(["group", "track"], sort=False))
+    cells = rows_of(((fault, part) for (fault, _), part in rows), _COLUMNS, "fault")
+    backends = ["back end", *(backend for (_, backend), _ in rows)]
+    lines = aligned([[row[0], name, *row[1:]] for row, name in zip(cells, backends, strict=True)])
+    finite = Column("", "finite", over=np.min)
+    reports = [
+        ("" if finite.value(part) else "NOT FINITE, ") + part["reported"].iloc[0]
+        for _, part in rows
+    ]
+    return "\n".join(
+        f"{line}   {words}" for line, words in zip(lines, ["reported", *reports], strict=True)
+    )
 
 
 def reported(health: Health) -> str:
@@ -224,21 +225,17 @@ def _corrupted(
     return replace(preprocessed, measurements=measurements)
 
 
-def _result(
-    fault: Fault, backend: str, track: Track, truth: Trajectory, without: float
-) -> FaultResult:
+_FIGURES = ("error_with", "end_error", "end_sigma")
+
+
+def _figures(track: Track, truth: Trajectory) -> dict[str, float]:
     assert track.covariance is not None  # both back ends give it
-    assert track.health is not None
     end = align(track.trajectory, truth, "first").position_W[-1]
     last = truth.at(np.clip(track.time[-1:], *truth.time[[0, -1]])).position_W[0]
     arrays = [values for values in track.arrays().values() if values.dtype.kind == "f"]
-    return FaultResult(
-        fault=fault.name,
-        backend=backend,
-        error_without=without,
-        error_with=evaluate_track(track.trajectory, truth).ate_m,
-        end_error=float(np.linalg.norm(end - last)),
-        end_sigma=float(np.sqrt(np.trace(track.covariance[-1, 6:9, 6:9]))),
-        finite=all(bool(np.isfinite(values).all()) for values in arrays),
-        reported=reported(track.health),
-    )
+    return {
+        "error_with": evaluate_track(track.trajectory, truth).ate_m,
+        "end_error": float(np.linalg.norm(end - last)),
+        "end_sigma": math.sqrt(np.trace(track.covariance[-1, 6:9, 6:9])),
+        "finite": float(all(bool(np.isfinite(values).all()) for values in arrays)),
+    }

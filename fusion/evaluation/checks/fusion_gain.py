@@ -8,23 +8,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
+import pandas as pd
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.checks.groups import GroupedResult, by_group
 from stario.fusion.evaluation.compare import Metrics, measure
 from stario.fusion.evaluation.known_positions import MIN_POSITIONS
+from stario.fusion.evaluation.scores import Column, geometric_mean, median_degrees, parts, scored
+from stario.fusion.evaluation.text import table
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
+from stario.fusion.state import Track
 from stario.sequences.accuracy.metrics import pose_errors
-from stario.sequences.drawing.text_table import aligned
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import ImuSequence
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
 SIGMA_BOUND = 3.0
 """Maximum yaw error of a consistent track, in standard deviations."""
@@ -32,28 +33,13 @@ SIGMA_BOUND = 3.0
 GOOD_YAW = math.radians(10.0)
 """Maximum acceptable yaw error at the end [rad]."""
 
+_NETWORK = {"track": "network"}
 
-@dataclass(frozen=True)
-class FusionGain(GroupedResult):
-    """Errors of one recording with and without fusion.
-
-    Attributes:
-        network_m: error of the network alone [m].
-        fused_m: error by back end [m].
-        nis: mean NIS of the first back end; 3 is expected.
-        position_nees: median NEES of the first back end's position; 2.4 is expected for three axes,
-            NaN without true attitude.
-        yaw_error: its yaw error at the end of the truth relative to its start [rad]; NaN without
-            true attitude.
-        yaw_sigma: reported standard deviation of the yaw there [rad]; NaN likewise.
-    """
-
-    network_m: float
-    fused_m: dict[str, float]
-    nis: float
-    position_nees: float
-    yaw_error: float
-    yaw_sigma: float
+_NOTES = (
+    "network: median error [m]; ratios to it: geometric mean, 95th percentile, worst",
+    "NIS: mean, 3 expected; NEES of position: median, 2.4 expected; yaw: error at the end "
+    "relative to the start",
+)
 
 
 def fusion_gain(
@@ -62,8 +48,12 @@ def fusion_gain(
     config: NavigatorConfig,
     group: str,
     backends: Sequence[BackendName] = get_args(BackendName),
-) -> FusionGain:
-    """Run a recording through the network alone and the back ends.
+) -> pd.DataFrame:
+    """Score the network alone and the back ends: `error_m`, its `ratio` to the network's, NIS.
+
+    With true poses also the NEES of position, and at the end of the truth the yaw error relative to
+    its start [rad], the yaw's reported standard deviation [rad], and whether the error is good and
+    within the bound.
 
     Raises:
         InputError: it has no ground truth or too few known positions, or cannot be run.
@@ -72,76 +62,71 @@ def fusion_gain(
     if truth is None and sequence.positions is None:
         raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
     preprocessed = Navigator(model, config).observe(sequence)
-    network_m = _error(measure(network_track(preprocessed), sequence))
-    if math.isnan(network_m):
+    alone = _error(measure(network_track(preprocessed), sequence))
+    if math.isnan(alone):
         raise InputError(
             f"{sequence.name}: positions",
             f"fewer than {MIN_POSITIONS} within the track",
             f"{MIN_POSITIONS} or more",
         )
-    tracks = {name: Navigator(model, config, backend=name).track(preprocessed) for name in backends}
-    figures = {name: measure(track, sequence) for name, track in tracks.items()}
-    first = backends[0]
-    yaw_error = yaw_sigma = math.nan
-    if truth is not None:
-        track = tracks[first]
-        assert track.covariance is not None  # both back ends give it
-        errors = pose_errors(track.trajectory, truth)
-        yaw = np.unwrap(errors.yaw)
-        # The truth may end before the track, whose sigma grows further.
-        last = np.searchsorted(track.time, errors.estimate.time[-1])
-        yaw_error, yaw_sigma = float(yaw[-1] - yaw[0]), math.sqrt(track.covariance[last, 2, 2])
-    return FusionGain(
-        sequence.name,
-        group,
-        network_m,
-        {name: _error(found) for name, found in figures.items()},
-        _number(figures[first]["nis_mean"]),
-        _number(figures[first]["nees_median"]),
-        yaw_error,
-        yaw_sigma,
-    )
+    figures: dict[str, Metrics] = {"network": {"error_m": alone}}
+    for name in backends:
+        track = Navigator(model, config, backend=name).track(preprocessed)
+        found = measure(track, sequence)
+        error = _error(found)
+        figures[name] = {"error_m": error, "ratio": error / alone, "nis": found["nis_mean"]}
+        if truth is not None:
+            figures[name] |= {"nees": found["nees_median"], **_yaw_at_the_end(track, truth)}
+    return scored(sequence.name, figures, group)
 
 
-def fusion_gain_table(found: Sequence[FusionGain]) -> str:
+def fusion_gain_table(scores: pd.DataFrame) -> str:
     """Return a row for each group: ratios to the network, NIS, and yaw error at the end."""
-    names = list(found[0].fused_m) if found else []
-    head = ["group", "n", "network"]
-    for name in names:
-        head += [f"{name} mean", "p95", "worst"]
-    rows = [[*head, "NIS", "NEES", "yaw deg", "< 10 deg", "< 3 sigma"]]
-    for group, part in by_group(found):
-        rows.append(_row(group, part, names))
-    note = "network: median error [m]; ratios to it: geometric mean, 95th percentile, worst"
-    consistency_note = (
-        "NIS: mean, 3 expected; NEES of position: median, 2.4 expected; yaw: error at the end "
-        "relative to the start"
-    )
-    return "\n".join([*aligned(rows), note, consistency_note])
+    backends = [name for name in scores["track"].unique() if name != "network"]
+    columns = [
+        Column("n", "error_m", ".0f", len, _NETWORK),
+        Column("network", "error_m", where=_NETWORK),
+    ]
+    for name in backends:
+        where = {"track": name}
+        columns += [
+            Column(f"{name} mean", "ratio", ".2f", geometric_mean, where),
+            Column("p95", "ratio", ".2f", _percentile_95, where),
+            Column("worst", "ratio", ".2f", np.max, where),
+        ]
+    first = {"track": backends[0]}
+    columns += [
+        Column("NIS", "nis", ".1f", np.mean, first),
+        Column("NEES", "nees", ".1f", np.median, first),
+        Column("yaw deg", "yaw_error", ".1f", median_degrees, first),
+        Column("< 10 deg", "yaw_good", ".0%", np.mean, first),
+        Column("< 3 sigma", "yaw_covered", ".0%", np.mean, first),
+    ]
+    return table(parts(scores), columns, "group", _NOTES)
 
 
-def _row(group: str, part: Sequence[FusionGain], names: Sequence[str]) -> list[str]:
-    row = [group, str(len(part)), f"{np.median([result.network_m for result in part]):.2f}"]
-    for name in names:
-        ratio = np.log([result.fused_m[name] / result.network_m for result in part])
-        figures = np.exp([ratio.mean(), np.quantile(ratio, 0.95), ratio.max()])
-        row += [f"{value:.2f}" for value in figures]
-    row.append(f"{np.nanmean([result.nis for result in part]):.1f}")
-    yaw = np.array([(result.yaw_error, result.yaw_sigma) for result in part])
-    yaw = np.abs(yaw[np.isfinite(yaw[:, 0])])
-    if len(yaw) == 0:
-        return [*row, "-", "-", "-", "-"]
-    good, covered = yaw[:, 0] < GOOD_YAW, yaw[:, 0] < SIGMA_BOUND * yaw[:, 1]
-    row += [f"{np.nanmedian([result.position_nees for result in part]):.1f}"]
-    row += [f"{np.degrees(np.median(yaw[:, 0])):.1f}"]
-    return [*row, f"{good.mean():.0%}", f"{covered.mean():.0%}"]
+def _yaw_at_the_end(track: Track, truth: Trajectory) -> dict[str, float]:
+    assert track.covariance is not None  # both back ends give it
+    errors = pose_errors(track.trajectory, truth)
+    yaw = np.unwrap(errors.yaw)
+    # The truth may end before the track, whose sigma grows further.
+    last = np.searchsorted(track.time, errors.estimate.time[-1])
+    error, sigma = float(yaw[-1] - yaw[0]), math.sqrt(track.covariance[last, 2, 2])
+    good, covered = abs(error) < GOOD_YAW, abs(error) < SIGMA_BOUND * sigma
+    return {
+        "yaw_error": error,
+        "yaw_sigma": sigma,
+        "yaw_good": float(good),
+        "yaw_covered": float(covered),
+    }
 
 
 def _error(figures: Metrics) -> float:
     """Return the horizontal error after a fit of yaw and position [m]; NaN if unknown."""
     fitted = figures["ate_fit_m"]
-    return _number(figures["known_positions_m"] if fitted is None else fitted)
+    found = figures["known_positions_m"] if fitted is None else fitted
+    return math.nan if found is None else found
 
 
-def _number(figure: float | None) -> float:
-    return math.nan if figure is None else figure
+def _percentile_95(ratios: FloatArray) -> float:
+    return float(np.exp(np.quantile(np.log(ratios), 0.95)))

@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.checks.groups import GroupedResult, by_group
-from stario.fusion.evaluation.judging.displacement_error import fit_yaw_and_position
-from stario.fusion.evaluation.judging.prepared import Complex
+from stario.fusion.evaluation.benchmark.aligned import Complex
+from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position
+from stario.fusion.evaluation.scores import Column, geometric_mean, joined, parts, scored
+from stario.fusion.evaluation.text import rows_of
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
@@ -58,31 +59,22 @@ _CARRIES = ("handheld", "pocket", "swinging", "bag")
 """How the device is carried in the simulated walks, one each."""
 
 
-@dataclass(frozen=True)
-class MomentCost(GroupedResult):
-    """Cost of one moment at one place in one recording, for one back end.
+def _small_share(ratio: FloatArray) -> float:
+    return float((ratio < MAX_RATIO).mean())
 
-    Attributes:
-        backend: "ekf" or "graph".
-        error_without: error of the rest, its parts fitted separately, without the moment [m].
-        error_with: with it [m].
-        joined_without: error of the rest fitted as a whole, without the moment [m].
-        joined_with: with it [m].
-        step: largest correction of the position between two outputs [m].
-        turn: largest correction of the attitude likewise [deg].
-        step_without: largest correction of the position without the moment [m].
-        turn_without: largest correction of the attitude without it [deg].
-    """
 
-    backend: str
-    error_without: float
-    error_with: float
-    joined_without: float
-    joined_with: float
-    step: float
-    turn: float
-    step_without: float
-    turn_without: float
+_COLUMNS = (
+    Column("n", "step", ".0f", len),
+    Column("without [m]", "error_without"),
+    Column("rest: mean", "ratio", over=geometric_mean),
+    Column("worst", "ratio", over=np.max),
+    Column("joined: mean", "joined_ratio", over=geometric_mean),
+    Column("worst", "joined_ratio", over=np.max),
+    Column(f"ratio < {MAX_RATIO:g}", "ratio", ".0%", _small_share),
+    Column("step [m]", "step", ".1f", np.max),
+    Column("turn [deg]", "turn", ".1f", np.max),
+    Column("both small", "small", ".0%", np.mean),
+)
 
 
 def simulated_walks(seconds: float = 120.0, seed: int = 0) -> list[ImuSequence]:
@@ -101,8 +93,12 @@ def moment_costs(
     config: NavigatorConfig,
     backends: Sequence[BackendName] = ("ekf",),
     seed: int = 0,
-) -> list[MomentCost]:
-    """Run a recording without and with each moment at each place.
+) -> pd.DataFrame:
+    """Score a recording without and with each moment and place, the rows' group, by back end.
+
+    Figures: error of the rest [m], its parts fitted separately (`error_without`, `error_with`,
+    their `ratio`) or as a whole (`joined_...`); largest correction of position [m] and attitude
+    [deg] between two outputs (`step`, `turn`, whether both are `small`, and without the moment).
 
     Raises:
         InputError: it has no ground truth, or cannot be run.
@@ -113,27 +109,30 @@ def moment_costs(
     observed = first.observe(sequence)
     poses = sequence.truth or network_track(observed).trajectory
     without = {name: each.track(observed) for name, each in navigators.items()}
-    costs = []
+    found = []
     for moment in MOMENTS:
         for place, share in PLACES.items():
             inserted = insert_moment(sequence, poses, moment, share, seed)
             observed = first.observe(inserted.sequence)
-            for name, navigator in navigators.items():
-                tracks = without[name], navigator.track(observed)
-                title = f"{moment.name}, {place}"
-                costs.append(_cost(sequence, inserted, *tracks, title, name))
-    return costs
+            figures = {
+                str(name): _cost(sequence, inserted, without[name], navigator.track(observed))
+                for name, navigator in navigators.items()
+            }
+            found.append(scored(sequence.name, figures, f"{moment.name}, {place}"))
+    return joined(found)
 
 
-def moment_table(found: Sequence[MomentCost]) -> str:
+def moment_table(scores: pd.DataFrame) -> str:
     """Return a row for each moment, place and back end: ratios of errors, largest corrections."""
-    head = ["moment", "back end", "n", "without [m]", "rest: mean", "worst", "joined: mean"]
-    rows = [[*head, "worst", f"ratio < {MAX_RATIO:g}", "step [m]", "turn [deg]", "both small"]]
-    for backend in dict.fromkeys(cost.backend for cost in found):
-        chosen = [cost for cost in found if cost.backend == backend]
-        rows += [_row(group, backend, part) for group, part in by_group(chosen)]
-    without = [(cost.step_without, cost.turn_without) for cost in found]
-    step, turn = np.max(without, axis=0) if without else (math.nan, math.nan)
+    rows = [
+        (group, backend, part)
+        for backend, chosen in scores.groupby("track", sort=False)
+        for group, part in parts(chosen)
+    ]
+    cells = rows_of([(group, part) for group, _, part in rows], _COLUMNS, "moment")
+    backends = ["back end", *(str(backend) for _, backend, _ in rows)]
+    lines = aligned([[row[0], name, *row[1:]] for row, name in zip(cells, backends, strict=True)])
+    step, turn = (Column("", f"{m}_without", over=np.max).value(scores) for m in ("step", "turn"))
     notes = [
         "without: median error [m] of the parts before and after, each fitted in yaw and position;",
         "ratio of that error with the moment to that without: geometric mean, worst; joined: both "
@@ -141,26 +140,7 @@ def moment_table(found: Sequence[MomentCost]) -> str:
         f"step, turn: largest correction between two outputs (without moments {step:.2f} m, "
         f"{turn:.1f} deg); share with at most {MAX_STEP:g} m and {MAX_TURN:g} deg",
     ]
-    return "\n".join([*aligned(rows), *notes])
-
-
-def _row(group: str, backend: str, part: Sequence[MomentCost]) -> list[str]:
-    rest = np.array([cost.error_with / cost.error_without for cost in part])
-    joined = np.array([cost.joined_with / cost.joined_without for cost in part])
-    known, steps = rest[np.isfinite(rest)], np.array([(cost.step, cost.turn) for cost in part])
-    small = (steps <= (MAX_STEP, MAX_TURN)).all(axis=1)
-    return [
-        *(group, backend, str(len(part))),
-        f"{np.nanmedian([cost.error_without for cost in part]):.2f}",
-        *(f"{value:.2f}" for value in (*_mean_and_worst(rest), *_mean_and_worst(joined))),
-        f"{(known < MAX_RATIO).mean():.0%}",
-        *(f"{value:.1f}" for value in steps.max(axis=0)),
-        f"{small.mean():.0%}",
-    ]
-
-
-def _mean_and_worst(ratio: FloatArray) -> tuple[float, float]:
-    return float(np.exp(np.nanmean(np.log(ratio)))), float(np.nanmax(ratio))
+    return "\n".join([*lines, *notes])
 
 
 def _with_truth(sequence: ImuSequence) -> ImuSequence:
@@ -174,13 +154,8 @@ def _with_truth(sequence: ImuSequence) -> ImuSequence:
 
 
 def _cost(
-    sequence: ImuSequence,
-    inserted: Inserted,
-    without: Track,
-    track: Track,
-    group: str,
-    backend: str,
-) -> MomentCost:
+    sequence: ImuSequence, inserted: Inserted, without: Track, track: Track
+) -> dict[str, float]:
     split = inserted.start
     errors = []
     for each, start, stop, recording in (
@@ -192,10 +167,20 @@ def _cost(
         errors.append(_errors(truth[rest], estimate[rest], time[rest] < start))
     step, turn = largest_correction(inserted.sequence, track)
     usual = largest_correction(sequence, without)
-    (apart, joined), (apart_with, joined_with) = errors
-    return MomentCost(
-        sequence.name, group, backend, apart, apart_with, joined, joined_with, step, turn, *usual
-    )
+    (apart, as_one), (apart_with, as_one_with) = errors
+    return {
+        "error_without": apart,
+        "error_with": apart_with,
+        "ratio": apart_with / apart,
+        "joined_without": as_one,
+        "joined_with": as_one_with,
+        "joined_ratio": as_one_with / as_one,
+        "step": step,
+        "turn": turn,
+        "small": float(step <= MAX_STEP and turn <= MAX_TURN),
+        "step_without": usual[0],
+        "turn_without": usual[1],
+    }
 
 
 def _known(sequence: ImuSequence, track: Track) -> tuple[FloatArray, Complex, Complex]:

@@ -7,19 +7,18 @@ dropped at random; all tracks begin in the same pose, so their ends are compared
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks.corruption import drops, gap
-from stario.fusion.evaluation.checks.groups import GroupedResult, by_group
+from stario.fusion.evaluation.scores import Column, parts, quantile, scored
+from stario.fusion.evaluation.text import table
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.lie import yaw_twist
 from stario.fusion.navigator import Navigator
 from stario.fusion.state import Track
-from stario.sequences.drawing.text_table import aligned
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 
@@ -36,19 +35,16 @@ _MIN_PATH = 1.0
 """Minimum path [m]: shifts are relative to the path."""
 
 
-@dataclass(frozen=True)
-class EndShift(GroupedResult):
-    """Shift of a track's end caused by missing samples.
-
-    Attributes:
-        fault: what was missing.
-        metres: horizontal distance between the ends, divided by the length of the track.
-        degrees: absolute difference of their yaws [deg].
-    """
-
-    fault: str
-    metres: float
-    degrees: float
+_COLUMNS = (
+    Column("ends", "metres", ".0f", len),
+    Column(f"within {MAX_SHIFT:.0%} and {MAX_TURN:g} deg", "within", ".0%", np.mean),
+    Column("of the path: median", "metres", ".2%"),
+    Column("p95", "metres", ".2%", quantile(0.95)),
+    Column("worst", "metres", ".2%", np.max),
+    Column("deg: median", "degrees"),
+    Column("p95", "degrees", over=quantile(0.95)),
+    Column("worst", "degrees", over=np.max),
+)
 
 
 def end_shifts(
@@ -56,8 +52,11 @@ def end_shifts(
     sequence: ImuSequence,
     config: NavigatorConfig,
     group: str,
-) -> list[EndShift]:
-    """Run a recording with each of the faults and return the shifts of its end.
+) -> pd.DataFrame:
+    """Score a track for each of the faults: the shift of its end.
+
+    `metres` is the horizontal distance between the ends over the length of the track, `degrees`
+    the absolute difference of their yaws.
 
     Raises:
         InputError: the recording cannot be run, or its track is shorter than a metre.
@@ -71,11 +70,13 @@ def end_shifts(
     instants = (np.arange(INSTANTS) + 0.5) / INSTANTS * sequence.duration
     faults = [(f"gap at {instant:.0f} s", gap(float(instant), GAP_SECONDS)) for instant in instants]
     faults.append((f"{DROPPED:.0%} dropped", drops(DROPPED)))
-    found = []
+    figures = {}
     for name, modify_samples in faults:
         faulty = navigator.run(modify_samples(sequence, np.random.default_rng(0)))
-        found.append(EndShift(sequence.name, group, name, *_end_shift(unmodified, faulty, path)))
-    return found
+        metres, degrees = _end_shift(unmodified, faulty, path)
+        within = float(metres <= MAX_SHIFT and degrees <= MAX_TURN)
+        figures[name] = {"metres": metres, "degrees": degrees, "within": within}
+    return scored(sequence.name, figures, group)
 
 
 def _end_shift(unmodified: Track, other: Track, path: float) -> tuple[float, float]:
@@ -85,18 +86,6 @@ def _end_shift(unmodified: Track, other: Track, path: float) -> tuple[float, flo
     return metres, abs(math.degrees(yaw_twist(turn)))
 
 
-def end_shift_table(found: Sequence[EndShift]) -> str:
+def end_shift_table(scores: pd.DataFrame) -> str:
     """Return a row for each group: share of the ends within limits, and how far ends move."""
-    head = ["group", "ends", f"within {MAX_SHIFT:.0%} and {MAX_TURN:g} deg"]
-    rows = [[*head, "% of the path: median", "p95", "worst", "deg: median", "p95", "worst"]]
-    for group, part in by_group(found):
-        metres = np.array([shift.metres for shift in part])
-        degrees = np.array([shift.degrees for shift in part])
-        within = ((metres <= MAX_SHIFT) & (degrees <= MAX_TURN)).mean()
-        figures = [
-            f"{value:.2f}"
-            for values in (100.0 * metres, degrees)
-            for value in np.quantile(values, (0.5, 0.95, 1.0))
-        ]
-        rows.append([group, str(len(part)), f"{within:.0%}", *figures])
-    return "\n".join(aligned(rows))
+    return table(parts(scores), _COLUMNS, "group")

@@ -6,15 +6,16 @@ track counts: by then several fixes have determined the direction.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
 
 import numpy as np
+import pandas as pd
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks.fusion_gain import SIGMA_BOUND
-from stario.fusion.evaluation.checks.groups import GroupedResult, by_group
+from stario.fusion.evaluation.scores import Column, median_degrees, parts, scored
+from stario.fusion.evaluation.text import table
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.fixes import Fix, position_fix
 from stario.fusion.imu.stateful import Predictor
@@ -22,7 +23,6 @@ from stario.fusion.navigator import Navigator
 from stario.sequences.accuracy.metrics import pose_errors
 from stario.sequences.accuracy.nees import nees
 from stario.sequences.arrays import even_grid
-from stario.sequences.drawing.text_table import aligned
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, Trajectory
 
@@ -30,25 +30,7 @@ _MIN_FIXES = 4
 """Minimum number of fixes for a track to be evaluated."""
 
 
-@dataclass(frozen=True)
-class FixConsistency(GroupedResult):
-    """Errors of one recording with fixes.
-
-    Attributes:
-        applied: share of the fixes that were applied.
-        position_rms: horizontal position error, root mean square [m].
-        position_nees: median NEES of position; 2.4 is expected for three axes.
-        yaw_rms: yaw error, root mean square [rad].
-        yaw_nees: mean NEES of yaw; 1 is expected.
-        yaw_covered: share of the poses whose yaw error is within three standard deviations.
-    """
-
-    applied: float
-    position_rms: float
-    position_nees: float
-    yaw_rms: float
-    yaw_nees: float
-    yaw_covered: float
+_NOTE = "second half of each track; expected: NEES of position 2.4 (median), of yaw 1 (mean)"
 
 
 def true_fixes(truth: Trajectory, every: float, sigma: float, seed: int) -> list[Fix]:
@@ -70,8 +52,12 @@ def track_with_fixes(
     every: float = 5.0,
     sigma: float = 0.3,
     backend: BackendName = "ekf",
-) -> FixConsistency:
-    """Run a recording with fixes and evaluate its track.
+) -> pd.DataFrame:
+    """Score the second half of a recording's track with fixes.
+
+    Figures: share of the fixes that were `applied`; horizontal `position_rms` [m] and median
+    `position_nees`; `yaw_rms` [rad], mean `yaw_nees`, and the share of poses whose yaw error is
+    within three standard deviations (`yaw_covered`).
 
     Raises:
         InputError: it has no true poses, is too short for enough fixes, or cannot be run.
@@ -89,32 +75,28 @@ def track_with_fixes(
     second_half = errors.estimate.time > middle
     rows = np.searchsorted(track.time, errors.estimate.time[second_half])
     P, error, yaw = track.covariance[rows], errors.position_W[second_half], errors.yaw[second_half]
-    return FixConsistency(
-        sequence.name,
-        group,
-        track.health.fixes.get("applied", 0) / len(fixes),
-        float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean())),
-        float(np.median(nees(error, P[:, 6:9, 6:9]))),
-        float(np.sqrt((yaw**2).mean())),
-        float((yaw**2 / P[:, 2, 2]).mean()),
-        float((np.abs(yaw) < SIGMA_BOUND * np.sqrt(P[:, 2, 2])).mean()),
-    )
+    figures = {
+        "applied": track.health.fixes.get("applied", 0) / len(fixes),
+        "position_rms": math.sqrt((error[:, :2] ** 2).sum(axis=1).mean()),
+        "position_nees": float(np.median(nees(error, P[:, 6:9, 6:9]))),
+        "yaw_rms": math.sqrt((yaw**2).mean()),
+        "yaw_nees": float((yaw**2 / P[:, 2, 2]).mean()),
+        "yaw_covered": float((np.abs(yaw) < SIGMA_BOUND * np.sqrt(P[:, 2, 2])).mean()),
+    }
+    return scored(sequence.name, {backend: figures}, group)
 
 
-def fixes_table(found: Sequence[FixConsistency]) -> str:
+_COLUMNS = (
+    Column("n", "applied", ".0f", len),
+    Column("fixes applied", "applied", ".0%", np.mean),
+    Column("position m", "position_rms"),
+    Column("NEES", "position_nees", ".1f"),
+    Column("yaw deg", "yaw_rms", ".1f", median_degrees),
+    Column("yaw NEES", "yaw_nees", ".1f"),
+    Column("< 3 sigma", "yaw_covered", ".1%", np.mean),
+)
+
+
+def fixes_table(scores: pd.DataFrame) -> str:
     """Return a row for each group: medians over recordings, and share of yaw errors in 3 sigma."""
-    head = ["group", "n", "fixes applied", "position m", "NEES", "yaw deg", "yaw NEES", "< 3 sigma"]
-    rows = [head]
-    for group, part in by_group(found):
-        rows.append(
-            [
-                *(group, str(len(part)), f"{np.mean([result.applied for result in part]):.0%}"),
-                f"{np.median([result.position_rms for result in part]):.2f}",
-                f"{np.median([result.position_nees for result in part]):.1f}",
-                f"{np.degrees(np.median([result.yaw_rms for result in part])):.1f}",
-                f"{np.median([result.yaw_nees for result in part]):.1f}",
-                f"{np.mean([result.yaw_covered for result in part]):.1%}",
-            ]
-        )
-    note = "second half of each track; expected: NEES of position 2.4 (median), of yaw 1 (mean)"
-    return "\n".join([*aligned(rows), note])
+    return table(parts(scores), _COLUMNS, "group", [_NOTE])

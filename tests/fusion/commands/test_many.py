@@ -46,9 +46,9 @@ def test_check_fusion_compares_the_fusion_with_its_network(
     (tmp_path / "walk.csv").write_bytes(recording.read_bytes())
     done = stario("check", "fusion", recording, "walk.csv", "--json")
     assert done.code == 0
-    first, second = json.loads(done.out)
-    assert first["network_m"] == second["network_m"]
-    assert first["network_m"] > 0.0
+    first, second = (one for one in json.loads(done.out) if one["track"] == "network")
+    assert [first["recording"], second["recording"]] == ["walk", "walk-2"]
+    assert first["error_m"] == second["error_m"] > 0.0
     refused = stario("check", "fusion", recording, "--by", "colour")
     assert refused.code == 1
     assert "carry" in refused.err
@@ -77,7 +77,7 @@ def test_check_moments_reports_what_a_bad_moment_costs(
     done = stario("check", "moments", recording, "--graph", "--json")
     assert done.code == 0
     found = json.loads(done.out)
-    assert [(one["recording"], one["group"], one["backend"]) for one in found] == [
+    assert [(one["recording"], one["group"], one["track"]) for one in found] == [
         ("walk", "lift, middle", backend) for backend in ("ekf", "graph")
     ]
     assert all(one["error_with"] > 0.0 for one in found)
@@ -371,7 +371,7 @@ def test_backends_compares_filter_and_graph(stario) -> None:
     assert done.code == 0
     content = json.loads(done.out)
     assert set(content["summary"]["median_ate_m"]) == {"ekf", "graph", "fixed_lag"}
-    assert content["scores"][0]["name"] == "walk 0"
+    assert content["scores"][0]["recording"] == "walk 0"
 
 
 def test_backends_continues_after_failures(stario, recording: Path, tmp_path: Path) -> None:
@@ -379,7 +379,7 @@ def test_backends_continues_after_failures(stario, recording: Path, tmp_path: Pa
     done = stario("check", "backends", "blind.csv", recording, "--json")
     assert done.code == 1
     assert "skipped: blind.csv" in done.err
-    assert [score["name"] for score in json.loads(done.out)["scores"]] == ["walk"]
+    assert {score["recording"] for score in json.loads(done.out)["scores"]} == {"walk"}
 
 
 def test_recordings_too_short_to_hold_out_a_part_require_validation_recordings(

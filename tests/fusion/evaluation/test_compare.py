@@ -18,10 +18,10 @@ from stario.fusion.evaluation.compare import (
     Comparison,
     compare,
     demonstration,
+    distinct_name,
     measure,
 )
-from stario.fusion.evaluation.folders import fresh_folder
-from stario.fusion.evaluation.many import distinct_name
+from stario.fusion.evaluation.folders import results_folder
 from stario.fusion.evaluation.results import write_comparison, write_run
 from stario.fusion.evaluation.summary import scores_of, summary, summary_table
 from stario.fusion.fixes import position_fix
@@ -260,7 +260,8 @@ def test_a_comparison_leaves_nothing_of_an_earlier_one_but_other_recordings(
 def test_every_file_of_a_comparison_can_be_removed(folder: Path, tmp_path: Path) -> None:
     written = shutil.copytree(folder, tmp_path / "copy")
     for inner in (written, *(path for path in written.iterdir() if path.is_dir())):
-        fresh_folder(inner)
+        with results_folder(inner):
+            pass  # a run without files
     assert not [path for path in written.rglob("*") if path.is_file()]
 
 
@@ -269,10 +270,11 @@ def test_a_removal_that_fails_can_be_repeated(folder: Path, tmp_path: Path) -> N
     inner, *_ = (path for path in written.iterdir() if path.is_dir())
     (inner / "network.npz").unlink()
     (inner / "network.npz").mkdir()
-    with pytest.raises(StarioError, match=r"network\.npz"):
-        fresh_folder(inner)
+    with pytest.raises(StarioError, match=r"network\.npz"), results_folder(inner):
+        pass
     (inner / "network.npz").rmdir()
-    fresh_folder(inner)
+    with results_folder(inner):
+        pass
     assert not list(inner.iterdir())
 
 

@@ -15,6 +15,7 @@ from support import Broken, ate, stream
 from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks.backends import score_walk, summary
+from stario.fusion.evaluation.scores import joined
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import position_fix, velocity_fix, yaw_fix
 from stario.fusion.graph.keyframe_state import KeyframeState
@@ -42,7 +43,7 @@ def graph(model: Any, config: NavigatorConfig = CONFIG, **more: Any) -> Navigato
 
 
 def test_the_graph_is_more_accurate_than_the_filter() -> None:
-    scores = [score_walk(seed, 30.0) for seed in range(1, 4)]
+    scores = joined(score_walk(seed, 30.0) for seed in range(1, 4))
     figures = summary(scores)
     assert figures["median_ate_to_ekf"]["graph"] < 0.95
     assert 0.8 < figures["median_ate_to_ekf"]["fixed_lag"] < 1.2

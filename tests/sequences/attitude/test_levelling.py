@@ -5,7 +5,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.levelling import (
-    BIAS_SIGMA,
     GravityStart,
     LevelledAttitude,
     integrate,
@@ -120,10 +119,8 @@ def test_after_a_gap_the_tilt_is_gravitys_and_bias_and_yaw_are_kept() -> None:
     time = np.arange(21) / 200.0
     accel = np.tile(STANDARD_GRAVITY * UP, (21, 1))
     attitude = LevelledAttitude(start_at(np.eye(3)))
-    assert attitude.bias_sigma == pytest.approx(BIAS_SIGMA)
     for _ in range(300):
         attitude.advance(time, np.tile([0.02, -0.01, 0.0], (21, 1)), accel)
-    assert attitude.bias_sigma < 0.3 * BIAS_SIGMA
     learned, before = attitude.b_g.copy(), attitude.R_NB
     np.testing.assert_allclose(learned, [0.02, -0.01, 0.0], atol=3e-3)
     turned = exp_so3(np.array([0.9, 0.4, 0.0]))  # with the device, unobserved

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from stario.fusion.evaluation.checks.corruption import Fault, faults
 from stario.fusion.evaluation.checks.faults import (
     DummyPredictor,
-    FaultResult,
     fault_table,
     matched_walk,
     run_faults,
     with_true_displacements,
 )
+from stario.fusion.evaluation.scores import wide
 from stario.fusion.navigator import Navigator
 from stario.sequences.errors import InputError
 
@@ -24,12 +26,17 @@ SAMPLES = ("time", "gyro", "accel")
 
 
 @pytest.fixture(scope="module")
-def results() -> dict[str, FaultResult]:
+def scores() -> pd.DataFrame:
     sequence, config = matched_walk(SECONDS, seed=1)
-    return {r.fault: r for r in run_faults(sequence, config, backends=("ekf",))}
+    return run_faults(sequence, config, backends=("ekf",))
 
 
-def test_every_fault_ends_in_finite_states(results: dict[str, FaultResult]) -> None:
+@pytest.fixture(scope="module")
+def results(scores: pd.DataFrame) -> dict[str, Any]:
+    return {row.group: row for row in wide(scores).itertuples()}
+
+
+def test_every_fault_ends_in_finite_states(results: dict[str, Any]) -> None:
     assert list(results) == [fault.name for fault in faults(SECONDS)]
     assert all(result.finite and np.isfinite(result.error_with) for result in results.values())
     assert results["none"].error_with == results["none"].error_without
@@ -53,12 +60,11 @@ def test_every_fault_but_none_modifies_samples_or_predictions() -> None:
 def test_a_refused_recording_is_a_row_of_the_table() -> None:
     in_degrees = Fault("rates in degrees", lambda s, _: replace(s, gyro=np.degrees(s.gyro)))
     sequence, config = matched_walk(SECONDS, seed=1)
-    refused, unchanged = run_faults(
-        sequence, config, backends=("ekf",), only=[in_degrees, Fault("none")]
-    )
+    found = run_faults(sequence, config, backends=("ekf",), only=[in_degrees, Fault("none")])
+    refused, unchanged = wide(found).itertuples()
     assert np.isnan(refused.error_with)
     assert unchanged.error_with == refused.error_without
-    row = next(row for row in fault_table([refused, unchanged]).splitlines() if "degrees" in row)
+    row = next(row for row in fault_table(found).splitlines() if "degrees" in row)
     assert " - " in row
     assert "refused: " in row
     assert "deg/s" in row
@@ -79,7 +85,7 @@ def test_a_refused_recording_is_a_row_of_the_table() -> None:
         ("accelerometer clipped", "saturated"),
     ],
 )
-def test_every_fault_is_reported(results: dict[str, FaultResult], fault: str, words: str) -> None:
+def test_every_fault_is_reported(results: dict[str, Any], fault: str, words: str) -> None:
     assert words in results[fault].reported
 
 
@@ -87,19 +93,19 @@ def test_every_fault_is_reported(results: dict[str, FaultResult], fault: str, wo
     "fault",
     ["one NaN in gyro", "5% of samples dropped", "20% of samples dropped", "190 Hz", "500 Hz"],
 )
-def test_small_faults_add_little_error(results: dict[str, FaultResult], fault: str) -> None:
+def test_small_faults_add_little_error(results: dict[str, Any], fault: str) -> None:
     assert results[fault].error_with < results[fault].error_without + 0.3
 
 
-def test_sigma_covers_the_error_after_a_gap(results: dict[str, FaultResult]) -> None:
+def test_sigma_covers_the_error_after_a_gap(results: dict[str, Any]) -> None:
     after = results["gap of 3 s"]
     assert after.end_error < 2.0 * after.end_sigma
     assert after.end_sigma > results["none"].end_sigma
 
 
-def test_the_table_has_a_line_per_fault(results: dict[str, FaultResult]) -> None:
-    lines = fault_table(list(results.values())).splitlines()
-    assert len(lines) == len(results) + 1
+def test_the_table_has_a_line_per_fault(scores: pd.DataFrame) -> None:
+    lines = fault_table(scores).splitlines()
+    assert len(lines) == len(faults(SECONDS)) + 1
     assert "not_finite 1" in next(line for line in lines if line.startswith("one NaN in gyro"))
 
 
@@ -152,5 +158,5 @@ def test_faults_are_drawn_from_the_seed() -> None:
 def test_five_seconds_of_false_displacements_cost_little_with_either_back_end() -> None:
     sequence, config = matched_walk(60.0, seed=1)
     block = [fault for fault in faults(60.0) if fault.name == "network off by 1 m for 5 s"]
-    for result in run_faults(sequence, config, only=block):
+    for result in wide(run_faults(sequence, config, only=block)).itertuples():
         assert result.error_with < result.error_without + 0.3

@@ -5,16 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks import moments
 from stario.fusion.evaluation.checks.moments import (
-    MomentCost,
     largest_correction,
     moment_costs,
     moment_table,
 )
+from stario.fusion.evaluation.scores import joined, scored, wide
 from stario.fusion.state import Track
 from stario.network.model import load_model
 from stario.sequences import ImuSequence, InputError
@@ -25,14 +26,16 @@ from stario.sequences.simulation.moments import MOMENTS
 BY_NAME = {moment.name: moment for moment in MOMENTS}
 
 
-def cost(ratio: float, step: float, turn: float, place: str = "start") -> MomentCost:
-    values = 2.0, 2.0 * ratio, 3.0, 6.0, step, turn, 0.1, 1.0
-    return MomentCost("walk", f"drop, {place}", "ekf", *values)
+def cost(walk: int, ratio: float, step: float, turn: float, place: str = "start") -> pd.DataFrame:
+    small = float(step <= 1.0 and turn <= 10.0)
+    figures = {"error_without": 2.0, "ratio": ratio, "joined_ratio": 2.0, "small": small}
+    figures |= {"step": step, "turn": turn, "step_without": 0.1, "turn_without": 1.0}
+    return scored(f"walk {walk}", {"ekf": figures}, f"drop, {place}")
 
 
 def test_the_table_counts_small_ratios_and_small_corrections() -> None:
-    found = [cost(1.0, 0.5, 20.0), cost(4.0, 0.5, 5.0), cost(1.1, 0.2, 2.0, "end")]
-    lines = moment_table(found).splitlines()
+    found = [cost(0, 1.0, 0.5, 20.0), cost(1, 4.0, 0.5, 5.0), cost(0, 1.1, 0.2, 2.0, "end")]
+    lines = moment_table(joined(found)).splitlines()
     assert lines[1].split()[:4] == ["drop,", "end", "ekf", "1"]
     start = lines[2].split()
     assert start[3:] == ["2", "2.00", "2.00", "4.00", "2.00", "2.00", "50%", "0.5", "20.0", "50%"]
@@ -77,11 +80,10 @@ def test_a_phone_laid_down_and_taken_up_costs_the_rest_little(
 ) -> None:
     monkeypatch.setattr(moments, "MOMENTS", (BY_NAME["table"],))
     monkeypatch.setattr(moments, "PLACES", {"middle": 0.5})
-    found = moment_costs(load_model("default"), walk, NavigatorConfig())
-    assert [(one.group, one.backend) for one in found] == [("table, middle", "ekf")]
-    assert found[0].error_without > 0.0
-    assert found[0].error_with < 2.0 * found[0].error_without
-    assert 0.0 < found[0].step_without < 0.5
+    [found] = wide(moment_costs(load_model("default"), walk, NavigatorConfig())).itertuples()
+    assert (found.group, found.track) == ("table, middle", "ekf")
+    assert 0.0 < found.error_with < 2.0 * found.error_without
+    assert 0.0 < found.step_without < 0.5
 
 
 def test_a_recording_without_known_positions_is_refused(walk: ImuSequence) -> None:

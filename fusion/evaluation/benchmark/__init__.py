@@ -1,0 +1,1 @@
+"""Benchmark of networks alone, by groups of recordings."""

@@ -1,0 +1,255 @@
+"""Benchmark of networks alone by groups of recordings: sets, people, devices, places.
+
+Each recording is aligned with its truth once and run through every network. `displacement_error`
+defines the errors, `stario.fusion.evaluation.bootstrap` the confidence intervals.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import pandas as pd
+
+from stario.fusion.evaluation.benchmark.aligned import Aligned
+from stario.fusion.evaluation.benchmark.displacement_error import (
+    FIGURES,
+    HORIZONS,
+    RecordingErrors,
+    recording_errors,
+)
+from stario.fusion.evaluation.benchmark.network_alone import RecordingPredictor, predictions
+from stario.fusion.evaluation.bootstrap import (
+    CONFIDENCE,
+    REPLICATES,
+    Interval,
+    block_rows,
+    paired_ratio,
+)
+from stario.fusion.evaluation.scores import joined, parts, scored, values, wide
+from stario.fusion.imu.stateful import Predictor
+from stario.fusion.navigator import Navigator
+from stario.sequences.datasets.batch import Skipped, without_skipped
+from stario.sequences.readers.archive import split_name
+from stario.sequences.sequence import ImuSequence
+
+log = logging.getLogger(__name__)
+
+By = Literal["set", "group", "person", "device", "place", "carry"]
+
+POOLED = "all"
+"""Name of the row over all sets, equally weighted; a group may have this name, too."""
+
+_UNKNOWN = "unknown"
+"""Label of a recording whose person, device, place or carry is not known."""
+
+_NOT_COMPARED = (
+    "not compared, because the ground truth moves by less than a metre, or has neither 2 s of "
+    "known positions nor three waypoints within an unbroken stretch of samples"
+)
+
+
+_DECISIVE = "rms_10s_m"
+_MAX_GROUP_RATIO = 1.1
+
+WORDS: dict[str, str] = {
+    **FIGURES,
+    "medians": "over the recordings of a group",
+    "ratio": "root mean square errors, ours over theirs: geometric mean over groups (for all sets, "
+    f"over sets); [{CONFIDENCE:.0%} interval] of {REPLICATES} bootstrap replicates that draw "
+    "groups, recordings and blocks of 30 s; for waypoints, their residuals replace the 10 s errors",
+}
+"""Meaning of each figure."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A group of recordings.
+
+    Attributes:
+        name: name of the group, or `POOLED`.
+        recordings: number of recordings compared; those with fewer than three waypoints are not.
+        path_km: total length of their true paths.
+        medians: medians over recordings, by name of the weights and by figure.
+        ratios: ratios of errors over 1, 10 and 30 s to those of the weights compared with, by
+            figure; empty without these. For waypoints, the residuals replace the 10 s errors.
+        pooled: whether the row covers all groups.
+    """
+
+    name: str
+    recordings: int
+    path_km: float
+    medians: dict[str, dict[str, float]]
+    ratios: dict[str, Interval]
+    pooled: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Benchmark:
+    """Scores of networks, whose weights are the tracks.
+
+    Attributes:
+        scores: `path_m` and `FIGURES` of each recording, named by its path, with its set, person,
+            device, place and carry, and the kind of its `truth`.
+        blocks: blocks of squared errors of each recording and horizon.
+    """
+
+    scores: pd.DataFrame
+    blocks: pd.DataFrame
+
+    def rows(self, by: By, ours: str, theirs: str | None) -> list[Row]:
+        """Return a row for each group, sorted by name, and one over all if there are several.
+
+        `ours` and `theirs` name the weights under evaluation and those to compare with, if any.
+        """
+        found = parts(self.scores, by, POOLED)
+        return [
+            self._row(name, part, ours, theirs, pooled=k > 0 and k == len(found) - 1)
+            for k, (name, part) in enumerate(found)
+        ]
+
+    def _row(
+        self, name: str, part: pd.DataFrame, ours: str, theirs: str | None, pooled: bool
+    ) -> Row:
+        weights = [ours] if theirs is None else [ours, theirs]
+        medians = {
+            one: {figure: _median(values(part, figure, track=one)) for figure in FIGURES}
+            for one in weights
+        }
+        ratios = {}
+        for horizon in HORIZONS if theirs is not None else ():
+            metric = f"rms_{horizon}s_m"
+            chosen = self.blocks["recording"].isin(part["recording"])
+            blocks = self.blocks[chosen & (self.blocks["metric"] == metric)]
+            ratio = paired_ratio(blocks, ours, str(theirs))
+            if ratio is not None:
+                ratios[metric] = ratio
+        paths = values(part, "path_m", track=ours)
+        return Row(name, int((paths > 0.0).sum()), paths.sum() / 1e3, medians, ratios, pooled)
+
+    def recordings(self) -> list[dict[str, object]]:
+        """Return each recording with its labels and the figures of all weights."""
+        found = []
+        for _, part in wide(self.scores).groupby("recording", sort=False):
+            by_weights = part.set_index("track")
+            labels = by_weights.iloc[0].drop([*FIGURES]).to_dict()
+            found.append(labels | {"figures": by_weights[[*FIGURES]].to_dict("index")})
+        return found
+
+
+def benchmark(
+    recordings: Iterable[Aligned | Skipped],
+    models: Mapping[str, Callable[[str], Predictor | RecordingPredictor]],
+    groups: Mapping[Path, str],
+    read: Callable[[Path], ImuSequence] | None = None,
+) -> tuple[Benchmark | None, list[Skipped]]:
+    """Run every recording through every network; return None if there is no recording.
+
+    Args:
+        recordings: aligned recordings, and those skipped.
+        models: by name of the weights, a function that returns the network for a group: networks
+            differ between groups if each group was held out of training in turn.
+        groups: group of each recording, by path; the name of the set where missing.
+        read: function that reads a path; if given, the EKF is run for its mean NIS, which is slow.
+    """
+    skipped: list[Skipped] = []
+    scores: list[pd.DataFrame] = []
+    blocks = [block_rows([], **dict.fromkeys(("set", "group", "recording", "network", "metric")))]
+    still: list[Path] = []
+    for aligned in without_skipped(recordings, skipped):
+        named = labels(aligned.path, aligned.attributes, groups.get(aligned.path, ""))
+        unit = {"set": named["set"], "group": named["group"], "recording": str(aligned.path)}
+        errors = {n: _errors(model(named["group"]), aligned, read) for n, model in models.items()}
+        figures = {n: {"path_m": found.path_m, **found.figures} for n, found in errors.items()}
+        others = {key: name for key, name in named.items() if key != "group"}
+        scores.append(
+            scored(str(aligned.path), figures, named["group"], **others, truth=aligned.kind)
+        )
+        for name, found in errors.items():
+            for horizon, sums in found.blocks.items():
+                metric = f"rms_{horizon}s_m"
+                blocks.append(block_rows(sums, **unit, network=name, seed=0, metric=metric))
+        if not any(found.path_m > 0.0 for found in errors.values()):
+            still.append(aligned.path)
+    _warn_of_not_compared(still, len(scores))
+    return Benchmark(joined(scores), joined(blocks)) if scores else None, skipped
+
+
+def _warn_of_not_compared(paths: Sequence[Path], count: int) -> None:
+    """Log one warning about all recordings in which nothing could be compared."""
+    if len(paths) > 1:
+        message = "%d of %d recordings, the first %s: %s"
+        log.warning(message, len(paths), count, paths[0], _NOT_COMPARED)
+    elif paths:
+        log.warning("%s: %s", paths[0], _NOT_COMPARED)
+
+
+def _errors(
+    model: Predictor | RecordingPredictor,
+    aligned: Aligned,
+    read: Callable[[Path], ImuSequence] | None,
+) -> RecordingErrors:
+    found = recording_errors(aligned, predictions(model, aligned))
+    if read is not None and not isinstance(model, RecordingPredictor):
+        found.figures["nis_ekf"] = Navigator(model).run(read(aligned.path)).nis or np.nan
+    return found
+
+
+def labels(path: Path, attributes: Mapping[str, object], group: str = "") -> dict[str, str]:
+    """Return the labels that a recording can be grouped by, given its group in a list, if any.
+
+    Its set is the first word of its group, or else the name of its archive or folder. OxIOD names
+    folders by the form of their data: `syn` counts as `oxiod`. Without a list, a group is all of
+    one person in a set, where the person is known: intervals tell how persons differ.
+    """
+    file, member = split_name(path)
+    above = file.absolute().parent.name
+    folder = "oxiod" if above == "syn" else above
+    set_name = group.split(" ")[0] if group else file.stem if member else folder
+    known = {key: str(attributes.get(key) or _UNKNOWN) for key in get_args(By)[2:]}
+    of_person = set_name if known["person"] == _UNKNOWN else f"{set_name} {known['person']}"
+    return {"set": set_name, "group": group or of_person, **known}
+
+
+def _median(known: np.ndarray[Any, Any]) -> float:
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+_MIN_GROUPS = 3
+"""Minimum number of groups for a verdict: intervals from fewer do not generalise to others."""
+
+
+def verdict(rows: Sequence[Row]) -> str:
+    """Return the verdict on replacing the weights compared with; empty without several groups.
+
+    Weights are accepted if the pooled interval is below 1 and no group is worse by over a tenth.
+    """
+    compared = [row for row in rows if _DECISIVE in row.ratios]
+    ratios = {row.name: row.ratios[_DECISIVE] for row in compared if not row.pooled}
+    pooled = next((row.ratios[_DECISIVE] for row in compared if row.pooled), None)
+    if pooled is None:
+        return ""
+    worst = max(ratios, key=lambda name: ratios[name].ratio)
+    accepted = pooled.high < 1.0 and ratios[worst].ratio <= _MAX_GROUP_RATIO
+    if len(ratios) < _MIN_GROUPS:
+        return f"not decided, {len(ratios)} groups are too few: pooled {pooled:.3f} over 10 s"
+    words = f"pooled {pooled:.3f} over 10 s, worst {worst} {ratios[worst]:.3f}"
+    return f"{'accepted' if accepted else 'not accepted'}: {words}"
+
+
+def benchmark_dict(
+    found: Benchmark, rows: Sequence[Row], ours: str, theirs: str | None
+) -> dict[str, object]:
+    """Return the result as plain values, including the recordings."""
+    return {
+        "ours": ours,
+        "theirs": theirs,
+        "verdict": verdict(rows),
+        "groups": [asdict(row) for row in rows],
+        "recordings": found.recordings(),
+        "words": WORDS,
+    }

@@ -1,0 +1,182 @@
+"""The hierarchical bootstrap of errors: ratios of networks with their intervals, and ranks.
+
+Errors within a recording, a person or a place are correlated: treating windows as independent would
+make any difference look certain. The hierarchical bootstrap (Davison, Hinkley: Bootstrap Methods
+and their Application, 1997, section 3.8) draws groups, then recordings in each group, then blocks
+of 30 s in each recording, all with replacement. Every replicate draws the same for all networks, so
+that difficulty common to them cancels. Sets are not resampled; they and their groups have equal
+weights, and so have the seeds of a network.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from stario.sequences.sequence import FloatArray
+
+REPLICATES = 1000
+CONFIDENCE = 0.95
+_BOUNDS = (50.0 * (1.0 - CONFIDENCE), 50.0 * (1.0 + CONFIDENCE))
+"""Percentiles of the replicates that bound an interval."""
+
+_MIN_BLOCKS = 5
+"""Minimum number of blocks for an interval: that of one has no width, and that of two recordings
+with a block each holds the true ratio only half of the time."""
+
+_UNITS = ("set", "group", "recording")
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Geometric mean of the ratios of root mean square errors to the baseline's, and its bounds.
+
+    The bounds are NaN if there is too little to draw from.
+    """
+
+    ratio: float
+    low: float
+    high: float
+
+    def __format__(self, form: str) -> str:
+        if not math.isfinite(self.low):
+            return f"{self.ratio:{form}} [too few data]"
+        return f"{self.ratio:{form}} [{self.low:{form}}, {self.high:{form}}]"
+
+
+@dataclass(frozen=True)
+class Rank:
+    """Rank of a network.
+
+    Attributes:
+        rank: 1 for the smallest error.
+        low: lower bound of the rank's interval.
+        high: upper bound of the rank's interval.
+        ratio: its error over the reference network's; None for the reference or without one.
+    """
+
+    rank: int
+    low: int
+    high: int
+    ratio: Interval | None
+
+
+def block_rows(sums: Sequence[Sequence[float]] | FloatArray, **labels: object) -> pd.DataFrame:
+    """Return the rows of a recording's blocks (B, 2): sums of squared errors, and their counts.
+
+    Labels are `set`, `group`, `recording`, `network` and `seed`.
+    """
+    table = pd.DataFrame(np.reshape(sums, (-1, 2)), columns=["squares", "count"])
+    return table.assign(block=np.arange(len(table)), **labels)
+
+
+def paired_ratio(blocks: pd.DataFrame, ours: str, theirs: str) -> Interval | None:
+    """Return the ratio of two networks' errors over the recordings that both have errors on.
+
+    A recording without any error, such as of a device at rest, has no ratio.
+    """
+    pair = blocks[blocks["network"].isin([ours, theirs])]
+    total = pair.groupby([*_UNITS, "network", "seed"])["squares"].transform("sum")
+    drawn = _Draws.of(pair[total > 0.0])
+    if drawn is None or not {ours, theirs} <= set(drawn.names):
+        return None
+    return drawn.ratio(ours, theirs)
+
+
+def ranks(blocks: pd.DataFrame, against: str) -> dict[str, Rank]:
+    """Rank networks by the geometric mean of their errors over the recordings common to all.
+
+    Returns:
+        Ranks by network name, with ratios to the errors of `against` if it is among them; empty if
+        no recording is common to all.
+    """
+    drawn = _Draws.of(blocks)
+    if drawn is None:
+        return {}
+    places = drawn.replicates.argsort(axis=0).argsort(axis=0) + 1
+    low, high = np.percentile(places, _BOUNDS, axis=1, method="nearest")
+    order = drawn.scores.argsort().argsort() + 1
+    compared = against in drawn.names
+    return {
+        name: Rank(
+            int(order[k]),
+            int(low[k]),
+            int(high[k]),
+            drawn.ratio(name, against) if compared and name != against else None,
+        )
+        for k, name in enumerate(drawn.names)
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class _Draws:
+    """Mean log errors (N,) of networks, those of every replicate (N, R), and the blocks' number."""
+
+    names: list[str]
+    scores: FloatArray
+    replicates: FloatArray
+    blocks: int
+
+    @classmethod
+    def of(cls, blocks: pd.DataFrame) -> _Draws | None:
+        """Draw from the recordings common to all networks; None if there are none."""
+        index = [*_UNITS, "block"]
+        table = blocks.set_index([*index, "network", "seed"])[["squares", "count"]]
+        runs = table.unstack(["network", "seed"], sort=False).dropna()
+        if runs.empty:
+            return None
+        rng = np.random.default_rng(0)
+        columns = runs["squares"].columns
+        found = np.mean(
+            [_of_set(part, rng) for _, part in runs.groupby("set", sort=False)], axis=0
+        )  # (1 + R, runs)
+        names = list(dict.fromkeys(columns.get_level_values("network")))
+        by_name = np.stack(
+            [found[:, columns.get_level_values("network") == name].mean(axis=1) for name in names]
+        )
+        return cls(names, by_name[:, 0], by_name[:, 1:], len(runs))
+
+    def ratio(self, name: str, against: str) -> Interval:
+        k, other = self.names.index(name), self.names.index(against)
+        ratio = float(np.exp(self.scores[k] - self.scores[other]))
+        if self.blocks < _MIN_BLOCKS:
+            return Interval(ratio, math.nan, math.nan)
+        differences = self.replicates[k] - self.replicates[other]
+        low, high = np.exp(np.percentile(differences, _BOUNDS)).tolist()
+        return Interval(ratio, low, high)
+
+
+def _of_set(part: pd.DataFrame, rng: np.random.Generator) -> FloatArray:
+    """Return the mean log errors of a set (1 + R, runs), those of the replicates from row 1 on."""
+    groups = []
+    for _, group in part.groupby("group", sort=False):
+        recordings = [
+            _of_recording(one["squares"].to_numpy(), one["count"].to_numpy(), rng)
+            for _, one in group.groupby("recording", sort=False)
+        ]
+        groups.append(_mean_of_draws(np.stack(recordings), rng))
+    return _mean_of_draws(np.stack(groups), rng)
+
+
+def _of_recording(squares: FloatArray, count: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return the log errors of a recording (1 + R, runs) from its blocks (B, runs)."""
+    rows = rng.integers(len(squares), size=(REPLICATES, len(squares)))
+    whole, drawn = (
+        np.log(np.maximum(sums, 1e-12) / counts)
+        for sums, counts in (
+            (squares.sum(axis=0), count.sum(axis=0)),
+            (squares[rows].sum(axis=1), count[rows].sum(axis=1)),
+        )
+    )
+    return np.asarray(0.5 * np.vstack([whole, drawn]))
+
+
+def _mean_of_draws(values: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return the mean (1 + R, runs) of members (n, 1 + R, runs), each replicate's drawn anew."""
+    rows = rng.integers(len(values), size=(len(values), REPLICATES))
+    drawn = np.take_along_axis(values[:, 1:], rows[..., None], axis=0)
+    return np.asarray(np.concatenate([values[:, :1], drawn], axis=1).mean(axis=0))

@@ -1,1 +1,0 @@
-"""Judging: evaluation of networks alone, by groups of recordings."""

@@ -1,0 +1,215 @@
+"""Networks side by side over many recordings: the paper's table.
+
+Each network yields three tracks of each recording: chained displacements with the true attitude
+(the papers' protocol), the same with the attitude levelled from the IMU, and the EKF's. Several
+weights of one network, for example from different training seeds, are averaged, with their spread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+
+import pandas as pd
+from scipy.spatial.transform import Rotation
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.compare import distinct_name
+from stario.fusion.evaluation.scores import Figures, Spread, joined, records, scored
+from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude, true_poses
+from stario.fusion.imu.stateful import Predictor
+from stario.fusion.navigator import Navigator
+from stario.fusion.recording import Progress, silent
+from stario.network.model import DisplacementModel
+from stario.network.runtime.cost import table_cost
+from stario.sequences.accuracy.metrics import (
+    CONVENTIONS,
+    Convention,
+    PoseErrors,
+    align,
+    evaluate_track,
+    pose_errors,
+)
+from stario.sequences.datasets.batch import Skipped, each
+from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.truth.problems import warn_of_truth
+
+TRUE_ATTITUDE, OWN_ATTITUDE, EKF = "network_true_attitude", "network", "ekf"
+
+PROTOCOLS = {
+    TRUE_ATTITUDE: "network, true attitude",
+    OWN_ATTITUDE: "network, own attitude",
+    EKF: "EKF",
+}
+"""Tracks of the table and their titles."""
+
+METRICS = {"ate_m": "ATE [m]", "rte_m": "RTE [m]", "pde": "PDE [1]"}
+
+MAX_DRAWN = 4
+"""Number of recordings whose tracks are kept for a figure."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Tracks of one recording with the true attitude, aligned with the truth, for a figure.
+
+    Attributes:
+        recording: name of the recording.
+        truth: true track.
+        tracks: tracks by network.
+        errors: ATE and RTE [m] of each track.
+    """
+
+    recording: str
+    truth: Trajectory
+    tracks: dict[str, Trajectory]
+    errors: dict[str, tuple[float, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkTable:
+    """Errors of several networks on several recordings.
+
+    Attributes:
+        convention: how position errors are averaged.
+        parameters: parameter count by network, in the table's order, by the paper's convention.
+        scores: `METRICS` of the tracks of `PROTOCOLS`, with labels `network` and `weights`.
+        samples: tracks of some recordings.
+    """
+
+    convention: Convention
+    parameters: dict[str, int]
+    scores: pd.DataFrame
+    samples: list[Sample]
+
+    def column(self, network: str, protocol: str, metric: str) -> Spread:
+        """Return a network's column: means over recordings, their deviation over weights."""
+        where = {"network": network, "track": protocol}
+        return Spread(network, metric, ".3f", where=where, by="weights")
+
+
+Models = Sequence[tuple[str, DisplacementModel]]
+"""Models, each with the name by which its weights were requested."""
+
+
+def compare_networks(
+    paths: Sequence[Path],
+    models: Models,
+    config: NavigatorConfig,
+    read: Callable[[Path], ImuSequence],
+    convention: Convention = "rms",
+    jobs: int | None = None,
+    progress: Progress = silent,
+) -> tuple[NetworkTable | None, list[Skipped]]:
+    """Compute the tracks of networks, given with distinct names, on recordings with true poses.
+
+    Recordings that cannot be used are returned, too; None if all of them are. `read` must be
+    picklable; `jobs` is as for `stario.sequences.datasets.batch.each`.
+    """
+    scores: list[pd.DataFrame] = []
+    samples: list[Sample] = []
+    skipped: list[Skipped] = []
+    names: set[str] = set()
+    work = partial(_tracks, models=models, config=config, read=read, convention=convention)
+    for done, outcome in enumerate(each(work, paths, jobs), 1):
+        if isinstance(outcome, Skipped):
+            skipped.append(outcome)
+        else:
+            found, sample = outcome
+            name = distinct_name(sample.recording, names)
+            scores.append(found.assign(recording=name))
+            if len(samples) < MAX_DRAWN:
+                samples.append(replace(sample, recording=name))
+        progress(done / len(paths))
+    if not scores:
+        return None, skipped
+    parameters = {model.name: table_cost(model.name).parameters for _, model in models}
+    return NetworkTable(convention, parameters, joined(scores), samples), skipped
+
+
+def table_dict(table: NetworkTable) -> dict[str, object]:
+    """Return the table as plain values."""
+    means: dict[str, dict[str, dict[str, object]]] = {}
+    for network, protocol, metric in product(table.parameters, PROTOCOLS, METRICS):
+        mean, spread = table.column(network, protocol, metric).mean_and_spread(table.scores)
+        metrics = means.setdefault(network, {}).setdefault(protocol, {})
+        metrics[metric] = {"mean": mean, "spread": spread}
+    return {
+        "networks": table.parameters,
+        "over_recordings": means,
+        "entries": entries(table),
+        "conventions": table_words(table),
+    }
+
+
+def entries(table: NetworkTable) -> list[dict[str, object]]:
+    """Return the errors of every track as plain values."""
+    return records(table.scores.drop(columns="group").rename(columns={"track": "protocol"}))
+
+
+def table_words(table: NetworkTable) -> dict[str, str]:
+    """Return the meaning of the table's words."""
+    keys = ("ate_m", "rte_m", "pde", "alignment", "convention")
+    return {
+        **{key: CONVENTIONS[key] for key in keys},
+        "here": f"horizontal errors, alignment first, convention {table.convention}",
+        "mean": "over recordings, equally weighted; +- deviation over weights of one network",
+    }
+
+
+def _tracks(
+    path: Path,
+    models: Models,
+    config: NavigatorConfig,
+    read: Callable[[Path], ImuSequence],
+    convention: Convention,
+) -> tuple[pd.DataFrame, Sample]:
+    sequence = read(path)
+    true_poses(sequence)
+    warn_of_truth(sequence)
+    scores: list[pd.DataFrame] = []
+    sample: Sample | None = None
+    for weights, model in models:
+        figures, errors = protocol_figures(model, sequence, config, convention)
+        scores.append(scored(sequence.name, figures, network=model.name, weights=weights))
+        sample = sample or Sample(sequence.name, errors.truth, {}, {})
+        add_track(sample, model.name, errors.estimate, figures[TRUE_ATTITUDE])
+    assert sample is not None  # there are models
+    return joined(scores), sample
+
+
+def add_track(sample: Sample, network: str, track: Trajectory, figures: Figures) -> None:
+    """Add a network's track to a sample, unless one of its other weights has been added."""
+    if network not in sample.tracks:
+        level = track.position_W * [1.0, 1.0, 0.0]
+        sample.tracks[network] = Trajectory(track.time, level, Rotation.identity(len(track)))
+        sample.errors[network] = float(figures["ate_m"] or 0.0), float(figures["rte_m"] or 0.0)
+
+
+def protocol_figures(
+    model: Predictor, sequence: ImuSequence, config: NavigatorConfig, convention: Convention
+) -> tuple[dict[str, dict[str, float]], PoseErrors]:
+    """Return the `METRICS` of the tracks of `PROTOCOLS`, and the errors with the true attitude.
+
+    These are those of a track aligned by its first pose. Raises the errors of
+    `network_track_true_attitude`.
+    """
+    truth = true_poses(sequence)
+    navigator = Navigator(model, config)
+    preprocessed = navigator.observe(sequence)
+    tracks = {
+        TRUE_ATTITUDE: network_track_true_attitude(model, sequence, config).trajectory,
+        OWN_ATTITUDE: network_track(preprocessed).trajectory,
+        EKF: navigator.track(preprocessed).trajectory,
+    }
+    figures = {name: metrics_of(track, truth, convention) for name, track in tracks.items()}
+    return figures, pose_errors(align(tracks[TRUE_ATTITUDE], truth, "first"), truth)
+
+
+def metrics_of(track: Trajectory, truth: Trajectory, convention: Convention) -> dict[str, float]:
+    """Return the `METRICS` of a track."""
+    result = evaluate_track(track, truth, convention=convention)
+    return {name: getattr(result, name) for name in METRICS}

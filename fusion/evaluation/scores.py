@@ -1,0 +1,151 @@
+"""One table of scores: a row for every figure of every track of every recording.
+
+It is a pandas frame with the columns `COLUMNS`, and with labels, such as network or person, where
+there is more to tell apart. Everything printed, drawn or concluded is a group-by of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from stario.sequences.drawing.text_table import figure
+from stario.sequences.sequence import FloatArray
+
+COLUMNS = ("recording", "group", "track", "metric", "value")
+
+Figures = Mapping[str, float | None]
+"""Figures of a track by metric; None where unknown."""
+
+
+def scored(
+    recording: str, figures: Mapping[str, Figures], group: str = "", **labels: object
+) -> pd.DataFrame:
+    """Return the rows of a recording from its figures by track; labels are columns of their own."""
+    rows = [
+        (recording, group, track, metric, np.nan if value is None else float(value))
+        for track, found in figures.items()
+        for metric, value in found.items()
+    ]
+    table = pd.DataFrame(rows, columns=list(COLUMNS)).astype({"value": float})
+    return table.assign(**labels)
+
+
+def joined(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
+    """Return the rows of several tables, of which there is at least one."""
+    return pd.concat(tables, ignore_index=True)
+
+
+def wide(scores: pd.DataFrame) -> pd.DataFrame:
+    """Return a row for each track, with a column for each metric in place of metric and value."""
+    labels = [name for name in scores.columns if name not in ("metric", "value")]
+    table = scores.set_index([*labels, "metric"])["value"].unstack("metric", sort=False)
+    return table.reset_index().rename_axis(columns=None)
+
+
+def records(scores: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the rows of `wide` as plain values."""
+    found: list[dict[str, Any]] = wide(scores).to_dict("records")
+    return found
+
+
+def parts(
+    scores: pd.DataFrame, by: str = "group", whole: str | None = "all"
+) -> list[tuple[str, pd.DataFrame]]:
+    """Return the groups, sorted by name; then all rows, called `whole`, if there are several."""
+    found = [(str(name), part) for name, part in scores.groupby(by)]
+    return [*found, (whole, scores)] if whole and len(found) > 1 else found
+
+
+def values(scores: pd.DataFrame, metric: str, **where: str) -> FloatArray:
+    """Return the known values (n,) of a metric, of the rows with these labels."""
+    chosen = scores["metric"] == metric
+    for label, name in where.items():
+        chosen &= scores[label] == name
+    found = scores.loc[chosen, "value"].to_numpy()
+    return np.asarray(found[np.isfinite(found)])
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a printed table: a metric of some rows, in one number.
+
+    Attributes:
+        title: title.
+        metric: metric.
+        form: format of the number.
+        over: function of the known values (n,), of which there is at least one.
+        where: labels of the rows, such as `{"track": "ekf"}`.
+    """
+
+    title: str
+    metric: str
+    form: str = ".2f"
+    over: Callable[[FloatArray], Any] = np.median
+    where: Mapping[str, str] = field(default_factory=dict)
+
+    def value(self, scores: pd.DataFrame) -> float:
+        """Return the number; NaN if no value is known."""
+        known = values(scores, self.metric, **self.where)
+        return float(self.over(known)) if len(known) else float("nan")
+
+    def text(self, scores: pd.DataFrame) -> str:
+        """Return the number as text, "-" if no value is known."""
+        return figure(self.value(scores), self.form)
+
+
+@dataclass(frozen=True)
+class Spread(Column):
+    """A column of means over recordings, and their deviation over weights or seeds.
+
+    Attributes:
+        by: label of the weights or seeds, which are averaged with equal weights.
+        standard_error: whether the deviation is that of the mean.
+        scale: factor of the values.
+    """
+
+    by: str = "seed"
+    standard_error: bool = False
+    scale: float = 1.0
+
+    def mean_and_spread(self, scores: pd.DataFrame) -> tuple[float, float | None]:
+        """Return mean and deviation; NaN if no value is known, None with a single one to average.
+
+        At rest, for example, there is no share of the path.
+        """
+        found = [values(part, self.metric, **self.where) for _, part in scores.groupby(self.by)]
+        means = [self.scale * known.mean() for known in found if len(known)]
+        if not means:
+            return math.nan, None
+        if len(means) == 1:
+            return float(means[0]), None
+        deviation = float(np.std(means, ddof=1))
+        if self.standard_error:
+            deviation /= math.sqrt(len(means))
+        return float(np.mean(means)), deviation
+
+    def text(self, scores: pd.DataFrame) -> str:
+        """Return mean and deviation as text, "-" if no value is known."""
+        mean, deviation = self.mean_and_spread(scores)
+        shown = figure(mean, self.form)
+        return shown if deviation is None else f"{shown} +- {figure(deviation, self.form)}"
+
+
+def geometric_mean(known: FloatArray) -> float:
+    """Return the geometric mean of ratios (n,)."""
+    return float(np.exp(np.log(known).mean()))
+
+
+def quantile(share: float) -> Callable[[FloatArray], float]:
+    """Return a function of values (n,): the value below which a share of them lies."""
+    return lambda known: float(np.quantile(known, share))
+
+
+def median_degrees(angles: FloatArray) -> float:
+    """Return the median size of angles (n,) [rad] in degrees."""
+    return math.degrees(np.median(np.abs(angles)))

@@ -1,0 +1,102 @@
+"""Errors of a network on its test recordings, for every kind of ground truth.
+
+With poses: the paper's protocol, own attitude and EKF. With any truth: the network alone along its
+own attitude, by `stario.fusion.evaluation.benchmark.displacement_error`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.benchmark.aligned import Aligned, aligned_recordings
+from stario.fusion.evaluation.benchmark.displacement_error import block_sums, recording_errors
+from stario.fusion.evaluation.benchmark.network_alone import predictions
+from stario.fusion.evaluation.networks import (
+    MAX_DRAWN,
+    OWN_ATTITUDE,
+    metrics_of,
+    protocol_figures,
+)
+from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning, pedestrian_track
+from stario.fusion.evaluation.tracks import true_poses
+from stario.fusion.paper_table.training import ReaderConfig
+from stario.network.model import DisplacementModel
+from stario.sequences.accuracy.metrics import Convention
+from stario.sequences.datasets.batch import Skipped, skipped, without_skipped
+from stario.sequences.datasets.splits import ListEntry
+from stario.sequences.errors import StarioError
+from stario.sequences.sequence import FloatArray
+
+CONVENTION: Convention = "ronin"
+"""How errors are averaged: as in the paper."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A track with true attitude for a figure: time (N,) [s], horizontal positions (N, 2) [m]."""
+
+    time: FloatArray
+    position_W: FloatArray
+    truth_W: FloatArray
+
+
+Model = DisplacementModel | PedestrianDeadReckoning
+
+
+def test_errors(
+    model: Model, test: Sequence[ListEntry], reading: ReaderConfig
+) -> tuple[list[dict[str, object]], dict[str, Shown], list[Skipped]]:
+    """Return the errors on every recording, tracks of the first ones, and skipped recordings.
+
+    Returns:
+        Plain values for each recording: `recording`, `path`, `group`, `kind` of truth, `path_m`;
+        `tracks` with ATE, RTE and PDE by track; `figures` as in `displacement_error.FIGURES`;
+        `blocks` of 30 s, [sum of squares, count], of the position error under the paper's protocol
+        ("ate") and of the displacement error over 10 s ("10").
+    """
+    found: list[dict[str, object]] = []
+    shown: dict[str, Shown] = {}
+    left_out: list[Skipped] = []
+    paths = [entry.path for entry in test]
+    outcomes = aligned_recordings(paths, reading.read, reading.options, reading.cache, 1)
+    groups = {entry.path: entry.group for entry in test}
+    for aligned in without_skipped(outcomes, left_out):
+        path = aligned.path
+        try:
+            row, track = _recording(model, aligned, reading)
+        except StarioError as error:
+            left_out.append(skipped(path, error))
+            continue
+        found.append({"path": str(path), "group": groups[path], **row})
+        if track is not None and len(shown) < MAX_DRAWN:
+            shown[aligned.name] = track
+    return found, shown, left_out
+
+
+def _recording(
+    model: Model, aligned: Aligned, reading: ReaderConfig
+) -> tuple[dict[str, object], Shown | None]:
+    alone = recording_errors(aligned, predictions(model, aligned))
+    blocks = {"10": alone.blocks["10"].tolist()} if "10" in alone.blocks else {}
+    row: dict[str, object] = {
+        "recording": aligned.name,
+        "kind": aligned.kind,
+        "path_m": alone.path_m,
+        "figures": alone.figures,
+        "blocks": blocks,
+        "tracks": {},
+    }
+    if aligned.kind != "poses":
+        return row, None
+    sequence = reading.read(aligned.path)
+    if isinstance(model, PedestrianDeadReckoning):
+        track = pedestrian_track(sequence).trajectory
+        row["tracks"] = {OWN_ATTITUDE: metrics_of(track, true_poses(sequence), CONVENTION)}
+        return row, None
+    row["tracks"], errors = protocol_figures(model, sequence, NavigatorConfig(), CONVENTION)
+    time, squares = errors.estimate.time, (errors.position_W[:, :2] ** 2).sum(axis=1)
+    blocks["ate"] = block_sums(time - time[0], squares).tolist()
+    positions = errors.estimate.position_W[:, :2], errors.truth.position_W[:, :2]
+    return row, Shown(time, *positions)

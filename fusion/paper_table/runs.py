@@ -1,0 +1,282 @@
+"""Runs of the table: a network trained and tested on a data set with a seed, kept as files.
+
+`<out>/<set>/<network>/<n>-steps/seed-<n>/` holds the model and `trained.json` once training is
+done, then `errors.json` and `tracks.npz`. Repeating a run adds only what is missing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import asdict, dataclass
+from functools import cache, partial
+from itertools import product
+from pathlib import Path
+from time import process_time
+
+import numpy as np
+
+from stario.fusion.evaluation.pedestrian import NAME as PDR
+from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
+from stario.fusion.paper_table.errors import Model, Shown, test_errors
+from stario.fusion.paper_table.sets import ALL, FIRST, DataSet
+from stario.fusion.paper_table.training import (
+    TEMPORARY_FILES,
+    ReaderConfig,
+    recipe_digest,
+    recording_state,
+    run_recipe,
+    train_run,
+)
+from stario.network.architectures import ARCHITECTURES, architecture
+from stario.network.model import load_model
+from stario.network.training.config import TrainingConfig
+from stario.sequences.arrays import check_choice
+from stario.sequences.datasets.batch import Skipped, each
+from stario.sequences.errors import ConfigError, InputError, ReadError
+from stario.sequences.files import write_json, write_npz
+from stario.sequences.lazy import optional_package
+
+LEADING = ("StarIO", "R-ResNet", "DeepILS", "StarIO without MSGCU")
+"""Networks that are completed first, and with several seeds."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """Definition of a run, as plain values that can be sent to any machine.
+
+    Attributes:
+        dataset: data set, with the recordings of each part.
+        network: architecture to train, or `pdr`, or weights as `load_model` accepts them.
+        seed: seed of the training.
+        recipe: training recipe; None where nothing is trained.
+    """
+
+    dataset: DataSet
+    network: str
+    seed: int
+    recipe: TrainingConfig | None
+
+    def __str__(self) -> str:
+        return f"{self.dataset.name}, {self.network}, seed {self.seed}"
+
+    def folder(self, out: Path) -> Path:
+        """Return its folder below `out`; each number of training steps has a folder of its own."""
+        above = out / self.dataset.name / self.network.replace("/", "_")
+        if self.recipe is None:
+            return above
+        return above / f"{self.recipe.steps}-steps" / f"seed-{self.seed}"
+
+    @property
+    def digest(self) -> str:
+        """Digest of everything that its results depend on except the code."""
+        test = [recording_state(entry.path) for entry in self.dataset.test]
+        if self.recipe is None:
+            learned = "" if self.network == PDR else _weights_sha256(self.network)
+        else:
+            learned = recipe_digest(self.recipe, self.dataset)
+        return hashlib.sha256(json.dumps([self.network, learned, test]).encode()).hexdigest()
+
+
+@cache
+def _weights_sha256(name: str) -> str:
+    return load_model(name).card.sha256
+
+
+def reference_rows(dataset: DataSet) -> tuple[str, ...]:
+    """Return the references that are compared with the networks trained on a set.
+
+    The default weights were trained on the groups that `ALL` holds out; the first-stage weights,
+    of the same architecture, were not.
+    """
+    return (PDR, "first-stage") if dataset.name == ALL else (PDR, "default")
+
+
+def complete_run(run: Run, out: Path, reading: ReaderConfig) -> Run:
+    """Train and evaluate a run, except for what is already done.
+
+    Raises:
+        ConfigError: existing results were made with another recipe, other weights or other
+            recordings.
+        InputError: the network cannot be trained.
+    """
+    folder = run.folder(out)
+    if _read_if_done(run, folder / "errors.json") is None:
+        folder.mkdir(parents=True, exist_ok=True)
+        recipe = run.recipe
+        if recipe is not None and _read_if_done(run, folder / "trained.json") is None:
+            _train(run, recipe, folder, reading)
+        _evaluate(run, folder, reading)
+    return run
+
+
+def read_run(run: Run, out: Path) -> dict[str, object] | None:
+    """Return the content of a run's `errors.json` and `trained.json`; None if it is not completed.
+
+    Raises:
+        ConfigError: it was completed with another recipe, other weights or other recordings.
+    """
+    folder = run.folder(out)
+    content = _read_if_done(run, folder / "errors.json")
+    if content is None or run.recipe is None:
+        return content
+    return content | {"trained": _read(folder / "trained.json")}
+
+
+def read_tracks(run: Run, out: Path) -> dict[str, Shown]:
+    """Return the tracks of some recordings, by recording name."""
+    path = run.folder(out) / "tracks.npz"
+    if not path.exists():
+        return {}
+    with np.load(path, allow_pickle=False) as arrays:
+        names = list(dict.fromkeys(key.rsplit("|", 1)[0] for key in arrays.files))
+        return {name: Shown(*(arrays[f"{name}|{part}"] for part in _PARTS)) for name in names}
+
+
+_PARTS = ("time", "position_W", "truth_W")
+
+
+def _train(run: Run, recipe: TrainingConfig, folder: Path, reading: ReaderConfig) -> None:
+    content = train_run(run.dataset, recipe, folder, reading)
+    write_json(folder / "trained.json", {"cell": run.digest, **content})
+    for spare in TEMPORARY_FILES:
+        (folder / spare).unlink(missing_ok=True)
+
+
+def _evaluate(run: Run, folder: Path, reading: ReaderConfig) -> None:
+    began = process_time()
+    model = _model(run, folder)
+    found, shown, skipped = test_errors(model, run.dataset.test, reading)
+    arrays = {f"{name}|{part}": getattr(t, part) for name, t in shown.items() for part in _PARTS}
+    if arrays:
+        write_npz(folder / "tracks.npz", **arrays)
+    content = {
+        "cell": run.digest,
+        "network": run.network,
+        "seed": run.seed,
+        "seconds": process_time() - began,
+        "recordings": found,
+        "skipped": [asdict(failure) for failure in skipped],
+    }
+    write_json(folder / "errors.json", content)
+
+
+def _model(run: Run, folder: Path) -> Model:
+    if run.network == PDR:
+        return PedestrianDeadReckoning()
+    if run.network in ARCHITECTURES:
+        return load_model(folder / "model.safetensors")
+    return load_model(run.network)
+
+
+def _read_if_done(run: Run, path: Path) -> dict[str, object] | None:
+    content = _read(path) if path.exists() else None
+    if content is not None and content.get("cell") != run.digest:
+        raise ConfigError(
+            str(path),
+            "made with another recipe, other weights, or recordings that differ or changed since",
+            "those of this table",
+            "use what it was made with, remove it to make it anew, or use another folder (--out)",
+        )
+    return content
+
+
+def _read(path: Path) -> dict[str, object]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ReadError(path, "file", str(error), "a complete JSON file") from error
+    assert isinstance(content, dict)  # written only by this module
+    return content
+
+
+def table_runs(
+    sets: Sequence[DataSet],
+    recipe: dict[str, object],
+    steps: int | None = None,
+    networks: Sequence[str] | None = None,
+    seeds: int = 3,
+) -> list[Run]:
+    """Return the runs: the sets of `FIRST` with one seed, their other seeds, the other sets.
+
+    Args:
+        sets: data sets.
+        recipe: training settings common to all runs.
+        steps: steps of every training; None for the recipe's.
+        networks: networks to train; None for all of the paper's table.
+        seeds: number of seeds for the networks of `LEADING`; the others have one.
+
+    Raises:
+        InputError: a network is unknown.
+        ConfigError: a setting of the recipe is unknown or out of range.
+    """
+    names = list(networks or [*LEADING, *(n for n in ARCHITECTURES if n not in LEADING)])
+    for name in names:
+        architecture(name)
+
+    first = [dataset for dataset in sets if dataset.name in FIRST]
+    others = [dataset for dataset in sets if dataset.name not in FIRST]
+    leading = [name for name in names if name in LEADING]
+    runs = []
+    for part in (first, others):
+        for seed, dataset in product(range(seeds), part):
+            if seed == 0:
+                runs += [Run(dataset, name, 0, None) for name in reference_rows(dataset)]
+            for name in leading if seed else names:
+                runs.append(Run(dataset, name, seed, run_recipe(recipe, name, seed, steps)))
+    return runs
+
+
+def complete(
+    runs: Sequence[Run], out: Path, reading: ReaderConfig, jobs: int | None = 1
+) -> Iterator[Run | Skipped]:
+    """Do what is missing; yield each run once it is completed, or the reason why it is not.
+
+    Runs are started in their order; `out` must be writable by every process that takes part.
+    `jobs` is as for `stario.sequences.datasets.batch.each`.
+    """
+    yield from each(partial(complete_run, out=out, reading=reading), runs, jobs)
+
+
+def backend(name: str) -> AbstractContextManager[object]:
+    """Select joblib's backend within a block: "loky" (processes on this machine), "dask" or "ray".
+
+    Dask uses the scheduler named in its configuration (`DASK_SCHEDULER_ADDRESS`), Ray the cluster
+    at `RAY_ADDRESS`; without these, both start on this machine.
+
+    Raises:
+        InputError: the name is unknown, or the backend's package is not installed.
+    """
+    backends: dict[str, Callable[[], AbstractContextManager[object]]] = {
+        "loky": nullcontext,
+        "dask": _dask,
+        "ray": _ray,
+    }
+    check_choice("--backend", name, backends)
+    return backends[name]()
+
+
+@contextmanager
+def _dask() -> Iterator[None]:
+    from joblib import parallel_config
+
+    distributed = optional_package("distributed", "cluster")
+    logging.getLogger("distributed").setLevel(logging.WARNING)
+    with distributed.Client(), parallel_config("dask"):
+        yield
+
+
+@contextmanager
+def _ray() -> Iterator[None]:
+    from joblib import parallel_config
+
+    try:
+        importlib.import_module("ray.util.joblib").register_ray()
+    except ImportError as error:
+        raise InputError("--backend", "ray, not installed", "ray", "pip install ray") from error
+    with parallel_config("ray"):
+        yield

@@ -1,0 +1,199 @@
+"""Training of a run: one recipe and number of steps for all networks, resumable."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache, partial
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+from stario.fusion.paper_table.sets import DataSet
+from stario.network.training.config import TrainingConfig, training_config
+from stario.network.training.data import (
+    RecordingStreams,
+    cached_walks,
+    mix_sources,
+    recording_streams,
+)
+from stario.network.training.history import EpochReport, History
+from stario.network.training.train import train
+from stario.sequences.datasets.batch import Skipped
+from stario.sequences.datasets.cache_files import recording_stamps
+from stario.sequences.datasets.stream_cache import recorded
+from stario.sequences.files import write_json
+from stario.sequences.sequence import ImuSequence
+from stario.sequences.windows import WINDOW_SAMPLES, Attitude, WorldStream
+
+_EPOCH_STEPS = 250
+"""Maximum steps between two checkpoints: what an interrupted run loses."""
+
+_VALIDATION_SAMPLES = 60 * WINDOW_SAMPLES
+"""Maximum samples of each validation stretch: all are evaluated after every epoch."""
+
+TEMPORARY_FILES = ("checkpoint.safetensors", "clock.json")
+"""Files of a training run that are not needed once its result is recorded."""
+
+_WALKS, _VALIDATION_WALKS = 40, 8
+"""Simulated walks for training and validation windows where no recording has poses: the same for
+every run, so that only the networks differ."""
+
+
+@dataclass(frozen=True)
+class ReaderConfig:
+    """How recordings are read, on any machine that works on a run; told apart by the cache alone.
+
+    Attributes:
+        read: function that reads the recording at a path; must be picklable.
+        options: what `read` depends on besides the path, as plain values.
+        cache: folder that caches windows for later runs.
+    """
+
+    read: Callable[[Path], ImuSequence] = field(compare=False)
+    options: dict[str, object] = field(compare=False)
+    cache: Path
+
+
+def run_recipe(
+    values: dict[str, object], network: str, seed: int, steps: int | None
+) -> TrainingConfig:
+    """Return the recipe of a run: the common one with a network, a seed and a number of steps.
+
+    Args:
+        values: common settings, such as from a parsed JSON file.
+        network: name of the architecture.
+        seed: seed of initial weights and draws.
+        steps: approximate number, in epochs of equal length; None for the common recipe's.
+
+    Raises:
+        ConfigError: a setting is unknown or out of range.
+    """
+    recipe = training_config({**values, "architecture": network, "seed": seed})
+    steps = recipe.steps if steps is None else steps
+    epochs = max(1, math.ceil(steps / _EPOCH_STEPS))
+    per_epoch = max(1, round(steps / epochs))
+    lengths = {"epochs": epochs, "epoch_windows": per_epoch * recipe.batch, "patience": epochs}
+    return training_config({**values, "architecture": network, "seed": seed, **lengths})
+
+
+def train_run(
+    dataset: DataSet, recipe: TrainingConfig, folder: Path, reading: ReaderConfig
+) -> dict[str, object]:
+    """Train a run's network, resuming from its checkpoint; write the model and `TEMPORARY_FILES`.
+
+    Returns:
+        Plain values: training error of the last epoch and validation error of the best one, whose
+        weights are kept [m^2], number of steps, windows per step, total and
+        mean computing time per step [s], the recipe, and the skipped recordings.
+
+    Raises:
+        InputError, ConfigError: as for `stario.network.training.train.train`.
+    """
+    streams, skipped = _streams(dataset.training, recipe.attitude, reading)
+    held_out, missing = _streams(dataset.validation, recipe.attitude, reading)
+    simulated = partial(cached_walks, folder=reading.cache, attitude=recipe.attitude)
+    poses = any(isinstance(s, WorldStream) for recording in streams for s in recording.streams)
+    walks = [] if poses else simulated(_WALKS, 0)
+    material = mix_sources(streams, walks, recipe.shares, recipe.reach)
+    validation_data = mix_sources(held_out, [])
+    clock = _Clock(folder / TEMPORARY_FILES[1])
+    train(
+        recipe,
+        material.streams,
+        material.weights,
+        [s.part(0, _VALIDATION_SAMPLES) for s in validation_data.streams]
+        or simulated(_VALIDATION_WALKS, 1),
+        folder,
+        on_step=lambda step, error: clock.step(),
+        on_epoch=lambda report: clock.keep(),
+        trained_on=material.words,
+        legs=material.legs,
+        validation_legs=validation_data.legs,
+        chosen_by_legs=not validation_data.streams,
+    )
+    clock.keep()
+    reports = _reports(folder / "log.json")
+    return {
+        "steps": recipe.steps,
+        "windows": recipe.batch + _leg_windows(recipe, material.legs),
+        "seconds": clock.seconds,
+        "step_seconds": clock.step_seconds,
+        "training_error_m2": reports[-1].training_error,
+        "validation_error_m2": History(recipe, reports).best().validation_error,
+        "recipe": asdict(recipe),
+        "skipped": [asdict(failure) for failure in skipped + missing],
+    }
+
+
+def _reports(log: Path) -> list[EpochReport]:
+    """Return the reports of a run's epochs; in JSON, errors that are not finite are null."""
+    rows: list[dict[str, Any]] = json.loads(log.read_text(encoding="utf-8"))
+    for row in rows:
+        row.update({name: math.nan for name, value in row.items() if value is None})
+    return [EpochReport(**row) for row in rows]
+
+
+def recipe_digest(recipe: TrainingConfig, dataset: DataSet) -> str:
+    """Return the digest of everything that a run's training depends on except the code."""
+    inputs = [
+        asdict(recipe),
+        [[*map(recording_state, part)] for part in (dataset.training, dataset.validation)],
+    ]
+    return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
+
+
+def recording_state(path: Path) -> list[object]:
+    """Return a recording's path and the stamps of its files, which tell that it has changed."""
+    return [str(path), *recording_stamps(path)]
+
+
+@lru_cache(maxsize=2)  # training and validation part of the set that runs are completed for
+def _streams(
+    files: tuple[Path, ...], attitude: Attitude, reading: ReaderConfig
+) -> tuple[list[RecordingStreams], list[Skipped]]:
+    """Return the streams of each recording; later runs of the same set reuse them."""
+    outcomes = recorded(files, reading.read, reading.options, reading.cache, 1, attitude)
+    return recording_streams(zip(files, outcomes, strict=True))
+
+
+def _leg_windows(recipe: TrainingConfig, legs: Sequence[object]) -> int:
+    kinds = {getattr(stream, "kind", "") for stream in legs}
+    waypoints = recipe.waypoint_stretches * recipe.waypoint_seconds if "waypoints" in kinds else 0
+    tracks = recipe.track_stretches * recipe.track_seconds if "positions" in kinds else 0
+    return waypoints + tracks
+
+
+class _Clock:
+    """Computing time of a training run [s], over all processes that continued it in turn."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else 0.0
+        self._before, self._began = float(before), process_time()
+        self._last: float | None = None
+        self._steps: list[float] = []
+
+    @property
+    def seconds(self) -> float:
+        return self._before + process_time() - self._began
+
+    @property
+    def step_seconds(self) -> float:
+        """Mean over the steps that were timed from start to end; NaN if there are none."""
+        return sum(self._steps) / len(self._steps) if self._steps else float("nan")
+
+    def step(self) -> None:
+        """Record that a step is done."""
+        if self._last is not None:
+            self._steps.append(process_time() - self._last)
+        self._last = process_time()
+
+    def keep(self) -> None:
+        """Write the time so far; that until the next call of `step` counts for no step."""
+        write_json(self._path, self.seconds)
+        self._last = None

@@ -1,1 +1,0 @@
-"""The paper's table: every network on every data set, cell by cell."""

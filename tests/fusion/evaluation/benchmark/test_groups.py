@@ -1,0 +1,155 @@
+"""Benchmark of networks alone by groups, with a stub that predicts a known share of the truth."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from judged import Stub, horizontal_path, with_waypoints
+
+from stario.fusion.evaluation.benchmark.aligned import aligned_recording
+from stario.fusion.evaluation.benchmark.groups import (
+    POOLED,
+    Benchmark,
+    benchmark,
+    labels,
+    verdict,
+)
+from stario.fusion.evaluation.figures import groups_figure, write_benchmark
+from stario.fusion.evaluation.scores import values
+from stario.fusion.evaluation.text import benchmark_text
+from stario.sequences.datasets.batch import Skipped
+from stario.sequences.sequence import ImuSequence
+
+
+def judged(*arguments: Any) -> Benchmark:
+    found, _ = benchmark(*arguments)
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def pair(walk: ImuSequence) -> Benchmark:
+    aligned = [
+        replace(aligned_recording(recording, Path(name)), attributes={"person": person})
+        for name, person, recording in (("one", "a", walk), ("two", "b", with_waypoints(walk)))
+    ]
+    groups = {Path("one"): "walks a", Path("two"): "walks b"}
+    scales = {"walks a": 0.95, "walks b": 0.9}
+    models = {
+        "ours": lambda group: Stub(walk, scales[group]),
+        "theirs": lambda group: Stub(walk, 0.8),
+    }
+    found, skipped = benchmark([*aligned, Skipped("three", "why")], models, groups)
+    assert [one.item for one in skipped] == ["three"]
+    assert found is not None
+    return found
+
+
+def test_a_recording_with_two_waypoints_is_named_as_not_compared(
+    walk: ImuSequence, caplog: pytest.LogCaptureFixture
+) -> None:
+    aligned = [
+        aligned_recording(with_waypoints(walk, every), Path(f"{every:g}")) for every in (50.0, 8.0)
+    ]
+    found = judged(aligned, {"ours": lambda group: Stub(walk)}, {})
+    assert [record.getMessage()[:17] for record in caplog.records] == ["50: not compared,"]
+    assert (values(found.scores, "path_m") > 0.0).tolist() == [False, True]
+    caplog.clear()
+    third = replace(aligned[0], path=Path("third"))
+    judged([aligned[0], third, aligned[1]], {"ours": lambda group: Stub(walk)}, {})
+    [record] = caplog.records
+    assert record.getMessage().startswith("2 of 3 recordings, the first 50: not compared,")
+
+
+def test_a_device_at_rest_counts_in_no_median_or_ratio(
+    walk: ImuSequence, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its errors relative to its path, the noise of its truth, would be a thousand percent."""
+    still = 1e-4 * np.random.default_rng(0).normal(size=walk.truth.position_W.shape)
+    resting = replace(walk, name="rest", truth=replace(walk.truth, position_W=still))
+    aligned = [aligned_recording(each, Path(each.name)) for each in (walk, resting)]
+    models = {"ours": lambda group: Stub(walk), "theirs": lambda group: Stub(walk, 0.8)}
+    found, walking = judged(aligned, models, {}), judged(aligned[:1], models, {})
+    assert "rest: not compared, because the ground truth moves by less" in caplog.text
+    both, alone = (part.rows("set", "ours", "theirs")[-1] for part in (found, walking))
+    assert str(both.medians) == str(alone.medians)  # some are NaN
+    assert both.ratios == alone.ratios
+    assert both.recordings == 1
+
+
+def test_rows_compare_weights_by_group_and_pooled(walk: ImuSequence, pair: Benchmark) -> None:
+    rows = {row.name: row for row in pair.rows("person", "ours", "theirs")}
+    assert list(rows) == ["a", "b", "all"]
+    assert rows["a"].ratios["rms_1s_m"].ratio == pytest.approx(0.25, rel=0.01)
+    assert rows["b"].ratios["rms_10s_m"].ratio == pytest.approx(0.5, abs=0.05)
+    assert list(rows["b"].ratios) == ["rms_10s_m"]
+    assert rows["all"].ratios["rms_10s_m"].ratio == pytest.approx(np.sqrt(0.25 * 0.5), abs=0.04)
+    assert rows["a"].path_km == pytest.approx(1e-3 * horizontal_path(walk), rel=0.05)
+    assert rows["a"].medians["theirs"]["length_ratio"] == pytest.approx(0.8, abs=0.02)
+
+
+def test_without_a_list_intervals_are_drawn_over_the_persons_of_an_archive(
+    walk: ImuSequence,
+) -> None:
+    """Over recordings alone, those of one person would pass for those of many."""
+    scales = {"r.h5:1": ("a", 0.95), "r.h5:2": ("b", 0.9), "r.h5:3": ("b", 0.9)}
+    aligned = [
+        replace(aligned_recording(walk, Path(name)), attributes={"person": person})
+        for name, (person, _) in scales.items()
+    ]
+    by_group = {f"r {person}": scale for person, scale in scales.values()}
+    models = {
+        "ours": lambda group: Stub(walk, by_group[group]),
+        "theirs": lambda group: Stub(walk, 0.8),
+    }
+    ratio = (
+        judged(aligned, models, {}).rows("person", "ours", "theirs")[-1].ratios["rms_1s_m"].ratio
+    )
+    assert ratio == pytest.approx(np.sqrt(0.25 * 0.5), rel=0.01)  # persons have equal weights
+
+
+def test_a_file_named_without_its_folder_belongs_to_the_set_of_that_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert labels(Path("walk.csv"), {})["set"] == tmp_path.name
+
+
+def test_a_recording_without_errors_has_no_ratio(pair: Benchmark) -> None:
+    """Of a device at rest, for example."""
+    perfect = replace(pair, blocks=pair.blocks.assign(squares=0.0))
+    assert [row.ratios for row in perfect.rows("set", "ours", "theirs")][-1] == {}
+
+
+def test_a_benchmark_is_written_as_tables_and_figure(pair: Benchmark, tmp_path: Path) -> None:
+    rows = pair.rows("set", "ours", "theirs")
+    assert "ratio over 10 s" in benchmark_text(rows, "ours", "theirs")
+    write_benchmark(tmp_path, pair, rows, "ours", "theirs")
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"groups.csv", "recordings.csv", "groups.json", "groups.png"}
+    with (tmp_path / "groups.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert [line["weights"] for line in lines] == ["ours", "theirs"]
+    assert float(lines[0]["rms_10s_m_low"]) <= float(lines[0]["rms_10s_m_ratio"])
+    content = json.loads((tmp_path / "groups.json").read_text())
+    assert content["recordings"][1]["truth"] == "waypoints"
+    assert (tmp_path / "groups.png").stat().st_size > 10_000
+
+
+def test_a_group_may_be_called_all(pair: Benchmark) -> None:
+    named = pair.scores.assign(person=pair.scores["person"].replace("b", POOLED))
+    found = replace(pair, scores=named)
+    rows = found.rows("person", "ours", "theirs")
+    assert [(row.name, row.pooled) for row in rows] == [("a", False), ("all", False), ("all", True)]
+    assert verdict(rows).startswith("not decided, 2 groups")
+    assert len(groups_figure(rows, "ours", "theirs").axes[0].get_yticks()) == 3
+    alone = replace(found, scores=named[named["person"] == POOLED])
+    rows = alone.rows("person", "ours", "theirs")
+    assert verdict(rows) == ""
+    assert len(groups_figure(rows, "ours", "theirs").axes[0].get_yticks()) == 1

@@ -1,0 +1,179 @@
+"""Errors of a network alone on one recording, against a known share of the truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from judged import Stub, aligned_once, errors_of, horizontal_path, with_waypoints
+from recorded import DATA
+from scipy.spatial.transform import Rotation
+
+from stario.fusion.evaluation.benchmark.aligned import aligned_recording
+from stario.fusion.evaluation.benchmark.displacement_error import (
+    _AtTicks,
+    _stretches,
+    _Sums,
+    recording_errors,
+)
+from stario.fusion.evaluation.benchmark.network_alone import Predictions, predictions
+from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
+from stario.sequences.attitude.rotations import about_z
+from stario.sequences.readers import read_recording
+from stario.sequences.sequence import ImuSequence, PositionTrack
+
+ARCHIVES = DATA / "archives"
+
+
+def with_positions(walk: ImuSequence, jump: float = 0.0) -> ImuSequence:
+    truth = walk.truth
+    assert truth is not None
+    position_W = truth.position_W + np.where(truth.time > 40.0, jump, 0.0)[:, None]
+    return replace(walk, truth=None, positions=PositionTrack(truth.time, position_W, "positions"))
+
+
+def test_with_poses_displacements_of_nine_tenths_give_that_length_ratio(walk: ImuSequence) -> None:
+    stub = Stub(walk)
+    size = float(np.sqrt(np.mean(np.sum(stub.displacement_H**2, axis=1))))
+    found = errors_of(walk, Stub(walk, 0.9))
+    assert found.figures["length_ratio"] == pytest.approx(0.9, abs=0.02)
+    assert found.figures["rms_1s_m"] == pytest.approx(0.1 * size, rel=0.02)
+    assert found.figures["nis"] == pytest.approx(1.5 * (0.1 * size) ** 2 / 0.01, rel=0.05)
+    assert found.figures["rms_10s_m"] > 4.0 * found.figures["rms_1s_m"]
+    assert found.path_m == pytest.approx(horizontal_path(walk), rel=0.05)
+    assert len(found.blocks["1"]) == 3  # of 30 s each, the last one shorter
+    total, count = found.blocks["1"].sum(axis=0)
+    assert np.sqrt(total / count) == pytest.approx(found.figures["rms_1s_m"])
+
+
+def test_the_yaw_from_the_levelled_frame_to_the_world_is_the_truths(walk: ImuSequence) -> None:
+    [piece] = aligned_once(walk).pieces
+    known = np.isfinite(piece.yaw_WN)
+    attitude_WB = about_z(piece.yaw_WN[known]) * Rotation.from_matrix(piece.stream.R_NB[known])
+    assert walk.truth is not None
+    true_WB = walk.truth.at(piece.stream.ticks[known]).attitude_WB
+    assert (attitude_WB * true_WB.inv()).magnitude().max() < 0.1  # what levelling is off by
+
+
+def test_with_poses_a_rotation_raises_displacement_errors_but_not_the_fitted_ate(
+    walk: ImuSequence,
+) -> None:
+    exact = errors_of(walk, Stub(walk)).figures
+    assert exact["rms_1s_m"] < 1e-9
+    assert exact["rms_30s_m"] < 0.1  # windows overlap: a track through them is smoother
+    assert exact["ate_fit_m"] < 0.1
+    assert exact["ate_first_m"] < 0.2
+    turned = errors_of(walk, Stub(walk, yaw=0.5)).figures
+    assert turned["ate_fit_m"] == pytest.approx(exact["ate_fit_m"], rel=0.01)
+    assert turned["ate_first_m"] > 10.0 * turned["ate_fit_m"]
+    assert turned["rms_1s_m"] > 0.3
+
+
+def test_with_positions_yaw_is_fitted_and_nothing_is_compared_across_a_jump(
+    walk: ImuSequence,
+) -> None:
+    smooth = errors_of(with_positions(walk), Stub(walk, 0.9, yaw=2.0))
+    jumped = errors_of(with_positions(walk, jump=9.0), Stub(walk, 0.9, yaw=2.0))
+    for found in (smooth, jumped):
+        assert found.figures["length_ratio"] == pytest.approx(0.9, abs=0.02)
+        assert found.figures["stretch_percent"] < 5.0
+        assert np.isnan(found.figures["ate_fit_m"])
+    assert jumped.figures["rms_10s_m"] == pytest.approx(smooth.figures["rms_10s_m"], rel=0.3)
+    assert jumped.blocks["10"][:, 1].sum() < smooth.blocks["10"][:, 1].sum()
+
+
+def test_positions_at_1_hz_give_the_same_errors(walk: ImuSequence) -> None:
+    assert walk.truth is not None
+    time = np.arange(1.0, 74.0)
+    track = PositionTrack(time, walk.truth.at(time).position_W, "positions")
+    slow = replace(walk, truth=None, positions=track)
+    found = errors_of(slow, Stub(walk, 0.9, yaw=2.0))
+    assert found.figures["length_ratio"] == pytest.approx(0.9, abs=0.02)
+    frequent = errors_of(with_positions(walk), Stub(walk, 0.9, yaw=2.0))
+    assert found.figures["rms_10s_m"] == pytest.approx(frequent.figures["rms_10s_m"], rel=0.05)
+
+
+def test_with_waypoints_yaw_and_position_are_fitted_first(walk: ImuSequence) -> None:
+    exact = errors_of(with_waypoints(walk), Stub(walk, yaw=-1.0))
+    short = errors_of(with_waypoints(walk), Stub(walk, 0.9))
+    assert exact.figures["ate_fit_m"] < 0.1
+    assert exact.figures["length_ratio"] == pytest.approx(1.0, abs=0.02)
+    assert short.figures["length_ratio"] == pytest.approx(0.9, abs=0.02)
+    # A track scaled about its centre has an error of a tenth of the waypoints' spread.
+    time = np.arange(1.0, 70.0, 8.0)
+    assert walk.truth is not None
+    xy = walk.truth.at(time).position_W[:, :2]
+    spread = float(np.sqrt(np.mean(np.sum((xy - xy.mean(axis=0)) ** 2, axis=1))))
+    assert short.figures["ate_fit_m"] == pytest.approx(0.1 * spread, rel=0.15)
+    total, count = short.blocks["10"].sum(axis=0)
+    assert np.sqrt(total / count) == pytest.approx(short.figures["ate_fit_m"])
+
+
+def test_positions_are_unknown_in_their_gaps_and_beyond_their_ends(walk: ImuSequence) -> None:
+    whole = with_positions(walk).positions
+    assert whole is not None
+    time = whole.time
+    valid = ((time > 5.0) & (time < 20.0)) | ((time > 30.0) & (time < 70.0))
+    with_gap = replace(walk, truth=None, positions=replace(whole, valid=valid))
+    [piece] = aligned_recording(with_gap, Path("walk")).pieces
+    ticks, known = piece.stream.ticks, np.isfinite(piece.position_W)
+    inside = ((ticks > 5.1) & (ticks < 19.9)) | ((ticks > 30.1) & (ticks < 69.9))
+    outside = (ticks < 4.9) | ((ticks > 20.1) & (ticks < 29.9)) | (ticks > 70.1)
+    assert known[inside].all()
+    assert not known[outside].any()
+    assert len(set(piece.breaks[(ticks > 5.1) & (ticks < 69.9)])) == 2  # before and after the gap
+
+
+def test_equal_displacements_give_a_straight_track_at_constant_speed() -> None:
+    displacement = np.tile([1.2, -0.4, 0.0], (9, 1))
+    track = Predictions(displacement, np.tile(np.eye(3), (9, 1, 1))).track()
+    np.testing.assert_allclose(track, (0.6 - 0.2j) * np.arange(11))
+
+
+@pytest.mark.skipif(not ARCHIVES.exists(), reason=f"no recordings at {ARCHIVES}")
+@pytest.mark.parametrize(
+    ("name", "kind", "path_m", "error"),
+    [
+        ("kipd.h5:yk_01", "poses", 127.4, "ate_fit_percent"),
+        ("rocip.h5:r4", "positions", 290.3, "stretch_percent"),
+        ("ilc.h5:site2_F1_5dd35c7527889b0006b76852", "waypoints", 65.2, "ate_fit_percent"),
+    ],
+)
+def test_pedestrian_dead_reckoning_is_near_the_truth_on_real_recordings(
+    name: str, kind: str, path_m: float, error: str
+) -> None:
+    path = Path(f"{ARCHIVES}/{name}")
+    aligned = aligned_recording(read_recording(path), path)
+    found = recording_errors(aligned, predictions(PedestrianDeadReckoning(), aligned))
+    assert aligned.kind == kind
+    assert found.path_m == pytest.approx(path_m, rel=0.05)
+    assert found.figures["length_ratio"] == pytest.approx(1.0, abs=0.3)
+    assert found.figures[error] < 15.0
+
+
+def test_pedestrian_dead_reckoning_is_judged_like_a_network(walk: ImuSequence) -> None:
+    [predicted] = PedestrianDeadReckoning().predictions(aligned_once(walk))
+    np.testing.assert_allclose(predicted.covariance_N[0], 0.3**2 * np.eye(3))  # its usual error
+    found = errors_of(walk, PedestrianDeadReckoning())
+    assert 0.5 < found.figures["length_ratio"] < 1.6
+
+
+def test_the_share_of_the_path_is_that_of_the_pieces_between_gaps(walk: ImuSequence) -> None:
+    """Pieces are fitted one by one: a share of the whole path would shrink with every gap."""
+    kept = np.abs(walk.time - walk.time.mean()) > 0.5
+    samples = {name: getattr(walk, name)[kept] for name in ("time", "gyro", "accel")}
+    found = errors_of(replace(walk, **samples), PedestrianDeadReckoning())
+    share = 100.0 * found.figures["ate_fit_m"] / (0.5 * found.path_m)
+    assert found.figures["ate_fit_percent"] == pytest.approx(share, rel=0.1)
+
+
+def test_stretches_at_rest_have_no_error_relative_to_their_path() -> None:
+    rng, sums = np.random.default_rng(0), _Sums()
+    track, truth = (0.01 * (rng.normal(size=100) + 1j * rng.normal(size=100)) for _ in range(2))
+    breaks = np.zeros(100, dtype=np.int64)
+    _stretches(_AtTicks(track, truth, breaks), sums)
+    assert sums.squares == {}
+    _stretches(_AtTicks(track, truth + np.arange(100.0), breaks), sums)
+    assert len(sums.squares["stretch"]) == 3

@@ -1,0 +1,273 @@
+"""Runs of the table: completed once, resumed after a kill; only new ones are completed later."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import pickle
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from training_runs import narrow
+from typer.testing import CliRunner
+
+from stario.fusion.commands.cli import app
+from stario.fusion.paper_table import runs as runs_module
+from stario.fusion.paper_table import training
+from stario.fusion.paper_table.runs import LEADING, Run, backend, complete, complete_run, table_runs
+from stario.fusion.paper_table.sets import DataSet, folder_set
+from stario.fusion.paper_table.summary import completed_runs, set_table
+from stario.fusion.paper_table.training import ReaderConfig, run_recipe
+from stario.network.architectures import ARCHITECTURES
+from stario.sequences.datasets.batch import Skipped
+from stario.sequences.errors import ConfigError, InputError, WeightsError
+from stario.sequences.readers import read_recording
+from stario.sequences.readers.csv_writer import write_csv
+from stario.sequences.sequence import ImuSequence, PositionTrack
+
+RECIPE: dict[str, object] = {"batch": 6, "device": "cpu", "attitude": "true"}
+
+
+@pytest.fixture(scope="module")
+def dataset(make_walk: Any, tmp_path_factory: pytest.TempPathFactory) -> DataSet:
+    folder = tmp_path_factory.mktemp("walks")
+    for seed in range(4):
+        write_csv(folder / f"walk{seed}.csv", make_walk(seed=seed, seconds=8.0))
+    return folder_set("own", folder, seed=0)
+
+
+@pytest.fixture(scope="module")
+def reading(tmp_path_factory: pytest.TempPathFactory) -> ReaderConfig:
+    return ReaderConfig(read_recording, {}, tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture
+def narrow_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Train a small StarIO, by default the network of the runs here."""
+    narrow(monkeypatch)
+
+
+def run(dataset: DataSet, network: str = "StarIO", seed: int = 0, steps: int = 4) -> Run:
+    return Run(dataset, network, seed, run_recipe(RECIPE, network, seed, steps))
+
+
+@pytest.mark.usefixtures("narrow_network")
+def test_a_filled_cell_writes_model_errors_and_tracks(
+    dataset: DataSet, reading: ReaderConfig, tmp_path: Path
+) -> None:
+    done = run(dataset, steps=2)
+    complete_run(done, tmp_path, reading)
+    folder = tmp_path / "own/StarIO/2-steps/seed-0"
+    names = {"errors.json", "log.json", "model.json", "model.safetensors", "tracks.npz"}
+    assert {path.name for path in folder.glob("[!.]*")} == {*names, "trained.json"}
+    trained = json.loads((folder / "trained.json").read_text())
+    assert (trained["steps"], trained["windows"]) == (2, 6)
+    assert 0.0 < trained["step_seconds"] < trained["seconds"]
+    assert trained["seconds"] > 0.0
+    [one] = json.loads((folder / "errors.json").read_text())["recordings"]
+    assert set(one["tracks"]) == {"network_true_attitude", "network", "ekf"}
+    total, count = map(sum, zip(*one["blocks"]["ate"], strict=True))
+    assert one["tracks"]["network_true_attitude"]["ate_m"] == pytest.approx(
+        (total / count / 2) ** 0.5
+    )
+
+
+def test_without_recorded_poses_the_legs_alone_select_the_weights(
+    dataset: DataSet, make_walk: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen: list[bool] = []
+
+    def trained(*arguments: Any, chosen_by_legs: bool = False, **rest: Any) -> None:
+        chosen.append(chosen_by_legs)
+        raise InputError("stop", "enough", "no training")
+
+    def waypoints(path: Path) -> ImuSequence:
+        walk = read_recording(path)
+        assert walk.truth is not None
+        time = walk.truth.time[0] + np.arange(0.5, 16.0, 3.0)
+        track = PositionTrack(time, walk.truth.at(time).position_W[:, :2], "waypoints")
+        return replace(walk, truth=None, positions=track)
+
+    long = [tmp_path / f"walk{seed}.csv" for seed in range(3)]
+    for seed, path in enumerate(long):
+        write_csv(path, make_walk(seed=seed, seconds=16.0))
+    monkeypatch.setattr(training, "train", trained)
+    monkeypatch.setattr(training, "cached_walks", lambda *arguments, **rest: [])
+    recipe = run_recipe(RECIPE, "StarIO", 0, 1)
+    for files, read in ((long, waypoints), (long, read_recording)):
+        alone = replace(dataset, training=tuple(files[:1]), validation=tuple(files[1:]))
+        with pytest.raises(InputError, match="stop"):
+            training.train_run(
+                alone, recipe, tmp_path, ReaderConfig(read, {}, tmp_path / read.__name__)
+            )
+    assert chosen == [True, False]
+
+
+@pytest.mark.usefixtures("narrow_network")
+def test_a_killed_cell_resumes_and_gives_the_same_model(
+    dataset: DataSet, reading: ReaderConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "_EPOCH_STEPS", 2)
+    whole, killed = run(dataset), run(dataset)
+    complete_run(whole, tmp_path / "whole", reading)
+    with monkeypatch.context() as during:
+
+        def kill(clock: object) -> None:
+            raise KeyboardInterrupt
+
+        during.setattr(training._Clock, "keep", kill)
+        with pytest.raises(KeyboardInterrupt):
+            complete_run(killed, tmp_path / "killed", reading)
+    folder = killed.folder(tmp_path / "killed")
+    assert (folder / "checkpoint.safetensors").exists()
+    assert not (folder / "trained.json").exists()
+    complete_run(killed, tmp_path / "killed", reading)
+    model = whole.folder(tmp_path / "whole") / "model.safetensors"
+    assert (folder / "model.safetensors").read_bytes() == model.read_bytes()
+    assert len(json.loads((folder / "log.json").read_text())) == 2
+
+
+@pytest.mark.usefixtures("narrow_network")
+def test_filled_cells_are_kept_and_only_new_networks_and_seeds_are_trained(
+    dataset: DataSet, reading: ReaderConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained: list[str] = []
+    original = runs_module.train_run
+
+    def counted(dataset: DataSet, recipe: Any, *rest: Any) -> dict[str, object]:
+        trained.append(f"{recipe.architecture} {recipe.seed}")
+        return original(dataset, recipe, *rest)
+
+    monkeypatch.setattr(runs_module, "train_run", counted)
+    first = [run(dataset, steps=1), Run(dataset, "pdr", 0, None)]
+    assert list(complete(first, tmp_path, reading)) == first
+    errors = first[0].folder(tmp_path) / "errors.json"
+    written = errors.stat().st_mtime_ns
+    more = [*first, run(dataset, "StarIO without MSGCU", steps=1), run(dataset, seed=1, steps=1)]
+    assert list(complete(more, tmp_path, reading)) == more
+    assert trained == ["StarIO 0", "StarIO without MSGCU 0", "StarIO 1"]
+    assert errors.stat().st_mtime_ns == written
+    table = set_table(dataset, completed_runs(more, tmp_path)["own"], {})
+    assert [row.network for row in table.rows] == ["pdr", "StarIO without MSGCU", "StarIO"]
+    mean = table.rows[2].figures["ate"]
+    values = [
+        json.loads((one.folder(tmp_path) / "errors.json").read_text())["recordings"][0]
+        ["tracks"]["network_true_attitude"]["ate_m"]
+        for one in (more[0], more[3])
+    ]  # fmt: skip
+    assert mean.value == pytest.approx(sum(values) / 2)
+    assert mean.error == pytest.approx(abs(values[0] - values[1]) / 2)  # deviation / sqrt(2)
+    assert table.rows[1].figures["ate"].error is None
+    assert "ate" not in table.rows[0].figures
+    assert "own_ate" in table.rows[0].figures
+    assert sorted(row.rank.rank for row in table.rows if row.rank) == [1, 2]
+
+
+@pytest.mark.usefixtures("narrow_network")
+def test_cells_of_another_recipe_are_refused_and_other_step_counts_are_separate(
+    dataset: DataSet, reading: ReaderConfig, tmp_path: Path
+) -> None:
+    done = run(dataset, steps=1)
+    complete_run(done, tmp_path, reading)
+    other = Run(dataset, "StarIO", 0, run_recipe({**RECIPE, "rate": 1e-2}, "StarIO", 0, 1))
+    with pytest.raises(ConfigError, match=r"errors\.json.*another recipe"):
+        complete_run(other, tmp_path, reading)
+    [outcome] = complete([other], tmp_path, reading)
+    assert isinstance(outcome, Skipped)
+    assert completed_runs([run(dataset, steps=2)], tmp_path) == {}
+
+
+def test_the_most_important_cells_come_first_and_all_have_equal_steps(dataset: DataSet) -> None:
+    names = ("tyrex", "oxiod", "all")
+    sets = [DataSet(n, dataset.training, dataset.validation, dataset.test, "") for n in names]
+    runs = table_runs(sets, {**RECIPE, "batch": 10}, steps=600, seeds=2)
+    order = [(c.dataset.name, c.seed) for c in runs if c.recipe]
+    assert list(dict.fromkeys(order)) == [
+        ("oxiod", 0), ("all", 0), ("oxiod", 1), ("all", 1), ("tyrex", 0), ("tyrex", 1),
+    ]  # fmt: skip
+    assert order.count(("all", 0)) == len(ARCHITECTURES)
+    assert [c.network for c in runs if (c.dataset.name, c.seed) == ("all", 1)] == list(LEADING)
+    recipes = [c.recipe for c in runs if c.recipe]
+    assert {(r.steps, r.batch, r.patience >= r.epochs) for r in recipes} == {(600, 10, True)}
+    assert [c.network for c in runs[:2]] == ["pdr", "default"]
+    with pytest.raises(InputError, match="Nobody"):
+        table_runs(sets, RECIPE, networks=["Nobody"])
+
+
+def test_a_cell_can_be_pickled_for_other_machines(dataset: DataSet, reading: ReaderConfig) -> None:
+    work = partial(complete_run, out=Path("out"), reading=reading)
+    sent = pickle.loads(pickle.dumps((work, run(dataset))))
+    assert sent[1] == run(dataset)
+    assert sent[1].digest == run(dataset).digest
+
+
+def test_results_belong_to_a_network_a_recipe_and_all_recordings_of_their_set(
+    dataset: DataSet,
+) -> None:
+    sets = [replace(dataset, **{part: ()}) for part in ("training", "validation", "test")]
+    others = [*map(run, sets), run(dataset, "R-ResNet"), run(dataset, seed=1)]
+    assert len({run(dataset).digest, *(other.digest for other in others)}) == 6
+
+
+def test_new_weights_or_changed_recordings_do_not_keep_old_results(
+    dataset: DataSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = Run(dataset, "default", 0, None)
+    before = given.digest, run(dataset).digest
+    with monkeypatch.context() as patch:
+        patch.setattr(runs_module, "_weights_sha256", lambda name: "new")
+        assert given.digest != before[0]
+        assert run(dataset).digest == before[1]
+    os.utime(dataset.training[0])  # as if it were written again
+    assert (given.digest, run(dataset).digest != before[1]) == (before[0], True)
+    os.utime(dataset.test[0].path)
+    assert given.digest != before[0]
+    with pytest.raises(WeightsError, match="no such file"):
+        _ = Run(dataset, "missing", 0, None).digest
+
+
+def test_an_unknown_backend_is_refused() -> None:
+    with pytest.raises(InputError, match="--backend"):
+        backend("mpi")
+
+
+def test_the_command_writes_tables_and_figures(
+    dataset: DataSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = dataset.training[0].parent
+    monkeypatch.setenv("STARIO_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("stario.network.runtime.survey._RUNS", {1: 1, 64: 1})
+    saved = "stario.fusion.evaluation.figures.save_figure"  # rendering is slow
+    monkeypatch.setattr(saved, lambda figure, path: path.touch())
+    (tmp_path / "recipe.json").write_text(json.dumps(RECIPE))
+    out = tmp_path / "out"
+    arguments = ["--set", f"ronin={folder}", "--out", str(out), "--steps", "1", "--seeds", "1"]
+    arguments += ["--networks", "DeepILS,R-ResNet", "--config", str(tmp_path / "recipe.json")]
+    done = CliRunner().invoke(app, ["check", "table", *arguments])
+    assert done.exit_code == 0, done.output
+    text = (out / "table.md").read_text()
+    assert text in done.output
+    for words in (
+        "1 training steps of 6 windows",
+        "| R-ResNet |",
+        "`pdr`",
+        "4.165, 3.724",
+        "core hours",
+    ):
+        assert words in text
+    with (out / "table.csv").open() as file:
+        assert [row["network"] for row in csv.DictReader(file)] == [
+            "pdr", "R-ResNet", "DeepILS", "default",
+        ]  # fmt: skip
+    content = json.loads((out / "table.json").read_text())["sets"]["ronin"]
+    assert (content["training"], content["validation"], content["tested"]) == (2, 1, 1)
+    figures = {path.name for path in (out / "ronin/figures").glob("*.png")}
+    assert figures == {"ate_parameters.png", "distributions.png", "pde.png", "trajectories.png"}
+    clash = ["check", "table", "--out", str(out), "--set", f"a={folder}", "--set", f"a={folder}"]
+    with pytest.raises(InputError, match="a name of its own"):
+        CliRunner().invoke(app, clash, catch_exceptions=False)
