@@ -29,6 +29,8 @@ class Health:
         zero_velocity: numbers of zero-velocity updates (one per state) applied, and refused by
             reason.
         bearings: numbers of magnetic bearings, likewise; 1 under "north" if they determined it.
+        corrections: time [s], distance [m], turn [rad] and cause of the latest updates, other than
+            by fixes, that moved a filter's track by more than 1 m or 10 degrees at once.
         fields_dropped: number of magnetometer samples dropped: their value or time is wrong, or
             repeats an earlier one.
         accel_noise_factor: final factor on the accelerometer's configured noise density, estimated
@@ -54,6 +56,7 @@ class Health:
     fixes: dict[str, int] = field(default_factory=dict)
     zero_velocity: dict[str, int] = field(default_factory=dict)
     bearings: dict[str, int] = field(default_factory=dict)
+    corrections: list[tuple[float, float, float, str]] = field(default_factory=list)
     fields_dropped: int = 0
     accel_noise_factor: float = 1.0
     network_error_level: float = 1.0

@@ -39,7 +39,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 26
+FORMAT, VERSION = "stario snapshot", 27
 
 
 _PACKAGES = ("fusion.filter", "fusion.graph", "fusion.imu")

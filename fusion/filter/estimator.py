@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.filter.corrections import correction
 from stario.fusion.filter.displacements import DisplacementUpdates
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.ekf_state import EkfState
@@ -70,13 +71,14 @@ class Estimator:
         self._hypotheses = HypothesisPair(self.ekf)
         self._displacements = DisplacementUpdates(self._hypotheses, f)
         self.bias = AdaptiveBiasPrior(self._hypotheses, config, start.time)
-        self._rest = ZeroVelocityUpdates(self._hypotheses, self.bias, f)
+        self._rest = ZeroVelocityUpdates(self._hypotheses, f)
         self._magnetic = MagneticUpdates(self._hypotheses)
         self._counts = UpdateCounts()
         self.in_gap = False
         self._history: History = ()
         self.released: Estimate | None = None
         initialise(self.ekf, start, prior, config)
+        self.bias.begin()
         self._clone()
 
     # --- one interval ----------------------------------------------------------------------------
@@ -102,13 +104,19 @@ class Estimator:
         if interval.gap or fixes:
             self._hypotheses.alternative = None
         segment, accepted = self._propagate(interval, fixes)
+        before = self.ekf.state
         zupt = self._update_zero_velocity(interval)
+        before = self._note_correction(before, "rest")
         # Zero velocity is more accurate than a network trained on walks, off by 1 cm/s at rest.
         offered = displacement if zupt is None else None
         outcome, revoked = self._update_displacement(offered)
+        before = self._note_correction(before, "network")
         bearing = self._update_bearing(interval)
+        self._note_correction(before, "magnetic field")
         accepted += self._update_north()
+        before = self.ekf.state
         self.bias.update(interval)
+        self._note_correction(before, "gyroscope's bias")
         if interval.update or interval.gap:
             self._clone()
         return IntervalMeasurements(
@@ -234,6 +242,16 @@ class Estimator:
         self._counts = self._counts.add("bearings", *result.outcomes)
         return (before, self.ekf.state) if self._streaming else None
 
+    def _note_correction(self, before: EkfState, cause: str) -> EkfState:
+        """Record a large correction since a state, and return the state now.
+
+        The first window's is none: until then nothing is known about the speed.
+        """
+        after = self.ekf.state
+        if self._counts.offered > 1:
+            self._counts = self._counts.add_correction(correction(before, after, cause))
+        return after
+
     def _clone(self) -> None:
         slots, oldest = self.ekf.state.clone_slots, None
         if len(slots) == self.ekf.slots:
@@ -254,6 +272,7 @@ class Estimator:
             self.ekf.state,
             self.frame.state,
             self._rest.detector.window,
+            self._rest.detector.rested,
             self._magnetic.reference,
             self._displacements.statistics,
             self.bias.prior,
@@ -266,7 +285,7 @@ class Estimator:
     @state.setter
     def state(self, s: EstimatorState) -> None:
         self.ekf.state, self.frame.state = s.ekf, s.map_frame
-        self._rest.detector.window = s.stillness
+        self._rest.detector.window, self._rest.detector.rested = s.stillness, s.rested
         self._magnetic.reference, self.bias.prior = s.magnetic, s.bias_prior
         self._counts = s.counts
         self._displacements.statistics = s.statistics

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stario.fusion.filter.corrections import CORRECTIONS_LISTED, Correction
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.engine import UpdateResult
 from stario.fusion.filter.estimates import Estimate
@@ -74,6 +75,7 @@ class UpdateCounts:
         bearings: numbers of magnetic bearings, likewise; 1 under "north" if they determined it.
         nis_sum: sum of the NIS of all valid network measurements.
         nis_count: number of valid network measurements.
+        corrections: the latest large corrections.
     """
 
     offered: int = 0
@@ -84,6 +86,13 @@ class UpdateCounts:
     bearings: Mapping[str, int] = field(default_factory=dict)
     nis_sum: float = 0.0
     nis_count: int = 0
+    corrections: tuple[Correction, ...] = ()
+
+    def add_correction(self, found: Correction | None) -> UpdateCounts:
+        """Return the counts with one more correction, if there is one."""
+        if found is None:
+            return self
+        return changed(self, corrections=(*self.corrections, found)[-CORRECTIONS_LISTED:])
 
     def add_displacement(self, result: UpdateResult) -> UpdateCounts:
         """Return the counts with one more network measurement."""
@@ -129,6 +138,7 @@ class UpdateCounts:
             fixes=dict(self.fixes),
             zero_velocity=dict(self.zero_velocity),
             bearings=dict(self.bearings),
+            corrections=list(self.corrections),
             final_sigma={name: math.sqrt(max(value, 0.0)) for name, value in variance.items()},
         )
 
@@ -168,6 +178,7 @@ class EstimatorState:
         ekf: pose, biases, clones and their covariance.
         map_frame: what is known about the map frame.
         stillness: sums over the last second (`StillnessDetector`).
+        rested: number of intervals of uninterrupted stillness so far.
         magnetic: usual size, dip and spread of the magnetic field.
         statistics: what the innovations of displacements tell.
         bias_prior: prior of the gyroscope's bias, as currently applied in the filter.
@@ -180,6 +191,7 @@ class EstimatorState:
     ekf: EkfState
     map_frame: MapFrameState
     stillness: tuple[FloatArray | None, ...]
+    rested: int
     magnetic: MagneticReference
     statistics: InnovationStatistics
     bias_prior: GyroBiasPrior

@@ -26,10 +26,6 @@ _DEGREES_OF_FREEDOM = 3.0
 """Of the t distribution. Fewer let slow errors of network and field into the bias (KIPD with the
 field: 1.25 of the error with 1, 1.07 with 2, 1.02 with 4), more keep a raw gyroscope's out."""
 
-_LONG_STILLNESS = 30.0
-"""Apparent stillness rejected for this long [s] is rest with a bias about the vertical, which
-gravity cannot reveal: nobody turns so evenly for so long."""
-
 _PRIOR_TOLERANCE = 1e-6
 """Relative difference up to which two variances count as equal."""
 
@@ -41,12 +37,10 @@ class GyroBiasPrior:
     Attributes:
         sigma: scale of the t distribution [rad/s].
         variance: variance per axis of the normal prior, as currently applied [rad^2/s^2].
-        refused_seconds: duration for which apparent stillness has been rejected [s].
     """
 
     sigma: float
     variance: float
-    refused_seconds: float = 0.0
 
     def updated(self, b_g: FloatArray, P: FloatArray, wander: float) -> GyroBiasPrior:
         """Return the prior with its variance's mean given the estimated bias.
@@ -61,16 +55,6 @@ class GyroBiasPrior:
             wander: variance by which the bias may have changed since the start [rad^2/s^2].
         """
         return changed(self, variance=self._mean(float(b_g @ b_g + np.trace(P)) - 3.0 * wander))
-
-    def at_rest(self, rate: FloatArray) -> GyroBiasPrior:
-        """Return the prior for an update at rest, where the gyroscope reads a rate (3,) [rad/s].
-
-        It is unchanged, so that a glide that turns is not taken for rest, until apparent rest has
-        been rejected for so long that only a bias can be so even.
-        """
-        if self.refused_seconds < _LONG_STILLNESS:
-            return self
-        return changed(self, variance=max(self.variance, self._mean(float(rate @ rate))))
 
     def _mean(self, squared: float) -> float:
         nu = _DEGREES_OF_FREEDOM
@@ -94,6 +78,13 @@ class AdaptiveBiasPrior:
         sigma = max(config.filter.gyro_bias_sigma, MIN_PRIOR_SIGMA)
         self.prior = GyroBiasPrior(sigma, sigma**2)
 
+    def begin(self) -> None:
+        """Widen the prior to its mean variance before anything is known of the bias."""
+        if self._config.filter.adaptive:
+            nu = _DEGREES_OF_FREEDOM
+            variance = nu / (nu - 2.0) * self.prior.sigma**2
+            self._replace_prior(changed(self.prior, variance=variance))
+
     def update(self, interval: ImuInterval) -> None:
         """Adapt the prior after an interval to what the data show about the bias."""
         if not self._config.filter.adaptive:
@@ -105,17 +96,6 @@ class AdaptiveBiasPrior:
         s = self._hypotheses.ekf.state
         P = s.P[GYRO_BIAS, GYRO_BIAS]
         self._replace_prior(self.prior.updated(s.b_g, P, self._wander))
-
-    def prepare_for_rest(self, rate: FloatArray) -> None:
-        """Adapt the prior to an update at rest, where the gyroscope reads a rate (3,) [rad/s]."""
-        if self._config.filter.adaptive:
-            self._replace_prior(self.prior.at_rest(rate))
-
-    def note_refused_rest(self, seconds: float) -> None:
-        """Add to the time of rejected apparent stillness [s]; 0 resets it (accepted, or moving)."""
-        refused_seconds = self.prior.refused_seconds + seconds if seconds else 0.0
-        if refused_seconds != self.prior.refused_seconds:
-            self.prior = changed(self.prior, refused_seconds=refused_seconds)
 
     def _replace_prior(self, updated: GyroBiasPrior) -> None:
         """Replace the prior in both filters as if the new one had been used from the start."""

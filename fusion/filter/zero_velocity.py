@@ -20,7 +20,6 @@ import numpy as np
 from stario.fusion.config import FilterConfig
 from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.filter.engine import UpdateResult
-from stario.fusion.filter.gyro_bias import AdaptiveBiasPrior
 from stario.fusion.filter.hypotheses import HypothesisPair
 from stario.fusion.imu.intervals import ImuInterval
 from stario.sequences.accuracy.chi_square import chi2_quantile
@@ -35,6 +34,10 @@ _HIDDEN_MOTION_NOISE = 10.0 * PHONE_NOISE.accel_noise
 _SWAY = 10.0
 """Variance of a person's sway about its mean over a second, relative to the variance within it: who
 stands turns the device at 1 to 2 deg/s, of which a second shows a third."""
+
+_SWAY_RATE = 0.02
+"""Standard deviation of a person's sway in a second that looks still [rad/s]. It falls with the
+square of the rest's duration: between two sways a second may look still, several do not."""
 
 _H_VELOCITY = np.eye(6, 3)
 _H_BIAS = np.eye(6, 3, k=-3)
@@ -58,18 +61,23 @@ class StillnessDetector:
         scale: factor on the noise densities of a phone's IMU; 0 never detects.
 
     Attributes:
+        rested: number of intervals for which it has been still without interruption.
         window: for each interval of the last second (14,): number of samples, seconds, sums of gyro
             and accel, sums of their squares; None if it moves more than a still second may.
     """
 
     def __init__(self, intervals: int, scale: float) -> None:
         self._intervals, self._scale = intervals, scale
+        self.rested = 0
         self.window: tuple[FloatArray | None, ...] = ()
 
     def is_still(self, interval: ImuInterval) -> bool:
         """Add an interval; return whether the device was still over the second ending with it."""
-        if self._scale == 0.0:
-            return False
+        still = self._scale > 0.0 and self._add(interval)
+        self.rested = self.rested + 1 if still else 0
+        return still
+
+    def _add(self, interval: ImuInterval) -> bool:
         if interval.gap:
             self.window = ()
             return False
@@ -90,7 +98,9 @@ class StillnessDetector:
         hidden_variance = _HIDDEN_MOTION_NOISE**2 * WINDOW_SECONDS
         white_variance = PHONE_NOISE.gyro_noise**2 / float(table[:, 1].mean())
         excess = max(float(rates.var(axis=0).sum()) - 3.0 * white_variance, 0.0)
-        rate_variance = np.full(3, white_variance + _SWAY * excess)
+        seconds = 1.0 + (self.rested - 1) / self._intervals
+        swaying = (_SWAY_RATE / seconds) ** 2
+        rate_variance = np.full(3, white_variance + _SWAY * excess + swaying)
         variances = [*[n * hidden_variance] * 3, *(n * rate_variance)]
         return ZeroVelocity(rates[n // 2], np.diag(variances))
 
@@ -131,34 +141,23 @@ class ZeroVelocityUpdates:
 
     Args:
         hypotheses: the filter and its alternative, which ends where rest is measured.
-        bias: the prior of the gyroscope's bias, which is widened before rest measures the bias.
         config: settings of the filter.
 
     Attributes:
         detector: detects rest.
     """
 
-    def __init__(
-        self, hypotheses: HypothesisPair, bias: AdaptiveBiasPrior, config: FilterConfig
-    ) -> None:
-        self._hypotheses, self._bias, self._gate = hypotheses, bias, chi2_quantile(config.gate, 6)
+    def __init__(self, hypotheses: HypothesisPair, config: FilterConfig) -> None:
+        self._hypotheses, self._gate = hypotheses, chi2_quantile(config.gate, 6)
         intervals = round(config.output_rate * WINDOW_SECONDS)
         self.detector = StillnessDetector(intervals, config.stillness_noise)
 
     def update(self, interval: ImuInterval) -> tuple[UpdateResult, ZeroVelocity] | None:
         """Update if the second that ends with an interval was still; None if the device moved."""
-        hypotheses, bias = self._hypotheses, self._bias
         if not self.detector.is_still(interval):
-            bias.note_refused_rest(0.0)
             return None
-        measured, ekf = self.detector.measurement(), hypotheses.ekf
-        before = ekf.state, bias.prior, hypotheses.alternative
-        bias.prepare_for_rest(measured.b_g)
-        result = update_zero_velocity(ekf, measured, self._gate)
+        measured = self.detector.measurement()
+        result = update_zero_velocity(self._hypotheses.ekf, measured, self._gate)
         if result.accepted:
-            bias.note_refused_rest(0.0)
-            hypotheses.alternative = None
-        else:
-            ekf.state, bias.prior, hypotheses.alternative = before
-            bias.note_refused_rest(interval.stop - interval.start)
+            self._hypotheses.alternative = None
         return result, measured

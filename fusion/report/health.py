@@ -75,7 +75,7 @@ def findings(health: Health) -> list[Finding]:
         reasons = [_invalid_data(health), *_samples(health), *_gaps(health)]
     else:
         reasons = [*_samples(health), *_flagged(health), *_gaps(health)]
-        reasons += [*([] if early else _updates(health)), *_field(health)]
+        reasons += [*([] if early else _updates(health)), *_corrections(health), *_field(health)]
     found = [*reasons, *_fixes(health), *_direction(health), *map(_noted, notes)]
     if early and health.zero_velocity.get("applied", 0) < _RESTING:
         found.append(Finding("note", "Too early to judge the motion: it takes ten seconds of it."))
@@ -221,6 +221,20 @@ def _updates(health: Health) -> Iterator[Finding]:
             "track do not show here."
         )
         yield Finding("note", text)
+
+
+def _corrections(health: Health) -> Iterator[Finding]:
+    if not health.corrections:
+        return
+    time, metres, turn, cause = max(health.corrections, key=lambda found: found[1])
+    count = len(health.corrections)
+    at_once = "Once the track was" if count == 1 else f"{count} times the track was"
+    text = (
+        f"{at_once} corrected by more than 1 m or 10 degrees (the largest by {metres:.1f} m and "
+        f"{math.degrees(turn):.0f} degrees at {time:.1f} s: {cause})."
+    )
+    advice = "Until then it was wrong by as much; the track of `--backend graph` has no such steps."
+    yield Finding("warning", text, advice)
 
 
 def _field(health: Health) -> Iterator[Finding]:

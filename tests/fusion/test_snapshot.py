@@ -207,7 +207,7 @@ def test_a_snapshot_of_another_version_is_refused(walk: ImuSequence, still_model
             navigator.restore(other)
 
 
-LAYOUTS = {26: "b4cc7acb"}
+LAYOUTS = {27: "66b73efc"}
 """CRC of the classes and attributes in a snapshot, by version."""
 
 
