@@ -9,9 +9,8 @@ force, averaged over an update period and rotated into N, should point up, becau
 mean acceleration vanishes over the filter's time constant of twelve seconds. Both are worth less
 while the device is shaken: the gyroscope's errors grow with its rate, and the force is gravity only
 as far as nothing accelerates. A shake then costs certainty, and the calm seconds after it tell what
-is right. The bias is estimated
-in body axes, so that it stays valid when the device turns: phones that report raw rates are off by
-up to 0.1 rad/s. The yaw is not observable here.
+is right. The bias is estimated in body axes, so that it stays valid when the device turns: phones
+that report raw rates are off by up to 0.1 rad/s. The yaw is not observable here.
 """
 
 from __future__ import annotations

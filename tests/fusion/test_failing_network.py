@@ -46,7 +46,7 @@ def test_a_stream_continues_after_its_network_has_failed(
     assert failures == 3
     errors = [np.linalg.norm(s.p_W - expected[s.time]) for s in states if s is not None]
     assert len(errors) == len(expected) - 3
-    assert max(errors) < 0.25
+    assert max(errors) < 0.1
 
 
 def test_no_motion_is_lost_if_the_network_fails_within_a_hole(

@@ -216,7 +216,7 @@ def test_a_streams_graph_estimates_the_same_bias_as_its_filter(
         pushed(Stream(oracle, config, backend="graph"), replace(walk, magnetometer=field))[-1]
         for field in (walk.magnetometer, None)
     )
-    assert abs(with_field.b_g[2] - filtered.b_g[2]) < 0.3 * abs(
+    assert abs(with_field.b_g[2] - filtered.b_g[2]) < 0.2 * abs(
         without_field.b_g[2] - filtered.b_g[2]
     )
 
