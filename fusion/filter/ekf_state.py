@@ -168,6 +168,10 @@ class EkfState:
         taken = [(time, k) for k, time in enumerate(self.clone_times) if time is not None]
         return [slot for _, slot in sorted(taken)]
 
+    def clone_rows(self, slot: int) -> slice:
+        """Return the rows of a clone in the error state."""
+        return slice(CORE + CLONE * slot, CORE + CLONE * (slot + 1))
+
     def time_of_clone(self, slot: int) -> float:
         """Return the time at which a clone was taken [s].
 
@@ -203,8 +207,7 @@ class EkfState:
         Raises:
             InputError: the slot holds no clone.
         """
-        time, first, zero = self.time_of_clone(slot), CORE + CLONE * slot, np.zeros(3)
-        rows = slice(first, first + CLONE)
+        time, rows, zero = self.time_of_clone(slot), self.clone_rows(slot), np.zeros(3)
         covariances = np.zeros((2, CORE, CORE))
         covariances[:, CLONED[:, None], CLONED] = self.covariances[:, rows, rows]
         X = self.X[1 + slot].copy()

@@ -20,13 +20,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter import ekf
 from stario.fusion.filter.ekf_state import EkfState, FieldState
-from stario.fusion.filter.engine import UpdateResult, gauss_markov
 from stario.fusion.filter.field_rotation import FieldRotation
-from stario.fusion.filter.hypotheses import HypothesisPair
+from stario.fusion.filter.kalman import UpdateResult, gauss_markov
 from stario.fusion.fixes import Fix, yaw_fix
-from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
+from stario.fusion.imu.intervals import SAME_TIME
 from stario.fusion.lie import yaw_twist
 from stario.fusion.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
@@ -176,33 +175,6 @@ class MagneticReference:
         )
 
 
-class MagneticUpdates:
-    """Updates with the bearings of the magnetic field.
-
-    Args:
-        hypotheses: the filter and its alternative; bearings are applied to both.
-
-    Attributes:
-        reference: usual properties of the field, and its last measurement.
-    """
-
-    def __init__(self, hypotheses: HypothesisPair) -> None:
-        self._hypotheses = hypotheses
-        self.reference = MagneticReference()
-
-    def update(self, interval: ImuInterval) -> UpdateResult | None:
-        """Update with the interval's field; return None if it has none, or none is due."""
-        field_B, ekf = interval.field_B, self._hypotheses.ekf
-        if field_B is None or not self.reference.is_due(interval.stop, ekf.state):
-            return None
-        result, self.reference = self._hypotheses.apply_to_both(
-            lambda: update_bearing(ekf, self.reference, field_B)
-        )
-        s = ekf.state
-        self.reference = changed(self.reference, pose=(s.R_WB, s.p_W))
-        return result
-
-
 def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> Fix | None:
     """Return the current yaw in a frame with x east and y north; None if it is not known yet.
 
@@ -250,36 +222,31 @@ def propagated_field(s: EkfState, seconds: float, sigma: float) -> EkfState:
 
 
 def update_bearing(
-    ekf: StateCloningEkf, reference: MagneticReference, m_B: FloatArray
-) -> tuple[UpdateResult, MagneticReference]:
-    """Update with the field (3,) [uT] in B at the filter's time.
-
-    Returns:
-        The outcome, and the reference after this field.
-    """
-    now, measured = ekf.state.time, float(np.linalg.norm(m_B))
+    s: EkfState, reference: MagneticReference, m_B: FloatArray
+) -> tuple[EkfState, UpdateResult, MagneticReference]:
+    """Update with the field (3,) [uT] in B at the state's time; return the reference after it."""
+    now, measured = s.time, float(np.linalg.norm(m_B))
     if measured > _STRONGEST:
-        return UpdateResult("too strong to be in uT"), changed(reference, time=now)
-    if ekf.state.field is None:
-        ekf.state = with_field(ekf.state, m_B)
+        return s, UpdateResult("too strong to be in uT"), changed(reference, time=now)
+    if s.field is None:
+        s = with_field(s, m_B)
     elif math.isfinite(reference.time):
-        ekf.state = propagated_field(ekf.state, now - reference.time, reference.wander_sigma)
-    s = ekf.state
+        s = propagated_field(s, now - reference.time, reference.wander_sigma)
     assert s.field is not None
     m_W = s.R_WB @ (m_B - s.field.hard_iron_B)
     horizontal = math.hypot(m_W[0], m_W[1])
     size, dip = math.hypot(horizontal, m_W[2]), math.atan2(-m_W[2], horizontal)
     if horizontal < _MIN_HORIZONTAL:
         reason = "too weak to be in uT" if measured < _WEAKEST else "no horizontal field"
-        return UpdateResult(reason), changed(reference, time=now)
+        return s, UpdateResult(reason), changed(reference, time=now)
     rotation = reference.rotation.updated(s, m_B, now - reference.time)
     reference = changed(reference, rotation=rotation)
     if rotation.contradicts_gyro:
-        return UpdateResult("contradicts the gyroscope"), changed(reference, time=now)
+        return s, UpdateResult("contradicts the gyroscope"), changed(reference, time=now)
     extrapolated = abs(measured - reference.measured) < HELD_CHANGE * measured
     new_place = not extrapolated and math.hypot(s.v_W[0], s.v_W[1]) > _MIN_SPEED
     reference = changed(reference.updated(now, size, dip, new_place), measured=measured)
     factor = _EXTRAPOLATED_FACTOR if extrapolated else 1.0
     sigma = BEARING_SIGMA * reference.wander_sigma / WANDER_SIGMA
     variance = sigma**2 * (1.0 + reference.unusual(size, dip) ** 2) * factor
-    return ekf.update_bearing(m_B, variance, chi2_quantile(_GATE, 1)), reference
+    return *ekf.update_bearing(s, m_B, variance, chi2_quantile(_GATE, 1)), reference

@@ -18,8 +18,8 @@ import numpy as np
 
 from stario.fusion.config import FilterConfig
 from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS, EkfState
-from stario.fusion.filter.engine import UpdateResult, gauss_markov
 from stario.fusion.filter.jacobians import CORE, plain_covariance
+from stario.fusion.filter.kalman import UpdateResult, gauss_markov
 from stario.fusion.imu.stateful import slope_variance
 from stario.fusion.state import changed
 from stario.sequences.sequence import FloatArray

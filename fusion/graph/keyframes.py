@@ -13,8 +13,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
+from copy import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
@@ -60,6 +61,17 @@ class Solution:
     down_weighted: int
 
 
+Held = TypeVar("Held")
+
+
+def shallow_copy(held: Held) -> Held:
+    """Return a copy of an object with copies of its lists and dictionaries."""
+    new = copy(held)
+    parts = {k: v.copy() for k, v in vars(held).items() if isinstance(v, dict | list)}
+    vars(new).update(parts)
+    return new
+
+
 class KeyframeGraph:
     """Keyframes, numbered from 0, with their IMU segments and measurements.
 
@@ -89,10 +101,9 @@ class KeyframeGraph:
         """Numbers of the keyframes held, in order."""
         return list(self._time)
 
-    @property
-    def is_solved(self) -> bool:
-        """Whether `solve` has been called since the last change."""
-        return self._solution is not None
+    def copied(self) -> KeyframeGraph:
+        """Return an unsolved copy that may be changed; what both hold is never modified."""
+        return shallow_copy(self)
 
     def time(self, k: int) -> float:
         """Return the time of a keyframe [s]."""
