@@ -240,7 +240,7 @@ def test_a_snapshot_with_other_classes_or_attributes_has_another_version(
         with np.load(io.BytesIO(navigator.snapshot())) as file:
             visit(json.loads(file["tree"].tobytes()))
     rare = [
-        AlternativeHypothesis(navigator._stream.estimator._filter.ekf.state, zero, (0.0,)),
+        AlternativeHypothesis(navigator._stream.state.filter.ekf, zero, (0.0,)),
         PriorPose(np.eye(3), zero, zero),
     ]
     with np.load(io.BytesIO(pack({"rare": rare}))) as file:
