@@ -14,6 +14,7 @@ from stario.fusion.health import SampleCounts
 from stario.fusion.imu.front_end import FrontEnd
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.recording import cut_recording
+from stario.sequences.attitude.levelling import LevelledAttitude
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.windows import WINDOW_SECONDS, world_streams
