@@ -16,7 +16,7 @@ import numpy as np
 from stario.fusion.config import MIN_PRIOR_SIGMA, FilterConfig
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, GYRO_BIAS
-from stario.fusion.filter.kalman import with_gain
+from stario.fusion.filter.kalman import corrected
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
 from stario.fusion.state import changed
 from stario.sequences.sequence import FloatArray
@@ -101,12 +101,11 @@ def with_prior_replaced(s: EkfState, old: float, new: float) -> EkfState:
         old, new = max(old, widest), new * max(1.0, widest / old)
     while abs(new - old) > _PRIOR_TOLERANCE * old:
         step = min(new, 2.0 * old)  # a larger one would be badly conditioned
-        P, HP = s.covariances, s.covariances[:, GYRO_BIAS]
-        S = HP[:, :, GYRO_BIAS] + old * step / (old - step) * np.eye(3)
-        K = np.asarray(np.linalg.solve(S[ASSUMED], HP[ASSUMED]).T, dtype=np.float64)
-        updated = with_gain(P, K, HP, S)
+        before, R = s.covariances, old * step / (old - step) * np.eye(3)
+        H = np.eye(3, before.shape[1], k=GYRO_BIAS.start)
+        s = corrected(s, -s.b_g, H, np.array((R, R)))
         if step > old:  # the error gains what the gains forget, however large it is
-            updated[ACTUAL] = P[ACTUAL] + updated[ASSUMED] - P[ASSUMED]
-        s = changed(s.plus(K @ -s.b_g), covariances=updated)
+            actual = before[ACTUAL] + s.P - before[ASSUMED]
+            s = changed(s, covariances=np.array((s.P, actual)))
         old = step
     return s

@@ -1,9 +1,9 @@
-"""The linear update of an error state with two covariances, and their propagation.
+"""filterpy's prediction and update of an error state, with gates and a second covariance.
 
-There are two of them: P, as assumed for the gains, and the covariance of the error that these gains
-leave (Gelb 1974, ch. 7: covariance analysis of a filter whose model is not the truth). They differ
-only by errors that updates consider without estimating them, whose rows of P are zero, and by white
-noise that is smaller than assumed. README.md, "Correlated errors" and "Gates".
+filterpy predicts and updates the covariance P that the gains assume. Beside it is the covariance of
+the error that these gains leave (Gelb 1974, ch. 7: covariance analysis of a filter whose model is
+not the truth). They differ only by errors that updates consider without estimating them, whose rows
+of P are zero, and by white noise that is smaller than assumed. README.md, "Correlated errors".
 """
 
 from __future__ import annotations
@@ -13,15 +13,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dtrtri
+from filterpy.kalman import ExtendedKalmanFilter
+from filterpy.kalman import predict as filterpy_predict
+from scipy.linalg.lapack import dposv, dpotrf
 
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CORE, Block, symmetric
 from stario.fusion.state import changed
 from stario.sequences.sequence import FloatArray
-
-_JOSEPH_RATIO = 1e9
-"""Ratio of innovation to measurement variance above which differences of P lose their digits."""
 
 
 class UpdateResult(NamedTuple):
@@ -76,14 +75,21 @@ class Linear(NamedTuple):
     noise: FloatArray | None = None
     """(m, m) R as it is, if that is another: R then also stands for considered errors."""
 
+    def jacobian(self, n: int) -> FloatArray:
+        """Return H (m, n)."""
+        H = np.zeros((len(self.residual), n))
+        for first, block in self.blocks:
+            H[:, first : first + block.shape[1]] = block
+        return H
+
 
 def predict(covariances: FloatArray, transition: FloatArray, noise: FloatArray) -> FloatArray:
     """Return covariances (2, n, n) after a transition (15, 15) with noises (2, 15, 15)."""
-    P = covariances.copy()
-    P[:, :CORE] = transition @ P[:, :CORE]
-    P[:, CORE:, :CORE] = P[:, :CORE, CORE:].transpose(0, 2, 1)
-    P[:, :CORE, :CORE] = symmetric(P[:, :CORE, :CORE] @ transition.T + noise)
-    return P
+    n = covariances.shape[1]
+    zero, F, Q = np.zeros(n), np.eye(n), np.zeros((2, n, n))
+    F[:CORE, :CORE], Q[:, :CORE, :CORE] = transition, noise
+    pairs = zip(covariances, Q, strict=True)
+    return symmetric(np.array([filterpy_predict(zero, P, F, q)[1] for P, q in pairs]))
 
 
 def update(
@@ -107,66 +113,42 @@ def update(
         The state and the outcome. Values that are not finite and covariances that are not positive
         definite are rejected with a reason; the state is then the one given.
     """
-    residual, blocks, covariance, noise = measured
-    if reason := fault_of(residual, covariance):
+    residual, _, covariance, noise = measured
+    if reason := _fault_of(residual, covariance):
         return s, UpdateResult(reason)
-    P = s.covariances
-    HP = _sum([H @ P[:, first : first + H.shape[1]] for first, H in blocks])
-    HPH = _sum([HP[:, :, first : first + H.shape[1]] @ H.T for first, H in blocks])
+    H = measured.jacobian(s.covariances.shape[1])
     R = np.array((covariance, covariance if noise is None else noise))
-    S = HPH + R
-    nis, sigma = _square(_whitener(S[ACTUAL]) @ residual), np.sqrt(S[ACTUAL].diagonal())
-    whitener = _whitener(S[gains_from])
-    gate_nis = _square(whitener @ residual)
-    scale = 1.0
+    S = H @ s.covariances @ H.T + R
+    nis, gate_nis = _nis(residual, S[ACTUAL]), _nis(residual, S[gains_from])
+    if not math.isfinite(gate_nis):
+        return s, UpdateResult("innovation covariance not invertible")
+    sigma, scale = np.sqrt(S[ACTUAL].diagonal()), 1.0
     if gate is not None and gate_nis > gate:
         if inflation is None:
             return s, UpdateResult("gated", nis, 1.0, residual, sigma, gate_nis)
         scale = (gate_nis / gate) ** inflation
-        R = R * scale
-        S = HPH + R
-        whitener = _whitener(S[gains_from])
-    if not math.isfinite(gate_nis):
-        return s, UpdateResult("innovation covariance not invertible")
-    K = (whitener.T @ whitener @ HP[gains_from]).T
-    K[s.considered_rows] = 0.0
-    moved = s.plus((K @ residual[:, None])[:, 0])
-    after = changed(moved, covariances=_with_gain(P, K, blocks, R, HP, S))
+    after = corrected(s, residual, H, scale * R, gains_from)
     return after, UpdateResult("", nis, scale, residual, sigma, gate_nis)
 
 
-def _with_gain(
-    P: FloatArray,
-    K: FloatArray,
-    blocks: Sequence[Block],
-    R: FloatArray,
-    HP: FloatArray,
-    S: FloatArray,
-) -> FloatArray:
-    """Return both covariances after the update with the gain K, whatever determined it."""
-    if not (S.diagonal(0, 1, 2) > _JOSEPH_RATIO * R.diagonal(0, 1, 2)).any():
-        return with_gain(P, K, HP, S)
-    # Joseph's form is slower, but without cancellation.
-    A = np.eye(P.shape[1])
-    for first, H in blocks:
-        A[:, first : first + H.shape[1]] -= K @ H
-    return symmetric(A @ P @ A.T + K @ R @ K.T)
+def corrected(
+    s: EkfState, residual: FloatArray, H: FloatArray, R: FloatArray, gains_from: int = ASSUMED
+) -> EkfState:
+    """Return the state after a measurement with H (m, n) and R (2, m, m), whatever they are.
 
-
-def fault_of(value: FloatArray, covariance: FloatArray) -> str:
-    """Return why a measurement cannot be used; empty if it can."""
-    if not math.isfinite(np.vdot(value, value) + np.vdot(covariance, covariance)):
-        return "value that is not finite"
-    return "covariance not positive definite" if dpotrf(covariance, lower=1)[1] else ""
-
-
-def with_gain(P: FloatArray, K: FloatArray, HP: FloatArray, S: FloatArray) -> FloatArray:
-    """Return covariances (..., n, n) after an update with any gain, S being H P H^T + R.
-
-    (I - K H) P (I - K H)^T + K R K^T = P - K H P - (K H P)^T + K S K^T
+    Errors that are only considered have no gain (Schmidt 1966).
     """
-    half = K @ (HP - 0.5 * S @ K.T)
-    return np.asarray(P - half - half.swapaxes(-1, -2))
+    filter_ = ExtendedKalmanFilter(H.shape[1], len(H))
+    filter_.P = s.covariances[gains_from]
+    filter_.update(residual[:, None], lambda x: H, lambda x: H @ x, R[gains_from])
+    K = filter_.K
+    K[s.considered_rows] = 0.0
+    A = np.eye(len(K)) - K @ H
+    # With any gain, Joseph's form gives the covariance of the error that it leaves.
+    P = symmetric(A @ s.covariances @ A.T + K @ R @ K.T)
+    if gains_from == ASSUMED:
+        P[ASSUMED] = symmetric(filter_.P)
+    return changed(s.plus(K @ residual), covariances=P)
 
 
 def gauss_markov(
@@ -187,21 +169,14 @@ def gauss_markov(
     return P
 
 
-def _square(white: FloatArray) -> float:
-    return float(white @ white)
+def _fault_of(value: FloatArray, covariance: FloatArray) -> str:
+    """Return why a measurement cannot be used; empty if it can."""
+    if not math.isfinite(np.vdot(value, value) + np.vdot(covariance, covariance)):
+        return "value that is not finite"
+    return "covariance not positive definite" if dpotrf(covariance, lower=1)[1] else ""
 
 
-def _sum(terms: list[FloatArray]) -> FloatArray:
-    total = terms[0]
-    for term in terms[1:]:
-        total = total + term
-    return total
-
-
-def _whitener(covariance: FloatArray) -> FloatArray:
-    """Return the inverse of the lower Cholesky factor; NaN if there is none."""
-    factor, failed = dpotrf(covariance, lower=1)
-    if failed:
-        return np.full_like(covariance, math.nan)
-    inverse: FloatArray = dtrtri(factor, lower=1)[0]
-    return inverse
+def _nis(residual: FloatArray, S: FloatArray) -> float:
+    """Return the normalised innovation squared; NaN if S is not positive definite."""
+    _, solved, failed = dposv(S, residual)
+    return math.nan if failed else float(residual @ solved.ravel())
