@@ -180,7 +180,7 @@ class KeyframeGraph:
         """Return a keyframe with its marginal covariance; call after `solve`."""
         R, v, p, b_g, b_a, _ = self.keyframe(k)
         assert self._solution is not None  # solved
-        joint = self._solution.covariance(k)
+        joint = self._solution.covariances[k]
         to_world = KeyframeState(R, np.zeros(3), np.zeros(3), b_g, b_a).invariant_from_local()
         return NavState(self._time[k], R, v, p, b_g, b_a, to_world @ joint @ to_world.T)
 
