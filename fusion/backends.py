@@ -125,9 +125,7 @@ def _graph_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solut
     first = replace(states[0], covariance=covariance)
     final = to_final_frame(states, frame.transforms)
     try:
-        solved, note = smooth(
-            final, first, filtered.records, frame.transforms, config, bias, last.ekf.has_turn
-        )
+        solved, note = smooth(final, first, filtered.records, frame.transforms, config, bias)
     except IndeterminateError as error:
         note = f"graph fell back to the filter's track: {error}"
         return _filter_states(filtered, config)._replace(notes=(note,))

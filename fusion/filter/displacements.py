@@ -11,14 +11,11 @@ import numpy as np
 
 from stario.fusion.config import FilterConfig
 from stario.fusion.filter.alternative import AlternativeHypothesis, Hypotheses
+from stario.fusion.filter.correlated_errors import displacement_errors
 from stario.fusion.filter.ekf import Updated, update_displacement
 from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.filter.innovations import InnovationStatistics
 from stario.fusion.filter.kalman import UpdateResult
-from stario.fusion.filter.network_errors import (
-    InnovationStatistics,
-    displacement_errors,
-    propagated_turn,
-)
 from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.lie import yaw_rotation
 from stario.fusion.state import changed
@@ -59,20 +56,19 @@ def update_with(
     f: FilterConfig,
 ) -> Displaced:
     """Update with the displacement of the window that began at the oldest clone and ends now."""
-    both = before.both(lambda s: propagated_turn(s, 1.0 / f.update_rate, f.network_turn_sigma))
     rare = statistics.outlier_share < _RARE_SHARE
     power = _RARE_POWER if rare else 1.0
-    ekf, result = _applied(both.ekf, displacement, statistics, f, f.gate, power)
-    both, statistics = changed(both, ekf=ekf), statistics.updated(result, f)
-    if both.alternative is None and rare and result.gated:
+    ekf, result = _applied(before.ekf, displacement, statistics, f, f.gate, power)
+    statistics = statistics.updated(result, f)
+    if before.alternative is None and rare and result.gated:
         assert result.residual is not None  # it has been compared with the gate
         first = AlternativeHypothesis(before.ekf, result.residual, (before.ekf.time,))
         return Displaced(Hypotheses(ekf, first), statistics, result, ())
-    if both.alternative is None or not result.accepted:
-        return Displaced(both, statistics, result, ())
-    other, fits = _alternative_with(displacement, both.alternative, statistics, f)
-    both, revoked = Hypotheses(ekf, other).judged(fits, not result.gated)
-    return Displaced(both, statistics, result, revoked)
+    if before.alternative is None or not result.accepted:
+        return Displaced(changed(before, ekf=ekf), statistics, result, ())
+    other, fits = _alternative_with(displacement, before.alternative, statistics, f)
+    after, revoked = Hypotheses(ekf, other).judged(fits, not result.gated)
+    return Displaced(after, statistics, result, revoked)
 
 
 def _alternative_with(
@@ -121,8 +117,7 @@ def _applied(
             d_W, covariance_W = d_W - offset_W, _OFFSET_SCALE * covariance_W
         errors = None
         if f.correlated_errors and np.isfinite(covariance_W).all():
-            level = statistics.error_level
-            errors = displacement_errors(d_W, covariance_W, level, s.has_turn, f)
+            errors = displacement_errors(d_W, covariance_W, statistics.error_level, f)
         limit = None if gate is None else chi2_quantile(gate, 3)
         covariance_W = f.overlap_scale * covariance_W
         return update_displacement(s, slot, d_W, covariance_W, limit, inflation, errors)

@@ -13,6 +13,7 @@ import numpy as np
 
 from stario.fusion.checked import check_covariance, checked, checked_rotation
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.filter.correlated_errors import DisplacementErrors, with_considered_propagated
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import (
     ACTUAL,
@@ -24,16 +25,14 @@ from stario.fusion.filter.jacobians import (
     position_jacobian,
     propagated,
     propagated_in_gap,
-    turn_jacobian,
     velocity_jacobian,
     yaw_jacobian,
 )
 from stario.fusion.filter.kalman import Linear, UpdateResult, predict, update
-from stario.fusion.filter.network_errors import DisplacementErrors, with_considered_propagated
 from stario.fusion.imu.gap import gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.lie import about_vertical, yaw_twist
+from stario.fusion.lie import yaw_twist
 from stario.fusion.state import NavState, changed
 from stario.sequences.attitude.rotations import tilt_aligning
 from stario.sequences.attitude.so3 import log_so3
@@ -150,8 +149,8 @@ def update_displacement(
     """Update with the displacement from clone i to the current pose j, in the estimated world.
 
     The caller has rotated the network's displacement from N to W by the estimated yaw of clone
-    i, so that it contains the error of this yaw, p_j - p_i = (I + theta_iz [e3]x) d + n, and
-    the network's own (turn). Those of its errors that last are considered.
+    i, so that it contains the error of this yaw, p_j - p_i = (I + theta_iz [e3]x) d + n. Those of
+    its errors that last are considered.
 
     Args:
         s: the state.
@@ -169,9 +168,6 @@ def update_displacement(
     s.time_of_clone(slot)
     p_i, p_j = s.X[1 + slot, :, 4], s.X[0, :, 4]
     blocks = displacement_jacobian(p_i, p_j, slot)
-    if s.has_turn:
-        d_W = about_vertical(-s.network_turn) @ d_W
-        blocks.append(turn_jacobian(p_j - p_i, s.turn_row))
     before, noise = s, None
     if errors is not None:
         noise, s = errors.white, with_considered_propagated(s)

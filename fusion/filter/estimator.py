@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter import displacements, ekf, magnetic, map_frame
+from stario.fusion.filter.correlated_errors import ACCEL_SHARE
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.estimator_state import EstimatorState, rewound, with_step
 from stario.fusion.filter.gained import Gained, gained_information
@@ -17,7 +18,6 @@ from stario.fusion.filter.initial import PriorPose, first_state, state_after_los
 from stario.fusion.filter.jacobians import GYRO_BIAS
 from stario.fusion.filter.kalman import UpdateResult
 from stario.fusion.filter.map_frame import Mapped
-from stario.fusion.filter.network_errors import ACCEL_SHARE
 from stario.fusion.filter.record import Record
 from stario.fusion.filter.zero_velocity import ZeroVelocity, update_zero_velocity
 from stario.fusion.fixes import Accepted, Fix, by_time

@@ -18,8 +18,8 @@ from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.estimates import Estimate, nav_states, smoothed_pose
 from stario.fusion.filter.frame_transform import MapFrameState, to_final_frame, with_undirected
 from stario.fusion.filter.gyro_bias import GyroBiasPrior
+from stario.fusion.filter.innovations import InnovationStatistics
 from stario.fusion.filter.magnetic import MagneticReference
-from stario.fusion.filter.network_errors import InnovationStatistics
 from stario.fusion.filter.record import UpdateCounts
 from stario.fusion.filter.zero_velocity import Stillness
 from stario.fusion.fixes import Fix

@@ -17,7 +17,7 @@ import numpy as np
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.gap import gap_covariance
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.lie import e3_cross, twist
+from stario.fusion.lie import twist
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.sequence import FloatArray
 
@@ -57,11 +57,6 @@ def displacement_jacobian(p_i_W: FloatArray, p_j_W: FloatArray, slot: int) -> li
     H_j = _LAST_EYE_CORE.copy()
     H_j[:, :3] -= P_j
     return [(CORE + CLONE * slot, H_i), (0, H_j)]
-
-
-def turn_jacobian(d_W: FloatArray, turn_row: int) -> Block:
-    """Return the block for the network's turn in that Jacobian: e3 x d, d (3,) displacement [m]."""
-    return turn_row, e3_cross(d_W)[:, None]
 
 
 def position_jacobian(p_W: FloatArray) -> list[Block]:

@@ -23,7 +23,6 @@ from stario.fusion.filter.frame_transform import FrameTransform, MapFrameState, 
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.filter.kalman import UpdateResult
-from stario.fusion.filter.network_errors import with_turn
 from stario.fusion.filter.planar_alignment import (
     PlanarAlignment,
     plane_sigma,
@@ -224,8 +223,6 @@ def _with_position_aligned(fix: Fix, m: Mapped) -> Mapped:
 
 
 def _updated(fix: Fix, m: Mapped, f: FilterConfig) -> tuple[Mapped, UpdateResult]:
-    if m.frame.oriented:
-        m = m._replace(ekf=with_turn(m.ekf, f.network_turn_sigma))
     gate = chi2_quantile(f.gate, len(fix.value))
     if fix.kind == "position":
         return _with_position(fix, m, gate)

@@ -31,7 +31,6 @@ def smooth(
     transforms: Sequence[FrameTransform],
     config: NavigatorConfig,
     gyro_bias: tuple[FloatArray, FloatArray] | None = None,
-    estimates_turn: bool = False,
 ) -> tuple[list[NavState], str]:
     """Optimise a filtered track as a whole.
 
@@ -43,7 +42,6 @@ def smooth(
         config: noise, filter and graph settings.
         gyro_bias: (3,) [rad/s] and covariance (3, 3) at the end, as estimated by the filter with
             the magnetic field, which the graph does not use; None without a field.
-        estimates_turn: whether the network's turn is a state, as it is for the filter with fixes.
 
     Returns:
         The graph's states, one for each filtered one, with their marginal covariances, and a
@@ -55,7 +53,7 @@ def smooth(
     origin = filtered[0].p_W  # near the track; see `EkfState`
     local = [state.shifted(-origin) for state in filtered]
     first = _inflated(local[0], prior, transforms)
-    builder = GraphBuilder(config, first, estimates_turn=estimates_turn)
+    builder = GraphBuilder(config, first)
     revoked = {time for record in records for time in record.revoked}
     for record, state in zip(records, local[1:], strict=True):
         # Neither is inflated as by the filter: the graph weights outliers by the whole track.

@@ -9,7 +9,6 @@ import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.initial import tilt_sigma
-from stario.fusion.filter.network_errors import TurnEstimate
 from stario.fusion.filter.record import Record
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Fix
@@ -42,9 +41,6 @@ class GraphBuilder:
         config: noise, filter and graph settings.
         first: the first state; its covariance is the prior.
         count: number of intervals since the start or the last gap, for a graph that begins later.
-        estimates_turn: whether the network's turn is a state: where fixes distinguish it from the
-            yaw.
-        turn: estimate of the turn at the first state; None if it is new.
         streaming: rely on the filter's gating of fixes, and of displacements if it weights them
             equally. A robust loss in the graph starts from the IMU's prediction: while the speed
             was still unknown it rejected correct displacements, one after the other, and in 2 of
@@ -54,7 +50,6 @@ class GraphBuilder:
         graph: the graph so far.
         segments: for each keyframe, the intervals' segments up to the next keyframe or now.
         count: number of intervals since the start or the last gap.
-        estimates_turn: whether the network's turn is a state.
     """
 
     def __init__(
@@ -62,15 +57,12 @@ class GraphBuilder:
         config: NavigatorConfig,
         first: NavState,
         count: int = 0,
-        estimates_turn: bool = False,
-        turn: TurnEstimate | None = None,
         streaming: bool = False,
     ) -> None:
         self._config = config
-        self.graph = KeyframeGraph(first, config.filter.gate, turn)
+        self.graph = KeyframeGraph(first, config.filter.gate)
         self.segments: dict[int, tuple[Segment, ...]] = {0: ()}
         self.count = count
-        self.estimates_turn = estimates_turn
         f = config.filter
         self._streaming = streaming
         self._overlap = 2 if f.update_rate % 2 == 0 else 1
@@ -126,8 +118,6 @@ class GraphBuilder:
         due = self.count % self._spacing == 0
         if due:
             self.close(guess)
-            if self.estimates_turn:
-                self.graph.add_turn(self._config.filter.network_turn_sigma)
             window_start = self._window_keyframes.get(self.count - self._window)
             if displacement is not None and window_start is not None:
                 self._add_displacement(window_start, displacement)
@@ -183,7 +173,7 @@ class GraphBuilder:
 
     def dead_reckoned(self, k: int, time: float = math.inf) -> Pose:
         """Dead-reckon from a keyframe to a time [s], or to the end of its data if earlier."""
-        R, v, p, b_g, b_a, _ = self.graph.keyframe(k)
+        R, v, p, b_g, b_a = self.graph.keyframe(k)
         if k in self._gaps:
             gap = self._gaps[k]
             until = min(time, gap.stop)

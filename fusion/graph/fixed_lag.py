@@ -25,7 +25,6 @@ from stario.fusion.filter.frame_transform import with_undirected
 from stario.fusion.filter.gained import Gained
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import ASSUMED
-from stario.fusion.filter.network_errors import turn_estimate
 from stario.fusion.filter.record import Record
 from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.graph.bearing import Bearing
@@ -111,9 +110,8 @@ class FixedLagState:
         """Whether the filter has since changed the state from which the graph began."""
         start, frame = self.start, self.filter.map_frame
         wider = self.filter.bias_prior.variance > _WIDER * start.bias_variance
-        turned = self.filter.ekf.has_turn and not self.builder.estimates_turn
         moved = (len(frame.transforms), frame.jumps) != (start.map_frame, start.jumps)
-        return wider or turned or moved
+        return wider or moved
 
 
 def begin(config: NavigatorConfig, start: Start, prior: PriorPose | None = None) -> FixedLagState:
@@ -195,8 +193,7 @@ def _begun(s: EstimatorState, count: int, config: NavigatorConfig) -> FixedLagSt
     first = nav_states([s.estimate()], ASSUMED)[0]
     start = GraphStart(first.p_W, first.map_frame, s.map_frame.jumps, s.bias_prior.variance)
     first = first.shifted(-first.p_W)
-    turn = turn_estimate(s.ekf)
-    builder = GraphBuilder(config, first, count, turn is not None, turn, streaming=True)
+    builder = GraphBuilder(config, first, count, streaming=True)
     return FixedLagState(s, builder, initialised(first, 0), start)
 
 

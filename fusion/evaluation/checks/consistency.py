@@ -19,11 +19,11 @@ import pandas as pd
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.scores import Column, joined, scored
 from stario.fusion.filter import estimator
+from stario.fusion.filter.correlated_errors import ACCEL_SHARE, displacement_errors
 from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
 from stario.fusion.filter.estimates import Estimate
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import ACTUAL, CORE
-from stario.fusion.filter.network_errors import ACCEL_SHARE, displacement_errors
 from stario.fusion.filter.record import innovations_of
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.stateful import WindowDisplacement, slope_variance
@@ -279,7 +279,7 @@ class _DrawnNetwork:
         covariance = _DISPLACEMENT_SIGMA**2 * np.eye(3)
         covariance[2, 2] += slope_variance(d_W)
         if f.correlated_errors:
-            errors = displacement_errors(d_W, covariance, 1.0, False, f)
+            errors = displacement_errors(d_W, covariance, 1.0, f)
             d_W = d_W + errors.considered @ self._lasting
             white = errors.white
         else:  # overlapping windows count as less certain than each one is

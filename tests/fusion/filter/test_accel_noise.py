@@ -9,8 +9,8 @@ import pytest
 
 from stario.fusion import Navigator, NavigatorConfig
 from stario.fusion.filter import estimator
+from stario.fusion.filter.innovations import InnovationStatistics
 from stario.fusion.filter.kalman import UpdateResult
-from stario.fusion.filter.network_errors import InnovationStatistics
 from stario.sequences.sequence import ImuSequence
 
 

@@ -18,7 +18,7 @@ from stario.fusion.evaluation.checks.faults import matched_walk, run_faults
 from stario.fusion.evaluation.scores import wide
 from stario.fusion.filter.alternative import AlternativeHypothesis, Hypotheses
 from stario.fusion.filter.displacements import update_with
-from stario.fusion.filter.network_errors import TURN_SECONDS, InnovationStatistics, with_turn
+from stario.fusion.filter.innovations import InnovationStatistics
 from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.state import NavState
 from stario.sequences.noise import ImuNoise
@@ -175,22 +175,6 @@ def test_the_alternative_is_dropped_when_both_fit_or_when_it_is_too_old() -> Non
 
 def displacement(d_N: np.ndarray, sigma: float) -> WindowDisplacement:
     return WindowDisplacement(d_N, sigma**2 * np.eye(3), np.eye(3))
-
-
-def test_a_false_displacement_lets_the_networks_turn_decay_once() -> None:
-    ekf, zero = Driven(slots=1), np.zeros(3)
-    ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, 1e-4 * np.eye(15)))
-    ekf.clone()
-    ekf.state = replace(with_turn(ekf.state, 0.05), network_turn=0.1)
-    pair = Hypotheses(ekf.state, AlternativeHypothesis(ekf.state, zero, (0.0,)))
-    far = displacement(np.array([5.0, 0.0, 0.0]), 1e-2)
-    after, _, result, _ = update_with(far, pair, InnovationStatistics(), FilterConfig())
-    alternative = after.alternative
-    assert result.gated
-    assert alternative is not None
-    assert len(alternative.outliers) == 2
-    for state in (after.ekf, alternative.ekf):
-        assert state.network_turn == pytest.approx(0.1 * np.exp(-0.5 / TURN_SECONDS), rel=1e-9)
 
 
 @pytest.mark.parametrize(("error", "fits"), [(1.0, False), (0.0, True)])

@@ -3,11 +3,11 @@ import pytest
 from initial_ekf import Driven, initialised
 
 from stario.fusion.config import FilterConfig
+from stario.fusion.filter.correlated_errors import displacement_errors
 from stario.fusion.filter.ekf import clone
 from stario.fusion.filter.ekf import initialised as filter_state
 from stario.fusion.filter.estimates import plain_covariances
 from stario.fusion.filter.jacobians import displacement_jacobian
-from stario.fusion.filter.network_errors import displacement_errors
 from stario.fusion.imu.preintegration import Segment, preintegrate
 from stario.fusion.state import NavState
 from stario.sequences.attitude.so3 import exp_so3
@@ -52,7 +52,7 @@ def drive(ekf: Driven, count: int, window: int = 6, seed: int = 0) -> list[float
 def turn_matrix(yaw: float, ekf: Driven) -> np.ndarray:
     """Transformation of the filter's error state when the world is turned."""
     turn = np.eye(len(ekf.P))  # the network's errors, the last ones, do not change
-    n = ekf.state.turn_row
+    n = ekf.state.considered_rows.start
     turn[:n, :n] = np.kron(np.eye(n // 3), exp_so3(yaw * YAW))
     return turn
 
@@ -214,7 +214,8 @@ def test_displacements_carry_no_information_about_yaw_and_position(
     driven.release(newest)  # it equals the current pose, P has no inverse with it
     held = np.flatnonzero(np.diag(driven.P))
     N = np.zeros((len(driven.P), 4))
-    for first, rho in ((0, 6), *((k, k + 3) for k in range(15, driven.state.turn_row, 6))):
+    clones = range(15, driven.state.considered_rows.start, 6)
+    for first, rho in ((0, 6), *((k, k + 3) for k in clones)):
         N[first + 2, 0] = 1.0
         N[rho : rho + 3, 1:] = np.eye(3)
     N = N[held]
@@ -280,7 +281,7 @@ def test_a_rejected_displacement_with_lasting_errors_leaves_the_state_unchanged(
     driven: Driven,
 ) -> None:
     before, d_W, covariance = driven.state, np.array([50.0, 0.0, 0.0]), 0.01 * np.eye(3)
-    errors = displacement_errors(d_W, covariance, 1.0, False, FilterConfig())
+    errors = displacement_errors(d_W, covariance, 1.0, FilterConfig())
     result = driven.update_displacement(0, d_W, covariance, 7.8, inflation=None, errors=errors)
     assert not result.accepted
     assert driven.state is before

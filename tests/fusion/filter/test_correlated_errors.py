@@ -11,21 +11,19 @@ from initial_ekf import Driven
 from stario.fusion import Navigator, NavigatorConfig
 from stario.fusion.config import FilterConfig
 from stario.fusion.filter import estimator, map_frame
+from stario.fusion.filter.correlated_errors import (
+    DRIFTING,
+    LASTING,
+    WHITE,
+    displacement_errors,
+)
 from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
 from stario.fusion.filter.estimates import Estimate
 from stario.fusion.filter.frame_transform import frame_rotation
 from stario.fusion.filter.initial import PriorPose
+from stario.fusion.filter.innovations import MAX_LEVEL, MIN_LEVEL, InnovationStatistics
 from stario.fusion.filter.kalman import UpdateResult
 from stario.fusion.filter.map_frame import Mapped
-from stario.fusion.filter.network_errors import (
-    DRIFTING,
-    LASTING,
-    MAX_LEVEL,
-    MIN_LEVEL,
-    WHITE,
-    InnovationStatistics,
-    displacement_errors,
-)
 from stario.fusion.fixes import position_fix
 from stario.fusion.graph.covariances import with_actual_covariances
 from stario.fusion.imu.preintegration import preintegrate
@@ -52,10 +50,10 @@ def config(correlated: bool) -> NavigatorConfig:
 def test_shares_add_up_along_a_displacement_and_vanish_with_the_level() -> None:
     d_W, covariance = np.array([1.2, -0.5, 0.0]), np.diag([0.02, 0.02, 0.01])
     u = d_W[:2] / np.linalg.norm(d_W)
-    white, considered = displacement_errors(d_W, covariance, 1.0, False, F)
+    white, considered = displacement_errors(d_W, covariance, 1.0, F)
     total = white + considered @ considered.T
     assert u @ total[:2, :2] @ u == pytest.approx(0.02 * (WHITE + DRIFTING + LASTING))
-    _, lasting = displacement_errors(d_W, covariance, 0.0, False, F)
+    _, lasting = displacement_errors(d_W, covariance, 0.0, F)
     assert u @ (lasting @ lasting.T)[:2, :2] @ u == pytest.approx(0.02 * LASTING)
 
 
@@ -64,7 +62,7 @@ def test_the_floors_slope_is_no_error_of_the_network() -> None:
     d_W, own, slope = np.array([1.2, -0.5, 0.0]), 1e-4, (0.03 * 1.3) ** 2
     covariance = np.diag([0.02, 0.02, own + slope])
     for level in (1.0, 0.2):
-        white, considered = displacement_errors(d_W, covariance, level, False, F)
+        white, considered = displacement_errors(d_W, covariance, level, F)
         height = white[2, 2] + considered[2] @ considered[2]
         assert height == pytest.approx(slope + level * own * (WHITE + DRIFTING))
 
@@ -73,7 +71,7 @@ def test_a_second_of_white_errors_is_the_same_at_any_update_rate() -> None:
     """More windows a second repeat each other's errors instead of averaging them."""
     d_W, covariance = np.array([1.2, -0.5, 0.0]), np.diag([0.02, 0.02, 0.01])
     slow, fast = (
-        displacement_errors(d_W, covariance, 1.0, False, FilterConfig(update_rate=rate))
+        displacement_errors(d_W, covariance, 1.0, FilterConfig(update_rate=rate))
         for rate in (2, 10)
     )
     np.testing.assert_allclose(fast.white / 10.0, slow.white / 2.0)
@@ -85,18 +83,12 @@ def test_errors_turn_with_the_world() -> None:
     R = about_z(1.1).as_matrix()
     root = rng.normal(size=(3, 3))
     d_W, covariance = rng.normal(size=3), 0.01 * root @ root.T + 0.01 * np.eye(3)
-    errors = displacement_errors(d_W, covariance, 0.7, False, F)
-    turned = displacement_errors(R @ d_W, R @ covariance @ R.T, 0.7, False, F)
+    errors = displacement_errors(d_W, covariance, 0.7, F)
+    turned = displacement_errors(R @ d_W, R @ covariance @ R.T, 0.7, F)
     np.testing.assert_allclose(turned.white, R @ errors.white @ R.T, atol=1e-10)
     drifting = R @ errors.considered[:, :3] @ R.T  # they are those of W's axes
     np.testing.assert_allclose(turned.considered[:, :3], drifting, atol=1e-10)
     np.testing.assert_allclose(turned.considered[:, 3:], R @ errors.considered[:, 3:], atol=1e-10)
-
-
-def test_a_turn_that_is_a_state_is_not_counted_again() -> None:
-    d_W, covariance = np.array([1.0, 0.0, 0.0]), 0.01 * np.eye(3)
-    assert displacement_errors(d_W, covariance, 1.0, False, F).considered[1, 4] != 0.0
-    assert displacement_errors(d_W, covariance, 1.0, True, F).considered[1, 4] == 0.0
 
 
 @pytest.mark.parametrize(("nis", "bound"), [(0.0, MIN_LEVEL), (1e6, MAX_LEVEL)])
@@ -144,7 +136,7 @@ def straight_walk(rng: np.random.Generator, seconds: int) -> tuple[Driven, np.nd
         ekf.propagate(segment)
         errors = kept * errors + np.sqrt(1.0 - kept**2) * rng.normal(size=len(kept))
         d_W, covariance = speed, 0.1**2 * np.eye(3)
-        model = displacement_errors(d_W, covariance, 1.0, False, F)
+        model = displacement_errors(d_W, covariance, 1.0, F)
         d_W = d_W + model.considered @ errors
         d_W = d_W + np.linalg.cholesky(model.white) @ rng.normal(size=3)
         result = ekf.update_displacement(slot, d_W, covariance, errors=model)
@@ -224,20 +216,19 @@ def test_the_first_fix_after_a_straight_walk_is_believed() -> None:
     accel = np.tile([0.0, 0.0, STANDARD_GRAVITY], (len(time), 1))
     noise = ImuNoise(gyro_noise=1e-3, accel_noise=0.1)
     frame = map_frame.first_frame(PriorPose(np.eye(3), zero, zero))
-    f = FilterConfig(network_turn_sigma=0.0)
     slot = ekf.clone()
     for second in range(200):
         samples = float(second) + time, np.zeros_like(accel), accel
         ekf.propagate(preintegrate(*samples, zero, zero, noise, STANDARD_GRAVITY))
         d_W, covariance = np.array([scale * length, 0.0, 0.0]), 0.1**2 * np.eye(3)
         d_W = d_W + rng.normal(0.0, 0.05, 3)
-        errors = displacement_errors(d_W, covariance, 1.0, False, F)
+        errors = displacement_errors(d_W, covariance, 1.0, F)
         ekf.update_displacement(slot, d_W, covariance, gate=14.0, errors=errors)
         slot = ekf.clone(instead_of=slot)
     truth = np.array([200.0 * length, 0.0, 0.0])
     assert ekf.state.p_W[0] - truth[0] > 3.0 * np.sqrt(ekf.P[6, 6])
     fix = position_fix(200.0, truth, np.eye(3))
-    (after, _), result = map_frame.update_with(fix, Mapped(ekf.state, frame), f)
+    (after, _), result = map_frame.update_with(fix, Mapped(ekf.state, frame), F)
     assert result.accepted
     assert result.scale == 1.0
     assert np.linalg.norm(after.p_W - truth) < 1.0
