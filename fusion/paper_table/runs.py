@@ -10,8 +10,8 @@ import hashlib
 import importlib
 import json
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from functools import cache, partial
 from itertools import product
@@ -242,7 +242,8 @@ def complete(
     yield from each(partial(complete_run, out=out, reading=reading), runs, jobs)
 
 
-def backend(name: str) -> AbstractContextManager[object]:
+@contextmanager
+def backend(name: str) -> Iterator[None]:
     """Select joblib's backend within a block: "loky" (processes on this machine), "dask" or "ray".
 
     Dask uses the scheduler named in its configuration (`DASK_SCHEDULER_ADDRESS`), Ray the cluster
@@ -251,32 +252,19 @@ def backend(name: str) -> AbstractContextManager[object]:
     Raises:
         InputError: the name is unknown, or the backend's package is not installed.
     """
-    backends: dict[str, Callable[[], AbstractContextManager[object]]] = {
-        "loky": nullcontext,
-        "dask": _dask,
-        "ray": _ray,
-    }
-    check_choice("--backend", name, backends)
-    return backends[name]()
-
-
-@contextmanager
-def _dask() -> Iterator[None]:
     from joblib import parallel_config
 
-    distributed = optional_package("distributed", "cluster")
-    logging.getLogger("distributed").setLevel(logging.WARNING)
-    with distributed.Client(), parallel_config("dask"):
-        yield
-
-
-@contextmanager
-def _ray() -> Iterator[None]:
-    from joblib import parallel_config
-
-    try:
-        importlib.import_module("ray.util.joblib").register_ray()
-    except ImportError as error:
-        raise InputError("--backend", "ray, not installed", "ray", "pip install ray") from error
-    with parallel_config("ray"):
+    check_choice("--backend", name, ("loky", "dask", "ray"))
+    with ExitStack() as within:
+        if name == "dask":
+            distributed = optional_package("distributed", "cluster")
+            logging.getLogger("distributed").setLevel(logging.WARNING)
+            within.enter_context(distributed.Client())
+        elif name == "ray":
+            try:
+                importlib.import_module("ray.util.joblib").register_ray()
+            except ImportError as error:
+                found, fix = "ray, not installed", "pip install ray"
+                raise InputError("--backend", found, "ray", fix) from error
+        within.enter_context(parallel_config(name))
         yield
