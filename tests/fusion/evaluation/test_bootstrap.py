@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from stario.fusion.evaluation.benchmark.groups import POOLED, Row, verdict
+from stario.fusion.evaluation.benchmark.groups import POOLED, verdict
 from stario.fusion.evaluation.bootstrap import Interval, block_rows, paired_ratio, ranks
 from stario.fusion.evaluation.scores import joined
 
@@ -83,9 +83,11 @@ def test_a_few_blocks_have_no_interval() -> None:
 BETTER = Interval(0.8, 0.7, 0.9)
 
 
-def rows_with(groups: list[Interval], pooled: Interval) -> list[Row]:
-    ratios = [(f"g{k}", ratio, False) for k, ratio in enumerate(groups)] + [(POOLED, pooled, True)]
-    return [Row(name, 5, 1.0, {}, {"rms_10s_m": ratio}, whole) for name, ratio, whole in ratios]
+def rows_with(groups: list[Interval], pooled: Interval) -> pd.DataFrame:
+    names = [f"g{k}" for k in range(len(groups))]
+    whole = [False] * len(groups) + [True]
+    columns = {"group": [*names, POOLED], "ratio_10s": [*groups, pooled], "pooled": whole}
+    return pd.DataFrame(columns)
 
 
 def test_two_groups_are_too_few_for_a_verdict() -> None:
