@@ -16,21 +16,29 @@ if TYPE_CHECKING:
 
 
 def rows_of(
-    parts: Iterable[tuple[str, pd.DataFrame]], columns: Sequence[Column], corner: str = ""
+    parts: Iterable[tuple[str | tuple[str, ...], pd.DataFrame]],
+    columns: Sequence[Column],
+    *corner: str,
 ) -> list[list[str]]:
-    """Return the cells of a table, its titles first: a row for each part of the scores."""
-    head = [corner, *(column.title for column in columns)]
-    return [head, *([name, *(c.text(part) for c in columns)] for name, part in parts)]
+    """Return the cells of a table, its titles first: a row for each part of the scores.
+
+    Parts are named by one label or by several, whose titles are `corner`.
+    """
+    rows = [[*corner, *(column.title for column in columns)]]
+    for name, part in parts:
+        names = (name,) if isinstance(name, str) else name
+        rows.append([*names, *(column.text(part) for column in columns)])
+    return rows
 
 
 def table(
-    parts: Iterable[tuple[str, pd.DataFrame]],
+    parts: Iterable[tuple[str | tuple[str, ...], pd.DataFrame]],
     columns: Sequence[Column],
-    corner: str = "",
+    corner: tuple[str, ...] = ("group",),
     notes: Sequence[str] = (),
 ) -> str:
     """Return a table with a row for each part of the scores, and notes below it."""
-    return "\n".join([*aligned(rows_of(parts, columns, corner)), *notes])
+    return "\n".join([*aligned(rows_of(parts, columns, *corner)), *notes])
 
 
 _BENCHMARK = {
@@ -83,7 +91,7 @@ def networks_text(table: NetworkTable) -> str:
     for protocol, words in PROTOCOLS.items():
         for metric, title in METRICS.items():
             columns = [table.column(name, protocol, metric) for name in table.parameters]
-            lines += [f"{words}: {title}", *aligned(rows_of(rows, columns)), ""]
+            lines += [f"{words}: {title}", *aligned(rows_of(rows, columns, "")), ""]
     return "\n".join([*lines, *(f"{key}: {words}." for key, words in table_words(table).items())])
 
 
