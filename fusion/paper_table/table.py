@@ -27,9 +27,9 @@ from stario.fusion.evaluation.networks import (
 from stario.fusion.evaluation.pedestrian import NAME as PDR
 from stario.fusion.evaluation.scores import Spread, joined, scored
 from stario.fusion.evaluation.text import rows_of
-from stario.fusion.paper_table.errors import CONVENTION, Shown
+from stario.fusion.paper_table.errors import CONVENTION
 from stario.fusion.paper_table.published import published
-from stario.fusion.paper_table.runs import Run, read_run, read_tracks
+from stario.fusion.paper_table.runs import Run, read_run
 from stario.fusion.paper_table.sets import DataSet, set_of
 from stario.network.architectures import ARCHITECTURES
 from stario.network.runtime.cost import table_cost
@@ -37,7 +37,7 @@ from stario.network.runtime.survey import BATCHES, ModelRow, survey
 from stario.network.training.config import TrainingConfig
 from stario.sequences.accuracy.metrics import CONVENTIONS
 from stario.sequences.files import atomic_write, write_json, write_rows
-from stario.sequences.sequence import FloatArray, Trajectory
+from stario.sequences.sequence import Trajectory
 
 REFERENCE_NETWORK = "StarIO"
 """Reference network that the others' errors are compared with."""
@@ -289,7 +289,7 @@ def write_results(
     ]
     write_rows(out / "table.csv", means)
     for name, table in tables.items() if drawn else ():
-        found = _for_figures(table, [run for run in runs if run.dataset.name == name], out)
+        found = _for_figures(table, completed[name])
         if found is not None:
             write_table(out / name / "figures", found)
     return text
@@ -402,7 +402,7 @@ _WORDS = (
 )
 
 
-def _for_figures(table: SetTable, runs: Sequence[Run], out: Path) -> NetworkTable | None:
+def _for_figures(table: SetTable, completed: Completed) -> NetworkTable | None:
     """Return the networks' errors on recordings with poses, for the figures; None without any."""
     scores = table.scores
     parameters = {
@@ -414,24 +414,23 @@ def _for_figures(table: SetTable, runs: Sequence[Run], out: Path) -> NetworkTabl
         return None
     found = scores[chosen].rename(columns={"seed": "weights"})
     found["weights"] = "seed " + found["weights"].astype(str)
-    return NetworkTable(CONVENTION, parameters, found, _samples(runs, found, out))
+    firsts = {network: completed[network].get(0, {}) for network in parameters}
+    return NetworkTable(CONVENTION, parameters, found, _samples(firsts))
 
 
-def _samples(runs: Sequence[Run], scores: pd.DataFrame, out: Path) -> list[Sample]:
-    """Return tracks of some recordings, by each network's first seed."""
-    first = scores[(scores["weights"] == "seed 0") & (scores["track"] == TRUE_ATTITUDE)]
-    figures = first.set_index(["network", "recording", "metric"])["value"]
+def _samples(firsts: Mapping[str, Mapping[str, Any]]) -> list[Sample]:
+    """Return tracks of some recordings, by the first seed of each network."""
     samples: dict[str, Sample] = {}
-    for run in runs:
-        if run.recipe is None or run.seed != 0:
-            continue
-        for name, shown in read_tracks(run, out).items():
-            sample = samples.setdefault(name, Sample(name, _level(shown, shown.truth_W), {}, {}))
-            track = _level(shown, shown.position_W)
-            add_track(sample, run.network, track, figures[run.network, name].to_dict())
+    for network, content in firsts.items():
+        for one in content.get("recordings", ()):
+            name, drawn = one["recording"], one.get("drawn")
+            if drawn:
+                truth, track = (_level(drawn["time"], drawn[key]) for key in ("truth", "track"))
+                sample = samples.setdefault(name, Sample(name, truth, {}, {}))
+                add_track(sample, network, track, one["tracks"][TRUE_ATTITUDE])
     return list(samples.values())
 
 
-def _level(shown: Shown, xy: FloatArray) -> Trajectory:
+def _level(time: Sequence[float], xy: Sequence[Sequence[float]]) -> Trajectory:
     flat = np.column_stack([xy, np.zeros(len(xy))])
-    return Trajectory(shown.time, flat, Rotation.identity(len(xy)))
+    return Trajectory(np.array(time), flat, Rotation.identity(len(xy)))

@@ -76,11 +76,11 @@ _COLUMNS = (
 )
 
 
-def simulated_walks(seconds: float = 120.0, seed: int = 0) -> list[ImuSequence]:
+def simulated_walks() -> list[ImuSequence]:
     """Simulate a walk of each carrying mode, with a phone's sensors in a building."""
     walks = []
-    for k, carry in enumerate(_CARRIES, seed):
-        walk = generate_walk(k, seconds, style=WalkStyle(carry=carry))
+    for k, carry in enumerate(_CARRIES):
+        walk = generate_walk(k, 120.0, style=WalkStyle(carry=carry))
         imu = simulate_imu(walk, 100.0, PHONE_IMU, k, name=carry, magnetic_field=INDOOR_FIELD)
         walks.append(imu)
     return walks

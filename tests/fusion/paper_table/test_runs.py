@@ -57,19 +57,20 @@ def run(dataset: DataSet, network: str = "StarIO", seed: int = 0, steps: int = 4
 
 
 @pytest.mark.usefixtures("narrow_network")
-def test_a_filled_cell_writes_model_errors_and_tracks(
+def test_a_filled_run_writes_model_and_errors(
     dataset: DataSet, reading: ReaderConfig, tmp_path: Path
 ) -> None:
     done = run(dataset, steps=2)
     complete_run(done, tmp_path, reading)
     folder = tmp_path / "own/StarIO/2-steps/seed-0"
-    names = {"errors.json", "log.json", "model.json", "model.safetensors", "tracks.npz"}
+    names = {"errors.json", "log.json", "model.json", "model.safetensors"}
     assert {path.name for path in folder.glob("[!.]*")} == {*names, "trained.json"}
     trained = json.loads((folder / "trained.json").read_text())
     assert trained["steps"] == 2
     assert trained["windows_per_s"] > 0.0
     assert trained["seconds"] > 0.0
     [one] = json.loads((folder / "errors.json").read_text())["recordings"]
+    assert len(one["drawn"]["track"]) == len(one["drawn"]["truth"]) == len(one["drawn"]["time"])
     assert set(one["tracks"]) == {"network_true_attitude", "network", "ekf"}
     total, count = map(sum, zip(*one["blocks"]["ate"], strict=True))
     assert one["tracks"]["network_true_attitude"]["ate_m"] == pytest.approx(
@@ -109,7 +110,7 @@ def test_without_recorded_poses_the_legs_alone_select_the_weights(
 
 
 @pytest.mark.usefixtures("narrow_network")
-def test_a_killed_cell_resumes_and_gives_the_same_model(
+def test_a_killed_run_resumes_and_gives_the_same_model(
     dataset: DataSet, reading: ReaderConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(training, "_EPOCH_STEPS", 2)
@@ -133,7 +134,7 @@ def test_a_killed_cell_resumes_and_gives_the_same_model(
 
 
 @pytest.mark.usefixtures("narrow_network")
-def test_filled_cells_are_kept_and_only_new_networks_and_seeds_are_trained(
+def test_filled_runs_are_kept_and_only_new_networks_and_seeds_are_trained(
     dataset: DataSet, reading: ReaderConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained: list[str] = []
@@ -174,7 +175,7 @@ def test_filled_cells_are_kept_and_only_new_networks_and_seeds_are_trained(
 
 
 @pytest.mark.usefixtures("narrow_network")
-def test_cells_of_another_recipe_are_refused_and_other_step_counts_are_separate(
+def test_runs_of_another_recipe_are_refused_and_other_step_counts_are_separate(
     dataset: DataSet, reading: ReaderConfig, tmp_path: Path
 ) -> None:
     done = run(dataset, steps=1)
@@ -187,7 +188,7 @@ def test_cells_of_another_recipe_are_refused_and_other_step_counts_are_separate(
     assert completed_runs([run(dataset, steps=2)], tmp_path) == {}
 
 
-def test_the_most_important_cells_come_first_and_all_have_equal_steps(dataset: DataSet) -> None:
+def test_the_most_important_runs_come_first_and_all_have_equal_steps(dataset: DataSet) -> None:
     names = ("tyrex", "oxiod", "all")
     sets = [DataSet(n, dataset.training, dataset.validation, dataset.test, "") for n in names]
     runs = table_runs(sets, {**RECIPE, "batch": 10}, steps=600, seeds=2)
@@ -204,7 +205,7 @@ def test_the_most_important_cells_come_first_and_all_have_equal_steps(dataset: D
         table_runs(sets, RECIPE, networks=["Nobody"])
 
 
-def test_a_cell_can_be_pickled_for_other_machines(dataset: DataSet, reading: ReaderConfig) -> None:
+def test_a_run_can_be_pickled_for_other_machines(dataset: DataSet, reading: ReaderConfig) -> None:
     work = partial(complete_run, out=Path("out"), reading=reading)
     sent = pickle.loads(pickle.dumps((work, run(dataset))))
     assert sent[1] == run(dataset)
