@@ -99,6 +99,7 @@ def backends(
     if paths or data is not None:
         settings, network = estimating.settings(), estimating.network()
         scores, skipped = _score_each(
+            "backends",
             reading,
             paths or [entry.path for entry in read_packaged_list(split, data or Path())],
             lambda path, sequence: score_recording(network, sequence, settings),
@@ -258,7 +259,9 @@ def moments(
     skipped: list[Skipped] = []
     judge = partial(moment_costs, model, config=settings, backends=backends, seed=seed)
     if paths:
-        found, skipped = _score_each(reading, paths, lambda path, sequence: judge(sequence))
+        found, skipped = _score_each(
+            "check moments", reading, paths, lambda path, sequence: judge(sequence)
+        )
     else:
         refuse_unused(changed(reading), "with simulated walks", "use with PATH")
         walks = simulated_walks()
@@ -285,10 +288,11 @@ def _check_groups(
     def judged(path: Path, sequence: ImuSequence) -> pd.DataFrame:
         return judge(model, sequence, settings, labels(path, sequence.attributes)[grouping])
 
-    _print_table(*_score_each(reading, paths, judged), table, as_json)
+    _print_table(*_score_each("check", reading, paths, judged), table, as_json)
 
 
 def _score_each(
+    title: str,
     reading: ReadingOptions,
     paths: Sequence[Path],
     score: Callable[[Path, ImuSequence], pd.DataFrame],
@@ -301,7 +305,7 @@ def _score_each(
     def named(path: Path, sequence: ImuSequence) -> pd.DataFrame:
         return score(path, replace(sequence, name=distinct_name(sequence.name, names)))
 
-    return map_recordings("check", reading, paths, named)
+    return map_recordings(title, reading, paths, named)
 
 
 def _print_table(
