@@ -36,7 +36,18 @@ FAST_RAD_S = 15.0
 """Largest 95th percentile of the rate of a carried device; recordings have at most 2.7, but at
 least 41 if deg/s are taken for rad/s."""
 
-MAGNETIC_UNITS = {"uT": 1.0, "nT": 1e-3, "mT": 1e3, "T": 1e6, "gauss": 100.0, "mg": 0.1}
+MAGNETIC_UNITS = {"uT": 1.0, "nT": 1e-3, "mT": 1e3, "T": 1e6, "gauss": 100.0, "g": 100.0, "mg": 0.1}
+"""`G`, in any case, and `mG` are gauss here."""
+
+_EARTH_UT = (20.0, 80.0)
+
+
+def magnetic_advice(size: float) -> str:
+    """Return what to do about a field of a size that is the earth's in another unit than uT."""
+    fits = (u for u in MAGNETIC_UNITS if _EARTH_UT[0] < size * MAGNETIC_UNITS[u] < _EARTH_UT[1])
+    unit = next(fits, "uT")
+    return "" if unit == "uT" else f"if in {unit}, give {MAGNETIC_UNITS[unit]:g} * field"
+
 
 _SPELLINGS = {
     spelling: unit

@@ -98,6 +98,9 @@ class ReadingOptions:
     truth_topic: Annotated[
         str | None, _reading(help="Topic of true poses or odometry in a bag.")
     ] = None
+    rate: Annotated[
+        float | None, _reading(help="Samples per second of a file that has no column of times.")
+    ] = None
     gravity: Annotated[
         str,
         _reading(
@@ -162,8 +165,12 @@ class ReadingOptions:
         from stario.sequences.conventions import with_conventions
         from stario.sequences.readers import read_recording
 
-        topics = {"imu_topic": self.imu_topic, "truth_topic": self.truth_topic}
-        given = {name: topic for name, topic in topics.items() if topic is not None}
+        options = {
+            "imu_topic": self.imu_topic,
+            "truth_topic": self.truth_topic,
+            "rate": self.rate,
+        }
+        given = {name: str(value) for name, value in options.items() if value is not None}
         sequence = read_recording(path, self.format, **given)
         return with_conventions(
             sequence, self.gyro_unit, self.accel_unit, self.axes, self.gravity, self.accel_sign

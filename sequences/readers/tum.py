@@ -15,6 +15,8 @@ from stario.sequences.readers.lines import read_lines
 from stario.sequences.readers.rows import parsed_rows, rows_below
 from stario.sequences.sequence import Trajectory
 
+_REMEDY = "pass track.trajectory, or Track.from_states(states).trajectory"
+
 _FIELDS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 
 
@@ -25,7 +27,7 @@ def write_tum(path: Path | str, trajectory: Trajectory) -> None:
         InputError: there is no valid pose, the folder does not exist, or an argument has the wrong
             type.
     """
-    check_type("trajectory", trajectory, Trajectory, "pass track.trajectory")
+    check_type("trajectory", trajectory, Trajectory, _REMEDY)
     valid = trajectory.valid
     if not valid.any():
         raise InputError("trajectory", "no valid pose", "at least one")
