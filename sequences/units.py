@@ -11,10 +11,10 @@ from stario.sequences.arrays import check_type, shown
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 
-TIME_UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
-"""Units per second: whole numbers, so that nanoseconds since 1970 can be read exactly."""
+TIME_UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+"""Nanoseconds per unit: whole numbers, so that nanoseconds since 1970 can be read exactly."""
 
-FILETIME_PER_SECOND = 10**7
+FILETIME_NS = 100
 """Windows and HoloLens count ticks of 100 ns since 1601."""
 
 FILETIME_1970 = 116_444_736_000_000_000

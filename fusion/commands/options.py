@@ -75,7 +75,7 @@ class ReadingOptions:
         str,
         _reading(
             help="Format: auto, or archive, ronin, ridi, imunet, rnin, tlio, bag, euroc (also "
-            "TUM-VI), oxiod, advio, phone, wide, events, zip, json, csv or long."
+            "TUM-VI), oxiod, advio, phone, joined, wide, events, zip, json, csv, long or untimed."
         ),
     ] = "auto"
     gyro_unit: Annotated[str, _reading(help="Unit of the gyroscope: rad/s, deg/s or mdps.")] = (

@@ -182,9 +182,9 @@ def _rewritten(head: TableHead, title: str, times: Iterator[str], dropped: set[i
         kept = (cell.replace(",", " ") for k, cell in enumerate(cells) if k not in dropped)
         return ",".join([time, *kept])
 
-    rows = (cells_of(row, head.delimiter, head.decimal) if is_row(row) else []
-            for row in read_lines(head.file)[head.skip :])  # fmt: skip
-    above = ["#"] * (head.skip - 1)
+    rows = (cells_of(row, head.layout.delimiter, head.layout.decimal) if is_row(row) else []
+            for row in read_lines(head.file)[head.layout.skip :])  # fmt: skip
+    above = ["#"] * (head.layout.skip - 1)
     titles = line(title, _titles(head))
     return [*above, titles, *(line(next(times, ""), row) if row else "#" for row in rows)]
 
@@ -217,8 +217,8 @@ def _texts(file: Path, least: int = 3) -> list[list[str]]:
     width = head.rows.shape[1]
     titles = head.titles or (["time"] if least == 1 else list("xyz")[:width])
     name = "" if least == 1 else f"{file.stem} "
-    rows = (row for row in read_lines(file)[head.skip :] if is_row(row))
-    texts = [cells_of(row, head.delimiter, head.decimal) for row in rows]
+    rows = (row for row in read_lines(file)[head.layout.skip :] if is_row(row))
+    texts = [cells_of(row, head.layout.delimiter, head.layout.decimal) for row in rows]
     return [[name + title for title in titles], *(cells for cells in texts if len(cells) == width)]
 
 
