@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -42,7 +42,7 @@ from stario.sequences.readers.published.ronin import is_ronin, read_ronin
 from stario.sequences.readers.published.tlio import is_tlio, read_tlio
 from stario.sequences.readers.unpacked_names import named_after
 from stario.sequences.readers.unrecognised import has_some_sensors, unrecognised
-from stario.sequences.readers.zipped import is_zip, unpacked
+from stario.sequences.readers.zipped import is_zip, unpack_zip
 from stario.sequences.sequence import ImuSequence
 
 __all__ = ["FORMATS", "Format", "find_recordings", "read_recording", "write_csv"]
@@ -68,10 +68,19 @@ class Format:
 
 
 def _read_unpacked(
-    unpack: Callable[[Path], AbstractContextManager[Path]], path: Path
+    unpack: Callable[..., None], source: str, path: Path, **options: str
 ) -> ImuSequence:
-    """Read the only recording unpacked from `path`; errors name `path` and the file in it."""
-    with unpack(path) as folder:
+    """Read the only recording unpacked from `path`; errors name `path` and the file in it.
+
+    Args:
+        unpack: function that writes the content of `path` into a folder.
+        source: the recording's source in words; empty if the files in the folder tell.
+        path: the file or folder.
+        options: further arguments of `unpack`.
+    """
+    with tempfile.TemporaryDirectory(prefix="stario-") as temporary:
+        folder = Path(temporary)
+        unpack(path, folder, **options)
         inside = [folder] if _is_recording(folder) else sorted(_below(folder)) or [folder]
         if len(inside) > 1:
             names = ", ".join(str(one.relative_to(folder)) for one in inside[:4])
@@ -81,17 +90,11 @@ def _read_unpacked(
             )
         with named_after(path, folder):
             sequence = read_recording(inside[0])
-    return replace(sequence, name=path.stem) if inside == [folder] else sequence
+    name = path.stem if inside == [folder] else sequence.name
+    return replace(sequence, name=name, source=source or sequence.source)
 
 
-def _read_untimed(path: Path, rate: str = "") -> ImuSequence:
-    return _read_unpacked(partial(unpack_joined, rate=rate), path)
-
-
-def _read_long_form(path: Path) -> ImuSequence:
-    words = "logger with the sensor named in each row"
-    return replace(_read_unpacked(unpack_long_form, path), source=words)
-
+_LONG = "logger with the sensor named in each row"
 
 FORMATS: dict[str, Format] = {
     "archive": Format(lambda path: is_archive(split_name(path)[0]), read_archive, "archive"),
@@ -105,14 +108,16 @@ FORMATS: dict[str, Format] = {
     "oxiod": Format(is_oxiod, read_oxiod, "OxIOD"),
     "advio": Format(is_advio, read_advio, "ADVIO"),
     "phone": Format(is_phone, read_phone, "phone"),
-    "joined": Format(is_joined, partial(_read_unpacked, unpack_joined), "phone"),
+    "joined": Format(is_joined, partial(_read_unpacked, unpack_joined, ""), "phone"),
     "wide": Format(is_wide, read_wide, "phone"),
     "events": Format(is_event_lines, read_event_lines, "logger with one line per event"),
-    "zip": Format(is_zip, partial(_read_unpacked, unpacked), "zip"),
-    "json": Format(is_json_export, partial(_read_unpacked, unpack_json), "Sensor Logger"),
+    "zip": Format(is_zip, partial(_read_unpacked, unpack_zip, ""), "zip"),
+    "json": Format(is_json_export, partial(_read_unpacked, unpack_json, ""), "Sensor Logger"),
     "csv": Format(is_generic_csv, read_generic_csv, "generic CSV"),
-    "long": Format(is_long_form, _read_long_form, "phone"),
-    "untimed": Format(is_untimed, _read_untimed, "phone", options=("rate",)),
+    "long": Format(is_long_form, partial(_read_unpacked, unpack_long_form, _LONG), "phone"),
+    "untimed": Format(
+        is_untimed, partial(_read_unpacked, unpack_joined, ""), "phone", options=("rate",)
+    ),
 }
 """Known formats by name, tried in this order, more specific ones first; `euroc` also covers TUM-VI,
 `ridi` also IMUNet's processed recordings. Files are found below a folder by `_SUFFIXES`."""

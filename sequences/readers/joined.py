@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import logging
 import math
-import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import chain, islice
 from pathlib import Path
 
@@ -77,12 +75,12 @@ def is_untimed(path: Path) -> bool:
     return head is not None and len(head.rows) >= _LEAST_ROWS and names_both_sensors(path)
 
 
-@contextmanager
-def unpack_joined(path: Path, rate: str = "") -> Iterator[Path]:
-    """Write the table with its times into a temporary file, which is deleted after the block.
+def unpack_joined(path: Path, folder: Path, rate: str = "") -> None:
+    """Write the table with its times into a folder.
 
     Args:
         path: the file or folder.
+        folder: the folder to write into.
         rate: samples per second of a recording without times; empty if it has some.
 
     Raises:
@@ -96,10 +94,7 @@ def unpack_joined(path: Path, rate: str = "") -> Iterator[Path]:
         if head is None:
             raise ReadError(path, "rows", "none of numbers", "samples of both sensors")
         lines = _with_rate(head, rate) if rate or not _clock_columns(head) else _with_clock(head)
-    with tempfile.TemporaryDirectory(prefix="stario-") as folder:
-        file = Path(folder) / f"{path.stem}.csv"
-        file.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        yield file
+    (folder / f"{path.stem}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _head(path: Path, least: int = 4) -> TableHead | None:

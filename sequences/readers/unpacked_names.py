@@ -20,8 +20,9 @@ def named_after(path: Path, folder: Path) -> Iterator[None]:
     """
 
     def shown(text: str) -> str:
-        text = text.replace(str(folder), str(path))
-        return text.replace(folder.name, path.stem) if folder.is_dir() else text
+        for inside in (folder / f"{path.stem}.csv", folder):  # the only file is `path` itself
+            text = text.replace(str(inside), str(path))
+        return text.replace(folder.name, path.stem)
 
     def rename(record: logging.LogRecord) -> bool:
         record.msg, record.args = shown(record.getMessage()), ()
