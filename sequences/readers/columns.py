@@ -69,6 +69,8 @@ _LIKE_TRUTH = re.compile(
     r"gt|truth|pos|quat|(ori|orientation)_?[wxyz]$|[ptq]?_?[xyz]$|q_?[w0-3]$", flags=re.IGNORECASE
 )
 _UNITS = {*ACCEL_UNITS, *GYRO_UNITS, *MAGNETIC_UNITS, *TIME_UNITS}
+_QUOTES = " \"'"
+
 _FEWEST_UNITS = 3
 """Number of cells that make a row of units: those of one sensor."""
 
@@ -141,7 +143,7 @@ def with_units_below(titles: list[str], below: list[str]) -> list[str] | None:
         return None
     units += [""] * (len(titles) - len(units))
     pairs = zip(titles, units, strict=False)
-    return [f"{title} [{unit}]" if unit else title for title, unit in pairs]
+    return [f"{title.strip(_QUOTES)} [{unit}]" if unit else title for title, unit in pairs]
 
 
 def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
