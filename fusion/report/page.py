@@ -69,7 +69,10 @@ def write_report(path: Path, found: Comparison) -> Path:
     mapped = drawn if truth is None else series
     known = shown_positions(sequence, tracks[main])
     health = tracks[main].health
-    corrections = [(t - start, *rest) for t, *rest in (health.corrections if health else [])]
+    corrections = [
+        (time - start, metres, turn, cause)
+        for time, metres, turn, cause in (health.corrections if health else [])
+    ]
     data = {
         "map": json.loads(map_figure(mapped, true_series, known, main, corrections).to_json()),
         "time": json.loads(time_figure(panels).to_json()),
