@@ -178,7 +178,7 @@ class EstimatorOptions:
     model: Annotated[
         str,
         _estimation(
-            help="Weights: default, open, first-stage, walks-36min, or a safetensors or ONNX file."
+            help="Weights: default, open, or a safetensors or ONNX file."
         ),
     ] = "default"
     magnetometer: Annotated[

@@ -135,7 +135,7 @@ def _error(figures: Metrics) -> float:
 
 
 def _path_length(sequence: ImuSequence) -> float | None:
-    """Return the length of the true path [m]; None if positions are too noisy to add their steps."""
+    """Return the length of the true path [m]; None for positions whose noise adds up."""
     if sequence.truth is not None:
         return sequence.truth.path_length()
     known = sequence.positions
