@@ -37,7 +37,7 @@ _NETWORK = {"track": "network"}
 
 _NOTES = (
     "network: median error [m]; ratios to it: geometric mean, 95th percentile, worst",
-    "% of path: the first back end's error over the length of the true path, median",
+    "% of path: error over the length of the true path, median",
     "NIS: mean, 3 expected; NEES of position: median, 2.4 expected; yaw: error at the end "
     "relative to the start",
 )
@@ -98,10 +98,10 @@ def fusion_gain_table(scores: pd.DataFrame) -> str:
             Column(f"{name} mean", "ratio", ".2f", geometric_mean, where),
             Column("p95", "ratio", ".2f", _percentile_95, where),
             Column("worst", "ratio", ".2f", np.max, where),
+            Column("% of path", "percent", ".1f", np.median, where),
         ]
     first = {"track": backends[0]}
     columns += [
-        Column("% of path", "percent", ".1f", np.median, first),
         Column("NIS", "nis", ".1f", np.mean, first),
         Column("NEES", "nees", ".1f", np.median, first),
         Column("yaw deg", "yaw_error", ".1f", median_degrees, first),
