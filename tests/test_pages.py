@@ -98,11 +98,11 @@ def run_line(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     elif words[0] != "stario":
         subprocess.run(["bash", "-ec", line], check=True, capture_output=True)
     else:
-        monkeypatch.setattr(sys, "argv", [word.replace("$STARIO_DATA", str(DATA)) for word in words])
-        try:
+        there = [word.replace("$STARIO_DATA", str(DATA)) for word in words]
+        monkeypatch.setattr(sys, "argv", there)
+        with pytest.raises(SystemExit) as leaving:
             main()
-        except SystemExit as leaving:
-            assert not leaving.code, line
+        assert not leaving.value.code, line
 
 
 @pytest.mark.parametrize("page", GUIDES, ids=page_name)
