@@ -23,6 +23,7 @@ from stario.sequences.readers.archive import (
 from stario.sequences.readers.bag import is_bag, read_bag
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import is_generic_csv, read_generic_csv
+from stario.sequences.readers.joined import is_joined, is_untimed, unpack_joined
 from stario.sequences.readers.lines import may_be_read
 from stario.sequences.readers.lists import is_list, list_entries
 from stario.sequences.readers.phones.event_lines import is_event_lines, read_event_lines
@@ -83,6 +84,10 @@ def _read_unpacked(
     return replace(sequence, name=path.stem) if inside == [folder] else sequence
 
 
+def _read_untimed(path: Path, rate: str = "") -> ImuSequence:
+    return _read_unpacked(partial(unpack_joined, rate=rate), path)
+
+
 def _read_long_form(path: Path) -> ImuSequence:
     words = "logger with the sensor named in each row"
     return replace(_read_unpacked(unpack_long_form, path), source=words)
@@ -100,12 +105,14 @@ FORMATS: dict[str, Format] = {
     "oxiod": Format(is_oxiod, read_oxiod, "OxIOD"),
     "advio": Format(is_advio, read_advio, "ADVIO"),
     "phone": Format(is_phone, read_phone, "phone"),
+    "joined": Format(is_joined, partial(_read_unpacked, unpack_joined), "phone"),
     "wide": Format(is_wide, read_wide, "phone"),
     "events": Format(is_event_lines, read_event_lines, "logger with one line per event"),
     "zip": Format(is_zip, partial(_read_unpacked, unpacked), "zip"),
     "json": Format(is_json_export, partial(_read_unpacked, unpack_json), "Sensor Logger"),
     "csv": Format(is_generic_csv, read_generic_csv, "generic CSV"),
     "long": Format(is_long_form, _read_long_form, "phone"),
+    "untimed": Format(is_untimed, _read_untimed, "phone", options=("rate",)),
 }
 """Known formats by name, tried in this order, more specific ones first; `euroc` also covers TUM-VI,
 `ridi` also IMUNet's processed recordings. Files are found below a folder by `_SUFFIXES`."""
@@ -125,7 +132,8 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
     Args:
         path: a file or a folder, depending on the format; `file.h5:name` in an archive.
         format: a name in `FORMATS`, or "auto" to recognise the format by the content.
-        options: further arguments of the format's reader: `imu_topic` and `truth_topic` for a bag.
+        options: further arguments of the format's reader: `imu_topic` and `truth_topic` for a bag,
+            `rate` [samples/s] for a table without times.
 
     Raises:
         InputError: `path` is not a path, the format is unknown, or it does not take an option.
@@ -134,6 +142,8 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
     check_choice("format", format, ("auto", *FORMATS))
     path = _readable(path, "a recording")
     name = _recognised(path) if format == "auto" else format
+    if "rate" in options and format == "auto":  # by which even an unknown table is read
+        name = "untimed"
     if name is None:
         raise unrecognised(path, sorted(_below(path)), _KNOWN)
     for option in options:

@@ -170,6 +170,8 @@ def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
         missing += [name for name in MAGNETIC if name not in columns]
     if missing:
         fix = "or remove the truth columns" if truth and not set(missing) & {"t", *IMU} else ""
+        if missing == ["t"]:
+            fix = "or pass the samples per second: `--rate 100`"
         expected = f"{HEADER},{TRUTH_HEADER}" if truth else HEADER
         expected += f",{MAGNETIC_HEADER}" if set(MAGNETIC) & set(missing) else ""
         raise ReadError(path, f"line {number}, header", f"no {', '.join(missing)}", expected, fix)

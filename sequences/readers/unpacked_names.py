@@ -14,13 +14,14 @@ _PACKAGE = "stario.sequences"
 
 @contextmanager
 def named_after(path: Path, folder: Path) -> Iterator[None]:
-    """Let errors and log records of the block name `path` instead of the folder it is unpacked to.
+    """Let errors and log records of the block name `path` instead of where it is unpacked to.
 
     `walk.zip/Gyroscope.csv` is the file of that name in the zip.
     """
 
     def shown(text: str) -> str:
-        return text.replace(str(folder), str(path)).replace(folder.name, path.stem)
+        text = text.replace(str(folder), str(path))
+        return text.replace(folder.name, path.stem) if folder.is_dir() else text
 
     def rename(record: logging.LogRecord) -> bool:
         record.msg, record.args = shown(record.getMessage()), ()

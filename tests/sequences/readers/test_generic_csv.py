@@ -240,7 +240,7 @@ GOOD = [HEADER, f"0,{ROW}", f"0.01,{ROW}", f"0.02,{ROW}"]
         ),
         ([*GOOD[:3], "0.02,0.1,0.2"], "line 4: found 3 values, expected 7; is the file cut short?"),
         ([*GOOD[:3], "0.02,0.1,0.2,x,1,2,9"], "line 4, gz: found 'x', expected a number"),
-        ([*GOOD[:3], "noon,0.1,0.2,0.3,1,2,9"], "line 4, t: found 'noon', expected a time"),
+        ([*GOOD[:3], "noon,0.1,0.2,0.3,1,2,9"], "line 4, t: found 'noon', expected a number"),
         ([*GOOD[:3], f",{ROW}"], "line 4, t: found '', expected a time"),
         (GOOD[:1], "rows: found none below the header"),
         (["# nothing else"], "header: found only comments"),
