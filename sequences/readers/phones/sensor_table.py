@@ -99,7 +99,7 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
     places, clock = table.axes[axes], table.clocks.get(axes, table.clock)
     head = table.head
     refuse_several_devices(
-        table.file, head.titles, head.layout.skip, head.layout.delimiter, places[0].index
+        table.file, head.titles, head.row_format.skip, head.row_format.delimiter, places[0].index
     )
     titles = ", ".join(p.title or f"column {p.index + 1}" for p in places)
     rows = table.read([clock, *places, *table.biases])
