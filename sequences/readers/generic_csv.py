@@ -98,8 +98,6 @@ def read_generic_csv(path: Path) -> ImuSequence:
     """Read a generic CSV in the format that the module's docstring describes."""
     lines = read_lines(path)
     header = read_header(path, lines)
-    gx = header.columns["gx"].index
-    refuse_several_devices(path, header.titles, header.lines, header.separator, gx)
     rows = _read_rows(path, lines, header)
     gyro, gyro_factors = _vectors(path, header, rows, "g", GYRO_UNITS)
     accel, accel_factors = _vectors(path, header, rows, "a", ACCEL_UNITS)
@@ -170,6 +168,7 @@ def _read_rows(path: Path, lines: list[str], header: Header) -> _Rows:
     names = ["t", *(name for name in QUANTITIES if name in columns)]
     used, titles = [columns[n].index for n in names], [columns[n].title for n in names]
     table = read_table(path, used, row_format, titles, killed=ends_within_a_row(path, separator))
+    refuse_several_devices(table, header.titles, columns["gx"].index)
     is_imu = _imu_rows(table, [names.index(name) for name in IMU])
     if not is_imu.any():
         raise ReadError(path, "gx", "no row with IMU samples", "numbers in every IMU column")

@@ -85,10 +85,11 @@ class Table:
     frame: Any = None
 
     def cells(self, column: int) -> list[str]:
-        """Return the text of a column of the file."""
+        """Return the text of a column of the file, empty in rows that are too short."""
         rows = self.row_format.rows(self.path) if self.rows is None else self.rows
         mark = self.row_format.delimiter
-        return [line.split(mark, column + 1)[column].strip() for _, line in rows]
+        after = ((*line.split(mark, column + 1), *[""] * (column + 1)) for _, line in rows)
+        return [cells[column].strip() for cells in after]
 
     def stamps_ns(
         self, column: int = 0, unit_ns: int = 1, kept: IntArray | None = None
