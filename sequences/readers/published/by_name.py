@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import finite_rows, magnetometer, rotations
-from stario.sequences.readers.json_file import read_json
-from stario.sequences.readers.lines import first_line, read_lines
+from stario.sequences.readers.lines import first_line, read_json, read_lines
 from stario.sequences.readers.text import RowFormat, read_table, seconds
 from stario.sequences.sequence import FloatArray, Magnetometer
 
