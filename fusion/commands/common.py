@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import logging
+import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -193,6 +195,24 @@ def origin_of(
         "reading": {k: v for k, v in asdict(reading).items() if v != default[k]},
         "fixes": fixes and str(fixes.absolute()),
     }
+
+
+def findings_are_printed() -> None:
+    """Keep findings out of the log: the command prints the verdict on them."""
+    logging.getLogger("stario.findings").disabled = True
+
+
+def training_command(paths: Sequence[Path], reading: ReadingOptions) -> str:
+    """Return the command that trains weights on these recordings, read in the same way."""
+    default = asdict(ReadingOptions())
+    options = [
+        f"--{name.replace('_', '-')}={each}"
+        for name, value in asdict(reading).items()
+        if value != default[name]
+        for each in (value if isinstance(value, list) else [value])
+    ]
+    words = ["stario", "train", *map(str, paths), *options, "--start-from", "default"]
+    return shlex.join(words)
 
 
 def recipe_values(path: Path) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,9 +12,11 @@ import typer
 from stario.fusion.commands.common import (
     exit_if_skipped,
     explanations,
+    findings_are_printed,
     origin_of,
     print_result,
     progress_bar,
+    training_command,
 )
 from stario.fusion.commands.options import (
     CompareOutOption,
@@ -77,11 +80,13 @@ def compare(
         raise InputError("--fixes", f"{len(files)} recordings", "one recording")
     folder = out or Path("runs") / "compare"
     check_folder(folder)
+    findings_are_printed()
     with progress_bar("compare", 100 * len(files)) as progress:
         outcomes = compare_recordings(
             files, model, settings, read, jobs, absolute_fixes, progress=progress
         )
-        comparisons = list(without_skipped(outcomes, skipped))
+        train = training_command(paths, reading) if paths else ""
+        comparisons = [replace(c, train=train) for c in without_skipped(outcomes, skipped)]
     written = write_comparison(folder, comparisons, settings, origin) if comparisons else []
     if report:
         from stario.fusion.report.page import write_report
@@ -113,4 +118,4 @@ def _lines(comparison: Comparison) -> list[str]:
 
         for name, track in comparison.tracks.items():
             lines.append(f"{name}: {position_error_words(track, sequence.positions)}")
-    return lines
+    return [*lines, *(finding.line() for finding in comparison.verdict)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 
 from stario.fusion.config import NavigatorConfig
@@ -17,6 +17,7 @@ from stario.fusion.evaluation.tracks import (
     network_track_true_attitude,
     true_poses,
 )
+from stario.fusion.evaluation.verdict import recording_verdict
 from stario.fusion.fix_file import check_within
 from stario.fusion.fixes import Fix, fix_list
 from stario.fusion.imu.stateful import Predictor
@@ -29,6 +30,7 @@ from stario.sequences.arrays import check_type, shown
 from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.errors import InputError
 from stario.sequences.files import unused_name
+from stario.sequences.findings import Finding
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
@@ -114,12 +116,19 @@ class Comparison:
             "network_true_attitude" without ground truth.
         metrics: metrics by track name.
         alignment: how tracks are aligned with the truth, for metrics and figures.
+        train: command that trains weights on the recording, for the verdict; empty for none.
     """
 
     sequence: ImuSequence
     tracks: dict[str, Track]
     metrics: dict[str, Metrics]
     alignment: Alignment = "first"
+    train: str = ""
+
+    @cached_property
+    def verdict(self) -> list[Finding]:
+        """What stands out about the recording and its main track, to act on first."""
+        return recording_verdict(self.sequence, self.tracks[self.main], train=self.train)
 
     @property
     def main(self) -> str:

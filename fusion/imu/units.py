@@ -13,6 +13,7 @@ import numpy as np
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval, Start
 from stario.sequences.clean_samples import MAX_RATE, MIN_RATE
 from stario.sequences.errors import InputError
+from stario.sequences.findings import warn
 from stario.sequences.inspection.checks import check_gyro
 from stario.sequences.inspection.constant_values import check_not_dead
 from stario.sequences.sequence import FloatArray
@@ -85,13 +86,14 @@ class SensorCheck:
         try:
             check_not_dead("stream", time, gyro, accel)
             remedy = "if it is in deg/s, push np.radians(gyro)"
-            check_gyro("stream", time, gyro, accel, [slice(0, len(time))])
+            *_, doubts = check_gyro("stream", time, gyro, accel, [slice(0, len(time))])
         except InputError as error:
             self._wrong += 1
             if self._wrong >= _MIN_FAILED_PIECES:
                 field = "accel" if error.field.endswith("accelerometer") else "gyro"
                 raise InputError(field, error.found, error.expected, remedy) from None
         else:
+            warn("stream", doubts)
             speed = np.percentile(np.linalg.norm(gyro, axis=1), 95)
             if speed < _DOUBTFUL_RAD_S:
                 self._wrong = 0

@@ -15,12 +15,12 @@ from plotly.offline import get_plotlyjs
 from stario.fusion.evaluation.compare import METRIC_TITLES, Comparison
 from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.report.figures import map_figure, time_figure
-from stario.fusion.report.health import Finding, findings
 from stario.fusion.report.panels import bias_panels, innovation_panels, motion_panels, style
 from stario.fusion.report.series import Series, track_series, trajectory_series
 from stario.fusion.state import Track
 from stario.sequences.drawing.text_table import figure
 from stario.sequences.files import atomic_write
+from stario.sequences.findings import Finding
 from stario.sequences.sequence import ImuSequence, PositionTrack
 
 _LEVEL_WORDS = {"warning": "To do", "good": "Good", "note": "Note"}
@@ -64,13 +64,12 @@ def write_report(path: Path, found: Comparison) -> Path:
         "time": json.loads(time_figure(panels).to_json()),
         "cursors": _cursors(drawn, main),
     }
-    health = tracks[main].health
     parts = {
         "TITLE": html.escape(sequence.name),
         "SUMMARY": html.escape(sequence.summary().removeprefix(f"{sequence.name}: ")),
         "FACTS": _facts(sequence, tracks[main], series[main]),
         "LEGEND": _legend([*([] if truth is None else ["truth"]), *mapped], known),
-        "HEALTH": "" if health is None else _health(findings(health)),
+        "HEALTH": _health(found.verdict),
         "TABLE": "" if truth is None else _table(found),
         "STYLE": _asset("report.css"),
         "SCRIPT": _asset("report.js"),

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from stario.network.card import Calibration
-from stario.network.known_motion import known_motion
 from stario.network.model import DisplacementModel
 from stario.network.training.augment import WindowSampler
 from stario.network.training.config import TrainingConfig
@@ -107,17 +106,12 @@ def train(
                 on_epoch(report)
         if before and (words := held_out.worse(before, run.history.best().validation_by_recording)):
             log.warning("%s: %s", folder, words)
-        known = known_motion(streams, legs)
-        if config.learned < 1.0 and start_from is not None and start_from.card.known_motion:
-            known = start_from.card.known_motion.extended(known)
         path = folder / "model.safetensors"
         if processes.is_leader:
             sources = [*trained_on, *_inherited(start_from)]
             validating = {id(stream) for stream in (*validation, *validation_legs)}
             learned = any(id(stream) in validating for stream in (*streams, *legs))
-            write_result(
-                path, run.best_network(), config, held_out, sources, calibration, known, learned
-            )
+            write_result(path, run.best_network(), config, held_out, sources, calibration, learned)
         return path
 
 

@@ -10,7 +10,6 @@ looks like a device held still.
 
 from __future__ import annotations
 
-import logging
 import math
 
 import numpy as np
@@ -19,15 +18,14 @@ from stario.sequences.arrays import check_type
 from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.clean_samples import clean_samples, unbroken
 from stario.sequences.errors import InputError
+from stario.sequences.findings import Finding, warn
 from stario.sequences.inspection.constant_values import check_not_dead
-from stario.sequences.inspection.times import check_time
+from stario.sequences.inspection.samples import check_time
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 from stario.sequences.truth.fit import TruthFit, fit_truth
 from stario.sequences.truth.part import without_spikes
 from stario.sequences.truth.positions import fit_positions
 from stario.sequences.units import FAST_RAD_S, GYRO_UNITS
-
-log = logging.getLogger(__name__)
 
 MIN_SECONDS = 1.5
 """Shortest recording that holds a window and a margin around it [s]."""
@@ -82,17 +80,26 @@ _MAX_TILT_RAD = math.radians(20.0)
 
 
 def check_units(sequence: ImuSequence) -> None:
-    """Check that a recording's numbers can be in s, rad/s and m/s^2.
+    """Check that a recording's numbers can be in s, rad/s and m/s^2; log what stays in doubt.
 
-    Warns of an accelerometer that may have Apple's sign, which nothing in the file tells.
+    Raises:
+        InputError: as for `unit_findings`.
+    """
+    check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
+    warn(sequence.name, unit_findings(sequence))
+
+
+def unit_findings(sequence: ImuSequence) -> list[Finding]:
+    """Check a recording's units, and return what nothing in the file tells.
+
+    These are a gyroscope that turns about the vertical only, fast enough for deg/s, and an
+    accelerometer that may have Apple's sign.
 
     Raises:
         InputError: it is too short or holds no number, time is in another unit, a sensor is dead,
             the gyroscope is in deg/s, the accelerometer is in g, lacks gravity or has the opposite
-            sign (detected only with a true attitude). The text names the option that fixes it. Or
-            `sequence` has the wrong type.
+            sign (detected only with a true attitude). The text names the option that fixes it.
     """
-    check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
     _check_content(sequence)
     check_time(sequence)
     time, gyro, accel = clean_samples(sequence)
@@ -101,17 +108,20 @@ def check_units(sequence: ImuSequence) -> None:
             f"{sequence.name}: duration", f"{time[-1] - time[0]:.2f} s", f"at least {MIN_SECONDS} s"
         )
     check_not_dead(sequence.name, time, gyro, accel)
-    pieces = _pieces(time)
+    pieces, found = _pieces(time), list[Finding]()
     if pieces:  # otherwise gaps leave nothing to average over
         known = "gyro" in sequence.converted
-        force, average = check_gyro(sequence.name, time, gyro, accel, pieces, known)
+        force, average, found = check_gyro(sequence.name, time, gyro, accel, pieces, known)
         _check_force(sequence, force, average)
     _check_direction(sequence, time, accel)
     if sequence.maybe_apple and sequence.truth is None:
-        log.warning(
-            "%s: gravity was logged apart, as Sensor Logger does on iPhones, whose sign is "
-            "inverted: if it is from an iPhone, pass `--accel-sign apple`", sequence.name,
-        )  # fmt: skip
+        text = (
+            "accelerometer: gravity was logged apart, as Sensor Logger does on iPhones, whose sign "
+            "is inverted"
+        )
+        fix = "if it is from an iPhone, pass `--accel-sign apple`"
+        found.append(Finding("apple_sign_open", text, fix, level="note"))
+    return found
 
 
 def _check_content(sequence: ImuSequence) -> None:
@@ -138,7 +148,7 @@ def check_gyro(
     accel: FloatArray,
     pieces: list[slice],
     unit_known: bool = False,
-) -> tuple[float, float]:
+) -> tuple[float, float, list[Finding]]:
     """Check the gyroscope's rotations against the accelerometer.
 
     Args:
@@ -150,7 +160,8 @@ def check_gyro(
         unit_known: whether the file names the unit; then no option changes it.
 
     Returns:
-        Median magnitude of the force, and of its average over a piece [m/s^2].
+        Median magnitude of the force, and of its average over a piece [m/s^2]; a finding if the
+        accelerometer cannot tell the gyroscope's unit.
 
     Raises:
         InputError: the gyroscope cannot be in rad/s.
@@ -169,12 +180,14 @@ def check_gyro(
     elif speed <= FAST_RAD_S:
         undecided = abs(force - in_degrees - lost) < _UNDECIDED * force
         if speed > _SUSTAINED_RAD_S and undecided and not unit_known:
-            log.warning(
-                "%s: gyroscope: found rotations of %.3g rad/s, all about the vertical, of which "
-                "the accelerometer tells nothing: if in deg/s, pass `--gyro-unit deg/s`",
-                name, speed,
-            )  # fmt: skip
-        return force, average
+            text = (
+                f"gyroscope: found rotations of {speed:.3g} rad/s, all about the vertical, of "
+                "which the accelerometer tells nothing"
+            )
+            values = {"rate_rad_s": speed}
+            fix = "if in deg/s, pass `--gyro-unit deg/s`"
+            return force, average, [Finding("gyro_unit_open", text, fix, values=values)]
+        return force, average, []
     fix = "if it is in deg/s, pass `--gyro-unit deg/s` or write `gx [deg/s]` in the CSV's header"
     if speed <= FAST_RAD_S:  # plausible by hand; in deg/s, a stationary device
         fix = "are its axes and signs the accelerometer's? If the device lay still, is it in deg/s?"

@@ -10,7 +10,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Literal
@@ -25,8 +25,9 @@ from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.datasets.cache_files import JUDGED, recording_file, remove_unused
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_write
+from stario.sequences.findings import Finding, warn
 from stario.sequences.inspection.checks import check_units
-from stario.sequences.inspection.constant_values import warn_of_dead_axes
+from stario.sequences.inspection.constant_values import dead_axes
 from stario.sequences.legs import gaps_and_jumps
 from stario.sequences.levelled_stream import LevelledStream, levelled_streams
 from stario.sequences.sequence import (
@@ -37,7 +38,7 @@ from stario.sequences.sequence import (
     Trajectory,
     is_gap,
 )
-from stario.sequences.truth.problems import truth_problems, warn_of_problems
+from stario.sequences.truth.problems import truth_findings
 
 log = logging.getLogger(__name__)
 
@@ -82,7 +83,7 @@ class Aligned:
         kind: kind of its ground truth.
         attributes: person, device, place and similar, where known.
         pieces: its unbroken stretches.
-        problems: problems of its ground truth, one line each.
+        problems: findings about its ground truth.
     """
 
     path: Path
@@ -90,7 +91,7 @@ class Aligned:
     kind: Kind
     attributes: dict[str, str]
     pieces: list[AlignedPiece]
-    problems: tuple[str, ...]
+    problems: tuple[Finding, ...]
 
 
 def aligned_recording(sequence: ImuSequence, path: Path) -> Aligned:
@@ -101,7 +102,7 @@ def aligned_recording(sequence: ImuSequence, path: Path) -> Aligned:
             unbroken stretch of 2 s, or a wrong unit.
     """
     check_units(sequence)
-    warn_of_dead_axes(sequence)
+    warn(sequence.name, dead_axes(sequence))
     streams = levelled_streams(sequence)
     if not streams:
         raise InputError(f"{sequence.name}: samples", "no unbroken stretch", "one of 2 s")
@@ -122,7 +123,7 @@ def aligned_recording(sequence: ImuSequence, path: Path) -> Aligned:
     else:
         raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
     attributes = {name: str(value) for name, value in sequence.attributes.items()}
-    problems = tuple(problem.line(sequence.name) for problem in truth_problems(sequence))
+    problems = tuple(truth_findings(sequence))
     return Aligned(path, sequence.name, kind, attributes, pieces, problems)
 
 
@@ -154,7 +155,7 @@ def _cached(
     if found is None:
         found = aligned_recording(read(path), path)
         _store(file, found)
-    warn_of_problems(found.problems)
+    warn(found.name, found.problems)
     return found
 
 
@@ -214,7 +215,7 @@ def _store(file: Path, aligned: Aligned) -> None:
         "kind": aligned.kind,
         "attributes": aligned.attributes,
         "starts": [piece.stream.start for piece in aligned.pieces],
-        "problems": aligned.problems,
+        "problems": [asdict(finding) for finding in aligned.problems],
     }
     content = safetensors.numpy.save(arrays, metadata={"recording": json.dumps(description)})
     try:
@@ -243,4 +244,11 @@ def _load(file: Path, path: Path) -> Aligned | None:
         log.warning("%s: unreadable, aligned again: %s", file, error)
         return None
     name, kind, attributes = (description[key] for key in ("name", "kind", "attributes"))
-    return Aligned(path, name, kind, attributes, pieces, tuple(description["problems"]))
+    return Aligned(
+        path,
+        name,
+        kind,
+        attributes,
+        pieces,
+        tuple(Finding(**each) for each in description["problems"]),
+    )
