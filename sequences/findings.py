@@ -27,8 +27,10 @@ _EXPLAINED = {
 }
 """Codes whose findings follow from another one: one fault is told once."""
 
-_log = logging.getLogger("stario.findings")
-"""Its messages repeat what a verdict says; commands that print verdicts disable it."""
+FINDINGS = "stario.findings"
+"""Name of the log of findings, for those who see no verdict."""
+
+_log = logging.getLogger(FINDINGS)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -195,11 +194,6 @@ def origin_of(
         "reading": {k: v for k, v in asdict(reading).items() if v != default[k]},
         "fixes": fixes and str(fixes.absolute()),
     }
-
-
-def findings_are_printed() -> None:
-    """Keep findings out of the log: the command prints the verdict on them."""
-    logging.getLogger("stario.findings").disabled = True
 
 
 def training_command(paths: Sequence[Path], reading: ReadingOptions) -> str:

@@ -12,7 +12,6 @@ import typer
 from stario.fusion.commands.common import (
     exit_if_skipped,
     explanations,
-    findings_are_printed,
     origin_of,
     print_result,
     progress_bar,
@@ -80,7 +79,6 @@ def compare(
         raise InputError("--fixes", f"{len(files)} recordings", "one recording")
     folder = out or Path("runs") / "compare"
     check_folder(folder)
-    findings_are_printed()
     with progress_bar("compare", 100 * len(files)) as progress:
         outcomes = compare_recordings(
             files, model, settings, read, jobs, absolute_fixes, progress=progress

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stario.fusion.commands.common import (
-    findings_are_printed,
     process_each,
     training_command,
 )
@@ -44,7 +43,6 @@ def inspect(
     from stario.fusion.navigator import Navigator
     from stario.network.model import load_model
 
-    findings_are_printed()
     train = training_command(paths, reading)
     work = partial(_inspect, navigator=Navigator(load_model(model)), train=train)
     process_each(reading, paths, out, work, as_json)

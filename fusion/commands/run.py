@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, get_args
 
 from stario.fusion.commands.common import (
-    findings_are_printed,
     origin_of,
     process_each,
     progress_bar,
@@ -76,7 +75,6 @@ def run(
         words=words,
         train=training_command(paths, reading),
     )
-    findings_are_printed()
     process_each(reading, paths, out, work, as_json, "--fixes" if fixes else "", words)
 
 

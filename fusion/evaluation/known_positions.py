@@ -15,9 +15,13 @@ from stario.sequences.sequence import MAX_TRUTH_GAP, FloatArray, ImuSequence, Po
 MIN_POSITIONS = 2
 """Minimum number of positions: a shift alone fits one; with two, their distance is compared."""
 
-_CHORD_S, _MIN_CHORDS, _MOVED_M = 10.0, 5, 2.0
-"""Time [s] between positions whose distance is compared with the track's, the least number of such
-chords, and the distance [m] below which a chord is rest."""
+_COURSE_S, _WAY_S = 10.0, 1.0
+"""Times [s] over which distances between positions are compared with the track's: the first tells
+the course whatever the windings of either, the second the way along them. With positions of
+uncertainty sigma they are at least four times as many seconds, in which a walker moves as far."""
+
+_MIN_CHORDS, _RESTING_M_S = 5, 0.2
+"""Least number of such distances, and speed [m/s] below which one is rest."""
 
 _SCALED = 1.25
 """Factor between both distances, in either direction, that contradicts the track."""
@@ -131,18 +135,35 @@ def _mirror_image(kind: str, truth: Complex, estimate: Complex, error: float) ->
 def _scale(
     known: PositionTrack, time: FloatArray, truth: Complex, estimate: Complex
 ) -> list[Finding]:
-    after = np.searchsorted(time, time + _CHORD_S)
+    """Compare the lengths of both ways, of their course and along their windings."""
+    sigma = known.typical_sigma or 0.0
+    course = _length_ratio(time, truth, estimate, max(_COURSE_S, 4.0 * sigma), 4.0 * sigma)
+    way = _length_ratio(time, truth, estimate, max(_WAY_S, 4.0 * sigma), 4.0 * sigma)
+    if (
+        course is None
+        or way is None
+        or not (min(course, way) > _SCALED or max(course, way) < 1.0 / _SCALED)
+    ):
+        return []
+    text = f"The {known.kind} say that the way is {way:.2g} times as long as the track."
+    advice = "These weights do not know this motion or carrying: rely on no length of the track."
+    return [Finding("track_scale", text, advice, values={"scale": way, "course_scale": course})]
+
+
+def _length_ratio(
+    time: FloatArray, truth: Complex, estimate: Complex, seconds: float, least: float
+) -> float | None:
+    """Return how much longer the true way is, by chords over `seconds`; None for too few.
+
+    Chords in which both moved less than `least` [m], or 0.2 m/s, are rest.
+    """
+    after = np.searchsorted(time, time + seconds - 1e-6)
     before = np.flatnonzero(after < len(time))
     moved, told = (np.abs(p[after[before]] - p[before]) for p in (truth, estimate))
-    walked = np.maximum(moved, told) > max(_MOVED_M, 4.0 * (known.typical_sigma or 0.0))
+    walked = np.maximum(moved, told) > max(_RESTING_M_S * seconds, least)
     if walked.sum() < _MIN_CHORDS:
-        return []
-    scale = float(moved[walked].sum() / max(told[walked].sum(), 1e-3))
-    if 1.0 / _SCALED < scale < _SCALED:
-        return []
-    text = f"The {known.kind} say that the way is {scale:.2g} times as long as the track."
-    advice = "These weights do not know this motion or carrying: rely on no length of the track."
-    return [Finding("track_scale", text, advice, values={"scale": scale})]
+        return None
+    return float(moved[walked].sum() / max(float(told[walked].sum()), 1e-3))
 
 
 def _beyond_sigma(

@@ -216,17 +216,18 @@ def _corrections(health: Health) -> Iterator[Finding]:
 
 def _field(health: Health) -> Iterator[Finding]:
     offered = sum(n for name, n in health.bearings.items() if name != "gated")
-    applied, gated = health.bearings.get("applied", 0), health.bearings.get("gated", 0)
-    if offered - applied > 0.5 * offered:
-        text = f"The magnetic field was of little use ({_counted(health.bearings)})."
-        yield Finding("field_useless", text, level="note", values=health.bearings)
-    elif applied >= MIN_UPDATES and gated > BEARINGS_SHARE * applied:
+    against = health.bearings.get("contradicts the gyroscope", 0)
+    if offered >= MIN_UPDATES and against > BEARINGS_SHARE * offered:
         yield Finding(
             "bearings_contradict",
-            f"{gated} of {applied} bearings of the magnetic field contradict the gyroscope.",
-            "Iron or a current disturbs the field: its heading cannot be relied on there.",
-            values={"gated": gated, "applied": applied},
+            f"{against} of {offered} bearings of the magnetic field contradict the gyroscope and "
+            "were not used.",
+            "Iron, a current or the device disturbs the field: walk elsewhere, or calibrate it.",
+            values={"contradicting": against, "offered": offered},
         )
+    elif offered - health.bearings.get("applied", 0) > 0.5 * offered:
+        text = f"The magnetic field was of little use ({_counted(health.bearings)})."
+        yield Finding("field_useless", text, level="note", values=health.bearings)
     if health.fields_dropped > _FIELDS_DROPPED:
         text = (
             f"{health.fields_dropped} magnetic fields were dropped: the sensor repeated its last "

@@ -133,7 +133,8 @@ def turns_about_one_axis(
     """Return whether both measured rotation about a single axis, which leaves the mount open."""
     phi_V, phi_B = _turns(time, attitude_WV, gyro_B.attitude(time), piece)
     common = np.linalg.svd(phi_V.T @ phi_B / len(phi_V), compute_uv=False)
-    return bool(np.sqrt(common[1]) < 0.1 * _SECOND_AXIS_RAD_S)
+    first, second = np.sqrt(common[:2]) / 0.1
+    return bool(second < _SECOND_AXIS_RAD_S < 0.2 * first)
 
 
 def _fit(

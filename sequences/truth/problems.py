@@ -79,10 +79,11 @@ def examine_truth(sequence: ImuSequence, refusal: str = "") -> TruthFindings:
         return TruthFindings(findings=tuple(found))
     found += fit_findings(fit, refusal)
     positions = None
-    comparable = fit.consistent and not fit.jumps and not fit.one_axis
-    if comparable and fit.misalignment < _NEAR_AXES_RAD:
-        positions = fit_positions(tracked, fit.time_offset)
-        if positions and not refusal:  # the accelerometer's unit or sign would explain all
+    near = fit.consistent and not fit.jumps and fit.misalignment < _NEAR_AXES_RAD
+    if near or fit.one_axis:  # whose clock and axes are unknown: as they are
+        positions = fit_positions(tracked, 0.0 if fit.one_axis else fit.time_offset)
+        same = positions and (not fit.one_axis or positions.correlation > _AGREEING)
+        if positions and same and not refusal:  # the accelerometer's unit would explain all
             found += position_fit_findings(positions)
     return TruthFindings(truth, fit, positions, tuple(found))
 
