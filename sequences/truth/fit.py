@@ -19,7 +19,7 @@ from stario.sequences.conventions import SAME_AXES, axes_matrix, axes_named
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence
 from stario.sequences.time_order import MAX_IMU_GAP
-from stario.sequences.truth.alignment import align_tracked_body
+from stario.sequences.truth.alignment import BodyAlignment, align_tracked_body
 from stario.sequences.truth.clock_offset import clock_offset
 from stario.sequences.truth.mounts import turns_about_one_axis
 from stario.sequences.truth.part import compared_samples
@@ -33,6 +33,9 @@ _MIN_CORRELATION, _MIN_AGREEING = 0.9, 0.7
 """Correlation, and share of agreeing truth samples, below which gyroscope and truth did not measure
 the same rotations; published recordings have at least 0.97 and 0.999. An even gait correlates with
 itself a few steps later by up to 0.94, but with a lower share."""
+
+_JUMPED_RAD, _REMOUNTED_RAD = np.deg2rad(15.0), np.deg2rad(30.0)
+"""Change of the world, and of the mount, that the gyroscope did not measure: a jump."""
 
 EDGE_S = 0.05
 """An offset this close [s] to the largest one searched is the end of the search, not a maximum."""
@@ -122,6 +125,7 @@ def fit_truth(sequence: ImuSequence) -> TruthFit:
     gaps = np.flatnonzero(np.diff(time) > MAX_IMU_GAP)
     valid = pose.valid & ~np.isin(np.searchsorted(time, grid) - 1, gaps)
     aligned = align_tracked_body(time, gyro, accel, grid, pose.attitude_WB, valid)
+    gyro_B = GyroIntegral(time, gyro)
     begin, end, mount = max(aligned.mounts, key=lambda piece: piece[1] - piece[0])
     piece = np.searchsorted(grid + aligned.lag, [begin, end])
     return TruthFit(
@@ -130,22 +134,33 @@ def fit_truth(sequence: ImuSequence) -> TruthFit:
         R_TB=mount,
         tilt=float(aligned.leveling_WW.magnitude()),
         agreeing=float(aligned.valid.sum() / max(valid.sum(), 1)),
-        jumps=sum(
-            not ((time[gaps] > before - 1.0) & (time[gaps] < after)).any()
-            for (_, before, _), (after, _, _) in pairwise(aligned.mounts)
-        ),
+        jumps=_jumps(gyro_B, time[gaps], aligned, grid + aligned.lag),
         accel_against=_accel_against(
             interpolated(grid + aligned.lag, time, accel)[aligned.valid],
             pose.attitude_WB[aligned.valid],
             mount,
         ),
         one_axis=turns_about_one_axis(
-            grid + aligned.lag, pose.attitude_WB, GyroIntegral(time, gyro), (piece[0], piece[1])
+            grid + aligned.lag, pose.attitude_WB, gyro_B, (piece[0], piece[1])
         ),
         applied_axes=sequence.axes,
         times=grid + aligned.lag,
         speed=_speed(pose.attitude_WB, pose.valid),
     )
+
+
+def _jumps(gyro_B: GyroIntegral, gaps: FloatArray, aligned: BodyAlignment, time: FloatArray) -> int:
+    """Count changes of mount or world that the gyroscope did not measure, outside its `gaps` [s]."""
+    count = 0
+    for (_, before, mount), (after, _, other) in pairwise(aligned.mounts):
+        if ((gaps > before - 1.0) & (gaps < after)).any():
+            continue
+        ends = np.searchsorted(time, [before, after])
+        true, measured = aligned.attitude_WB[ends], gyro_B.attitude(time[ends])
+        turned = (true[0].inv() * true[1]) * (measured[0].inv() * measured[1]).inv()
+        jumped = turned.magnitude() > _JUMPED_RAD
+        count += bool(jumped or (mount.inv() * other).magnitude() > _REMOUNTED_RAD)
+    return count
 
 
 def _accel_against(force_B: FloatArray, attitude_WT: Rotation, R_TB: Rotation) -> float:

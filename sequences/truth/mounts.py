@@ -23,7 +23,7 @@ _STRIDES_S = (0.03, 0.1, 0.25, 0.5)
 _FLIP_RAD = np.deg2rad(15.0)
 _GLITCH_RAD = np.deg2rad(6.0)
 _SAME_MOUNT_RAD = np.deg2rad(30.0)
-_MIN_PIECE_S = 1.0
+_MIN_PIECE_S, _REMOUNTED_S = 1.0, 0.5
 
 _MIN_OWN_S, _OWN_BETTER = 3.0, 0.5
 """Length of a piece [s] that can tell that it was mounted anew, and the share of the carried
@@ -58,11 +58,16 @@ def _angle_error(attitude_WV: Rotation, attitude_B: Rotation, stride: int) -> Fl
 def pieces_between_jumps(
     time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation, valid: BoolArray
 ) -> list[tuple[int, int]]:
-    """Return runs of samples [start, stop) between attitude jumps, if long enough to be useful."""
+    """Return runs of samples [start, stop) between attitude jumps, if long enough to be useful.
+
+    A gap of the capture of half a second ends a run: the body may be mounted anew in it, by a turn
+    whose angle happens to be that of the gyroscope.
+    """
     known = np.flatnonzero(valid)
     if len(known) < 2:
         return []
     jump = _angle_error(attitude_WV[known], attitude_B[known], 1) > _FLIP_RAD
+    jump |= np.diff(time[known]) > _REMOUNTED_S
     edges = np.concatenate([[0], np.flatnonzero(jump) + 1, [len(known)]])
     runs = [(known[a], known[b - 1] + 1) for a, b in itertools.pairwise(edges)]
     return [(a, b) for a, b in runs if time[b - 1] - time[a] >= _MIN_PIECE_S]

@@ -181,7 +181,7 @@ def test_of_a_long_recording_the_middle_is_compared() -> None:
 def test_a_new_mounting_after_each_gap_of_the_truth_does_not_contradict_the_gyroscope(
     rate: float,
 ) -> None:
-    """The pieces are too short for the long fit but the first, and no mount may be carried across the gaps."""
+    """All pieces but the first are too short for the long fit; no mount lasts across a gap."""
     walk = simulate_imu(generate_walk(8, 120.0, style=WalkStyle()), 100.0, PHONE_IMU, 2)
     assert walk.truth is not None
     time = np.arange(0.0, 120.0, 1.0 / rate)
@@ -202,3 +202,13 @@ def test_rotation_about_one_axis_leaves_clock_and_axes_open(walk: ImuSequence) -
     assert planar.one_axis
     assert fit_findings(planar, "") == []
     assert not fit_truth(walk).one_axis
+
+
+def test_a_gap_of_the_truth_is_no_jump(walk: ImuSequence) -> None:
+    truth = walk.truth
+    assert truth is not None
+    gappy = replace(walk, truth=replace(truth, valid=np.abs(truth.time - 20.0) > 1.0))
+    assert fit_truth(gappy).jumps == 0
+    turned = Rotation.from_euler("z", np.where(truth.time > 20.0, 2.0, 0.0)[:, None])
+    reset = replace(gappy.truth, attitude_WB=turned * truth.attitude_WB)
+    assert fit_truth(replace(walk, truth=reset)).jumps == 1
