@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -54,7 +55,7 @@ def train(
         folder: folder for `checkpoint.safetensors`, `model.safetensors`, its card and `log.json`.
         on_step: called after each step with the step and its mean squared error [m^2], for a
             progress bar.
-        on_epoch: called after each validation.
+        on_epoch: called after each validation; for initial weights before the first epoch, too.
         trained_on: description of the training data, for the card; that of the initial weights is
             added to it.
         start_from: model that provides the initial weights.
@@ -96,7 +97,9 @@ def train(
         before: dict[str, float] = {}
         if start_from is not None:
             run.start_from(start_from)
-            before = held_out.errors(run.averaged) if processes.is_leader else {}
+            if processes.is_leader:
+                before = held_out.errors(run.averaged)
+                on_epoch(EpochReport(0, math.nan, held_out.selection_error(before), before))
         run.resume()
         if run.step >= config.steps:
             log.warning("%s: all %d epochs are done, nothing left to train", folder, config.epochs)

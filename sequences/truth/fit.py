@@ -150,7 +150,7 @@ def fit_truth(sequence: ImuSequence) -> TruthFit:
 
 
 def _jumps(gyro_B: GyroIntegral, gaps: FloatArray, aligned: BodyAlignment, time: FloatArray) -> int:
-    """Count changes of mount or world that the gyroscope did not measure, outside its `gaps` [s]."""
+    """Count changes of mount or world that no gyroscope measured, outside its `gaps` [s]."""
     count = 0
     for (_, before, mount), (after, _, other) in pairwise(aligned.mounts):
         if ((gaps > before - 1.0) & (gaps < after)).any():

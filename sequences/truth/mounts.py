@@ -9,6 +9,7 @@ import itertools
 import warnings
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import samples_in
@@ -23,7 +24,7 @@ _STRIDES_S = (0.03, 0.1, 0.25, 0.5)
 _FLIP_RAD = np.deg2rad(15.0)
 _GLITCH_RAD = np.deg2rad(6.0)
 _SAME_MOUNT_RAD = np.deg2rad(30.0)
-_MIN_PIECE_S, _REMOUNTED_S = 1.0, 0.5
+_MIN_PIECE_S, _GAP_S = 1.0, 0.5
 
 _MIN_OWN_S, _OWN_BETTER = 3.0, 0.5
 """Length of a piece [s] that can tell that it was mounted anew, and the share of the carried
@@ -60,17 +61,44 @@ def pieces_between_jumps(
 ) -> list[tuple[int, int]]:
     """Return runs of samples [start, stop) between attitude jumps, if long enough to be useful.
 
-    A gap of the capture of half a second ends a run: the body may be mounted anew in it, by a turn
-    whose angle happens to be that of the gyroscope.
+    A gap of the capture in which the body was mounted anew also ends a run: the angle of that turn
+    may happen to be the gyroscope's.
     """
     known = np.flatnonzero(valid)
     if len(known) < 2:
         return []
     jump = _angle_error(attitude_WV[known], attitude_B[known], 1) > _FLIP_RAD
-    jump |= np.diff(time[known]) > _REMOUNTED_S
+    gaps = np.flatnonzero((np.diff(time[known]) > _GAP_S) & ~jump)
+    jump[gaps] = [_remounted(time, attitude_WV, attitude_B, known, int(gap)) for gap in gaps]
     edges = np.concatenate([[0], np.flatnonzero(jump) + 1, [len(known)]])
     runs = [(known[a], known[b - 1] + 1) for a, b in itertools.pairwise(edges)]
     return [(a, b) for a, b in runs if time[b - 1] - time[a] >= _MIN_PIECE_S]
+
+
+def _remounted(
+    time: FloatArray,
+    attitude_WV: Rotation,
+    attitude_B: Rotation,
+    known: NDArray[np.intp],
+    gap: int,
+) -> bool:
+    """Return whether the mounts fitted to up to 10 s before and after a gap contradict."""
+    longest = samples_in(MIN_FIT_S, time)
+    breaks = np.concatenate([[-1], np.flatnonzero(np.diff(known) > 1), [len(known) - 1]])
+    k = int(np.searchsorted(breaks, gap))
+    before = known[max(breaks[k - 1] + 1, gap - longest) : gap + 1]
+    after = known[gap + 1 : min(breaks[k + 1], gap + longest) + 1]
+    sides = []
+    for part in (before, after):
+        piece = int(part[0]), int(part[-1]) + 1
+        own = _fit(time, attitude_WV, attitude_B, piece, _MIN_OWN_S)
+        if own is None:  # too short to tell
+            return False
+        sides.append((own, _turns(time, attitude_WV, attitude_B, piece)))
+    (before_gap, _), (own, phi) = sides
+    return not _same_mount(before_gap, own) and (
+        _residual(own, *phi) < _OWN_BETTER * _residual(before_gap, *phi)
+    )
 
 
 def fitted_mounts(
