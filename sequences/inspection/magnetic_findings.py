@@ -9,6 +9,7 @@ import numpy as np
 
 from stario.sequences.findings import Finding
 from stario.sequences.sequence import FloatArray
+from stario.sequences.units import magnetic_advice
 
 LAGS_S = np.arange(-0.05, 0.151, 0.01)
 """Lags of the time stamps that are tried [s]."""
@@ -140,7 +141,7 @@ def magnetic_findings(found: MagneticFindings) -> list[Finding]:
     agreement, size = found.correlation_with_gyroscope, found.size_median_uT
     if not _SIZES_UT[0] < size < _SIZES_UT[1]:
         text = f"magnetometer: found {size:.3g} uT, expected the earth's 25 to 65"
-        fix = "is it uncalibrated, in another unit or near a magnet?"
+        fix = magnetic_advice(size) or "is it uncalibrated, in another unit or near a magnet?"
         result.append(Finding("field_size", text, fix, values={"size_uT": size}))
     if agreement is not None and agreement < _VERDICTS[-1][2]:
         text = f"magnetometer: does not follow the gyroscope (correlation {agreement:.2f})"
