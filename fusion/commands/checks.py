@@ -269,6 +269,53 @@ def moments(
     _print_table(found, skipped, moment_table, as_json)
 
 
+@expand_option_groups
+def simulation(
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
+    paths: OptionalPathsArgument = None,
+    walks: Annotated[int, typer.Option(min=1, help="Simulated walks of each way.")] = 10,
+    seconds: Annotated[
+        float, typer.Option(min=10.0, help="Duration of each walk in s.")
+    ] = _SECONDS,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare simulated walks with recordings by way of carrying: motion by band, steps, errors.
+
+    Without PATH, print those of the simulated walks.
+    """
+    from stario.fusion.evaluation.checks.simulation import (
+        RECORDED,
+        SIMULATED,
+        SPEEDS,
+        carry_of,
+        motion_scores,
+        motion_table,
+        simulated_walk,
+    )
+
+    if not paths:
+        refuse_unused(changed(reading), "with simulated walks", "use with PATH")
+    model, settings = estimating.network(), estimating.settings()
+    wanted = [(carry, seed) for carry in SPEEDS for seed in range(walks)]
+    found = [
+        motion_scores(model, simulated_walk(carry, seed, seconds), settings, carry, SIMULATED)
+        for carry, seed in with_bar("check simulation", wanted, len(wanted))
+    ]
+    skipped: list[Skipped] = []
+    if paths:
+        recorded, skipped = _score_each(
+            "check simulation",
+            reading,
+            paths,
+            lambda path, sequence: motion_scores(
+                model, sequence, settings, carry_of(sequence), RECORDED
+            ),
+        )
+        found += recorded
+    _print_table(found, skipped, motion_table, as_json)
+
+
 def _check_groups(
     reading: ReadingOptions,
     paths: Sequence[Path],
