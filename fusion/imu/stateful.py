@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stario.fusion.checked import floored
 from stario.fusion.health import SampleCounts
-from stario.fusion.imu.intervals import ImuInterval, Window
+from stario.fusion.imu.intervals import Flags, Window
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
@@ -99,17 +99,16 @@ class WindowBuffer:
         self._blocks.clear()
         self._tail = None
 
-    def add(self, interval: ImuInterval) -> None:
-        """Add the samples of the next interval."""
-        attitudes, flags = interval.attitudes, interval.flags
-        rows = np.empty((len(interval.time), 7))
-        rows[:, 0] = interval.time
-        rows[:, 1:4] = (attitudes @ interval.gyro[:, :, None])[:, :, 0]
-        rows[:, 4:] = (attitudes @ interval.accel[:, :, None])[:, :, 0]
+    def add(self, table: FloatArray, attitudes: FloatArray, flags: Flags) -> None:
+        """Add the next interval's samples (n, 7) with their levelled attitudes (n, 3, 3)."""
+        rows = np.empty_like(table)
+        rows[:, 0] = table[:, 0]
+        rows[:, 1:4] = (attitudes @ table[:, 1:4, None])[:, :, 0]
+        rows[:, 4:] = (attitudes @ table[:, 4:, None])[:, :, 0]
         tail, self._tail = self._tail, rows[-_TAIL_SAMPLES - 1 : -1]
         # The first average reaches half a grid step back, into the tail.
         samples = rows if tail is None else np.concatenate([tail, rows])
-        imu_N = resample(samples[:, 0], samples[:, 1:], interval.start + self._grid)
+        imu_N = resample(samples[:, 0], samples[:, 1:], table[0, 0] + self._grid)
         flagged = flags.gyro or flags.accel or flags.missing
         self._blocks.append(Block(imu_N.astype(np.float32).T, attitudes[0], flagged))
 

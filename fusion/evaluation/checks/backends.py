@@ -19,8 +19,8 @@ from stario.fusion.evaluation.checks.faults import (
 from stario.fusion.evaluation.scores import Column, parts, scored, wide
 from stario.fusion.evaluation.text import table
 from stario.fusion.evaluation.tracks import true_poses
-from stario.fusion.filter.estimator_state import innovations_of
-from stario.fusion.graph.fixed_lag import FixedLagEstimator
+from stario.fusion.filter.record import innovations_of
+from stario.fusion.graph import fixed_lag
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.recording import PreprocessedRecording
@@ -163,14 +163,14 @@ def _streamed(
     preprocessed: PreprocessedRecording, config: NavigatorConfig
 ) -> tuple[Track, FloatArray]:
     """Return the newest states of the fixed-lag graph, and the processor time of each step [s]."""
-    estimator = FixedLagEstimator(config, preprocessed.start)
-    states, times = [estimator.nav_state()], []
+    state = fixed_lag.begin(config, preprocessed.start)
+    states, times = [state.nav_state()], []
     for interval, measurement in zip(
         preprocessed.intervals, preprocessed.measurements, strict=True
     ):
         began = process_time()
-        estimator.step(interval, measurement)
-        states.append(estimator.nav_state())
+        state, _ = fixed_lag.step(state, interval, measurement, (), config)
+        states.append(state.nav_state())
         times.append(process_time() - began)
-    health = estimator.health(preprocessed.front_end.counts)
+    health = state.health(preprocessed.front_end.counts, config.filter)
     return track_from_states(states, innovations_of([]), health), np.array(times)

@@ -18,13 +18,13 @@ import pandas as pd
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.scores import Column, joined, scored
+from stario.fusion.filter import estimator
+from stario.fusion.filter.correlated_errors import ACCEL_SHARE, displacement_errors
 from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
 from stario.fusion.filter.estimates import Estimate
-from stario.fusion.filter.estimator import Estimator
-from stario.fusion.filter.estimator_state import innovations_of
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import ACTUAL, CORE
-from stario.fusion.filter.network_errors import ACCEL_SHARE, displacement_errors
+from stario.fusion.filter.record import innovations_of
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.stateful import WindowDisplacement, slope_variance
 from stario.fusion.lie import log_se23, yaw_rotation
@@ -151,20 +151,22 @@ def _run(config: NavigatorConfig, yaw_sigma: float, seconds: float, seed: int) -
 
     intervals, front_end = cut_recording(ImuSequence("walk", exact.time, gyro, accel), config)
     assert front_end.start is not None  # two seconds are enough
-    estimator = Estimator(config, front_end.start, prior)
+    state = estimator.begin(config, front_end.start, prior)
     network = _DrawnNetwork(walk, config, rng)
-    rows, steps = [], []
+    rows, records = [], []
     for count, interval in enumerate(intervals, 1):
-        steps.append(estimator.step(interval, network.displacement(interval)))
+        measured = network.displacement(interval)
+        state, record = estimator.step(state, interval, measured, (), config)
+        records.append(record)
         if count % config.filter.output_rate == 0:
             k = round(interval.stop * RATE)
-            rows.append(_errors(estimator.estimate(), walk, k, b_g[k], b_a[k]))
+            rows.append(_errors(record.estimate, walk, k, b_g[k], b_a[k]))
     nees, yaw_square, yaw_variance = np.array(rows).T
     return {
         "nees": float(nees.mean()),
         "nees_end": float(nees[-1]),
         "yaw": float((yaw_square / yaw_variance).mean()),
-        "nis": float(innovations_of(steps).nis.mean()),
+        "nis": float(innovations_of(records).nis.mean()),
         "yaw_sigma": math.sqrt(yaw_variance[-1]),
         "yaw_error": math.sqrt(yaw_square[-1]),
     }
@@ -222,7 +224,7 @@ class _DrawnNetwork:
         covariance = _DISPLACEMENT_SIGMA**2 * np.eye(3)
         covariance[2, 2] += slope_variance(d_W)
         if f.correlated_errors:
-            errors = displacement_errors(d_W, covariance, 1.0, False, f)
+            errors = displacement_errors(d_W, covariance, 1.0, f)
             d_W = d_W + errors.considered @ self._lasting
             white = errors.white
         else:  # overlapping windows count as less certain than each one is

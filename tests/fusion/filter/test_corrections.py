@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from initial_ekf import Driven
 
 from stario.fusion import Navigator, NavigatorConfig
 from stario.fusion.filter.corrections import correction
-from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.health import Health
 from stario.fusion.lie import about_vertical
 from stario.fusion.report.health import findings
@@ -20,7 +20,7 @@ from stario.fusion.report.health import findings
 def test_a_step_beyond_a_metre_or_ten_degrees_is_a_correction(
     turn: float, shift: float, recorded: bool
 ) -> None:
-    before = StateCloningEkf(slots=1).state
+    before = Driven(slots=1).state
     before = before.plus(np.zeros(len(before.P)))
     after = before.transformed(about_vertical(turn), np.array([shift, 0.0, 0.0]))
     found = correction(before, after, "rest")
