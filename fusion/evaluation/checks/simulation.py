@@ -14,6 +14,7 @@ import pandas as pd
 from scipy.signal import butter, sosfiltfilt, welch
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.checks.fusion_gain import fitted_error
 from stario.fusion.evaluation.compare import Metrics, measure
 from stario.fusion.evaluation.scores import Column, scored
 from stario.fusion.evaluation.text import table
@@ -106,9 +107,7 @@ def motion_scores(
     figures: Metrics = dict(motion(sequence))
     figures["speed"] = length / sequence.duration
     for name, track in (("network", network_track(observed)), ("graph", navigator.track(observed))):
-        found = measure(track, sequence)
-        error = found["known_positions_m"] if found["ate_fit_m"] is None else found["ate_fit_m"]
-        figures[name] = None if error is None else 100.0 * error / length
+        figures[name] = 100.0 * fitted_error(measure(track, sequence)) / length
     return scored(sequence.name, {kind: figures}, carry)
 
 
