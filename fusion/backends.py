@@ -15,10 +15,10 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
-from stario.fusion.config import NavigatorConfig
+from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.filter import estimator
 from stario.fusion.filter.estimates import Estimate, nav_states
-from stario.fusion.filter.estimator import Estimator
-from stario.fusion.filter.estimator_state import IntervalMeasurements, innovations_of
+from stario.fusion.filter.estimator_state import EstimatorState
 from stario.fusion.filter.frame_transform import (
     frame_rotation,
     smoothed_track,
@@ -27,10 +27,11 @@ from stario.fusion.filter.frame_transform import (
 )
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import ASSUMED, GYRO_BIAS
+from stario.fusion.filter.record import Record, innovations_of
 from stario.fusion.fixes import Accepted, Fix, FixQueue
+from stario.fusion.graph import fixed_lag
 from stario.fusion.graph.batch import smooth
 from stario.fusion.graph.covariances import with_actual_covariances
-from stario.fusion.graph.fixed_lag import FixedLagEstimator
 from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.health import Health, SampleCounts
 from stario.fusion.imu.intervals import ImuInterval, Start
@@ -45,27 +46,13 @@ BackendName = Literal["ekf", "graph"]
 """The EKF, or the factor graph: fixed-lag for streams, the whole track for recordings."""
 
 
-class StreamEstimator(Protocol):
-    """An estimator that runs on a stream, interval by interval; see `filter.estimator`."""
-
-    state: Any
-    """Complete state, which can be assigned back."""
-
-    def step(
-        self,
-        interval: ImuInterval,
-        displacement: WindowDisplacement | None,
-        fixes: Sequence[Fix] = (),
-    ) -> object:
-        """Move to the interval's end and apply the displacement of the window that ends there."""
-
-    def late_fix(self, fix: Fix) -> list[Accepted] | None:
-        """Apply a fix from the past; return all fixes applied since, None if it is too late."""
+class StreamState(Protocol):
+    """State of a stream between two intervals; see `filter.estimator_state`."""
 
     def nav_state(self) -> NavState:
         """Return the newest state."""
 
-    def health(self, counts: SampleCounts) -> Health:
+    def health(self, counts: SampleCounts, f: FilterConfig) -> Health:
         """Return the health report so far."""
 
     @property
@@ -80,14 +67,17 @@ class StreamEstimator(Protocol):
 class FilteredRecording(NamedTuple):
     """A recording after the filter."""
 
-    estimator: Estimator
-    """The filter after the last interval."""
-    estimates: list[Estimate]
-    """The initial state and one per interval."""
-    measurements: list[IntervalMeasurements]
-    """Measurements applied, one entry per interval."""
-    clones: list[Estimate]
-    """Poses released from the window, corrected by all its measurements."""
+    first: Estimate
+    """The initial estimate."""
+    records: list[Record]
+    """What the filter did, interval by interval."""
+    last: EstimatorState
+    """The filter's state after the last interval."""
+
+    @property
+    def estimates(self) -> list[Estimate]:
+        """The initial estimate and one per interval."""
+        return [self.first, *(record.estimate for record in self.records)]
 
 
 class Solution(NamedTuple):
@@ -101,36 +91,41 @@ class Solution(NamedTuple):
 class Backend(NamedTuple):
     """What a back end does with a stream and with a recording."""
 
-    stream: Callable[[NavigatorConfig, Start, PriorPose | None], StreamEstimator]
-    """Create an estimator for a stream with this start."""
+    begin: Callable[[NavigatorConfig, Start, PriorPose | None], Any]
+    """Return the first `StreamState` of a stream with this start."""
+    step: Callable[
+        [Any, ImuInterval, WindowDisplacement | None, Sequence[Fix], NavigatorConfig],
+        tuple[Any, Record],
+    ]
+    """Return the state after an interval with its displacement and fixes, and what was done."""
+    late_fix: Callable[[Any, Fix, NavigatorConfig], tuple[Any, list[Accepted]] | None]
+    """Return the state with a fix from the past, and all fixes since; None if it is too late."""
     solve: Callable[[FilteredRecording, NavigatorConfig], Solution]
     """Return the states of a filtered recording."""
 
 
 def _filter_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
     """Return the filter's states."""
-    frame = filtered.estimator.frame.state
+    frame = filtered.last.map_frame
     states = to_final_frame(nav_states(filtered.estimates), frame.transforms)
-    smoothed = smoothed_track(nav_states(filtered.clones), (*frame.transforms, *frame.undirected))
+    clones = [record.released for record in filtered.records if record.released is not None]
+    smoothed = smoothed_track(nav_states(clones), (*frame.transforms, *frame.undirected))
     return Solution(with_undirected(states, frame.undirected), smoothed)
 
 
 def _graph_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
     """Optimise the whole track at once; the filter's states if the graph is indeterminate."""
-    estimator = filtered.estimator
-    frame, states = estimator.frame.state, nav_states(filtered.estimates, ASSUMED)
-    end, has_field = states[-1], estimator.ekf.state.field is not None
+    last, states = filtered.last, nav_states(filtered.estimates, ASSUMED)
+    frame, end = last.map_frame, states[-1]
+    has_field = last.ekf.field is not None
     bias = (end.b_g, end.covariance[GYRO_BIAS, GYRO_BIAS]) if has_field else None
     covariance = states[0].covariance.copy()
     # The filter's last prior.
-    covariance[GYRO_BIAS, GYRO_BIAS] = estimator.bias.prior.variance * np.eye(3)
+    covariance[GYRO_BIAS, GYRO_BIAS] = last.bias_prior.variance * np.eye(3)
     first = replace(states[0], covariance=covariance)
     final = to_final_frame(states, frame.transforms)
-    has_turn = estimator.ekf.state.has_turn
     try:
-        solved, note = smooth(
-            final, first, filtered.measurements, frame.transforms, config, bias, has_turn
-        )
+        solved, note = smooth(final, first, filtered.records, frame.transforms, config, bias)
     except IndeterminateError as error:
         note = f"graph fell back to the filter's track: {error}"
         return _filter_states(filtered, config)._replace(notes=(note,))
@@ -143,8 +138,10 @@ def _graph_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solut
 
 
 BACKENDS = {
-    "ekf": Backend(partial(Estimator, streaming=True), _filter_states),
-    "graph": Backend(FixedLagEstimator, _graph_states),
+    "ekf": Backend(
+        partial(estimator.begin, streaming=True), estimator.step, estimator.late_fix, _filter_states
+    ),
+    "graph": Backend(fixed_lag.begin, fixed_lag.step, fixed_lag.late_fix, _graph_states),
 }
 
 
@@ -173,11 +170,11 @@ def track_recording(
     queue = FixQueue(fixes, most=math.inf)  # all fixes of a recording are known from the start
     filtered = _filtered(recording, config, prior, queue, progress)
     solution = backend.solve(filtered, config)
-    counts, estimator = recording.front_end.counts, filtered.estimator
-    health = queue.health(estimator.health(counts, solution.states[-1]))
+    counts = recording.front_end.counts
+    health = queue.health(filtered.last.health(counts, config.filter, solution.states[-1]))
     return track_from_states(
         solution.states,
-        innovations_of(filtered.measurements),
+        innovations_of(filtered.records),
         replace(health, notes=[*health.notes, *solution.notes]),
         smoothed=solution.smoothed,
         seconds_network=recording.seconds_network,
@@ -193,18 +190,15 @@ def _filtered(
     progress: Progress,
 ) -> FilteredRecording:
     queue.start(recording.start.time)
-    estimator = Estimator(config, recording.start, prior)
-    filtered = FilteredRecording(estimator, [estimator.estimate()], [], [])
+    state = estimator.begin(config, recording.start, prior)
+    filtered = FilteredRecording(state.estimate(), [], state)
     pairs = zip(recording.intervals, recording.measurements, strict=True)
     for k, (interval, displacement) in enumerate(pairs):
-        applied = estimator.step(interval, displacement, queue.due(interval.stop))
-        filtered.measurements.append(applied)
-        filtered.estimates.append(estimator.estimate())
-        clone = estimator.released
-        if clone is not None and clone not in filtered.clones[-1:]:
-            filtered.clones.append(clone)
+        due = queue.due(interval.stop)
+        state, record = estimator.step(state, interval, displacement, due, config)
+        filtered.records.append(record)
         if k % 500 == 0:
             progress(0.6 + 0.4 * k / len(recording.intervals))
     progress(1.0)
     queue.refuse("after the end", len(queue.due(math.inf)))
-    return filtered
+    return filtered._replace(last=state)

@@ -155,8 +155,8 @@ class Navigator:
     @property
     def state(self) -> NavState | None:
         """Newest state of the stream; None during the first second."""
-        estimator = self._stream.estimator
-        return None if estimator is None else estimator.nav_state()
+        state = self._stream.state
+        return None if state is None else state.nav_state()
 
     @property
     def continuous(self) -> ContinuousPose | None:
@@ -170,8 +170,8 @@ class Navigator:
 
         It changes with each network update; None before the first, and for the graph.
         """
-        estimator = self._stream.estimator
-        return None if estimator is None else estimator.smoothed
+        state = self._stream.state
+        return None if state is None else state.smoothed
 
     @property
     def health(self) -> Health:

@@ -81,8 +81,7 @@ class DisplacementModel:
                 into frame H: z up, the device's heading zero (README, "The window and its frame").
 
         Returns:
-            Displacement (B, 3) [m] and covariance (B, 3, 3) [m^2], in the window's frame; inflated
-            if a window is outside the known motion of the weights (`stario.network.known_motion`).
+            Displacement (B, 3) [m] and covariance (B, 3, 3) [m^2], in the window's frame.
 
         Raises:
             InputError: the shape is wrong or a value is not finite.
@@ -91,15 +90,13 @@ class DisplacementModel:
         if len(batch) == 0:
             return np.zeros((0, 3)), np.zeros((0, 3, 3))
         mean, log_sigma, _ = self.engine.run(batch)
-        return self.calibrated(batch, mean, log_sigma)
+        return self.calibrated(mean, log_sigma)
 
     def calibrated(
-        self, windows: Float32Array, mean: Float32Array, log_sigma: Float32Array
+        self, mean: Float32Array, log_sigma: Float32Array
     ) -> tuple[FloatArray, FloatArray]:
         """Return displacements and covariances, as `predict`, from the network's own outputs."""
         variance = self.card.calibration.variance(log_sigma.astype(np.float64))
-        if self.card.known_motion is not None:
-            variance *= self.card.known_motion.variance_factor(windows)[:, None]
         return mean.astype(np.float64), variance[:, :, None] * np.eye(3)
 
 
@@ -136,7 +133,7 @@ class StatefulModel:
                 batch[k : k + 1], self._engine.first_state() if before is None else before
             )
         self.memory = first + len(batch), tuple(states)
-        return self._model.calibrated(batch, mean, log_sigma)
+        return self._model.calibrated(mean, log_sigma)
 
 
 def save_model(path: Path, network: DisplacementNetwork, card: Card) -> Card:
@@ -170,10 +167,11 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     """Load a model by name or path.
 
     Args:
-        name_or_path: name of packaged weights ("default"; "open", whose sources allow any use;
-            "first-stage", trained without the held-out groups; "walks-36min", the earlier ones), a
-            safetensors file with its card next to it, or an ONNX file written by `export_onnx`.
-            StarIO and ONNX files run in ONNX Runtime, other networks in PyTorch.
+        name_or_path: name of packaged weights ("default", or "open", whose sources allow any use),
+            a safetensors file with its card next to it, or an ONNX file written by `export_onnx`.
+            In a clone of the repository also "first-stage", trained without the held-out groups,
+            and "walks-36min", the earlier ones. StarIO and ONNX files run in ONNX Runtime, other
+            networks in PyTorch.
 
     Raises:
         WeightsError: the file or its card is missing or truncated, or they do not match.
@@ -189,7 +187,8 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     if is_name and packaged.is_file():
         path = packaged
     elif is_name and not path.exists():
-        raise WeightsError(path, "weights", "no such file", f"a file, or {packaged_names()}")
+        fix = "others are files in network/weights of StarIO's repository"
+        raise WeightsError(path, "weights", "no such file", f"a file, or {packaged_names()}", fix)
     content, card = read_weights(path)
     if card.architecture not in ARCHITECTURES:
         known = f"one of {', '.join(ARCHITECTURES)}"

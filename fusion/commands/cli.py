@@ -26,6 +26,7 @@ from stario.fusion.commands.simulate import simulate
 from stario.fusion.commands.table import table
 from stario.fusion.commands.train import train
 from stario.sequences.errors import StarioError
+from stario.sequences.findings import FINDINGS
 
 app = typer.Typer(
     add_completion=False,
@@ -38,7 +39,7 @@ def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
-        typer.echo(version("stario"))
+        typer.echo(version("stario-nav"))
         raise typer.Exit
 
 
@@ -57,7 +58,14 @@ for command in (run, live, compare, evaluate, inspect, convert, train, simulate,
 check = typer.Typer(no_args_is_help=True, help="Check estimators and networks on this machine.")
 for command in (
     *(checks.models, table, checks.fusion, checks.backends, checks.faults),
-    *(checks.gaps, checks.moments, checks.fixes, checks.consistency, checks.benchmark),
+    *(
+        checks.gaps,
+        checks.moments,
+        checks.simulation,
+        checks.fixes,
+        checks.consistency,
+        checks.benchmark,
+    ),
 ):
     check.command()(command)
 app.add_typer(check, name="check")
@@ -85,6 +93,8 @@ def main() -> None:
     """Entry point of the `stario` command."""
     shown = logging.StreamHandler(sys.stderr)
     shown.addFilter(_Once())
+    if {"run", "compare", "inspect"} & set(sys.argv[1:2]):  # these print the verdict on findings
+        shown.addFilter(lambda record: record.name != FINDINGS)
     logging.basicConfig(level=logging.WARNING, format="stario: %(message)s", handlers=[shown])
     try:
         app()

@@ -18,8 +18,9 @@ from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.benchmark.aligned import Complex
 from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position
+from stario.fusion.evaluation.checks.simulation import simulated_walk
 from stario.fusion.evaluation.scores import Column, geometric_mean, joined, parts, scored
-from stario.fusion.evaluation.text import rows_of
+from stario.fusion.evaluation.text import table
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
@@ -28,14 +29,10 @@ from stario.sequences.arrays import interpolated
 from stario.sequences.attitude.rotations import GyroIntegral
 from stario.sequences.attitude.stacks import composed
 from stario.sequences.clean_samples import clean_samples
-from stario.sequences.drawing.text_table import aligned
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence
-from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.insertion import Inserted, insert_moment
-from stario.sequences.simulation.magnetometer import INDOOR_FIELD
 from stario.sequences.simulation.moments import MOMENTS
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 PLACES = {"start": 0.0, "middle": 0.5, "end": 0.85}
 """Instants of a moment, as shares of the recording."""
@@ -77,14 +74,9 @@ _COLUMNS = (
 )
 
 
-def simulated_walks(seconds: float = 120.0, seed: int = 0) -> list[ImuSequence]:
+def simulated_walks() -> list[ImuSequence]:
     """Simulate a walk of each carrying mode, with a phone's sensors in a building."""
-    walks = []
-    for k, carry in enumerate(_CARRIES, seed):
-        walk = generate_walk(k, seconds, style=WalkStyle(carry=carry))
-        imu = simulate_imu(walk, 100.0, PHONE_IMU, k, name=carry, magnetic_field=INDOOR_FIELD)
-        walks.append(imu)
-    return walks
+    return [simulated_walk(carry, seed) for seed, carry in enumerate(_CARRIES)]
 
 
 def moment_costs(
@@ -125,13 +117,10 @@ def moment_costs(
 def moment_table(scores: pd.DataFrame) -> str:
     """Return a row for each moment, place and back end: ratios of errors, largest corrections."""
     rows = [
-        (group, backend, part)
+        ((group, str(backend)), part)
         for backend, chosen in scores.groupby("track", sort=False)
         for group, part in parts(chosen)
     ]
-    cells = rows_of([(group, part) for group, _, part in rows], _COLUMNS, "moment")
-    backends = ["back end", *(str(backend) for _, backend, _ in rows)]
-    lines = aligned([[row[0], name, *row[1:]] for row, name in zip(cells, backends, strict=True)])
     step, turn = (Column("", f"{m}_without", over=np.max).value(scores) for m in ("step", "turn"))
     notes = [
         "without: median error [m] of the parts before and after, each fitted in yaw and position;",
@@ -140,7 +129,7 @@ def moment_table(scores: pd.DataFrame) -> str:
         f"step, turn: largest correction between two outputs (without moments {step:.2f} m, "
         f"{turn:.1f} deg); share with at most {MAX_STEP:g} m and {MAX_TURN:g} deg",
     ]
-    return "\n".join([*lines, *notes])
+    return table(rows, _COLUMNS, ("moment", "back end"), notes)
 
 
 def _with_truth(sequence: ImuSequence) -> ImuSequence:
