@@ -171,7 +171,7 @@ def test_a_snapshot_of_another_version_is_refused(walk: ImuSequence, still_model
         navigator.restore(data)
 
 
-LAYOUTS = {28: "2e5173b8"}
+LAYOUTS = {29: "71cff956"}
 """CRC of the classes and attributes in a snapshot, by version."""
 
 

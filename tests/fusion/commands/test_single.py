@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 import subprocess
@@ -187,6 +188,25 @@ def test_run_warns_of_a_truth_whose_positions_are_wrong(
     truth = replace(walk.truth, position_W=1e3 * walk.truth.position_W)
     write_csv(tmp_path / "mm.csv", replace(walk, truth=truth))
     assert "truth_positions_scale" in codes(tmp_path / "mm.csv")
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_run_inspect_and_report_give_one_verdict(stario, recording: Path, tmp_path: Path) -> None:
+    """Here on positions that contradict accelerometer and track."""
+    pytest.importorskip("plotly")
+    walk = read_generic_csv(recording)
+    truth = replace(walk.truth, position_W=3.0 * walk.truth.position_W)
+    write_csv(tmp_path / "wrong.csv", replace(walk, truth=truth))
+    run, inspection = (
+        json.loads(stario(*words, "--json").out)["verdict"]
+        for words in (("run", "wrong.csv", "--report"), ("inspect", "wrong.csv"))
+    )
+    assert run == inspection
+    page = (tmp_path / "runs/wrong/report.html").read_text()
+    assert all(html.escape(finding["text"]) in page for finding in run)
+    assert not any(finding["code"] == "nothing" for finding in run)
+    told = stario("run", "wrong.csv").out
+    assert all(told.count(finding["text"]) == 1 for finding in run)
 
 
 @pytest.mark.usefixtures("no_figures")
