@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ from stario.fusion.commands.common import (
     origin_of,
     print_result,
     progress_bar,
+    training_command,
 )
 from stario.fusion.commands.options import (
     CompareOutOption,
@@ -81,7 +83,8 @@ def compare(
         outcomes = compare_recordings(
             files, model, settings, read, jobs, absolute_fixes, progress=progress
         )
-        comparisons = list(without_skipped(outcomes, skipped))
+        train = training_command(paths, reading) if paths else ""
+        comparisons = [replace(c, train=train) for c in without_skipped(outcomes, skipped)]
     also = {}
     if report:
         from stario.fusion.report.page import write_report
@@ -112,4 +115,4 @@ def _lines(comparison: Comparison) -> list[str]:
 
         for name, track in comparison.tracks.items():
             lines.append(f"{name}: {position_error_words(track, sequence.positions)}")
-    return lines
+    return [*lines, *(finding.line() for finding in comparison.verdict)]

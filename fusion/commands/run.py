@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, get_args
 
-import typer
-
-from stario.fusion.commands.common import origin_of, process_each, progress_bar
+from stario.fusion.commands.common import (
+    origin_of,
+    process_each,
+    progress_bar,
+    training_command,
+)
 from stario.fusion.commands.options import (
     BackendOption,
     EstimatorOptions,
@@ -69,6 +73,7 @@ def run(
         report=report,
         view=view,
         words=words,
+        train=training_command(paths, reading),
     )
     process_each(reading, paths, out, work, as_json, "--fixes" if fixes else "", words)
 
@@ -82,22 +87,18 @@ def _run(
     report: bool,
     view: bool,
     words: dict[str, str],
+    train: str,
 ) -> tuple[dict[str, object], str]:
     """Write one recording's track; return its record and a summary; `words` explain its columns."""
     from stario.fusion.evaluation.compare import measured
     from stario.fusion.evaluation.results import write_run
     from stario.fusion.evaluation.text import column_words
     from stario.fusion.fix_file import check_within
-    from stario.sequences.inspection.gyro_axes import compare_gyro_axes
-    from stario.sequences.truth.problems import warn_of_truth
 
     check_within(fixes, sequence)
     with progress_bar(f"run {sequence.name}") as progress:
         track = navigator.run(sequence, progress, fixes)
-    for line in compare_gyro_axes(sequence).problems(sequence.name):
-        typer.echo(f"stario: {line}", err=True)
-    warn_of_truth(sequence)
-    found = measured(sequence, {navigator.backend: track}, fixes)
+    found = replace(measured(sequence, {navigator.backend: track}, fixes), train=train)
     also: dict[str, Callable[[Path, Comparison], object]] = {}
     if report:
         from stario.fusion.report.page import write_report
@@ -114,6 +115,7 @@ def _run(
         words |= column_words(found)
     lines = [*_lines(found, track), f"{len(written)} files in {folder}"]
     record: dict[str, object] = {"recording": sequence.name, **found.metrics}
+    record["verdict"] = [asdict(finding) for finding in found.verdict]
     return record | {"folder": str(folder)}, "\n".join(lines)
 
 
@@ -123,7 +125,6 @@ def _lines(found: Comparison, track: Track) -> list[str]:
 
     from stario.fusion.evaluation.known_positions import position_error_words
     from stario.fusion.evaluation.text import track_table, tracked_words
-    from stario.fusion.report.health import health_lines
 
     sequence = found.sequence
     length = track.trajectory.path_length()
@@ -138,5 +139,5 @@ def _lines(found: Comparison, track: Track) -> list[str]:
     elif sequence.positions is not None:
         lines.append(position_error_words(track, sequence.positions))
     if track.health is not None:
-        lines += [*track.health.lines(), *health_lines(track.health)]
-    return lines
+        lines += track.health.lines()
+    return [*lines, *(finding.line() for finding in found.verdict)]

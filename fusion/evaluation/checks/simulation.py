@@ -35,7 +35,8 @@ CARRIED = {
     "handheld (at the ear)": "call",
     "swinging": "swinging",
     "bag": "bag",
-    "handheld (flat in front)": "handheld",
+    "handheld": "handheld",
+    "handheld (flat in front)": "in-front",
 }
 """The simulator's carrying mode for an archive's attribute `carry`."""
 
@@ -47,6 +48,7 @@ SPEEDS = {
     "swinging": 0.9,
     "bag": 1.25,
     "handheld": 1.2,
+    "in-front": 1.2,
 }
 """Preferred speeds [m/s] of the simulated walks: the archives' medians while walking, since bands
 grow with the speed."""

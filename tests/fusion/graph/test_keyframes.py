@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support import GRAPH as CONFIG
 from support import Broken, ate, stream
+from told import health_lines
 
 from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig
@@ -23,7 +24,6 @@ from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.lie import yaw_twist
-from stario.fusion.report.health import health_lines
 from stario.fusion.state import NavState
 from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.attitude.rotations import about_z, yaw_of
