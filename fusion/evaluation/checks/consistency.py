@@ -2,9 +2,9 @@
 
 The IMU of simulated walks is exact; the sensor's noise, its biases and scale, the displacements'
 noise and the initial state's errors are drawn with a configuration's standard deviations. The
-navigator's own filter runs on them, with its rates, windows and gates. For a consistent filter the NEES of n
-states averages to n, and its mean over N independent runs follows chi-square with n N degrees of
-freedom, divided by N.
+navigator's own filter runs on them, with its rates, windows and gates. For a consistent filter the
+NEES of n states averages to n, and its mean over N independent runs follows chi-square with n N
+degrees of freedom, divided by N.
 """
 
 from __future__ import annotations
