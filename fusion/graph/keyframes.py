@@ -135,11 +135,13 @@ class KeyframeGraph:
         self._terms.append(Whitened.of(term, limit))
         self._solution = None
 
-    def solve(self, max_rounds: int = 50) -> Solution:
+    def solve(self, max_rounds: int = 50, trusted_rounds: int = 0) -> Solution:
         """Optimise the keyframes by Gauss-Newton steps.
 
         Args:
             max_rounds: maximum number of linearisations of the measurements.
+            trusted_rounds: number of first rounds in which none is down-weighted: a poor start must
+                not decide which of them are false.
 
         Raises:
             IndeterminateError: a state is not determined, or the optimisation diverged; the
@@ -147,7 +149,7 @@ class KeyframeGraph:
         """
         start = self._states
         try:
-            rounds, values = self._optimise(max_rounds)
+            rounds, values = self._optimise(max_rounds, trusted_rounds)
             self._states = {k: KeyframeState.of(values, k) for k in self._time}
             self._check_determined()
             down_weighted = sum(term.weighted(values)[2] < 1.0 for term in self._terms)
@@ -230,7 +232,7 @@ class KeyframeGraph:
         self.last += 1
         self._time[self.last], self._states[self.last], self._solution = time, state, None
 
-    def _optimise(self, max_rounds: int) -> tuple[int, Any]:
+    def _optimise(self, max_rounds: int, trusted_rounds: int) -> tuple[int, Any]:
         """Take full Gauss-Newton steps, which follow the IMU's stiff factors as a filter does.
 
         From a poor start, a correct step may increase their error by its second-order terms.
@@ -240,7 +242,7 @@ class KeyframeGraph:
         for _round in range(max_rounds):
             linear = factors.linearize(values)
             for term in self._terms:
-                linear.push_back(term.factor(values))
+                linear.push_back(term.factor(values, trusted=_round < trusted_rounds))
             self._solution = LinearSolution(linear, ordering)
             before = self._positions(values)
             values = values.retract(self._solution.step())
