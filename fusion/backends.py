@@ -1,7 +1,7 @@
-"""The two back ends behind one interface: the EKF, and the factor graph initialised from it.
+"""The two estimators, EKF and factor graph, of streams and of recordings.
 
-For a stream, a back end creates an estimator that is stepped interval by interval; for a recording,
-it turns the filter's output into the states of the track.
+A stream's is stepped interval by interval. A recording is filtered, and then smoothed as a whole by
+the graph, which starts from the filter's states.
 """
 
 from __future__ import annotations
@@ -19,12 +19,7 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.estimates import Estimate, nav_states
 from stario.fusion.filter.estimator import Estimator
 from stario.fusion.filter.estimator_state import IntervalMeasurements, innovations_of
-from stario.fusion.filter.frame_transform import (
-    frame_rotation,
-    smoothed_track,
-    to_final_frame,
-    with_undirected,
-)
+from stario.fusion.filter.frame_transform import frame_rotation, to_final_frame, with_undirected
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import ASSUMED, GYRO_BIAS
 from stario.fusion.fixes import Accepted, Fix, FixQueue
@@ -39,10 +34,9 @@ from stario.fusion.recording import PreprocessedRecording, Progress
 from stario.fusion.state import NavState, SmoothedPose, Track, track_from_states
 from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import Trajectory
 
 BackendName = Literal["ekf", "graph"]
-"""The EKF, or the factor graph: fixed-lag for streams, the whole track for recordings."""
+"""The EKF, or the factor graph: over the last seconds of a stream, over all of a recording."""
 
 
 class StreamEstimator(Protocol):
@@ -86,37 +80,29 @@ class FilteredRecording(NamedTuple):
     """The initial state and one per interval."""
     measurements: list[IntervalMeasurements]
     """Measurements applied, one entry per interval."""
-    clones: list[Estimate]
-    """Poses released from the window, corrected by all its measurements."""
 
 
-class Solution(NamedTuple):
-    """States of a recording in its final map frame, poses delayed by one window, and notes."""
-
-    states: list[NavState]
-    smoothed: Trajectory | None = None
-    notes: tuple[str, ...] = ()
+STREAM_ESTIMATORS: dict[
+    BackendName, Callable[[NavigatorConfig, Start, PriorPose | None], StreamEstimator]
+] = {"ekf": partial(Estimator, streaming=True), "graph": FixedLagEstimator}
+"""By back end, what creates the estimator of a stream from configuration, start and prior."""
 
 
-class Backend(NamedTuple):
-    """What a back end does with a stream and with a recording."""
-
-    stream: Callable[[NavigatorConfig, Start, PriorPose | None], StreamEstimator]
-    """Create an estimator for a stream with this start."""
-    solve: Callable[[FilteredRecording, NavigatorConfig], Solution]
-    """Return the states of a filtered recording."""
-
-
-def _filter_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
-    """Return the filter's states."""
+def _filtered_states(filtered: FilteredRecording) -> list[NavState]:
+    """Return the filter's states in the final map frame."""
     frame = filtered.estimator.frame.state
     states = to_final_frame(nav_states(filtered.estimates), frame.transforms)
-    smoothed = smoothed_track(nav_states(filtered.clones), (*frame.transforms, *frame.undirected))
-    return Solution(with_undirected(states, frame.undirected), smoothed)
+    return with_undirected(states, frame.undirected)
 
 
-def _graph_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
-    """Optimise the whole track at once; the filter's states if the graph is indeterminate."""
+def _smoothed_states(
+    filtered: FilteredRecording, config: NavigatorConfig
+) -> tuple[list[NavState], str]:
+    """Optimise the whole track at once; the filter's states if the graph is indeterminate.
+
+    Returns:
+        States in the final map frame, and a note for the health report if the graph failed.
+    """
     estimator = filtered.estimator
     frame, states = estimator.frame.state, nav_states(filtered.estimates, ASSUMED)
     end, has_field = states[-1], estimator.ekf.state.field is not None
@@ -128,35 +114,28 @@ def _graph_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solut
     final = to_final_frame(states, frame.transforms)
     has_turn = estimator.ekf.state.has_turn
     try:
-        solved, note = smooth(
+        solved = smooth(
             final, first, filtered.measurements, frame.transforms, config, bias, has_turn
         )
     except IndeterminateError as error:
-        note = f"graph fell back to the filter's track: {error}"
-        return _filter_states(filtered, config)._replace(notes=(note,))
+        return _filtered_states(filtered), f"graph fell back to the filter's track: {error}"
     turns = [
         frame_rotation(after.R_WB @ before.R_WB.T)
         for before, after in zip(states, final, strict=True)
     ]
     solved = with_actual_covariances(solved, filtered.estimates, np.array(turns))
-    return Solution(with_undirected(solved, frame.undirected), notes=(note,))
-
-
-BACKENDS = {
-    "ekf": Backend(partial(Estimator, streaming=True), _filter_states),
-    "graph": Backend(FixedLagEstimator, _graph_states),
-}
+    return with_undirected(solved, frame.undirected), ""
 
 
 def track_recording(
-    backend: Backend,
+    backend: BackendName,
     recording: PreprocessedRecording,
     config: NavigatorConfig,
     prior: PriorPose | None,
     fixes: Iterable[Fix],
     progress: Progress,
 ) -> Track:
-    """Filter a recording, then solve it with the back end.
+    """Filter a recording, and smooth it if the back end is the graph.
 
     Raises:
         InputError: it was preprocessed for another update rate, or an argument has the wrong type.
@@ -171,18 +150,25 @@ def track_recording(
         )
     began = perf_counter()
     queue = FixQueue(fixes, most=math.inf)  # all fixes of a recording are known from the start
-    filtered = _filtered(recording, config, prior, queue, progress)
-    solution = backend.solve(filtered, config)
-    counts, estimator = recording.front_end.counts, filtered.estimator
-    health = queue.health(estimator.health(counts, solution.states[-1]))
-    return track_from_states(
-        solution.states,
-        innovations_of(filtered.measurements),
-        replace(health, notes=[*health.notes, *solution.notes]),
-        smoothed=solution.smoothed,
-        seconds_network=recording.seconds_network,
-        seconds_filter=recording.seconds_front_end + perf_counter() - began,
-    )
+    run = _filtered(recording, config, prior, queue, progress)
+    innovations = innovations_of(run.measurements)
+
+    def track(states: list[NavState], note: str = "", filtered: Track | None = None) -> Track:
+        health = queue.health(run.estimator.health(recording.front_end.counts, states[-1]))
+        return track_from_states(
+            states,
+            innovations,
+            replace(health, notes=[*health.notes, *([note] if note else [])]),
+            filtered=filtered,
+            seconds_network=recording.seconds_network,
+            seconds_filter=recording.seconds_front_end + perf_counter() - began,
+        )
+
+    found = track(_filtered_states(run))
+    if backend == "graph":
+        found = track(*_smoothed_states(run, config), filtered=found)
+    progress(1.0)
+    return found
 
 
 def _filtered(
@@ -194,17 +180,13 @@ def _filtered(
 ) -> FilteredRecording:
     queue.start(recording.start.time)
     estimator = Estimator(config, recording.start, prior)
-    filtered = FilteredRecording(estimator, [estimator.estimate()], [], [])
+    filtered = FilteredRecording(estimator, [estimator.estimate()], [])
     pairs = zip(recording.intervals, recording.measurements, strict=True)
     for k, (interval, displacement) in enumerate(pairs):
         applied = estimator.step(interval, displacement, queue.due(interval.stop))
         filtered.measurements.append(applied)
         filtered.estimates.append(estimator.estimate())
-        clone = estimator.released
-        if clone is not None and clone not in filtered.clones[-1:]:
-            filtered.clones.append(clone)
         if k % 500 == 0:
-            progress(0.6 + 0.4 * k / len(recording.intervals))
-    progress(1.0)
+            progress(0.6 + 0.3 * k / len(recording.intervals))
     queue.refuse("after the end", len(queue.due(math.inf)))
     return filtered

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from stario.fusion.backends import BACKENDS, BackendName, StreamEstimator
+from stario.fusion.backends import STREAM_ESTIMATORS, BackendName, StreamEstimator
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Fix, FixOutcome, FixQueue
@@ -44,7 +44,8 @@ class Stream:
         prior: PriorPose | None,
         backend: BackendName,
     ) -> None:
-        self._model, self._config, self._backend = model, config, BACKENDS[backend]
+        self._model, self._config = model, config
+        self._new_estimator = STREAM_ESTIMATORS[backend]
         self.prior, self._fixes = prior, FixQueue()
         self._begin()
 
@@ -88,7 +89,7 @@ class Stream:
             self.front_end.sensors.check(interval)
             if self.estimator is None:
                 check_start(start, self._config.gravity)
-                self.estimator = self._backend.stream(self._config, start, self.prior)
+                self.estimator = self._new_estimator(self._config, start, self.prior)
                 self._fixes.start(start.time)
         except InputError:
             self._begin()
@@ -147,5 +148,5 @@ class Stream:
         if parts["estimator"] is not None:
             start = self.front_end.start
             assert start is not None  # there is a state
-            self.estimator = self._backend.stream(self._config, start, self.prior)
+            self.estimator = self._new_estimator(self._config, start, self.prior)
             self.estimator.state = parts["estimator"]

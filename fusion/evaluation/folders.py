@@ -19,14 +19,11 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 _FIGURES = ("plan.png", "error.png", "innovations.png", "report.html")
+_TRACKS = tuple(f"{track}{suffix}" for track, suffix in product(TRACKS, (".tum", ".npz")))
 
 RESULTS = {
     "metrics.json": ("config.json", "run.json"),
-    "health.json": (*_FIGURES, "track.rrd", "ekf.tum", "ekf.npz", "graph.tum", "graph.npz"),
-    "inertial.npz": (
-        *(*_FIGURES, "truth.tum"),
-        *(f"{track}{suffix}" for track, suffix in product(TRACKS, (".tum", ".npz"))),
-    ),
+    "track.npz": (*_FIGURES, *_TRACKS, "health.json", "truth.tum", "track.rrd"),
     "networks.json": (
         *("networks.csv", "ate_parameters.png", "distributions.png", "pde.png"),
         "trajectories.png",
@@ -34,7 +31,7 @@ RESULTS = {
     "groups.json": ("groups.csv", "recordings.csv", "groups.png"),
 }
 """Files of a run, by one that only such a run writes: of every `run`, `compare` and `evaluate`; of
-`run`; of a recording in `compare` and `evaluate`; of `evaluate --models`; of `evaluate --by`.
+a recording in these; of `evaluate --models`; of `evaluate --by`.
 
 Those of `inspect` are not here: they describe the recording, and it writes all of them anew."""
 

@@ -32,7 +32,7 @@ def smooth(
     config: NavigatorConfig,
     gyro_bias: tuple[FloatArray, FloatArray] | None = None,
     estimates_turn: bool = False,
-) -> tuple[list[NavState], str]:
+) -> list[NavState]:
     """Optimise a filtered track as a whole.
 
     Args:
@@ -46,8 +46,7 @@ def smooth(
         estimates_turn: whether the network's turn is a state, as it is for the filter with fixes.
 
     Returns:
-        The graph's states, one for each filtered one, with their marginal covariances, and a
-        one-line summary for the health report.
+        The graph's states, one for each filtered one, with their marginal covariances.
 
     Raises:
         IndeterminateError: the graph does not determine a state.
@@ -65,17 +64,12 @@ def smooth(
     builder.close(local[-1])
     if gyro_bias is not None:
         builder.graph.add(GyroBias(builder.graph.last, *gyro_bias), gated=False)
-    solution = builder.graph.solve()
+    builder.graph.solve()
     solved = {state.time: state for state in all_states(builder.graph, builder.segments)}
-    states = [
+    return [
         replace(solved[f.time], in_gap=f.in_gap, map_frame=f.map_frame).shifted(origin)
         for f in filtered
     ]
-    note = (
-        f"graph of {len(builder.graph.keyframes)} keyframes, {solution.rounds} rounds, "
-        f"{solution.down_weighted} measurements down-weighted"
-    )
-    return states, note
 
 
 def _inflated(first: NavState, prior: NavState, transforms: Sequence[FrameTransform]) -> NavState:

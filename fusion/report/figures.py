@@ -188,8 +188,8 @@ def _known(known: PositionTrack) -> go.Scatter:
 def _frame(
     tracks: Mapping[str, Series], truth: Series | None, known: PositionTrack | None
 ) -> FloatArray:
-    """Return limits (2, 2) of x and y that fit known positions and all tracks but the inertial."""
-    bounded = [s for name, s in tracks.items() if name != "inertial"]
+    """Return limits (2, 2) of x and y that fit known positions and all but dead reckoning."""
+    bounded = [s for name, s in tracks.items() if name != "dead_reckoning"]
     points = np.vstack([s.position[:, :2] for s in ([truth] if truth else []) + bounded])
     if truth is not None:  # a diverged track must not shrink the truth to a dot
         low, high = np.nanmin(truth.position, axis=0)[:2], np.nanmax(truth.position, axis=0)[:2]

@@ -233,7 +233,7 @@ def _corrections(health: Health) -> Iterator[Finding]:
         f"{at_once} corrected by more than 1 m or 10 degrees (the largest by {metres:.1f} m and "
         f"{math.degrees(turn):.0f} degrees at {time:.1f} s: {cause})."
     )
-    advice = "Until then it was wrong by as much; the track of `--backend graph` has no such steps."
+    advice = "Until then a stream's track was wrong by as much; a recording's is smoothed."
     yield Finding("warning", text, advice)
 
 

@@ -17,7 +17,7 @@ from stario.sequences.sequence import BoolArray, FloatArray
 INK, GRID, FAINT = "#222222", "#E3E6EA", "#767676"
 _AXIS_LOOKS = (("x", "#0072B2", "solid"), ("y", "#D55E00", "dash"), ("z", "#009E73", "dot"))
 TRUTH = "truth"
-_DASHES = {"ekf": "solid", "graph": "dash", "network": "dot", "network_true_attitude": "dashdot"}
+_DASHES = {"filtered": "dash", "network": "dot", "network_true_attitude": "dashdot"}
 _MAX_INNOVATIONS = 1500
 _MAX_PAUSE = 1.0
 """Longest time between updates [s] across which the innovations' band is drawn."""
