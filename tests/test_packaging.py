@@ -125,6 +125,6 @@ def test_wheel_installs_and_runs_outside_the_tree(tmp_path):
     call(sys.executable, "-m", "venv", "fresh")
     call("fresh/bin/pip", "install", "-q", "-c", str(ROOT / "constraints.txt"), str(wheel))
     out = call("fresh/bin/stario", "compare", "--out", "demo")
-    assert "ekf" in out
+    assert "dead reckoning" in out
     assert (tmp_path / "demo/metrics.json").exists()
     assert (tmp_path / "demo/demonstration/plan.png").exists()

@@ -109,10 +109,8 @@ def compare(
         explain()
     if comparisons:
         lines = [line for found in comparisons for line in _lines(found, bool(tracks))]
-        pictures = [path for path in written if path.name == "plan.png"]
-        lines.append(f"figures and tracks: {pictures[0]}")
-        if len(pictures) > 1:
-            lines[-1] += f" and {len(written) - 1} other files in {folder}"
+        first = folder / comparisons[0].sequence.name / "plan.png"
+        lines.append(f"figures and tracks: {first} and {len(written) - 1} other files")
         if not paths:
             lines.append(f"next: {_command()} run FILE --report, with a phone's recording")
         scores = [scores_of(comparison) for comparison in comparisons]

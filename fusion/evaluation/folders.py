@@ -23,7 +23,8 @@ _TRACKS = tuple(f"{track}{suffix}" for track, suffix in product(TRACKS, (".tum",
 
 RESULTS = {
     "metrics.json": ("config.json", "run.json"),
-    "track.npz": (*_FIGURES, *_TRACKS, "health.json", "truth.tum", "track.rrd"),
+    "health.json": (*_FIGURES, *_TRACKS[:4], "track.rrd"),
+    "dead_reckoning.npz": (*_FIGURES, *_TRACKS, "truth.tum"),
     "networks.json": (
         *("networks.csv", "ate_parameters.png", "distributions.png", "pde.png"),
         "trajectories.png",
@@ -31,7 +32,7 @@ RESULTS = {
     "groups.json": ("groups.csv", "recordings.csv", "groups.png"),
 }
 """Files of a run, by one that only such a run writes: of every `run`, `compare` and `evaluate`; of
-a recording in these; of `evaluate --models`; of `evaluate --by`.
+`run`; of a recording in `compare` and `evaluate`; of `evaluate --models`; of `evaluate --by`.
 
 Those of `inspect` are not here: they describe the recording, and it writes all of them anew."""
 

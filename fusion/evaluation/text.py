@@ -116,18 +116,12 @@ def shown_value(metrics: Metrics, key: str) -> float | None:
 
 def track_table(found: Comparison) -> str:
     """Format a table with a row of known metrics per track; `EXPLANATION` explains it."""
-    metrics, truth, columns = found.metrics, found.sequence.truth, _known_columns(found)
+    columns = _known_columns(found)
     rows = [
         [name, *(figure(shown_value(values, key), ".2f") for key in columns)]
-        for name, values in metrics.items()
+        for name, values in found.metrics.items()
     ]
-    lines = aligned([["", *columns.values()], *rows])
-    if truth is None:
-        return "\n".join(lines)
-    covered = float(truth.covers(found.track.time).mean())
-    if covered < FULL_COVERAGE:
-        lines.append(f"The truth covers {covered:.0%} of the track; metrics refer to that part.")
-    return "\n".join(lines)
+    return "\n".join(aligned([["", *columns.values()], *rows]))
 
 
 def _known_columns(found: Comparison) -> dict[str, str]:
@@ -183,6 +177,8 @@ def error_words(found: Comparison, name: str = "track") -> str:
     if covariance is not None:
         sigma = math.sqrt(float(np.mean(covariance[:, 0, 0] + covariance[:, 1, 1])))
         words += f"; its sigma says {sigma:.2f} m"
+    if (metrics["coverage"] or 0.0) < FULL_COVERAGE:
+        words += f"; the truth covers {metrics['coverage']:.0%} of it"
     return words
 
 

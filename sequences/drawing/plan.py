@@ -21,7 +21,7 @@ from stario.sequences.drawing.figures import (
     style_of,
 )
 from stario.sequences.drawing.plots import draw_error
-from stario.sequences.drawing.timed_path import draw_scale_bar, draw_timed_path
+from stario.sequences.drawing.timed_path import draw_scale_bar, draw_timed_path, round_times
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, PositionTrack, Trajectory
 
@@ -94,7 +94,9 @@ def plan_view(
             label += f" (leaves the figure by {distance(beyond[name])})"
         if k == 0:
             colours, main_colour = draw_timed_path(axes, tracks[name], label, fine)
-            bar = fig.colorbar(colours, ax=axes, shrink=0.5, aspect=30, pad=0.02, format=_minutes)
+            ticks = round_times(float(np.ptp(tracks[name].time)))
+            bar = fig.colorbar(colours, ax=axes, shrink=0.5, aspect=30, pad=0.02, ticks=ticks)
+            bar.ax.set_yticklabels([clock(tick) for tick in ticks])
             bar.set_label("time [min:s]", fontsize=9)
             bar.ax.tick_params(labelsize=8)
         else:
@@ -121,10 +123,6 @@ def _new_plan(frame: FloatArray, title: str, with_error: bool) -> tuple[Figure, 
     for panel in panels:
         apply_style(panel)
     return fig, panels[0], panels[1] if with_error else None
-
-
-def _minutes(seconds: float, _position: int) -> str:
-    return clock(seconds)
 
 
 def _path_of(track: Trajectory) -> FloatArray:

@@ -16,8 +16,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.cm import ScalarMappable
 
-_ARROW_SECONDS, _MOST_ARROWS = (10, 30, 60, 120, 300, 600, 1800, 3600), 8
-"""Times between arrows [s], of which the shortest is taken with no more arrows than that."""
+_ROUND_SECONDS = (10, 30, 60, 120, 300, 600, 1800, 3600)
+"""Times between arrows, and between ticks of the colour bar [s]."""
+
+_MOST = 8
+"""Number of arrows and of ticks, unless a track is many hours long."""
 
 _STRIDE = 1.0
 """Time before and after an arrow [s] between which it points."""
@@ -86,20 +89,33 @@ def _at(scale: ScalarMappable, seconds: float) -> str:
     return to_hex((red, green, blue))
 
 
+def round_times(duration: float) -> FloatArray:
+    """Return a few round times within a duration [s], from zero on."""
+    step = next((s for s in _ROUND_SECONDS if duration <= s * _MOST), _ROUND_SECONDS[-1])
+    return np.arange(0.0, duration, step)
+
+
 def _draw_arrows(axes: Axes, track: Trajectory, scale: ScalarMappable) -> None:
-    start, stop = track.time[0], track.time[-1]
-    step = next((s for s in _ARROW_SECONDS if stop - start <= s * _MOST_ARROWS), _ARROW_SECONDS[-1])
-    for time in np.arange(start + 0.5 * step, stop, step):
-        ends = np.clip([time - _STRIDE, time, time + _STRIDE], start, stop)
-        if not track.covers(ends).all():
+    """Draw an arrow where the device moves fastest in the middle of each round time."""
+    start, stop = track.time[0] + _STRIDE, track.time[-1] - _STRIDE
+    time = np.arange(start, stop, 0.5 * _STRIDE)
+    behind, at, ahead = (
+        interpolated(time + shift, track.time, track.position_W[:, :2])
+        for shift in (-_STRIDE, 0.0, _STRIDE)
+    )
+    known = track.covers(time - _STRIDE) & track.covers(time) & track.covers(time + _STRIDE)
+    stride = np.where(known, np.linalg.norm(ahead - behind, axis=1), 0.0)
+    begins = round_times(float(track.time[-1] - track.time[0]))
+    step = begins[1] - begins[0] if len(begins) > 1 else track.time[-1] - track.time[0]
+    for begin in track.time[0] + begins:
+        middle = (time > begin + 0.2 * step) & (time < begin + 0.8 * step) & (stride > _MIN_STRIDE)
+        if not middle.any():
             continue
-        behind, at, ahead = interpolated(ends, track.time, track.position_W[:, :2])
-        if np.linalg.norm(ahead - behind) < _MIN_STRIDE:
-            continue
-        tip = at + 1e-3 * (ahead - behind)
-        style = {"arrowstyle": "-|>", "mutation_scale": 17, "lw": 0.6, "ec": "white",
-                 "fc": _at(scale, time - start), "shrinkA": 0, "shrinkB": 0}  # fmt: skip
-        axes.annotate("", xy=tip, xytext=at, arrowprops=style, zorder=5)
+        k = int(np.argmax(np.where(middle, stride, 0.0)))
+        tip = at[k] + 1e-3 * (ahead[k] - behind[k])
+        style = {"arrowstyle": "-|>", "mutation_scale": 19, "lw": 0.8, "ec": "white",
+                 "fc": _at(scale, time[k] - track.time[0]), "shrinkA": 0, "shrinkB": 0}  # fmt: skip
+        axes.annotate("", xy=tip, xytext=at[k], arrowprops=style, zorder=5)
 
 
 def _draw_ends(axes: Axes, ends: FloatArray, scale: ScalarMappable) -> None:
@@ -116,12 +132,12 @@ def _draw_ends(axes: Axes, ends: FloatArray, scale: ScalarMappable) -> None:
 
 
 def draw_scale_bar(axes: Axes, frame: FloatArray) -> None:
-    """Draw a bar of a round length in the lower left corner of a frame (2, 2) [m]."""
-    width, height = np.ptp(frame, axis=0)
-    power = 10.0 ** math.floor(math.log10(0.25 * width))
-    length = power * max(n for n in (1, 2, 5) if n * power <= 0.25 * width)
-    x, y = frame[0] + 0.03 * max(width, height)
-    axes.plot([x, x + length], [y, y], color=INK, lw=3.0, solid_capstyle="butt", zorder=8)
+    """Draw a bar of a round length above the right end of a frame (2, 2) [m]."""
+    width = float(np.ptp(frame[:, 0]))
+    power = 10.0 ** math.floor(math.log10(0.3 * width))
+    length = power * max(n for n in (1, 2, 5) if n * power <= 0.3 * width)
+    ends, place = (frame[1, 0] - length, frame[1, 0]), axes.get_xaxis_transform()
+    axes.plot(ends, (1.02, 1.02), color=INK, lw=3.0, clip_on=False, transform=place)
     text = distance(length) if length >= 1.0 else f"{100 * length:.0f} cm"
-    axes.annotate(text, (x + 0.5 * length, y), (0, 4), textcoords="offset points", ha="center",
-                  fontsize=9, color=INK, zorder=8)  # fmt: skip
+    axes.text(sum(ends) / 2, 1.03, text, transform=place, ha="center", va="bottom", fontsize=9,
+              color=INK)  # fmt: skip

@@ -120,7 +120,7 @@ def test_positions_too_close_to_give_a_direction_alone_give_it_together(
     farthest = np.linalg.norm(walk.truth.position_W[:, :2] - walk.truth.position_W[0, :2], axis=1)
     sigma = 0.4 * float(farthest.max())
     fixes = true_fixes(walk.truth, 1.0, sigma, seed=3)
-    track = Navigator(oracle, CONFIG).run(walk, fixes=fixes)
+    track = Navigator(oracle, CONFIG, backend="ekf").run(walk, fixes=fixes)
     counts = track.health.fixes
     assert counts["yaw not known"] > 3
     assert counts["applied"] > 10

@@ -35,12 +35,12 @@ def test_map_and_panels_break_where_poses_are_missing(rate):
     inside = (series.time > 20.0) & (series.time < 27.0)
     assert np.isnan(series.position[inside]).all()
     assert inside.any()
-    figure = map_figure({"ekf": series}, None, None)
+    figure = map_figure({"track": series}, None, None)
     path = next(
         trace for trace in figure.data if trace.mode == "lines" and trace.customdata is not None
     )
     assert stretches(path.x) == 2
-    height = motion_panels({"ekf": series}, None)[0]
+    height = motion_panels({"track": series}, None)[0]
     assert [stretches(trace.y) for trace in height.traces] == [2, 2]  # band and line
 
 
@@ -48,7 +48,7 @@ def test_an_error_is_drawn_only_where_the_truth_is_known():
     time = np.arange(0.0, 60.0, 0.1)
     truth = along_x(time[(time < 20.0) | (time > 27.0)])
     series, true = (trajectory_series(track, 0.0) for track in (along_x(time), truth))
-    error = motion_panels({"ekf": series}, true)[0].traces[0]
+    error = motion_panels({"track": series}, true)[0].traces[0]
     x, y = np.asarray(error.x), np.asarray(error.y, dtype=float)
     assert np.isnan(y[(x > 20.05) & (x < 26.95)]).all()
     assert np.isfinite(y[(x < 19.85) | (x > 27.15)]).all()
@@ -57,13 +57,13 @@ def test_an_error_is_drawn_only_where_the_truth_is_known():
 def test_a_device_at_rest_does_not_fill_the_map():
     track = along_x(np.arange(0.0, 60.0, 0.1), speed=5e-5)  # 3 mm
     series = trajectory_series(replace(track, position_covariance_W=None), 0.0)
-    low, high = map_figure({"ekf": series}, None, None).layout.xaxis.range
+    low, high = map_figure({"track": series}, None, None).layout.xaxis.range
     assert high - low >= 1.0
 
 
 def test_known_positions_are_within_the_map():
     series = trajectory_series(along_x(np.arange(0.0, 10.0, 0.1)), 0.0)
     taps = PositionTrack(np.array([1.0, 9.0]), np.array([[0.0, -40.0], [9.0, 0.0]]), "waypoints")
-    low, high = map_figure({"ekf": series}, None, taps).layout.yaxis.range
+    low, high = map_figure({"track": series}, None, taps).layout.yaxis.range
     assert low < -40.0
     assert high > 0.0
