@@ -88,7 +88,7 @@ class Stream:
         try:
             self.front_end.sensors.check(interval)
             if self.estimator is None:
-                check_start(start, self._config.gravity)
+                check_start(start, self._config.gravity, interval.table)
                 self.estimator = self._new_estimator(self._config, start, self.prior)
                 self._fixes.start(start.time)
         except InputError:

@@ -98,16 +98,15 @@ def compare(
             files, model, settings, read, jobs, absolute_fixes, progress=progress, names=chosen
         )
         comparisons = list(without_skipped(outcomes, skipped))
-    written = write_comparison(folder, comparisons, settings, origin) if comparisons else []
+    also = {}
     if report:
         from stario.fusion.report.page import write_report
 
-        for comparison in comparisons:
-            path = folder / comparison.sequence.name / "report.html"
-            written.append(write_report(path, comparison))
+        also["report.html"] = write_report
     if explained:
         explain()
     if comparisons:
+        written = write_comparison(folder, comparisons, settings, origin, also)
         lines = [line for found in comparisons for line in _lines(found, bool(tracks))]
         first = folder / comparisons[0].sequence.name / "plan.png"
         lines.append(f"figures and tracks: {first} and {len(written) - 1} other files")

@@ -12,7 +12,7 @@ from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.drawing.figures import indices_after_gaps
 from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray, Trajectory
 
-MAX_POINTS = 1500
+MAX_POINTS = 1000
 """Maximum number of poses drawn per track; a screen shows no more, and the file stays small."""
 
 

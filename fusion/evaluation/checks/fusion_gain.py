@@ -102,7 +102,7 @@ def fusion_gain_table(scores: pd.DataFrame) -> str:
         Column("< 10 deg", "yaw_good", ".0%", np.mean, first),
         Column("< 3 sigma", "yaw_covered", ".0%", np.mean, first),
     ]
-    return table(parts(scores), columns, "group", _NOTES)
+    return table(parts(scores), columns, notes=_NOTES)
 
 
 def _yaw_at_the_end(track: Track, truth: Trajectory) -> dict[str, float]:
