@@ -38,7 +38,7 @@ def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
-        typer.echo(version("stario"))
+        typer.echo(version("stario-nav"))
         raise typer.Exit
 
 

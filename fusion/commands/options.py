@@ -187,9 +187,7 @@ class EstimatorOptions:
     config: ConfigOption = None
     model: Annotated[
         str,
-        _estimation(
-            help="Weights: default, open, first-stage, walks-36min, or a safetensors or ONNX file."
-        ),
+        _estimation(help="Weights: default, open, or a safetensors or ONNX file."),
     ] = "default"
     magnetometer: Annotated[
         bool, _estimation(metavar="", help="Use the magnetometer, if there is one.")

@@ -164,7 +164,7 @@ def motion_table(scores: pd.DataFrame) -> str:
     ]
     if RECORDED not in set(scores["track"]):
         notes.append("recordings to compare with: none given (PATH: archives with attribute carry)")
-    return table(list(_rows(scores)), columns, "carried", notes)
+    return table(list(_rows(scores)), columns, ("carried",), notes)
 
 
 def _rows(scores: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:

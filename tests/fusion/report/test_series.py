@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-pytest.importorskip("plotly", reason="pip install 'stario[report]'")
+pytest.importorskip("plotly", reason="pip install '.[report]'")
 
 from stario.fusion.report.page import _cursors
 from stario.fusion.report.panels import motion_panels
