@@ -126,7 +126,7 @@ def _lines(found: Comparison, as_table: bool) -> list[str]:
     far = alone["ate_m"] or alone["known_positions_m"]
     far = far or found.tracks["dead_reckoning"].trajectory.path_length()
     words = error_words(found) or track_words(found)
-    line = f"{found.sequence.name}: {words}; dead reckoning without StarIO: {distance(far)}"
+    line = f"{found.sequence.name}: StarIO's track: {words}; dead reckoning: {distance(far)}"
     return [line, *([track_table(found)] if as_table else [])]
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _ROUND_SECONDS = (10, 30, 60, 120, 300, 600, 1800, 3600)
 """Times between arrows, and between ticks of the colour bar [s]."""
 
-_MOST = 8
+_MOST = 10
 """Number of arrows and of ticks, unless a track is many hours long."""
 
 _STRIDE = 1.0

@@ -37,9 +37,9 @@ def test_compare_sets_the_track_against_dead_reckoning(stario, recording: Path) 
     assert done.err == ""
     seen, files = done.out.splitlines()
     assert re.fullmatch(
-        r"walk: [\d.]+ m rms from the truth \([\d.]+ % of its [\d.]+ m\), "
+        r"walk: StarIO's track: [\d.]+ m rms from the truth \([\d.]+ % of its [\d.]+ m\), "
         r"[\d.]+ m after a yaw fit; its sigma says [\d.]+ m; "
-        r"dead reckoning without StarIO: [\d.]+ m",
+        r"dead reckoning: [\d.]+ m",
         seen,
     )
     assert files.startswith("figures and tracks: out/walk/plan.png")
