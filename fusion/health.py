@@ -40,6 +40,11 @@ class Health:
         final_sigma: final standard deviations, the largest in any direction (the semi-axis of the
             ellipse): tilt and yaw [rad], velocity [m/s], horizontal position and height [m], biases
             [rad/s], [m/s^2].
+        set_back: amount by which a recording's clock was set back where its track ends [s].
+        longest_late: longest duration of consecutive samples out of order [s].
+        stopped: number of samples dropped because one sensor alone had stopped, by sensor.
+        network_turn: yaw from the network's direction to the accelerometer's [rad], of a recording.
+        network_turn_sigma: its standard deviation [rad]; pi if it is unknown.
         notes: further remarks, one line each, such as a graph that fell back to the filter.
     """
 
@@ -61,6 +66,11 @@ class Health:
     accel_noise_factor: float = 1.0
     network_error_level: float = 1.0
     final_sigma: dict[str, float] = field(default_factory=dict)
+    set_back: float = 0.0
+    longest_late: float = 0.0
+    stopped: dict[str, int] = field(default_factory=dict)
+    network_turn: float = 0.0
+    network_turn_sigma: float = math.pi
     notes: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
@@ -120,19 +130,10 @@ def _counted(counts: dict[str, int]) -> str:
 GAPS_LISTED = 100
 """Maximum number of gaps listed one by one; an endless stream may have any number."""
 
-LATE_NOTE_SECONDS = 0.5
-"""Duration of consecutive late samples beyond which the health report notes them [s]."""
-
-FIELD_DROPS_NOTED = 50
-"""Number of dropped magnetic fields beyond which the health report notes them."""
-
-UNFAMILIAR_SHARE = 0.3
-"""Share of unfamiliar windows beyond which health notes them; 0.05 of training windows are."""
-
 
 @dataclass
 class SampleCounts:
-    """Counts of the samples used, dropped and flagged, of gaps and of windows.
+    """Counts of the samples used, dropped and flagged, and of gaps; direction of the network.
 
     Attributes:
         used: samples used.
@@ -151,9 +152,9 @@ class SampleCounts:
         gap_count: stretches without samples longer than `MAX_IMU_GAP`.
         longest_gap: length of the longest [s].
         gaps: (start, length) [s] of the newest `GAPS_LISTED`.
-        windows: windows given to the network.
-        unfamiliar: those of them outside what its weights were trained on.
         set_back: amount by which a recording's clock was set back where its track ends [s].
+        network_turn: as in `Health`.
+        network_turn_sigma: likewise.
     """
 
     used: int = 0
@@ -171,9 +172,9 @@ class SampleCounts:
     gap_count: int = 0
     longest_gap: float = 0.0
     gaps: list[tuple[float, float]] = field(default_factory=list)
-    windows: int = 0
-    unfamiliar: int = 0
     set_back: float = 0.0
+    network_turn: float = 0.0
+    network_turn_sigma: float = math.pi
 
     def add_frozen(self, stopped: Stopped) -> None:
         """Count a sample in which sensors had stopped."""
@@ -197,38 +198,16 @@ class SampleCounts:
             longest_gap=self.longest_gap,
             gaps=list(self.gaps),
             fields_dropped=self.field_dropped,
-            notes=self._notes(),
-        )
-
-    def _notes(self) -> list[str]:
-        notes = []
-        if self.set_back:
-            notes.append(
-                f"the recording's clock was set back by {self.set_back:.3g} s: the track ends there"
-            )
-        elif self.longest_late > LATE_NOTE_SECONDS:
-            notes.append(
-                f"samples arrived late for {self.longest_late:.1f} s in a row: logged twice, or "
-                "from a clock that was set back; if so, that time is missing and no sigma covers it"
-            )
-        for count, sensor, other in (
-            (self.frozen_gyro, "gyroscope", "accelerometer"),
-            (self.frozen_accel, "accelerometer", "gyroscope"),
-        ):
-            if count:
-                notes.append(
-                    f"the {sensor} stopped: it repeats its value in {count} samples in which the "
-                    f"{other} shows motion; they were dropped"
+            set_back=self.set_back,
+            longest_late=self.longest_late,
+            stopped={
+                sensor: count
+                for sensor, count in (
+                    ("gyroscope", self.frozen_gyro),
+                    ("accelerometer", self.frozen_accel),
                 )
-        if self.field_dropped > FIELD_DROPS_NOTED:
-            notes.append(
-                f"{self.field_dropped} magnetic fields were dropped: the sensor repeated its last "
-                "value, or their times or values are wrong"
-            )
-        if self.unfamiliar > UNFAMILIAR_SHARE * self.windows:
-            share = self.unfamiliar / self.windows
-            notes.append(
-                f"{share:.0%} of the windows move unlike anything the weights were trained on: "
-                "the network's sigma is widened there"
-            )
-        return notes
+                if count
+            },
+            network_turn=self.network_turn,
+            network_turn_sigma=self.network_turn_sigma,
+        )

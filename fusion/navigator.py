@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stario.fusion.backends import STREAM_ESTIMATORS, BackendName, track_recording
+from stario.fusion.backends import BACKENDS, BackendName, track_recording
 from stario.fusion.checked import Vector, seconds, three
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.initial import PriorPose
@@ -57,7 +57,7 @@ class Navigator:
         backend: BackendName | None = None,
     ) -> None:
         if backend is not None:
-            check_choice("backend", backend, STREAM_ESTIMATORS)
+            check_choice("backend", backend, BACKENDS)
         if not hasattr(model, "predict") or isinstance(model, type):
             remedy = "load_model(name) returns one"
             raise InputError("model", repr(model), "a model with `predict`", remedy)
@@ -158,8 +158,8 @@ class Navigator:
     @property
     def state(self) -> NavState | None:
         """Newest state of the stream; None during the first second."""
-        estimator = self._stream.estimator
-        return None if estimator is None else estimator.nav_state()
+        state = self._stream.state
+        return None if state is None else state.nav_state()
 
     @property
     def continuous(self) -> ContinuousPose | None:
@@ -173,8 +173,8 @@ class Navigator:
 
         It changes with each network update; None before the first, and for the graph.
         """
-        estimator = self._stream.estimator
-        return None if estimator is None else estimator.smoothed
+        state = self._stream.state
+        return None if state is None else state.smoothed
 
     @property
     def health(self) -> Health:

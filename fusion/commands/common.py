@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import typer
@@ -23,6 +25,9 @@ if TYPE_CHECKING:
     from stario.sequences.sequence import ImuSequence
 
 Result = TypeVar("Result")
+
+_LINE_SECONDS = 10.0
+"""Time between lines of progress [s] where there is no terminal for a bar."""
 
 _NAMED = 3
 """Number of skipped recordings with the same reason that are listed one by one."""
@@ -153,6 +158,34 @@ def progress_bar(title: str, total: int = 100, shown: bool = True) -> Iterator[P
         yield advance
 
 
+@contextmanager
+def training_progress(steps: int, shown: bool = True) -> Iterator[Callable[[int, float], None]]:
+    """Show the progress of a training on stderr: a bar, and without a terminal a line at times.
+
+    The function that is yielded takes the step and its mean squared error [m^2].
+    """
+    from tqdm import tqdm
+
+    told = monotonic()
+    with progress_bar("train", steps, shown) as bar:
+        first, began = 0, told
+
+        def advance(step: int, error: float) -> None:
+            nonlocal told, first, began
+            bar(step / steps)
+            now = monotonic()
+            if not first:  # of a resumed run another than 1
+                first, began = step, now
+            if not shown or sys.stderr.isatty() or now - told < _LINE_SECONDS:
+                return
+            told = now
+            left = (steps - step) * (now - began) / max(step - first, 1)
+            words = f"step {step} of {steps}, about {tqdm.format_interval(left)} left"
+            typer.echo(f"{words}, error {error:.4f} m^2", err=True)
+
+        yield advance
+
+
 def print_result(as_json: bool, record: object, text: str = "") -> None:
     """Print a result on stdout: its record as JSON, or else its text."""
     from stario.sequences.files import json_text
@@ -188,6 +221,19 @@ def origin_of(
         "reading": {k: v for k, v in asdict(reading).items() if v != default[k]},
         "fixes": fixes and str(fixes.absolute()),
     }
+
+
+def training_command(paths: Sequence[Path], reading: ReadingOptions) -> str:
+    """Return the command that trains weights on these recordings, read in the same way."""
+    default = asdict(ReadingOptions())
+    options = [
+        f"--{name.replace('_', '-')}={each}"
+        for name, value in asdict(reading).items()
+        if value != default[name]
+        for each in (value if isinstance(value, list) else [value])
+    ]
+    words = ["stario", "train", *map(str, paths), *options, "--start-from", "default"]
+    return shlex.join(words)
 
 
 def recipe_values(path: Path) -> dict[str, Any]:

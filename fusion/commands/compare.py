@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,6 +18,7 @@ from stario.fusion.commands.common import (
     origin_of,
     print_result,
     progress_bar,
+    training_command,
 )
 from stario.fusion.commands.options import (
     CompareOutOption,
@@ -97,7 +99,8 @@ def compare(
         outcomes = compare_recordings(
             files, model, settings, read, jobs, absolute_fixes, progress=progress, names=chosen
         )
-        comparisons = list(without_skipped(outcomes, skipped))
+        train = training_command(paths, reading) if paths else ""
+        comparisons = [replace(c, train=train) for c in without_skipped(outcomes, skipped)]
     also = {}
     if report:
         from stario.fusion.report.page import write_report
@@ -127,7 +130,8 @@ def _lines(found: Comparison, as_table: bool) -> list[str]:
     far = far or found.tracks["dead_reckoning"].trajectory.path_length()
     words = error_words(found) or track_words(found)
     line = f"{found.sequence.name}: StarIO's track: {words}; dead reckoning: {distance(far)}"
-    return [line, *([track_table(found)] if as_table else [])]
+    table = [track_table(found)] if as_table else []
+    return [line, *table, *(finding.line() for finding in found.verdict)]
 
 
 def _command() -> str:

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from stario.fusion.commands.common import explain, origin_of, process_each, progress_bar
+from stario.fusion.commands.common import (
+    explain,
+    origin_of,
+    process_each,
+    progress_bar,
+    training_command,
+)
 from stario.fusion.commands.options import (
     EstimatorOptions,
     ExplainOption,
@@ -69,6 +74,7 @@ def run(
         filtered=filtered,
         report=report,
         view=view,
+        train=training_command(paths, reading),
     )
     process_each(reading, paths, out, work, as_json, "--fixes" if fixes else "")
 
@@ -82,24 +88,20 @@ def _run(
     filtered: bool,
     report: bool,
     view: bool,
+    train: str,
 ) -> tuple[dict[str, object], str]:
     """Write one recording's track; return its record and a summary."""
     from stario.fusion.evaluation.compare import measured
     from stario.fusion.evaluation.results import write_run
     from stario.fusion.fix_file import check_within
-    from stario.sequences.inspection.gyro_axes import compare_gyro_axes
-    from stario.sequences.truth.problems import warn_of_truth
 
     check_within(fixes, sequence)
     with progress_bar(f"run {sequence.name}") as progress:
         track = navigator.run(sequence, progress, fixes)
-    for line in compare_gyro_axes(sequence).problems(sequence.name):
-        typer.echo(f"stario: {line}", err=True)
-    warn_of_truth(sequence)
     tracks = {"track": track}
     if filtered and track.filtered is not None:
         tracks["filtered"] = track.filtered
-    found = measured(sequence, tracks, fixes)
+    found = replace(measured(sequence, tracks, fixes), train=train)
     also: dict[str, Callable[[Path, Comparison], object]] = {}
     if report:
         from stario.fusion.report.page import write_report
@@ -114,17 +116,16 @@ def _run(
         open_view(folder / "track.rrd")
     lines = [*_lines(found), f"{folder}: {', '.join(path.name for path in written)}"]
     record: dict[str, object] = {"recording": sequence.name, **found.metrics}
+    record["verdict"] = [asdict(finding) for finding in found.verdict]
     return record | {"folder": str(folder)}, "\n".join(lines)
 
 
 def _lines(found: Comparison) -> list[str]:
-    """Return what was recorded, the track, its errors and its health, a fact per line."""
+    """Return what was recorded, the track, its errors and the verdict, a fact per line."""
     from stario.fusion.evaluation.text import error_words, track_words
-    from stario.fusion.report.health import health_lines
 
     lines = [found.sequence.summary(), f"track: {track_words(found)}"]
     for name in found.tracks:
         if words := error_words(found, name):
             lines.append(f"{'error' if name == 'track' else f'{name}, error'}: {words}")
-    health = found.track.health
-    return lines if health is None else [*lines, *health_lines(health)]
+    return [*lines, *(finding.line() for finding in found.verdict)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 
 from stario.fusion.config import NavigatorConfig
@@ -17,6 +17,7 @@ from stario.fusion.evaluation.tracks import (
     network_track_true_attitude,
     true_poses,
 )
+from stario.fusion.evaluation.verdict import recording_verdict
 from stario.fusion.fix_file import check_within
 from stario.fusion.fixes import Fix, fix_list
 from stario.fusion.imu.stateful import Predictor
@@ -29,9 +30,11 @@ from stario.sequences.arrays import check_choice, check_type, shown
 from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.errors import InputError
 from stario.sequences.files import unused_name
+from stario.sequences.findings import Finding
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
+from stario.sequences.simulation.magnetometer import INDOOR_FIELD
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.truth.problems import warn_of_truth
 
@@ -49,8 +52,9 @@ TRACK_WORDS = {
 
 TRACKS = tuple(TRACK_WORDS)
 
-DEMONSTRATION_SEED = 2**31 + 2026
-"""Seed of the bundled demonstration: training seeds are below 2^31 and exclude this walk."""
+DEMONSTRATION_SEED = 2**31 + 49
+"""Seed of the bundled demonstration: training seeds are below 2^31 and exclude this walk. 49 is the
+number of the issue that asked for it, so chosen before its result was known."""
 
 Metrics = dict[str, float | None]
 
@@ -122,12 +126,19 @@ class Comparison:
             missing, such as "network_true_attitude" without ground truth.
         metrics: metrics by track name.
         alignment: how tracks are aligned with the truth, for metrics and figures.
+        train: command that trains weights on the recording, for the verdict; empty for none.
     """
 
     sequence: ImuSequence
     tracks: dict[str, Track]
     metrics: dict[str, Metrics]
     alignment: Alignment = "first"
+    train: str = ""
+
+    @cached_property
+    def verdict(self) -> list[Finding]:
+        """What stands out about the recording and its main track, to act on first."""
+        return recording_verdict(self.sequence, self.track, train=self.train)
 
     @property
     def track(self) -> Track:
@@ -351,7 +362,17 @@ def _loaded(name: str) -> Predictor:
 
 
 def demonstration() -> ImuSequence:
-    """Return the bundled demonstration: a simulated phone carried in the hand for two minutes."""
-    style = WalkStyle(carry="handheld", preferred_speed=1.1, mount_rotvec=(0.3, -0.2, 0.9))
-    walk = generate_walk(DEMONSTRATION_SEED, duration=120.0, style=style)
-    return simulate_imu(walk, 200.0, PHONE_IMU, DEMONSTRATION_SEED, name="demonstration")
+    """Return the bundled demonstration: a simulated walk of two and a half minutes in a building.
+
+    A phone with a magnetometer is carried in the hand along the corridors.
+    """
+    style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.2, 0.9))
+    walk = generate_walk(DEMONSTRATION_SEED, duration=150.0, style=style, corridors=True)
+    return simulate_imu(
+        walk,
+        200.0,
+        PHONE_IMU,
+        DEMONSTRATION_SEED,
+        name="demonstration",
+        magnetic_field=INDOOR_FIELD,
+    )

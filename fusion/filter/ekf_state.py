@@ -75,8 +75,6 @@ class EkfState:
             gains and the errors' correlation (README.md, "Correlated errors").
         clone_times: times of the clones [s]; None for an empty slot.
         considered_time: time up to which the considered errors are propagated [s].
-        network_turn: yaw error (turn) of the network's displacements, positive left [rad]; fixed at
-            zero until fixes determine the direction (`network_errors.py`).
         field: the magnetic field; None before its first measurement.
     """
 
@@ -88,7 +86,6 @@ class EkfState:
     covariances: FloatArray
     clone_times: tuple[float | None, ...]
     considered_time: float
-    network_turn: float = 0.0
     field: FieldState | None = None
 
     @classmethod
@@ -97,11 +94,11 @@ class EkfState:
         origin_W = state.p_W if np.linalg.norm(state.p_W) > _MAX_ORIGIN_DISTANCE else np.zeros(3)
         X = np.tile(np.eye(3, 5), (slots + 1, 1, 1))
         X[0, :, :3], X[0, :, 3], X[0, :, 4] = state.R_WB, state.v_W, state.p_W - origin_W
-        turn_row = CORE + CLONE * slots
-        n = turn_row + 1 + len(CONSIDERED_SECONDS)
+        clones_end = CORE + CLONE * slots
+        n = clones_end + len(CONSIDERED_SECONDS)
         P = np.zeros((2, n, n))
         P[:, :CORE, :CORE] = plain_covariance(state.covariance, -X[0, :, 3:].T)
-        P[ACTUAL, turn_row + 1 :, turn_row + 1 :] = np.eye(len(CONSIDERED_SECONDS))
+        P[ACTUAL, clones_end:, clones_end:] = np.eye(len(CONSIDERED_SECONDS))
         times = (None,) * slots, state.time
         return cls(state.time, X, origin_W, state.b_g, state.b_a, P, *times)
 
@@ -143,30 +140,25 @@ class EkfState:
         return nav_states([self.estimate()])[0]
 
     @property
-    def turn_row(self) -> int:
-        """Row of the network's turn in the error state."""
-        return CORE + CLONE * len(self.clone_times)
-
-    @property
-    def has_turn(self) -> bool:
-        """Whether the network's turn is estimated; until then it is fixed at zero."""
-        return bool(self.P[self.turn_row, self.turn_row] > 0.0)
-
-    @property
     def considered_rows(self) -> slice:
         """Rows of the network's errors that are considered and never estimated."""
-        return slice(self.turn_row + 1, self.field_row)
+        first = CORE + CLONE * len(self.clone_times)
+        return slice(first, first + len(CONSIDERED_SECONDS))
 
     @property
     def field_row(self) -> int:
         """First row of the magnetic field's error: azimuth, wander, hard iron (3)."""
-        return self.turn_row + 1 + len(CONSIDERED_SECONDS)
+        return CORE + CLONE * len(self.clone_times) + len(CONSIDERED_SECONDS)
 
     @property
     def clone_slots(self) -> list[int]:
         """Slots that hold a clone, oldest first."""
         taken = [(time, k) for k, time in enumerate(self.clone_times) if time is not None]
         return [slot for _, slot in sorted(taken)]
+
+    def clone_rows(self, slot: int) -> slice:
+        """Return the rows of a clone in the error state."""
+        return slice(CORE + CLONE * slot, CORE + CLONE * (slot + 1))
 
     def time_of_clone(self, slot: int) -> float:
         """Return the time at which a clone was taken [s].
@@ -203,8 +195,7 @@ class EkfState:
         Raises:
             InputError: the slot holds no clone.
         """
-        time, first, zero = self.time_of_clone(slot), CORE + CLONE * slot, np.zeros(3)
-        rows = slice(first, first + CLONE)
+        time, rows, zero = self.time_of_clone(slot), self.clone_rows(slot), np.zeros(3)
         covariances = np.zeros((2, CORE, CORE))
         covariances[:, CLONED[:, None], CLONED] = self.covariances[:, rows, rows]
         X = self.X[1 + slot].copy()
@@ -214,7 +205,7 @@ class EkfState:
         """Return the state moved by an error (n,), X <- exp(error) X, with its covariances."""
         xi = np.zeros((len(self.X), 3, 3))  # rows theta, rho_v, rho_p of each pose
         xi[0] = error[:9].reshape(3, 3)
-        xi[1:, ::2] = error[CORE : self.turn_row].reshape(-1, 2, 3)
+        xi[1:, ::2] = error[CORE : self.considered_rows.start].reshape(-1, 2, 3)
         field = self.field
         if field is not None:
             azimuth, wander, *_ = error[self.field_row :].tolist()
@@ -225,7 +216,6 @@ class EkfState:
             X=exp_times(xi[:, 0], xi[:, 1:].transpose(0, 2, 1), self.X),
             b_g=self.b_g + error[9:12],
             b_a=self.b_a + error[12:15],
-            network_turn=self.network_turn + float(error[self.turn_row]),
             field=field,
         )
 

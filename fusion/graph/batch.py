@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.estimator_state import IntervalMeasurements
 from stario.fusion.filter.frame_transform import FrameTransform, frame_rotation
 from stario.fusion.filter.jacobians import POSITION
+from stario.fusion.filter.record import Record
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.keyframes import KeyframeGraph
@@ -27,23 +27,21 @@ _UNKNOWN_POSITION = 1e4
 def smooth(
     filtered: Sequence[NavState],
     prior: NavState,
-    measurements: Sequence[IntervalMeasurements],
+    records: Sequence[Record],
     transforms: Sequence[FrameTransform],
     config: NavigatorConfig,
     gyro_bias: tuple[FloatArray, FloatArray] | None = None,
-    estimates_turn: bool = False,
 ) -> list[NavState]:
     """Optimise a filtered track as a whole.
 
     Args:
         filtered: the filter's states in one frame: the start and one for each interval.
         prior: first state before any frame transform.
-        measurements: measurements given to the filter, interval by interval.
+        records: the filter's, interval by interval.
         transforms: frame transforms since the start.
         config: noise, filter and graph settings.
         gyro_bias: (3,) [rad/s] and covariance (3, 3) at the end, as estimated by the filter with
             the magnetic field, which the graph does not use; None without a field.
-        estimates_turn: whether the network's turn is a state, as it is for the filter with fixes.
 
     Returns:
         The graph's states, one for each filtered one, with their marginal covariances.
@@ -54,13 +52,13 @@ def smooth(
     origin = filtered[0].p_W  # near the track; see `EkfState`
     local = [state.shifted(-origin) for state in filtered]
     first = _inflated(local[0], prior, transforms)
-    builder = GraphBuilder(config, first, estimates_turn=estimates_turn)
-    revoked = {time for m in measurements for time in m.revoked}
-    for m, state in zip(measurements, local[1:], strict=True):
+    builder = GraphBuilder(config, first)
+    revoked = {time for record in records for time in record.revoked}
+    for record, state in zip(records, local[1:], strict=True):
         # Neither is inflated as by the filter: the graph weights outliers by the whole track.
-        fixes = [accepted.fix.shifted(-origin) for accepted in m.fixes]
-        offered = None if m.interval.stop in revoked else m.offered
-        builder.step(m.interval, offered, fixes, m.zero_velocity, state, m.segment)
+        fixes = [accepted.fix.shifted(-origin) for accepted in record.fixes]
+        valid = record.displacement is not None and record.interval.stop not in revoked
+        builder.step(record, record.offered if valid else None, fixes, state)
     builder.close(local[-1])
     if gyro_bias is not None:
         builder.graph.add(GyroBias(builder.graph.last, *gyro_bias), gated=False)
@@ -89,7 +87,7 @@ def _inflated(first: NavState, prior: NavState, transforms: Sequence[FrameTransf
     return replace(first, covariance=covariance)
 
 
-def all_states(graph: KeyframeGraph, segments: dict[int, list[Segment]]) -> list[NavState]:
+def all_states(graph: KeyframeGraph, segments: dict[int, tuple[Segment, ...]]) -> list[NavState]:
     """Return the keyframes of a solved graph and the states where the segments between them end."""
     keyframes = graph.keyframes
     states = [graph.state(keyframes[0])]
@@ -101,7 +99,9 @@ def all_states(graph: KeyframeGraph, segments: dict[int, list[Segment]]) -> list
     return states
 
 
-def _interpolated_states(start: NavState, end: NavState, segments: list[Segment]) -> list[NavState]:
+def _interpolated_states(
+    start: NavState, end: NavState, segments: Sequence[Segment]
+) -> list[NavState]:
     """Return the states between two keyframes: dead-reckoned, then corrected to meet the second.
 
     The error at the end is attributed to white noise throughout. The attitude correction grows with

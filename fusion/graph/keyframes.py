@@ -13,8 +13,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
+from copy import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
@@ -23,11 +24,10 @@ from scipy.linalg import block_diag
 
 from stario.fusion.checked import check_covariance
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.network_errors import TURN_SECONDS, TurnEstimate
 from stario.fusion.graph.factors import Prior, Term
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.marginals import LinearSolution
-from stario.fusion.graph.processes import Coasting, TurnProcess
+from stario.fusion.graph.processes import Coasting
 from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_factor
 from stario.fusion.imu.gap import gap_covariance, gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import ImuInterval
@@ -44,7 +44,7 @@ _UNDETERMINED_SIGMA = 1e5
 """A state this uncertain [m, m/s, rad, ...] is undetermined: no walk is so far, fast or biased."""
 
 _GROUPS = ("attitude", "velocity", "position", "gyroscope bias", "accelerometer bias")
-_NAMES = {"x": "pose", "v": "velocity", "b": "bias", "t": "turn"}
+_NAMES = {"x": "pose", "v": "velocity", "b": "bias"}
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,17 @@ class Solution:
     down_weighted: int
 
 
+Held = TypeVar("Held")
+
+
+def shallow_copy(held: Held) -> Held:
+    """Return a copy of an object with copies of its lists and dictionaries."""
+    new = copy(held)
+    parts = {k: v.copy() for k, v in vars(held).items() if isinstance(v, dict | list)}
+    vars(new).update(parts)
+    return new
+
+
 class KeyframeGraph:
     """Keyframes, numbered from 0, with their IMU segments and measurements.
 
@@ -67,10 +78,9 @@ class KeyframeGraph:
         first: the first keyframe; its covariance is the prior.
         gate: probability beyond which a residual counts as an outlier and is down-weighted, unless
             it is added with `gated` false.
-        turn: estimate of the network's turn at the first keyframe; None if that is no state.
     """
 
-    def __init__(self, first: NavState, gate: float, turn: TurnEstimate | None = None) -> None:
+    def __init__(self, first: NavState, gate: float) -> None:
         self._gate = gate
         self._states: dict[int, KeyframeState] = {}
         self._time: dict[int, float] = {}
@@ -78,7 +88,7 @@ class KeyframeGraph:
         self._terms: list[Whitened] = []
         self._solution: LinearSolution | None = None  # of the last round
         self.last = -1
-        self.add_disconnected(first, turn)
+        self.add_disconnected(first)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return all but the solution: after restoring, call `solve` before `state`."""
@@ -89,10 +99,9 @@ class KeyframeGraph:
         """Numbers of the keyframes held, in order."""
         return list(self._time)
 
-    @property
-    def is_solved(self) -> bool:
-        """Whether `solve` has been called since the last change."""
-        return self._solution is not None
+    def copied(self) -> KeyframeGraph:
+        """Return an unsolved copy that may be changed; what both hold is never modified."""
+        return shallow_copy(self)
 
     def time(self, k: int) -> float:
         """Return the time of a keyframe [s]."""
@@ -113,9 +122,9 @@ class KeyframeGraph:
         self.add(Coasting(i, self.last, t, rotation, covariance), gated=False)
         return self.last
 
-    def add_disconnected(self, state: NavState, turn: TurnEstimate | None = None) -> int:
+    def add_disconnected(self, state: NavState) -> int:
         """Add a disconnected keyframe with its covariance as prior; return its number."""
-        prior = Prior.of(self.last + 1, state, turn)
+        prior = Prior.of(self.last + 1, state)
         self._insert(state.time, prior.reference[0])
         self.add(prior, gated=False)
         return self.last
@@ -125,17 +134,6 @@ class KeyframeGraph:
         limit = chi2_quantile(self._gate, len(term.covariance)) if gated else math.inf
         self._terms.append(Whitened.of(term, limit))
         self._solution = None
-
-    def add_turn(self, sigma: float) -> None:
-        """Make the network's turn at the newest keyframe a state with a stationary sigma [rad]."""
-        j = self.last
-        turns = {k: state.turn for k, state in self._states.items() if state.turn is not None}
-        i = max(turns, default=j)
-        correlation = math.exp((self._time[i] - self._time[j]) / TURN_SECONDS) if i != j else 0.0
-        turn = correlation * turns.get(i, 0.0)
-        self._states[j] = self._states[j]._replace(turn=turn)
-        covariance = np.array([[(1.0 - correlation**2) * sigma**2]])
-        self.add(TurnProcess(i, j, correlation, covariance), gated=False)
 
     def solve(self, max_rounds: int = 50) -> Solution:
         """Optimise the keyframes by Gauss-Newton steps.
@@ -167,9 +165,9 @@ class KeyframeGraph:
 
     def state(self, k: int) -> NavState:
         """Return a keyframe with its marginal covariance; call after `solve`."""
-        R, v, p, b_g, b_a, _ = self.keyframe(k)
+        R, v, p, b_g, b_a = self.keyframe(k)
         assert self._solution is not None  # solved
-        joint = self._solution.covariance(k)
+        joint = self._solution.covariances[k]
         to_world = KeyframeState(R, np.zeros(3), np.zeros(3), b_g, b_a).invariant_from_local()
         return NavState(self._time[k], R, v, p, b_g, b_a, to_world @ joint @ to_world.T)
 
@@ -222,7 +220,7 @@ class KeyframeGraph:
         to_local = [np.linalg.inv(state.invariant_from_local()) for state in reference]
         for k, state in zip(keyframes, reference, strict=True):
             # A window may reach only a pose: add the other columns, without information.
-            nothing = state.blocks(k, np.zeros((1, 16)))
+            nothing = state.blocks(k, np.zeros((1, 15)))
             remaining.push_back(linear_factor(nothing, np.zeros(1)))
         A, b = remaining.jacobian(self._ordering(keyframes))
         table = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))[: A.shape[1]]
@@ -281,7 +279,7 @@ class KeyframeGraph:
 
     def _undetermined_state(self, message: str) -> str:
         """Return the name and time of the state that gtsam's message concerns."""
-        match = re.search(r"Symbol: ([xvbt])(\d+)", message)
+        match = re.search(r"Symbol: ([xvb])(\d+)", message)
         if match is None:
             return message.strip().splitlines()[0]
         return f"{_NAMES[match[1]]} at {self._time[int(match[2])]:.1f} s is undetermined"

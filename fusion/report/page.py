@@ -19,7 +19,6 @@ from stario.fusion.evaluation.compare import METRIC_TITLES, Comparison
 from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.evaluation.text import shown_value
 from stario.fusion.report.figures import map_figure, time_figure
-from stario.fusion.report.health import Finding, findings
 from stario.fusion.report.panels import (
     bias_panels,
     innovation_panels,
@@ -32,6 +31,7 @@ from stario.fusion.state import Track
 from stario.sequences.drawing.figures import clock
 from stario.sequences.drawing.text_table import figure
 from stario.sequences.files import atomic_write
+from stario.sequences.findings import Finding
 from stario.sequences.sequence import ImuSequence, PositionTrack
 
 _LEVEL_WORDS = {"warning": "To do", "good": "Good", "note": "Note"}
@@ -87,7 +87,7 @@ def write_report(path: Path, found: Comparison) -> Path:
         "LEGEND": _legend(
             [*([] if truth is None else ["truth"]), *mapped], known, len(corrections)
         ),
-        "HEALTH": "" if health is None else _health(findings(health)),
+        "HEALTH": _health(found.verdict),
         "TABLE": "" if truth is None else _table(found),
         "STYLE": _asset("report.css"),
         "SCRIPT": _asset("report.js"),

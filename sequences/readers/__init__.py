@@ -40,9 +40,8 @@ from stario.sequences.readers.published.ridi import is_ridi, read_ridi
 from stario.sequences.readers.published.rnin import is_rnin, read_rnin
 from stario.sequences.readers.published.ronin import is_ronin, read_ronin
 from stario.sequences.readers.published.tlio import is_tlio, read_tlio
-from stario.sequences.readers.unpacked_names import named_after
+from stario.sequences.readers.unpacking import is_zip, named_after, unpack_zip
 from stario.sequences.readers.unrecognised import has_some_sensors, unrecognised
-from stario.sequences.readers.zipped import is_zip, unpack_zip
 from stario.sequences.sequence import ImuSequence
 
 __all__ = ["FORMATS", "Format", "find_recordings", "read_recording", "write_csv"]

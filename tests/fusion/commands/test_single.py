@@ -188,15 +188,16 @@ def test_run_prints_json(stario, recording: Path, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("no_figures")
 def test_run_warns_of_a_truth_whose_positions_are_wrong(
-    stario, recording: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    stario, recording: Path, tmp_path: Path
 ) -> None:
-    assert stario("run", recording, "--json").code == 0
-    assert "unreliable" not in caplog.text
+    def codes(path: Path) -> set[str]:
+        return {found["code"] for found in json.loads(stario("run", path, "--json").out)["verdict"]}
+
+    assert "truth_positions_scale" not in codes(recording)
     walk = read_generic_csv(recording)
     truth = replace(walk.truth, position_W=1e3 * walk.truth.position_W)
     write_csv(tmp_path / "mm.csv", replace(walk, truth=truth))
-    assert stario("run", "mm.csv", "--json").code == 0
-    assert "errors are unreliable: mm: truth: positions that seem to be in mm" in caplog.text
+    assert "truth_positions_scale" in codes(tmp_path / "mm.csv")
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -361,7 +362,7 @@ def test_inspect_names_the_option_that_helps(stario, recording: Path, tmp_path: 
     assert "--accel-unit g" in done.out
     assert (tmp_path / "out/inspection.png").stat().st_size > 10_000
     corrected = json.loads(stario("inspect", "g.csv", "--accel-unit", "g", "--json").out)
-    assert corrected["problems"] == []
+    assert all(each["code"] != "refused" for each in corrected["verdict"])
     assert corrected == json.loads((tmp_path / "runs/g/inspection.json").read_text())
     assert corrected["rate_hz"] == pytest.approx(100.0)
 

@@ -158,7 +158,7 @@ def test_neither_gaps_nor_fixes_make_a_streams_graph_grow(
         oracle = make_oracle(recording, walk.truth, CONFIG)
         navigator = Navigator(oracle, CONFIG, backend="graph")
         stream_with_fixes(navigator, recording, fixes)
-        assert len(navigator._stream.estimator._builder.graph.keyframes) < 16
+        assert len(navigator._stream.state.builder.graph.keyframes) < 16
 
 
 def yaw_error(walk: ImuSequence, states: list[NavState]) -> tuple[np.ndarray, np.ndarray]:
@@ -254,7 +254,7 @@ def test_the_first_positions_drift_is_its_own_error(walk: ImuSequence, still_mod
     """Else the track's drift to the next position would seem small next to it."""
     navigator = Navigator(still_model)
     stream_with_fixes(navigator, walk, [position_fix(3.0, MAP, 0.3**2 * np.eye(3))])
-    assert navigator._stream.estimator.frame.state.alignment.drift < 0.2
+    assert navigator._stream.state.map_frame.alignment.drift < 0.2
 
 
 def test_uninformative_fixes_in_a_gap_leave_its_turn_as_uncertain(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stario.fusion import Navigator, NavigatorConfig
-from stario.fusion.filter.estimator import Estimator
+from stario.fusion.filter import estimator
 from stario.sequences import ImuSequence
 
 RAW = np.array([0.04, -0.03, 0.05])
@@ -36,10 +36,10 @@ def test_a_corrected_gyroscope_keeps_its_prior(make_walk, make_oracle, size: flo
     config = NavigatorConfig()
     walk = biased(make_walk(seed=4, seconds=20.0), np.array([size, 0.0, 0.0]))
     preprocessed = Navigator(make_oracle(walk, walk.truth, config), config).observe(walk)
-    estimator = Estimator(config, preprocessed.start)
+    state = estimator.begin(config, preprocessed.start)
     for interval, measured in zip(preprocessed.intervals, preprocessed.measurements, strict=True):
-        estimator.step(interval, measured)
-    assert 1e-3 <= np.sqrt(estimator.bias.prior.variance) < max(2.5e-3, size)
+        state, _ = estimator.step(state, interval, measured, (), config)
+    assert 1e-3 <= np.sqrt(state.bias_prior.variance) < max(2.5e-3, size)
 
 
 def test_the_track_changes_continuously_with_the_bias(make_walk, make_oracle) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -13,7 +14,8 @@ from recorded import DATA
 from stario.fusion import Navigator, PriorPose, Track
 from stario.fusion.backends import BackendName
 from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.fusion.filter.zero_velocity import StillnessDetector
+from stario.fusion.filter.zero_velocity import Stillness
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.recording import cut_recording
 from stario.network import load_model
 from stario.sequences import read_recording
@@ -43,8 +45,15 @@ def lying(
 
 def fraction_at_rest(sequence: ImuSequence) -> float:
     intervals, _ = cut_recording(sequence, CONFIG)
-    detector = StillnessDetector(10, CONFIG.filter.stillness_noise)
-    return float(np.mean([detector.is_still(interval) for interval in intervals]))
+    return float(np.mean(at_rest(intervals)))
+
+
+def at_rest(intervals: list[ImuInterval]) -> list[bool]:
+    """Whether the device was at rest at the end of each interval."""
+    states = itertools.accumulate(
+        intervals, lambda state, each: state.after(each, CONFIG.filter), initial=Stillness()
+    )
+    return [state.rested > 0 for state in states][1:]
 
 
 @pytest.mark.parametrize("rate", [50.0, 100.0, 200.0, 1000.0])
@@ -56,8 +65,7 @@ def test_a_device_on_a_table_is_at_rest_after_a_second(rate: float) -> None:
 def test_a_moving_device_is_not_at_rest(make_walk: Make, carry: str) -> None:
     walk = make_walk(5, 20.0, 100.0, PHONE_IMU, carry=carry)
     intervals, _ = cut_recording(walk, CONFIG)
-    detector = StillnessDetector(10, CONFIG.filter.stillness_noise)
-    still = np.array([e.stop for e in intervals if detector.is_still(e)])
+    still = np.array([e.stop for e in intervals])[at_rest(intervals)]
     if len(still):
         moved = walk.truth.at(still).position_W - walk.truth.at(still - 1.0).position_W
         assert np.linalg.norm(moved, axis=1).max() < 0.1  # a simulated trolley creeps smoothly
@@ -66,8 +74,7 @@ def test_a_moving_device_is_not_at_rest(make_walk: Make, carry: str) -> None:
 def test_rest_needs_a_whole_second_and_a_gap_ends_it() -> None:
     intervals, _ = cut_recording(lying(6.0), CONFIG)
     intervals[30] = replace(intervals[30], gap=True)
-    detector = StillnessDetector(10, CONFIG.filter.stillness_noise)
-    found = [detector.is_still(interval) for interval in intervals]
+    found = at_rest(intervals)
     assert not any(found[:9])
     assert all(found[9:30])
     assert not any(found[30:40])
@@ -154,8 +161,7 @@ def test_rest_is_detected_only_where_the_ground_truth_rests(name: str, found: bo
     start = recording.time[0]
     recording = recording.slice(start, start + 40.0)
     intervals, _ = cut_recording(recording, NavigatorConfig(filter=FilterConfig()))
-    detector = StillnessDetector(10, CONFIG.filter.stillness_noise)
-    still = np.array([e.stop for e in intervals if detector.is_still(e)])
+    still = np.array([e.stop for e in intervals])[at_rest(intervals)]
     assert (len(still) > 10) == found
     if not found:
         return

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 from support import CONFIG, stream
+from told import health_lines
 
 from stario.fusion import Navigator
 from stario.fusion.imu.faults import FrozenSensorDetector
-from stario.fusion.report.health import health_lines
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 
