@@ -1,10 +1,10 @@
 """Monte Carlo check that the filter's covariance matches its errors.
 
-The IMU of simulated walks is exact; the sensor's noise, its biases, the displacements' noise and
-the initial state's errors are drawn with a configuration's standard deviations. The navigator's
-own filter runs on them, with its rates, windows and gates. For a consistent filter the NEES of n
-states averages to n, and its mean over N independent runs follows chi-square with n N degrees of
-freedom, divided by N.
+The IMU of simulated walks is exact; the sensor's noise, its biases and scale, the displacements'
+noise and the initial state's errors are drawn with a configuration's standard deviations. The
+navigator's own filter runs on them, with its rates, windows and gates. For a consistent filter the
+NEES of n states averages to n, and its mean over N independent runs follows chi-square with n N
+degrees of freedom, divided by N.
 """
 
 from __future__ import annotations
@@ -145,6 +145,10 @@ def _run(config: NavigatorConfig, yaw_sigma: float, seconds: float, seed: int) -
     for bias, density in ((b_g, noise.gyro_walk), (b_a, noise.accel_walk)):
         bias += density * rng.normal(size=bias.shape).cumsum(axis=0) / white
     gyro = exact.gyro + b_g + noise.gyro_noise * white * rng.normal(size=b_g.shape)
+    # Errors of scale and alignment are independent from one interval to the next, as assumed.
+    part = np.arange(len(exact)) * config.filter.output_rate // round(RATE)
+    rate = np.linalg.norm(exact.gyro, axis=1, keepdims=True)
+    gyro += noise.gyro_scale * rate * rng.normal(size=(part[-1] + 1, 3))[part]
     share = ACCEL_SHARE if config.filter.correlated_errors else 1.0
     accel_noise = math.sqrt(share) * noise.accel_noise
     accel = exact.accel + b_a + accel_noise * white * rng.normal(size=b_a.shape)

@@ -62,8 +62,8 @@ def test_with_poses_a_rotation_raises_displacement_errors_but_not_the_fitted_ate
 ) -> None:
     exact = errors_of(walk, Stub(walk)).figures
     assert exact["rms_1s_m"] < 1e-9
-    assert exact["rms_30s_m"] < 0.1  # windows overlap: a track through them is smoother
-    assert exact["ate_fit_m"] < 0.1
+    assert exact["rms_30s_m"] < 0.3  # windows overlap: a track through them is smoother
+    assert exact["ate_fit_m"] < 0.2
     assert exact["ate_first_m"] < 0.2
     turned = errors_of(walk, Stub(walk, yaw=0.5)).figures
     assert turned["ate_fit_m"] == pytest.approx(exact["ate_fit_m"], rel=0.01)
@@ -98,7 +98,7 @@ def test_positions_at_1_hz_give_the_same_errors(walk: ImuSequence) -> None:
 def test_with_waypoints_yaw_and_position_are_fitted_first(walk: ImuSequence) -> None:
     exact = errors_of(with_waypoints(walk), Stub(walk, yaw=-1.0))
     short = errors_of(with_waypoints(walk), Stub(walk, 0.9))
-    assert exact.figures["ate_fit_m"] < 0.1
+    assert exact.figures["ate_fit_m"] < 0.2
     assert exact.figures["length_ratio"] == pytest.approx(1.0, abs=0.02)
     assert short.figures["length_ratio"] == pytest.approx(0.9, abs=0.02)
     # A track scaled about its centre has an error of a tenth of the waypoints' spread.
