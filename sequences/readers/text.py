@@ -249,6 +249,10 @@ def numbers_in_row(
         ReadError: the row is cut short or holds something that is not a number.
     """
     number, cells = row[0], row[1].split(row_format.delimiter)
+    try:
+        return [float(cells[column] or "nan") for column in wanted]
+    except (ValueError, IndexError):
+        pass  # explained below
     if len(cells) <= max(wanted):
         fix = "is the file cut short?"
         if len(cells) == 1:
