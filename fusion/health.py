@@ -84,10 +84,11 @@ class Health:
             text.append(f"samples flagged: {_counted(self.flagged)}")
         text.append(f"gaps {self.gap_count}, longest {self.longest_gap:.2f} s")
         if self.updates:
+            nis = f"mean NIS {self.mean_nis:.2f} (expected {self.nis_expected})"
+            outliers = {"outliers": self.gated, **self.refused}
+            found = {name: n for name, n in outliers.items() if n}
             text.append(
-                f"updates {self.updates}, outliers {self.gated / self.updates:.1%} "
-                f"(given less weight), refused {_counted(self.refused)}, "
-                f"mean NIS {self.mean_nis:.2f} (expected {self.nis_expected})"
+                ", ".join([f"updates {self.updates}", nis, *([_counted(found)] if found else [])])
             )
         else:
             text.append("updates none: no window was complete, or the device was stationary")
@@ -106,8 +107,19 @@ class Health:
         if self.network_error_level != 1.0:
             level = math.sqrt(self.network_error_level)
             text.append(f"short-term errors of the network: {level:.1f} times the predicted sigma")
-        sigma = ", ".join(f"{k} {v:.3g}" for k, v in self.final_sigma.items())
+        sigma = ", ".join(_sigma_words(k, v) for k, v in self.final_sigma.items())
         return [*text, f"final sigma: {sigma}"]
+
+
+_UNITS = {"m": "m", "m_s": "m/s", "m_s2": "m/s^2", "rad": "deg", "rad_s": "deg/s"}
+"""Units in which sigmas are printed, by the ends of their names."""
+
+
+def _sigma_words(name: str, sigma: float) -> str:
+    """Return a sigma by name, unit and value; angles are in degrees."""
+    end = next(end for end in ("m_s2", "rad_s", "m_s", "rad", "m") if name.endswith(f"_{end}"))
+    value = math.degrees(sigma) if end.startswith("rad") else sigma
+    return f"{name.removesuffix(f'_{end}').replace('_', ' ')} {value:.2g} {_UNITS[end]}"
 
 
 def _counted(counts: dict[str, int]) -> str:

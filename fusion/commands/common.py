@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -54,7 +54,6 @@ def process_each(
     work: Callable[[ImuSequence, Path], tuple[dict[str, object], str]],
     as_json: bool,
     single: str = "",
-    explained: Mapping[str, str] | None = None,
 ) -> None:
     """Apply `work` to each recording, giving each its own folder for files, and print the results.
 
@@ -65,7 +64,6 @@ def process_each(
         work: function of a recording and its folder, distinct for each; returns record and text.
         as_json: whether to print the records rather than the texts.
         single: name of an option in use that allows only one recording; empty if none.
-        explained: meaning of words in the texts, which `work` may fill; printed once, at the end.
     """
     from stario.fusion.evaluation.compare import distinct_name
     from stario.fusion.evaluation.folders import check_folder
@@ -90,14 +88,14 @@ def process_each(
     records = list(without_skipped(each(recorded, files, jobs=1), skipped))
     if as_json and records:
         print_result(True, records[0] if len(files) == 1 else records)
-    elif explained:
-        typer.echo("\n".join(explanations(explained)))
     exit_if_skipped(skipped)
 
 
-def explanations(words: Mapping[str, str]) -> list[str]:
-    """Return lines that explain words."""
-    return [f"{word}: {meaning}." for word, meaning in words.items()]
+def explain() -> None:
+    """Print what the words of `run` and `compare` mean."""
+    from stario.fusion.evaluation.text import EXPLANATION
+
+    typer.echo(EXPLANATION)
 
 
 def check_new(field: str, path: Path, overwrite: bool) -> None:
@@ -196,7 +194,6 @@ def print_result(as_json: bool, record: object, text: str = "") -> None:
 
 
 def origin_of(
-    backends: Iterable[str],
     paths: Sequence[Path],
     reading: ReadingOptions,
     estimating: EstimatorOptions,
@@ -206,7 +203,6 @@ def origin_of(
     """Return the content of `run.json`; the settings are in `config.json`.
 
     Args:
-        backends: estimators that are run.
         paths: recordings, or the folders or list files that were given.
         reading: options for reading recordings; those that differ from the defaults are named.
         estimating: options of the estimator.
@@ -221,7 +217,6 @@ def origin_of(
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "model": estimating.model,
         "weights_sha256": network.card.sha256 or None,
-        "backends": list(backends),
         "inputs": [str(path.absolute()) for path in paths],
         "reading": {k: v for k, v in asdict(reading).items() if v != default[k]},
         "fixes": fixes and str(fixes.absolute()),

@@ -54,7 +54,7 @@ class Whitened:
         return residual, blocks, (self.limit / squared) ** power
 
     def factor(self, values: Any, trusted: bool = False) -> Any:
-        """Return the linear factor at gtsam `Values`, weighted there unless `trusted`."""
+        """Return the factor, linearised and, unless `trusted`, weighted at gtsam `Values`."""
         residual, blocks, weight = self.weighted(values)
         if trusted:
             weight = 1.0

@@ -209,7 +209,7 @@ def _corrections(health: Health) -> Iterator[Finding]:
         f"{at_once} corrected by more than 1 m or 10 degrees (the largest by {metres:.1f} m and "
         f"{math.degrees(turn):.0f} degrees at {time:.1f} s: {cause})."
     )
-    advice = "Until then it was wrong by as much; a track smoothed by the graph has no such steps."
+    advice = "Until then a stream's track was wrong by as much; a recording's is smoothed."
     values = {"count": count, "largest_m": metres, "turn_deg": math.degrees(turn), "at_s": time}
     yield Finding("corrections", text, advice, values=values)
 

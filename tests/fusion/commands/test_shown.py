@@ -16,11 +16,11 @@ from stario.sequences.readers.generic_csv import read_generic_csv
 def test_run_writes_a_report_only_on_request(stario, recording, tmp_path, no_figures):
     assert stario("run", recording, "--out", "plain").code == 0
     assert not (tmp_path / "plain/report.html").exists()
-    done = stario("run", recording, "--out", "told", "--report", "--backend", "graph")
+    done = stario("run", recording, "--out", "told", "--report", "--filtered")
     assert done.code == 0
     text = (tmp_path / "told/report.html").read_text()
     assert "<h1>walk</h1>" in text
-    assert "factor graph" in text
+    assert "filter, as in a stream" in text
     assert "Accuracy against ground truth" in text
     assert "in x and y only" in text
 
@@ -38,20 +38,24 @@ def test_a_warning_is_shown_once_however_often_a_file_is_read(
 
 
 def test_compare_writes_a_report_next_to_the_tracks(stario, recording, tmp_path, no_figures):
-    assert stario("compare", recording, "--out", "told", "--report").code == 0
+    done = stario("compare", recording, "--out", "told", "--report", "--tracks", "network")
+    assert done.code == 0
     text = (tmp_path / "told/walk/report.html").read_text()
-    for label in ("inertial", "network", "EKF", "factor graph", "truth"):
+    for label in ("dead reckoning (IMU alone)", "network alone", "StarIO", "truth"):
         assert f"</svg>{label}</button>" in text
+    assert "filter, as in a stream" not in text
 
 
 def test_compare_without_truth_shows_only_what_is_known(stario, recording, no_figures, tmp_path):
     write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
-    done = stario("compare", "blind.csv", "--out", "told", "--report")
+    done = stario("compare", "blind.csv", "--out", "told", "--report", "--tracks", "network")
     assert "ATE" not in done.out
-    assert "NIS: mean NIS" in done.out
+    assert "NIS" in done.out
     text = (tmp_path / "told/blind/report.html").read_text()
-    assert "</svg>EKF</button>" in text
-    assert "</svg>inertial</button>" not in text  # the map without truth leaves it out
+    assert "</svg>StarIO</button>" in text
+    assert (
+        "</svg>dead reckoning (IMU alone)</button>" not in text
+    )  # the map without truth leaves it out
 
 
 def test_view_writes_a_file_and_opens_it(stario, recording, tmp_path, no_figures, monkeypatch):

@@ -84,7 +84,7 @@ def test_a_recordings_track_ends_there_and_its_health_states_why(
     make_walk: Make, still_model: Any, by: float
 ) -> None:
     walk = set_back(make_walk(3, 16.0), by)
-    track = Navigator(still_model).run(walk)
+    track = Navigator(still_model, backend="ekf").run(walk)
     assert track.time[-1] == pytest.approx(8.0, abs=0.11)
     (line,) = [line for line in health_lines(track.health) if "clock" in line]
     assert line.startswith("! ")
@@ -111,7 +111,10 @@ def test_a_block_that_is_logged_twice_does_not_change_the_track(
     walk = make_walk(3, 16.0).without_truth()
     rows = np.r_[0:800, 600 : len(walk)]
     twice = replace(walk, time=walk.time[rows], gyro=walk.gyro[rows], accel=walk.accel[rows])
-    track, plain = Navigator(still_model).run(twice), Navigator(still_model).run(walk)
+    track, plain = (
+        Navigator(still_model, backend="ekf").run(twice),
+        Navigator(still_model, backend="ekf").run(walk),
+    )
     np.testing.assert_array_equal(track.trajectory.position_W, plain.trajectory.position_W)
 
 
@@ -137,7 +140,7 @@ def test_impossible_values_are_reported_and_excluded_from_the_means(make_walk: M
 
 def test_a_clock_set_back_by_a_few_seconds_is_reported(make_walk: Make, still_model: Any) -> None:
     walk = make_walk(3, 16.0)
-    track = Navigator(still_model).run(set_back(walk, 3.0))
+    track = Navigator(still_model, backend="ekf").run(set_back(walk, 3.0))
     assert any("late for 3.0 s in a row" in line for line in health_lines(track.health))
-    usual = Navigator(still_model).run(walk).health
+    usual = Navigator(still_model, backend="ekf").run(walk).health
     assert not any("late" in line for line in health_lines(usual))

@@ -67,8 +67,10 @@ def test_a_layout_is_read_at_its_rate(name: str, seconds: float | None, rate: fl
     ],
 )
 def test_a_file_is_refused_with_what_to_do(name: str, words: str) -> None:
-    with pytest.raises(StarioError, match=words):
-        read_recording(case(name))
+    path = case(name)
+    for read in (read_recording, *([find_recordings] if path.is_dir() else [])):
+        with pytest.raises(StarioError, match=words):
+            read(path)
 
 
 def test_two_exports_without_times_are_two_recordings_at_the_rate_given() -> None:

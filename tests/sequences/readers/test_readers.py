@@ -309,7 +309,7 @@ def test_find_recordings_searches_folders_in_order(
     assert find_recordings(imu) == [imu]
     assert find_recordings(str(tmp_path / "a")) == [tmp_path / "a"]
     (tmp_path / "nothing").mkdir()
-    with pytest.raises(ReadError, match="no recording"):
+    with pytest.raises(ReadError, match="a folder with nothing"):
         find_recordings(tmp_path / "nothing")
     with pytest.raises(ReadError, match="no such file"):
         find_recordings(tmp_path / "none")
