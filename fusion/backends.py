@@ -1,7 +1,7 @@
-"""The two back ends behind one interface: the EKF, and the factor graph initialised from it.
+"""The two estimators, EKF and factor graph, of streams and of recordings.
 
-For a stream, a back end creates an estimator that is stepped interval by interval; for a recording,
-it turns the filter's output into the states of the track.
+A stream's is stepped interval by interval. A recording is filtered, and then smoothed as a whole by
+the graph, which starts from the filter's states.
 """
 
 from __future__ import annotations
@@ -19,12 +19,7 @@ from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.filter import estimator
 from stario.fusion.filter.estimates import Estimate, nav_states
 from stario.fusion.filter.estimator_state import EstimatorState
-from stario.fusion.filter.frame_transform import (
-    frame_rotation,
-    smoothed_track,
-    to_final_frame,
-    with_undirected,
-)
+from stario.fusion.filter.frame_transform import frame_rotation, to_final_frame, with_undirected
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import ASSUMED, GYRO_BIAS
 from stario.fusion.filter.record import Record, innovations_of
@@ -40,10 +35,9 @@ from stario.fusion.recording import PreprocessedRecording, Progress
 from stario.fusion.state import NavState, SmoothedPose, Track, track_from_states
 from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import Trajectory
 
 BackendName = Literal["ekf", "graph"]
-"""The EKF, or the factor graph: fixed-lag for streams, the whole track for recordings."""
+"""The EKF, or the factor graph: over the last seconds of a stream, over all of a recording."""
 
 
 class StreamState(Protocol):
@@ -80,16 +74,8 @@ class FilteredRecording(NamedTuple):
         return [self.first, *(record.estimate for record in self.records)]
 
 
-class Solution(NamedTuple):
-    """States of a recording in its final map frame, poses delayed by one window, and notes."""
-
-    states: list[NavState]
-    smoothed: Trajectory | None = None
-    notes: tuple[str, ...] = ()
-
-
 class Backend(NamedTuple):
-    """What a back end does with a stream and with a recording."""
+    """What a back end does with a stream."""
 
     begin: Callable[[NavigatorConfig, Start, PriorPose | None], Any]
     """Return the first `StreamState` of a stream with this start."""
@@ -100,21 +86,29 @@ class Backend(NamedTuple):
     """Return the state after an interval with its displacement and fixes, and what was done."""
     late_fix: Callable[[Any, Fix, NavigatorConfig], tuple[Any, list[Accepted]] | None]
     """Return the state with a fix from the past, and all fixes since; None if it is too late."""
-    solve: Callable[[FilteredRecording, NavigatorConfig], Solution]
-    """Return the states of a filtered recording."""
 
 
-def _filter_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
-    """Return the filter's states."""
+BACKENDS: dict[BackendName, Backend] = {
+    "ekf": Backend(partial(estimator.begin, streaming=True), estimator.step, estimator.late_fix),
+    "graph": Backend(fixed_lag.begin, fixed_lag.step, fixed_lag.late_fix),
+}
+
+
+def _filtered_states(filtered: FilteredRecording) -> list[NavState]:
+    """Return the filter's states in the final map frame."""
     frame = filtered.last.map_frame
     states = to_final_frame(nav_states(filtered.estimates), frame.transforms)
-    clones = [record.released for record in filtered.records if record.released is not None]
-    smoothed = smoothed_track(nav_states(clones), (*frame.transforms, *frame.undirected))
-    return Solution(with_undirected(states, frame.undirected), smoothed)
+    return with_undirected(states, frame.undirected)
 
 
-def _graph_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
-    """Optimise the whole track at once; the filter's states if the graph is indeterminate."""
+def _smoothed_states(
+    filtered: FilteredRecording, config: NavigatorConfig
+) -> tuple[list[NavState], str]:
+    """Optimise the whole track at once; the filter's states if the graph is indeterminate.
+
+    Returns:
+        States in the final map frame, and a note for the health report if the graph failed.
+    """
     last, states = filtered.last, nav_states(filtered.estimates, ASSUMED)
     frame, end = last.map_frame, states[-1]
     has_field = last.ekf.field is not None
@@ -125,35 +119,26 @@ def _graph_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solut
     first = replace(states[0], covariance=covariance)
     final = to_final_frame(states, frame.transforms)
     try:
-        solved, note = smooth(final, first, filtered.records, frame.transforms, config, bias)
+        solved = smooth(final, first, filtered.records, frame.transforms, config, bias)
     except IndeterminateError as error:
-        note = f"graph fell back to the filter's track: {error}"
-        return _filter_states(filtered, config)._replace(notes=(note,))
+        return _filtered_states(filtered), f"graph fell back to the filter's track: {error}"
     turns = [
         frame_rotation(after.R_WB @ before.R_WB.T)
         for before, after in zip(states, final, strict=True)
     ]
     solved = with_actual_covariances(solved, filtered.estimates, np.array(turns))
-    return Solution(with_undirected(solved, frame.undirected), notes=(note,))
-
-
-BACKENDS = {
-    "ekf": Backend(
-        partial(estimator.begin, streaming=True), estimator.step, estimator.late_fix, _filter_states
-    ),
-    "graph": Backend(fixed_lag.begin, fixed_lag.step, fixed_lag.late_fix, _graph_states),
-}
+    return with_undirected(solved, frame.undirected), ""
 
 
 def track_recording(
-    backend: Backend,
+    backend: BackendName,
     recording: PreprocessedRecording,
     config: NavigatorConfig,
     prior: PriorPose | None,
     fixes: Iterable[Fix],
     progress: Progress,
 ) -> Track:
-    """Filter a recording, then solve it with the back end.
+    """Filter a recording, and smooth it if the back end is the graph.
 
     Raises:
         InputError: it was preprocessed for another update rate, or an argument has the wrong type.
@@ -168,18 +153,25 @@ def track_recording(
         )
     began = perf_counter()
     queue = FixQueue(fixes, most=math.inf)  # all fixes of a recording are known from the start
-    filtered = _filtered(recording, config, prior, queue, progress)
-    solution = backend.solve(filtered, config)
-    counts = recording.front_end.counts
-    health = queue.health(filtered.last.health(counts, config.filter, solution.states[-1]))
-    return track_from_states(
-        solution.states,
-        innovations_of(filtered.records),
-        replace(health, notes=[*health.notes, *solution.notes]),
-        smoothed=solution.smoothed,
-        seconds_network=recording.seconds_network,
-        seconds_filter=recording.seconds_front_end + perf_counter() - began,
-    )
+    run = _filtered(recording, config, prior, queue, progress)
+    counts, innovations = recording.front_end.counts, innovations_of(run.records)
+
+    def track(states: list[NavState], note: str = "", filtered: Track | None = None) -> Track:
+        health = queue.health(run.last.health(counts, config.filter, states[-1]))
+        return track_from_states(
+            states,
+            innovations,
+            replace(health, notes=[*health.notes, *([note] if note else [])]),
+            filtered=filtered,
+            seconds_network=recording.seconds_network,
+            seconds_filter=recording.seconds_front_end + perf_counter() - began,
+        )
+
+    found = track(_filtered_states(run))
+    if backend == "graph":
+        found = track(*_smoothed_states(run, config), filtered=found)
+    progress(1.0)
+    return found
 
 
 def _filtered(
@@ -198,7 +190,6 @@ def _filtered(
         state, record = estimator.step(state, interval, displacement, due, config)
         filtered.records.append(record)
         if k % 500 == 0:
-            progress(0.6 + 0.4 * k / len(recording.intervals))
-    progress(1.0)
+            progress(0.6 + 0.3 * k / len(recording.intervals))
     queue.refuse("after the end", len(queue.due(math.inf)))
     return filtered._replace(last=state)

@@ -98,8 +98,7 @@ class Stream:
         displacement = None
         try:
             if interval.window is not None:
-                counts = self.front_end.counts
-                (displacement,) = displacements_of(self._network, [interval.window], counts)
+                (displacement,) = displacements_of(self._network, [interval.window])
         finally:  # if the network fails, the IMU's motion must not be lost
             due = self._fixes.due(interval.stop)
             self.state, _ = self._backend.step(

@@ -36,7 +36,7 @@ def smooth(
     transforms: Sequence[FrameTransform],
     config: NavigatorConfig,
     gyro_bias: tuple[FloatArray, FloatArray] | None = None,
-) -> tuple[list[NavState], str]:
+) -> list[NavState]:
     """Optimise a filtered track as a whole.
 
     Args:
@@ -49,8 +49,7 @@ def smooth(
             the magnetic field, which the graph does not use; None without a field.
 
     Returns:
-        The graph's states, one for each filtered one, with their marginal covariances, and a
-        one-line summary for the health report.
+        The graph's states, one for each filtered one, with their marginal covariances.
 
     Raises:
         IndeterminateError: the graph does not determine a state.
@@ -69,17 +68,12 @@ def smooth(
     builder.close(local[-1])
     if gyro_bias is not None:
         builder.graph.add(GyroBias(builder.graph.last, *gyro_bias), gated=False)
-    solution = builder.graph.solve(trusted_rounds=_TRUSTED_ROUNDS)
+    builder.graph.solve(trusted_rounds=_TRUSTED_ROUNDS)
     solved = {state.time: state for state in all_states(builder.graph, builder.segments)}
-    states = [
+    return [
         replace(solved[f.time], in_gap=f.in_gap, map_frame=f.map_frame).shifted(origin)
         for f in filtered
     ]
-    note = (
-        f"graph of {len(builder.graph.keyframes)} keyframes, {solution.rounds} rounds, "
-        f"{solution.down_weighted} measurements down-weighted"
-    )
-    return states, note
 
 
 def _inflated(first: NavState, prior: NavState, transforms: Sequence[FrameTransform]) -> NavState:

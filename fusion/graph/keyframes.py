@@ -14,7 +14,6 @@ import math
 import re
 from collections.abc import Iterable
 from copy import copy
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import gtsam
@@ -45,19 +44,6 @@ _UNDETERMINED_SIGMA = 1e5
 
 _GROUPS = ("attitude", "velocity", "position", "gyroscope bias", "accelerometer bias")
 _NAMES = {"x": "pose", "v": "velocity", "b": "bias"}
-
-
-@dataclass(frozen=True)
-class Solution:
-    """Outcome of an optimisation.
-
-    Attributes:
-        rounds: number of times that the measurements were linearised.
-        down_weighted: number of measurements weighted less than their covariance implies.
-    """
-
-    rounds: int
-    down_weighted: int
 
 
 Held = TypeVar("Held")
@@ -135,7 +121,7 @@ class KeyframeGraph:
         self._terms.append(Whitened.of(term, limit))
         self._solution = None
 
-    def solve(self, max_rounds: int = 50, trusted_rounds: int = 0) -> Solution:
+    def solve(self, max_rounds: int = 50, trusted_rounds: int = 0) -> None:
         """Optimise the keyframes by Gauss-Newton steps.
 
         Args:
@@ -149,17 +135,15 @@ class KeyframeGraph:
         """
         start = self._states
         try:
-            rounds, values = self._optimise(max_rounds, trusted_rounds)
+            values = self._optimise(max_rounds, trusted_rounds)
             self._states = {k: KeyframeState.of(values, k) for k in self._time}
             self._check_determined()
-            down_weighted = sum(term.weighted(values)[2] < 1.0 for term in self._terms)
         except (RuntimeError, IndeterminateError) as error:
             self._states, self._solution = start, None
             if isinstance(error, IndeterminateError):
                 raise
             # gtsam's way to report it
             raise IndeterminateError(self._undetermined_state(str(error))) from error
-        return Solution(rounds, down_weighted)
 
     def keyframe(self, k: int) -> KeyframeState:
         """Return a keyframe without its covariance."""
@@ -232,7 +216,7 @@ class KeyframeGraph:
         self.last += 1
         self._time[self.last], self._states[self.last], self._solution = time, state, None
 
-    def _optimise(self, max_rounds: int, trusted_rounds: int) -> tuple[int, Any]:
+    def _optimise(self, max_rounds: int, trusted_rounds: int) -> Any:
         """Take full Gauss-Newton steps, which follow the IMU's stiff factors as a filter does.
 
         From a poor start, a correct step may increase their error by its second-order terms.
@@ -251,7 +235,7 @@ class KeyframeGraph:
                 break
         if not np.isfinite(change):
             raise IndeterminateError("the optimisation diverged")
-        return _round + 1, values
+        return values
 
     def _positions(self, values: Any) -> FloatArray:
         return np.array([values.atPose3(X(k)).translation() for k in self._time])

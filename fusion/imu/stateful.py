@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stario.fusion.checked import floored
-from stario.fusion.health import SampleCounts
 from stario.fusion.imu.intervals import Flags, Window
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
@@ -147,10 +146,13 @@ class StatefulInference:
     Args:
         model: the model; its network may remember earlier windows.
         updates: number of windows that begin within the length of one.
+
+    Attributes:
+        updates: that number.
     """
 
     def __init__(self, model: Predictor, updates: int) -> None:
-        self._model, self._updates = model, updates
+        self._model, self.updates = model, updates
         self.restart()
 
     @property
@@ -161,7 +163,7 @@ class StatefulInference:
     def restart(self) -> None:
         """Clear the memory of windows before a gap."""
         begin = getattr(self._model, "stateful_inference", None)
-        self._stretch: Any = self._model if begin is None else begin(self._updates)
+        self._stretch: Any = self._model if begin is None else begin(self.updates)
 
     def predict(
         self, windows_N: NDArray[np.float32], heading: FloatArray
@@ -185,11 +187,6 @@ class StatefulInference:
         with np.errstate(invalid="ignore"):  # the estimator refuses values that are not finite
             mean_N: FloatArray = (R_NH @ mean_H[:, :, None])[:, :, 0]
             return mean_N, R_NH @ covariance_H @ R_NH.transpose(0, 2, 1)
-
-    def unfamiliar(self, windows: NDArray[np.float32]) -> int:
-        """Count the windows (B, 6, 200) that move unlike anything the weights were trained on."""
-        known_motion = getattr(getattr(self._model, "card", None), "known_motion", None)
-        return 0 if known_motion is None else int(known_motion.is_unfamiliar(windows).sum())
 
     @property
     def memory(self) -> Any:
@@ -230,15 +227,10 @@ def _checked(answer: Any, count: int) -> tuple[FloatArray, FloatArray]:
 
 
 def displacements_of(
-    network: StatefulInference, windows: Sequence[Window], counts: SampleCounts
+    network: StatefulInference, windows: Sequence[Window]
 ) -> list[WindowDisplacement]:
-    """Predict the displacements of windows, with inflated and floored covariances.
-
-    Also count the windows, and those that move unlike anything the weights were trained on.
-    """
+    """Predict the displacements of windows, with inflated and floored covariances."""
     windows_N = np.stack([window.imu_N for window in windows])
-    counts.windows += len(windows_N)
-    counts.unfamiliar += network.unfamiliar(windows_N)
     heading = np.array([window.heading for window in windows])
     mean_N, covariance_N = network.predict(windows_N, heading)
     flagged = np.array([window.flagged for window in windows])

@@ -181,7 +181,7 @@ def test_the_track_does_not_depend_on_them(walk: ImuSequence, oracle: Any, backe
 def test_a_stream_gives_the_covariances_of_its_filter(
     walk: ImuSequence, oracle: Any, backend: Any
 ) -> None:
-    recording = Navigator(oracle, config(True)).run(walk)
+    recording = Navigator(oracle, config(True), backend="ekf").run(walk)
     navigator = Navigator(oracle, config(True), backend=backend)
     samples = zip(walk.time, walk.gyro, walk.accel, strict=True)
     states = [state for sample in samples if (state := navigator.push(*sample)) is not None]
@@ -198,7 +198,7 @@ def test_a_position_fix_removes_them(walk: ImuSequence, oracle: Any) -> None:
         position_fix(t, p, 1e-4 * np.eye(3))
         for t, p in zip(truth.time, truth.position_W, strict=True)
     ]
-    track = Navigator(oracle, config(True)).run(walk, fixes=fixes)
+    track = Navigator(oracle, config(True), backend="ekf").run(walk, fixes=fixes)
     variance = np.trace(track.covariance[:, 6:8, 6:8], axis1=1, axis2=2)
     before, after = np.searchsorted(track.time, (29.85, 30.05))
     assert variance[before] > 0.01

@@ -88,8 +88,8 @@ def yaw_drift(track: Track) -> float:
 
 def test_rest_measures_the_bias_and_holds_yaw_and_position(still_model: Any) -> None:
     table = lying(30.0)
-    with_zero_velocity = Navigator(still_model, CONFIG).run(table)
-    without = Navigator(still_model, NO_STILLNESS).run(table)
+    with_zero_velocity = Navigator(still_model, CONFIG, backend="ekf").run(table)
+    without = Navigator(still_model, NO_STILLNESS, backend="ekf").run(table)
     assert with_zero_velocity.health.zero_velocity == {"applied": 291}
     assert without.health.zero_velocity == {}
     np.testing.assert_allclose(with_zero_velocity.b_g[-1], BIAS, atol=1e-4)
@@ -115,14 +115,14 @@ def test_a_standing_person_who_sways_teaches_no_bias(still_model: Any) -> None:
     table = lying(40.0, bias=np.zeros(3))
     sway = np.radians(1.5) * np.sin(2.0 * np.pi * 0.2 * table.time)
     swaying = replace(table, gyro=table.gyro + np.outer(sway, [0.0, 0.0, 1.0]))
-    track = Navigator(still_model, CONFIG).run(swaying)
+    track = Navigator(still_model, CONFIG, backend="ekf").run(swaying)
     assert track.health.zero_velocity["applied"] > 5
     assert np.abs(track.b_g[:, 2]).max() < 2e-3
 
 
 def test_rest_gives_no_information_about_yaw(still_model: Any) -> None:
     prior = PriorPose(exp_so3(np.array([0.0, 0.0, 1.0])), np.zeros(3), np.zeros(3), yaw_sigma=0.3)
-    track = Navigator(still_model, CONFIG, prior).run(lying(10.0))
+    track = Navigator(still_model, CONFIG, prior, backend="ekf").run(lying(10.0))
     assert np.sqrt(track.covariance[-1, 2, 2]) > 0.3
 
 
@@ -131,14 +131,16 @@ def test_a_steady_glide_is_not_stopped(still_model: Any) -> None:
     fast = PriorPose(np.eye(3), np.array([1.5, 0.0, 0.0]), np.zeros(3), 1e-3, 0.02, 0.05)
     quiet = replace(CONFIG.filter, accel_bias_sigma=0.02)
     config = replace(CONFIG, noise=PHONE_IMU.noise, filter=quiet)
-    track = Navigator(still_model, config, fast).run(lying(3.0, bias=np.zeros(3)))
+    track = Navigator(still_model, config, fast, backend="ekf").run(lying(3.0, bias=np.zeros(3)))
     assert track.health.zero_velocity == {"gated": 21}
     assert track.trajectory.velocity_W[-1, 0] > 1.2
 
 
 def test_a_slow_turn_is_not_mistaken_for_bias(still_model: Any) -> None:
     """Unless it lasts for longer than anybody turns so evenly."""
-    track = Navigator(still_model, CONFIG).run(lying(3.0, turn=0.05, bias=np.zeros(3)))
+    track = Navigator(still_model, CONFIG, backend="ekf").run(
+        lying(3.0, turn=0.05, bias=np.zeros(3))
+    )
     assert np.abs(track.b_g[-1]).max() < 0.01
 
 
