@@ -14,6 +14,7 @@ from stario.fusion.filter.estimator_state import EstimatorState, rewound, with_s
 from stario.fusion.filter.gained import Gained, gained_information
 from stario.fusion.filter.gyro_bias import GyroBiasPrior, first_prior, is_due, with_prior_replaced
 from stario.fusion.filter.initial import PriorPose, first_state, state_after_loss, tilt_sigma
+from stario.fusion.filter.innovations import InnovationStatistics
 from stario.fusion.filter.jacobians import GYRO_BIAS
 from stario.fusion.filter.kalman import UpdateResult
 from stario.fusion.filter.map_frame import Mapped
@@ -203,6 +204,9 @@ def _with_fix(
 ) -> tuple[EstimatorState, list[Accepted]]:
     (state, frame), result = map_frame.update_with(fix, Mapped(s.ekf, s.map_frame), config.filter)
     s = changed(s, ekf=state, map_frame=frame).counted("fixes", *result.outcomes)
+    if result.gated:  # a displacement that contradicts the filter now need not be false
+        doubtful = InnovationStatistics().outlier_share
+        s = changed(s, statistics=changed(s.statistics, outlier_share=doubtful))
     return s, [Accepted(fix, result.scale)] if result.accepted else []
 
 
