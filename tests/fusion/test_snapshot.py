@@ -171,11 +171,7 @@ def test_a_snapshot_of_another_version_is_refused(walk: ImuSequence, still_model
         navigator.restore(data)
 
 
-<<<<<<< HEAD
-LAYOUTS = {29: "71cff956"}
-=======
-LAYOUTS = {28: "4d1b9d55"}
->>>>>>> state
+LAYOUTS = {29: "abed7485"}
 """CRC of the classes and attributes in a snapshot, by version."""
 
 
