@@ -5,10 +5,12 @@ from __future__ import annotations
 import logging
 import socket
 import sys
+from itertools import count
 
 import pytest
 from phone_exports import androsensor
 
+from stario.fusion.commands.common import training_progress
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
 
@@ -91,3 +93,17 @@ def test_live_refuses_a_port_in_use(stario):
 
 def test_live_refuses_an_invalid_address_of_a_phone(stario):
     stario("live", "--port", 0, "--phyphox", "file:///etc/passwd").assert_one_line_error("phyphox")
+
+
+def test_training_without_a_terminal_tells_its_progress_and_the_time_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Steps of four seconds: a line every third of them, none of seconds that had no step."""
+    clock = count(0.0, 4.0)
+    monkeypatch.setattr("stario.fusion.commands.common.monotonic", lambda: next(clock))
+    with training_progress(100) as progress:
+        for step in range(1, 8):
+            progress(step, 0.05)
+    lines = capsys.readouterr().err.split("\n")
+    assert lines[0] == "step 3 of 100, about 06:28 left, error 0.0500 m^2"
+    assert [line.split()[1] for line in lines if line.startswith("step")] == ["3", "6"]

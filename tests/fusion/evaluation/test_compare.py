@@ -247,6 +247,23 @@ def test_files_of_an_earlier_run_do_not_pass_for_those_of_a_later_one(
 
 
 @pytest.mark.usefixtures("blank_figures")
+def test_a_report_that_cannot_be_written_leaves_the_earlier_run_whole(
+    tmp_path: Path, compared: Comparison, walk: ImuSequence
+) -> None:
+    alone = Comparison(walk, {"ekf": compared.tracks["ekf"]}, {"ekf": {}})
+
+    def full_disk(path: Path, run: Comparison) -> None:
+        path.write_text("half")
+        raise OSError(28, "No space left on device")
+
+    write_run(tmp_path, alone, CONFIG, {"first": 1}, {"r.html": lambda path, _: path.touch()})
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    with pytest.raises(StarioError, match="No space left"):
+        write_run(tmp_path, alone, CONFIG, {"second": 2}, {"r.html": full_disk})
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+@pytest.mark.usefixtures("blank_figures")
 def test_a_comparison_leaves_nothing_of_an_earlier_one_but_other_recordings(
     tmp_path: Path, compared: Comparison, blind: Comparison
 ) -> None:
