@@ -147,7 +147,7 @@ def test_figures_of_several_recordings_are_explained_once(
 ) -> None:
     shutil.copy(recording, tmp_path / "again.csv")
     done = stario(command, recording, "again.csv", "--out", "out", "--explain")
-    assert done.out.count("\nfitted: ATE after") == 1
+    assert done.out.count("\nfitted [m]: ATE after") == 1
     assert done.out.count("m rms from the truth") == 2
 
 
