@@ -144,11 +144,12 @@ def corrected(
     K = filter_.K
     K[s.considered_rows] = 0.0
     A = np.eye(len(K)) - K @ H
-    # With any gain, Joseph's form gives the covariance of the error that it leaves.
-    P = symmetric(A @ s.covariances @ A.T + K @ R @ K.T)
-    if gains_from == ASSUMED:
-        P[ASSUMED] = symmetric(filter_.P)
-    return changed(s.plus(K @ residual), covariances=P)
+    P = s.covariances.copy()
+    P[ASSUMED] = filter_.P
+    for which in (ACTUAL,) if gains_from == ASSUMED else (ASSUMED, ACTUAL):
+        # With any gain, Joseph's form gives the covariance of the error that it leaves.
+        P[which] = A @ s.covariances[which] @ A.T + K @ R[which] @ K.T
+    return changed(s.plus(K @ residual), covariances=symmetric(P))
 
 
 def gauss_markov(

@@ -149,7 +149,7 @@ def test_an_undetermined_state_is_named(first: int, name: str) -> None:
 def test_if_the_graph_fails_the_track_is_the_filters_and_a_note_says_why(
     walk: ImuSequence, make_oracle: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fails(self: KeyframeGraph, max_rounds: int = 5) -> None:
+    def fails(self: KeyframeGraph, **options: Any) -> None:
         raise IndeterminateError("velocity at 12.3 s is undetermined")
 
     oracle = make_oracle(walk, walk.truth, CONFIG)
