@@ -176,7 +176,7 @@ def training_progress(steps: int, shown: bool = True) -> Iterator[Callable[[int,
             now = monotonic()
             if not first:  # of a resumed run another than 1
                 first, began = step, now
-            if not shown or sys.stderr.isatty() or now - told < _LINE_SECONDS:
+            if not shown or sys.stderr.isatty() or step == first or now - told < _LINE_SECONDS:
                 return
             told = now
             left = (steps - step) * (now - began) / max(step - first, 1)

@@ -130,7 +130,7 @@ def _in_band(values: FloatArray, low: float, high: float) -> FloatArray:
 
 def _step_rates(force: FloatArray) -> FloatArray:
     """Return the strongest frequency (M,) [Hz] of the force's norm in each window."""
-    count = round(_STEP_WINDOW * _RATE)
+    count = min(round(_STEP_WINDOW * _RATE), len(force))
     windows = force[: len(force) // count * count].reshape(-1, count)
     f, power = welch(windows, _RATE, nperseg=count, nfft=4 * count)
     possible = (f > _STEP_RATES[0]) & (f < _STEP_RATES[1])

@@ -147,7 +147,7 @@ def test_figures_of_several_recordings_are_explained_once(
 ) -> None:
     shutil.copy(recording, tmp_path / "again.csv")
     done = stario(command, recording, "again.csv", "--out", "out", "--explain")
-    assert done.out.count("\nfitted: ATE after") == 1
+    assert done.out.count("\nfitted [m]: ATE after") == 1
     assert done.out.count("m rms from the truth") == 2
 
 
@@ -238,7 +238,7 @@ def test_evaluate_compares_with_other_weights_by_groups(
     equal = {"ratio": 1.0, "low": None, "high": None}  # one block each has no interval
     assert (short["ratio_1s"], short["ratio_10s"]) == (equal, None)
     assert (long["ratio_1s"], long["ratio_10s"]) == (equal, equal)
-    assert long["length_ratio"] == pytest.approx(1.0, abs=0.2)
+    assert long["length_ratio"] == pytest.approx(1.0, abs=0.5)  # of a walk of 25 s
     assert long["rms_1s_m"] < long["rms_10s_m"] < 10.0 * long["rms_1s_m"]
     assert 0.5 < long["nis_ekf"] < 6.0  # 3 is expected of a consistent filter
     written = json.loads((tmp_path / "out/groups.json").read_text())["groups"]

@@ -386,7 +386,7 @@ def test_demonstration_is_reproducible_with_a_seed_outside_the_training_range() 
     np.testing.assert_array_equal(first.gyro, second.gyro)
     np.testing.assert_array_equal(first.truth.position_W, second.truth.position_W)
     assert compare_module.DEMONSTRATION_SEED >= 2**31
-    assert first.duration == pytest.approx(120.0)
+    assert first.duration == pytest.approx(150.0)
 
 
 def test_a_wrong_truth_is_warned_of(

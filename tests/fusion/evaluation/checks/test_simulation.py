@@ -59,6 +59,8 @@ def test_motion_is_that_of_a_known_vibration() -> None:
     assert found["force_10"] < 0.02
     assert found["rate"] == pytest.approx(0.5)
     assert found["step_rate"] == pytest.approx(2.0, abs=0.06)
+    short = motion(ImuSequence("short", time[:400], gyro[:400], accel[:400]))
+    assert short["step_rate"] == pytest.approx(2.0, abs=0.1)
 
 
 def test_a_recording_without_a_known_carry_is_refused() -> None:
