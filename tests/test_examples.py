@@ -106,7 +106,7 @@ def test_replay_live_ends_where_a_run_on_the_saved_recording_ends():
     sample_count, end, path = load("replay_live").main(speed=20.0, seconds=6.0)
     recording = read_recording(path)
     assert sample_count == len(recording) == 1200
-    track = Navigator(load_model("default")).run(recording)
+    track = Navigator(load_model("default"), backend="ekf").run(recording)
     np.testing.assert_allclose(track.trajectory.position_W[-1], end, atol=1e-4)
 
 

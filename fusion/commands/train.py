@@ -158,12 +158,12 @@ def train(
     make_folder(out)
     virtual = virtual_recordings(body or [], recipe.seed, folder)
     learned = recorded + virtual + (held_out if last_stage is not None else [])
+    held = validation_material(held_out, required=bool(recorded))
     if walks and is_leader():
         typer.echo(
             f"simulating {walks} walks of a minute, or reading them from the cache", err=True
         )
     material = training_material(learned, walks, recipe, folder)
-    held = validation_material(held_out, required=bool(recorded))
     calibrated_by = last_stage or (
         start_from if seconds_of(held.streams) < _CALIBRATING_S else None
     )

@@ -35,7 +35,8 @@ def test_compare_prints_json_and_writes_the_same(stario, recording: Path, tmp_pa
 def test_compare_sets_the_track_against_dead_reckoning(stario, recording: Path) -> None:
     done = stario("compare", recording, "--out", "out")
     assert done.err == ""
-    seen, files = done.out.splitlines()
+    seen, *findings, files = done.out.splitlines()
+    assert all(line.startswith(("! ", "  ")) for line in findings)
     assert re.fullmatch(
         r"walk: StarIO's track: [\d.]+ m rms from the truth \([\d.]+ % of its [\d.]+ m\), "
         r"[\d.]+ m after a yaw fit; its sigma says [\d.]+ m; "

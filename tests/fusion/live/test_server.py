@@ -30,7 +30,7 @@ def rerun(session, new_navigator):
     """Run the navigator on the recording and the fixes that a session wrote."""
     fixes = session.track._file.fixes_path
     known = read_fixes(fixes) if fixes.exists() else ()
-    return new_navigator().run(read_recording(session.track.path), fixes=known)
+    return new_navigator().run(read_recording(session.track.path), fixes=known).filtered
 
 
 def test_drawn_track_ends_as_that_of_the_recording(client, hub, pushes, new_navigator, walk):
