@@ -2,7 +2,7 @@
 
 joblib distributes the recordings to the backend that `joblib.parallel_config` names: with Ray,
 `backend="ray"` after `ray.util.joblib.register_ray()` does the same. The workers must be able to
-read the recordings' paths. Needs `pip install 'stario[cluster]'`.
+read the recordings' paths. Needs `pip install '.[cluster]'`.
 
     python examples/cluster.py
 """

@@ -16,7 +16,7 @@ Corrections by fixes go into map -> odom. Metres, radians, quaternions x y z w
 between them and use the IMU's frame name instead.
 
 With ROS 2 sourced, `python examples/ros2_node.py --node` spins the node. Without ROS, the same code
-runs on a bag (`pip install 'stario[bags]'`) or, with no argument, on the bundled demonstration:
+runs on a bag (`pip install '.[bags]'`) or, with no argument, on the bundled demonstration:
 
     python examples/ros2_node.py [BAG]
 """

@@ -18,7 +18,8 @@ import numpy as np
 
 from stario.fusion.checked import floored, shaped
 from stario.fusion.health import Health
-from stario.sequences.arrays import check_type
+from stario.sequences.arrays import check_type, shown
+from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 
 FixKind = Literal["position", "yaw", "velocity"]
@@ -38,6 +39,9 @@ _MAX_VALUE, _MAX_VARIANCE = 1e9, 1e100
 """Largest number in the value of a fix and in its covariance. More stands for "unknown" in the
 output of receivers: it would place the track where 64 bits have no digits for metres, and the
 squares that an update needs are not finite."""
+
+_HIGH_M, _HIGHEST_M = 150.0, 9e3
+"""Heights of places on earth, but not within a map that is less than 180 m wide."""
 
 _MIN_SIGMA = 1e-4
 """Smallest standard deviation of a fix [m], [m/s], [rad]."""
@@ -112,9 +116,16 @@ def position_fix(time: float, p_W: Any, covariance: Any) -> Fix:
     """Create a fix of position (3,) [m] with covariance (3, 3) [m^2].
 
     Raises:
-        InputError: a value does not have that shape.
+        InputError: a value does not have that shape, or the position can only be latitude and
+            longitude in degrees with a height.
     """
-    return make_fix(time, "position", p_W, covariance)
+    fix = make_fix(time, "position", p_W, covariance)
+    latitude, longitude, height = np.abs(fix.value)
+    if latitude <= 90.0 and longitude <= 180.0 and _HIGH_M < height < _HIGHEST_M:
+        remedy = "give metres east, north and up of a place nearby; if these are, take it higher up"
+        found = f"{shown(fix.value.tolist())}, as of latitude, longitude and height"
+        raise InputError("position", found, "metres in the map's frame", remedy)
+    return fix
 
 
 def velocity_fix(time: float, v_W: Any, covariance: Any) -> Fix:

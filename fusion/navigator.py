@@ -128,7 +128,7 @@ class Navigator:
             "waiting" until its time or the first state, or "refused", with the reason in `health`.
 
         Raises:
-            InputError: a value has another shape.
+            InputError: a value has another shape, or the position is one in degrees.
         """
         return self._stream.take(position_fix(time, p_W, covariance))
 

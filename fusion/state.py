@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -10,6 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.health import Health
+from stario.sequences.arrays import check_type
+from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, Trajectory
 
 T = TypeVar("T")
@@ -225,6 +228,23 @@ class Track:
     seconds_network: float = 0.0
     seconds_filter: float = 0.0
 
+    @classmethod
+    def from_states(cls, states: Sequence[NavState]) -> Track:
+        """Return the track of a stream's states, as `push` returned them, to be drawn or written.
+
+        Raises:
+            InputError: there is none, one is something else, or they are in several map frames.
+        """
+        listed = list(states)
+        for state in listed:
+            check_type("states", state, NavState, "collect what push returns, but None")
+        frames = {state.map_frame for state in listed}
+        if len(frames) != 1:
+            found = f"those of {len(frames)} map frames" if frames else "none"
+            fix = "keep those with the last `map_frame`" if frames else ""
+            raise InputError("states", found, "states in one frame", fix)
+        return track_from_states(listed)
+
     def __repr__(self) -> str:
         nis = "" if self.nis is None else f", mean NIS {self.nis:.2f}"
         return f"Track({self.trajectory!r}{nis})"
@@ -256,8 +276,8 @@ class Track:
 
 def track_from_states(
     states: list[NavState],
-    innovations: Innovations,
-    health: Health,
+    innovations: Innovations | None = None,
+    health: Health | None = None,
     smoothed: Trajectory | None = None,
     seconds_network: float = 0.0,
     seconds_filter: float = 0.0,

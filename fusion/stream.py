@@ -87,7 +87,7 @@ class Stream:
         try:
             self.front_end.sensors.check(interval)
             if self.estimator is None:
-                check_start(start, self._config.gravity)
+                check_start(start, self._config.gravity, interval.table)
                 self.estimator = self._backend.stream(self._config, start, self.prior)
                 self._fixes.start(start.time)
         except InputError:

@@ -1,4 +1,11 @@
-"""Neural networks: architectures, training and inference."""
+"""Networks: displacements with covariance from one-second windows of IMU data.
+
+Use: `load_model`, `DisplacementModel`.
+
+Train: `train`, `TrainingConfig`, `Augmentation`, `EpochReport`.
+
+What weights are: `Card`, `Calibration`.
+"""
 
 from stario.sequences.lazy import public_names
 

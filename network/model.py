@@ -170,10 +170,11 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     """Load a model by name or path.
 
     Args:
-        name_or_path: name of packaged weights ("default"; "open", whose sources allow any use;
-            "first-stage", trained without the held-out groups; "walks-36min", the earlier ones), a
-            safetensors file with its card next to it, or an ONNX file written by `export_onnx`.
-            StarIO and ONNX files run in ONNX Runtime, other networks in PyTorch.
+        name_or_path: name of packaged weights ("default", or "open", whose sources allow any use),
+            a safetensors file with its card next to it, or an ONNX file written by `export_onnx`.
+            In a clone of the repository also "first-stage", trained without the held-out groups,
+            and "walks-36min", the earlier ones. StarIO and ONNX files run in ONNX Runtime, other
+            networks in PyTorch.
 
     Raises:
         WeightsError: the file or its card is missing or truncated, or they do not match.
@@ -189,7 +190,8 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
     if is_name and packaged.is_file():
         path = packaged
     elif is_name and not path.exists():
-        raise WeightsError(path, "weights", "no such file", f"a file, or {packaged_names()}")
+        fix = "others are files in network/weights of StarIO's repository"
+        raise WeightsError(path, "weights", "no such file", f"a file, or {packaged_names()}", fix)
     content, card = read_weights(path)
     if card.architecture not in ARCHITECTURES:
         known = f"one of {', '.join(ARCHITECTURES)}"

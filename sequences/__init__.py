@@ -1,4 +1,24 @@
-"""Recordings: sequences, readers, simulation, windows, metrics and figures."""
+"""Recordings: read, inspect, simulate, compare, write.
+
+Read and write: `read_recording`, `find_recordings`, `write_csv`, `read_tum`, `write_tum`.
+
+A recording: `ImuSequence`, `Trajectory`, `PositionTrack`, `Magnetometer`, `DeviceAttitude`,
+`STANDARD_GRAVITY`.
+
+Inspect: `inspect_recording`, `Inspection`, `truth_problems`, `TruthProblem`, `check_units`.
+
+Units and axes: `with_units`, `with_conventions`, `yaw_of`, `about_z`.
+
+Compare a track with the truth: `align`, `Alignment`, `evaluate_track`, `TrackMetrics`,
+`position_nees`, `PositionNees`.
+
+Simulate: `generate_walk`, `WalkStyle`, `simulate_imu`, `ImuErrors`, `PERFECT_IMU`, `GOOD_IMU`,
+`PHONE_IMU`, `MagneticField`, `INDOOR_FIELD`, `ImuNoise`.
+
+For training: `world_streams`, `WorldStream`, `leg_streams`, `LegStream`.
+
+Errors: `StarioError`, `InputError`, `ReadError`, `ConfigError`, `WeightsError`, `Skipped`.
+"""
 
 from stario.sequences.lazy import public_names
 

@@ -11,10 +11,10 @@ from stario.sequences.arrays import check_type, shown
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 
-TIME_UNITS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
-"""Units per second: whole numbers, so that nanoseconds since 1970 can be read exactly."""
+TIME_UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+"""Nanoseconds per unit: whole numbers, so that nanoseconds since 1970 can be read exactly."""
 
-FILETIME_PER_SECOND = 10**7
+FILETIME_NS = 100
 """Windows and HoloLens count ticks of 100 ns since 1601."""
 
 FILETIME_1970 = 116_444_736_000_000_000
@@ -36,7 +36,18 @@ FAST_RAD_S = 15.0
 """Largest 95th percentile of the rate of a carried device; recordings have at most 2.7, but at
 least 41 if deg/s are taken for rad/s."""
 
-MAGNETIC_UNITS = {"uT": 1.0, "nT": 1e-3, "mT": 1e3, "T": 1e6, "gauss": 100.0, "mg": 0.1}
+MAGNETIC_UNITS = {"uT": 1.0, "nT": 1e-3, "mT": 1e3, "T": 1e6, "gauss": 100.0, "g": 100.0, "mg": 0.1}
+"""`G`, in any case, and `mG` are gauss here."""
+
+_EARTH_UT = (20.0, 80.0)
+
+
+def magnetic_advice(size: float) -> str:
+    """Return what to do about a field of a size that is the earth's in another unit than uT."""
+    fits = (u for u in MAGNETIC_UNITS if _EARTH_UT[0] < size * MAGNETIC_UNITS[u] < _EARTH_UT[1])
+    unit = next(fits, "uT")
+    return "" if unit == "uT" else f"if in {unit}, give {MAGNETIC_UNITS[unit]:g} * field"
+
 
 _SPELLINGS = {
     spelling: unit

@@ -221,7 +221,7 @@ BAGS = sorted(DATA.glob("raw/rosbag/*.bag"))
 @pytest.mark.skipif(not BAGS, reason="the data folder holds no recorded bags")
 @pytest.mark.parametrize("bag", BAGS, ids=lambda path: path.stem)
 def test_ros2_node_runs_on_recorded_bags(bag):
-    pytest.importorskip("rosbags", reason="pip install 'stario[bags]'")
+    pytest.importorskip("rosbags", reason="pip install '.[bags]'")
     outputs = load("ros2_node").main(bag)
     assert len(outputs) > 20
     # Shaking saturates the razor's accelerometer: no track can be computed from it.

@@ -4,12 +4,14 @@ import ast
 import importlib
 import inspect
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
 import typing
 from graphlib import TopologicalSorter
 from pathlib import Path
+from zipfile import ZipFile
 
 import pytest
 
@@ -28,13 +30,11 @@ def test_every_package_in_the_tree_is_listed_in_pyproject():
 
 
 @pytest.mark.parametrize("package", FOLDERS)
-def test_readme_names_every_public_name_and_each_can_be_imported(package):
+def test_a_package_lists_its_public_names_by_task_and_each_can_be_imported(package):
     module = importlib.import_module(f"stario.{package}")
-    text = (ROOT / package / "README.md").read_text()
+    assert sorted(re.findall(r"`(\w+)`", module.__doc__)) == module.__all__ == dir(module)
     for name in module.__all__:
         assert getattr(module, name) is not None
-        assert re.search(rf"`{name}\b", text), name
-    assert dir(module) == module.__all__
 
 
 def test_what_public_functions_return_is_public_too():
@@ -111,20 +111,84 @@ def test_help_imports_nothing_heavy():
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.slow
-def test_wheel_installs_and_runs_outside_the_tree(tmp_path):
-    def call(*command: str) -> str:
-        done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
+def test_another_package_of_this_name_is_refused_by_name(tmp_path):
+    (tmp_path / "stario").mkdir()
+    (tmp_path / "stario/__init__.py").touch()
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import stario.network"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    *_, error = done.stderr.splitlines()
+    assert error.startswith("ImportError: stario: found another package")
+    assert str(tmp_path / "stario") in error
+    assert "pip uninstall stario" in error
 
-    call(sys.executable, "-m", "build", "--outdir", str(tmp_path / "dist"), str(ROOT))
-    (wheel,) = (tmp_path / "dist").glob("*.whl")
-    (sdist,) = (tmp_path / "dist").glob("*.tar.gz")
-    assert sdist.stat().st_size > 1_000_000  # it contains the weights
-    call(sys.executable, "-m", "venv", "fresh")
-    call("fresh/bin/pip", "install", "-q", "-c", str(ROOT / "constraints.txt"), str(wheel))
-    out = call("fresh/bin/stario", "compare", "--out", "demo")
-    assert "ekf" in out
-    assert (tmp_path / "demo/metrics.json").exists()
-    assert (tmp_path / "demo/demonstration/plan.png").exists()
+
+def called(folder: Path, *command: str | Path) -> str:
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def outside(tmp_path_factory):
+    """A folder outside the tree, with the built distributions and an environment of the wheel."""
+    folder = tmp_path_factory.mktemp("outside")
+    called(folder, sys.executable, "-m", "build", "--outdir", folder / "dist", ROOT)
+    called(folder, sys.executable, "-m", "venv", "fresh")
+    [wheel] = (folder / "dist").glob("*.whl")
+    called(folder, "fresh/bin/pip", "install", "-q", "-c", ROOT / "constraints.txt", wheel)
+    return folder
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_the_weights_in_use_and_no_others(outside):
+    [wheel] = (outside / "dist").glob("stario_nav-*.whl")
+    [source] = (outside / "dist").glob("stario_nav-*.tar.gz")
+    assert wheel.stat().st_size < 26e6
+    assert source.stat().st_size < 26e6
+    weights = {name for name in ZipFile(wheel).namelist() if name.endswith(".safetensors")}
+    assert {Path(name).stem for name in weights} == {"default", "open"}
+    done = subprocess.run(
+        ["fresh/bin/stario", "compare", "--model", "first-stage"],
+        capture_output=True, text=True, cwd=outside,
+    )  # fmt: skip
+    assert "default or open; others are files in network/weights" in done.stderr
+
+
+@pytest.mark.slow
+def test_the_wheel_runs_outside_the_tree(outside):
+    assert "ekf" in called(outside, "fresh/bin/stario", "compare", "--out", "demo")
+    assert (outside / "demo/metrics.json").exists()
+    assert (outside / "demo/demonstration/plan.png").exists()
+
+
+_PROGRAM = """
+import numpy as np
+from stario.fusion import Navigator, NavState, Track
+from stario.network import load_model
+from stario.sequences import read_recording, write_tum
+
+navigator = Navigator(load_model("default"))
+track: Track = navigator.run(read_recording("walk.csv"))
+write_tum("walk.tum", track.trajectory)
+state: NavState | None = navigator.push(0.0, (0.0, 0.0, 0.0), np.zeros(3))
+if state is not None:
+    print(state.p_W + track.trajectory.position_W[-1], state.position_covariance)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "checker",
+    [("mypy", "--strict", "--python-executable"), ("pyright", "--pythonpath")],
+    ids=lambda checker: checker[0],
+)
+def test_type_checkers_know_the_wheel(outside, checker):
+    if checker[0] == "pyright" and shutil.which("node") is None:
+        pytest.skip("pyright needs node")
+    pytest.importorskip(checker[0], reason=f"pip install {checker[0]}")
+    program = outside / "program.py"
+    command = (sys.executable, "-m", *checker, outside / "fresh/bin/python", program)
+    program.write_text(_PROGRAM)
+    called(outside, *command)
+    program.write_text(_PROGRAM + "navigator.push('now', 1.0, 2.0)\n")
+    assert subprocess.run(command, capture_output=True, cwd=outside).returncode == 1

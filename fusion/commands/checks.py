@@ -197,8 +197,7 @@ def fusion(
 
     backends: tuple[BackendName, ...] = ("ekf", "graph") if graph else ("ekf",)
     judge = partial(fusion_gain, backends=backends)
-    gains, skipped = _judge_each("check fusion", reading, paths, estimating, by, judge)
-    _print_table(gains, skipped, fusion_gain_table, as_json)
+    _check_groups(reading, paths, estimating, by, judge, fusion_gain_table, as_json)
 
 
 @expand_option_groups
@@ -219,8 +218,7 @@ def fixes(
 
     chosen: BackendName = check_choice("--backend", backend, get_args(BackendName))
     judge = partial(track_with_fixes, every=every, sigma=sigma, backend=chosen)
-    found, skipped = _judge_each("check fixes", reading, paths, estimating, by, judge)
-    _print_table(found, skipped, fixes_table, as_json)
+    _check_groups(reading, paths, estimating, by, judge, fixes_table, as_json)
 
 
 @expand_option_groups
@@ -234,8 +232,7 @@ def gaps(
     """Remove 0.1 s at one of six instants or 5 % of the samples; report how far the end moves."""
     from stario.fusion.evaluation.checks.sample_loss import end_shift_table, end_shifts
 
-    found, skipped = _judge_each("check gaps", reading, paths, estimating, by, end_shifts)
-    _print_table(found, skipped, end_shift_table, as_json)
+    _check_groups(reading, paths, estimating, by, end_shifts, end_shift_table, as_json)
 
 
 @expand_option_groups
@@ -272,15 +269,63 @@ def moments(
     _print_table(found, skipped, moment_table, as_json)
 
 
-def _judge_each(
-    title: str,
+@expand_option_groups
+def simulation(
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
+    paths: OptionalPathsArgument = None,
+    walks: Annotated[int, typer.Option(min=1, help="Simulated walks of each way.")] = 10,
+    seconds: Annotated[
+        float, typer.Option(min=10.0, help="Duration of each walk in s.")
+    ] = _SECONDS,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare simulated walks with recordings by way of carrying: motion by band, steps, errors.
+
+    Without PATH, print those of the simulated walks.
+    """
+    from stario.fusion.evaluation.checks.simulation import (
+        RECORDED,
+        SIMULATED,
+        SPEEDS,
+        carry_of,
+        motion_scores,
+        motion_table,
+        simulated_walk,
+    )
+
+    if not paths:
+        refuse_unused(changed(reading), "with simulated walks", "use with PATH")
+    model, settings = estimating.network(), estimating.settings()
+    wanted = [(carry, seed) for carry in SPEEDS for seed in range(walks)]
+    found = [
+        motion_scores(model, simulated_walk(carry, seed, seconds), settings, carry, SIMULATED)
+        for carry, seed in with_bar("check simulation", wanted, len(wanted))
+    ]
+    skipped: list[Skipped] = []
+    if paths:
+        recorded, skipped = _score_each(
+            "check simulation",
+            reading,
+            paths,
+            lambda path, sequence: motion_scores(
+                model, sequence, settings, carry_of(sequence), RECORDED
+            ),
+        )
+        found += recorded
+    _print_table(found, skipped, motion_table, as_json)
+
+
+def _check_groups(
     reading: ReadingOptions,
     paths: Sequence[Path],
     estimating: EstimatorOptions,
     by: str,
     judge: Callable[[Predictor, ImuSequence, NavigatorConfig, str], pd.DataFrame],
-) -> tuple[list[pd.DataFrame], list[Skipped]]:
-    """Score each recording as one of its group; return the scores and what was skipped."""
+    table: Callable[[pd.DataFrame], str],
+    as_json: bool,
+) -> None:
+    """Score each recording as one of its group, and print the table."""
     from stario.fusion.evaluation.benchmark.groups import By, labels
     from stario.sequences.arrays import check_choice
 
@@ -290,7 +335,7 @@ def _judge_each(
     def judged(path: Path, sequence: ImuSequence) -> pd.DataFrame:
         return judge(model, sequence, settings, labels(path, sequence.attributes)[grouping])
 
-    return _score_each(title, reading, paths, judged)
+    _print_table(*_score_each("check", reading, paths, judged), table, as_json)
 
 
 def _score_each(

@@ -38,7 +38,7 @@ def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
-        typer.echo(version("stario"))
+        typer.echo(version("stario-nav"))
         raise typer.Exit
 
 
@@ -57,7 +57,14 @@ for command in (run, live, compare, evaluate, inspect, convert, train, simulate,
 check = typer.Typer(no_args_is_help=True, help="Check estimators and networks on this machine.")
 for command in (
     *(checks.models, table, checks.fusion, checks.backends, checks.faults),
-    *(checks.gaps, checks.moments, checks.fixes, checks.consistency, checks.benchmark),
+    *(
+        checks.gaps,
+        checks.moments,
+        checks.simulation,
+        checks.fixes,
+        checks.consistency,
+        checks.benchmark,
+    ),
 ):
     check.command()(command)
 app.add_typer(check, name="check")

@@ -184,7 +184,7 @@ def origin_of(
 
     default = asdict(ReadingOptions())
     return {
-        "stario": version("stario"),
+        "stario": version("stario-nav"),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "model": estimating.model,
         "weights_sha256": network.card.sha256 or None,

@@ -82,14 +82,13 @@ def compare(
             files, model, settings, read, jobs, absolute_fixes, progress=progress
         )
         comparisons = list(without_skipped(outcomes, skipped))
-    written = write_comparison(folder, comparisons, settings, origin) if comparisons else []
+    also = {}
     if report:
         from stario.fusion.report.page import write_report
 
-        for comparison in comparisons:
-            path = folder / comparison.sequence.name / "report.html"
-            written.append(write_report(path, comparison))
+        also["report.html"] = write_report
     if comparisons:
+        written = write_comparison(folder, comparisons, settings, origin, also)
         lines = [line for comparison in comparisons for line in _lines(comparison)]
         words = {k: v for comparison in comparisons for k, v in column_words(comparison).items()}
         lines += explanations(words)

@@ -75,7 +75,7 @@ class ReadingOptions:
         str,
         _reading(
             help="Format: auto, or archive, ronin, ridi, imunet, rnin, tlio, bag, euroc (also "
-            "TUM-VI), oxiod, advio, phone, wide, events, zip, json, csv or long."
+            "TUM-VI), oxiod, advio, phone, joined, wide, events, zip, json, csv, long or untimed."
         ),
     ] = "auto"
     gyro_unit: Annotated[str, _reading(help="Unit of the gyroscope: rad/s, deg/s or mdps.")] = (
@@ -97,6 +97,9 @@ class ReadingOptions:
     imu_topic: Annotated[str | None, _reading(help="IMU topic of a bag with several IMUs.")] = None
     truth_topic: Annotated[
         str | None, _reading(help="Topic of true poses or odometry in a bag.")
+    ] = None
+    rate: Annotated[
+        float | None, _reading(help="Samples per second of a file that has no column of times.")
     ] = None
     gravity: Annotated[
         str,
@@ -162,8 +165,12 @@ class ReadingOptions:
         from stario.sequences.conventions import with_conventions
         from stario.sequences.readers import read_recording
 
-        topics = {"imu_topic": self.imu_topic, "truth_topic": self.truth_topic}
-        given = {name: topic for name, topic in topics.items() if topic is not None}
+        options = {
+            "imu_topic": self.imu_topic,
+            "truth_topic": self.truth_topic,
+            "rate": self.rate,
+        }
+        given = {name: str(value) for name, value in options.items() if value is not None}
         sequence = read_recording(path, self.format, **given)
         return with_conventions(
             sequence, self.gyro_unit, self.accel_unit, self.axes, self.gravity, self.accel_sign
@@ -177,9 +184,7 @@ class EstimatorOptions:
     config: ConfigOption = None
     model: Annotated[
         str,
-        _estimation(
-            help="Weights: default, open, first-stage, walks-36min, or a safetensors or ONNX file."
-        ),
+        _estimation(help="Weights: default, open, or a safetensors or ONNX file."),
     ] = "default"
     magnetometer: Annotated[
         bool, _estimation(metavar="", help="Use the magnetometer, if there is one.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, get_args
@@ -98,16 +98,18 @@ def _run(
         typer.echo(f"stario: {line}", err=True)
     warn_of_truth(sequence)
     found = measured(sequence, {navigator.backend: track}, fixes)
-    written = write_run(folder, found, navigator.config, origin)
+    also: dict[str, Callable[[Path, Comparison], object]] = {}
     if report:
         from stario.fusion.report.page import write_report
 
-        written.append(write_report(folder / "report.html", found))
+        also["report.html"] = write_report
     if view:
         from stario.fusion.report.view import open_view, write_view
 
-        written.append(write_view(folder / "track.rrd", found))
-        open_view(written[-1])
+        also["track.rrd"] = write_view
+    written = write_run(folder, found, navigator.config, origin, also)
+    if view:
+        open_view(folder / "track.rrd")
     if sequence.truth is not None:
         words |= column_words(found)
     lines = [*_lines(found, track), f"{len(written)} files in {folder}"]

@@ -48,23 +48,6 @@ class Interval:
         return f"{self.ratio:{form}} [{self.low:{form}}, {self.high:{form}}]"
 
 
-@dataclass(frozen=True)
-class Rank:
-    """Rank of a network.
-
-    Attributes:
-        rank: 1 for the smallest error.
-        low: lower bound of the rank's interval.
-        high: upper bound of the rank's interval.
-        ratio: its error over the reference network's; None for the reference or without one.
-    """
-
-    rank: int
-    low: int
-    high: int
-    ratio: Interval | None
-
-
 def block_rows(sums: Sequence[Sequence[float]] | FloatArray, **labels: object) -> pd.DataFrame:
     """Return the rows of a recording's blocks (B, 2): sums of squared errors, and their counts.
 
@@ -87,29 +70,26 @@ def paired_ratio(blocks: pd.DataFrame, ours: str, theirs: str) -> Interval | Non
     return drawn.ratio(ours, theirs)
 
 
-def ranks(blocks: pd.DataFrame, against: str) -> dict[str, Rank]:
+def ranks(blocks: pd.DataFrame, against: str) -> pd.DataFrame:
     """Rank networks by the geometric mean of their errors over the recordings common to all.
 
     Returns:
-        Ranks by network name, with ratios to the errors of `against` if it is among them; empty if
-        no recording is common to all.
+        Each `network` with its `rank`, 1 for the smallest error, the interval's bounds `rank_low`
+        and `rank_high`, and the `ratio` of its error to that of `against`, an `Interval`; None for
+        `against` itself or without it. No rows if no recording is common to all.
     """
     drawn = _Draws.of(blocks)
-    if drawn is None:
-        return {}
+    rows = [] if drawn is None else _ranked(drawn, against)
+    return pd.DataFrame(rows, columns=["network", "rank", "rank_low", "rank_high", "ratio"])
+
+
+def _ranked(drawn: _Draws, against: str) -> list[tuple[object, ...]]:
     places = drawn.replicates.argsort(axis=0).argsort(axis=0) + 1
-    low, high = np.percentile(places, _BOUNDS, axis=1, method="nearest")
+    bounds = np.percentile(places, _BOUNDS, axis=1, method="nearest")
     order = drawn.scores.argsort().argsort() + 1
-    compared = against in drawn.names
-    return {
-        name: Rank(
-            int(order[k]),
-            int(low[k]),
-            int(high[k]),
-            drawn.ratio(name, against) if compared and name != against else None,
-        )
-        for k, name in enumerate(drawn.names)
-    }
+    compared = set(drawn.names) - {against} if against in drawn.names else set()
+    ratios = [drawn.ratio(name, against) if name in compared else None for name in drawn.names]
+    return list(zip(drawn.names, order, *bounds, ratios, strict=True))
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,15 +5,16 @@ Drawn without pyplot, like those of `stario.sequences.drawing.plots`.
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
-from stario.fusion.evaluation.benchmark.groups import Benchmark, Row, benchmark_dict
+from stario.fusion.evaluation.benchmark.groups import RATIOS, Benchmark, benchmark_dict
+from stario.fusion.evaluation.bootstrap import Interval
 from stario.fusion.evaluation.folders import results_folder
 from stario.fusion.evaluation.networks import (
     PROTOCOLS,
@@ -32,7 +33,7 @@ from stario.sequences.drawing.figures import (
     save_figure,
     split_at_gaps,
 )
-from stario.sequences.files import write_json, write_rows
+from stario.sequences.files import json_text, write_json, write_rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -176,34 +177,21 @@ def _colour(index: int) -> str:
 
 
 def write_benchmark(
-    folder: Path, found: Benchmark, rows: Sequence[Row], ours: str, theirs: str | None
+    folder: Path, found: Benchmark, rows: pd.DataFrame, ours: str, theirs: str | None
 ) -> None:
     """Write `groups.csv`, `recordings.csv`, `groups.json` and `groups.png` into a folder.
 
     Raises:
         InputError: as `results_folder`.
     """
-    by_group = [
-        {"group": row.name, "weights": name, "recordings": row.recordings, "path_km": row.path_km}
-        | figures
-        | (_ratios(row) if name == ours else {})
-        for row in rows
-        for name, figures in row.medians.items()
-    ]
-    single = records(found.scores.rename(columns={"track": "weights"}))
+    content = benchmark_dict(found, rows, ours, theirs)
     with results_folder(folder) as new:
-        write_rows(new / "groups.csv", by_group)
-        write_rows(new / "recordings.csv", single)
-        write_json(new / "groups.json", benchmark_dict(found, rows, ours, theirs))
+        flat = json.loads(json_text(content["groups"]))  # ratios become tables, unknown values None
+        table = pd.json_normalize(flat, sep="_").drop(columns=[*RATIOS], errors="ignore")
+        table.to_csv(new / "groups.csv", index=False)
+        write_rows(new / "recordings.csv", records(found.scores))
+        write_json(new / "groups.json", content)
         save_figure(groups_figure(rows, ours, theirs), new / "groups.png")
-
-
-def _ratios(row: Row) -> dict[str, float]:
-    return {
-        f"{key}_{part}": value
-        for key, interval in row.ratios.items()
-        for part, value in asdict(interval).items()
-    }
 
 
 _BEFORE, _AFTER = "#8C8C8C", BLUE
@@ -217,32 +205,36 @@ _PANELS = (
 )
 
 
-def groups_figure(rows: Sequence[Row], ours: str, theirs: str | None) -> Figure:
+def groups_figure(rows: pd.DataFrame, ours: str, theirs: str | None) -> Figure:
     """Draw a line for each group: medians of both weights, paired ratio with its interval."""
-    groups = [row for row in rows if not row.pooled]
-    fig = new_figure(12.0 if theirs else 9.0, 1.8 + 0.55 * len(rows), "")
+    shown = rows[rows["role"] == "ours"]
+    groups = rows[~rows["pooled"]]
+    fig = new_figure(12.0 if theirs else 9.0, 1.8 + 0.55 * len(shown), "")
     panels = fig.subplots(1, 3 if theirs else 2, sharey=True)
     for axes, (title, keys) in zip(panels, _PANELS, strict=False):
-        _draw_medians(axes, groups, keys, ours, theirs)
+        known = groups.set_index("weights")[list(keys)].bfill(axis=1).iloc[:, 0]
+        _draw_medians(
+            axes, known[[ours]].to_list(), known[[theirs or ours]].to_list(), ours, theirs
+        )
         axes.set_title(title, loc="left", fontsize=10)
     panels[0].set_xlim(left=0.0)
     panels[1].axvline(1.0, color=INK, lw=1.0)
-    shown = groups
     if theirs:
-        shown = [*groups, *(row for row in rows if row.pooled)]
-        _draw_ratios(panels[2], shown)
-    panels[0].set_yticks(range(len(shown)), [f"{row.name} ({row.recordings})" for row in shown])
-    panels[0].set_ylim(len(shown) - 0.5, -0.5)
+        _draw_ratios(panels[2], shown["ratio_10s"].to_list())
+    else:
+        shown = shown[~shown["pooled"]]
+    names = [f"{row['group']} ({row['recordings']})" for row in shown.to_dict("records")]
+    panels[0].set_yticks(range(len(names)), names)
+    panels[0].set_ylim(len(names) - 0.5, -0.5)
     handles, labels = panels[0].get_legend_handles_labels()
     fig.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
     return fig
 
 
 def _draw_medians(
-    axes: Axes, rows: Sequence[Row], keys: tuple[str, ...], ours: str, theirs: str | None
+    axes: Axes, afters: list[float], befores: list[float], ours: str, theirs: str | None
 ) -> None:
-    for k, row in enumerate(rows):
-        after, before = (_first_known(row, name, keys) for name in (ours, theirs or ours))
+    for k, (after, before) in enumerate(zip(afters, befores, strict=True)):
         axes.plot([before, after], [k, k], color="#CCCCCC", lw=3.0, zorder=1)
         if theirs:
             label = f"before: {theirs}" if k == 0 else None
@@ -255,16 +247,14 @@ def _draw_medians(
     apply_style(axes)
 
 
-def _draw_ratios(axes: Axes, rows: Sequence[Row]) -> None:
-    for k, row in enumerate(rows):
-        ratio = row.ratios.get("rms_10s_m")
-        if ratio is not None:
-            axes.plot([ratio.low, ratio.high], [k, k], color=_AFTER, lw=2.0)
-            axes.plot(ratio.ratio, k, "o", color=_AFTER, ms=8)
+def _draw_ratios(axes: Axes, ratios: list[Interval | None]) -> None:
+    known = {k: r for k, r in enumerate(ratios) if isinstance(r, Interval)}
+    for k, ratio in known.items():
+        axes.plot([ratio.low, ratio.high], [k, k], color=_AFTER, lw=2.0)
+        axes.plot(ratio.ratio, k, "o", color=_AFTER, ms=8)
     axes.axvline(1.0, color=INK, lw=1.0)
     axes.set_xscale("log")
-    found = [row.ratios["rms_10s_m"] for row in rows if "rms_10s_m" in row.ratios]
-    limits = [x for r in found for x in (r.low, r.ratio, r.high) if np.isfinite(x)]
+    limits = [x for r in known.values() for x in (r.low, r.ratio, r.high) if np.isfinite(x)]
     ticks = [t for t in (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)
              if min([0.7, *limits]) <= t <= max([1.5, *limits])]  # fmt: skip
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
@@ -272,8 +262,3 @@ def _draw_ratios(axes: Axes, rows: Sequence[Row]) -> None:
     title = "error over 10 s, after / before, 95 % interval\n(waypoints: residuals)"
     axes.set_title(title, loc="left", fontsize=10)
     apply_style(axes)
-
-
-def _first_known(row: Row, weights: str, keys: tuple[str, ...]) -> float:
-    values = (row.medians[weights][key] for key in keys)
-    return next((value for value in values if np.isfinite(value)), float("nan"))

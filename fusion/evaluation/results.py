@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from stario.fusion.config import NavigatorConfig
@@ -21,8 +22,16 @@ if TYPE_CHECKING:
     from stario.fusion.evaluation.summary import Scores
 
 
+Writers = Mapping[str, Callable[[Path, Comparison], object]]
+"""Functions that write a recording's further files, by the files' names."""
+
+
 def write_run(
-    folder: Path, run: Comparison, config: NavigatorConfig, origin: Mapping[str, object]
+    folder: Path,
+    run: Comparison,
+    config: NavigatorConfig,
+    origin: Mapping[str, object],
+    also: Writers = MappingProxyType({}),
 ) -> list[Path]:
     """Write the fused track of a run, its only one, and return the files written.
 
@@ -43,7 +52,7 @@ def write_run(
     }
     with results_folder(folder) as new:
         written = _track_files(new, run)
-        written += [*_json_files(new, contents), *_figures(new, run)]
+        written += [*_json_files(new, contents), *_figures(new, run), *_further(new, run, also)]
     return [folder / path.relative_to(new) for path in written]
 
 
@@ -52,6 +61,7 @@ def write_comparison(
     comparisons: Sequence[Comparison],
     config: NavigatorConfig,
     origin: Mapping[str, object],
+    also: Writers = MappingProxyType({}),
 ) -> list[Path]:
     """Write what `write_summary` does, and a sub-folder of tracks and figures per recording.
 
@@ -65,7 +75,7 @@ def write_comparison(
     with results_folder(folder) as new:
         written = write_summary(new, [scores_of(c) for c in comparisons], config, origin)
         for comparison in comparisons:
-            written += write_recording(new, comparison)
+            written += write_recording(new, comparison, also)
     return [folder / path.relative_to(new) for path in written]
 
 
@@ -96,7 +106,15 @@ def _json_files(folder: Path, contents: Mapping[str, object]) -> list[Path]:
     return [folder / file for file in contents]
 
 
-def write_recording(folder: Path, comparison: Comparison) -> list[Path]:
+def _further(folder: Path, run: Comparison, also: Writers) -> list[Path]:
+    for name, write in also.items():
+        write(folder / name, run)
+    return [folder / name for name in also]
+
+
+def write_recording(
+    folder: Path, comparison: Comparison, also: Writers = MappingProxyType({})
+) -> list[Path]:
     """Write tracks and figures of one recording into a sub-folder named after it.
 
     Raises:
@@ -109,7 +127,7 @@ def write_recording(folder: Path, comparison: Comparison) -> list[Path]:
         if truth is not None:
             write_tum(new / "truth.tum", truth)
             written.append(new / "truth.tum")
-        written += _figures(new, comparison)
+        written += [*_figures(new, comparison), *_further(new, comparison, also)]
     return [inner / path.relative_to(new) for path in written]
 
 

@@ -117,10 +117,10 @@ def summary_table(recordings: Sequence[Scores]) -> str:
     """
     for scores in recordings:
         check_type("recordings", scores, Scores, "scores_of(comparison) returns one")
-    rows = rows_of(((_name_with_coverage(r), r.table) for r in recordings), _columns(np.mean))
+    rows = rows_of(((_name_with_coverage(r), r.table) for r in recordings), _columns(np.mean), "")
     counted = _counted(recordings)
     for name, over in (("median", np.median), ("mean", np.mean)):
-        rows += rows_of([(name, _together(counted))], _columns(over))[1:]
+        rows += rows_of([(name, _together(counted))], _columns(over), "")[1:]
     lines = aligned(rows)
     if len(counted) < len(recordings):
         least = f"{_MIN_COVERAGE:.0%}"

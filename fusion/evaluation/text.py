@@ -11,27 +11,34 @@ from stario.sequences.drawing.text_table import aligned, figure
 if TYPE_CHECKING:
     import pandas as pd
 
-    from stario.fusion.evaluation.benchmark.groups import Row
     from stario.fusion.evaluation.networks import NetworkTable
     from stario.fusion.evaluation.scores import Column
 
 
 def rows_of(
-    parts: Iterable[tuple[str, pd.DataFrame]], columns: Sequence[Column], corner: str = ""
+    parts: Iterable[tuple[str | tuple[str, ...], pd.DataFrame]],
+    columns: Sequence[Column],
+    *corner: str,
 ) -> list[list[str]]:
-    """Return the cells of a table, its titles first: a row for each part of the scores."""
-    head = [corner, *(column.title for column in columns)]
-    return [head, *([name, *(c.text(part) for c in columns)] for name, part in parts)]
+    """Return the cells of a table, its titles first: a row for each part of the scores.
+
+    Parts are named by one label or by several, whose titles are `corner`.
+    """
+    rows = [[*corner, *(column.title for column in columns)]]
+    for name, part in parts:
+        names = (name,) if isinstance(name, str) else name
+        rows.append([*names, *(column.text(part) for column in columns)])
+    return rows
 
 
 def table(
-    parts: Iterable[tuple[str, pd.DataFrame]],
+    parts: Iterable[tuple[str | tuple[str, ...], pd.DataFrame]],
     columns: Sequence[Column],
-    corner: str = "",
+    corner: tuple[str, ...] = ("group",),
     notes: Sequence[str] = (),
 ) -> str:
     """Return a table with a row for each part of the scores, and notes below it."""
-    return "\n".join([*aligned(rows_of(parts, columns, corner)), *notes])
+    return "\n".join([*aligned(rows_of(parts, columns, *corner)), *notes])
 
 
 _BENCHMARK = {
@@ -51,26 +58,27 @@ _BENCHMARK = {
 """Titles and formats of the figures of a benchmark."""
 
 
-def benchmark_text(rows: Sequence[Row], ours: str, theirs: str | None) -> str:
+def benchmark_text(rows: pd.DataFrame, ours: str, theirs: str | None) -> str:
     """Return for every group rows "theirs" and "ours", then the ratios, the verdict, the words."""
-    from stario.fusion.evaluation.benchmark.groups import WORDS, verdict
+    from stario.fusion.evaluation.benchmark.groups import RATIOS, WORDS, verdict
+    from stario.fusion.evaluation.bootstrap import Interval
 
-    named = {"theirs": theirs, "ours": ours} if theirs else {"ours": ours}
     cells = [["", "", "n", "km", *(title for title, _ in _BENCHMARK.values())]]
-    for row in rows:
-        for label, name in named.items():
-            found = [figure(row.medians[name][key], form) for key, (_, form) in _BENCHMARK.items()]
-            cells.append([row.name, label, str(row.recordings), f"{row.path_km:.2f}", *found])
+    for row in rows.to_dict("records"):
+        known = [row["group"], row["role"], str(row["recordings"])]
+        found = [figure(row[key], form) for key, (_, form) in _BENCHMARK.items()]
+        cells.append([*known, f"{row['path_km']:.2f}", *found])
     head, *body = aligned(cells)
     lines = [head]
-    for k, row in enumerate(rows):
-        lines += body[k * len(named) : (k + 1) * len(named)]
-        for key, interval in row.ratios.items():
-            title = _BENCHMARK[key][0].split(" [")[0]
-            lines.append(f"{row.name}: ratio over {title}: {interval:.3f}")
+    for line, row in zip(body, rows.to_dict("records"), strict=True):
+        lines.append(line)
+        for key, metric in RATIOS.items():
+            if isinstance(row[key], Interval):
+                title = _BENCHMARK[metric][0].split(" [")[0]
+                lines.append(f"{row['group']}: ratio over {title}: {row[key]:.3f}")
     if conclusion := verdict(rows):
         lines.append(conclusion)
-    lines += [f"{label}: {name}" for label, name in reversed(named.items())]
+    lines += [f"ours: {ours}", *([f"theirs: {theirs}"] if theirs else [])]
     return "\n".join([*lines, *(f"{key}: {words}." for key, words in WORDS.items())])
 
 
@@ -83,7 +91,7 @@ def networks_text(table: NetworkTable) -> str:
     for protocol, words in PROTOCOLS.items():
         for metric, title in METRICS.items():
             columns = [table.column(name, protocol, metric) for name in table.parameters]
-            lines += [f"{words}: {title}", *aligned(rows_of(rows, columns)), ""]
+            lines += [f"{words}: {title}", *aligned(rows_of(rows, columns, "")), ""]
     return "\n".join([*lines, *(f"{key}: {words}." for key, words in table_words(table).items())])
 
 

@@ -38,7 +38,7 @@ from stario.fusion.imu.intervals import (
     interpolated_sample,
 )
 from stario.fusion.imu.stateful import WindowBuffer
-from stario.fusion.imu.units import SensorCheck
+from stario.fusion.imu.units import SensorCheck, warn_of_field
 from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.errors import InputError
@@ -186,6 +186,7 @@ class FrontEnd:
         start = Start(**vars(gravity), time=first, rate=rate)
         self._origin, self._index, self._next = first, 1, first + self._period
         if self._attitude is None:
+            warn_of_field(self._fields.waiting)
             self.start, self._attitude = start, LevelledAttitude(start)
             return self._complete()
         assert self._before_gap is not None

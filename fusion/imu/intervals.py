@@ -252,6 +252,11 @@ class FieldBuffer:
         self._fields.append((time, field_B))
         return room
 
+    @property
+    def waiting(self) -> FloatArray:
+        """The fields (N, 3) that are held."""
+        return np.reshape([field for _, field in self._fields], (-1, 3))
+
     def at(self, time: float) -> FloatArray | None:
         """Return the newest field (3,) up to a time [s], None if it is too old; later ones wait."""
         self._last_query = time

@@ -8,34 +8,70 @@ several, with no calm one in between, are needed to refuse the stream.
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval, Start
 from stario.sequences.clean_samples import MAX_RATE, MIN_RATE
 from stario.sequences.errors import InputError
-from stario.sequences.inspection.checks import check_gyro
+from stario.sequences.inspection.checks import check_gyro, warn_if_downward
 from stario.sequences.inspection.constant_values import check_not_dead
 from stario.sequences.sequence import FloatArray
+from stario.sequences.units import magnetic_advice
+
+log = logging.getLogger(__name__)
+
+_DEG_S = "if it is in deg/s, push np.radians(gyro)"
 
 _START_FORCE = (5.0, 15.0)
 """Accepted mean force of the first second [m/s^2]: allows for a jump, excludes units of g."""
 
 
-def check_start(start: Start, gravity: float) -> None:
+_SPINNING_RAD_S = 6.0
+"""Rate beyond that of any walk, by which a force of 9.8 m/s^2 averages to something else."""
+
+
+def check_start(start: Start, gravity: float, table: FloatArray) -> None:
     """Check the first second of a stream.
 
+    Args:
+        start: what was made of it.
+        gravity: its magnitude [m/s^2].
+        table: (N, 7) time, gyro, accel of the samples since.
+
     Raises:
-        InputError: the rate is not about 50 Hz to 1 kHz, or the mean force cannot be gravity.
+        InputError: the rate is not about 50 Hz to 1 kHz, the mean force cannot be gravity, or the
+            gyroscope cannot be in rad/s.
     """
+    warn_if_downward("stream", table[:, 4:7])
     if not MIN_RATE <= start.rate <= MAX_RATE:
         raise InputError("time", f"{start.rate:.3g} samples a second", "50 to 1000")
     if not _START_FORCE[0] <= start.force <= _START_FORCE[1]:
+        speed, size = (
+            float(np.median(np.linalg.norm(table[:, columns], axis=1)))
+            for columns in (slice(1, 4), slice(4, 7))
+        )
+        if speed > _SPINNING_RAD_S and _START_FORCE[0] <= size <= _START_FORCE[1]:
+            raise InputError(
+                "gyro", f"rotations of {speed:.3g} in the first second", "rad/s", _DEG_S
+            )
+        if _START_FORCE[0] <= speed <= _START_FORCE[1]:
+            fix = "gyro and accel are swapped: push(time, gyro, accel)"
+            raise InputError("gyro", f"values of {speed:.3g}, as of gravity", "rad/s", fix)
         raise InputError(
             "accel",
             f"an average of {start.force:.3g} over the first second",
             f"about {gravity:.2f} m/s^2",
             "give specific force in m/s^2 with gravity left in, and rates in rad/s",
         )
+
+
+def warn_of_field(fields: FloatArray) -> None:
+    """Warn of magnetic fields (N, 3) that are the earth's in another unit than uT."""
+    size = float(np.median(np.linalg.norm(fields, axis=1))) if len(fields) else 0.0
+    if advice := magnetic_advice(size):
+        log.warning("magnetometer: found a field of %.3g, expected 25 to 65 uT: %s", size, advice)
 
 
 _PIECE_SECONDS = 4.0
@@ -81,16 +117,14 @@ class SensorCheck:
             self._check_piece(piece[:, 0], piece[:, 1:4], piece[:, 4:7])
 
     def _check_piece(self, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> None:
-        remedy = "is the sensor connected?"
         try:
             check_not_dead("stream", time, gyro, accel)
-            remedy = "if it is in deg/s, push np.radians(gyro)"
-            check_gyro("stream", time, gyro, accel, [slice(0, len(time))])
+            check_gyro("stream", time, gyro, accel, [slice(0, len(time))], _DEG_S)
         except InputError as error:
             self._wrong += 1
             if self._wrong >= _MIN_FAILED_PIECES:
                 field = "accel" if error.field.endswith("accelerometer") else "gyro"
-                raise InputError(field, error.found, error.expected, remedy) from None
+                raise InputError(field, error.found, error.expected, error.fix) from None
         else:
             speed = np.percentile(np.linalg.norm(gyro, axis=1), 95)
             if speed < _DOUBTFUL_RAD_S:

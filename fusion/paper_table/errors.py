@@ -7,7 +7,6 @@ own attitude, by `stario.fusion.evaluation.benchmark.displacement_error`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.benchmark.aligned import Aligned, aligned_recordings
@@ -33,51 +32,43 @@ CONVENTION: Convention = "ronin"
 """How errors are averaged: as in the paper."""
 
 
-@dataclass(frozen=True, eq=False)
-class Shown:
-    """A track with true attitude for a figure: time (N,) [s], horizontal positions (N, 2) [m]."""
-
-    time: FloatArray
-    position_W: FloatArray
-    truth_W: FloatArray
-
-
 Model = DisplacementModel | PedestrianDeadReckoning
 
 
 def test_errors(
     model: Model, test: Sequence[ListEntry], reading: ReaderConfig
-) -> tuple[list[dict[str, object]], dict[str, Shown], list[Skipped]]:
-    """Return the errors on every recording, tracks of the first ones, and skipped recordings.
+) -> tuple[list[dict[str, object]], list[Skipped]]:
+    """Return the errors on every recording, and the recordings that were skipped.
 
     Returns:
         Plain values for each recording: `recording`, `path`, `group`, `kind` of truth, `path_m`;
         `tracks` with ATE, RTE and PDE by track; `figures` as in `displacement_error.FIGURES`;
         `blocks` of 30 s, [sum of squares, count], of the position error under the paper's protocol
-        ("ate") and of the displacement error over 10 s ("10").
+        ("ate") and of the displacement error over 10 s ("10"); for the first recordings with poses
+        `drawn`, the track with the true attitude: time (N,) [s], horizontal positions `track` and
+        `truth` (N, 2) [m].
     """
     found: list[dict[str, object]] = []
-    shown: dict[str, Shown] = {}
     left_out: list[Skipped] = []
     paths = [entry.path for entry in test]
     outcomes = aligned_recordings(paths, reading.read, reading.options, reading.cache, 1)
     groups = {entry.path: entry.group for entry in test}
+    drawn = 0
     for aligned in without_skipped(outcomes, left_out):
-        path = aligned.path
         try:
             row, track = _recording(model, aligned, reading)
         except StarioError as error:
-            left_out.append(skipped(path, error))
+            left_out.append(skipped(aligned.path, error))
             continue
-        found.append({"path": str(path), "group": groups[path], **row})
-        if track is not None and len(shown) < MAX_DRAWN:
-            shown[aligned.name] = track
-    return found, shown, left_out
+        if track and drawn < MAX_DRAWN:
+            row["drawn"], drawn = track, drawn + 1
+        found.append({"path": str(aligned.path), "group": groups[aligned.path], **row})
+    return found, left_out
 
 
 def _recording(
     model: Model, aligned: Aligned, reading: ReaderConfig
-) -> tuple[dict[str, object], Shown | None]:
+) -> tuple[dict[str, object], dict[str, FloatArray]]:
     alone = recording_errors(aligned, predictions(model, aligned))
     blocks = {"10": alone.blocks["10"].tolist()} if "10" in alone.blocks else {}
     row: dict[str, object] = {
@@ -89,14 +80,14 @@ def _recording(
         "tracks": {},
     }
     if aligned.kind != "poses":
-        return row, None
+        return row, {}
     sequence = reading.read(aligned.path)
     if isinstance(model, PedestrianDeadReckoning):
         track = pedestrian_track(sequence).trajectory
         row["tracks"] = {OWN_ATTITUDE: metrics_of(track, true_poses(sequence), CONVENTION)}
-        return row, None
+        return row, {}
     row["tracks"], errors = protocol_figures(model, sequence, NavigatorConfig(), CONVENTION)
     time, squares = errors.estimate.time, (errors.position_W[:, :2] ** 2).sum(axis=1)
     blocks["ate"] = block_sums(time - time[0], squares).tolist()
-    positions = errors.estimate.position_W[:, :2], errors.truth.position_W[:, :2]
-    return row, Shown(time, *positions)
+    xy = {"track": errors.estimate.position_W[:, :2], "truth": errors.truth.position_W[:, :2]}
+    return row, {"time": time, **xy}

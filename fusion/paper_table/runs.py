@@ -1,7 +1,7 @@
 """Runs of the table: a network trained and tested on a data set with a seed, kept as files.
 
 `<out>/<set>/<network>/<n>-steps/seed-<n>/` holds the model and `trained.json` once training is
-done, then `errors.json` and `tracks.npz`. Repeating a run adds only what is missing.
+done, then `errors.json`. Repeating a run adds only what is missing.
 """
 
 from __future__ import annotations
@@ -10,19 +10,17 @@ import hashlib
 import importlib
 import json
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from functools import cache, partial
 from itertools import product
 from pathlib import Path
 from time import process_time
 
-import numpy as np
-
 from stario.fusion.evaluation.pedestrian import NAME as PDR
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
-from stario.fusion.paper_table.errors import Model, Shown, test_errors
+from stario.fusion.paper_table.errors import Model, test_errors
 from stario.fusion.paper_table.sets import ALL, FIRST, DataSet
 from stario.fusion.paper_table.training import (
     TEMPORARY_FILES,
@@ -38,7 +36,7 @@ from stario.network.training.config import TrainingConfig
 from stario.sequences.arrays import check_choice
 from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.errors import ConfigError, InputError, ReadError
-from stario.sequences.files import write_json, write_npz
+from stario.sequences.files import write_json
 from stario.sequences.lazy import optional_package
 
 LEADING = ("StarIO", "R-ResNet", "DeepILS", "StarIO without MSGCU")
@@ -127,19 +125,6 @@ def read_run(run: Run, out: Path) -> dict[str, object] | None:
     return content | {"trained": _read(folder / "trained.json")}
 
 
-def read_tracks(run: Run, out: Path) -> dict[str, Shown]:
-    """Return the tracks of some recordings, by recording name."""
-    path = run.folder(out) / "tracks.npz"
-    if not path.exists():
-        return {}
-    with np.load(path, allow_pickle=False) as arrays:
-        names = list(dict.fromkeys(key.rsplit("|", 1)[0] for key in arrays.files))
-        return {name: Shown(*(arrays[f"{name}|{part}"] for part in _PARTS)) for name in names}
-
-
-_PARTS = ("time", "position_W", "truth_W")
-
-
 def _train(run: Run, recipe: TrainingConfig, folder: Path, reading: ReaderConfig) -> None:
     content = train_run(run.dataset, recipe, folder, reading)
     write_json(folder / "trained.json", {"cell": run.digest, **content})
@@ -150,10 +135,7 @@ def _train(run: Run, recipe: TrainingConfig, folder: Path, reading: ReaderConfig
 def _evaluate(run: Run, folder: Path, reading: ReaderConfig) -> None:
     began = process_time()
     model = _model(run, folder)
-    found, shown, skipped = test_errors(model, run.dataset.test, reading)
-    arrays = {f"{name}|{part}": getattr(t, part) for name, t in shown.items() for part in _PARTS}
-    if arrays:
-        write_npz(folder / "tracks.npz", **arrays)
+    found, skipped = test_errors(model, run.dataset.test, reading)
     content = {
         "cell": run.digest,
         "network": run.network,
@@ -242,7 +224,8 @@ def complete(
     yield from each(partial(complete_run, out=out, reading=reading), runs, jobs)
 
 
-def backend(name: str) -> AbstractContextManager[object]:
+@contextmanager
+def backend(name: str) -> Iterator[None]:
     """Select joblib's backend within a block: "loky" (processes on this machine), "dask" or "ray".
 
     Dask uses the scheduler named in its configuration (`DASK_SCHEDULER_ADDRESS`), Ray the cluster
@@ -251,32 +234,19 @@ def backend(name: str) -> AbstractContextManager[object]:
     Raises:
         InputError: the name is unknown, or the backend's package is not installed.
     """
-    backends: dict[str, Callable[[], AbstractContextManager[object]]] = {
-        "loky": nullcontext,
-        "dask": _dask,
-        "ray": _ray,
-    }
-    check_choice("--backend", name, backends)
-    return backends[name]()
-
-
-@contextmanager
-def _dask() -> Iterator[None]:
     from joblib import parallel_config
 
-    distributed = optional_package("distributed", "cluster")
-    logging.getLogger("distributed").setLevel(logging.WARNING)
-    with distributed.Client(), parallel_config("dask"):
-        yield
-
-
-@contextmanager
-def _ray() -> Iterator[None]:
-    from joblib import parallel_config
-
-    try:
-        importlib.import_module("ray.util.joblib").register_ray()
-    except ImportError as error:
-        raise InputError("--backend", "ray, not installed", "ray", "pip install ray") from error
-    with parallel_config("ray"):
+    check_choice("--backend", name, ("loky", "dask", "ray"))
+    with ExitStack() as within:
+        if name == "dask":
+            distributed = optional_package("distributed", "cluster")
+            logging.getLogger("distributed").setLevel(logging.WARNING)
+            within.enter_context(distributed.Client())
+        elif name == "ray":
+            try:
+                importlib.import_module("ray.util.joblib").register_ray()
+            except ImportError as error:
+                found, fix = "ray, not installed", "pip install ray"
+                raise InputError("--backend", found, "ray", fix) from error
+        within.enter_context(parallel_config(name))
         yield

@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
 from time import process_time
 from typing import Any
+
+import numpy as np
 
 from stario.fusion.paper_table.sets import DataSet
 from stario.network.training.config import TrainingConfig, training_config
@@ -87,8 +89,8 @@ def train_run(
 
     Returns:
         Plain values: training error of the last epoch and validation error of the best one, whose
-        weights are kept [m^2], number of steps, windows per step, total and
-        mean computing time per step [s], the recipe, and the skipped recordings.
+        weights are kept [m^2], number of steps, windows per second, computing time over all
+        processes that continued the run in turn [s], the recipe, and the skipped recordings.
 
     Raises:
         InputError, ConfigError: as for `stario.network.training.train.train`.
@@ -100,7 +102,8 @@ def train_run(
     walks = [] if poses else simulated(_WALKS, 0)
     material = mix_sources(streams, walks, recipe.shares, recipe.reach)
     validation_data = mix_sources(held_out, [])
-    clock = _Clock(folder / TEMPORARY_FILES[1])
+    began, clock = process_time(), folder / TEMPORARY_FILES[1]
+    before = float(json.loads(clock.read_text())) if clock.exists() else 0.0  # of killed processes
     train(
         recipe,
         material.streams,
@@ -108,20 +111,17 @@ def train_run(
         [s.part(0, _VALIDATION_SAMPLES) for s in validation_data.streams]
         or simulated(_VALIDATION_WALKS, 1),
         folder,
-        on_step=lambda step, error: clock.step(),
-        on_epoch=lambda report: clock.keep(),
+        on_epoch=lambda report: write_json(clock, before + process_time() - began),
         trained_on=material.words,
         legs=material.legs,
         validation_legs=validation_data.legs,
         chosen_by_legs=not validation_data.streams,
     )
-    clock.keep()
     reports = _reports(folder / "log.json")
     return {
         "steps": recipe.steps,
-        "windows": recipe.batch + _leg_windows(recipe, material.legs),
-        "seconds": clock.seconds,
-        "step_seconds": clock.step_seconds,
+        "windows_per_s": float(np.mean([report.windows_per_second for report in reports])),
+        "seconds": before + process_time() - began,
         "training_error_m2": reports[-1].training_error,
         "validation_error_m2": History(recipe, reports).best().validation_error,
         "recipe": asdict(recipe),
@@ -158,42 +158,3 @@ def _streams(
     """Return the streams of each recording; later runs of the same set reuse them."""
     outcomes = recorded(files, reading.read, reading.options, reading.cache, 1, attitude)
     return recording_streams(zip(files, outcomes, strict=True))
-
-
-def _leg_windows(recipe: TrainingConfig, legs: Sequence[object]) -> int:
-    kinds = {getattr(stream, "kind", "") for stream in legs}
-    waypoints = recipe.waypoint_stretches * recipe.waypoint_seconds if "waypoints" in kinds else 0
-    tracks = recipe.track_stretches * recipe.track_seconds if "positions" in kinds else 0
-    return waypoints + tracks
-
-
-class _Clock:
-    """Computing time of a training run [s], over all processes that continued it in turn."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else 0.0
-        self._before, self._began = float(before), process_time()
-        self._last: float | None = None
-        self._steps: list[float] = []
-
-    @property
-    def seconds(self) -> float:
-        return self._before + process_time() - self._began
-
-    @property
-    def step_seconds(self) -> float:
-        """Mean over the steps that were timed from start to end; NaN if there are none."""
-        return sum(self._steps) / len(self._steps) if self._steps else float("nan")
-
-    def step(self) -> None:
-        """Record that a step is done."""
-        if self._last is not None:
-            self._steps.append(process_time() - self._last)
-        self._last = process_time()
-
-    def keep(self) -> None:
-        """Write the time so far; that until the next call of `step` counts for no step."""
-        write_json(self._path, self.seconds)
-        self._last = None

@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import plotly.graph_objects as go
+from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
-from stario.fusion.report.panels import FAINT, GRID, INK, TRUTH, Panel, style
-from stario.fusion.report.series import Series, ellipse
-from stario.sequences.arrays import evenly_spaced
+from stario.fusion.filter.corrections import Correction
+from stario.fusion.report.panels import FAINT, GRID, INK, TRUTH, Panel, numbers, style
+from stario.fusion.report.series import Series, clock, ellipse
+from stario.sequences.arrays import evenly_spaced, interpolated
 from stario.sequences.sequence import FloatArray, PositionTrack
 
-PANEL_HEIGHT = 190
-"""Height of a panel over time [px]."""
+_ELLIPSES = 8
+"""Number of ellipses drawn along the main track."""
 
-_ELLIPSES = 12
-"""Number of ellipses drawn along a track."""
+_ARROW_SECONDS, _MAX_ARROWS = 30.0, 24
+"""Time between the main track's arrows [s], and their maximum number."""
+
+_MIN_ARROW_STEP = 0.2
+"""Distance walked in the two seconds around an arrow [m] below which there is no direction."""
+
+_FEW_POSITIONS = 30
+"""Number of known positions above which they are drawn small: each is then of little interest."""
 
 _LAYOUT = {
     "font": {"family": "system-ui, sans-serif", "size": 13, "color": INK},
@@ -39,50 +48,60 @@ _LEFT = 58
 
 
 def map_figure(
-    tracks: Mapping[str, Series], truth: Series | None, known: PositionTrack | None
+    tracks: Mapping[str, Series],
+    truth: Series | None,
+    known: PositionTrack | None,
+    main: str,
+    corrections: Sequence[Correction] = (),
 ) -> go.Figure:
-    """Draw all tracks from above on equal axes, with 3-sigma ellipses where there is covariance.
+    """Draw all tracks from above on equal axes.
 
     Args:
         tracks: tracks by name.
         truth: ground truth in the same frame, or None.
         known: positions or waypoints in the same frame, if there is no true track, or None.
+        main: name of the track drawn with 3-sigma ellipses, arrows and times.
+        corrections: time since the first sample [s], distance [m], turn [rad] and cause of the main
+            track's large corrections.
     """
-    figure, frame = go.Figure(), _frame(tracks, truth, known)
-    if truth is not None:
-        figure.add_trace(_path(TRUTH, truth, 3.0))
-    largest = 0.4 * float(np.ptp(frame, axis=1).max())
-    for name, series in tracks.items():
-        if series.position_covariance is not None:
-            figure.add_trace(_ellipses(name, series, series.position_covariance, largest))
-    for name, series in tracks.items():
-        figure.add_trace(_path(name, series, 2.0))
-    for name, series in (dict(tracks) if truth is None else {TRUTH: truth, **tracks}).items():
-        figure.add_trace(_ends(name, series))
-    if known is not None:
-        figure.add_trace(_known(known))
+    frame = _frame(tracks, truth, known)
+    outlines = _outlines(tracks[main], 0.4 * float(np.ptp(frame, axis=1).max()))
+    traces = [
+        *([] if known is None else [_known(known)]),
+        *([] if truth is None else [_path(TRUTH, truth, 3.0)]),
+        _ellipses(main, outlines),
+        *(_path(name, series, 2.0) for name, series in tracks.items()),
+        *(_ends(name, series) for name, series in tracks.items() if name != main),
+        *([] if truth is None else [_ends(TRUTH, truth)]),
+        _arrows(main, tracks[main]),
+        _ends(main, tracks[main], timed=True),
+        *([_corrections(main, tracks[main], corrections)] if corrections else []),
+    ]
+    figure = go.Figure(traces)
     figure.update_layout(
         **_LAYOUT,
-        margin={"l": _LEFT, "r": 12, "t": 8, "b": 44},
+        # The toolbar lies in the upper margin.
+        margin={"l": _LEFT, "r": 12, "t": 34, "b": 44},
         hovermode="closest",
         dragmode="pan",
     )
-    figure.update_xaxes(title=_title("x [m]"), range=frame[0], **_AXIS)
-    figure.update_yaxes(
-        title=_title("y [m]"), range=frame[1], scaleanchor="x", scaleratio=1, **_AXIS
-    )
+    x, y = _limits(np.vstack([frame.T, outlines]))
+    figure.update_xaxes(title=_title("x [m]"), range=x, **_AXIS)
+    figure.update_yaxes(title=_title("y [m]"), range=y, scaleanchor="x", scaleratio=1, **_AXIS)
     return figure
 
 
 def time_figure(panels: Sequence[Panel]) -> go.Figure:
     """Stack all panels over one time axis."""
-    count = len(panels)
-    height = PANEL_HEIGHT * count + 60
+    count, gap = len(panels), 46
+    heights = [panel.height for panel in panels]
+    height = sum(heights) + gap * (count - 1) + 96
     figure = make_subplots(
         rows=count,
         cols=1,
         shared_xaxes=True,
-        vertical_spacing=46 / height,
+        row_heights=heights,
+        vertical_spacing=gap / (height - 96),
         subplot_titles=[panel.title for panel in panels],
     )
     for row, panel in enumerate(panels, start=1):
@@ -97,7 +116,7 @@ def time_figure(panels: Sequence[Panel]) -> go.Figure:
     figure.update_layout(
         **_LAYOUT,
         height=height,
-        margin={"l": _LEFT, "r": 12, "t": 28, "b": 44},
+        margin={"l": _LEFT, "r": 12, "t": 52, "b": 44},
         hovermode="x",
         dragmode="zoom",
     )
@@ -111,41 +130,41 @@ def _title(text: str) -> dict[str, object]:
 def _path(name: str, series: Series, width: float) -> go.Scatter:
     label, colour, dash = style(name)
     sigma = series.horizontal_sigma
-    sigma_column = np.full(len(series.time), np.nan) if sigma is None else sigma
-    sigma_text = "" if sigma is None else "<br>sigma %{customdata[1]:.2f} m"
+    columns = [series.time, series.speed, *([] if sigma is None else [sigma])]
+    sigma_text = "" if sigma is None else "<br>sigma %{customdata[2]:.2f} m"
     return go.Scatter(
-        x=series.position[:, 0].round(4),
-        y=series.position[:, 1].round(4),
+        x=numbers(series.position[:, 0], 2),
+        y=numbers(series.position[:, 1], 2),
         name=label,
         legendgroup=name,
         mode="lines",
         line={"color": colour, "dash": dash, "width": width},
-        customdata=np.column_stack([series.time, sigma_column, series.speed]).round(3),
+        customdata=np.column_stack(columns).round(2).tolist(),
         hovertemplate=f"<b>{label}</b> at %{{customdata[0]:.1f}} s{sigma_text}"
-        "<br>speed %{customdata[2]:.2f} m/s<br>x %{x:.2f} m, y %{y:.2f} m<extra></extra>",
+        "<br>speed %{customdata[1]:.2f} m/s<br>x %{x:.2f} m, y %{y:.2f} m<extra></extra>",
     )
 
 
-def _ellipses(name: str, series: Series, covariance: FloatArray, largest: float) -> go.Scatter:
-    """Draw some outlines in one trace, separated by NaN.
+def _outlines(series: Series, largest: float) -> FloatArray:
+    """Return some outlines (n, 2) [m], separated by NaN, of ellipses along a track.
 
     Semi-axes beyond `largest` [m] are too large for the map: they appear at the slider's time only.
     """
-    valid = np.flatnonzero(np.isfinite(series.position[:, 0]))
-    rows = valid[evenly_spaced(len(valid), _ELLIPSES)]
-    outlines = [(k, ellipse(covariance[k])) for k in rows]
-    parts = [
-        np.vstack([series.position[k, :2] + outline, [[np.nan] * 2]])
-        for k, outline in outlines
-        if np.linalg.norm(outline, axis=1).max() <= largest
-    ]
-    outline = np.vstack([np.full((1, 2), np.nan), *parts]).round(3)
+    parts = [np.full((1, 2), np.nan)]
+    if series.position_covariance is not None:
+        for k in _shown_rows(series, _ELLIPSES):
+            outline = ellipse(series.position_covariance[k])
+            if np.linalg.norm(outline, axis=1).max() <= largest:
+                parts += [series.position[k, :2] + outline, parts[0]]
+    return np.vstack(parts)
+
+
+def _ellipses(name: str, outlines: FloatArray) -> go.Scatter:
     return go.Scatter(
-        x=outline[:, 0],
-        y=outline[:, 1],
+        x=numbers(outlines[:, 0], 2),
+        y=numbers(outlines[:, 1], 2),
         name="3 sigma",
         legendgroup=name,
-        showlegend=False,
         mode="lines",
         line={"color": style(name)[1], "width": 0.8},
         opacity=0.55,
@@ -153,15 +172,44 @@ def _ellipses(name: str, series: Series, covariance: FloatArray, largest: float)
     )
 
 
-def _ends(name: str, series: Series) -> go.Scatter:
-    """Mark the start with an open circle and the end with a square."""
-    valid = np.flatnonzero(np.isfinite(series.position[:, 0]))
-    ends = series.position[valid[[0, -1]], :2]
+def _arrows(name: str, series: Series) -> go.Scatter:
+    """Draw arrowheads along a track where it moves."""
+    duration = float(series.time[-1] - series.time[0])
+    rows = _shown_rows(series, min(_MAX_ARROWS, int(duration / _ARROW_SECONDS)) + 2)[1:-1]
+    behind, ahead = (
+        interpolated(series.time[rows] + seconds, series.time, series.position[:, :2])
+        for seconds in (-1.0, 1.0)
+    )
+    step = ahead - behind
+    moving = np.linalg.norm(step, axis=1) > _MIN_ARROW_STEP
+    rows, step = rows[moving], step[moving]
     return go.Scatter(
-        x=ends[:, 0],
-        y=ends[:, 1],
+        x=numbers(series.position[rows, 0], 3),
+        y=numbers(series.position[rows, 1], 3),
         legendgroup=name,
         mode="markers",
+        marker={
+            "symbol": "arrow",
+            "size": 13,
+            "angle": np.degrees(np.arctan2(step[:, 0], step[:, 1])).round(1).tolist(),
+            "color": style(name)[1],
+            "line": {"color": "white", "width": 1},
+        },
+        hoverinfo="skip",
+    )
+
+
+def _ends(name: str, series: Series, timed: bool = False) -> go.Scatter:
+    """Mark the start with an open circle and the end with a square, on request with their times."""
+    rows = _shown_rows(series, 2)[[0, -1]]
+    ends = series.position[rows, :2]
+    return go.Scatter(
+        x=numbers(ends[:, 0], 3),
+        y=numbers(ends[:, 1], 3),
+        legendgroup=name,
+        mode="markers+text" if timed else "markers",
+        text=[clock(time) for time in series.time[rows]],
+        textposition=["bottom right", "top left"],
         marker={
             "symbol": ["circle-open", "square"],
             "size": 9,
@@ -172,23 +220,60 @@ def _ends(name: str, series: Series) -> go.Scatter:
     )
 
 
+def _corrections(name: str, series: Series, corrections: Sequence[Correction]) -> go.Scatter:
+    """Mark where a track was corrected, with time, size and cause."""
+    times = np.array([time for time, *_ in corrections])
+    position = interpolated(times, series.time, series.position[:, :2])
+    words = [
+        f"{time:.1f} s: corrected by {metres:.1f} m, {math.degrees(turn):.0f} deg<br>{cause}"
+        for time, metres, turn, cause in corrections
+    ]
+    return go.Scatter(
+        x=numbers(position[:, 0], 2),
+        y=numbers(position[:, 1], 2),
+        legendgroup=name,
+        name="corrected",
+        mode="markers",
+        marker={
+            "symbol": "triangle-up",
+            "size": 12,
+            "color": "#F0E442",
+            "line": {"color": "black", "width": 1.5},
+        },
+        text=words,
+        hovertemplate="%{text}<extra></extra>",
+    )
+
+
 def _known(known: PositionTrack) -> go.Scatter:
     """Mark known positions, such as waypoints or satellite fixes, with crosses."""
+    few = len(known) <= _FEW_POSITIONS
     return go.Scatter(
-        x=known.position_W[:, 0].round(3),
-        y=known.position_W[:, 1].round(3),
+        x=numbers(known.position_W[:, 0], 3),
+        y=numbers(known.position_W[:, 1], 3),
         name=known.kind,
         mode="markers",
-        marker={"symbol": "x-thin-open", "color": "#000000", "size": 10, "line": {"width": 2}},
+        marker={
+            "symbol": "x-thin-open",
+            "color": INK if few else FAINT,
+            "size": 10 if few else 5,
+            "line": {"width": 2 if few else 1},
+        },
         hovertemplate=f"{known.kind}: x %{{x:.2f}} m, y %{{y:.2f}} m, fitted to the track"
         "<extra></extra>",
     )
 
 
+def _shown_rows(series: Series, most: int) -> NDArray[np.intp]:
+    """Return up to `most` evenly spaced rows of those that are shown."""
+    shown = np.flatnonzero(np.isfinite(series.position[:, 0]))
+    return shown[evenly_spaced(len(shown), most)]
+
+
 def _frame(
     tracks: Mapping[str, Series], truth: Series | None, known: PositionTrack | None
 ) -> FloatArray:
-    """Return limits (2, 2) of x and y that fit known positions and all tracks but the inertial."""
+    """Return limits (2, 2) of x and y of known positions and all tracks but the inertial."""
     bounded = [s for name, s in tracks.items() if name != "inertial"]
     points = np.vstack([s.position[:, :2] for s in ([truth] if truth else []) + bounded])
     if truth is not None:  # a diverged track must not shrink the truth to a dot
@@ -196,8 +281,13 @@ def _frame(
         points = np.clip(points, low - (high - low).max(), high + (high - low).max())
     if known is not None:
         points = np.vstack([points, known.position_W[:, :2]])
+    return np.stack([np.nanmin(points, axis=0), np.nanmax(points, axis=0)], axis=1)
+
+
+def _limits(points: FloatArray) -> FloatArray:
+    """Return limits (2, 2) of x and y with room around the points (n, 2) [m]."""
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
     # At least a metre, lest the millimetres of a device at rest look like a walk.
-    half = 0.5 * (high - low) + 0.08 * max(1.0, float((high - low).max()))
+    half = 0.5 * (high - low) + 0.06 * max(1.0, float((high - low).max()))
     half = np.maximum(half, 0.5)
     return np.stack([0.5 * (low + high) - half, 0.5 * (low + high) + half], axis=1)

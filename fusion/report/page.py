@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import html
 import importlib.resources
 import json
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +19,14 @@ from stario.fusion.evaluation.compare import METRIC_TITLES, Comparison
 from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.report.figures import map_figure, time_figure
 from stario.fusion.report.health import Finding, findings
-from stario.fusion.report.panels import bias_panels, innovation_panels, motion_panels, style
-from stario.fusion.report.series import Series, track_series, trajectory_series
+from stario.fusion.report.panels import (
+    bias_panels,
+    innovation_panels,
+    motion_panels,
+    numbers,
+    style,
+)
+from stario.fusion.report.series import Series, clock, track_series, trajectory_series
 from stario.fusion.state import Track
 from stario.sequences.drawing.text_table import figure
 from stario.sequences.files import atomic_write
@@ -53,29 +62,35 @@ def write_report(path: Path, found: Comparison) -> Path:
     main = found.main
     # The inertial-only track is kilometres off within a minute: no axis fits it and the others.
     drawn = {name: s for name, s in series.items() if name != "inertial"}
-    panels = motion_panels(drawn, true_series) + bias_panels(main, series[main])
+    panels = motion_panels(drawn, true_series, main) + bias_panels(main, series[main])
     innovations = tracks[main].innovations
     if innovations is not None and len(innovations.time):
         panels += innovation_panels(innovations, start)
     mapped = drawn if truth is None else series
     known = shown_positions(sequence, tracks[main])
+    health = tracks[main].health
+    corrections = [
+        (time - start, metres, turn, cause)
+        for time, metres, turn, cause in (health.corrections if health else [])
+    ]
     data = {
-        "map": json.loads(map_figure(mapped, true_series, known).to_json()),
+        "map": json.loads(map_figure(mapped, true_series, known, main, corrections).to_json()),
         "time": json.loads(time_figure(panels).to_json()),
         "cursors": _cursors(drawn, main),
     }
-    health = tracks[main].health
     parts = {
         "TITLE": html.escape(sequence.name),
         "SUMMARY": html.escape(sequence.summary().removeprefix(f"{sequence.name}: ")),
         "FACTS": _facts(sequence, tracks[main], series[main]),
-        "LEGEND": _legend([*([] if truth is None else ["truth"]), *mapped], known),
+        "LEGEND": _legend(
+            [*([] if truth is None else ["truth"]), *mapped], known, len(corrections)
+        ),
         "HEALTH": "" if health is None else _health(findings(health)),
         "TABLE": "" if truth is None else _table(found),
         "STYLE": _asset("report.css"),
         "SCRIPT": _asset("report.js"),
-        "DATA": _script_json(data),
-        "PLOTLY": get_plotlyjs(),
+        "DATA": _packed(json.dumps(data, separators=(",", ":"))),
+        "PLOTLY": _packed_plotly(),
     }
     with atomic_write(path) as file:
         file.write(_filled(parts))
@@ -93,16 +108,26 @@ def _filled(parts: Mapping[str, str]) -> str:
     return "".join(piece if k % 2 == 0 else parts[piece] for k, piece in enumerate(pieces))
 
 
-def _script_json(content: object) -> str:
-    """Encode JSON for a script element, which `</script>` in a name must not end."""
-    return json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
+@cache
+def _packed_plotly() -> str:
+    return _packed(get_plotlyjs())
+
+
+def _packed(text: str) -> str:
+    """Return a text compressed for a script element, a quarter to a third as long.
+
+    Base 85 is shorter than 64 by a sixteenth, which keeps the file below 2 MB. Its `<`, which
+    could begin a tag or a comment, is written as a comma.
+    """
+    packed = base64.b85encode(gzip.compress(text.encode(), mtime=0))
+    return packed.decode("ascii").replace("<", ",")
 
 
 def _facts(sequence: ImuSequence, track: Track, series: Series) -> str:
     duration = sequence.duration
     facts = [
-        (_clock(duration), "recorded (min:s)"),
-        (_clock(track.time[-1] - track.time[0]), "tracked (min:s)"),
+        (clock(duration), "recorded (min:s)"),
+        (clock(track.time[-1] - track.time[0]), "tracked (min:s)"),
         (f"{track.trajectory.path_length():.0f} m", "estimated path length"),
         (f"{len(sequence) / max(duration, 1e-9):.0f} Hz", "sampling rate"),
     ]
@@ -114,10 +139,10 @@ def _facts(sequence: ImuSequence, track: Track, series: Series) -> str:
     return "".join(f"<div><b>{value}</b><span>{label}</span></div>" for value, label in facts)
 
 
-def _legend(names: Sequence[str], known: PositionTrack | None) -> str:
+def _legend(names: Sequence[str], known: PositionTrack | None, corrections: int) -> str:
     """Return a button for each track, with its line, that hides and shows it everywhere.
 
-    Known positions have words only.
+    Known positions and corrections have words only.
     """
     dashes = {"solid": "none", "dash": "7 4", "dot": "2 3", "dashdot": "7 3 2 3"}
     buttons = []
@@ -133,6 +158,8 @@ def _legend(names: Sequence[str], known: PositionTrack | None) -> str:
         )
     if known is not None:
         buttons.append(f"<span>&#10005; {known.kind}, fitted to the track</span>")
+    if corrections:
+        buttons.append(f"<span>&#9650; corrected at once ({corrections})</span>")
     return "".join(buttons)
 
 
@@ -147,10 +174,10 @@ def _health(found: Sequence[Finding]) -> str:
 
 
 def _table(found: Comparison) -> str:
-    head = "".join(f"<th>{METRIC_TITLES[key]}</th>" for key in _DIGITS)
+    head = "".join(f"<th>{METRIC_TITLES[key].replace(' ', '<br>')}</th>" for key in _DIGITS)
     rows = []
     for name, figures in found.metrics.items():
-        cells = (figure(figures.get(key), f".{digits}f") for key, digits in _DIGITS.items())
+        cells = (_cell(figures.get(key), digits) for key, digits in _DIGITS.items())
         row = "".join(f"<td>{cell}</td>" for cell in cells)
         rows.append(f"<tr><th>{html.escape(style(name)[0])}</th>{row}</tr>")
     words = found.words
@@ -163,10 +190,15 @@ def _table(found: Comparison) -> str:
         for key in ("horizontal", "alignment")
     )
     return (
-        "<h2>Accuracy against ground truth</h2><div class='wide'><table>"
-        f"<tr><th></th>{head}</tr>{''.join(rows)}</table></div>"
-        f"<ul class='words'>{explanations}</ul>"
+        f"<h2>Accuracy against ground truth</h2><table><tr><th></th>{head}</tr>{''.join(rows)}"
+        "</table><details class='words'><summary>What the figures mean</summary>"
+        f"<ul>{explanations}</ul></details>"
     )
+
+
+def _cell(value: float | None, digits: int) -> str:
+    """Format a figure; of a large one the decimals say nothing, and a phone is narrow."""
+    return figure(value, ".0f" if value is not None and abs(value) >= 100.0 else f".{digits}f")
 
 
 def _cursors(tracks: Mapping[str, Series], main: str) -> list[dict[str, Any]]:
@@ -179,22 +211,15 @@ def _cursors(tracks: Mapping[str, Series], main: str) -> list[dict[str, Any]]:
             "t": series.time,
             "x": series.position[:, 0],
             "y": series.position[:, 1],
-            "z": series.position[:, 2],
             "speed": series.speed,
             "yaw": series.yaw,
         }
         P = series.position_covariance
         if P is not None:
             columns |= {"xx": P[:, 0, 0], "xy": P[:, 0, 1], "yy": P[:, 1, 1]}
-        rounded = {key: _numbers(column) for key, column in columns.items()}
+        rounded = {
+            key: numbers(column, 3 if key in ("xx", "xy", "yy") else 2)
+            for key, column in columns.items()
+        }
         cursors.append({"name": name, "label": label, "colour": colour, **rounded})
     return cursors
-
-
-def _numbers(column: np.ndarray[Any, np.dtype[np.float64]]) -> list[float | None]:
-    return [value if value == value else None for value in np.round(column, 4).tolist()]
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes}:{rest:02d}"

@@ -15,20 +15,26 @@ from stario.sequences.drawing.figures import TRACK_STYLES, split_at_gaps, split_
 from stario.sequences.sequence import BoolArray, FloatArray
 
 INK, GRID, FAINT = "#222222", "#E3E6EA", "#767676"
-_AXIS_LOOKS = (("x", "#0072B2", "solid"), ("y", "#D55E00", "dash"), ("z", "#009E73", "dot"))
 TRUTH = "truth"
 _DASHES = {"ekf": "solid", "graph": "dash", "network": "dot", "network_true_attitude": "dashdot"}
-_MAX_INNOVATIONS = 1500
+_MAX_INNOVATIONS = 600
+_MAX_POINTS = 600
+"""Maximum number of points of a curve: a panel is as many pixels wide, and the file stays small."""
+
+PANEL_HEIGHT, LOW_HEIGHT = 144, 84
+"""Heights of a panel [px]: of its own, and of one of three axes."""
+
 _MAX_PAUSE = 1.0
 """Longest time between updates [s] across which the innovations' band is drawn."""
 
 
 class Panel(NamedTuple):
-    """One row of the figure over time: title with unit, plotly traces, layout of its y axis."""
+    """A row of the figure over time: title with unit, traces, y axis and height [px]."""
 
     title: str
     traces: list[go.Scatter]
     layout: dict[str, Any]
+    height: int = PANEL_HEIGHT
 
 
 def style(name: str) -> tuple[str, str, str]:
@@ -39,15 +45,19 @@ def style(name: str) -> tuple[str, str, str]:
     return label, colour, _DASHES.get(name, "solid")
 
 
-def motion_panels(tracks: Mapping[str, Series], truth: Series | None) -> list[Panel]:
-    """Return panels of height, speed and yaw, and of position error if there is ground truth."""
+def motion_panels(tracks: Mapping[str, Series], truth: Series | None, main: str) -> list[Panel]:
+    """Return panels of height, speed and yaw, and of position error if there is ground truth.
+
+    The main track has bands; more of them on one another would show none.
+    """
     shown = dict(tracks) if truth is None else {TRUTH: truth, **tracks}
     first = next(iter(shown.values()))
     height, speed, yaw = [], [], []
     for name, s in shown.items():
-        height += _curve(name, s.time, s.position[:, 2], "m", s.height_sigma)
-        speed += _curve(name, s.time, s.speed, "m/s", s.speed_sigma)
-        yaw += _curve(name, s.time, s.yaw + _whole_turns(s, first), "deg", s.yaw_sigma)
+        sigmas = (s.height_sigma, s.speed_sigma, s.yaw_sigma) if name == main else (None,) * 3
+        height += _curve(name, s.time, s.position[:, 2], "m", sigmas[0])
+        speed += _curve(name, s.time, s.speed, "m/s", sigmas[1], lowest=0.0)
+        yaw += _curve(name, s.time, s.yaw + _whole_turns(s, first), "deg", sigmas[2])
     return [
         *([] if truth is None else [_error_panel(tracks, truth)]),
         _fitted("Height [m], band: 3 sigma", height),
@@ -57,7 +67,7 @@ def motion_panels(tracks: Mapping[str, Series], truth: Series | None) -> list[Pa
 
 
 def bias_panels(name: str, series: Series) -> list[Panel]:
-    """Return panels of both biases of a track by axis."""
+    """Return a panel for each axis of both biases of a track; those of one bias share limits."""
     panels = []
     for title, unit, bias in (
         ("Gyroscope bias", "deg/s", series.gyro_bias),
@@ -65,12 +75,12 @@ def bias_panels(name: str, series: Series) -> list[Panel]:
     ):
         if bias is None:
             continue
-        label, traces = style(name)[0], []
-        for k, (axis, *look) in enumerate(_AXIS_LOOKS):
-            value, sigma = bias[0][:, k], bias[1][:, k]
-            traces += _curve(name, series.time, value, unit, sigma, (f"{label} {axis}", *look))
-        words = f"{title} [{unit}]: x \u2014 y \u2013 \u2013 z \u00b7\u00b7\u00b7"
-        panels.append(_fitted(words, traces))
+        axes = [_curve(name, series.time, bias[0][:, k], unit, bias[1][:, k]) for k in range(3)]
+        limits = _fitted("", [trace for traces in axes for trace in traces]).layout
+        panels += [
+            Panel(f"{title} {axis} [{unit}], band: 3 sigma", traces, limits, LOW_HEIGHT)
+            for axis, traces in zip("xyz", axes, strict=True)
+        ]
     return panels
 
 
@@ -88,9 +98,10 @@ def innovation_panels(innovations: Innovations, start: float) -> list[Panel]:
     for k, axis in enumerate("xyz"):
         residual, sigma = innovations.residual_W[rows, k], innovations.sigma[rows, k]
         ticks, edge = split_at_gaps(time, sigma[:, None], max_gap=_MAX_PAUSE)
-        band = _band("innovation", ticks, 0.0 * edge[:, 0], edge[:, 0], FAINT)
+        band = _band("innovation", ticks, -3.0 * edge[:, 0], 3.0 * edge[:, 0], FAINT)
         traces = [band, *_dots(time, residual, gated, "m")]
-        panels.append(_fitted(f"Innovation {axis} [m], band: 3 sigma", traces))
+        panel = _fitted(f"Innovation {axis} [m], band: 3 sigma", traces)
+        panels.append(panel._replace(height=LOW_HEIGHT))
     nis = np.maximum(innovations.nis[rows], 1e-2)
     traces = [*_dots(time, nis, gated, ""), _expected_nis(time[[0, -1]])]
     panels.append(Panel("NIS [1], dotted: expected 3", traces, {"type": "log", "dtick": 1}))
@@ -103,23 +114,29 @@ def _curve(
     value: FloatArray,
     unit: str,
     sigma: FloatArray | None = None,
-    look: tuple[str, ...] = (),
+    lowest: float = -np.inf,
 ) -> list[go.Scatter]:
-    """Return a line with hover text, and its 3-sigma band if there is a sigma."""
-    label, colour, dash = look or style(name)
+    """Return a line with hover text, and its 3-sigma band above `lowest` if there is a sigma."""
+    label, colour, dash = style(name)
+    rows = np.union1d(evenly_spaced(len(time), _MAX_POINTS), np.flatnonzero(np.isnan(value)))
+    time, value = time[rows], value[rows]
     line = go.Scatter(
-        x=_rounded(time),
-        y=_rounded(value),
+        x=numbers(time, 2),
+        y=numbers(value),
         name=label,
         legendgroup=name,
         mode="lines",
         line={"color": colour, "dash": dash, "width": 1.6},
-        customdata=None if sigma is None else _rounded(sigma),
-        hovertemplate=f"{label} %{{y:.3g}} {unit}"
-        + ("" if sigma is None else f", sigma %{{customdata:.2g}} {unit}")
-        + "<extra></extra>",
+        hovertemplate=f"{label} %{{y:.3g}} {unit}<extra></extra>",
     )
-    return [line] if sigma is None else [_band(name, time, value, sigma, colour), line]
+    if sigma is None:
+        return [line]
+    line.customdata = numbers(sigma[rows])
+    line.hovertemplate = (
+        f"{label} %{{y:.3g}} {unit}, sigma %{{customdata:.2g}} {unit}<extra></extra>"
+    )
+    low = np.maximum(value - 3.0 * sigma[rows], lowest)
+    return [_band(name, time, low, value + 3.0 * sigma[rows], colour), line]
 
 
 def _error_panel(tracks: Mapping[str, Series], truth: Series) -> Panel:
@@ -134,15 +151,16 @@ def _error_panel(tracks: Mapping[str, Series], truth: Series) -> Panel:
 
 
 def _band(
-    group: str, time: FloatArray, value: FloatArray, sigma: FloatArray, colour: str
+    group: str, time: FloatArray, low: FloatArray, high: FloatArray, colour: str
 ) -> go.Scatter:
     red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
-    edges = split_at_nan(np.column_stack([time, value - 3.0 * sigma, value + 3.0 * sigma]))
+    edges = split_at_nan(np.column_stack([time, low, high]))
+    edges = [part[evenly_spaced(len(part), _MAX_POINTS // 2)] for part in edges]
     outlines = [np.vstack([part[:, [0, 1]], part[::-1, [0, 2]], [[np.nan] * 2]]) for part in edges]
     x, y = np.vstack([np.empty((0, 2)), *outlines]).T
     return go.Scatter(
-        x=_rounded(x),
-        y=_rounded(y),
+        x=numbers(x, 2),
+        y=numbers(y),
         mode="lines",
         line={"width": 0},
         hoverinfo="skip",
@@ -159,8 +177,8 @@ def _dots(time: FloatArray, value: FloatArray, gated: BoolArray, unit: str) -> l
     )
     return [
         go.Scatter(
-            x=_rounded(time[rows]),
-            y=_rounded(value[rows]),
+            x=numbers(time[rows], 2),
+            y=numbers(value[rows]),
             name=name,
             mode="markers",
             marker=marker,
@@ -173,7 +191,7 @@ def _dots(time: FloatArray, value: FloatArray, gated: BoolArray, unit: str) -> l
 
 def _expected_nis(ends: FloatArray) -> go.Scatter:
     return go.Scatter(
-        x=_rounded(ends),
+        x=numbers(ends, 2),
         y=[3.0, 3.0],
         name="expected 3",
         mode="lines",
@@ -184,8 +202,9 @@ def _expected_nis(ends: FloatArray) -> go.Scatter:
 
 def _fitted(title: str, traces: list[go.Scatter]) -> Panel:
     """Return a panel that fits all curves, and the bands except for brief wide parts."""
-    curves = np.concatenate([t.y for t in traces if t.hoverinfo != "skip"])
-    bands = np.concatenate([[np.nan], *(t.y for t in traces if t.hoverinfo == "skip")])
+    drawn = [(t.hoverinfo == "skip", np.asarray(t.y, dtype=float)) for t in traces]
+    curves = np.concatenate([y for is_band, y in drawn if not is_band])
+    bands = np.concatenate([[np.nan], *(y for is_band, y in drawn if is_band)])
     low, high = np.nanmin(curves), np.nanmax(curves)
     if np.isfinite(bands).any():
         inner = np.nanpercentile(bands, [2.5, 97.5])
@@ -202,6 +221,6 @@ def _whole_turns(series: Series, reference: Series) -> float:
     return -360.0 * float(np.round(np.median(known) / 360.0)) if len(known) else 0.0
 
 
-def _rounded(values: FloatArray) -> FloatArray:
-    """Return values rounded to screen precision, to keep the file small."""
-    return np.round(values, 5).astype(np.float32)
+def numbers(values: FloatArray, digits: int = 4) -> list[float | None]:
+    """Return values as rounded for the screen, None for NaN: as text they need little room."""
+    return [value if value == value else None for value in np.round(values, digits).tolist()]

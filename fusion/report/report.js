@@ -1,11 +1,31 @@
 "use strict";
 // The slider moves a cursor on the map and on every panel; so does a click on a track or panel.
-(() => {
-  const data = JSON.parse(document.getElementById("data").textContent);
+(async () => {
+  // Text of a script element, compressed as by `_packed` of page.py.
+  const unpacked = async (id) => {
+    const digits = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz!#$%&()*+-;,=>?@^_`{|}~";
+    const value = Object.fromEntries([...digits].map((digit, k) => [digit, k]));
+    const text = document.getElementById(id).textContent;
+    const bytes = new DataView(new ArrayBuffer(4 * Math.ceil(text.length / 5)));
+    for (let k = 0; k < text.length; k += 5) {
+      let number = 0;
+      for (let n = k; n < k + 5; n += 1) number = 85 * number + (n < text.length ? value[text[n]] : 84);
+      bytes.setUint32((4 * k) / 5, number);
+    }
+    const missing = (5 - (text.length % 5)) % 5;
+    const stream = new Blob([new Uint8Array(bytes.buffer, 0, bytes.byteLength - missing)]).stream();
+    return new Response(stream.pipeThrough(new DecompressionStream("gzip"))).text();
+  };
+  if (!window.DecompressionStream) {
+    document.getElementById("map").textContent = "This browser is too old to draw the report: it takes one of 2023 or later.";
+    return;
+  }
+  document.head.append(Object.assign(document.createElement("script"), { textContent: await unpacked("plotly") }));
+  const data = JSON.parse(await unpacked("data"));
   const [map, time] = ["map", "time"].map((id) => document.getElementById(id));
   const [slider, readout, play] = ["slider", "readout", "play"].map((id) => document.getElementById(id));
   const config = { responsive: true, displaylogo: false, scrollZoom: true,
-    modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
+    modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d", "sendChartToCloud"] };
   const cursors = data.cursors;
   const main = cursors[0];
   const [first, last] = [main.t[0], main.t[main.t.length - 1]];
@@ -45,6 +65,14 @@
     if (c.x[k] === null) return [];
     return c.xx ? [outline(c, k), place(c, k)] : [place(c, k)];
   });
+  // A bar of 1, 2 or 5 times a power of ten metres, at most 120 px long.
+  const scale = () => {
+    const { _length, range } = map._fullLayout.xaxis;
+    const perMetre = _length / (range[1] - range[0]);
+    const power = 10 ** Math.floor(Math.log10(120 / perMetre));
+    const metres = power * [5, 2, 1].find((n) => n * power * perMetre <= 120);
+    Object.assign(document.getElementById("scale"), { textContent: `${+metres.toPrecision(1)} m` }).style.width = `${metres * perMetre}px`;
+  };
   const number = (value, digits) => (value === null || value === undefined ? "-" : value.toFixed(digits));
 
   const wrapped = (deg) => (deg === null ? null : deg - 360 * Math.round(deg / 360));
@@ -95,7 +123,12 @@
   }
 
   const narrow = window.innerWidth <= 900;
-  if (narrow) data.time.layout.dragmode = false;  // a finger on a panel scrolls the page
+  if (narrow) {
+    data.time.layout.dragmode = false;  // a finger on a panel scrolls the page
+    data.map.layout.margin.t = 8;  // no toolbar
+    data.time.layout.height -= 24;
+    data.time.layout.margin.t -= 24;
+  }
   Promise.all([
     Plotly.newPlot(map, data.map.data, data.map.layout, { ...config, displayModeBar: !narrow }),
     Plotly.newPlot(time, data.time.data, data.time.layout, { ...config, scrollZoom: false, displayModeBar: !narrow }),
@@ -105,7 +138,9 @@
       const at = event.points[0].customdata;
       if (at) { stop(); move(at[0]); }
     });
-    move(last);
+    map.on("plotly_relayout", scale);
+    scale();
+    move(first);
     document.body.dataset.ready = "yes";
   });
 })();

@@ -12,7 +12,7 @@ from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.drawing.figures import indices_after_gaps
 from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray, Trajectory
 
-MAX_POINTS = 1500
+MAX_POINTS = 1000
 """Maximum number of poses drawn per track; a screen shows no more, and the file stays small."""
 
 
@@ -120,6 +120,12 @@ def ellipse(covariance: FloatArray) -> FloatArray:
     circle = np.stack([np.cos(angle), np.sin(angle)])
     outline: FloatArray = (axes * 3.0 * np.sqrt(np.maximum(values, 0.0))) @ circle
     return outline.T
+
+
+def clock(seconds: float) -> str:
+    """Return a time as minutes and seconds."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02d}"
 
 
 def _rows(

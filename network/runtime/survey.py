@@ -8,9 +8,12 @@ import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -18,14 +21,16 @@ from stario.network.architectures import ARCHITECTURES, architecture, build_netw
 from stario.network.card import Card
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import DisplacementModel
-from stario.network.runtime.benchmark import median_milliseconds
 from stario.network.runtime.cost import cost
 from stario.network.runtime.engines import Engine
 from stario.network.runtime.torch_engine import TorchEngine
 from stario.sequences.drawing.text_table import aligned, figure
+from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 from stario.sequences.windows import WINDOW_SAMPLES
 
 BATCHES = (1, 64)
+
+_WARM_UP = 3
 
 _RUNS = {1: 60, 64: 10}
 
@@ -164,6 +169,29 @@ def _times(engines: Sequence[Engine]) -> dict[str, list[float]]:
     return {
         str(batch): median_milliseconds(engines, batch, _RUNS[batch]).tolist() for batch in BATCHES
     }
+
+
+def random_windows(batch: int) -> NDArray[np.float32]:
+    """Return windows (batch, 6, 200) of noise about gravity."""
+    windows = np.random.default_rng(0).standard_normal((batch, 6, WINDOW_SAMPLES))
+    windows[:, 5] += STANDARD_GRAVITY
+    return windows.astype(np.float32)
+
+
+def median_milliseconds(engines: Sequence[Engine], batch: int, runs: int) -> FloatArray:
+    """Return the median time per window (engines,) [ms].
+
+    Every run calls all engines in turn, so that all are timed under the same load; a few runs
+    before them are not timed.
+    """
+    windows = random_windows(batch)
+    seconds = np.zeros((_WARM_UP + runs, len(engines)))
+    for row in seconds:
+        for column, engine in enumerate(engines):
+            began = perf_counter()
+            engine.run(windows)
+            row[column] = perf_counter() - began
+    return np.asarray(np.median(1e3 / batch * seconds[_WARM_UP:], axis=0))
 
 
 def _peak_memory(network: DisplacementNetwork) -> int:

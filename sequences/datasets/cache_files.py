@@ -23,8 +23,7 @@ from stario.sequences.readers import FORMATS
 from stario.sequences.readers.archive import split_name
 from stario.sequences.readers.published.oxiod import capture_file
 
-STREAMS, JUDGED = ".streams", ".judged"
-"""Suffixes of the cache's files: training data, and recordings prepared for judging networks."""
+_SUFFIX = ".streams"
 
 _UNUSED_S = 30 * 86_400.0
 """Time after which a file of other code that nobody has read is removed [s]."""
@@ -47,17 +46,17 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stario"
 
 
-def cache_file(folder: Path, key: Mapping[str, object], suffix: str) -> Path:
+def cache_file(folder: Path, key: Mapping[str, object]) -> Path:
     """Return the file of a key: plain values that determine its content, besides this code."""
     text = json.dumps(key, sort_keys=True, default=str)
     digest = hashlib.blake2b(text.encode(), digest_size=20).hexdigest()
-    return folder / f"{_code()}-{digest}{suffix}"
+    return folder / f"{_code()}-{digest}{_SUFFIX}"
 
 
-def recording_file(folder: Path, path: Path, options: Mapping[str, object], suffix: str) -> Path:
+def recording_file(folder: Path, path: Path, options: Mapping[str, object]) -> Path:
     """Return the file of a recording; the options are all else that its content depends on."""
     key = {"path": str(path.resolve()), "files": recording_stamps(path), "options": options}
-    return cache_file(folder, key, suffix)
+    return cache_file(folder, key)
 
 
 def recording_stamps(path: Path) -> list[tuple[str, int, int]]:
@@ -72,7 +71,7 @@ def recording_stamps(path: Path) -> list[tuple[str, int, int]]:
 def remove_unused(folder: Path) -> None:
     """Remove files that other code has written and that have not been read for 30 days."""
     for file in folder.iterdir():
-        if file.suffix in (STREAMS, JUDGED) and not file.name.startswith(_code()):
+        if file.suffix in (_SUFFIX, ".judged") and not file.name.startswith(_code()):
             with suppress(OSError):  # another process has removed it, or has it open on Windows
                 stat = file.stat()
                 if time.time() - max(stat.st_atime, stat.st_mtime) > _UNUSED_S:

@@ -47,7 +47,8 @@ def read_list(file: Path, data: Path) -> list[ListEntry]:
             continue
         path = data / name
         if not split_name(path)[0].exists():
-            expected, fix = f"a recording of {file.name}", "set the data folder: --data"
+            expected = f"a recording of {file.name}"
+            fix = "set the data folder: --data (examples/guides/data.md)"
             raise InputError(str(path), "no such file", expected, fix)
         listed.append(ListEntry(path, group))
     return listed

@@ -1,15 +1,7 @@
-"""Disk cache of world-frame streams: built once, then memory-mapped, so that they need no memory.
-
-There is one file per recording and set of options, in the layout of safetensors: a header, then
-the numbers of all stretches. A file gets its name only when it is complete: a killed writer leaves
-nothing that would be read, and if two write at once, the second replaces the first's file by the
-same content. The folder may be deleted at any time.
-"""
+"""Training data of recordings: read, checked, cut into streams and kept in the cache."""
 
 from __future__ import annotations
 
-import json
-import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -17,18 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors.numpy
-from numpy.typing import NDArray
 
+from stario.sequences.datasets.array_cache import Part, kept, read_parts
 from stario.sequences.datasets.batch import Skipped, each, skipped
-from stario.sequences.datasets.cache_files import (
-    STREAMS,
-    cache_file,
-    recording_file,
-    remove_unused,
-)
+from stario.sequences.datasets.cache_files import cache_file, recording_file
 from stario.sequences.errors import InputError, StarioError
-from stario.sequences.files import atomic_write, remove_abandoned
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.legs import LegStream, leg_streams
 from stario.sequences.readers.archive import split_name
@@ -36,13 +21,10 @@ from stario.sequences.sequence import ImuSequence, low_rate_message
 from stario.sequences.truth.problems import check_truth
 from stario.sequences.windows import Attitude, WorldStream, world_streams
 
-log = logging.getLogger(__name__)
-
 Stream = WorldStream | LegStream
 """Training data of a network: with poses, or with legs between known positions."""
 
 _POSES = "poses"
-_ABANDONED_S = 3600.0
 _OPEN_FILES = 10_240
 """Number of open files to ask for where a system states no limit; macOS allows no more."""
 
@@ -98,8 +80,9 @@ def cached(
 
     The key has plain values that determine the result, except for this package's code.
     """
-    kept = _kept(cache_file(folder, key, STREAMS), build)
-    return (_opened(kept) or build()) if isinstance(kept, Path) else kept
+    file = cache_file(folder, key)
+    streams = kept(file, build, _parts)
+    return (_opened(file) or build()) if streams is None else streams
 
 
 def _stored(
@@ -112,16 +95,9 @@ def _stored(
     """Return a recording's cache file, or its streams if that cannot be written."""
     if not split_name(path)[0].exists():
         return _streams(read(path), attitude)
-    file = recording_file(folder, path, {**options, "attitude": attitude}, STREAMS)
-    return _kept(file, lambda: _streams(read(path), attitude))
-
-
-def _kept(file: Path, build: Callable[[], Sequence[Stream]]) -> Path | Sequence[Stream]:
-    """Return a cache file, written if it is missing, or the streams if that fails."""
-    if _opened(file) is not None:
-        return file
-    streams = build()
-    return file if _written(file, streams) else streams
+    file = recording_file(folder, path, {**options, "attitude": attitude})
+    streams = kept(file, lambda: _streams(read(path), attitude), _parts)
+    return file if streams is None else streams
 
 
 def _streams(sequence: ImuSequence, attitude: Attitude) -> list[Stream]:
@@ -145,68 +121,23 @@ def _streams(sequence: ImuSequence, attitude: Attitude) -> list[Stream]:
     return streams
 
 
-def _written(file: Path, streams: Sequence[Stream]) -> bool:
-    """Write streams to the cache; return False, with a warning, if they cannot be written."""
-    if not streams:
-        return False
-    tables = [
-        {name: value for name, value in vars(stream).items() if isinstance(value, np.ndarray)}
+def _parts(streams: Sequence[Stream]) -> list[Part]:
+    return [
+        (
+            {"name": stream.name, "kind": getattr(stream, "kind", _POSES)},
+            {name: value for name, value in vars(stream).items() if isinstance(value, np.ndarray)},
+        )
         for stream in streams
     ]
-    metadata = [
-        {
-            "name": stream.name,
-            "kind": getattr(stream, "kind", _POSES),
-            "rows": {name: len(array) for name, array in table.items()},
-        }
-        for stream, table in zip(streams, tables, strict=True)
-    ]
-    content = safetensors.numpy.save(
-        {name: np.concatenate([table[name] for table in tables]) for name in tables[0]},
-        metadata={"streams": json.dumps(metadata)},
-    )
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        remove_abandoned(file.parent, _ABANDONED_S, file.name)
-        remove_unused(file.parent)
-        with atomic_write(file, "wb") as target:
-            target.write(content)
-    except (OSError, InputError) as error:
-        log.warning("%s: windows are not kept for the next run: %s", file.parent, error)
-        return False
-    return True
 
 
 def _opened(file: Path) -> list[Stream] | None:
     """Return memory-mapped streams, or None if the file is missing or incomplete."""
-    try:
-        mapped = np.memmap(file, dtype=np.uint8, mode="r")  # once: each map keeps a file open
-        begin = 8 + int.from_bytes(mapped[:8].tobytes(), "little")
-        header = json.loads(mapped[8:begin].tobytes())
-        metadata = json.loads(header.pop("__metadata__")["streams"])
-        if len(mapped) != begin + max(tensor["data_offsets"][1] for tensor in header.values()):
-            raise ValueError(f"{len(mapped)} bytes")
-        whole = {name: _array(mapped[begin:], tensor) for name, tensor in header.items()}
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        log.warning("%s: incomplete, will be rebuilt: %s", file, error)
-        return None
-    first = dict.fromkeys(whole, 0)
-    streams: list[Stream] = []
-    for entry in metadata:
-        arrays = {}
-        for name, rows in entry["rows"].items():
-            arrays[name] = whole[name][first[name] : first[name] + rows]
-            first[name] += rows
-        if entry["kind"] == _POSES:
-            streams.append(WorldStream(entry["name"], **arrays))
-        else:
-            streams.append(LegStream(entry["name"], entry["kind"], **arrays))
-    return streams
+    parts = read_parts(file)
+    return None if parts is None else [_stream(*part) for part in parts]
 
 
-def _array(content: NDArray[np.uint8], tensor: Mapping[str, Any]) -> NDArray[Any]:
-    begin, stop = tensor["data_offsets"]
-    dtype = {"F32": "<f4", "F64": "<f8"}[tensor["dtype"]]
-    return np.asarray(content[begin:stop].view(dtype).reshape(tensor["shape"]))
+def _stream(values: dict[str, Any], arrays: dict[str, Any]) -> Stream:
+    if values["kind"] == _POSES:
+        return WorldStream(values["name"], **arrays)
+    return LegStream(**values, **arrays)

@@ -20,6 +20,7 @@ from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.clean_samples import clean_samples, unbroken
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.constant_values import check_not_dead
+from stario.sequences.inspection.samples import LARGE_M_S2, limit_words
 from stario.sequences.inspection.times import check_time
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 from stario.sequences.truth.fit import TruthFit, fit_truth
@@ -47,6 +48,9 @@ _OFF_GRAVITY = 0.1
 _SHAKEN_OFF_GRAVITY = 0.35
 """The same for a shaken device, whose sensors saturate; without gravity it is near 1."""
 
+_SATURATED_OFF_GRAVITY = 0.6
+"""The same if the accelerometer is at its limit: 2 g cut a runner's steps to 5.9 m/s^2."""
+
 _MIN_LOSS_RATIO = 6.0
 """Factor by which a wrong gyroscope unit reduces the average more than the right one."""
 
@@ -64,6 +68,9 @@ a runner they saturate, and the average is as low as 7.4 m/s^2."""
 _SUSTAINED_RAD_S, _UNDECIDED = 3.0, 0.005
 """Rate that a twentieth of the samples exceed above which the unit is asked for, if the average
 force in both units differs by less than this share of it: the device turns about the vertical."""
+
+_DOWNWARD = -0.9
+"""Cosine between z and the mean force below which a device lies face down, or the sign is wrong."""
 
 _UNIT_NAMED = "its unit is the one named in the file: is that right?"
 """Remedy if `with_units` accepts no other unit."""
@@ -103,15 +110,45 @@ def check_units(sequence: ImuSequence) -> None:
     check_not_dead(sequence.name, time, gyro, accel)
     pieces = _pieces(time)
     if pieces:  # otherwise gaps leave nothing to average over
-        known = "gyro" in sequence.converted
-        force, average = check_gyro(sequence.name, time, gyro, accel, pieces, known)
-        _check_force(sequence, force, average)
+        fix = _UNIT_NAMED if "gyro" in sequence.converted else _advice(sequence, "gyro", "deg/s")
+        force, average = check_gyro(sequence.name, time, gyro, accel, pieces, fix)
+        saturated = limit_words("accelerometer", accel, "m/s^2", LARGE_M_S2)
+        _check_force(sequence, force, average, saturated)
     _check_direction(sequence, time, accel)
     if sequence.maybe_apple and sequence.truth is None:
         log.warning(
             "%s: gravity was logged apart, as Sensor Logger does on iPhones, whose sign is "
             "inverted: if it is from an iPhone, pass `--accel-sign apple`", sequence.name,
         )  # fmt: skip
+    if not sequence.source:  # a reader would have told the sign, or asked
+        warn_if_downward(sequence.name, accel)
+
+
+def warn_if_downward(name: str, accel: FloatArray) -> None:
+    """Warn of forces (N, 3) that point along -z on average: a sign that no other check can tell."""
+    mean = accel.mean(axis=0)
+    if mean[2] < _DOWNWARD * np.linalg.norm(mean):
+        log.warning(
+            "%s: accelerometer: found %.1f m/s^2 along z on average; right for a device face down "
+            "or axes with z down; if it lay face up, give -accel: specific force points up at rest",
+            name, mean[2],
+        )  # fmt: skip
+
+
+def _advice(sequence: ImuSequence, sensor: str, unit: str) -> str:
+    """Return how to convert a sensor that is in another unit, by where its numbers come from."""
+    if sequence.source:
+        title = f"write `{sensor[0]}x [{unit}]` in the CSV's header"
+        return f"if it is in {unit}, pass `--{sensor}-unit {unit}` or {title}"
+    return (
+        f"if it is in {unit}, "
+        + {
+            "deg/s": "give np.radians(gyro)",
+            "g": f"give {STANDARD_GRAVITY} * accel",
+            "mg": f"give {STANDARD_GRAVITY / 1e3} * accel",
+            "mdps": "give np.radians(gyro / 1000)",
+        }[unit]
+    )
 
 
 def _check_content(sequence: ImuSequence) -> None:
@@ -126,7 +163,7 @@ def _check_content(sequence: ImuSequence) -> None:
             size = float(np.nanmedian(np.linalg.norm(values, axis=1)))
         if size > _NO_SENSOR:
             fix = "is another column meant, or is one of them a clock?"
-            fix += " If it is in mdps, pass `--gyro-unit mdps`" if field == "gyro" else ""
+            fix += f" Or {_advice(sequence, field, 'mdps')}" if field == "gyro" else ""
             found = f"{size:.3g} on average"
             raise InputError(f"{sequence.name}: {field}", found, "a plausible sensor value", fix)
 
@@ -137,7 +174,7 @@ def check_gyro(
     gyro: FloatArray,
     accel: FloatArray,
     pieces: list[slice],
-    unit_known: bool = False,
+    fix: str,
 ) -> tuple[float, float]:
     """Check the gyroscope's rotations against the accelerometer.
 
@@ -147,7 +184,7 @@ def check_gyro(
         gyro: (N, 3) [rad/s].
         accel: (N, 3) [m/s^2].
         pieces: unbroken stretches to average the force over.
-        unit_known: whether the file names the unit; then no option changes it.
+        fix: what to do if it is in deg/s.
 
     Returns:
         Median magnitude of the force, and of its average over a piece [m/s^2].
@@ -156,6 +193,8 @@ def check_gyro(
         InputError: the gyroscope cannot be in rad/s.
     """
     force = float(np.median(np.linalg.norm(accel, axis=1)))
+    if abs(force / STANDARD_GRAVITY - 1.0) > _SHAKEN_OFF_GRAVITY:
+        _check_swapped(name, time, gyro, accel, pieces)
     average = _average_force(time, gyro, accel, pieces)
     in_degrees = _average_force(time, gyro * GYRO_UNITS["deg/s"], accel, pieces)
     speed = float(np.percentile(np.linalg.norm(gyro, axis=1), 95))
@@ -168,42 +207,58 @@ def check_gyro(
         found += " that contradict the accelerometer"
     elif speed <= FAST_RAD_S:
         undecided = abs(force - in_degrees - lost) < _UNDECIDED * force
-        if speed > _SUSTAINED_RAD_S and undecided and not unit_known:
+        if speed > _SUSTAINED_RAD_S and undecided and fix != _UNIT_NAMED:
             log.warning(
                 "%s: gyroscope: found rotations of %.3g rad/s, all about the vertical, of which "
-                "the accelerometer tells nothing: if in deg/s, pass `--gyro-unit deg/s`",
-                name, speed,
+                "the accelerometer tells nothing: %s", name, speed, fix,
             )  # fmt: skip
         return force, average
-    fix = "if it is in deg/s, pass `--gyro-unit deg/s` or write `gx [deg/s]` in the CSV's header"
     if speed <= FAST_RAD_S:  # plausible by hand; in deg/s, a stationary device
         fix = "are its axes and signs the accelerometer's? If the device lay still, is it in deg/s?"
-    elif unit_known:
-        fix = _UNIT_NAMED
-    elif speed * GYRO_UNITS["deg/s"] > FAST_RAD_S:
+    elif fix != _UNIT_NAMED and speed * GYRO_UNITS["deg/s"] > FAST_RAD_S:
         fix = "these are neither rad/s nor deg/s: convert a sensor's counts to one of the two"
     raise InputError(f"{name}: gyroscope", found, "rad/s", fix)
 
 
-def _check_force(sequence: ImuSequence, force: float, average: float) -> None:
+def _check_swapped(
+    name: str, time: FloatArray, gyro: FloatArray, accel: FloatArray, pieces: list[slice]
+) -> None:
+    """Check that the gyroscope's values, rotated by the accelerometer's, do not give gravity."""
+    size = float(np.median(np.linalg.norm(gyro, axis=1)))
+    average = _average_force(time, accel, gyro, pieces)
+    if (
+        max(abs(size / STANDARD_GRAVITY - 1.0), abs(average / STANDARD_GRAVITY - 1.0))
+        < _SHAKEN_OFF_GRAVITY
+    ):
+        found = f"values of {size:.3g} that average to gravity"
+        fix = "gyroscope and accelerometer are swapped: exchange them"
+        raise InputError(f"{name}: gyroscope", found, "rad/s", fix)
+
+
+def _check_force(sequence: ImuSequence, force: float, average: float, saturated: str) -> None:
     field, found = f"{sequence.name}: accelerometer", f"an average of {average:.3g}"
     expected = f"about {STANDARD_GRAVITY:.2f} m/s^2"
     # Shaking makes samples exceed gravity: an average that equals gravity is accepted anyway. In
     # the hand of a runner both sensors saturate, and the average loses a fourth.
-    gravity = abs(average / STANDARD_GRAVITY - 1.0) <= _SHAKEN_OFF_GRAVITY
+    off = abs(average / STANDARD_GRAVITY - 1.0)
+    if saturated and _SHAKEN_OFF_GRAVITY < off <= _SATURATED_OFF_GRAVITY:
+        log.warning("%s: %s, and %s instead of gravity", sequence.name, saturated, found)
+        return
+    gravity = off <= _SHAKEN_OFF_GRAVITY
     if not (gravity or average > _COHERENT * force) or average < _NO_GRAVITY:
         found += f" from samples of {force:.3g}"
         expected = f"specific force with gravity, {expected} on average"
         fix = "record the raw accelerometer: gravity cannot be restored without a true attitude"
-        if sequence.truth is not None:
+        if sequence.truth is not None or sequence.device_attitude is not None:
             fix = "pass `--gravity removed`"
+            if not sequence.source:
+                fix = "give with_conventions(sequence, gravity='removed')"
         fix = f"if it is linear or user acceleration, {fix}"
     elif any(_G_RANGE[0] <= average / size <= _G_RANGE[1] for size in (1.0, 1e3)):
         unit = "g" if average <= _G_RANGE[1] else "mg"
-        fix = (
-            f"if it is in {unit}, pass `--accel-unit {unit}` (and `--accel-sign apple` if it is "
-            f"from an iPhone) or write `ax [{unit}]` in the CSV's header"
-        )
+        fix = _advice(sequence, "accel", unit)
+        if sequence.source:
+            fix += "; from an iPhone, pass `--accel-sign apple` as well"
         if "accel" in sequence.converted:
             fix = _UNIT_NAMED
     elif not _FORCE_RANGE[0] <= average <= _FORCE_RANGE[1]:

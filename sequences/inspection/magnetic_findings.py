@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.sequences.sequence import FloatArray
+from stario.sequences.units import magnetic_advice
 
 LAGS_S = np.arange(-0.05, 0.151, 0.01)
 """Lags of the time stamps that are tried [s]."""
@@ -138,10 +139,10 @@ def magnetic_problems(name: str, findings: MagneticFindings) -> list[str]:
     iron = certain_iron(findings.hard_iron_uT, findings.hard_iron_sigma_uT)
     agreement = findings.correlation_with_gyroscope
     if not _SIZES_UT[0] < findings.size_median_uT < _SIZES_UT[1]:
-        problems.append(
-            f"{field}: found {findings.size_median_uT:.3g} uT, expected the earth's 25 to 65; "
-            "is it uncalibrated, in another unit or near a magnet?"
-        )
+        advice = magnetic_advice(findings.size_median_uT)
+        advice = advice or "is it uncalibrated, in another unit or near a magnet?"
+        found = f"found {findings.size_median_uT:.3g} uT, expected the earth's 25 to 65"
+        problems.append(f"{field}: {found}; {advice}")
     if agreement is not None and agreement < _VERDICTS[-1][2]:
         problems.append(
             f"{field}: does not follow the gyroscope (correlation {agreement:.2f}): "

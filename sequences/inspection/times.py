@@ -44,7 +44,8 @@ def check_time(sequence: ImuSequence) -> None:
             "these are the times at which batches arrived: space their samples evenly",
         )  # fmt: skip
     fix = "set the app to 50 Hz or more" if 1.0 <= rate < MIN_RATE else ""
-    for unit, per_second in TIME_UNITS.items():
+    for unit, ns in TIME_UNITS.items():
+        per_second = 10**9 // ns
         if rate and unit != "s" and MIN_RATE <= rate * per_second <= MAX_RATE:
             fix = f"time seems to be in {unit}: convert it, or write `t [{unit}]` in a CSV's header"
         if rate and unit != "s" and MIN_RATE <= rate / per_second <= MAX_RATE:
@@ -64,7 +65,7 @@ def magnetometer_time_problems(sequence: ImuSequence) -> list[str]:
     if ((field.time >= start) & (field.time <= stop)).mean() >= _INSIDE:
         return []
     longer = float(np.ptp(field.time)) / max(stop - start, 1e-9)
-    units = (unit for unit, n in TIME_UNITS.items() if unit != "s" and 0.5 < longer / n < 2.0)
+    units = (u for u, ns in TIME_UNITS.items() if u != "s" and 0.5 < longer * ns / 1e9 < 2.0)
     unit = next(units, None)
     fix = f"they seem to be in {unit}" if unit else "use one clock for both"
     return [

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,7 @@ from stario.sequences.readers.archive import (
 from stario.sequences.readers.bag import is_bag, read_bag
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import is_generic_csv, read_generic_csv
+from stario.sequences.readers.joined import is_joined, is_untimed, unpack_joined
 from stario.sequences.readers.lines import may_be_read
 from stario.sequences.readers.lists import is_list, list_entries
 from stario.sequences.readers.phones.event_lines import is_event_lines, read_event_lines
@@ -41,7 +42,7 @@ from stario.sequences.readers.published.ronin import is_ronin, read_ronin
 from stario.sequences.readers.published.tlio import is_tlio, read_tlio
 from stario.sequences.readers.unpacked_names import named_after
 from stario.sequences.readers.unrecognised import has_some_sensors, unrecognised
-from stario.sequences.readers.zipped import is_zip, unpacked
+from stario.sequences.readers.zipped import is_zip, unpack_zip
 from stario.sequences.sequence import ImuSequence
 
 __all__ = ["FORMATS", "Format", "find_recordings", "read_recording", "write_csv"]
@@ -67,10 +68,19 @@ class Format:
 
 
 def _read_unpacked(
-    unpack: Callable[[Path], AbstractContextManager[Path]], path: Path
+    unpack: Callable[..., None], source: str, path: Path, **options: str
 ) -> ImuSequence:
-    """Read the only recording unpacked from `path`; errors name `path` and the file in it."""
-    with unpack(path) as folder:
+    """Read the only recording unpacked from `path`; errors name `path` and the file in it.
+
+    Args:
+        unpack: function that writes the content of `path` into a folder.
+        source: the recording's source in words; empty if the files in the folder tell.
+        path: the file or folder.
+        options: further arguments of `unpack`.
+    """
+    with tempfile.TemporaryDirectory(prefix="stario-") as temporary:
+        folder = Path(temporary)
+        unpack(path, folder, **options)
         inside = [folder] if _is_recording(folder) else sorted(_below(folder)) or [folder]
         if len(inside) > 1:
             names = ", ".join(str(one.relative_to(folder)) for one in inside[:4])
@@ -80,13 +90,11 @@ def _read_unpacked(
             )
         with named_after(path, folder):
             sequence = read_recording(inside[0])
-    return replace(sequence, name=path.stem) if inside == [folder] else sequence
+    name = path.stem if inside == [folder] else sequence.name
+    return replace(sequence, name=name, source=source or sequence.source)
 
 
-def _read_long_form(path: Path) -> ImuSequence:
-    words = "logger with the sensor named in each row"
-    return replace(_read_unpacked(unpack_long_form, path), source=words)
-
+_LONG = "logger with the sensor named in each row"
 
 FORMATS: dict[str, Format] = {
     "archive": Format(lambda path: is_archive(split_name(path)[0]), read_archive, "archive"),
@@ -100,12 +108,16 @@ FORMATS: dict[str, Format] = {
     "oxiod": Format(is_oxiod, read_oxiod, "OxIOD"),
     "advio": Format(is_advio, read_advio, "ADVIO"),
     "phone": Format(is_phone, read_phone, "phone"),
+    "joined": Format(is_joined, partial(_read_unpacked, unpack_joined, ""), "phone"),
     "wide": Format(is_wide, read_wide, "phone"),
     "events": Format(is_event_lines, read_event_lines, "logger with one line per event"),
-    "zip": Format(is_zip, partial(_read_unpacked, unpacked), "zip"),
-    "json": Format(is_json_export, partial(_read_unpacked, unpack_json), "Sensor Logger"),
+    "zip": Format(is_zip, partial(_read_unpacked, unpack_zip, ""), "zip"),
+    "json": Format(is_json_export, partial(_read_unpacked, unpack_json, ""), "Sensor Logger"),
     "csv": Format(is_generic_csv, read_generic_csv, "generic CSV"),
-    "long": Format(is_long_form, _read_long_form, "phone"),
+    "long": Format(is_long_form, partial(_read_unpacked, unpack_long_form, _LONG), "phone"),
+    "untimed": Format(
+        is_untimed, partial(_read_unpacked, unpack_joined, ""), "phone", options=("rate",)
+    ),
 }
 """Known formats by name, tried in this order, more specific ones first; `euroc` also covers TUM-VI,
 `ridi` also IMUNet's processed recordings. Files are found below a folder by `_SUFFIXES`."""
@@ -125,7 +137,8 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
     Args:
         path: a file or a folder, depending on the format; `file.h5:name` in an archive.
         format: a name in `FORMATS`, or "auto" to recognise the format by the content.
-        options: further arguments of the format's reader: `imu_topic` and `truth_topic` for a bag.
+        options: further arguments of the format's reader: `imu_topic` and `truth_topic` for a bag,
+            `rate` [samples/s] for a table without times.
 
     Raises:
         InputError: `path` is not a path, the format is unknown, or it does not take an option.
@@ -134,6 +147,8 @@ def read_recording(path: str | Path, format: str = "auto", **options: str) -> Im
     check_choice("format", format, ("auto", *FORMATS))
     path = _readable(path, "a recording")
     name = _recognised(path) if format == "auto" else format
+    if "rate" in options and format == "auto":  # by which even an unknown table is read
+        name = "untimed"
     if name is None:
         raise unrecognised(path, sorted(_below(path)), _KNOWN)
     for option in options:

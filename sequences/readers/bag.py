@@ -17,12 +17,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.lazy import optional_package
 from stario.sequences.readers.checked import finite_rows, magnetometer, rotations, trajectory
 from stario.sequences.readers.clocks import resample_to_gyro
 from stario.sequences.readers.lines import first_bytes
+from stario.sequences.readers.phones.attitude import agreeing_attitude, device_attitude
+from stario.sequences.readers.phones.sensor_table import Samples
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.units import MAGNETIC_UNITS
@@ -39,7 +42,7 @@ _DOUBLES = {
     "geometry_msgs/msg/PoseWithCovarianceStamped": 7 + 36,
     "nav_msgs/msg/Odometry": 7 + 36 + 6 + 36,
 }
-_GYRO, _ACCEL = slice(13, 16), slice(25, 28)
+_ORIENTATION, _GYRO, _ACCEL = slice(0, 4), slice(13, 16), slice(25, 28)
 _STAMP = slice(4, 12)
 
 _MEND = (
@@ -83,7 +86,14 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
         accel=accel,
         truth=None if truth is None else _truth(path, truth, stamps[0]),
         magnetometer=magnetic,
+        device_attitude=device_attitude(_own_attitude(imu), stamps[0]),
     )
+
+
+def _own_attitude(imu: _Messages) -> tuple[IntArray, Rotation] | None:
+    """Return the attitude in the IMU's messages if it agrees with their gyroscope."""
+    samples = Samples(imu.stamps_ns, imu.values[:, _GYRO])
+    return agreeing_attitude(imu.stamps_ns, imu.values[:, _ORIENTATION], samples)
 
 
 def is_bag(path: Path) -> bool:

@@ -16,7 +16,7 @@ from stario.sequences.readers.phones.sensor_words import XSENS_CLOCK
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray
 from stario.sequences.time_order import MAX_IMU_GAP, increasing_mask
-from stario.sequences.units import FILETIME_1970, FILETIME_PER_SECOND, TIME_UNITS
+from stario.sequences.units import FILETIME_1970, FILETIME_NS, TIME_UNITS
 
 _log = logging.getLogger(__name__)
 
@@ -25,11 +25,14 @@ _RATES = (9.0, 1.05 * MAX_RATE)
 the factor between two units, so that only one unit fits."""
 
 
-_CLOCKS = {XSENS_CLOCK: {"ticks of 100 us": 10**4, "us": 10**6}}
-"""Units of clocks by their title: Xsens counts 10 kHz ticks in MT devices, microseconds in DOTs."""
+_CLOCKS = {XSENS_CLOCK: {"ticks of 100 us": 10**5, "us": 10**3}}
+"""Units [ns] of clocks by title: Xsens counts ticks in MT devices, microseconds in DOTs."""
 
 _MARGIN_S = 60.0
 """Maximum time [s] by which rare rows may precede or follow their recording."""
+
+_DAY_NS, _EXCEL_DAYS = 86_400 * 10**9, (25_569.0, 73_050.0)
+"""Unit of the dates of spreadsheets, and those of 1970 and 2100: days since the end of 1899."""
 
 LATEST_S = 4.1e9
 """Seconds from 1970 to 2100: a unit that makes times later is not theirs."""
@@ -175,7 +178,7 @@ def _is_date(time: FloatArray) -> bool:
 
 
 def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.int64) -> int:
-    """Return the number of time units in a second with which most times lie within a recording.
+    """Return the time unit [ns] with which most times lie within a recording.
 
     For rows too rare for `time_unit`.
 
@@ -191,8 +194,8 @@ def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.in
     start, stop = float(start_ns) * 1e-9 - _MARGIN_S, float(stop_ns) * 1e-9 + _MARGIN_S
     # Times from zero fit finer units as well, but all at the start.
     fitting = {
-        unit: int(((time / unit > start) & (time / unit < stop)).sum())
-        for unit in sorted(TIME_UNITS.values())
+        unit: int(((time * unit * 1e-9 > start) & (time * unit * 1e-9 < stop)).sum())
+        for unit in sorted(TIME_UNITS.values(), reverse=True)
     }
     unit = max(fitting, key=lambda unit: fitting[unit])
     if not fitting[unit]:
@@ -203,16 +206,16 @@ def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.in
     return unit
 
 
-def assumed_unit(per_second: int, first: float) -> str:
+def assumed_unit(unit_ns: int, first: float) -> str:
     """Return the unit that times without one were taken for, empty if no other is possible.
 
     Args:
-        per_second: units per second, as `time_unit` returns it.
+        unit_ns: the unit [ns], as `time_unit` returns it.
         first: the first time in that unit; one counted from 1970 fits no other unit.
     """
-    if first / per_second > _SINCE_1970_S:
+    if first * unit_ns * 1e-9 > _SINCE_1970_S:
         return ""
-    return next(unit for unit, count in TIME_UNITS.items() if count == per_second)
+    return next(unit for unit, ns in TIME_UNITS.items() if ns == unit_ns)
 
 
 def source_words(source: str, unit: str) -> str:
@@ -221,7 +224,7 @@ def source_words(source: str, unit: str) -> str:
 
 
 def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:
-    """Return the number of time units in a second, inferred from the rate if no unit is named.
+    """Return the unit of times (N,) [ns], inferred from the rate if none is named.
 
     Samples that share a rounded time are spread over the time to the next one.
 
@@ -237,11 +240,17 @@ def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:
     forward = steps[steps > 0]
     step = float(np.median(forward)) * len(forward) / len(steps) if len(forward) else 0.0
     first = float(time[np.isfinite(time)][:1].sum())
-    if not unit and 0.0 < first / FILETIME_PER_SECOND - FILETIME_1970 * 1e-7 < LATEST_S:
-        return FILETIME_PER_SECOND
-    for name, per_second in candidates.items():
-        if first / per_second < LATEST_S and step and _RATES[0] <= per_second / step <= _RATES[1]:
+
+    def fits(unit_ns: int) -> bool:
+        return step > 0.0 and _RATES[0] <= 1e9 / (step * unit_ns) <= _RATES[1]
+
+    if not unit and 0.0 < (first - FILETIME_1970) * FILETIME_NS * 1e-9 < LATEST_S:
+        return FILETIME_NS
+    if not unit and _EXCEL_DAYS[0] < first < _EXCEL_DAYS[1] and fits(_DAY_NS):
+        return _DAY_NS
+    for name, unit_ns in candidates.items():
+        if first * unit_ns * 1e-9 < LATEST_S and fits(unit_ns):
             _log.info("%s: its times name no unit, their rate fits %s", file, name)
-            return per_second
+            return unit_ns
     expected = f"10 to {MAX_RATE:.0f} samples per second in one of {', '.join(candidates)}"
     raise ReadError(file, "time", f"a step of {step:.4g}", expected)

@@ -69,6 +69,8 @@ _LIKE_TRUTH = re.compile(
     r"gt|truth|pos|quat|(ori|orientation)_?[wxyz]$|[ptq]?_?[xyz]$|q_?[w0-3]$", flags=re.IGNORECASE
 )
 _UNITS = {*ACCEL_UNITS, *GYRO_UNITS, *MAGNETIC_UNITS, *TIME_UNITS}
+_QUOTES = " \"'"
+
 _FEWEST_UNITS = 3
 """Number of cells that make a row of units: those of one sensor."""
 
@@ -141,7 +143,7 @@ def with_units_below(titles: list[str], below: list[str]) -> list[str] | None:
         return None
     units += [""] * (len(titles) - len(units))
     pairs = zip(titles, units, strict=False)
-    return [f"{title} [{unit}]" if unit else title for title, unit in pairs]
+    return [f"{title.strip(_QUOTES)} [{unit}]" if unit else title for title, unit in pairs]
 
 
 def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
@@ -170,6 +172,8 @@ def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
         missing += [name for name in MAGNETIC if name not in columns]
     if missing:
         fix = "or remove the truth columns" if truth and not set(missing) & {"t", *IMU} else ""
+        if missing == ["t"]:
+            fix = "or pass the samples per second: `--rate 100`"
         expected = f"{HEADER},{TRUTH_HEADER}" if truth else HEADER
         expected += f",{MAGNETIC_HEADER}" if set(MAGNETIC) & set(missing) else ""
         raise ReadError(path, f"line {number}, header", f"no {', '.join(missing)}", expected, fix)

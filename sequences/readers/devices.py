@@ -9,7 +9,7 @@ from pathlib import Path
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.lines import is_row, read_lines, unquoted
 from stario.sequences.readers.phones.sensor_words import words_of
-from stario.sequences.readers.rows import is_missing
+from stario.sequences.readers.text import is_missing
 
 _TITLES = {
     *map("".join, product(("device", "imu", "node"), ("", "id", "name", "number", "address"))),

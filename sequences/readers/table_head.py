@@ -18,8 +18,7 @@ from stario.sequences.readers.columns import Column, with_units_below
 from stario.sequences.readers.dates import with_seconds
 from stario.sequences.readers.lines import head_lines, unquoted
 from stario.sequences.readers.phones.sensor_words import axis_of, is_time
-from stario.sequences.readers.rows import is_missing
-from stario.sequences.readers.text import Table, read_table
+from stario.sequences.readers.text import Layout, Table, is_missing, read_table
 from stario.sequences.sequence import FloatArray
 
 _FORMS: tuple[tuple[str | None, str], ...] = (
@@ -42,18 +41,14 @@ class TableHead:
 
     Attributes:
         file: the file.
-        skip: number of lines before the first row.
-        delimiter: separator of the cells; None for blanks.
-        decimal: decimal mark, a point or a comma.
+        layout: how its rows are written.
         titles: titles of the columns; empty without any.
         rows: (N, K) first rows, NaN where a cell is not a number.
         dates: indices of the columns with dates or times of day, which become seconds.
     """
 
     file: Path
-    skip: int
-    delimiter: str | None
-    decimal: str
+    layout: Layout
     titles: list[str]
     rows: FloatArray
     dates: frozenset[int] = frozenset()
@@ -64,10 +59,7 @@ class TableHead:
         Raises:
             ReadError: a row is malformed.
         """
-        return read_table(
-            self.file, columns, self.skip, self.delimiter, self.decimal,
-            killed=True, dated=bool(self.dates),
-        )  # fmt: skip
+        return read_table(self.file, columns, self.layout, killed=True)
 
     def clock(self, column: Column) -> Column:
         """Return a clock's column with its unit, seconds if it holds dates."""
@@ -86,9 +78,10 @@ def table_heads(file: Path, least: int = 4) -> Iterator[TableHead]:
         yield head
     in_seconds = with_seconds(written)
     if in_seconds != written and (head := _head(file, numbers, in_seconds, least)):
-        cells = cells_of(written[numbers.index(head.skip)], head.delimiter, head.decimal)
-        dates = (k for k, cell in enumerate(cells) if math.isnan(number_of(cell)))
-        yield replace(head, dates=frozenset(dates))
+        layout = head.layout
+        cells = cells_of(written[numbers.index(layout.skip)], layout.delimiter, layout.decimal)
+        dates = frozenset(k for k, cell in enumerate(cells) if math.isnan(number_of(cell)))
+        yield replace(head, dates=dates, layout=replace(layout, dated=bool(dates)))
 
 
 def _head(file: Path, numbers: list[int], lines: list[str], least: int) -> TableHead | None:
@@ -105,7 +98,7 @@ def _head(file: Path, numbers: list[int], lines: list[str], least: int) -> Table
         above.pop()
     titles = _titles(above, delimiter, width)
     values = np.array([[number_of(cell) for cell in row] for row in rows if len(row) == width])
-    return TableHead(file, numbers[first], delimiter, decimal, titles[:width], values)
+    return TableHead(file, Layout(numbers[first], delimiter, decimal), titles[:width], values)
 
 
 def _titles(above: list[str], delimiter: str | None, width: int) -> list[str]:

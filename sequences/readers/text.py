@@ -1,12 +1,11 @@
-"""Reading of numbers from text files, with errors that name file, line and column."""
+"""Rows of numbers in text files, read exactly; errors name file, line and column."""
 
 from __future__ import annotations
 
-import importlib
 import logging
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
 
@@ -15,183 +14,259 @@ from numpy.typing import NDArray
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.dates import with_seconds
-from stario.sequences.readers.lines import ends_within_a_row, read_lines, unquoted
-from stario.sequences.readers.rows import NumberedLine, parsed_rows, rows_below
+from stario.sequences.readers.lines import ends_within_a_row, is_row, read_lines, unquoted
 from stario.sequences.sequence import FloatArray
-from stario.sequences.units import FILETIME_1970, FILETIME_PER_SECOND
+from stario.sequences.units import FILETIME_1970, FILETIME_NS
 
 _log = logging.getLogger(__name__)
 
 IntArray = NDArray[np.int64]
 
+Row = tuple[int, str]
+"""Number of a row's line in its file, counted from 1, and its text."""
+
 _LARGE_BYTES = 2_000_000
 
 
 @dataclass(frozen=True)
+class Layout:
+    """How the rows of a file are written.
+
+    Attributes:
+        skip: number of lines above the rows; below, lines that start with `#` are skipped.
+        delimiter: separator of the cells; None for blanks.
+        decimal: decimal mark, a point or a comma.
+        dated: whether dates and times of day are read as seconds, as `with_seconds` does.
+    """
+
+    skip: int = 0
+    delimiter: str | None = ","
+    decimal: str = "."
+    dated: bool = False
+
+    def rows(self, path: Path) -> list[Row]:
+        """Return the rows of a file, without quotes.
+
+        Raises:
+            ReadError: the file cannot be read or has none.
+        """
+        lines = [unquoted(line, self.delimiter, self.decimal) for line in read_lines(path)]
+        lines = with_seconds(lines) if self.dated else lines
+        rows = [row for row in enumerate(lines[self.skip :], self.skip + 1) if is_row(row[1])]
+        if not rows:
+            raise ReadError(path, "rows", "none below the header", "rows of numbers")
+        return rows
+
+
+@dataclass(frozen=True)
 class Table:
-    """Rows of numbers as they are in a file.
+    """Columns of a file as numbers.
 
     Attributes:
         path: the file.
-        values: (N, K) numbers; `nan` and empty cells are NaN.
-        first_row: line number of the first row in the file, counted from 1.
-        cells: function that returns the text of a column of the file.
-        frame: the numbers as pandas read them, None otherwise.
+        layout: how it is written.
+        columns: indices of the columns in the file.
+        values: (N, K) their numbers; `nan` and empty cells are NaN.
+        line_numbers: number of each row's line.
+        rows: the rows as text; None for a file that pandas read.
+        frame: the numbers as pandas read them, by column; None otherwise.
     """
 
     path: Path
+    layout: Layout
+    columns: list[int]
     values: FloatArray
-    first_row: int
-    cells: Callable[[int], list[str]]
+    line_numbers: Sequence[int]
+    rows: list[Row] | None = None
     frame: Any = None
 
-    def numbers(self, column: int) -> NDArray[Any] | None:
-        """Return a column that was read, integers if all are written so; None without pandas."""
-        return None if self.frame is None else self.frame[column].to_numpy()
+    def cells(self, column: int) -> list[str]:
+        """Return the text of a column of the file."""
+        rows = self.layout.rows(self.path) if self.rows is None else self.rows
+        mark = self.layout.delimiter
+        return [line.split(mark, column + 1)[column].strip() for _, line in rows]
 
     def stamps_ns(
-        self, column: int = 0, per_second: int = 10**9, rows: IntArray | None = None
+        self, column: int = 0, unit_ns: int = 1, kept: IntArray | None = None
     ) -> IntArray:
         """Return a column of times (N,) as integer nanoseconds, which float64 cannot hold exactly.
 
         Args:
             column: index of the column in the file.
-            per_second: number of the column's units in a second.
-            rows: rows to return the times of; all if None.
+            unit_ns: its unit [ns].
+            kept: rows to return the times of; all if None.
 
         Raises:
             ReadError: a cell is not a time.
         """
-        unit_ns = 10**9 // per_second
-        since_1970 = FILETIME_1970 if per_second == FILETIME_PER_SECOND else 0
-        rows = np.arange(len(self.values)) if rows is None else rows
-        numbers = self.numbers(column)
-        numbers = None if numbers is None else numbers[rows]
-        if numbers is not None and numbers.dtype.kind == "i":
-            return np.asarray((numbers.astype(np.int64) - since_1970) * unit_ns, dtype=np.int64)
-        if (
-            not since_1970
-            and numbers is not None
-            and np.spacing(np.abs(numbers).max()) * unit_ns < 0.5
-        ):
-            return np.asarray(np.rint(numbers * unit_ns), dtype=np.int64)
+        kept = np.arange(len(self.values)) if kept is None else kept
+        since_1970 = FILETIME_1970 if unit_ns == FILETIME_NS else 0
+        if self.frame is not None:
+            numbers = self.frame[column].to_numpy()[kept]
+            if numbers.dtype.kind == "i":
+                stamps = (numbers.astype(np.int64) - since_1970) * unit_ns
+                return np.asarray(stamps, dtype=np.int64)
+            if not since_1970 and np.spacing(np.abs(numbers).max()) * unit_ns < 0.5:
+                return np.asarray(np.rint(numbers * unit_ns), dtype=np.int64)
         cells = self.cells(column)
+        exact = [self._stamp(k, cells[k], since_1970, unit_ns) for k in kept.tolist()]
         try:
-            stamps = [(int(cells[k]) - since_1970) * unit_ns for k in rows]
-        except ValueError:
-            stamps = [self._stamp(k, cells[k], unit_ns) for k in rows.tolist()]
-        try:
-            return np.array(stamps, dtype=np.int64)
+            return np.array(exact, dtype=np.int64)
         except OverflowError:
-            found = f"a time of {max(map(abs, stamps)):.3g} ns"
+            found = f"a time of {max(map(abs, exact)):.3g} ns"
             fix = "is its unit the one that the header names?"
             raise ReadError(self.path, "time", found, "at most 9.2e18 ns", fix) from None
 
-    def _stamp(self, row: int, cell: str, unit_ns: int) -> int:
+    def _stamp(self, row: int, cell: str, since: int, unit_ns: int) -> int:
         try:
-            whole, _, fraction = cell.strip().partition(".")
-            if whole.isdecimal() and (fraction.isdecimal() or not fraction):
+            whole, _, fraction = cell.partition(".")
+            if whole.removeprefix("-").isdecimal() and not fraction:
+                return (int(whole) - since) * unit_ns
+            if whole.isdecimal() and fraction.isdecimal():
                 # By digits: seconds since 1970 with nine decimals exceed the precision of a float.
-                return int(whole) * unit_ns + round(float(f"0.{fraction or 0}") * unit_ns)
-            return round(float(cell) * unit_ns)
+                return (int(whole) - since) * unit_ns + round(float(f"0.{fraction}") * unit_ns)
+            return round((float(cell) - since) * unit_ns)
         except (ValueError, OverflowError):
-            where = f"line {row + self.first_row}, time"
-            raise ReadError(self.path, where, repr(cell.strip()), "a time") from None
+            where = f"line {self.line_numbers[row]}, time"
+            raise ReadError(self.path, where, repr(cell), "a time") from None
+
+    def seconds(self, column: int, title: str, unit_ns: int, origin: int) -> FloatArray:
+        """Return a column of times (N,) as seconds since those of a row, exactly as written.
+
+        Args:
+            column: index of the column in the file.
+            title: its title, for errors.
+            unit_ns: its unit [ns].
+            origin: the row; if it has no time, the first one below that has.
+
+        Raises:
+            ReadError: a cell is not a time.
+        """
+        if self.frame is not None:
+            numbers = self.frame[column].to_numpy()
+            if numbers.dtype.kind == "i":
+                return np.asarray((numbers - numbers[origin]) * unit_ns / 1e9, dtype=np.float64)
+            if unit_ns == 10**9 and numbers[origin] == 0.0:
+                return np.asarray(numbers, dtype=np.float64)
+        stamps = []
+        for number, cell in zip(self.line_numbers, self.cells(column), strict=True):
+            try:
+                stamps.append(Decimal(cell))
+            except InvalidOperation:
+                raise ReadError(
+                    self.path, f"line {number}, {title}", repr(cell), "a time"
+                ) from None
+        start = next((stamp for stamp in stamps[origin:] if stamp.is_finite()), Decimal(0))
+        return np.array([float((stamp - start) * unit_ns / 10**9) for stamp in stamps])
 
 
 def read_table(
     path: Path,
     columns: int | list[int],
-    skip: int = 0,
-    delimiter: str | None = ",",
-    decimal: str = ".",
+    layout: Layout = Layout(),
+    titles: Sequence[str] = (),
     killed: bool = False,
-    dated: bool = False,
 ) -> Table:
-    """Read rows of numbers; `nan` and empty cells become NaN.
+    """Read columns of numbers; `nan` and empty cells become NaN.
 
     Args:
-        path: the file; lines that start with `#` are skipped.
+        path: the file.
         columns: number of columns to return, or the indices of those to return.
-        skip: number of header lines.
-        delimiter: separator of the cells; None for blanks.
-        decimal: decimal mark, a point or a comma.
-        killed: whether to skip a last row that is cut short because the app was killed.
-        dated: whether to read dates and times of day as seconds, as `with_seconds` does.
+        layout: how the rows are written.
+        titles: titles of these columns, for errors.
+        killed: whether to skip a last row that is cut short because the recorder was killed.
 
     Raises:
         ReadError: a row is cut short or holds something that is not a number.
     """
     wanted = list(range(columns)) if isinstance(columns, int) else columns
-    cut = killed and ends_within_a_row(path, delimiter)
-    quick = None if cut or dated else read_quickly(path, skip, delimiter, wanted, decimal)
-    if quick is not None:
+    cut = killed and ends_within_a_row(path, layout.delimiter)
+    if not cut and (quick := _read_quickly(path, layout, wanted)) is not None:
         return quick
-    numbered = _numbered_rows(path, skip, delimiter, decimal, dated)
-    if killed and len(numbered) > 1 and (cut or not _is_row(path, numbered[-1], delimiter, wanted)):
-        _log.warning("%s: skipped the last row, which is cut short", path)
-        numbered.pop()
-    values = parsed_rows(path, numbered, delimiter, wanted)
-    return Table(path, values, numbered[0][0], partial(_column, numbered, delimiter))
+    rows = layout.rows(path)
+    titles = titles or [f"column {k + 1}" for k in wanted]
+    if killed and len(rows) > 1 and (cut or not _is_whole(path, layout, rows[-1], wanted)):
+        _log.warning("%s: skipped the last row, line %d, which is cut short", path, rows.pop()[0])
+    values = np.array([numbers_in_row(path, layout, row, wanted, titles) for row in rows])
+    return Table(path, layout, wanted, values, [number for number, _ in rows], rows)
 
 
-def read_quickly(
-    path: Path, skip: int, delimiter: str | None, wanted: list[int], decimal: str = "."
-) -> Table | None:
-    """Read a large file with pandas, five times as fast as with NumPy; return None if it cannot.
+def _read_quickly(path: Path, layout: Layout, wanted: list[int]) -> Table | None:
+    """Read a large file with pandas, five times as fast; return None if it cannot.
 
-    It cannot read a small file, or any without pandas, nor blank or malformed cells or rows cut
-    short, which only the slow reader reports. Arguments are those of `read_table`; `wanted` are the
-    indices of its columns.
+    It reads neither small files, for which importing pandas takes longer, nor dates, nor blank or
+    malformed cells or rows cut short.
     """
     try:
-        if path.stat().st_size < _LARGE_BYTES or _has_mark_within_a_row(path.read_bytes()):
+        if path.stat().st_size < _LARGE_BYTES or layout.dated or _has_mark_within_a_row(path):
             return None
-        pandas = importlib.import_module("pandas")
-        frame = pandas.read_csv(
+        import pandas as pd  # half a second, which small files do not need
+
+        frame = pd.read_csv(
             path,
-            sep=r"\s+" if delimiter is None else delimiter,
+            sep=r"\s+" if layout.delimiter is None else layout.delimiter,
             header=None,
-            skiprows=skip,
+            skiprows=layout.skip,
             usecols=sorted(wanted),
             comment="#",
-            decimal=decimal,
+            decimal=layout.decimal,
             na_filter=False,
         )
-    except (ImportError, OSError, ValueError, UnicodeDecodeError):
+    except (OSError, ValueError):
         return None
     if not all(kind.kind in "if" for kind in frame.dtypes) or not len(frame):
         return None
-
-    def cells(column: int) -> list[str]:
-        return _column(_numbered_rows(path, skip, delimiter, decimal), delimiter, column)
-
-    return Table(path, frame[wanted].to_numpy(dtype=np.float64), skip + 1, cells, frame)
+    lines = range(layout.skip + 1, layout.skip + 1 + len(frame))
+    values = frame[wanted].to_numpy(dtype=np.float64)
+    return Table(path, layout, wanted, values, lines, frame=frame)
 
 
-def _has_mark_within_a_row(content: bytes) -> bool:
+def _has_mark_within_a_row(path: Path) -> bool:
     """Return whether a `#` begins no comment, as in `-1.#IND`, of which pandas would read -1."""
+    content = path.read_bytes()
     return content.count(b"#") > content.startswith(b"#") + content.count(b"\n#")
 
 
-def _numbered_rows(
-    path: Path, skip: int, delimiter: str | None, decimal: str, dated: bool = False
-) -> list[NumberedLine]:
-    """Return the rows below `skip` lines, with decimal points and without quotes or dates."""
-    lines = [unquoted(line, delimiter, decimal) for line in read_lines(path)]
-    return rows_below(path, with_seconds(lines) if dated else lines, skip)
-
-
-def _is_row(path: Path, row: NumberedLine, delimiter: str | None, wanted: list[int]) -> bool:
+def _is_whole(path: Path, layout: Layout, row: Row, wanted: list[int]) -> bool:
     try:
-        parsed_rows(path, [row], delimiter, wanted)
+        numbers_in_row(path, layout, row, wanted, [""] * len(wanted))
     except ReadError:
         return False
     return True
 
 
-def _column(numbered: list[NumberedLine], delimiter: str | None, column: int) -> list[str]:
-    return [line.split(delimiter, column + 1)[column] for _, line in numbered]
+def numbers_in_row(
+    path: Path, layout: Layout, row: Row, wanted: list[int], titles: Sequence[str]
+) -> list[float]:
+    """Return the numbers in some columns of a row, NaN where a cell holds none.
+
+    Raises:
+        ReadError: the row is cut short or holds something that is not a number.
+    """
+    number, cells = row[0], row[1].split(layout.delimiter)
+    if len(cells) <= max(wanted):
+        fix = "is the file cut short?"
+        if len(cells) == 1:
+            fix = "separate the values as in the other lines, or remove the line"
+        found = f"{len(cells)} values"
+        raise ReadError(path, f"line {number}", found, f"{max(wanted) + 1}", fix)
+    numbers = []
+    for column, title in zip(wanted, titles, strict=True):
+        cell = cells[column]
+        try:
+            numbers.append(float(cell))
+        except ValueError:
+            if not is_missing(cell):
+                fix = "write a decimal point" if "," in cell else ""
+                where = f"line {number}, {title}"
+                raise ReadError(path, where, repr(cell.strip()), "a number", fix) from None
+            numbers.append(float("nan"))
+    return numbers
+
+
+def is_missing(cell: str) -> bool:
+    """Return whether a cell is blank or says that there is no value."""
+    return cell.strip().lower() in ("", "na", "n/a", "null", "none")
 
 
 def seconds(stamps_ns: IntArray, origin_ns: np.int64 | int) -> FloatArray:

@@ -11,9 +11,10 @@ from stario.sequences.arrays import check_type
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.files import atomic_write
-from stario.sequences.readers.lines import read_lines
-from stario.sequences.readers.rows import parsed_rows, rows_below
+from stario.sequences.readers.text import Layout, numbers_in_row
 from stario.sequences.sequence import Trajectory
+
+_REMEDY = "pass track.trajectory, or Track.from_states(states).trajectory"
 
 _FIELDS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 
@@ -25,7 +26,7 @@ def write_tum(path: Path | str, trajectory: Trajectory) -> None:
         InputError: there is no valid pose, the folder does not exist, or an argument has the wrong
             type.
     """
-    check_type("trajectory", trajectory, Trajectory, "pass track.trajectory")
+    check_type("trajectory", trajectory, Trajectory, _REMEDY)
     valid = trajectory.valid
     if not valid.any():
         raise InputError("trajectory", "no valid pose", "at least one")
@@ -43,13 +44,14 @@ def read_tum(path: Path | str) -> Trajectory:
         ReadError: the file cannot be read, or a line does not hold eight finite numbers with
             increasing time and a unit quaternion; the error names line and field.
     """
-    path = Path(path)
-    numbered = rows_below(path, read_lines(path), 0)
+    path, layout, count = Path(path), Layout(delimiter=None), len(_FIELDS)
+    numbered = layout.rows(path)
     for number, line in numbered:
-        if (count := len(line.split())) != len(_FIELDS):
-            expected = f"{len(_FIELDS)}: {' '.join(_FIELDS)}"
-            raise ReadError(path, f"line {number}", f"{count} values", expected)
-    rows = parsed_rows(path, numbered, None, range(len(_FIELDS)), _FIELDS)
+        if (cells := len(line.split())) != count:
+            expected = f"{count}: {' '.join(_FIELDS)}"
+            raise ReadError(path, f"line {number}", f"{cells} values", expected)
+    wanted = list(range(count))
+    rows = np.array([numbers_in_row(path, layout, row, wanted, _FIELDS) for row in numbered])
 
     def refusal(k: int, field: str, found: str, expected: str) -> ReadError:
         return ReadError(path, f"line {numbered[k][0]}, {field}", found, expected)

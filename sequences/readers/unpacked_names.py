@@ -14,13 +14,15 @@ _PACKAGE = "stario.sequences"
 
 @contextmanager
 def named_after(path: Path, folder: Path) -> Iterator[None]:
-    """Let errors and log records of the block name `path` instead of the folder it is unpacked to.
+    """Let errors and log records of the block name `path` instead of where it is unpacked to.
 
     `walk.zip/Gyroscope.csv` is the file of that name in the zip.
     """
 
     def shown(text: str) -> str:
-        return text.replace(str(folder), str(path)).replace(folder.name, path.stem)
+        for inside in (folder / f"{path.stem}.csv", folder):  # the only file is `path` itself
+            text = text.replace(str(inside), str(path))
+        return text.replace(folder.name, path.stem)
 
     def rename(record: logging.LogRecord) -> bool:
         record.msg, record.args = shown(record.getMessage()), ()

@@ -12,7 +12,6 @@ from stario.sequences.readers.phones.files import (
     NO_SAMPLES,
     SUFFIXES,
     incomplete_sensors,
-    names_both_sensors,
     recording_with,
     unmatched_files,
     unread_files,
@@ -40,18 +39,13 @@ def unrecognised(path: Path, inside: list[Path], known: str) -> ReadError:
         inside: the recordings below it.
         known: what would have been a recording.
     """
-    if is_echo(first_lines(path, 1)):
-        found, fix = "text of `rostopic echo`", "name the bag, or write it with `rostopic echo -p`"
-    elif inside:
+    if inside:
         found, fix = f"a folder of {len(inside)} recordings", f"name one, such as {inside[0]}"
     elif has_some_sensors(path):
         return _incomplete(path)
     elif part_of := recording_with(path):
         found, fix = "one sensor of a recording", f"name its gyroscope: {part_of.gyro}"
         return ReadError(path, "content", found, "a recording", fix)
-    elif names_both_sensors(path):
-        found, fix = "no column of times that grow", "name one `t [s]`; a count of samples is none"
-        return ReadError(path, "time", found, "one next to the sensors'", fix)
     elif path.is_dir() and (files := unmatched_files(path)):
         found = f"files of different devices or recordings ({first_of([f.name for f in files])})"
         expected, fix = "those of one", "name the files of one alike: gyro_a.csv and accel_a.csv"
@@ -109,6 +103,8 @@ def _file(path: Path) -> tuple[str, str]:
             return words, _EXPORT
     if start.startswith(b"\x80"):
         return "a pickle, which may run code", "save it as CSV or npy of plain numbers"
+    if is_echo(first_lines(path, 1)):
+        return "text of `rostopic echo`", "name the bag, or write it with `rostopic echo -p`"
     if line is None:
         return "no line of text", "is it empty or compressed?"
     return f"{line.strip()[:60]!r}", f"a CSV of your own must start with {HEADER}"

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
 import zipfile
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 from stario.sequences.errors import ReadError
@@ -31,23 +28,20 @@ def is_zip(path: Path) -> bool:
         return False
 
 
-@contextmanager
-def unpacked(path: Path) -> Iterator[Path]:
-    """Unpack a zip's text files into a temporary folder, which is deleted after the block.
+def unpack_zip(path: Path, folder: Path) -> None:
+    """Unpack a zip's text files, and those of the zips in it, into a folder.
 
     Raises:
         ReadError: the zip is damaged, encrypted or far too large.
     """
-    with tempfile.TemporaryDirectory(prefix="stario-") as folder:
-        try:
-            left = _extract(path, path, Path(folder), _MAX_BYTES)
-            for inner in sorted(Path(folder).rglob("*.zip")):
-                left = _extract(path, inner, inner.with_suffix(""), left)
-                inner.unlink()
-        except _DAMAGED as error:
-            found = " ".join(str(error).split())
-            raise ReadError(path, "zip", found, "an intact zip", "is the zip complete?") from None
-        yield Path(folder)
+    try:
+        left = _extract(path, path, folder, _MAX_BYTES)
+        for inner in sorted(folder.rglob("*.zip")):
+            left = _extract(path, inner, inner.with_suffix(""), left)
+            inner.unlink()
+    except _DAMAGED as error:
+        found = " ".join(str(error).split())
+        raise ReadError(path, "zip", found, "an intact zip", "is the zip complete?") from None
 
 
 _DAMAGED = (OSError, EOFError, zlib.error, zipfile.BadZipFile, RuntimeError, NotImplementedError)

@@ -4,12 +4,16 @@ H has x forward, y left, z up and its origin on the floor below the person. Ever
 gives the device's offset in H [m] and its rotation from a neutral attitude as a rotation vector in
 H [rad]. A gait repeats with the stride (two steps). With phi the phase of the step, and so phi / 2
 that of the stride, the trunk rises, falls and surges with phi and sways with phi / 2; each heel
-strike excites ringing at 5 to 12 Hz in the body.
+strike excites ringing in what carries the device: the thigh, the hip, the arm, a strap.
 
 The phase offsets between these motions are those of real people, with some spread, never arbitrary:
 they distinguish forward from backward. The trunk is highest at mid-stance (phi = 0) and slowest
 there too (kinetic energy has become potential), and every heel strike brakes it (Cavagna et al.,
 1976).
+
+Bounce, strength, resonance and damping of each mode are those that `stario check simulation` finds
+in recordings carried so: phones in pockets, hands and at the ear (tyrex), in bags (RIDI), flat in
+front (Indoor Location).
 """
 
 from __future__ import annotations
@@ -22,7 +26,14 @@ import numpy as np
 from stario.sequences.sequence import FloatArray
 from stario.sequences.simulation.routes import band_noise, drift, smoothed
 
-_STRIKE_HARMONICS = 9
+_STRIKE_HARMONICS = 12
+
+_STRIKE_LEVER = 0.1
+"""Distance [m] from the point about which a device turns as it rings: angular rates in the bands of
+the ringing are about 0.3 rad/s per m/s^2, wherever a phone is carried."""
+
+_TRUNK_BOUNCE = 2.0
+"""Typical root mean square of the trunk's vertical acceleration at effort 1 [m/s^2]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,59 +72,82 @@ class CarryMotion:
     turn_H: FloatArray
 
 
-def trunk(gait: Gait) -> FloatArray:
+@dataclass(frozen=True)
+class Strike:
+    """What a heel strike excites in a device: an oscillator.
+
+    Attributes:
+        strength: root mean square of its vertical acceleration at effort 1 and vigor 1 [m/s^2].
+        resonance: undamped frequency [Hz].
+        damping: damping ratio.
+    """
+
+    strength: float
+    resonance: float
+    damping: float
+
+
+_ARM = (5.0, 0.4)
+"""Resonance [Hz] and damping ratio of a device at the end of an arm."""
+
+
+def trunk(gait: Gait, bounce: float) -> FloatArray:
     """Return the trunk's motion (N, 3) in H [m]: bounce and surge per step, sway per stride.
 
-    The bounce follows an inverted pendulum: a step of length L on legs of length l lifts the
-    trunk by L^2 / (8 l), of which knees and ankles absorb about a third (Zijlstra & Hof, 2003).
+    Its acceleration, not its height, grows with the effort: slow steps are short, not rare.
+    `bounce` [m/s^2] is the root mean square of the vertical acceleration at effort 1.
     """
     rng, phi = gait.rng, gait.phase
-    bounce, sway, surge, limp = rng.uniform([0.6, 0.5, 0.4, 0.0], [1.0, 1.4, 1.2, 0.25])
-    length = gait.speed / gait.step_rate
-    rise = 0.5 * bounce * gait.effort * length**2 / (8.0 * 0.53 * gait.height)
+    size, sway, surge, limp = rng.uniform([0.75, 0.5, 0.4, 0.0], [1.25, 1.4, 1.2, 0.25])
+    per_acceleration = np.sqrt(2.0) * gait.effort / (2.0 * np.pi * gait.step_rate) ** 2
+    rise = size * bounce * per_acceleration
     shift = rng.uniform(-np.pi, np.pi, 4)
     shift[2] = np.pi + rng.normal(0.0, 0.3)  # slowest at the highest point
     z = rise * (np.cos(phi) + limp * np.cos(phi / 2.0 + shift[0]))
     y = 0.018 * sway * gait.effort * (np.sin(phi / 2.0) + 0.15 * np.sin(1.5 * phi + shift[1]))
-    x = 0.012 * surge * gait.effort * (np.sin(phi + shift[2]) + 0.3 * np.sin(phi / 2 + shift[3]))
+    x = 0.5 * surge * _TRUNK_BOUNCE * per_acceleration
+    x = x * (np.sin(phi + shift[2]) + 0.3 * np.sin(phi / 2 + shift[3]))
     return np.stack([x, y, z], axis=1)
 
 
-def heel_strikes(gait: Gait, strength: float) -> FloatArray:
-    """Return the ringing (N, 3) in H [m] that heel strikes excite in the device.
+def heel_strikes(gait: Gait, strike: Strike) -> CarryMotion:
+    """Return the ringing that heel strikes excite in the device.
 
-    The model is an oscillator with a resonance at 4.5 to 9 Hz, excited once per step: harmonic n of
-    the step gets the oscillator's response at n times the step rate. `strength` [m/s^2] is about
-    the standard deviation of the vertical acceleration at effort 1 and vigor 1.
+    The oscillator is excited once per step: harmonic n of the step gets the oscillator's response
+    at n times the step rate. The device turns with it about a point nearby.
     """
     rng = gait.rng
-    resonance, damping = rng.uniform([4.5, 0.15], [9.0, 0.45])
+    resonance = strike.resonance * rng.uniform(0.85, 1.15)
     tilt = np.array([rng.normal(-0.4, 0.15), rng.normal(0.0, 0.2), 1.0])  # strikes brake
+    turn_axis = rng.standard_normal(3)
+    turn_axis /= np.linalg.norm(turn_axis)
     typical = float(np.median(gait.step_rate))
     n = np.arange(2, _STRIKE_HARMONICS + 1)
+    n = n[n * typical < 0.4 * gait.rate]
     ratio = n * typical / resonance
-    response = 1.0 / (1.0 - ratio**2 + 2j * damping * ratio)
-    response *= np.exp(-((n * typical / 14.0) ** 2))
-    response *= np.sqrt(2.0) * strength / np.sqrt(np.sum(np.abs(response) ** 2))
-    ring = np.zeros((len(gait), 3))
+    response = 1.0 / (1.0 - ratio**2 + 2j * strike.damping * ratio)
+    response *= np.sqrt(2.0) * strike.strength / np.sqrt(np.sum(np.abs(response) ** 2))
+    offset, turn = np.zeros((2, len(gait), 3))
     for k, gain in zip(n, response, strict=True):
         amplitude = np.abs(gain) / (2.0 * np.pi * k * gait.step_rate) ** 2
         # The strike comes half a step after mid-stance.
         angle = k * (gait.phase - np.pi) + np.angle(gain)
-        stray = rng.uniform(-0.4, 0.4, 3)
-        ring += (amplitude * gait.effort)[:, None] * np.cos(angle[:, None] + stray) * tilt
-    return gait.vigor * ring
+        stray = rng.uniform(-0.4, 0.4, 4)
+        ring = (gait.vigor * amplitude * gait.effort)[:, None] * np.cos(angle[:, None] + stray)
+        offset += ring[:, :3] * tilt
+        turn += ring[:, 3:] * turn_axis / _STRIKE_LEVER
+    return CarryMotion(offset, turn)
 
 
-def _held(gait: Gait, strength: float, tremor: float, wobble: float) -> CarryMotion:
+def _held(gait: Gait, bounce: float, strike: Strike, tremor: float, wobble: float) -> CarryMotion:
     """Return the motion of a device held steady: trunk, heel strikes, gait wobble, hand tremor.
 
     `tremor` [rad/s] is the angular rate of the tremor, `wobble` [rad] the rotation with the gait.
     """
     rng, n = gait.rng, len(gait)
-    offset = trunk(gait) + heel_strikes(gait, strength)
-    offset += 0.012 * drift(rng, n, gait.rate, 0.6, 3)
-    turn = 0.08 * drift(rng, n, gait.rate, 0.7, 3)
+    ring = heel_strikes(gait, strike)
+    offset = trunk(gait, bounce) + ring.offset_H + 0.012 * drift(rng, n, gait.rate, 0.6, 3)
+    turn = ring.turn_H + 0.08 * drift(rng, n, gait.rate, 0.7, 3)
     turn += 0.8 * tremor / (2.0 * np.pi * 3.0) * band_noise(rng, n, gait.rate, 1.5, 5.0, 3)
     turn += tremor / (2.0 * np.pi * 8.0) * band_noise(rng, n, gait.rate, 5.0, 11.0, 3)
     shift, size = rng.uniform(-0.7, 0.7, (2, 3)), rng.uniform(0.3, 1.0, (2, 3))
@@ -126,16 +160,32 @@ def _held(gait: Gait, strength: float, tremor: float, wobble: float) -> CarryMot
 
 
 def _handheld(gait: Gait) -> CarryMotion:
+    """Return the motion of a device flat in front: the forearm bounces more than the trunk."""
     rng = gait.rng
-    strength = 0.2 * np.exp(rng.uniform(0.0, 2.0))
-    motion = _held(gait, strength, rng.uniform(0.08, 0.25), rng.uniform(0.01, 0.03))
-    place = np.array([rng.uniform(0.2, 0.45), rng.uniform(-0.2, 0.2), 0.7 * gait.height])
-    return CarryMotion(motion.offset_H + place, motion.turn_H)
+    bounce = 1.9 * np.exp(rng.uniform(0.0, 0.9))
+    strike = Strike(rng.uniform(1.0, 2.8), *_ARM)
+    motion = _held(gait, bounce, strike, rng.uniform(0.05, 0.15), rng.uniform(0.03, 0.07))
+    return _displaced(motion, rng.uniform(0.2, 0.45), rng.uniform(-0.2, 0.2), 0.7 * gait.height)
+
+
+def _texting(gait: Gait) -> CarryMotion:
+    """Return the motion of a device that is read: the arms keep it steadier than the trunk."""
+    rng = gait.rng
+    strike = Strike(rng.uniform(0.5, 1.4), *_ARM)
+    wobble, tremor = rng.uniform(0.04, 0.08), rng.uniform(0.03, 0.1)
+    motion = _held(gait, rng.uniform(0.4, 0.9), strike, tremor, wobble)
+    return _displaced(motion, rng.uniform(0.2, 0.4), rng.uniform(-0.1, 0.1), 0.72 * gait.height)
+
+
+def _displaced(motion: CarryMotion, x: float, y: float, z: float) -> CarryMotion:
+    return CarryMotion(motion.offset_H + np.array([x, y, z]), motion.turn_H)
 
 
 def _call(gait: Gait) -> CarryMotion:
     rng, n = gait.rng, len(gait)
-    motion = _held(gait, rng.uniform(0.2, 0.7), rng.uniform(0.05, 0.15), rng.uniform(0.01, 0.03))
+    strike = Strike(rng.uniform(0.6, 1.4), *_ARM)
+    wobble, tremor = rng.uniform(0.05, 0.1), rng.uniform(0.03, 0.1)
+    motion = _held(gait, rng.uniform(0.5, 1.0), strike, tremor, wobble)
     head = 0.35 * drift(rng, n, gait.rate, 1.0)
     arm = np.array([0.05, rng.choice([-1.0, 1.0]) * 0.1, 0.0])
     offset = motion.offset_H + np.array([0.0, 0.0, 0.93 * gait.height]) + _about(2, head, arm)
@@ -145,49 +195,69 @@ def _call(gait: Gait) -> CarryMotion:
 
 def _swinging(gait: Gait) -> CarryMotion:
     rng, n = gait.rng, len(gait)
-    amplitude = np.radians(rng.uniform(12.0, 30.0)) * np.sqrt(gait.vigor)
+    amplitude = np.radians(rng.uniform(22.0, 40.0)) * np.sqrt(gait.vigor)
     forward = np.radians(rng.uniform(0.0, 12.0))
     angle = _pendulum(gait, amplitude, forward, harmonic=0.12)
     side = rng.choice([-1.0, 1.0])
     arm = np.array([0.0, 0.0, -0.38 * gait.height])
     shoulder = np.array([0.0, side * 0.13 * gait.height, 0.81 * gait.height])
-    offset = shoulder + _about(1, -angle, arm) + trunk(gait)
-    offset += heel_strikes(gait, rng.uniform(0.4, 1.2)) + 0.008 * drift(rng, n, gait.rate, 0.5, 3)
+    ring = heel_strikes(gait, Strike(rng.uniform(0.8, 1.6), *_ARM))
+    offset = shoulder + _about(1, -angle, arm) + trunk(gait, rng.uniform(0.8, 2.0))
+    offset += ring.offset_H + 0.008 * drift(rng, n, gait.rate, 0.5, 3)
     twist = rng.uniform(0.1, 0.5) * angle + 0.08 * drift(rng, n, gait.rate, 0.7)
     roll = 0.08 * drift(rng, n, gait.rate, 0.7)
-    turn = np.stack([roll, -angle, twist], axis=1)
-    turn += 0.15 / (2.0 * np.pi * 8.0) * band_noise(rng, n, gait.rate, 5.0, 11.0, 3)
-    return CarryMotion(offset, turn)
+    return CarryMotion(offset, np.stack([roll, -angle, twist], axis=1) + ring.turn_H)
 
 
 def _pocket(gait: Gait) -> CarryMotion:
+    """Return the motion of a device in a front pocket: it swings and shakes with the thigh."""
+    rng = gait.rng
+    amplitude = np.radians(rng.uniform(14.0, 24.0))
+    place = (0.08, -rng.uniform(0.08, 0.16) * gait.height)
+    strike = Strike(rng.uniform(1.6, 3.2), 8.0, 0.25)
+    return _on_thigh(gait, amplitude, place, rng.uniform(0.7, 1.5), strike)
+
+
+def _back_pocket(gait: Gait) -> CarryMotion:
+    """Return the motion of a device in a back pocket: it turns with pelvis and thigh."""
+    rng = gait.rng
+    amplitude = np.radians(rng.uniform(10.0, 18.0))
+    place = (-0.1, -rng.uniform(0.0, 0.04) * gait.height)
+    strike = Strike(rng.uniform(1.5, 2.9), 7.0, 0.3)
+    return _on_thigh(gait, amplitude, place, rng.uniform(1.0, 1.9), strike)
+
+
+def _on_thigh(
+    gait: Gait, amplitude: float, place: tuple[float, float], bounce: float, strike: Strike
+) -> CarryMotion:
+    """Return the motion of a device at a place (x, z) [m] from the hip that swings with a leg."""
     rng, n = gait.rng, len(gait)
-    amplitude = np.radians(rng.uniform(14.0, 24.0)) * np.sqrt(gait.vigor)
-    angle = _pendulum(gait, amplitude, np.radians(rng.uniform(0.0, 12.0)), harmonic=0.3)
-    thigh = np.array([0.08, 0.0, -rng.uniform(0.08, 0.16) * gait.height])
+    forward = np.radians(rng.uniform(0.0, 12.0))
+    angle = _pendulum(gait, amplitude * np.sqrt(gait.vigor), forward, harmonic=0.3)
     hip = np.array([0.0, rng.choice([-1.0, 1.0]) * 0.1, 0.52 * gait.height])
-    offset = hip + _about(1, -angle, thigh) + trunk(gait)
-    offset += heel_strikes(gait, rng.uniform(1.0, 2.2))
+    ring = heel_strikes(gait, strike)
+    offset = hip + _about(1, -angle, np.array([place[0], 0.0, place[1]]))
+    offset += trunk(gait, bounce) + ring.offset_H
     shift = rng.uniform(-0.7, 0.7, 2)
     yaw = 0.1 * gait.effort * np.cos(gait.phase / 2.0 + shift[0])
     roll = 0.06 * gait.effort * np.cos(gait.phase + shift[1]) + 0.03 * drift(rng, n, gait.rate, 1.0)
-    turn = np.stack([roll, -angle, yaw], axis=1)
-    turn += _slap(gait, rng.uniform(0.15, 0.5))
-    return CarryMotion(offset, turn)
+    return CarryMotion(offset, np.stack([roll, -angle, yaw], axis=1) + ring.turn_H)
 
 
 def _bag(gait: Gait) -> CarryMotion:
     rng, n = gait.rng, len(gait)
-    hang, sway = rng.uniform([0.0, 0.02], [0.4, 0.1])
+    hang, sway = rng.uniform([0.0, 0.06], [0.4, 0.16])
     shift = rng.uniform(-0.7, 0.7, 3)
     stride = np.cos(gait.phase[:, None] / 2.0 + shift)
     turn = sway * gait.effort[:, None] * stride * np.array([1.0, 0.5, 0.8])
-    turn += 0.02 * gait.effort[:, None] * np.cos(gait.phase[:, None] + shift[::-1])
-    turn += 0.04 * drift(rng, n, gait.rate, 1.0, 3) + _slap(gait, rng.uniform(0.05, 0.3))
+    turn += 0.03 * gait.effort[:, None] * np.cos(gait.phase[:, None] + shift[::-1])
+    turn += 0.04 * drift(rng, n, gait.rate, 1.0, 3)
     body = np.array([rng.choice([-0.15, 0.12]), rng.uniform(-0.15, 0.15), 0.75 * gait.height])
     strap = np.array([0.0, 0.0, -hang])
-    offset = body + np.cross(turn, strap) + strap + trunk(gait)
-    return CarryMotion(offset + heel_strikes(gait, rng.uniform(0.3, 1.2)), turn)
+    # A bag knocks against the body: its ringing is damped most.
+    ring = heel_strikes(gait, Strike(rng.uniform(0.7, 1.6), 8.0, 0.6))
+    offset = body + np.cross(turn, strap) + strap + trunk(gait, rng.uniform(1.5, 2.4))
+    return CarryMotion(offset + ring.offset_H, turn + ring.turn_H)
 
 
 def _trolley(gait: Gait) -> CarryMotion:
@@ -212,7 +282,8 @@ def _trolley(gait: Gait) -> CarryMotion:
 def _rig(gait: Gait) -> CarryMotion:
     """Return a rig's motion: quick turns to random directions, arms waved by up to their length."""
     rng, n = gait.rng, len(gait)
-    motion = _held(gait, rng.uniform(0.2, 0.6), rng.uniform(0.03, 0.1), rng.uniform(0.01, 0.03))
+    strike = Strike(rng.uniform(0.2, 0.6), *_ARM)
+    motion = _held(gait, _TRUNK_BOUNCE, strike, rng.uniform(0.03, 0.1), rng.uniform(0.01, 0.03))
     reach = np.array([0.2, 0.25, 0.2]) * rng.uniform(0.3, 1.1)
     waved = drift(rng, n, gait.rate, rng.uniform(0.25, 0.5), 3)
     lively = 0.5 * (1.0 + np.tanh(1.5 + 1.5 * drift(rng, n, gait.rate, 3.0, 1)))
@@ -223,9 +294,11 @@ def _rig(gait: Gait) -> CarryMotion:
 
 CARRIES: dict[str, Callable[[Gait], CarryMotion]] = {
     "handheld": _handheld,
+    "texting": _texting,
     "call": _call,
     "swinging": _swinging,
     "pocket": _pocket,
+    "back-pocket": _back_pocket,
     "bag": _bag,
     "trolley": _trolley,
     "rig": _rig,
@@ -252,20 +325,6 @@ def _pendulum(gait: Gait, amplitude: float, forward: float, harmonic: float) -> 
     overtone = harmonic * np.cos(2.0 * stride + rng.uniform(-0.5, 0.5))
     restless = 0.03 * drift(rng, n, gait.rate, 0.6)
     return np.asarray(forward + size * (np.sin(stride) + overtone) + restless)
-
-
-def _slap(gait: Gait, rate_deviation: float) -> FloatArray:
-    """Return rotations (N, 3) [rad] of a loose device at the step's harmonics.
-
-    `rate_deviation` [rad/s] is about their standard deviation as angular rate.
-    """
-    turn = np.zeros((len(gait), 3))
-    for k in range(2, 6):
-        shift = gait.rng.uniform(-np.pi, np.pi, 3)
-        size = rate_deviation * np.sqrt(0.5) * gait.rng.uniform(0.3, 1.0, 3)
-        amplitude = (gait.effort / (2.0 * np.pi * k * gait.step_rate))[:, None]
-        turn += amplitude * size * np.cos(k * gait.phase[:, None] + shift)
-    return turn
 
 
 def _about(axis: int, angle: FloatArray, lever: FloatArray) -> FloatArray:

@@ -392,3 +392,11 @@ def test_beyond_the_most_that_wait_those_furthest_ahead_are_refused() -> None:
 def test_variances_instead_of_a_covariance_are_refused_with_the_matrix_to_pass() -> None:
     with pytest.raises(InputError, match=r"np\.diag"):
         position_fix(0.0, [1.0, 2.0, 3.0], [0.1, 0.1, 0.2])
+
+
+def test_a_position_in_degrees_is_refused_with_what_to_do(still_model: Any) -> None:
+    navigator = Navigator(still_model)
+    with pytest.raises(InputError, match=r"latitude, longitude and height.*metres east"):
+        navigator.update_position(0.0, [48.1, 11.5, 500.0], EYE)
+    for place in ([48.1, 11.5, 12.0], [690_000.0, 5_330_000.0, 500.0]):
+        assert navigator.update_position(0.0, place, EYE) == "waiting"

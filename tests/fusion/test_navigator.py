@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,9 @@ from stario.fusion.evaluation.tracks import inertial_track
 from stario.sequences.accuracy.metrics import align, pose_errors
 from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.attitude.rotations import about_z, yaw_of
+from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
+from stario.sequences.readers.tum import read_tum, write_tum
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.imu import ImuErrors
 
@@ -37,6 +40,27 @@ def test_results_print_without_their_arrays(track: Track, walk: ImuSequence, sti
     for pose in (state, navigator.continuous, navigator.smoothed):
         assert repr(pose).startswith(f"{type(pose).__name__}(time={pose.time:.3f} s, p_W=[")
         assert len(repr(pose)) < 80
+
+
+def test_the_states_of_a_stream_become_a_track_that_can_be_written(
+    walk: ImuSequence, still_model: Any, tmp_path: Path
+) -> None:
+    states = stream(Navigator(still_model), walk.slice(0.0, 4.0))
+    written = Track.from_states(states).trajectory
+    write_tum(tmp_path / "walk.tum", written)
+    read = read_tum(tmp_path / "walk.tum")
+    np.testing.assert_allclose(read.time, [state.time for state in states])
+    np.testing.assert_allclose(read.position_W, [state.p_W for state in states], atol=1e-8)
+    moved = [*states, replace(states[-1], time=9.0, map_frame=1)]
+    for wrong, words in (
+        ([], "found none"),
+        (moved, "2 map frames"),
+        ([None], "collect what push"),
+    ):
+        with pytest.raises(InputError, match=words):
+            Track.from_states(wrong)
+    with pytest.raises(InputError, match=r"Track\.from_states"):
+        write_tum(tmp_path / "walk.tum", states)
 
 
 # --- accuracy --------------------------------------------------------------------------------

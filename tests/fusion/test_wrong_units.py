@@ -17,14 +17,14 @@ Make = Callable[..., Any]
 
 
 @pytest.mark.parametrize(
-    ("scale_gyro", "scale_accel", "option"),
-    [(180 / np.pi, 1.0, "--gyro-unit deg/s"), (1.0, 1 / 9.80665, "--accel-unit g")],
+    ("scale_gyro", "scale_accel", "remedy"),
+    [(180 / np.pi, 1.0, r"np\.radians\(gyro\)"), (1.0, 1 / 9.80665, "9.80665 . accel")],
 )
-def test_wrong_units_are_refused_with_the_option_that_fixes_them(
-    walk: ImuSequence, still_model: Any, scale_gyro: float, scale_accel: float, option: str
+def test_wrong_units_are_refused_with_what_fixes_them(
+    walk: ImuSequence, still_model: Any, scale_gyro: float, scale_accel: float, remedy: str
 ) -> None:
     wrong = replace(walk, gyro=scale_gyro * walk.gyro, accel=scale_accel * walk.accel)
-    with pytest.raises(InputError, match=option) as caught:
+    with pytest.raises(InputError, match=remedy) as caught:
         Navigator(still_model).run(wrong.without_truth())
     assert "\n" not in str(caught.value)
 
@@ -44,6 +44,34 @@ def test_a_stream_in_wrong_units_is_refused_after_its_first_second(
         stream(navigator, replace(walk, accel=scale * walk.accel))
     assert navigator.state is None
     assert stream_deviation(stream(navigator, walk), Navigator(navigator.model).run(walk)) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (lambda gyro, accel: (np.degrees(gyro) + 40.0, accel), r"gyro: .*np\.radians\(gyro\)"),
+        (lambda gyro, accel: (accel, gyro), "gyro and accel are swapped"),
+    ],
+)
+def test_the_first_second_of_a_stream_blames_the_right_sensor(
+    walk: ImuSequence, still_model: Any, wrong: Callable[..., Any], words: str
+) -> None:
+    """In deg/s the force averages to nothing, although each sample of it is right."""
+    gyro, accel = wrong(walk.gyro, walk.accel)
+    with pytest.raises(InputError, match=words):
+        stream(Navigator(still_model), replace(walk, gyro=gyro, accel=accel))
+
+
+def test_an_inverted_accelerometer_and_a_field_in_gauss_are_said(
+    still_model: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    navigator = Navigator(still_model)
+    noise = 0.02 * np.random.default_rng(0).standard_normal((300, 6))
+    for k, row in enumerate(noise):
+        navigator.push_magnetometer(0.01 * k, [0.2, row[0], -0.43])
+        navigator.push(0.01 * k, row[:3], row[3:] - [0.0, 0.0, STANDARD_GRAVITY])
+    assert "give -accel" in caplog.text
+    assert caplog.text.count("if in gauss, give 100 * field") == 1
 
 
 def after_a_still_start(walk: ImuSequence) -> ImuSequence:

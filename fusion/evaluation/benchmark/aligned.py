@@ -7,8 +7,6 @@ read it from the cache.
 from __future__ import annotations
 
 import hashlib
-import json
-import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -16,15 +14,13 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import safetensors
-import safetensors.numpy
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.rotations import yaw_of
+from stario.sequences.datasets.array_cache import Part, read_parts, write_parts
 from stario.sequences.datasets.batch import Skipped, each
-from stario.sequences.datasets.cache_files import JUDGED, recording_file, remove_unused
+from stario.sequences.datasets.cache_files import recording_file
 from stario.sequences.errors import InputError
-from stario.sequences.files import atomic_write
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.inspection.constant_values import warn_of_dead_axes
 from stario.sequences.legs import gaps_and_jumps
@@ -39,15 +35,15 @@ from stario.sequences.sequence import (
 )
 from stario.sequences.truth.problems import truth_problems, warn_of_problems
 
-log = logging.getLogger(__name__)
-
 Kind = Literal["poses", "positions", "waypoints"]
 
 Complex = np.ndarray[tuple[int], np.dtype[np.complex128]]
 """Horizontal positions or vectors x + iy."""
 
+_SHARED = ("name", "kind", "attributes", "problems")
 _STREAM = ("imu_N", "facing_N", "R_NB")
 _TRUTH = ("position_W", "breaks", "yaw_WN", "waypoint_time", "waypoint_W")
+_COMPLEX = ("position_W", "waypoint_W")
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,11 +145,12 @@ def aligned_recordings(
 def _cached(
     path: Path, read: Callable[[Path], ImuSequence], options: dict[str, object], folder: Path
 ) -> Aligned:
-    file = recording_file(folder, path, {**options, "preparation": _code()}, JUDGED)
-    found = _load(file, path)
-    if found is None:
-        found = aligned_recording(read(path), path)
-        _store(file, found)
+    file = recording_file(folder, path, {**options, "preparation": _code()})
+    parts = read_parts(file)
+    if parts is None:
+        parts = _parts(aligned_recording(read(path), path))
+        write_parts(file, parts)
+    found = _from_parts(path, parts)
     warn_of_problems(found.problems)
     return found
 
@@ -202,45 +199,23 @@ def _code() -> str:
     return hashlib.blake2b(Path(__file__).read_bytes(), digest_size=20).hexdigest()
 
 
-def _store(file: Path, aligned: Aligned) -> None:
-    arrays = {}
-    for k, piece in enumerate(aligned.pieces):
-        values = {name: getattr(piece.stream, name) for name in _STREAM}
-        values |= {name: getattr(piece, name) for name in _TRUTH}
-        for name, value in values.items():  # the format knows no complex numbers
-            arrays[f"{k}.{name}"] = value.view(np.float64) if np.iscomplexobj(value) else value
-    description = {
-        "name": aligned.name,
-        "kind": aligned.kind,
-        "attributes": aligned.attributes,
-        "starts": [piece.stream.start for piece in aligned.pieces],
-        "problems": aligned.problems,
-    }
-    content = safetensors.numpy.save(arrays, metadata={"recording": json.dumps(description)})
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        remove_unused(file.parent)
-        with atomic_write(file, "wb") as target:
-            target.write(content)
-    except (OSError, InputError) as error:
-        log.warning("%s: aligned recordings cannot be cached: %s", file.parent, error)
+def _parts(aligned: Aligned) -> list[Part]:
+    shared = {name: getattr(aligned, name) for name in _SHARED}
+    parts = []
+    for piece in aligned.pieces:
+        arrays = {name: getattr(piece.stream, name) for name in _STREAM}
+        arrays |= {name: getattr(piece, name) for name in _TRUTH}
+        for name in _COMPLEX:  # the file's format has no double complex numbers
+            arrays[name] = arrays[name].view(np.float64)
+        parts.append(({**shared, "start": piece.stream.start}, arrays))
+    return parts
 
 
-def _load(file: Path, path: Path) -> Aligned | None:
-    if not file.exists():
-        return None
-    try:
-        with safetensors.safe_open(file, "numpy") as source:
-            description = json.loads(source.metadata()["recording"])
-            pieces = []
-            for k, start in enumerate(description["starts"]):
-                found = {n: source.get_tensor(f"{k}.{n}") for n in (*_STREAM, *_TRUTH)}
-                for name in ("position_W", "waypoint_W"):
-                    found[name] = found[name].view(np.complex128)
-                stream = LevelledStream(start, *(found[name] for name in _STREAM))
-                pieces.append(AlignedPiece(stream, *(found[name] for name in _TRUTH)))
-    except (OSError, KeyError, ValueError, safetensors.SafetensorError) as error:
-        log.warning("%s: unreadable, aligned again: %s", file, error)
-        return None
-    name, kind, attributes = (description[key] for key in ("name", "kind", "attributes"))
-    return Aligned(path, name, kind, attributes, pieces, tuple(description["problems"]))
+def _from_parts(path: Path, parts: Sequence[Part]) -> Aligned:
+    pieces = []
+    for values, arrays in parts:
+        arrays = arrays | {name: arrays[name].view(np.complex128) for name in _COMPLEX}
+        stream = LevelledStream(values["start"], *(arrays[name] for name in _STREAM))
+        pieces.append(AlignedPiece(stream, *(arrays[name] for name in _TRUTH)))
+    name, kind, attributes, problems = (parts[0][0][key] for key in _SHARED)
+    return Aligned(path, name, kind, attributes, pieces, tuple(problems))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -30,7 +30,7 @@ from stario.fusion.evaluation.bootstrap import (
     block_rows,
     paired_ratio,
 )
-from stario.fusion.evaluation.scores import joined, parts, scored, values, wide
+from stario.fusion.evaluation.scores import joined, parts, records, scored, wide
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.sequences.datasets.batch import Skipped, without_skipped
@@ -53,7 +53,10 @@ _NOT_COMPARED = (
 )
 
 
-_DECISIVE = "rms_10s_m"
+RATIOS = {f"ratio_{horizon}s": f"rms_{horizon}s_m" for horizon in HORIZONS}
+"""Ratios of errors, and the figure that each is of."""
+
+_DECISIVE = "ratio_10s"
 _MAX_GROUP_RATIO = 1.1
 
 WORDS: dict[str, str] = {
@@ -64,28 +67,6 @@ WORDS: dict[str, str] = {
     "groups, recordings and blocks of 30 s; for waypoints, their residuals replace the 10 s errors",
 }
 """Meaning of each figure."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """A group of recordings.
-
-    Attributes:
-        name: name of the group, or `POOLED`.
-        recordings: number of recordings compared; those with fewer than three waypoints are not.
-        path_km: total length of their true paths.
-        medians: medians over recordings, by name of the weights and by figure.
-        ratios: ratios of errors over 1, 10 and 30 s to those of the weights compared with, by
-            figure; empty without these. For waypoints, the residuals replace the 10 s errors.
-        pooled: whether the row covers all groups.
-    """
-
-    name: str
-    recordings: int
-    path_km: float
-    medians: dict[str, dict[str, float]]
-    ratios: dict[str, Interval]
-    pooled: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,44 +82,41 @@ class Benchmark:
     scores: pd.DataFrame
     blocks: pd.DataFrame
 
-    def rows(self, by: By, ours: str, theirs: str | None) -> list[Row]:
-        """Return a row for each group, sorted by name, and one over all if there are several.
+    def rows(self, by: By, ours: str, theirs: str | None) -> pd.DataFrame:
+        """Return rows "theirs", if any, and "ours" (`role`) of each `group`; then over all groups.
 
-        `ours` and `theirs` name the weights under evaluation and those to compare with, if any.
+        The other columns are the `weights`; the medians of `FIGURES` over recordings; the number of
+        `recordings` compared, without those with fewer than three waypoints; the length `path_km`
+        of their true paths; whether the row is `pooled` over all groups, if there are several; and
+        in those of ours the `RATIOS` of errors to theirs, as `Interval`s where there are any. For
+        waypoints, the residuals replace the 10 s errors.
         """
-        found = parts(self.scores, by, POOLED)
-        return [
-            self._row(name, part, ours, theirs, pooled=k > 0 and k == len(found) - 1)
+        found = parts(wide(self.scores), by, POOLED)
+        return pd.DataFrame(
+            row
             for k, (name, part) in enumerate(found)
-        ]
+            for row in self._rows(name, part, 0 < k == len(found) - 1, ours, theirs)
+        )
 
-    def _row(
-        self, name: str, part: pd.DataFrame, ours: str, theirs: str | None, pooled: bool
-    ) -> Row:
-        weights = [ours] if theirs is None else [ours, theirs]
-        medians = {
-            one: {figure: _median(values(part, figure, track=one)) for figure in FIGURES}
-            for one in weights
+    def _rows(
+        self, name: str, part: pd.DataFrame, pooled: bool, ours: str, theirs: str | None
+    ) -> list[dict[str, Any]]:
+        medians = part.groupby("track")[[*FIGURES]].median().to_dict("index")
+        blocks = self.blocks[self.blocks["recording"].isin(part["recording"])]
+        ratios = {
+            key: theirs and paired_ratio(blocks[blocks["metric"] == metric], ours, theirs)
+            for key, metric in RATIOS.items()
         }
-        ratios = {}
-        for horizon in HORIZONS if theirs is not None else ():
-            metric = f"rms_{horizon}s_m"
-            chosen = self.blocks["recording"].isin(part["recording"])
-            blocks = self.blocks[chosen & (self.blocks["metric"] == metric)]
-            ratio = paired_ratio(blocks, ours, str(theirs))
-            if ratio is not None:
-                ratios[metric] = ratio
-        paths = values(part, "path_m", track=ours)
-        return Row(name, int((paths > 0.0).sum()), paths.sum() / 1e3, medians, ratios, pooled)
-
-    def recordings(self) -> list[dict[str, object]]:
-        """Return each recording with its labels and the figures of all weights."""
-        found = []
-        for _, part in wide(self.scores).groupby("recording", sort=False):
-            by_weights = part.set_index("track")
-            labels = by_weights.iloc[0].drop([*FIGURES]).to_dict()
-            found.append(labels | {"figures": by_weights[[*FIGURES]].to_dict("index")})
-        return found
+        paths = part.loc[part["track"] == ours, "path_m"]
+        known = {"recordings": int((paths > 0.0).sum()), "path_km": paths.sum() / 1e3}
+        return [
+            {"group": name, "pooled": pooled, "role": role, "weights": weights}
+            | known
+            | medians[weights]
+            | (ratios if role == "ours" else dict.fromkeys(RATIOS))
+            for role, weights in (("theirs", theirs), ("ours", ours))
+            if weights
+        ]
 
 
 def benchmark(
@@ -215,22 +193,18 @@ def labels(path: Path, attributes: Mapping[str, object], group: str = "") -> dic
     return {"set": set_name, "group": group or of_person, **known}
 
 
-def _median(known: np.ndarray[Any, Any]) -> float:
-    return float(np.median(known)) if len(known) else float("nan")
-
-
 _MIN_GROUPS = 3
 """Minimum number of groups for a verdict: intervals from fewer do not generalise to others."""
 
 
-def verdict(rows: Sequence[Row]) -> str:
+def verdict(rows: pd.DataFrame) -> str:
     """Return the verdict on replacing the weights compared with; empty without several groups.
 
     Weights are accepted if the pooled interval is below 1 and no group is worse by over a tenth.
     """
-    compared = [row for row in rows if _DECISIVE in row.ratios]
-    ratios = {row.name: row.ratios[_DECISIVE] for row in compared if not row.pooled}
-    pooled = next((row.ratios[_DECISIVE] for row in compared if row.pooled), None)
+    compared = [r for r in rows.to_dict("records") if isinstance(r[_DECISIVE], Interval)]
+    ratios = {str(r["group"]): r[_DECISIVE] for r in compared if not r["pooled"]}
+    pooled = next((r[_DECISIVE] for r in compared if r["pooled"]), None)
     if pooled is None:
         return ""
     worst = max(ratios, key=lambda name: ratios[name].ratio)
@@ -242,14 +216,14 @@ def verdict(rows: Sequence[Row]) -> str:
 
 
 def benchmark_dict(
-    found: Benchmark, rows: Sequence[Row], ours: str, theirs: str | None
+    found: Benchmark, rows: pd.DataFrame, ours: str, theirs: str | None
 ) -> dict[str, object]:
     """Return the result as plain values, including the recordings."""
     return {
         "ours": ours,
         "theirs": theirs,
         "verdict": verdict(rows),
-        "groups": [asdict(row) for row in rows],
-        "recordings": found.recordings(),
+        "groups": rows.to_dict("records"),
+        "recordings": records(found.scores.rename(columns={"track": "weights"})),
         "words": WORDS,
     }

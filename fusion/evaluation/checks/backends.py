@@ -126,7 +126,7 @@ def score_table(scores: pd.DataFrame) -> str:
         f"{found['slowest_update_ms']:.1f} ms",
     )
     rows = [*parts(scores, "recording", whole=None), ("median", scores)]
-    return table(rows, _COLUMNS, "", notes)
+    return table(rows, _COLUMNS, ("",), notes)
 
 
 def _by_estimator(scores: pd.DataFrame, metric: str) -> FloatArray:

@@ -123,9 +123,7 @@ def run_faults(
 def fault_table(scores: pd.DataFrame) -> str:
     """Return the results as text."""
     rows = list(scores.groupby(["group", "track"], sort=False))
-    cells = rows_of(((fault, part) for (fault, _), part in rows), _COLUMNS, "fault")
-    backends = ["back end", *(backend for (_, backend), _ in rows)]
-    lines = aligned([[row[0], name, *row[1:]] for row, name in zip(cells, backends, strict=True)])
+    lines = aligned(rows_of(rows, _COLUMNS, "fault", "back end"))
     finite = Column("", "finite", over=np.min)
     reports = [
         ("" if finite.value(part) else "NOT FINITE, ") + part["reported"].iloc[0]

@@ -37,6 +37,7 @@ _NETWORK = {"track": "network"}
 
 _NOTES = (
     "network: median error [m]; ratios to it: geometric mean, 95th percentile, worst",
+    "% of path: error over the length of the true path, median",
     "NIS: mean, 3 expected; NEES of position: median, 2.4 expected; yaw: error at the end "
     "relative to the start",
 )
@@ -50,6 +51,8 @@ def fusion_gain(
     backends: Sequence[BackendName] = get_args(BackendName),
 ) -> pd.DataFrame:
     """Score the network alone and the back ends: `error_m`, its `ratio` to the network's, NIS.
+
+    The error is also given in percent of the true path (of the legs between waypoints).
 
     With true poses also the NEES of position, and at the end of the truth the yaw error relative to
     its start [rad], the yaw's reported standard deviation [rad], and whether the error is good and
@@ -69,12 +72,14 @@ def fusion_gain(
             f"fewer than {MIN_POSITIONS} within the track",
             f"{MIN_POSITIONS} or more",
         )
+    path = _path_length(sequence)
     figures: dict[str, Metrics] = {"network": {"error_m": alone}}
     for name in backends:
         track = Navigator(model, config, backend=name).track(preprocessed)
         found = measure(track, sequence)
         error = _error(found)
-        figures[name] = {"error_m": error, "ratio": error / alone, "nis": found["nis_mean"]}
+        figures[name] = {"error_m": error, "percent": 100.0 * error / path if path else None}
+        figures[name] |= {"ratio": error / alone, "nis": found["nis_mean"]}
         if truth is not None:
             figures[name] |= {"nees": found["nees_median"], **_yaw_at_the_end(track, truth)}
     return scored(sequence.name, figures, group)
@@ -93,6 +98,7 @@ def fusion_gain_table(scores: pd.DataFrame) -> str:
             Column(f"{name} mean", "ratio", ".2f", geometric_mean, where),
             Column("p95", "ratio", ".2f", _percentile_95, where),
             Column("worst", "ratio", ".2f", np.max, where),
+            Column("% of path", "percent", ".1f", np.median, where),
         ]
     first = {"track": backends[0]}
     columns += [
@@ -102,7 +108,7 @@ def fusion_gain_table(scores: pd.DataFrame) -> str:
         Column("< 10 deg", "yaw_good", ".0%", np.mean, first),
         Column("< 3 sigma", "yaw_covered", ".0%", np.mean, first),
     ]
-    return table(parts(scores), columns, "group", _NOTES)
+    return table(parts(scores), columns, notes=_NOTES)
 
 
 def _yaw_at_the_end(track: Track, truth: Trajectory) -> dict[str, float]:
@@ -126,6 +132,17 @@ def _error(figures: Metrics) -> float:
     fitted = figures["ate_fit_m"]
     found = figures["known_positions_m"] if fitted is None else fitted
     return math.nan if found is None else found
+
+
+def _path_length(sequence: ImuSequence) -> float | None:
+    """Return the length of the true path [m]; None for positions whose noise adds up."""
+    if sequence.truth is not None:
+        return sequence.truth.path_length()
+    known = sequence.positions
+    if known is None or known.kind != "waypoints":
+        return None
+    steps = np.diff(known.position_W[known.valid], axis=0)
+    return float(np.linalg.norm(steps, axis=1).sum())
 
 
 def _percentile_95(ratios: FloatArray) -> float:

@@ -19,7 +19,7 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.benchmark.aligned import Complex
 from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position
 from stario.fusion.evaluation.scores import Column, geometric_mean, joined, parts, scored
-from stario.fusion.evaluation.text import rows_of
+from stario.fusion.evaluation.text import table
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
@@ -28,7 +28,6 @@ from stario.sequences.arrays import interpolated
 from stario.sequences.attitude.rotations import GyroIntegral
 from stario.sequences.attitude.stacks import composed
 from stario.sequences.clean_samples import clean_samples
-from stario.sequences.drawing.text_table import aligned
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
@@ -77,11 +76,11 @@ _COLUMNS = (
 )
 
 
-def simulated_walks(seconds: float = 120.0, seed: int = 0) -> list[ImuSequence]:
+def simulated_walks() -> list[ImuSequence]:
     """Simulate a walk of each carrying mode, with a phone's sensors in a building."""
     walks = []
-    for k, carry in enumerate(_CARRIES, seed):
-        walk = generate_walk(k, seconds, style=WalkStyle(carry=carry))
+    for k, carry in enumerate(_CARRIES):
+        walk = generate_walk(k, 120.0, style=WalkStyle(carry=carry))
         imu = simulate_imu(walk, 100.0, PHONE_IMU, k, name=carry, magnetic_field=INDOOR_FIELD)
         walks.append(imu)
     return walks
@@ -125,13 +124,10 @@ def moment_costs(
 def moment_table(scores: pd.DataFrame) -> str:
     """Return a row for each moment, place and back end: ratios of errors, largest corrections."""
     rows = [
-        (group, backend, part)
+        ((group, str(backend)), part)
         for backend, chosen in scores.groupby("track", sort=False)
         for group, part in parts(chosen)
     ]
-    cells = rows_of([(group, part) for group, _, part in rows], _COLUMNS, "moment")
-    backends = ["back end", *(str(backend) for _, backend, _ in rows)]
-    lines = aligned([[row[0], name, *row[1:]] for row, name in zip(cells, backends, strict=True)])
     step, turn = (Column("", f"{m}_without", over=np.max).value(scores) for m in ("step", "turn"))
     notes = [
         "without: median error [m] of the parts before and after, each fitted in yaw and position;",
@@ -140,7 +136,7 @@ def moment_table(scores: pd.DataFrame) -> str:
         f"step, turn: largest correction between two outputs (without moments {step:.2f} m, "
         f"{turn:.1f} deg); share with at most {MAX_STEP:g} m and {MAX_TURN:g} deg",
     ]
-    return "\n".join([*lines, *notes])
+    return table(rows, _COLUMNS, ("moment", "back end"), notes)
 
 
 def _with_truth(sequence: ImuSequence) -> ImuSequence:

@@ -88,4 +88,4 @@ def _end_shift(unmodified: Track, other: Track, path: float) -> tuple[float, flo
 
 def end_shift_table(scores: pd.DataFrame) -> str:
     """Return a row for each group: share of the ends within limits, and how far ends move."""
-    return table(parts(scores), _COLUMNS, "group")
+    return table(parts(scores), _COLUMNS)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from time import perf_counter, process_time
@@ -20,7 +19,8 @@ from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.navigator import Navigator
 from stario.fusion.state import NavState
 from stario.network.model import DisplacementModel
-from stario.network.runtime.benchmark import network_speed
+from stario.network.runtime.survey import BATCHES, median_milliseconds
+from stario.network.runtime.torch_engine import TorchEngine
 from stario.sequences.datasets.stream_cache import recorded
 from stario.sequences.noise import ImuNoise
 from stario.sequences.readers import read_recording, write_csv
@@ -28,7 +28,7 @@ from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
 
-_RUNS = 5
+_RUNS, _NETWORK_RUNS = 5, 30
 
 _ENGINE_RUNS = 9
 """Number of runs of each engine, alternating; the fastest counts: other load only adds to it."""
@@ -112,6 +112,7 @@ def speed_report(model: DisplacementModel) -> dict[str, Any]:
         runs["run_network"].append(track.seconds_network / minutes)
         seconds, _track = _timed(lambda: fast.track(preprocessed))
         runs["filter_20_hz"].append(seconds / minutes)
+    forms = [model.engine, TorchEngine(model.training_form)]
     medians = {name: float(np.median(values)) for name, values in runs.items()}
     return {
         "filter_s_per_min_20_hz": medians["filter_20_hz"],
@@ -123,7 +124,11 @@ def speed_report(model: DisplacementModel) -> dict[str, Any]:
         **push_speed(model),
         "update_rate_hz": default.config.filter.update_rate,
         **windows_speed(),
-        "network": [asdict(speed) for speed in network_speed(model)],
+        "network": [
+            {"batch": batch, "model": as_run, "torch": in_torch}
+            for batch in BATCHES
+            for as_run, in_torch in [median_milliseconds(forms, batch, _NETWORK_RUNS).tolist()]
+        ],
     }
 
 

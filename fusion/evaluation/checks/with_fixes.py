@@ -99,4 +99,4 @@ _COLUMNS = (
 
 def fixes_table(scores: pd.DataFrame) -> str:
     """Return a row for each group: medians over recordings, and share of yaw errors in 3 sigma."""
-    return table(parts(scores), _COLUMNS, "group", [_NOTE])
+    return table(parts(scores), _COLUMNS, notes=[_NOTE])

@@ -114,7 +114,7 @@ def unread_files(folder: Path) -> list[Path]:
 
 def _groups(folder: Path) -> list[PhoneFiles]:
     """Return a folder's files of each recording, complete or not."""
-    named = [(file, words_of(file.stem)) for file in sorted(folder.iterdir()) if _may_hold(file)]
+    named = [(file, words_of(file.stem)) for file in sorted(folder.iterdir()) if may_hold(file)]
     groups: dict[str, PhoneFiles] = {}
     for file, words in sorted(named, key=lambda item: _preference(*item)):
         sensor = _sensor_of(words)
@@ -158,7 +158,7 @@ def incomplete_sensors(path: Path) -> list[Sensor]:
 
 def names_both_sensors(path: Path) -> bool:
     """Return whether a line at the start of a file names axes of both sensors, clock or not."""
-    for line in head_lines(path) if _may_hold(path) else ():
+    for line in head_lines(path) if may_hold(path) else ():
         axes = (axis_of(cell.strip(" \"'")) for cell in re.split("[,;\t]", line))
         if is_complete({sensor_of(axis[1]) for axis in axes if axis is not None}):
             return True
@@ -167,15 +167,16 @@ def names_both_sensors(path: Path) -> bool:
 
 def _sensors(path: Path) -> list[Sensor]:
     if not path.is_dir():
-        table = sensor_table(path) if _may_hold(path) else None
+        table = sensor_table(path) if may_hold(path) else None
         order: tuple[Sensor, ...] = ("accel", "linear", "gyro", "mag")
         return [sensor for sensor in order if table is not None and sensor in table.axes]
-    files = [file for file in sorted(path.iterdir()) if _may_hold(file)]
+    files = [file for file in sorted(path.iterdir()) if may_hold(file)]
     named = [(sensor_of(words_of(file.stem)), file) for file in files]
     return list(dict.fromkeys(s for s, file in named if s is not None and sensor_table(file)))
 
 
-def _may_hold(file: Path) -> bool:
+def may_hold(file: Path) -> bool:
+    """Return whether a file may hold samples as text, by its name; never raises."""
     return file.suffix.lower() in SUFFIXES and file.is_file() and not file.name.startswith(".")
 
 

@@ -9,9 +9,6 @@ from __future__ import annotations
 
 import csv
 import re
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +27,8 @@ def is_json_export(path: Path) -> bool:
     return _FIRST.match("\n".join(head_lines(path))) is not None
 
 
-@contextmanager
-def unpack_json(path: Path) -> Iterator[Path]:
-    """Write a file for each sensor into a temporary folder, which is deleted after the block.
+def unpack_json(path: Path, folder: Path) -> None:
+    """Write a file for each sensor into a folder.
 
     Raises:
         ReadError: the file is not a JSON array of objects that name sensors.
@@ -44,15 +40,12 @@ def unpack_json(path: Path) -> Iterator[Path]:
             sensors.setdefault(name, []).append(row)
     if not sensors:
         raise ReadError(path, "sensor", "no name", "a sensor name in each object")
-    with tempfile.TemporaryDirectory(prefix="stario-") as folder:
-        for name, rows in sensors.items():
-            titles = [title for title in rows[0] if title != "sensor"]
-            file = Path(folder) / f"{name}.csv"
-            with file.open("w", newline="", encoding="utf-8") as text:
-                writer = csv.DictWriter(text, titles, extrasaction="ignore")
-                writer.writeheader()
-                writer.writerows(rows)
-        yield Path(folder)
+    for name, rows in sensors.items():
+        titles = [title for title in rows[0] if title != "sensor"]
+        with (folder / f"{name}.csv").open("w", newline="", encoding="utf-8") as text:
+            writer = csv.DictWriter(text, titles, extrasaction="ignore")
+            writer.writeheader()
+            writer.writerows(rows)
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:

@@ -10,9 +10,6 @@ The rows are sorted into a file for each sensor, to be read as the folder of a p
 from __future__ import annotations
 
 import re
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,9 +46,8 @@ def is_echo(lines: list[str]) -> bool:
     return lines[:1] != [] and lines[0].rstrip() == "header:"
 
 
-@contextmanager
-def unpack_long_form(path: Path) -> Iterator[Path]:
-    """Write a file for each sensor into a temporary folder, which is deleted after the block.
+def unpack_long_form(path: Path, folder: Path) -> None:
+    """Write a file for each sensor into a folder.
 
     Raises:
         ReadError: the file cannot be read or has another form.
@@ -67,13 +63,11 @@ def unpack_long_form(path: Path) -> Iterator[Path]:
         name = "".join(row[layout.column : layout.column + 1])
         stem = re.sub(r"\W+", "_", name) or "unnamed"
         sensors.setdefault(stem, []).append(row)
-    with tempfile.TemporaryDirectory(prefix="stario-") as folder:
-        for stem, own in sensors.items():
-            kept = ([cell for k, cell in enumerate(row) if k != layout.column]
-                    for row in [*titles, *own])  # fmt: skip
-            text = "".join((layout.delimiter or " ").join(row) + "\n" for row in kept)
-            (Path(folder) / f"{stem}.csv").write_text(text, encoding="utf-8")
-        yield Path(folder)
+    for stem, own in sensors.items():
+        kept = ([cell for k, cell in enumerate(row) if k != layout.column]
+                for row in [*titles, *own])  # fmt: skip
+        text = "".join((layout.delimiter or " ").join(row) + "\n" for row in kept)
+        (folder / f"{stem}.csv").write_text(text, encoding="utf-8")
 
 
 def _layout(lines: list[str]) -> _Layout | None:

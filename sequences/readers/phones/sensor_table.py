@@ -98,7 +98,9 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
         raise ReadError(table.file, "header", f"several IMUs ({table.conflict})", "one", fix)
     places, clock = table.axes[axes], table.clocks.get(axes, table.clock)
     head = table.head
-    refuse_several_devices(table.file, head.titles, head.skip, head.delimiter, places[0].index)
+    refuse_several_devices(
+        table.file, head.titles, head.layout.skip, head.layout.delimiter, places[0].index
+    )
     titles = ", ".join(p.title or f"column {p.index + 1}" for p in places)
     rows = table.read([clock, *places, *table.biases])
     kept = _complete_rows(table.file, sensor, titles, rows.values[:, 1:])
@@ -111,9 +113,9 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
     values = unit_factor(table.file, named, UNITS[sensor]) * values
     sound = _sound_samples(table.file, sensor, titles, values)
     kept, time, values = kept[sound], time[sound], values[sound]
-    per_second = time_unit(table.file, time, clock.unit)
-    stamps = rows.stamps_ns(clock.index, per_second, kept)
-    assumed = "" if clock.unit else assumed_unit(per_second, float(time[0]))
+    unit_ns = time_unit(table.file, time, clock.unit)
+    stamps = rows.stamps_ns(clock.index, unit_ns, kept)
+    assumed = "" if clock.unit else assumed_unit(unit_ns, float(time[0]))
     return Samples(stamps, values, named.unit, assumed)
 
 
@@ -158,5 +160,5 @@ def read_quaternion(table: SensorTable) -> tuple[IntArray, FloatArray]:
         ReadError: a row is malformed.
     """
     rows = table.read([table.clock, *table.quaternion])
-    per_second = time_unit(table.file, rows.values[:, 0], table.clock.unit)
-    return rows.stamps_ns(table.clock.index, per_second), rows.values[:, 1:]
+    unit_ns = time_unit(table.file, rows.values[:, 0], table.clock.unit)
+    return rows.stamps_ns(table.clock.index, unit_ns), rows.values[:, 1:]

@@ -82,8 +82,8 @@ def unit_of(name: str) -> str:
 
 
 def _bracketed_unit(name: str) -> str:
-    match = _BRACKETS.search(name)
-    return unit_named(match[1]) if match else ""
+    named = (match[1] for match in _BRACKETS.finditer(name) if not match[1].isdecimal())
+    return unit_named(next(named, ""))  # not the number of a device: `IMU(0):gyroX`
 
 
 def _without_unit(name: str) -> tuple[str, str]:

@@ -13,7 +13,7 @@ from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import finite_rows, magnetometer, rotations
 from stario.sequences.readers.json_file import read_json
 from stario.sequences.readers.lines import first_line, read_lines
-from stario.sequences.readers.text import read_table, seconds
+from stario.sequences.readers.text import Layout, read_table, seconds
 from stario.sequences.sequence import FloatArray, Magnetometer
 
 
@@ -47,7 +47,7 @@ class NamedColumns:
         read = [*names, *(axes_of(self._magnetic) if self._magnetic else [])]
         self._places = {name: k for k, name in enumerate(read)}
         self._columns = [header.index(name) for name in read]
-        self._table = read_table(path, self._columns, skip=1)
+        self._table = read_table(path, self._columns, Layout(skip=1))
         values = self._table.values[:, : len(names)]
         damaged = np.flatnonzero(~np.isfinite(values).all(axis=0))
         self._rows = finite_rows(path, ", ".join(read[k] for k in damaged), values)
@@ -59,13 +59,13 @@ class NamedColumns:
     def rotations(self, stem: str) -> Rotation:
         """Return the N rotations in the columns `stem_w`, ..., `stem_z`."""
         quat_wxyz = self._all_rows(stem, "wxyz")
-        first = self._table.first_row
+        first = self._table.line_numbers[0]
         return rotations(self._table.path, stem, quat_wxyz, first_row=first, rows=self._rows)
 
-    def seconds(self, name: str, per_second: int = 10**9) -> FloatArray:
+    def seconds(self, name: str, unit_ns: int = 1) -> FloatArray:
         """Return a column of times (N,) as seconds since the first."""
         place = self._columns[self._places[name]]
-        stamps = self._table.stamps_ns(place, per_second, self._rows)
+        stamps = self._table.stamps_ns(place, unit_ns, self._rows)
         return seconds(stamps, stamps[0])
 
     def magnetometer(self, time: FloatArray) -> Magnetometer | None:

@@ -37,7 +37,7 @@ def read_euroc(path: Path) -> ImuSequence:
         raise ReadError(path, "mav0/imu0/data.csv", "no such file", expected, "unpack all of it")
     _check_titles(imu)
     table = read_table(imu, columns=7)
-    stamps = table.stamps_ns(0, _per_second(imu))
+    stamps = table.stamps_ns(0, _unit_ns(imu))
     truth_file = _truth_file(imu.parent.parent)
     return ImuSequence(
         name=_name(imu),
@@ -62,10 +62,10 @@ def _check_titles(imu: Path) -> None:
         raise ReadError(imu, "header", repr(header.strip()[:80]), expected, fix)
 
 
-def _per_second(path: Path) -> int:
-    """Return the units per second of a file's times, nanoseconds unless its title names another."""
+def _unit_ns(path: Path) -> int:
+    """Return the unit of a file's times [ns], nanoseconds unless its title names another."""
     title = next(iter(first_lines(path, 1, comments=True)), "").split(",")[0]
-    return TIME_UNITS.get(time_unit_of(title), TIME_UNITS["ns"])
+    return TIME_UNITS.get(time_unit_of(title), 1)
 
 
 def is_euroc(path: Path) -> bool:
@@ -96,7 +96,7 @@ def _truth(path: Path, start_ns: np.int64) -> Trajectory:
     estimated = path.parent.name.startswith("state_groundtruth")
     columns = 11 if estimated and (first_line(path) or "").count(",") >= 10 else 8
     rows = read_table(path, columns=columns)
-    table, time = rows.values, seconds(rows.stamps_ns(0, _per_second(path)), start_ns)
+    table, time = rows.values, seconds(rows.stamps_ns(0, _unit_ns(path)), start_ns)
     keep = pose_mask(path, time)
     table, time = table[keep], time[keep]
     attitude_WB, valid = captured_rotations(table[:, [5, 6, 7, 4]])

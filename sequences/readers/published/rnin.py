@@ -42,7 +42,7 @@ def read_rnin(path: Path) -> ImuSequence:
         raise ReadError(file, "file", "no such file", f"a recording's {_FILE}")
     time_name = "times" if "times" in header_names(file) else "time"
     columns = NamedColumns(file, (time_name, *_COLUMNS), magnetic=_MAGNETIC)
-    time = columns.seconds(time_name, per_second=1)
+    time = columns.seconds(time_name, unit_ns=10**9)
     captured = bool((np.ptp(columns.stack("gt_q", "wxyz"), axis=0) > 0).any())
     source = "gt" if captured else "vio"
     attitude_WB = columns.rotations(f"{source}_q")

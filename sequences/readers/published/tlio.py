@@ -148,7 +148,7 @@ def _read_raw(file: Path) -> ImuSequence:
     table = read_table(file, columns=8)
     samples = table.values[:, 2:8]
     rows = finite_rows(file, "samples", samples)
-    stamps, samples = table.stamps_ns(rows=rows), samples[rows]
+    stamps, samples = table.stamps_ns(kept=rows), samples[rows]
     calibration = JsonFields(file.with_name(_CALIBRATION))
     sequence = ImuSequence(
         name=file.resolve().parent.name,

@@ -211,17 +211,16 @@ def test_evaluate_compares_with_other_weights_by_groups(
         "--out", "out", "--json",
     )  # fmt: skip
     assert done.code == 0, done.err
-    groups = {group["name"]: group for group in json.loads(done.out)["groups"]}
-    short, long = groups[recording.parent.name], groups["walks"]
+    groups = {(group["group"], group["role"]): group for group in json.loads(done.out)["groups"]}
+    short, long = (groups[name, "ours"] for name in (recording.parent.name, "walks"))
     equal = {"ratio": 1.0, "low": None, "high": None}  # one block each has no interval
-    assert short["ratios"] == {"rms_1s_m": equal}
-    assert long["ratios"] == {"rms_1s_m": equal, "rms_10s_m": equal}
-    figures = long["medians"]["default"]
-    assert figures["length_ratio"] == pytest.approx(1.0, abs=0.2)
-    assert figures["rms_1s_m"] < figures["rms_10s_m"] < 10.0 * figures["rms_1s_m"]
-    assert 0.5 < figures["nis_ekf"] < 6.0  # 3 is expected of a consistent filter
+    assert (short["ratio_1s"], short["ratio_10s"]) == (equal, None)
+    assert (long["ratio_1s"], long["ratio_10s"]) == (equal, equal)
+    assert long["length_ratio"] == pytest.approx(1.0, abs=0.2)
+    assert long["rms_1s_m"] < long["rms_10s_m"] < 10.0 * long["rms_1s_m"]
+    assert 0.5 < long["nis_ekf"] < 6.0  # 3 is expected of a consistent filter
     written = json.loads((tmp_path / "out/groups.json").read_text())["groups"]
-    assert {group["name"]: group for group in written} == groups
+    assert {(group["group"], group["role"]): group for group in written} == groups
 
 
 def test_every_option_that_changes_what_is_read_is_part_of_the_key_of_a_cache() -> None:

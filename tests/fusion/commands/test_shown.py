@@ -55,7 +55,7 @@ def test_compare_without_truth_shows_only_what_is_known(stario, recording, no_fi
 
 
 def test_view_writes_a_file_and_opens_it(stario, recording, tmp_path, no_figures, monkeypatch):
-    pytest.importorskip("rerun", reason="pip install 'stario[view]'")
+    pytest.importorskip("rerun", reason="pip install '.[view]'")
     opened = []
     monkeypatch.setattr("stario.fusion.report.view.open_view", opened.append)
     assert stario("run", recording, "--out", "seen", "--view").code == 0

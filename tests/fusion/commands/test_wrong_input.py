@@ -226,7 +226,7 @@ def test_a_missing_package_ends_a_batch_instead_of_leaving_out_recordings(
     (tmp_path / "list.txt").write_text("all.h5:walk\n")
     monkeypatch.setitem(sys.modules, "h5py", None)
     done = stario(command, recording, where, "--out", "out")
-    done.assert_one_line_error("h5py", "not installed", "stario[readers]")
+    done.assert_one_line_error("h5py", "not installed", "pip install 'h5py>=3")
 
 
 def test_waypoints_alone_cannot_be_all_recorded_data(

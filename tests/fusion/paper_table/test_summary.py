@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from stario.fusion.paper_table.published import published
 from stario.fusion.paper_table.sets import DataSet
-from stario.fusion.paper_table.summary import Content, seconds_by_network, set_table
-from stario.fusion.paper_table.text import published, table_text
+from stario.fusion.paper_table.table import set_table, table_text, work_of
 from stario.network.runtime.survey import ModelRow
 from stario.network.training.config import TrainingConfig
 from stario.sequences.datasets.splits import ListEntry
@@ -17,7 +20,7 @@ TESTED = tuple(ListEntry(Path(f"ridi.h5:{name}"), "ridi") for name in "ab")
 DATASET = DataSet("own", (Path("ridi.h5:c"),), (Path("ridi.h5:d"),), TESTED, "")
 
 
-def content(ate_m: float, seconds: float = 0.0) -> Content:
+def content(ate_m: float, seconds: float = 0.0) -> Mapping[str, Any]:
     """Results on both recordings, the second without a drift."""
     tracks = [
         {"network_true_attitude": {"ate_m": ate_m, "rte_m": 2.0, "pde": pde}}
@@ -32,29 +35,31 @@ def content(ate_m: float, seconds: float = 0.0) -> Content:
     return {"recordings": recordings, "skipped": [], "seconds": seconds}
 
 
-def trained(ate_m: float) -> Content:
-    work = {"windows": 100, "step_seconds": 0.5, "seconds": 7200.0, "skipped": []}
+def trained(ate_m: float) -> Mapping[str, Any]:
+    work = {"windows_per_s": 200.0, "seconds": 7200.0, "skipped": []}
     errors = {"training_error_m2": 0.1, "validation_error_m2": 0.2}
     return {**content(ate_m, seconds=1800.0), "trained": work | errors}
 
 
 def test_errors_are_means_over_recordings_in_their_units() -> None:
-    [row] = set_table(DATASET, {"pdr": {0: content(1.5)}}, {}).rows
-    assert row.figures["ate"].value == 1.5
-    assert row.figures["pde"].value == pytest.approx(3.0)  # in %, where it is known
-    assert set(row.figures) == {"ate", "rte", "pde"}
+    [row] = set_table(DATASET, {"pdr": {0: content(1.5)}}, {}).means()
+    assert row["ate"] == 1.5
+    assert row["pde"] == pytest.approx(3.0)  # in %, where it is known
+    known = {key for key, value in row.items() if isinstance(value, float) and np.isfinite(value)}
+    assert known == {"ate", "rte", "pde"}
 
 
 def test_recordings_that_weights_have_learned_are_counted_among_the_tested_ones() -> None:
     learned = {"default": frozenset({TESTED[0].path, *DATASET.training, *DATASET.validation})}
     table = set_table(DATASET, {"default": {0: content(1.0)}, "open": {0: content(1.0)}}, learned)
-    assert [(row.network, row.learned) for row in table.rows] == [("default", 1), ("open", 0)]
+    rows = table.rows.to_dict("records")
+    assert [(row["network"], row["learned"]) for row in rows] == [("default", 1), ("open", 0)]
 
 
 def test_work_is_told_in_core_hours_and_windows_per_second() -> None:
     completed = {"StarIO": {0: trained(1.0), 1: trained(1.2)}}
-    work = seconds_by_network([completed])
-    assert work == {"StarIO": (14400.0, 3600.0, 200.0)}
+    work = work_of([completed])
+    assert work.loc["StarIO"].tolist() == [14400.0, 3600.0, 200.0]
     times = {"torch": {"1": 1.0, "64": 0.5}}
     costs = [ModelRow("StarIO", 2_761_650, 25_124_210, 2_761_682, times, 11.2)]
     text = table_text([set_table(DATASET, completed, {})], costs, work, TrainingConfig())

@@ -9,7 +9,7 @@ from stario.sequences.sequence import Trajectory
 
 @pytest.fixture
 def view():
-    pytest.importorskip("rerun", reason="pip install 'stario[view]'")
+    pytest.importorskip("rerun", reason="pip install '.[view]'")
     from stario.fusion.report import view
 
     return view

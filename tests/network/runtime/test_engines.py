@@ -19,9 +19,9 @@ from stario.network.card import Card
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import load_model, save_model
 from stario.network.runtime import onnx_engine
-from stario.network.runtime.benchmark import network_speed, random_windows
 from stario.network.runtime.engines import Engine, Float32Array
 from stario.network.runtime.onnx_engine import GRAPHS, OnnxEngine, weights_engine
+from stario.network.runtime.survey import random_windows
 from stario.network.runtime.torch_engine import TorchEngine
 from stario.network.stario import StarIO
 from stario.sequences.sequence import STANDARD_GRAVITY
@@ -199,9 +199,3 @@ def test_weights_and_commands_need_no_pytorch(tmp_path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-
-
-def test_speed_is_measured_for_each_batch() -> None:
-    speeds = network_speed(load_model("default"), batches=(1, 4), runs=2)
-    assert [speed.batch for speed in speeds] == [1, 4]
-    assert min(min(speed.model, speed.torch) for speed in speeds) > 0.0

@@ -9,7 +9,7 @@ from stario.network.architectures import ARCHITECTURES, build_network
 from stario.network.card import Calibration, Card
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import DisplacementModel, load_model, save_model
-from stario.network.runtime.benchmark import random_windows
+from stario.network.runtime.survey import random_windows
 from stario.network.runtime.torch_engine import TorchEngine
 from stario.sequences.errors import InputError, WeightsError
 from stario.sequences.sequence import FloatArray

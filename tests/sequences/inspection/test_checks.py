@@ -1,3 +1,4 @@
+import re
 import warnings
 from dataclasses import replace
 
@@ -33,8 +34,9 @@ def without_gravity(sequence: ImuSequence) -> ImuSequence:
 
 
 def refusal(sequence: ImuSequence) -> str:
+    """Return the error of a recording that was read from a file."""
     with pytest.raises(InputError) as caught:
-        check_units(sequence)
+        check_units(replace(sequence, source="generic CSV"))
     text = str(caught.value)
     assert "\n" not in text
     assert text.startswith(sequence.name)
@@ -381,5 +383,49 @@ def test_the_unit_of_a_vehicle_that_turns_about_the_vertical_is_asked_for(
     level = np.zeros((len(time), 3))
     level[:, 2] = 9.81
     tilted = 9.81 * np.column_stack([np.zeros(len(time)), np.sin(angle), np.cos(angle)])
-    check_units(ImuSequence("robot", time, rate, level if axis == 2 else tilted))
+    robot = ImuSequence("robot", time, rate, level if axis == 2 else tilted)
+    check_units(replace(robot, source="generic CSV"))
     assert ("--gyro-unit deg/s" in caplog.text) == asked
+    caplog.clear()
+    check_units(robot)
+    assert ("np.radians(gyro)" in caplog.text) == asked
+
+
+def test_advice_on_arrays_names_no_option_of_the_command(walk: ImuSequence) -> None:
+    walk = walk.without_truth()
+    cases = {
+        "np.radians(gyro)": in_degrees(walk),
+        "9.80665 * accel": replace(walk, accel=walk.accel / STANDARD_GRAVITY),
+        "swapped": replace(walk, gyro=walk.accel, accel=walk.gyro),
+    }
+    for words, wrong in cases.items():
+        with pytest.raises(InputError, match=re.escape(words)) as caught:
+            check_units(wrong)
+        assert "--" not in str(caught.value)
+
+
+def test_a_force_along_minus_z_is_named_for_arrays(
+    walk: ImuSequence, caplog: pytest.LogCaptureFixture
+) -> None:
+    """No other sensor tells the sign; a reader has asked for it."""
+    down = replace(walk.without_truth(), accel=-walk.accel)
+    check_units(walk)
+    check_units(replace(down, source="generic CSV"))
+    assert not caplog.text
+    check_units(down)
+    assert "give -accel" in caplog.text
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_a_saturated_accelerometer_is_named_before_its_unit_is_judged(
+    caplog: pytest.LogCaptureFixture, noise: float
+) -> None:
+    """A runner's steps of up to 4 g, cut at 2 g: the average force is far below gravity."""
+    time = np.arange(6000) / 100.0
+    step = np.sin(2.0 * np.pi * 2.7 * time)
+    force = np.column_stack([np.zeros_like(time), np.zeros_like(time), 9.8 + 60.0 * (step**9)])
+    force[:, 2] = np.clip(force[:, 2] - 24.0 * (step > 0.6) + 15.0 * (step < -0.6), -19.6, 19.6)
+    force += np.random.default_rng(0).normal(0.0, noise, force.shape)
+    gyro = np.column_stack([step, 0.3 * step, np.cos(time)])
+    check_units(ImuSequence("runner", time, gyro, force, source="phone"))
+    assert "of its samples are at its limit of" in caplog.text

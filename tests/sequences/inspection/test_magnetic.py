@@ -88,7 +88,9 @@ def test_magnets_wrong_axes_apples_sign_and_wrong_units_are_detected() -> None:
     lines = inspect_recording(replace(good, truth=None, accel=-good.accel)).lines()
     assert any("points up by" in line and "--accel-sign apple" in line for line in lines)
     unit = Magnetometer(good.magnetometer.time, 1e3 * good.magnetometer.field)
-    assert "another unit" in " ".join(inspect_recording(replace(good, magnetometer=unit)).problems)
+    assert "if in nT, give 0.001" in " ".join(
+        inspect_recording(replace(good, magnetometer=unit)).problems
+    )
 
 
 def test_a_field_extrapolated_by_the_device_is_detected_by_its_constant_norm() -> None:

@@ -14,6 +14,9 @@ from recorded import CASES
 from stario.fusion.config import read_config
 from stario.fusion.fix_file import read_fixes
 from stario.sequences.errors import StarioError
+from stario.sequences.inspection.checks import check_units
+from stario.sequences.inspection.gyro_axes import compare_gyro_axes
+from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.readers import find_recordings, read_recording
 
 
@@ -36,6 +39,9 @@ def case(name: str) -> Path:
         ("zeros_of_other_sensor/accel_333_gyro_100.csv", 15.0, 100.0),
         ("crash_ten_minutes/first_three_samples_lost_30s.csv", 30.0, 100.0),
         ("compare_pdr_positions/walk.csv", None, None),
+        ("xsens_utc_columns/MT_01.txt", 15.0, 100.0),
+        ("one_sensor_per_file_and_time_csv", 15.0, 100.0),
+        ("run_silent_on_axes/gyro_not_rotated.csv", None, None),
     ],
 )
 def test_a_layout_is_read_at_its_rate(name: str, seconds: float | None, rate: float | None) -> None:
@@ -57,11 +63,38 @@ def test_a_layout_is_read_at_its_rate(name: str, seconds: float | None, rate: fl
         ("crash_first_row_short/middle_row_cut.csv", "line 302: found 6 values, expected 7"),
         ("crash_first_row_short/both_ends_cut.csv", "line 2: found 6 values, expected 7"),
         ("rostopic_echo_text/echo.txt", "rostopic echo -p"),
+        ("rostopic_echo_text", "rostopic echo -p"),
+        ("folder_of_CalInertialAndMag/walk_CalInertialAndMag.csv", "--rate"),
     ],
 )
 def test_a_file_is_refused_with_what_to_do(name: str, words: str) -> None:
     with pytest.raises(StarioError, match=words):
         read_recording(case(name))
+
+
+def test_two_exports_without_times_are_two_recordings_at_the_rate_given() -> None:
+    """Gauss, g and deg/s are named by the titles; a packet counter is no time."""
+    found = find_recordings(case("folder_of_CalInertialAndMag"))
+    assert [path.stem.split("_")[0] for path in found] == ["stairs", "walk"]
+    for path in found:
+        read = read_recording(path, rate="256")
+        assert 1.0 / np.median(np.diff(read.time)) == pytest.approx(256.0)
+        assert np.median(np.linalg.norm(read.accel, axis=1)) == pytest.approx(9.8, rel=0.05)
+        assert read.magnetometer is not None
+        assert 20.0 < np.linalg.norm(read.magnetometer.field[0]) < 80.0
+
+
+def test_degrees_of_a_robot_that_turns_only_about_the_vertical_are_asked_for(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    check_units(read_recording(case("gyro_degrees_planar_robot/robot.csv")))
+    assert "--gyro-unit deg/s" in caplog.text
+
+
+def test_axes_of_the_gyroscope_that_are_not_the_accelerometers_are_a_problem() -> None:
+    read = read_recording(case("run_silent_on_axes/gyro_not_rotated.csv"))
+    assert any("gyro" in line and "axes" in line for line in inspect_recording(read).problems)
+    assert compare_gyro_axes(read).problems(read.name)  # which `run` says
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")

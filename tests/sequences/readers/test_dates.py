@@ -57,6 +57,17 @@ def test_times_are_read_with_any_date_and_zone(
     np.testing.assert_allclose(read.gyro[-1], [0.1, 0.2, 0.3])
 
 
+@pytest.mark.parametrize("header", [GENERIC, WIDE])
+def test_days_of_a_spreadsheet_are_times(tmp_path: Path, header: str) -> None:
+    """Days since the end of 1899; ten decimals are eight microseconds."""
+    separator = max(",;", key=header.count)
+    days = [f"{45413.524268391 + 0.01 * k / 86400.0:.10f}" for k in range(200)]
+    rows = [separator.join([day, "0.1", "0.2", "0.3", "1", "2", "9.5"]) for day in days]
+    read = read_recording(write_lines(tmp_path / "own.csv", header, *rows))
+    np.testing.assert_allclose(read.time, 0.01 * np.arange(200), atol=2e-5)
+    assert "taken as" not in read.source
+
+
 def test_zones_and_names_of_months_give_the_same_instant() -> None:
     noon = "1714564800.5"
     for text in ("2024-05-01T12:00:00.5Z", "2024-05-01 14:00:00.5 +02:00", "2024/05/01 12:00:00.5",

@@ -34,11 +34,7 @@ def phone_rows(cells: str = "0.1,0.2,9.5", count: int = 60) -> list[str]:
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-8-sig", "latin-1"])
-def test_any_encoding_of_a_csv_is_read(tmp_path: Path, encoding: str) -> None:
-    path = tmp_path / "own.csv"
-    path.write_bytes(("\n".join([HEADER, *ROWS]) + "\n").encode(encoding))
-    assert find_recordings(path) == [path]
-    assert np.allclose(read_recording(path).accel, [1.5, 2.5, 9.25])
+def test_any_encoding_of_a_phones_files_is_read(tmp_path: Path, encoding: str) -> None:
     folder = phone(tmp_path / "phone", phone_rows(), phone_rows(), encoding)
     assert find_recordings(folder) == [folder]
     assert np.allclose(read_recording(folder).accel, [0.1, 0.2, 9.5])
@@ -70,20 +66,6 @@ def test_a_date_that_is_none_is_refused_in_one_line(tmp_path: Path) -> None:
     rows = [f"2024-02-28T25:00:00.0{k},{ROW}" for k in range(6)]
     with pytest.raises(ReadError, match=r"line 2, t: found '2024-02-28T25:00:00\.00'"):
         read_recording(write(tmp_path / "own.csv", HEADER, *rows))
-
-
-def test_a_line_that_tells_a_spreadsheet_the_separator_is_skipped(tmp_path: Path) -> None:
-    header = f"{HEADER},px [m],py [m],pz [m],qx,qy,qz,qw"
-    rows = [f"{row},1,2,3,0,0,0,1" for row in ROWS]
-    read = read_recording(write(tmp_path / "own.csv", "sep=,", header, *rows))
-    assert read.truth is not None
-    assert len(read.truth) == len(ROWS)
-
-
-def test_quoted_cells_are_numbers(tmp_path: Path) -> None:
-    header, *rows = ([f'"{cell}"' for cell in line.split(",")] for line in (HEADER, *ROWS))
-    path = write(tmp_path / "own.csv", ",".join(header), *map(",".join, rows))
-    assert np.allclose(read_recording(path).accel, [1.5, 2.5, 9.25])
 
 
 @pytest.mark.parametrize("missing", ["", "NA", "n/a", "NULL"])
@@ -127,22 +109,6 @@ def test_a_blank_cell_of_a_phones_sensor_loses_only_its_sample(
     assert 0.4 not in read.time.round(6)
     assert np.allclose(read.accel, [0.1, 0.2, 9.5])
     assert "Gyroscope.csv: dropped 1 samples of the gyro with a blank cell" in caplog.text
-
-
-@pytest.mark.parametrize(("separator", "quote"), [(";", ""), ("\t", ""), (";", '"'), (",", '"')])
-def test_decimal_commas_are_read_where_they_do_not_separate_cells(
-    tmp_path: Path, separator: str, quote: str
-) -> None:
-    rows = [
-        separator.join(f"{quote}{cell.replace('.', ',')}{quote}" for cell in row.split(","))
-        for row in ["0," + ROW, *ROWS[1:]]
-    ]
-    path = write(tmp_path / "own.csv", HEADER.replace(",", separator), *rows)
-    assert find_recordings(path) == [path]
-    read = read_recording(path)
-    assert read.time.tolist() == [0.0, 0.01, 0.02, 0.03, 0.04, 0.05]
-    assert np.allclose(read.gyro, [0.1, 0.2, 0.3])
-    assert np.allclose(read.accel, [1.5, 2.5, 9.25])
 
 
 def test_thousands_are_not_taken_for_fractions(tmp_path: Path) -> None:

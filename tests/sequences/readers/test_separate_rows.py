@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from csv_lines import write_lines
 
-from stario.sequences import ReadError, read_recording
+from stario.sequences import read_recording
 from stario.sequences.readers.columns import HEADER
 from stario.sequences.sequence import FloatArray
 
@@ -83,18 +83,3 @@ def test_gravity_in_columns_of_its_own_is_added(tmp_path: Path, accel: str) -> N
     rows = [f"{t},{text(rate(t))},{t},{-t},0.5,1,2,8.5" for t in GYRO_TIMES.tolist()]
     path = write_lines(tmp_path / "own.csv", ",".join(["t", *names]), *rows)
     np.testing.assert_allclose(read_recording(path).accel, expected(GYRO_TIMES, 0.0)[1], atol=1e-9)
-
-
-@pytest.mark.parametrize("header", [HEADER, WIDE])
-def test_units_in_a_second_row_are_converted(tmp_path: Path, header: str) -> None:
-    titles = [title.split(" [")[0] for title in header.split(",")]
-    units = "ms,deg/s,deg/s,deg/s,g,g,g"
-    rows = [f"{10 * k},90,0,-90,0,0,1" for k in range(200)]
-    path = write_lines(tmp_path / "own.csv", ",".join(titles), units, *rows)
-    read = read_recording(path)
-    assert read.rate == pytest.approx(100.0)
-    np.testing.assert_allclose(read.gyro[0], np.radians([90.0, 0.0, -90.0]))
-    np.testing.assert_allclose(read.accel[0], [0.0, 0.0, 9.80665])
-    path.write_text(path.read_text().replace("deg/s", "counts", 1))
-    with pytest.raises(ReadError, match="found unit 'counts'"):
-        read_recording(path)

@@ -53,6 +53,10 @@ def test_the_error_of_the_fusion_at_waypoints_agrees_with_its_error_at_poses(
     waypoints = fusion_gain(oracle, at_waypoints, CONFIG, "walks", ("ekf",))
     assert of(poses, "error_m") < 0.5
     assert of(waypoints, "error_m") == pytest.approx(of(poses, "error_m"), abs=0.2)
+    path = walk.truth.path_length()
+    assert of(poses, "percent") == pytest.approx(100.0 * of(poses, "error_m") / path)
+    legs = np.linalg.norm(np.diff(at[1], axis=0), axis=1).sum()
+    assert of(waypoints, "percent") == pytest.approx(100.0 * of(waypoints, "error_m") / legs)
 
 
 def test_the_yaw_error_is_that_since_the_start_next_to_the_sigma_of_yaw(

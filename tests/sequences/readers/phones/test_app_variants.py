@@ -48,20 +48,6 @@ def android(folder: Path, walk: ImuSequence) -> None:
     zyx(folder, walk, TotalAcceleration=walk.accel, Gyroscope=walk.gyro, Magnetometer=field(walk))
 
 
-def with_byte_order_mark(folder: Path, walk: ImuSequence) -> None:
-    android(folder, walk)
-    for file in folder.iterdir():
-        file.write_text("\ufeff" + file.read_text(), encoding="utf-8")
-
-
-def every_cell_quoted(folder: Path, walk: ImuSequence) -> None:
-    """As saved by a spreadsheet on Windows."""
-    android(folder, walk)
-    for file in folder.iterdir():
-        lines = ['"' + line.replace(",", '","') + '"' for line in file.read_text().splitlines()]
-        file.write_bytes("\r\n".join([*lines, ""]).encode())
-
-
 def readable_times(folder: Path, walk: ImuSequence) -> None:
     texts = [["2024-06-10 14:45:36.872"]] * len(walk)
     for name, values in (("TotalAcceleration", walk.accel), ("Gyroscope", walk.gyro),
@@ -246,7 +232,7 @@ def ios_logger_with_poses(folder: Path, walk: ImuSequence) -> None:
 VARIANTS: dict[str, Callable[[Path, ImuSequence], None]] = {
     write.__name__: write
     for write in (
-        with_byte_order_mark, every_cell_quoted, readable_times, extra_sensors, watch, iphone,
+        readable_times, extra_sensors, watch, iphone,
         iphone_standardised, iphone_uncalibrated, json_export, json_export_of_a_watch, zip_in_a_zip,
         phyphox_with_and_without_g, phyphox_one_table, androsensor_other_units,
         androsensor_garbled, androsensor_lost_symbols, senslogs_first_version,
@@ -328,7 +314,7 @@ def test_an_undetermined_accelerometer_sign_is_reported(
     ios_logger(tmp_path / "t", walk)
     for name in ("Motion.txt", "MotMagnFull.txt"):
         (tmp_path / "t" / name).unlink()
-    with pytest.raises(InputError, match=r"`--accel-unit g` \(and `--accel-sign apple`"):
+    with pytest.raises(InputError, match=r"`--accel-unit g`.* `--accel-sign apple`"):
         check_units(read_recording(tmp_path / "t"))
     assert not caplog.text
 

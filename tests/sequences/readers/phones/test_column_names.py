@@ -35,6 +35,8 @@ def header(clock: str, accel: str, gyro: str, separator: str = ",") -> str:
         (header("time_s", "acc_#_mps2", "gyro_#_rads"), 1.0, 1.0),
         (header("t", "a#_g", "g#_dps"), G, DEG),
         (header("t", "a#_ms2", "w#_rad_s"), 1.0, 1.0),
+        (header("time", "IMU(0):acc#", "IMU(0):gyro#"), 1.0, 1.0),
+        (header("time", "IMU(0):acc# (g)", "IMU(0):gyro# (deg/s)"), G, DEG),
         (header("Time, s", "Acc #, g", "Gyro #, deg/s", ";"), G, DEG),
     ],
 )
@@ -51,6 +53,16 @@ def test_a_single_g_is_a_unit_only_next_to_a_sensor() -> None:
     assert (axis_of("imu_g_x"), unit_of("imu_g_x")) == (("x", ("imu", "g")), "")
     assert sensor_of(("imu", "g")) == "gyro"
     assert unit_of("gx") == unit_of("gyro_x_g") == ""
+
+
+def test_a_magnetic_field_in_gauss_is_converted(walk: ImuSequence, tmp_path: Path) -> None:
+    titles = header("Time (s)", "Accelerometer # (g)", "Gyroscope # (deg/s)")
+    titles += ",Magnetometer X (G),Magnetometer Y (G),Magnetometer Z (G)"
+    field = 0.5 * walk.gyro
+    save(tmp_path / "own.csv", titles, walk.time, G * walk.accel, DEG * walk.gyro, field)
+    read = read_recording(tmp_path / "own.csv")
+    assert read.magnetometer is not None
+    np.testing.assert_allclose(read.magnetometer.field, 100.0 * field, atol=1e-6)
 
 
 def test_numbered_elements_of_a_sensor_are_its_axes(walk: ImuSequence, tmp_path: Path) -> None:

@@ -143,7 +143,10 @@ def test_messages_about_a_zip_name_the_zip_and_the_file(
             file.writestr(f"walk/{one.name}", one.read_text()[:-20])
     with caplog.at_level("INFO"):
         read_recording(path)
-    assert f"{path}/walk/Gyroscope.csv: skipped the last row, which is cut short" in caplog.text
+    assert (
+        f"{path}/walk/Gyroscope.csv: skipped the last row, line 1502, which is cut short"
+        in caplog.text
+    )
     assert "stario-" not in caplog.text
     caplog.clear()
     read_recording(tmp_path / "s")

@@ -1,0 +1,172 @@
+"""Simulated walks beside recordings: motion by band, step rate, and errors, by way of carrying.
+
+A simulator that moves like people lets tests, training and the demonstration say something about
+real walks. Recordings are those of archives whose attribute `carry` is in `CARRIED`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+from scipy.signal import butter, sosfiltfilt, welch
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.compare import Metrics, measure
+from stario.fusion.evaluation.scores import Column, scored
+from stario.fusion.evaluation.text import table
+from stario.fusion.evaluation.tracks import network_track
+from stario.fusion.imu.stateful import Predictor
+from stario.fusion.navigator import Navigator
+from stario.sequences.arrays import even_grid, generator, interpolated, rms
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
+from stario.sequences.simulation.magnetometer import INDOOR_FIELD
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
+
+CARRIED = {
+    "pocket (front)": "pocket",
+    "pocket (back)": "back-pocket",
+    "handheld (texting)": "texting",
+    "handheld (at the ear)": "call",
+    "swinging": "swinging",
+    "bag": "bag",
+    "handheld (flat in front)": "handheld",
+}
+"""The simulator's carrying mode for an archive's attribute `carry`."""
+
+SPEEDS = {
+    "pocket": 0.8,
+    "back-pocket": 0.8,
+    "texting": 0.55,
+    "call": 0.65,
+    "swinging": 0.9,
+    "bag": 1.25,
+    "handheld": 1.2,
+}
+"""Preferred speeds [m/s] of the simulated walks: the archives' medians while walking, since bands
+grow with the speed."""
+
+BANDS = ((0.5, 3.0), (3.0, 6.0), (6.0, 10.0), (10.0, 20.0))
+"""Edges [Hz] of the bands: steps, their harmonics, the resonance of heel strikes, and its end."""
+
+_RATE = 100.0
+_STEP_RATES, _STEP_WINDOW = (1.1, 2.8), 5.0
+"""Possible step rates [Hz], and seconds of a spectrum that shows them."""
+
+SIMULATED, RECORDED = "simulated", "recorded"
+
+
+def simulated_walk(carry: str, seed: int, seconds: float = 120.0) -> ImuSequence:
+    """Simulate a person, drawn with the walk, who carries a phone in a building."""
+    rng = generator(seed)
+    speed = SPEEDS[carry] * float(rng.uniform(0.8, 1.2))
+    style = replace(WalkStyle.random(rng), carry=carry, next_carry="", preferred_speed=speed)
+    walk = generate_walk(seed, seconds, style=style)
+    name = f"{carry} {seed}"
+    return simulate_imu(walk, _RATE, PHONE_IMU, seed, name=name, magnetic_field=INDOOR_FIELD)
+
+
+def carry_of(sequence: ImuSequence) -> str:
+    """Return the simulator's name of how a recording was carried.
+
+    Raises:
+        InputError: its attributes do not say, or it is none of `CARRIED`.
+    """
+    carry = sequence.attributes.get("carry", "none")
+    if carry not in CARRIED:
+        where = f"{sequence.name}: attribute carry"
+        raise InputError(where, str(carry), f"one of {', '.join(CARRIED)}")
+    return CARRIED[str(carry)]
+
+
+def motion_scores(
+    model: Predictor, sequence: ImuSequence, config: NavigatorConfig, carry: str, kind: str
+) -> pd.DataFrame:
+    """Score a recording's motion, as `motion`, and the errors of network and graph [%] of its path.
+
+    Args:
+        model: network.
+        sequence: recording with poses, positions or waypoints.
+        config: configuration of the navigator.
+        carry: carrying mode, the rows' group.
+        kind: `SIMULATED` or `RECORDED`.
+
+    Raises:
+        InputError: it has no ground truth, or cannot be run.
+    """
+    length = _path_length(sequence)
+    navigator = Navigator(model, config, backend="graph")
+    observed = navigator.observe(sequence)
+    figures: Metrics = dict(motion(sequence))
+    figures["speed"] = length / sequence.duration
+    for name, track in (("network", network_track(observed)), ("graph", navigator.track(observed))):
+        found = measure(track, sequence)
+        error = found["known_positions_m"] if found["ate_fit_m"] is None else found["ate_fit_m"]
+        figures[name] = None if error is None else 100.0 * error / length
+    return scored(sequence.name, {kind: figures}, carry)
+
+
+def motion(sequence: ImuSequence) -> dict[str, float]:
+    """Return how a device moves.
+
+    It is the root mean square in each band of the specific force's norm [m/s^2], which no attitude
+    changes, that of the angular rate [rad/s], and the median step rate [Hz].
+    """
+    time = even_grid(float(sequence.time[0]), float(sequence.time[-1]), 1.0 / _RATE)
+    force = np.linalg.norm(interpolated(time, sequence.time, sequence.accel), axis=1)
+    found = {f"force_{low:g}": rms(_in_band(force, low, high)[:, None]) for low, high in BANDS}
+    return {**found, "rate": rms(sequence.gyro), "step_rate": float(np.median(_step_rates(force)))}
+
+
+def _in_band(values: FloatArray, low: float, high: float) -> FloatArray:
+    filtered = sosfiltfilt(butter(4, (low, high), "bandpass", fs=_RATE, output="sos"), values)
+    return np.asarray(filtered, dtype=np.float64)
+
+
+def _step_rates(force: FloatArray) -> FloatArray:
+    """Return the strongest frequency (M,) [Hz] of the force's norm in each window."""
+    count = round(_STEP_WINDOW * _RATE)
+    windows = force[: len(force) // count * count].reshape(-1, count)
+    f, power = welch(windows, _RATE, nperseg=count, nfft=4 * count)
+    possible = (f > _STEP_RATES[0]) & (f < _STEP_RATES[1])
+    return np.asarray(f[possible][np.argmax(power[:, possible], axis=1)])
+
+
+def _path_length(sequence: ImuSequence) -> float:
+    """Return the length of the true path [m]: with waypoints, of the straight lines between."""
+    if sequence.truth is not None:
+        return sequence.truth.path_length()
+    if sequence.positions is None:
+        raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
+    steps = np.diff(sequence.positions.position_W[sequence.positions.valid], axis=0)
+    return float(np.linalg.norm(steps, axis=1).sum())
+
+
+def motion_table(scores: pd.DataFrame) -> str:
+    """Return for each way of carrying a row of simulated walks and one of recordings."""
+    columns = [
+        Column("n", "rate", ".0f", len),
+        *(Column(f"{low:g}-{high:g} Hz", f"force_{low:g}", ".2f") for low, high in BANDS),
+        Column("rate", "rate", ".2f"),
+        Column("steps", "step_rate", ".2f"),
+        Column("speed", "speed", ".2f"),
+        Column("network %", "network", ".1f"),
+        Column("graph %", "graph", ".1f"),
+    ]
+    notes = [
+        "medians; force by band [m/s^2]: root mean square of its norm; rate: of the angular rate "
+        "[rad/s]; steps [Hz]; speed: path over time [m/s]",
+        "network, graph: error after a fit of yaw and position, in % of the path",
+    ]
+    if RECORDED not in set(scores["track"]):
+        notes.append("recordings to compare with: none given (PATH: archives with attribute carry)")
+    return table(list(_rows(scores)), columns, ("carried",), notes)
+
+
+def _rows(scores: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    for (carry, kind), part in scores.groupby(["group", "track"]):
+        yield f"{carry}, {kind}", part
