@@ -32,6 +32,7 @@ VIRTUAL = {"cmu.h5": 0.15, "bandai.h5": 0.12}
 
 
 def stario(*arguments: object) -> None:
+    """Run a command of StarIO."""
     subprocess.run(
         [sys.executable, "-m", "stario.fusion.commands.cli", *map(str, arguments)], check=True
     )
@@ -69,6 +70,7 @@ def judged(data: Path, out: Path, left_out: str) -> None:
 
 
 def main() -> None:
+    """Train, then judge, set by set."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, default=os.environ.get("STARIO_DATA"))
     parser.add_argument("--out", type=Path, default=Path("runs/left-out"))
