@@ -22,7 +22,7 @@ from pathlib import Path
 
 from stario.network.training.splits import read_packaged_list
 
-SETS = ("tyrex", "ilc", "rocip", "ridi", "kipd", "rfbr", "ipin")
+SETS = ("tyrex", "ilc", "rocip", "ridi", "kipd", "rfbr")
 RECIPE = {
     "epochs": 2, "epoch_windows": 120_000, "batch": 160, "rate": 7e-4, "dropout": 0.2,
     "likelihood_from": 0.0, "precision": "bfloat16", "patience": 100, "seed": 1,
