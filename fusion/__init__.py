@@ -10,7 +10,7 @@ Fixes from outside: `Fix`, `FixOutcome`, `position_fix`, `velocity_fix`, `yaw_fi
 Compare tracks: `compare`, `Comparison`, `compare_recordings`, `Scores`, `scores_of`,
 `summary_table`, `network_track`, `inertial_track`, `demonstration`.
 
-Parts on their own: `StateCloningEkf`, `UpdateResult`, `preintegrate`, `Segment`, `Predictor`,
+Parts on their own: `UpdateResult`, `preintegrate`, `Segment`, `Predictor`,
 `PreprocessedRecording`, `WindowDisplacement`.
 
 Live: `LiveServer`, with the extra live.

@@ -14,9 +14,8 @@ from stario.fusion.evaluation.summary import scores_of as scores_of
 from stario.fusion.evaluation.summary import summary_table as summary_table
 from stario.fusion.evaluation.tracks import inertial_track as inertial_track
 from stario.fusion.evaluation.tracks import network_track as network_track
-from stario.fusion.filter.ekf import StateCloningEkf as StateCloningEkf
-from stario.fusion.filter.engine import UpdateResult as UpdateResult
 from stario.fusion.filter.initial import PriorPose as PriorPose
+from stario.fusion.filter.kalman import UpdateResult as UpdateResult
 from stario.fusion.fix_file import read_fixes as read_fixes
 from stario.fusion.fixes import Fix as Fix
 from stario.fusion.fixes import FixOutcome as FixOutcome

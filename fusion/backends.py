@@ -1,7 +1,7 @@
-"""The two back ends behind one interface: the EKF, and the factor graph initialised from it.
+"""The two estimators, EKF and factor graph, of streams and of recordings.
 
-For a stream, a back end creates an estimator that is stepped interval by interval; for a recording,
-it turns the filter's output into the states of the track.
+A stream's is stepped interval by interval. A recording is filtered, and then smoothed as a whole by
+the graph, which starts from the filter's states.
 """
 
 from __future__ import annotations
@@ -15,22 +15,18 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
-from stario.fusion.config import NavigatorConfig
+from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.filter import estimator
 from stario.fusion.filter.estimates import Estimate, nav_states
-from stario.fusion.filter.estimator import Estimator
-from stario.fusion.filter.estimator_state import IntervalMeasurements, innovations_of
-from stario.fusion.filter.frame_transform import (
-    frame_rotation,
-    smoothed_track,
-    to_final_frame,
-    with_undirected,
-)
+from stario.fusion.filter.estimator_state import EstimatorState
+from stario.fusion.filter.frame_transform import frame_rotation, to_final_frame, with_undirected
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import ASSUMED, GYRO_BIAS
+from stario.fusion.filter.record import Record, innovations_of
 from stario.fusion.fixes import Accepted, Fix, FixQueue
+from stario.fusion.graph import fixed_lag
 from stario.fusion.graph.batch import smooth
 from stario.fusion.graph.covariances import with_actual_covariances
-from stario.fusion.graph.fixed_lag import FixedLagEstimator
 from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.health import Health, SampleCounts
 from stario.fusion.imu.intervals import ImuInterval, Start
@@ -39,33 +35,18 @@ from stario.fusion.recording import PreprocessedRecording, Progress
 from stario.fusion.state import NavState, SmoothedPose, Track, track_from_states
 from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import Trajectory
 
 BackendName = Literal["ekf", "graph"]
-"""The EKF, or the factor graph: fixed-lag for streams, the whole track for recordings."""
+"""The EKF, or the factor graph: over the last seconds of a stream, over all of a recording."""
 
 
-class StreamEstimator(Protocol):
-    """An estimator that runs on a stream, interval by interval; see `filter.estimator`."""
-
-    state: Any
-    """Complete state, which can be assigned back."""
-
-    def step(
-        self,
-        interval: ImuInterval,
-        displacement: WindowDisplacement | None,
-        fixes: Sequence[Fix] = (),
-    ) -> object:
-        """Move to the interval's end and apply the displacement of the window that ends there."""
-
-    def late_fix(self, fix: Fix) -> list[Accepted] | None:
-        """Apply a fix from the past; return all fixes applied since, None if it is too late."""
+class StreamState(Protocol):
+    """State of a stream between two intervals; see `filter.estimator_state`."""
 
     def nav_state(self) -> NavState:
         """Return the newest state."""
 
-    def health(self, counts: SampleCounts) -> Health:
+    def health(self, counts: SampleCounts, f: FilterConfig) -> Health:
         """Return the health report so far."""
 
     @property
@@ -80,83 +61,84 @@ class StreamEstimator(Protocol):
 class FilteredRecording(NamedTuple):
     """A recording after the filter."""
 
-    estimator: Estimator
-    """The filter after the last interval."""
-    estimates: list[Estimate]
-    """The initial state and one per interval."""
-    measurements: list[IntervalMeasurements]
-    """Measurements applied, one entry per interval."""
-    clones: list[Estimate]
-    """Poses released from the window, corrected by all its measurements."""
+    first: Estimate
+    """The initial estimate."""
+    records: list[Record]
+    """What the filter did, interval by interval."""
+    last: EstimatorState
+    """The filter's state after the last interval."""
 
-
-class Solution(NamedTuple):
-    """States of a recording in its final map frame, poses delayed by one window, and notes."""
-
-    states: list[NavState]
-    smoothed: Trajectory | None = None
-    notes: tuple[str, ...] = ()
+    @property
+    def estimates(self) -> list[Estimate]:
+        """The initial estimate and one per interval."""
+        return [self.first, *(record.estimate for record in self.records)]
 
 
 class Backend(NamedTuple):
-    """What a back end does with a stream and with a recording."""
+    """What a back end does with a stream."""
 
-    stream: Callable[[NavigatorConfig, Start, PriorPose | None], StreamEstimator]
-    """Create an estimator for a stream with this start."""
-    solve: Callable[[FilteredRecording, NavigatorConfig], Solution]
-    """Return the states of a filtered recording."""
+    begin: Callable[[NavigatorConfig, Start, PriorPose | None], Any]
+    """Return the first `StreamState` of a stream with this start."""
+    step: Callable[
+        [Any, ImuInterval, WindowDisplacement | None, Sequence[Fix], NavigatorConfig],
+        tuple[Any, Record],
+    ]
+    """Return the state after an interval with its displacement and fixes, and what was done."""
+    late_fix: Callable[[Any, Fix, NavigatorConfig], tuple[Any, list[Accepted]] | None]
+    """Return the state with a fix from the past, and all fixes since; None if it is too late."""
 
 
-def _filter_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
-    """Return the filter's states."""
-    frame = filtered.estimator.frame.state
+BACKENDS: dict[BackendName, Backend] = {
+    "ekf": Backend(partial(estimator.begin, streaming=True), estimator.step, estimator.late_fix),
+    "graph": Backend(fixed_lag.begin, fixed_lag.step, fixed_lag.late_fix),
+}
+
+
+def _filtered_states(filtered: FilteredRecording) -> list[NavState]:
+    """Return the filter's states in the final map frame."""
+    frame = filtered.last.map_frame
     states = to_final_frame(nav_states(filtered.estimates), frame.transforms)
-    smoothed = smoothed_track(nav_states(filtered.clones), (*frame.transforms, *frame.undirected))
-    return Solution(with_undirected(states, frame.undirected), smoothed)
+    return with_undirected(states, frame.undirected)
 
 
-def _graph_states(filtered: FilteredRecording, config: NavigatorConfig) -> Solution:
-    """Optimise the whole track at once; the filter's states if the graph is indeterminate."""
-    estimator = filtered.estimator
-    frame, states = estimator.frame.state, nav_states(filtered.estimates, ASSUMED)
-    end, has_field = states[-1], estimator.ekf.state.field is not None
+def _smoothed_states(
+    filtered: FilteredRecording, config: NavigatorConfig
+) -> tuple[list[NavState], str]:
+    """Optimise the whole track at once; the filter's states if the graph is indeterminate.
+
+    Returns:
+        States in the final map frame, and a note for the health report if the graph failed.
+    """
+    last, states = filtered.last, nav_states(filtered.estimates, ASSUMED)
+    frame, end = last.map_frame, states[-1]
+    has_field = last.ekf.field is not None
     bias = (end.b_g, end.covariance[GYRO_BIAS, GYRO_BIAS]) if has_field else None
     covariance = states[0].covariance.copy()
     # The filter's last prior.
-    covariance[GYRO_BIAS, GYRO_BIAS] = estimator.bias.prior.variance * np.eye(3)
+    covariance[GYRO_BIAS, GYRO_BIAS] = last.bias_prior.variance * np.eye(3)
     first = replace(states[0], covariance=covariance)
     final = to_final_frame(states, frame.transforms)
-    has_turn = estimator.ekf.state.has_turn
     try:
-        solved, note = smooth(
-            final, first, filtered.measurements, frame.transforms, config, bias, has_turn
-        )
+        solved = smooth(final, first, filtered.records, frame.transforms, config, bias)
     except IndeterminateError as error:
-        note = f"graph fell back to the filter's track: {error}"
-        return _filter_states(filtered, config)._replace(notes=(note,))
+        return _filtered_states(filtered), f"graph fell back to the filter's track: {error}"
     turns = [
         frame_rotation(after.R_WB @ before.R_WB.T)
         for before, after in zip(states, final, strict=True)
     ]
     solved = with_actual_covariances(solved, filtered.estimates, np.array(turns))
-    return Solution(with_undirected(solved, frame.undirected), notes=(note,))
-
-
-BACKENDS = {
-    "ekf": Backend(partial(Estimator, streaming=True), _filter_states),
-    "graph": Backend(FixedLagEstimator, _graph_states),
-}
+    return with_undirected(solved, frame.undirected), ""
 
 
 def track_recording(
-    backend: Backend,
+    backend: BackendName,
     recording: PreprocessedRecording,
     config: NavigatorConfig,
     prior: PriorPose | None,
     fixes: Iterable[Fix],
     progress: Progress,
 ) -> Track:
-    """Filter a recording, then solve it with the back end.
+    """Filter a recording, and smooth it if the back end is the graph.
 
     Raises:
         InputError: it was preprocessed for another update rate, or an argument has the wrong type.
@@ -171,18 +153,25 @@ def track_recording(
         )
     began = perf_counter()
     queue = FixQueue(fixes, most=math.inf)  # all fixes of a recording are known from the start
-    filtered = _filtered(recording, config, prior, queue, progress)
-    solution = backend.solve(filtered, config)
-    counts, estimator = recording.front_end.counts, filtered.estimator
-    health = queue.health(estimator.health(counts, solution.states[-1]))
-    return track_from_states(
-        solution.states,
-        innovations_of(filtered.measurements),
-        replace(health, notes=[*health.notes, *solution.notes]),
-        smoothed=solution.smoothed,
-        seconds_network=recording.seconds_network,
-        seconds_filter=recording.seconds_front_end + perf_counter() - began,
-    )
+    run = _filtered(recording, config, prior, queue, progress)
+    counts, innovations = recording.front_end.counts, innovations_of(run.records)
+
+    def track(states: list[NavState], note: str = "", filtered: Track | None = None) -> Track:
+        health = queue.health(run.last.health(counts, config.filter, states[-1]))
+        return track_from_states(
+            states,
+            innovations,
+            replace(health, notes=[*health.notes, *([note] if note else [])]),
+            filtered=filtered,
+            seconds_network=recording.seconds_network,
+            seconds_filter=recording.seconds_front_end + perf_counter() - began,
+        )
+
+    found = track(_filtered_states(run))
+    if backend == "graph":
+        found = track(*_smoothed_states(run, config), filtered=found)
+    progress(1.0)
+    return found
 
 
 def _filtered(
@@ -193,18 +182,14 @@ def _filtered(
     progress: Progress,
 ) -> FilteredRecording:
     queue.start(recording.start.time)
-    estimator = Estimator(config, recording.start, prior)
-    filtered = FilteredRecording(estimator, [estimator.estimate()], [], [])
+    state = estimator.begin(config, recording.start, prior)
+    filtered = FilteredRecording(state.estimate(), [], state)
     pairs = zip(recording.intervals, recording.measurements, strict=True)
     for k, (interval, displacement) in enumerate(pairs):
-        applied = estimator.step(interval, displacement, queue.due(interval.stop))
-        filtered.measurements.append(applied)
-        filtered.estimates.append(estimator.estimate())
-        clone = estimator.released
-        if clone is not None and clone not in filtered.clones[-1:]:
-            filtered.clones.append(clone)
+        due = queue.due(interval.stop)
+        state, record = estimator.step(state, interval, displacement, due, config)
+        filtered.records.append(record)
         if k % 500 == 0:
-            progress(0.6 + 0.4 * k / len(recording.intervals))
-    progress(1.0)
+            progress(0.6 + 0.3 * k / len(recording.intervals))
     queue.refuse("after the end", len(queue.due(math.inf)))
-    return filtered
+    return filtered._replace(last=state)

@@ -44,8 +44,6 @@ class FilterConfig:
         covariance_scale: factor on the network's covariance, in addition to update_rate x window
             length, which accounts for overlapping windows; fitted to the tracks of the training
             recordings and of validation recordings unseen by the network.
-        network_turn_sigma: standard deviation of the network's yaw error, correlated over about a
-            minute [rad]; becomes a state once fixes make the direction observable.
         correlated_errors: whether covariances and NIS take the network's errors for correlated, as
             those of real networks are, and the accelerometer for better than the gains assume;
             False if all errors are white and as large as configured, as in a simulation.
@@ -76,7 +74,6 @@ class FilterConfig:
 
     update_rate: int = 2
     covariance_scale: float = 0.5
-    network_turn_sigma: float = 0.05
     correlated_errors: bool = True
     gate: float = 0.997
     tilt_sigma: float = 0.05

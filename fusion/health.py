@@ -40,6 +40,11 @@ class Health:
         final_sigma: final standard deviations, the largest in any direction (the semi-axis of the
             ellipse): tilt and yaw [rad], velocity [m/s], horizontal position and height [m], biases
             [rad/s], [m/s^2].
+        set_back: amount by which a recording's clock was set back where its track ends [s].
+        longest_late: longest duration of consecutive samples out of order [s].
+        stopped: number of samples dropped because one sensor alone had stopped, by sensor.
+        network_turn: yaw from the network's direction to the accelerometer's [rad], of a recording.
+        network_turn_sigma: its standard deviation [rad]; pi if it is unknown.
         notes: further remarks, one line each, such as a graph that fell back to the filter.
     """
 
@@ -61,6 +66,11 @@ class Health:
     accel_noise_factor: float = 1.0
     network_error_level: float = 1.0
     final_sigma: dict[str, float] = field(default_factory=dict)
+    set_back: float = 0.0
+    longest_late: float = 0.0
+    stopped: dict[str, int] = field(default_factory=dict)
+    network_turn: float = 0.0
+    network_turn_sigma: float = math.pi
     notes: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
@@ -74,10 +84,11 @@ class Health:
             text.append(f"samples flagged: {_counted(self.flagged)}")
         text.append(f"gaps {self.gap_count}, longest {self.longest_gap:.2f} s")
         if self.updates:
+            nis = f"mean NIS {self.mean_nis:.2f} (expected {self.nis_expected})"
+            outliers = {"outliers": self.gated, **self.refused}
+            found = {name: n for name, n in outliers.items() if n}
             text.append(
-                f"updates {self.updates}, outliers {self.gated / self.updates:.1%} "
-                f"(given less weight), refused {_counted(self.refused)}, "
-                f"mean NIS {self.mean_nis:.2f} (expected {self.nis_expected})"
+                ", ".join([f"updates {self.updates}", nis, *([_counted(found)] if found else [])])
             )
         else:
             text.append("updates none: no window was complete, or the device was stationary")
@@ -96,8 +107,19 @@ class Health:
         if self.network_error_level != 1.0:
             level = math.sqrt(self.network_error_level)
             text.append(f"short-term errors of the network: {level:.1f} times the predicted sigma")
-        sigma = ", ".join(f"{k} {v:.3g}" for k, v in self.final_sigma.items())
+        sigma = ", ".join(_sigma_words(k, v) for k, v in self.final_sigma.items())
         return [*text, f"final sigma: {sigma}"]
+
+
+_UNITS = {"m": "m", "m_s": "m/s", "m_s2": "m/s^2", "rad": "deg", "rad_s": "deg/s"}
+"""Units in which sigmas are printed, by the ends of their names."""
+
+
+def _sigma_words(name: str, sigma: float) -> str:
+    """Return a sigma by name, unit and value; angles are in degrees."""
+    end = next(end for end in ("m_s2", "rad_s", "m_s", "rad", "m") if name.endswith(f"_{end}"))
+    value = math.degrees(sigma) if end.startswith("rad") else sigma
+    return f"{name.removesuffix(f'_{end}').replace('_', ' ')} {value:.2g} {_UNITS[end]}"
 
 
 def _counted(counts: dict[str, int]) -> str:
@@ -108,19 +130,10 @@ def _counted(counts: dict[str, int]) -> str:
 GAPS_LISTED = 100
 """Maximum number of gaps listed one by one; an endless stream may have any number."""
 
-LATE_NOTE_SECONDS = 0.5
-"""Duration of consecutive late samples beyond which the health report notes them [s]."""
-
-FIELD_DROPS_NOTED = 50
-"""Number of dropped magnetic fields beyond which the health report notes them."""
-
-UNFAMILIAR_SHARE = 0.3
-"""Share of unfamiliar windows beyond which health notes them; 0.05 of training windows are."""
-
 
 @dataclass
 class SampleCounts:
-    """Counts of the samples used, dropped and flagged, of gaps and of windows.
+    """Counts of the samples used, dropped and flagged, and of gaps; direction of the network.
 
     Attributes:
         used: samples used.
@@ -139,9 +152,9 @@ class SampleCounts:
         gap_count: stretches without samples longer than `MAX_IMU_GAP`.
         longest_gap: length of the longest [s].
         gaps: (start, length) [s] of the newest `GAPS_LISTED`.
-        windows: windows given to the network.
-        unfamiliar: those of them outside what its weights were trained on.
         set_back: amount by which a recording's clock was set back where its track ends [s].
+        network_turn: as in `Health`.
+        network_turn_sigma: likewise.
     """
 
     used: int = 0
@@ -159,9 +172,9 @@ class SampleCounts:
     gap_count: int = 0
     longest_gap: float = 0.0
     gaps: list[tuple[float, float]] = field(default_factory=list)
-    windows: int = 0
-    unfamiliar: int = 0
     set_back: float = 0.0
+    network_turn: float = 0.0
+    network_turn_sigma: float = math.pi
 
     def add_frozen(self, stopped: Stopped) -> None:
         """Count a sample in which sensors had stopped."""
@@ -185,38 +198,16 @@ class SampleCounts:
             longest_gap=self.longest_gap,
             gaps=list(self.gaps),
             fields_dropped=self.field_dropped,
-            notes=self._notes(),
-        )
-
-    def _notes(self) -> list[str]:
-        notes = []
-        if self.set_back:
-            notes.append(
-                f"the recording's clock was set back by {self.set_back:.3g} s: the track ends there"
-            )
-        elif self.longest_late > LATE_NOTE_SECONDS:
-            notes.append(
-                f"samples arrived late for {self.longest_late:.1f} s in a row: logged twice, or "
-                "from a clock that was set back; if so, that time is missing and no sigma covers it"
-            )
-        for count, sensor, other in (
-            (self.frozen_gyro, "gyroscope", "accelerometer"),
-            (self.frozen_accel, "accelerometer", "gyroscope"),
-        ):
-            if count:
-                notes.append(
-                    f"the {sensor} stopped: it repeats its value in {count} samples in which the "
-                    f"{other} shows motion; they were dropped"
+            set_back=self.set_back,
+            longest_late=self.longest_late,
+            stopped={
+                sensor: count
+                for sensor, count in (
+                    ("gyroscope", self.frozen_gyro),
+                    ("accelerometer", self.frozen_accel),
                 )
-        if self.field_dropped > FIELD_DROPS_NOTED:
-            notes.append(
-                f"{self.field_dropped} magnetic fields were dropped: the sensor repeated its last "
-                "value, or their times or values are wrong"
-            )
-        if self.unfamiliar > UNFAMILIAR_SHARE * self.windows:
-            share = self.unfamiliar / self.windows
-            notes.append(
-                f"{share:.0%} of the windows move unlike anything the weights were trained on: "
-                "the network's sigma is widened there"
-            )
-        return notes
+                if count
+            },
+            network_turn=self.network_turn,
+            network_turn_sigma=self.network_turn_sigma,
+        )

@@ -1,9 +1,10 @@
-"""The navigator: the same estimate for streams and recordings.
+"""The navigator of streams and recordings.
 
 Samples are cut into IMU intervals (`imu.front_end`), the network predicts displacements from their
 windows, and both drive an estimator (`filter.estimator`). A stream is processed sample by sample,
 while the windows of a recording pass through the network in batches. Since the front end does not
-depend on the filter, both give the same track.
+depend on the filter, the filter's track of both is the same. A recording is known to its end: its
+track is smoothed.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ class Navigator:
         model: a `DisplacementModel`, or any object with its `predict`.
         config: noise, filter, gravity; the defaults are for handheld devices.
         prior: prior on the first pose; None starts levelled by gravity, with yaw and position zero.
-        backend: "ekf", or "graph" for the factor graph, which is more accurate and slower.
+        backend: "ekf" or "graph" for the EKF or the factor graph, of streams and recordings; None
+            has what suits each: the EKF for a stream, the graph over the whole of a recording.
 
     Raises:
         InputError: the back end does not exist, or an argument has the wrong type.
@@ -52,9 +54,10 @@ class Navigator:
         model: Predictor,
         config: NavigatorConfig | None = None,
         prior: PriorPose | None = None,
-        backend: BackendName = "ekf",
+        backend: BackendName | None = None,
     ) -> None:
-        check_choice("backend", backend, BACKENDS)
+        if backend is not None:
+            check_choice("backend", backend, BACKENDS)
         if not hasattr(model, "predict") or isinstance(model, type):
             remedy = "load_model(name) returns one"
             raise InputError("model", repr(model), "a model with `predict`", remedy)
@@ -155,8 +158,8 @@ class Navigator:
     @property
     def state(self) -> NavState | None:
         """Newest state of the stream; None during the first second."""
-        estimator = self._stream.estimator
-        return None if estimator is None else estimator.nav_state()
+        state = self._stream.state
+        return None if state is None else state.nav_state()
 
     @property
     def continuous(self) -> ContinuousPose | None:
@@ -170,8 +173,8 @@ class Navigator:
 
         It changes with each network update; None before the first, and for the graph.
         """
-        estimator = self._stream.estimator
-        return None if estimator is None else estimator.smoothed
+        state = self._stream.state
+        return None if state is None else state.smoothed
 
     @property
     def health(self) -> Health:
@@ -206,10 +209,11 @@ class Navigator:
     def run(
         self, sequence: ImuSequence, progress: Progress = silent, fixes: Iterable[Fix] = ()
     ) -> Track:
-        """Estimate the fused track of a recording; its ground truth is not used.
+        """Estimate the smoothed track of a recording; its ground truth is not used.
 
-        It has the states of a stream, and those of the first second and of the second after each
-        gap as well. The stream of `push` is not affected.
+        Each state uses all measurements, also the later ones. `Track.filtered` is what a stream
+        gives: the filter's states, and those of the first second and of the second after each gap
+        as well; with `backend="ekf"` it is the track. The stream of `push` is not affected.
 
         Args:
             sequence: the recording.
@@ -243,13 +247,14 @@ class Navigator:
             InputError: it was preprocessed for another update rate, or gravity contradicts the
                 prior's attitude.
         """
-        backend = BACKENDS[self.backend]
+        backend = self.backend or "graph"
         return track_recording(backend, preprocessed, self.config, self.prior, fixes, progress)
 
     def _identity(self) -> dict[str, Any]:
         """Return what must be the same where a snapshot is restored."""
         checksum = str(getattr(getattr(self.model, "card", None), "sha256", ""))
-        return {"backend": self.backend, "config": asdict(self.config), "model": checksum}
+        backend = self.backend or "ekf"
+        return {"backend": backend, "config": asdict(self.config), "model": checksum}
 
     def _new_stream(self, prior: PriorPose | None) -> Stream:
-        return Stream(self.model, self.config, prior, self.backend)
+        return Stream(self.model, self.config, prior, self.backend or "ekf")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.health import SampleCounts
+from stario.fusion.imu.direction import Complex, Direction, direction, weighted_force
 from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
 from stario.fusion.imu.intervals import ImuInterval, Start
@@ -22,8 +24,9 @@ from stario.fusion.imu.stateful import (
 )
 from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
+from stario.sequences.findings import warn
 from stario.sequences.inspection.checks import check_units
-from stario.sequences.inspection.constant_values import warn_of_dead_axes
+from stario.sequences.inspection.constant_values import dead_axes
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.time_order import MAX_IMU_GAP
 from stario.sequences.windows import WINDOW_SECONDS
@@ -85,7 +88,7 @@ def preprocess(
         remedy = "pass fixes by name: fixes=[...]"
         raise InputError("progress", f"{progress!r:.60}", "a function of the fraction done", remedy)
     check_units(sequence)
-    warn_of_dead_axes(sequence)
+    warn(sequence.name, dead_axes(sequence))
     began = perf_counter()
     intervals, front_end = cut_recording(sequence, config)
     if front_end.start is None or not any(e.window is not None for e in intervals):
@@ -145,16 +148,34 @@ def _displacements(
     progress: Progress,
 ) -> list[WindowDisplacement | None]:
     measurements: list[WindowDisplacement | None] = [None] * len(intervals)
+    weighted = [np.empty((0, 2), dtype=np.complex128)]
     for batch in _batches(intervals, unbroken=network.is_recurrent):
         if network.is_recurrent and intervals[batch[0]].gap:
             network.restart()
         windows = {k: window for k in batch if (window := intervals[k].window) is not None}
         if windows:
-            displacements = displacements_of(network, list(windows.values()), counts)
+            displacements = displacements_of(network, list(windows.values()))
+            weighted.append(weighted_force(np.stack([w.imu_N for w in windows.values()])))
             for k, displacement in zip(windows, displacements, strict=True):
                 measurements[k] = displacement
         progress(0.1 + 0.5 * (batch[-1] + 1) / len(intervals))
+    found = _direction(measurements, np.concatenate(weighted), network.updates)
+    if found.sigma < math.pi:
+        counts.network_turn, counts.network_turn_sigma = found.turn, found.sigma
     return measurements
+
+
+def _direction(
+    measurements: list[WindowDisplacement | None], weighted: Complex, updates: int
+) -> Direction:
+    """Compare displacements with the accelerometer over each unbroken run of windows."""
+    ends = np.flatnonzero([m is not None for m in measurements])
+    if not len(ends):
+        return Direction()
+    moved = np.array([m.d_N for m in measurements if m is not None])
+    cuts = np.flatnonzero(np.diff(ends) > 1) + 1
+    parts = zip(np.split(weighted, cuts), np.split(moved, cuts), strict=True)
+    return sum((direction(w, d, updates) for w, d in parts), Direction())
 
 
 def _batches(intervals: Sequence[ImuInterval], unbroken: bool) -> Iterator[range]:

@@ -1,25 +1,10 @@
 """Snapshots of a stream as bytes, without pickle, to continue it in another process.
 
-Format: an npz (a zip of arrays). Its member `tree` is the UTF-8 text, as bytes, of a JSON value in
-which `{"array": k}` stands for the member `a<k>`, `{"tuple": [...]}` and
-`{"deque": [...], "maxlen": n}` for such sequences, `{"map": [[key, value], ...]}` for a
-dictionary whose keys are not strings, and `{"is": name, "has": {...}}` for an object of a class in
-`_PACKAGES` and `_MODULES`; NaN and infinity are written as NaN and Infinity. The member
-`sha256` is the checksum of all others. The tree contains
-
-    format     "stario snapshot"
-    version    version of this layout; others are refused
-    backend    "ekf" or "graph"
-    config     effective configuration, which must equal that of the restoring navigator
-    model      checksum of the weights, which must be equal too; empty for models without a card
-    prior      prior on the first pose, or null
-    front end  samples, windows and counts
-    network    memory of the network, or null
-    continuous the continuous pose, or null
-    fixes      waiting fixes, and counts of those refused
-    estimator  state of the back end, or null during the first second
-
-Arrays and numbers keep every bit, so the continued stream gives the same states.
+Format: a line with `FORMAT` and `VERSION`, the SHA-256 of the rest, and an npz. Its `tree` is
+the JSON of the stream's parts (`Stream.parts`), of its back end, configuration and weights, in
+which `{"array": k}` stands for its array `k`, and other objects for a sequence, a dictionary or an
+instance of a class of `_PACKAGES` and `_MODULES`. Arrays and numbers keep every bit, so the
+continued stream gives the same states.
 """
 
 from __future__ import annotations
@@ -29,9 +14,7 @@ import importlib
 import io
 import json
 import pkgutil
-import zipfile
 from collections import deque
-from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -39,14 +22,17 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 
-FORMAT, VERSION = "stario snapshot", 27
-
+FORMAT, VERSION = "stario snapshot", 29
 
 _PACKAGES = ("fusion.filter", "fusion.graph", "fusion.imu")
 _MODULES = """
 fusion.config fusion.fixes fusion.health fusion.state sequences.attitude.levelling sequences.noise
 """
 """Packages and modules whose classes a snapshot may hold: plain data, rebuilt from attributes."""
+
+
+Arrays = dict[int, tuple[int, np.ndarray[Any, Any]]]
+"""Numbered arrays by identity, since states share those that are unchanged."""
 
 
 @cache
@@ -67,45 +53,36 @@ def _classes() -> dict[str, type]:
 
 def pack(tree: dict[str, Any]) -> bytes:
     """Convert a tree of dicts, sequences, arrays, plain values and known objects to bytes."""
-    # By identity: states share unchanged arrays.
-    arrays: dict[int, tuple[int, np.ndarray[Any, Any]]] = {}
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, np.ndarray):
-            k, _ = arrays.setdefault(id(value), (len(arrays), value))
-            return {"array": k}
-        if isinstance(value, np.generic):
-            return value.item()
-        name = type(value).__name__
-        if name in _classes():
-            has = value._asdict() if hasattr(value, "_asdict") else value.__getstate__()
-            return {"is": name, "has": {key: plain(entry) for key, entry in has.items()}}
-        if isinstance(value, deque):
-            return {"deque": [plain(entry) for entry in value], "maxlen": value.maxlen}
-        if isinstance(value, tuple):
-            return {"tuple": [plain(entry) for entry in value]}
-        if isinstance(value, list):
-            return [plain(entry) for entry in value]
-        if isinstance(value, dict) and all(isinstance(key, str) for key in value):
-            return {key: plain(entry) for key, entry in value.items()}
-        if isinstance(value, dict):
-            return {"map": [[plain(key), plain(entry)] for key, entry in value.items()]}
-        return value
-
-    text = json.dumps(plain({"format": FORMAT, "version": VERSION, **tree}))
-    members = {f"a{k}": array for k, array in arrays.values()}
-    members["tree"] = np.frombuffer(text.encode(), dtype=np.uint8)
+    arrays: Arrays = {}
+    text = json.dumps(plain(tree, arrays))
+    members = {str(k): array for k, array in arrays.values()}
     file = io.BytesIO()
-    np.savez(file, sha256=_checksum(members), **members)  # type: ignore[arg-type]
-    return file.getvalue()
+    np.savez(file, allow_pickle=False, tree=np.frombuffer(text.encode(), np.uint8), **members)
+    content = file.getvalue()
+    head = f"{FORMAT} {VERSION}\n".encode()
+    return head + hashlib.sha256(content).digest() + content
 
 
-def _checksum(members: Mapping[str, np.ndarray[Any, Any]]) -> np.ndarray[Any, Any]:
-    """Return the SHA-256 of the names, types, shapes and values of arrays, (32,) bytes."""
-    digest = hashlib.sha256()
-    for name, array in sorted(members.items()):
-        digest.update(f"{name} {array.dtype.str} {array.shape} ".encode() + array.tobytes())
-    return np.frombuffer(digest.digest(), dtype=np.uint8)
+def plain(value: Any, arrays: Arrays) -> Any:
+    """Return a value for JSON; add its arrays to `arrays`."""
+
+    def each(values: Any) -> list[Any]:
+        return [plain(entry, arrays) for entry in values]
+
+    if isinstance(value, np.ndarray):
+        return {"array": arrays.setdefault(id(value), (len(arrays), value))[0]}
+    if isinstance(value, np.generic):
+        return value.item()
+    if type(value).__name__ in _classes():
+        has = value._asdict() if hasattr(value, "_asdict") else value.__getstate__()
+        return {"is": type(value).__name__, "has": plain(has, arrays)}
+    if isinstance(value, dict):
+        return {"map": [each(item) for item in value.items()]}
+    if isinstance(value, deque):
+        return {"deque": each(value), "maxlen": value.maxlen}
+    if isinstance(value, tuple):
+        return {"tuple": each(value)}
+    return each(value) if isinstance(value, list) else value
 
 
 def unpack(data: bytes) -> dict[str, Any]:
@@ -116,44 +93,40 @@ def unpack(data: bytes) -> dict[str, Any]:
     """
     if not isinstance(data, bytes | bytearray | memoryview):
         raise InputError("snapshot", type(data).__name__, f"bytes of a {FORMAT}")
-    if bytes(data[:2]) != b"PK" or not zipfile.is_zipfile(io.BytesIO(data)):
+    head, _, rest = bytes(data).partition(b"\n")
+    name, _, version = head.rpartition(b" ")
+    if name != FORMAT.encode():
         raise InputError("snapshot", "bytes of something else", f"all bytes of a {FORMAT}")
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        tree = json.loads(arrays["tree"].tobytes().decode())
-        if tree["format"] != FORMAT:
-            raise ValueError(f"the format {tree['format']!r}")
-        if tree["version"] != VERSION:
-            raise InputError("snapshot: version", repr(tree["version"]), str(VERSION))
-        if not np.array_equal(arrays.pop("sha256"), _checksum(arrays)):
-            found, fix = "edited or damaged content", "use another snapshot or begin a new stream"
-            raise InputError("snapshot", found, "the bytes as they were written", fix)
-        return {key: _whole(value, arrays) for key, value in tree.items()}
-    except InputError:
-        raise
-    except Exception as error:  # corrupt bytes may fail anywhere in zip, NumPy or JSON
-        found = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError("snapshot", found, f"all bytes of a {FORMAT}") from error
+    if version != str(VERSION).encode():
+        raise InputError("snapshot: version", version.decode(errors="replace"), str(VERSION))
+    digest, content = rest[:32], rest[32:]
+    if digest != hashlib.sha256(content).digest():
+        found, fix = "edited or damaged content", "use another snapshot or begin a new stream"
+        raise InputError("snapshot", found, "the bytes as they were written", fix)
+    with np.load(io.BytesIO(content), allow_pickle=False) as file:
+        arrays = dict(file)
+    tree: dict[str, Any] = _whole(json.loads(arrays["tree"].tobytes()), arrays)
+    return tree
 
 
 def _whole(value: Any, arrays: dict[str, Any]) -> Any:
-    if isinstance(value, list):
-        return [_whole(entry, arrays) for entry in value]
-    if not isinstance(value, dict):
-        return value
+    def each(values: Any) -> list[Any]:
+        return [_whole(entry, arrays) for entry in values]
+
     match value:
+        case list():
+            return each(value)
         case {"array": k}:
-            return arrays[f"a{k}"]
+            return arrays[str(k)]
         case {"is": name, "has": has}:
-            return _rebuilt(_classes()[name], {k: _whole(v, arrays) for k, v in has.items()})
-        case {"deque": entries, "maxlen": maxlen}:
-            return deque((_whole(entry, arrays) for entry in entries), maxlen=maxlen)
-        case {"tuple": entries}:
-            return tuple(_whole(entry, arrays) for entry in entries)
+            return _rebuilt(_classes()[name], _whole(has, arrays))
         case {"map": entries}:
-            return {_whole(key, arrays): _whole(entry, arrays) for key, entry in entries}
-    return {key: _whole(entry, arrays) for key, entry in value.items()}
+            return dict(each(entries))
+        case {"deque": entries, "maxlen": maxlen}:
+            return deque(each(entries), maxlen)
+        case {"tuple": entries}:
+            return tuple(each(entries))
+    return value
 
 
 def _rebuilt(kind: type, has: dict[str, Any]) -> Any:

@@ -212,8 +212,8 @@ class Track:
         covariance: (N, 15, 15) as in `NavState`, None if not estimated.
         innovations: innovations of the network's measurements, None without a filter.
         health: report of the run, None without a filter.
-        smoothed: poses at the times of the filter's clones, each estimated one window later; None
-            if there are none.
+        filtered: the filter's track, in which each state uses only the measurements until then, as
+            a stream's does; None if this is it, or there is no filter.
         seconds_network: computing time of the network [s].
         seconds_filter: computing time of everything else [s].
     """
@@ -224,7 +224,7 @@ class Track:
     covariance: FloatArray | None = None
     innovations: Innovations | None = None
     health: Health | None = None
-    smoothed: Trajectory | None = None
+    filtered: Track | None = None
     seconds_network: float = 0.0
     seconds_filter: float = 0.0
 
@@ -278,7 +278,7 @@ def track_from_states(
     states: list[NavState],
     innovations: Innovations | None = None,
     health: Health | None = None,
-    smoothed: Trajectory | None = None,
+    filtered: Track | None = None,
     seconds_network: float = 0.0,
     seconds_filter: float = 0.0,
 ) -> Track:
@@ -299,7 +299,7 @@ def track_from_states(
         covariance=covariance,
         innovations=innovations,
         health=health,
-        smoothed=smoothed,
+        filtered=filtered,
         seconds_network=seconds_network,
         seconds_filter=seconds_filter,
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from stario.fusion.backends import BACKENDS, BackendName, StreamEstimator
+from stario.fusion.backends import BACKENDS, BackendName, StreamState
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Fix, FixOutcome, FixQueue
@@ -33,7 +33,7 @@ class Stream:
 
     Attributes:
         prior: the prior; None after the clock was set back.
-        estimator: estimator; None before the first state.
+        state: state of the estimator; None before the first one.
         continuous: newest pose without steps at updates; None before the first state.
     """
 
@@ -50,7 +50,7 @@ class Stream:
 
     def _begin(self) -> None:
         self.front_end = FrontEnd(self._config)
-        self.estimator: StreamEstimator | None = None
+        self.state: StreamState | None = None
         self.continuous: ContinuousPose | None = None
         self._network = StatefulInference(self._model, self._config.filter.window_updates)
 
@@ -74,7 +74,7 @@ class Stream:
             try:
                 state = self._advance(interval)
             except Exception as error:
-                if self.estimator is None:  # the stream begins again
+                if self.state is None:  # the stream begins again
                     raise
                 failure = failure or error
         if failure is not None:
@@ -86,9 +86,9 @@ class Stream:
         assert start is not None  # set before the first interval
         try:
             self.front_end.sensors.check(interval)
-            if self.estimator is None:
+            if self.state is None:
                 check_start(start, self._config.gravity, interval.table)
-                self.estimator = self._backend.stream(self._config, start, self.prior)
+                self.state = self._backend.begin(self._config, start, self.prior)
                 self._fixes.start(start.time)
         except InputError:
             self._begin()
@@ -98,25 +98,27 @@ class Stream:
         displacement = None
         try:
             if interval.window is not None:
-                counts = self.front_end.counts
-                (displacement,) = displacements_of(self._network, [interval.window], counts)
+                (displacement,) = displacements_of(self._network, [interval.window])
         finally:  # if the network fails, the IMU's motion must not be lost
             due = self._fixes.due(interval.stop)
-            self.estimator.step(interval.without_window(), displacement, due)
-        state = self.estimator.nav_state()
+            self.state, _ = self._backend.step(
+                self.state, interval.without_window(), displacement, due, self._config
+            )
+        state = self.state.nav_state()
         self.continuous = copied(advanced(self.continuous, state))  # `state` is writable
         return state
 
     def take(self, fix: Fix) -> FixOutcome:
         """Apply a fix, or keep it until its time."""
-        if self.estimator is None or fix.fault() or fix.time > self.estimator.time:
+        if self.state is None or fix.fault() or fix.time > self.state.time:
             return self._fixes.add(fix)
-        accepted = self.estimator.late_fix(fix)
-        if accepted is None:
+        found = self._backend.late_fix(self.state, fix, self._config)
+        if found is None:
             self._fixes.refuse("too late")
             return "refused"
+        self.state, accepted = found
         if self.continuous is not None:
-            state = self.estimator.nav_state()
+            state = self.state.nav_state()
             if state.map_frame != self.continuous.map_frame:
                 self.continuous = advanced(self.continuous, state)
         return next((applied.outcome for applied in accepted if applied.fix is fix), "refused")
@@ -125,7 +127,9 @@ class Stream:
         """Return the health report so far."""
         counts = self.front_end.counts
         return self._fixes.health(
-            counts.health() if self.estimator is None else self.estimator.health(counts)
+            counts.health()
+            if self.state is None
+            else self.state.health(counts, self._config.filter)
         )
 
     def parts(self) -> dict[str, Any]:
@@ -136,16 +140,11 @@ class Stream:
             "fixes": self._fixes,
             "network": self._network.memory,
             "continuous": self.continuous,
-            "estimator": None if self.estimator is None else self.estimator.state,
+            "estimator": self.state,
         }
 
     def continue_from(self, parts: dict[str, Any]) -> None:
         """Continue a new stream from the parts of another."""
         self.prior, self._fixes = parts["prior"], parts["fixes"]
         self.front_end, self.continuous = parts["front end"], parts["continuous"]
-        self._network.memory = parts["network"]
-        if parts["estimator"] is not None:
-            start = self.front_end.start
-            assert start is not None  # there is a state
-            self.estimator = self._backend.stream(self._config, start, self.prior)
-            self.estimator.state = parts["estimator"]
+        self._network.memory, self.state = parts["network"], parts["estimator"]

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from stario.network.known_motion import KnownMotion, known_motion_from_dict
 from stario.sequences.errors import WeightsError
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_RATE, WINDOW_SAMPLES
@@ -73,7 +72,6 @@ class Card:
         trained_on: descriptions of the training recordings and simulations.
         recipe: the command and settings that produced the weights.
         figures: results on named recordings.
-        known_motion: summary of the training windows, None if there is none.
         format: version of the card's layout.
     """
 
@@ -88,7 +86,6 @@ class Card:
     trained_on: list[str] = field(default_factory=list)
     recipe: dict[str, Any] = field(default_factory=dict)
     figures: dict[str, Any] = field(default_factory=dict)
-    known_motion: KnownMotion | None = None
     format: int = FORMAT
 
 
@@ -99,9 +96,7 @@ def card_path(weights: Path) -> Path:
 
 def dump_card(card: Card) -> str:
     """Return the card as JSON text."""
-    known = card.known_motion
-    content = asdict(card) | {"known_motion": None if known is None else known.as_dict()}
-    return json.dumps({k: v for k, v in content.items() if v is not None}, indent=2) + "\n"
+    return json.dumps(asdict(card), indent=2) + "\n"
 
 
 def read_weights(weights: Path) -> tuple[bytes, Card]:
@@ -151,16 +146,15 @@ def parse_card(text: str, path: Path) -> Card:
     """
     try:
         content = json.loads(text)
-        missing = {f.name for f in fields(Card)} - {"known_motion", *content}
+        content.pop("known_motion", None)  # on cards until 2026; nothing depends on it any more
+        missing = {f.name for f in fields(Card)} - {*content}
         if missing:
             raise ValueError(f"no {sorted(missing)[0]!r}")
         calibration = _calibration(content.pop("calibration"))
-        known = content.pop("known_motion", None)
-        known = None if known is None else known_motion_from_dict(known)
         unknown = set(content) - {f.name for f in fields(Card)}
         if unknown:
             raise ValueError(f"unknown key {sorted(unknown)[0]!r}")
-        card = Card(calibration=calibration, known_motion=known, **content)
+        card = Card(calibration=calibration, **content)
         for name in ("architecture", "sha256"):
             if not isinstance(getattr(card, name), str):
                 raise ValueError(f"{name} {getattr(card, name)!r}")

@@ -81,8 +81,7 @@ class DisplacementModel:
                 into frame H: z up, the device's heading zero (README, "The window and its frame").
 
         Returns:
-            Displacement (B, 3) [m] and covariance (B, 3, 3) [m^2], in the window's frame; inflated
-            if a window is outside the known motion of the weights (`stario.network.known_motion`).
+            Displacement (B, 3) [m] and covariance (B, 3, 3) [m^2], in the window's frame.
 
         Raises:
             InputError: the shape is wrong or a value is not finite.
@@ -91,15 +90,13 @@ class DisplacementModel:
         if len(batch) == 0:
             return np.zeros((0, 3)), np.zeros((0, 3, 3))
         mean, log_sigma, _ = self.engine.run(batch)
-        return self.calibrated(batch, mean, log_sigma)
+        return self.calibrated(mean, log_sigma)
 
     def calibrated(
-        self, windows: Float32Array, mean: Float32Array, log_sigma: Float32Array
+        self, mean: Float32Array, log_sigma: Float32Array
     ) -> tuple[FloatArray, FloatArray]:
         """Return displacements and covariances, as `predict`, from the network's own outputs."""
         variance = self.card.calibration.variance(log_sigma.astype(np.float64))
-        if self.card.known_motion is not None:
-            variance *= self.card.known_motion.variance_factor(windows)[:, None]
         return mean.astype(np.float64), variance[:, :, None] * np.eye(3)
 
 
@@ -136,7 +133,7 @@ class StatefulModel:
                 batch[k : k + 1], self._engine.first_state() if before is None else before
             )
         self.memory = first + len(batch), tuple(states)
-        return self._model.calibrated(batch, mean, log_sigma)
+        return self._model.calibrated(mean, log_sigma)
 
 
 def save_model(path: Path, network: DisplacementNetwork, card: Card) -> Card:

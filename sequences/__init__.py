@@ -5,7 +5,7 @@ Read and write: `read_recording`, `find_recordings`, `write_csv`, `read_tum`, `w
 A recording: `ImuSequence`, `Trajectory`, `PositionTrack`, `Magnetometer`, `DeviceAttitude`,
 `STANDARD_GRAVITY`.
 
-Inspect: `inspect_recording`, `Inspection`, `truth_problems`, `TruthProblem`, `check_units`.
+Inspect: `inspect_recording`, `Inspection`, `Finding`, `verdict`, `truth_findings`, `check_units`.
 
 Units and axes: `with_units`, `with_conventions`, `yaw_of`, `about_z`.
 

@@ -15,6 +15,8 @@ from stario.sequences.errors import InputError as InputError
 from stario.sequences.errors import ReadError as ReadError
 from stario.sequences.errors import StarioError as StarioError
 from stario.sequences.errors import WeightsError as WeightsError
+from stario.sequences.findings import Finding as Finding
+from stario.sequences.findings import verdict as verdict
 from stario.sequences.inspection.checks import check_units as check_units
 from stario.sequences.inspection.report import Inspection as Inspection
 from stario.sequences.inspection.report import inspect_recording as inspect_recording
@@ -41,8 +43,7 @@ from stario.sequences.simulation.magnetometer import INDOOR_FIELD as INDOOR_FIEL
 from stario.sequences.simulation.magnetometer import MagneticField as MagneticField
 from stario.sequences.simulation.walks import WalkStyle as WalkStyle
 from stario.sequences.simulation.walks import generate_walk as generate_walk
-from stario.sequences.truth.findings import TruthProblem as TruthProblem
-from stario.sequences.truth.problems import truth_problems as truth_problems
+from stario.sequences.truth.problems import truth_findings as truth_findings
 from stario.sequences.units import with_units as with_units
 from stario.sequences.windows import WorldStream as WorldStream
 from stario.sequences.windows import world_streams as world_streams

@@ -33,6 +33,8 @@ TICK_SAMPLES = 100
 TICK_SECONDS = TICK_SAMPLES / WINDOW_RATE
 """Time from one tick to the next [s]."""
 
+TICKS_PER_SECOND = round(WINDOW_RATE) // TICK_SAMPLES
+
 
 @dataclass(frozen=True, eq=False)
 class LevelledStream:

@@ -52,7 +52,7 @@ def test_run_recording_gives_a_finite_track_without_truth():
 def test_compare_tracks_ranks_the_filter_above_the_imu_alone():
     comparison = load("compare_tracks").main(seconds=30.0)
     ate = {name: metrics["ate_m"] for name, metrics in comparison.metrics.items()}
-    assert ate["ekf"] < 1.1 * ate["network"] < 5.0 < 100.0 < ate["inertial"]
+    assert ate["track"] < 1.1 * ate["network"] < 5.0 < 100.0 < ate["dead_reckoning"]
 
 
 def test_streaming_yields_states_ten_times_a_second():
@@ -96,7 +96,7 @@ def test_cluster_distributes_recordings_among_workers_and_skips_a_broken_one(pro
     scores, skipped, workers = example.main(tmp_path, seconds=8.0)
     assert [recording.name for recording in scores] == ["walk-0", "walk-1", "walk-3"]
     for recording in scores:
-        assert recording.metrics["ekf"]["ate_m"] > 0.0
+        assert recording.metrics["track"]["ate_m"] > 0.0
     assert [entry.item for entry in skipped] == [str(tmp_path / "walk-2.csv")]
     assert "line 2" in skipped[0].reason
     assert len(workers) == 2

@@ -156,7 +156,7 @@ def test_the_wheel_holds_the_weights_in_use_and_no_others(outside):
 
 @pytest.mark.slow
 def test_the_wheel_runs_outside_the_tree(outside):
-    assert "ekf" in called(outside, "fresh/bin/stario", "compare", "--out", "demo")
+    assert "dead reckoning" in called(outside, "fresh/bin/stario", "compare", "--out", "demo")
     assert (outside / "demo/metrics.json").exists()
     assert (outside / "demo/demonstration/plan.png").exists()
 

@@ -17,11 +17,8 @@ from recorded import DATA
 from stario.fusion.commands.cli import app, main
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = sorted(
-    path
-    for path in ROOT.rglob("*.md")
-    if path.name != "CHANGELOG.md" and not path.relative_to(ROOT).parts[0].startswith(".venv")
-)
+FOLDERS = ("examples", "fusion", "network", "sequences")
+PAGES = [ROOT / "README.md", *sorted(page for f in FOLDERS for page in (ROOT / f).rglob("*.md"))]
 GUIDES = [ROOT / "README.md", *sorted((ROOT / "examples/guides").glob("*.md"))]
 BLOCK = re.compile(r"^```(\w+)( long)?\n(.*?)^```", re.M | re.S)
 INLINE = re.compile(r"`(stario [^`]+)`|^ {4,}(?:\.venv/bin/)?(stario .+?)(?: # .*)?$", re.M)

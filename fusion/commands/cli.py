@@ -26,6 +26,7 @@ from stario.fusion.commands.simulate import simulate
 from stario.fusion.commands.table import table
 from stario.fusion.commands.train import train
 from stario.sequences.errors import StarioError
+from stario.sequences.findings import FINDINGS
 
 app = typer.Typer(
     add_completion=False,
@@ -92,6 +93,8 @@ def main() -> None:
     """Entry point of the `stario` command."""
     shown = logging.StreamHandler(sys.stderr)
     shown.addFilter(_Once())
+    if {"run", "compare", "inspect"} & set(sys.argv[1:2]):  # these print the verdict on findings
+        shown.addFilter(lambda record: record.name != FINDINGS)
     logging.basicConfig(level=logging.WARNING, format="stario: %(message)s", handlers=[shown])
     try:
         app()

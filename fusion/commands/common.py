@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import typer
@@ -23,6 +25,9 @@ if TYPE_CHECKING:
     from stario.sequences.sequence import ImuSequence
 
 Result = TypeVar("Result")
+
+_LINE_SECONDS = 10.0
+"""Time between lines of progress [s] where there is no terminal for a bar."""
 
 _NAMED = 3
 """Number of skipped recordings with the same reason that are listed one by one."""
@@ -49,7 +54,6 @@ def process_each(
     work: Callable[[ImuSequence, Path], tuple[dict[str, object], str]],
     as_json: bool,
     single: str = "",
-    explained: Mapping[str, str] | None = None,
 ) -> None:
     """Apply `work` to each recording, giving each its own folder for files, and print the results.
 
@@ -60,7 +64,6 @@ def process_each(
         work: function of a recording and its folder, distinct for each; returns record and text.
         as_json: whether to print the records rather than the texts.
         single: name of an option in use that allows only one recording; empty if none.
-        explained: meaning of words in the texts, which `work` may fill; printed once, at the end.
     """
     from stario.fusion.evaluation.compare import distinct_name
     from stario.fusion.evaluation.folders import check_folder
@@ -85,14 +88,14 @@ def process_each(
     records = list(without_skipped(each(recorded, files, jobs=1), skipped))
     if as_json and records:
         print_result(True, records[0] if len(files) == 1 else records)
-    elif explained:
-        typer.echo("\n".join(explanations(explained)))
     exit_if_skipped(skipped)
 
 
-def explanations(words: Mapping[str, str]) -> list[str]:
-    """Return lines that explain words."""
-    return [f"{word}: {meaning}." for word, meaning in words.items()]
+def explain() -> None:
+    """Print what the words of `run` and `compare` mean."""
+    from stario.fusion.evaluation.text import EXPLANATION
+
+    typer.echo(EXPLANATION)
 
 
 def check_new(field: str, path: Path, overwrite: bool) -> None:
@@ -155,6 +158,34 @@ def progress_bar(title: str, total: int = 100, shown: bool = True) -> Iterator[P
         yield advance
 
 
+@contextmanager
+def training_progress(steps: int, shown: bool = True) -> Iterator[Callable[[int, float], None]]:
+    """Show the progress of a training on stderr: a bar, and without a terminal a line at times.
+
+    The function that is yielded takes the step and its mean squared error [m^2].
+    """
+    from tqdm import tqdm
+
+    told = monotonic()
+    with progress_bar("train", steps, shown) as bar:
+        first, began = 0, told
+
+        def advance(step: int, error: float) -> None:
+            nonlocal told, first, began
+            bar(step / steps)
+            now = monotonic()
+            if not first:  # of a resumed run another than 1
+                first, began = step, now
+            if not shown or sys.stderr.isatty() or step == first or now - told < _LINE_SECONDS:
+                return
+            told = now
+            left = (steps - step) * (now - began) / max(step - first, 1)
+            words = f"step {step} of {steps}, about {tqdm.format_interval(left)} left"
+            typer.echo(f"{words}, error {error:.4f} m^2", err=True)
+
+        yield advance
+
+
 def print_result(as_json: bool, record: object, text: str = "") -> None:
     """Print a result on stdout: its record as JSON, or else its text."""
     from stario.sequences.files import json_text
@@ -163,7 +194,6 @@ def print_result(as_json: bool, record: object, text: str = "") -> None:
 
 
 def origin_of(
-    backends: Iterable[str],
     paths: Sequence[Path],
     reading: ReadingOptions,
     estimating: EstimatorOptions,
@@ -173,7 +203,6 @@ def origin_of(
     """Return the content of `run.json`; the settings are in `config.json`.
 
     Args:
-        backends: estimators that are run.
         paths: recordings, or the folders or list files that were given.
         reading: options for reading recordings; those that differ from the defaults are named.
         estimating: options of the estimator.
@@ -188,11 +217,23 @@ def origin_of(
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "model": estimating.model,
         "weights_sha256": network.card.sha256 or None,
-        "backends": list(backends),
         "inputs": [str(path.absolute()) for path in paths],
         "reading": {k: v for k, v in asdict(reading).items() if v != default[k]},
         "fixes": fixes and str(fixes.absolute()),
     }
+
+
+def training_command(paths: Sequence[Path], reading: ReadingOptions) -> str:
+    """Return the command that trains weights on these recordings, read in the same way."""
+    default = asdict(ReadingOptions())
+    options = [
+        f"--{name.replace('_', '-')}={each}"
+        for name, value in asdict(reading).items()
+        if value != default[name]
+        for each in (value if isinstance(value, list) else [value])
+    ]
+    words = ["stario", "train", *map(str, paths), *options, "--start-from", "default"]
+    return shlex.join(words)
 
 
 def recipe_values(path: Path) -> dict[str, Any]:

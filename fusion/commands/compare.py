@@ -1,23 +1,29 @@
-"""`stario compare`: all tracks of each recording side by side."""
+"""`stario compare`: tracks of each recording side by side."""
 
 from __future__ import annotations
 
+import shutil
+import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stario.fusion.commands.common import (
     exit_if_skipped,
-    explanations,
+    explain,
+    names_in,
     origin_of,
     print_result,
     progress_bar,
+    training_command,
 )
 from stario.fusion.commands.options import (
     CompareOutOption,
     EstimatorOptions,
+    ExplainOption,
     FixesOption,
     JobsOption,
     JsonOption,
@@ -34,6 +40,9 @@ if TYPE_CHECKING:
     from stario.fusion.evaluation.compare import Comparison
     from stario.sequences.sequence import ImuSequence
 
+_SHOWN = ("track", "dead_reckoning")
+"""Tracks without `--tracks`: what StarIO gives, and what one would have without it."""
+
 
 @expand_option_groups
 def compare(
@@ -43,20 +52,27 @@ def compare(
     fixes: FixesOption = None,
     jobs: JobsOption = 1,
     out: CompareOutOption = None,
+    tracks: Annotated[
+        str,
+        typer.Option(
+            help="Further tracks, also as a table: filtered, network, network_true_attitude, pdr "
+            "(from steps), separated by commas, or all."
+        ),
+    ] = "",
     report: ReportOption = False,
     as_json: JsonOption = False,
+    explained: ExplainOption = False,
 ) -> None:
-    """Compare tracks: inertial, pdr (from steps), network, EKF and graph.
+    """Compare each recording's track with its truth and with dead reckoning by the IMU alone.
 
-    Without PATH, those of a simulated walk.
+    Without PATH, that of a simulated walk.
     """
-    from stario.fusion.backends import BACKENDS
-    from stario.fusion.evaluation.compare import compare_recordings, demonstration
+    from stario.fusion.evaluation.compare import TRACKS, compare_recordings, demonstration
     from stario.fusion.evaluation.folders import check_folder
     from stario.fusion.evaluation.results import scores_dict, write_comparison
     from stario.fusion.evaluation.summary import scores_of
-    from stario.fusion.evaluation.text import column_words
     from stario.fusion.fix_file import read_fixes
+    from stario.sequences.arrays import check_choice
     from stario.sequences.datasets.batch import without_skipped
     from stario.sequences.lazy import optional_package
 
@@ -64,14 +80,16 @@ def compare(
         refuse_unused(changed(reading), "without PATH", "use with a recording to read")
     if report:
         optional_package("plotly", "report")
+    chosen = TRACKS if tracks == "all" else [*_SHOWN, *(names_in(tracks) if tracks else [])]
+    for name in chosen:
+        check_choice("--tracks", name, TRACKS)
     settings, network = estimating.settings(), estimating.network()
     model = estimating.for_processes(network, jobs)
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
     files, skipped = reading.recordings(paths or [])
-    origin = origin_of(BACKENDS, files, reading, estimating, network, fixes)
+    origin = origin_of(files, reading, estimating, network, fixes)
     read: Callable[[Path], ImuSequence] = reading.read
     if not paths:
-        typer.echo("demonstration: a simulated walk not used in training", err=True)
         files, read = [Path("demonstration")], lambda path: demonstration()
     if fixes is not None and len(files) > 1:
         raise InputError("--fixes", f"{len(files)} recordings", "one recording")
@@ -79,37 +97,43 @@ def compare(
     check_folder(folder)
     with progress_bar("compare", 100 * len(files)) as progress:
         outcomes = compare_recordings(
-            files, model, settings, read, jobs, absolute_fixes, progress=progress
+            files, model, settings, read, jobs, absolute_fixes, progress=progress, names=chosen
         )
-        comparisons = list(without_skipped(outcomes, skipped))
+        train = training_command(paths, reading) if paths else ""
+        comparisons = [replace(c, train=train) for c in without_skipped(outcomes, skipped)]
     also = {}
     if report:
         from stario.fusion.report.page import write_report
 
         also["report.html"] = write_report
+    if explained:
+        explain()
     if comparisons:
         written = write_comparison(folder, comparisons, settings, origin, also)
-        lines = [line for comparison in comparisons for line in _lines(comparison)]
-        words = {k: v for comparison in comparisons for k, v in column_words(comparison).items()}
-        lines += explanations(words)
-        lines.append(f"{len(written)} files in {folder}")
+        lines = [line for found in comparisons for line in _lines(found, bool(tracks))]
+        first = folder / comparisons[0].sequence.name / "plan.png"
+        lines.append(f"figures and tracks: {first} and {len(written) - 1} other files")
+        if not paths:
+            lines.append(f"next: {_command()} run FILE --report, with a phone's recording")
         scores = [scores_of(comparison) for comparison in comparisons]
         print_result(as_json, scores_dict(scores), "\n".join(lines))
     exit_if_skipped(skipped)
 
 
-def _lines(comparison: Comparison) -> list[str]:
-    from stario.fusion.evaluation.text import track_table, tracked_words
+def _lines(found: Comparison, as_table: bool) -> list[str]:
+    """Return how good the track is beside dead reckoning, and perhaps a table of all tracks."""
+    from stario.fusion.evaluation.text import error_words, track_table, track_words
+    from stario.sequences.drawing.figures import distance
 
-    sequence, path = comparison.sequence, comparison.path_m
-    length = f"truth: {sequence.truth_summary()}" if path is None else f"{path:.1f} m"
-    lines = [
-        f"{sequence.name}: {tracked_words(comparison)}, {length}",
-        track_table(comparison),
-    ]
-    if sequence.truth is None and sequence.positions is not None:
-        from stario.fusion.evaluation.known_positions import position_error_words
+    alone = found.metrics["dead_reckoning"]
+    far = alone["ate_m"] or alone["known_positions_m"]
+    far = far or found.tracks["dead_reckoning"].trajectory.path_length()
+    words = error_words(found) or track_words(found)
+    line = f"{found.sequence.name}: StarIO's track: {words}; dead reckoning: {distance(far)}"
+    table = [track_table(found)] if as_table else []
+    return [line, *table, *(finding.line() for finding in found.verdict)]
 
-        for name, track in comparison.tracks.items():
-            lines.append(f"{name}: {position_error_words(track, sequence.positions)}")
-    return lines
+
+def _command() -> str:
+    """Return how this command can be typed again: from a virtual environment, with its path."""
+    return "stario" if shutil.which("stario") else sys.argv[0]

@@ -163,7 +163,6 @@ def _tracks(
     as_json: bool,
 ) -> list[Skipped]:
     """Write and print the table of recordings; return those that were skipped."""
-    from stario.fusion.backends import BACKENDS
     from stario.fusion.evaluation.compare import compare_recordings
     from stario.fusion.evaluation.results import write_recording, write_summary
     from stario.fusion.evaluation.summary import Scores, scores_of, summary, summary_table
@@ -171,7 +170,7 @@ def _tracks(
 
     settings, network = estimating.settings(), estimating.network()
     model = estimating.for_processes(network, jobs)
-    origin = origin_of(BACKENDS, files, reading, estimating, network)
+    origin = origin_of(files, reading, estimating, network)
     skipped: list[Skipped] = []
     recordings: list[Scores] = []
     with progress_bar("evaluate", 100 * len(files)) as progress:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import process_each
+from stario.fusion.commands.common import (
+    process_each,
+    training_command,
+)
 from stario.fusion.commands.options import (
     JsonOption,
     PathsArgument,
@@ -19,7 +23,7 @@ from stario.fusion.commands.options import (
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
-    from stario.network.model import DisplacementModel
+    from stario.fusion.navigator import Navigator
     from stario.sequences.sequence import ImuSequence
 
 
@@ -28,32 +32,36 @@ def inspect(
     paths: PathsArgument,
     reading: ReadingOptions,
     model: Annotated[
-        str, typer.Option(help="Compare the motion with these weights' training.")
+        str, typer.Option(help="Weights that the recording is tried with.")
     ] = "default",
     out: Annotated[
         Path | None, typer.Option(help="Folder for figure and findings. Default: runs/NAME.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Inspect recordings: timing, noise, units, signs, magnetometer, truth, kind of motion."""
+    """Inspect recordings: timing, noise, units, signs, magnetometer, truth, track."""
+    from stario.fusion.navigator import Navigator
     from stario.network.model import load_model
 
-    process_each(reading, paths, out, partial(_inspect, network=load_model(model)), as_json)
+    train = training_command(paths, reading)
+    work = partial(_inspect, navigator=Navigator(load_model(model)), train=train)
+    process_each(reading, paths, out, work, as_json)
 
 
 def _inspect(
-    sequence: ImuSequence, folder: Path, network: DisplacementModel
+    sequence: ImuSequence, folder: Path, navigator: Navigator, train: str
 ) -> tuple[dict[str, object], str]:
     """Write one recording's figure and findings; return its record and the findings in words."""
-    from stario.fusion.evaluation.familiarity import familiarity
     from stario.fusion.evaluation.folders import make_folder
+    from stario.fusion.evaluation.verdict import recording_verdict
     from stario.sequences.drawing.figures import save_figure
     from stario.sequences.drawing.plots import imu_overview
     from stario.sequences.files import write_json
     from stario.sequences.inspection.report import inspect_recording
     from stario.sequences.inspection.samples import without_times_ahead
 
-    found, sequence = inspect_recording(sequence), without_times_ahead(sequence)
+    given, found = sequence, inspect_recording(sequence)
+    sequence = without_times_ahead(sequence)
     make_folder(folder)
     fit, rest = found.fit, found.rest
     figure = imu_overview(
@@ -63,10 +71,11 @@ def _inspect(
         gaps=[(start, start + length) for start, length in found.timing.gaps],
     )
     save_figure(figure, folder / "inspection.png")
-    motion = None
-    with suppress(InputError):  # undetermined: the problems give the reason
-        motion = familiarity(network, sequence)
-    record = found.as_dict() | {"motion": motion and motion.as_dict()}
+    track = None
+    with suppress(InputError):  # refused: the inspection gives the reason
+        track = navigator.run(given)
+    verdict = recording_verdict(given, track, found, train)
+    record = found.as_dict() | {"verdict": [asdict(finding) for finding in verdict]}
     write_json(folder / "inspection.json", record)
-    lines = [sequence.summary(), *found.lines(), *(motion.lines() if motion else [])]
+    lines = [sequence.summary(), *found.lines(), *(finding.line() for finding in verdict)]
     return record, "\n".join([*lines, f"figure: {folder / 'inspection.png'}"])

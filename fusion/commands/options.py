@@ -63,6 +63,9 @@ JobsOption = Annotated[
 ReportOption = Annotated[
     bool, flag("--report", help="Also write report.html: map, time slider, plots, health.")
 ]
+ExplainOption = Annotated[
+    bool, flag("--explain", help="Say first what the printed words and figures mean.")
+]
 OverwriteOption = Annotated[bool, flag("--overwrite", help="Replace an existing file.")]
 JsonOption = Annotated[bool, flag("--json", help="Print the results as JSON on stdout.")]
 

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, get_args
+from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from stario.fusion.commands.common import origin_of, process_each, progress_bar
+from stario.fusion.commands.common import (
+    explain,
+    origin_of,
+    process_each,
+    progress_bar,
+    training_command,
+)
 from stario.fusion.commands.options import (
-    BackendOption,
     EstimatorOptions,
+    ExplainOption,
     FixesOption,
     JsonOption,
     PathsArgument,
@@ -27,7 +32,6 @@ if TYPE_CHECKING:
     from stario.fusion.evaluation.compare import Comparison
     from stario.fusion.fixes import Fix
     from stario.fusion.navigator import Navigator
-    from stario.fusion.state import Track
     from stario.sequences.sequence import ImuSequence
 
 
@@ -37,40 +41,42 @@ def run(
     reading: ReadingOptions,
     estimating: EstimatorOptions,
     fixes: FixesOption = None,
-    backend: BackendOption = "ekf",
     out: RunOutOption = None,
+    filtered: Annotated[
+        bool, flag("--filtered", help="Also write the filter's track, as a stream gives it.")
+    ] = False,
     report: ReportOption = False,
     view: Annotated[
         bool, flag("--view", help="Open the rerun 3-D viewer; its file is kept in --out.")
     ] = False,
     as_json: JsonOption = False,
+    explained: ExplainOption = False,
 ) -> None:
-    """Fuse each recording into a track with attitude, velocity, biases and covariance."""
-    from stario.fusion.backends import BackendName
+    """Fuse each recording into a smooth track with attitude, velocity, biases and covariance."""
     from stario.fusion.fix_file import read_fixes
     from stario.fusion.navigator import Navigator
-    from stario.sequences.arrays import check_choice
     from stario.sequences.lazy import optional_package
 
     if report:
         optional_package("plotly", "report")
     if view:
         optional_package("rerun", "view")
-    chosen: BackendName = check_choice("--backend", backend, get_args(BackendName))
     network = estimating.network()
-    navigator = Navigator(network, estimating.settings(), backend=chosen)
+    navigator = Navigator(network, estimating.settings())
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
-    words: dict[str, str] = {}
+    if explained:
+        explain()
     work = partial(
         _run,
         navigator=navigator,
         fixes=absolute_fixes,
-        origin=origin_of([chosen], paths, reading, estimating, network, fixes),
+        origin=origin_of(paths, reading, estimating, network, fixes),
+        filtered=filtered,
         report=report,
         view=view,
-        words=words,
+        train=training_command(paths, reading),
     )
-    process_each(reading, paths, out, work, as_json, "--fixes" if fixes else "", words)
+    process_each(reading, paths, out, work, as_json, "--fixes" if fixes else "")
 
 
 def _run(
@@ -79,25 +85,23 @@ def _run(
     navigator: Navigator,
     fixes: Sequence[Fix],
     origin: dict[str, object],
+    filtered: bool,
     report: bool,
     view: bool,
-    words: dict[str, str],
+    train: str,
 ) -> tuple[dict[str, object], str]:
-    """Write one recording's track; return its record and a summary; `words` explain its columns."""
+    """Write one recording's track; return its record and a summary."""
     from stario.fusion.evaluation.compare import measured
     from stario.fusion.evaluation.results import write_run
-    from stario.fusion.evaluation.text import column_words
     from stario.fusion.fix_file import check_within
-    from stario.sequences.inspection.gyro_axes import compare_gyro_axes
-    from stario.sequences.truth.problems import warn_of_truth
 
     check_within(fixes, sequence)
     with progress_bar(f"run {sequence.name}") as progress:
         track = navigator.run(sequence, progress, fixes)
-    for line in compare_gyro_axes(sequence).problems(sequence.name):
-        typer.echo(f"stario: {line}", err=True)
-    warn_of_truth(sequence)
-    found = measured(sequence, {navigator.backend: track}, fixes)
+    tracks = {"track": track}
+    if filtered and track.filtered is not None:
+        tracks["filtered"] = track.filtered
+    found = replace(measured(sequence, tracks, fixes), train=train)
     also: dict[str, Callable[[Path, Comparison], object]] = {}
     if report:
         from stario.fusion.report.page import write_report
@@ -110,33 +114,18 @@ def _run(
     written = write_run(folder, found, navigator.config, origin, also)
     if view:
         open_view(folder / "track.rrd")
-    if sequence.truth is not None:
-        words |= column_words(found)
-    lines = [*_lines(found, track), f"{len(written)} files in {folder}"]
+    lines = [*_lines(found), f"{folder}: {', '.join(path.name for path in written)}"]
     record: dict[str, object] = {"recording": sequence.name, **found.metrics}
+    record["verdict"] = [asdict(finding) for finding in found.verdict]
     return record | {"folder": str(folder)}, "\n".join(lines)
 
 
-def _lines(found: Comparison, track: Track) -> list[str]:
-    """Return what was recorded, the track, its errors and its health as lines of text."""
-    import numpy as np
+def _lines(found: Comparison) -> list[str]:
+    """Return what was recorded, the track, its errors and the verdict, a fact per line."""
+    from stario.fusion.evaluation.text import error_words, track_words
 
-    from stario.fusion.evaluation.known_positions import position_error_words
-    from stario.fusion.evaluation.text import track_table, tracked_words
-    from stario.fusion.report.health import health_lines
-
-    sequence = found.sequence
-    length = track.trajectory.path_length()
-    ends = np.linalg.norm(np.diff(track.trajectory.position_W[[0, -1], :2], axis=0))
-    lines = [
-        sequence.summary(),
-        f"{sequence.name}: {tracked_words(found)}, {length:.1f} m travelled (estimated), "
-        f"ending {ends:.1f} m from the start",
-    ]
-    if sequence.truth is not None:
-        lines.append(track_table(found))
-    elif sequence.positions is not None:
-        lines.append(position_error_words(track, sequence.positions))
-    if track.health is not None:
-        lines += [*track.health.lines(), *health_lines(track.health)]
-    return lines
+    lines = [found.sequence.summary(), f"track: {track_words(found)}"]
+    for name in found.tracks:
+        if words := error_words(found, name):
+            lines.append(f"{'error' if name == 'track' else f'{name}, error'}: {words}")
+    return [*lines, *(finding.line() for finding in found.verdict)]

@@ -25,9 +25,10 @@ def simulate(
     carry: Annotated[
         str,
         typer.Option(
-            help="How the device is carried: handheld, call, swinging, pocket, bag, trolley, rig, "
-            "or random, which also draws the person. On a body: front-pocket, back-pocket, belt, "
-            "jacket, bag, swinging, wrist, ear, head, in-front, foot, or random."
+            help="How the device is carried: handheld, in-front, texting, call, swinging, pocket, "
+            "back-pocket, bag, trolley, rig, or random, which also draws the person. On a body: "
+            "front-pocket, back-pocket, belt, jacket, bag, swinging, wrist, ear, head, in-front, "
+            "foot, or random."
         ),
     ] = "random",
     body: Annotated[

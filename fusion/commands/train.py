@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import list_skipped, progress_bar, recipe_values
+from stario.fusion.commands.common import list_skipped, recipe_values, training_progress
 from stario.fusion.commands.options import (
     CacheOption,
     OptionalPathsArgument,
@@ -158,6 +158,10 @@ def train(
     make_folder(out)
     virtual = virtual_recordings(body or [], recipe.seed, folder)
     learned = recorded + virtual + (held_out if last_stage is not None else [])
+    if walks and is_leader():
+        typer.echo(
+            f"simulating {walks} walks of a minute, or reading them from the cache", err=True
+        )
     material = training_material(learned, walks, recipe, folder)
     held = validation_material(held_out, required=bool(recorded))
     calibrated_by = last_stage or (
@@ -215,14 +219,14 @@ def _trained(
 
     # Sigma needs windows with full ground truth; if there are none, use simulated walks.
     windows = held.streams or cached_walks(10, recipe.seed + 1, folder, recipe.attitude)
-    with progress_bar("train", total=recipe.steps, shown=is_leader()) as progress:
+    with training_progress(recipe.steps, shown=is_leader()) as progress:
         return train_network(
             recipe,
             material.streams,
             material.weights,
             windows,
             out,
-            on_step=lambda step, error: progress(step / recipe.steps),
+            on_step=progress,
             on_epoch=_print_epoch,
             trained_on=material.words,
             start_from=first,
@@ -234,6 +238,10 @@ def _trained(
 
 
 def _print_epoch(report: EpochReport) -> None:
+    if report.epoch == 0:
+        words = f"initial weights: validation {report.validation_error:.4f} m^2"
+        typer.echo(words, err=True)
+        return
     typer.echo(
         f"epoch {report.epoch}: training {report.training_error:.4f} m^2, "
         f"validation {report.validation_error:.4f} m^2; "

@@ -19,14 +19,12 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 _FIGURES = ("plan.png", "error.png", "innovations.png", "report.html")
+_TRACKS = tuple(f"{track}{suffix}" for track, suffix in product(TRACKS, (".tum", ".npz")))
 
 RESULTS = {
     "metrics.json": ("config.json", "run.json"),
-    "health.json": (*_FIGURES, "track.rrd", "ekf.tum", "ekf.npz", "graph.tum", "graph.npz"),
-    "inertial.npz": (
-        *(*_FIGURES, "truth.tum"),
-        *(f"{track}{suffix}" for track, suffix in product(TRACKS, (".tum", ".npz"))),
-    ),
+    "health.json": (*_FIGURES, *_TRACKS[:4], "track.rrd"),
+    "dead_reckoning.npz": (*_FIGURES, *_TRACKS, "truth.tum"),
     "networks.json": (
         *("networks.csv", "ate_parameters.png", "distributions.png", "pde.png"),
         "trajectories.png",

@@ -5,13 +5,32 @@ from __future__ import annotations
 import numpy as np
 
 from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position
+from stario.fusion.imu.direction import Complex
 from stario.fusion.state import Track
-from stario.sequences.arrays import interpolated
+from stario.sequences.arrays import even_grid, interpolated
+from stario.sequences.findings import Finding
 from stario.sequences.legs import jumps
 from stario.sequences.sequence import MAX_TRUTH_GAP, FloatArray, ImuSequence, PositionTrack
 
 MIN_POSITIONS = 2
 """Minimum number of positions: a shift alone fits one; with two, their distance is compared."""
+
+_COURSE_S, _WAY_S = 10.0, 1.0
+"""Times [s] over which distances between positions are compared with the track's: the first tells
+the course whatever the windings of either, the second the way along them. With positions of
+uncertainty sigma they are at least four times as many seconds, in which a walker moves as far."""
+
+_MIN_CHORDS, _RESTING_M_S = 5, 0.2
+"""Least number of such distances, and speed [m/s] below which one is rest."""
+
+_SCALED = 1.25
+"""Factor between both distances, in either direction, that contradicts the track."""
+
+_MIRRORED, _MIRRORED_M = 0.4, 2.0
+"""Share of the error that a mirrored track must leave, and error [m] from which that is tested."""
+
+_SIGMAS = 3.0
+"""Error in standard deviations, both over the whole track, that contradicts the track."""
 
 
 def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:
@@ -70,3 +89,93 @@ def position_error_words(track: Track, known: PositionTrack) -> str:
     if len(found := jumps(known)):
         words += f", but jump by up to {found.max():.0f} m"
     return words
+
+
+def position_findings(track: Track, sequence: ImuSequence) -> list[Finding]:
+    """Return how known positions, of the truth or without attitude, contradict a track."""
+    known = _known(sequence)
+    if known is None:
+        return []
+    fitted = placed(track, known)
+    if fitted is None or len(fitted) < _MIN_CHORDS:
+        return []
+    truth, estimate = (
+        xy[:, 0] + 1j * xy[:, 1] for xy in (fitted.position_W, _track_at(track, fitted.time))
+    )
+    error = float(np.sqrt(np.mean(np.abs(truth - estimate) ** 2)))
+    return [
+        *_mirror_image(known.kind, truth, estimate, error),
+        *_scale(known, fitted.time, truth, estimate),
+        *_beyond_sigma(track, known, fitted.time, error),
+    ]
+
+
+def _known(sequence: ImuSequence) -> PositionTrack | None:
+    """Return the known positions; those of true poses once a second."""
+    truth = sequence.truth
+    if truth is None or not truth.valid.any():
+        return None if truth is not None else sequence.positions
+    pose = truth.at(even_grid(float(truth.time[0]), float(truth.time[-1]), 1.0))
+    return PositionTrack(pose.time[pose.valid], pose.position_W[pose.valid, :2], "positions")
+
+
+def _mirror_image(kind: str, truth: Complex, estimate: Complex, error: float) -> list[Finding]:
+    mirrored = fit_yaw_and_position(truth.conj(), estimate)
+    left = float(np.sqrt(np.mean(np.abs(mirrored - estimate) ** 2)))
+    if error < _MIRRORED_M or left > _MIRRORED * error:
+        return []
+    text = f"Mirrored, the track fits the {kind} to {left:.1f} m instead of {error:.1f} m."
+    advice = (
+        "Has the accelerometer the opposite sign, or are axes left-handed? Try "
+        "`--accel-sign apple`, else `--axes`."
+    )
+    return [Finding("mirror_image", text, advice, values={"error_m": error, "mirrored_m": left})]
+
+
+def _scale(
+    known: PositionTrack, time: FloatArray, truth: Complex, estimate: Complex
+) -> list[Finding]:
+    """Compare the lengths of both ways, of their course and along their windings."""
+    sigma = known.typical_sigma or 0.0
+    course = _length_ratio(time, truth, estimate, max(_COURSE_S, 4.0 * sigma), 4.0 * sigma)
+    way = _length_ratio(time, truth, estimate, max(_WAY_S, 4.0 * sigma), 4.0 * sigma)
+    if (
+        course is None
+        or way is None
+        or not (min(course, way) > _SCALED or max(course, way) < 1.0 / _SCALED)
+    ):
+        return []
+    text = f"The {known.kind} say that the way is {way:.2g} times as long as the track."
+    advice = "These weights do not know this motion or carrying: rely on no length of the track."
+    return [Finding("track_scale", text, advice, values={"scale": way, "course_scale": course})]
+
+
+def _length_ratio(
+    time: FloatArray, truth: Complex, estimate: Complex, seconds: float, least: float
+) -> float | None:
+    """Return how much longer the true way is, by chords over `seconds`; None for too few.
+
+    Chords in which both moved less than `least` [m], or 0.2 m/s, are rest.
+    """
+    after = np.searchsorted(time, time + seconds - 1e-6)
+    before = np.flatnonzero(after < len(time))
+    moved, told = (np.abs(p[after[before]] - p[before]) for p in (truth, estimate))
+    walked = np.maximum(moved, told) > max(_RESTING_M_S * seconds, least)
+    if walked.sum() < _MIN_CHORDS:
+        return None
+    return float(moved[walked].sum() / max(float(told[walked].sum()), 1e-3))
+
+
+def _beyond_sigma(
+    track: Track, known: PositionTrack, time: FloatArray, error: float
+) -> list[Finding]:
+    variance = track.trajectory.position_covariance_W
+    if variance is None:
+        return []
+    of_track = np.interp(time, track.time, np.trace(variance[:, :2, :2], axis1=1, axis2=2))
+    sigma = float(np.sqrt(of_track.mean() + 2.0 * (known.typical_sigma or 0.0) ** 2))
+    if error < _SIGMAS * sigma:
+        return []
+    text = f"The track is {error:.1f} m off the {known.kind}; its sigma is {sigma:.1f} m."
+    advice = "Its uncertainty is larger than stated: are positions, clock and axes right?"
+    return [Finding("track_error", text, advice, values={"error_m": error, "sigma_m": sigma})]

@@ -198,7 +198,7 @@ def protocol_figures(
     `network_track_true_attitude`.
     """
     truth = true_poses(sequence)
-    navigator = Navigator(model, config)
+    navigator = Navigator(model, config, backend="ekf")
     preprocessed = navigator.observe(sequence)
     tracks = {
         TRUE_ATTITUDE: network_track_true_attitude(model, sequence, config).trajectory,

@@ -33,22 +33,23 @@ def write_run(
     origin: Mapping[str, object],
     also: Writers = MappingProxyType({}),
 ) -> list[Path]:
-    """Write the fused track of a run, its only one, and return the files written.
+    """Write the tracks of a run, and return the files written.
 
-    These are `ekf.tum` (9 decimals), `ekf.npz` (velocity, biases, covariance), `metrics.json`,
-    `config.json`, `run.json` (`origin`: what produced them), `health.json` and the figures; the
-    graph's track is called `graph`. Without truth, known positions in the track's frame
-    (`known_positions.placed`) are drawn. Results of an earlier run into this folder are removed.
+    These are `track.tum` (9 decimals), `track.npz` (velocity, biases, covariance), `metrics.json`,
+    `config.json`, `run.json` (`origin`: what produced them), `health.json` and the figures; with
+    the filter's track also `filtered.tum` and `filtered.npz`. Without truth, known positions in the
+    track's frame (`known_positions.placed`) are drawn. Results of an earlier run into this folder
+    are removed.
 
     Raises:
         InputError: the folder cannot be created.
     """
-    [track] = run.tracks.values()
+    health = run.track.health
     contents = {
         "metrics.json": {"recording": run.sequence.name, **run.metrics, "conventions": run.words},
         "config.json": asdict(config),
         "run.json": origin,
-        "health.json": asdict(track.health) if track.health else None,
+        "health.json": asdict(health) if health else None,
     }
     with results_folder(folder) as new:
         written = _track_files(new, run)
@@ -149,12 +150,12 @@ def _track_files(folder: Path, found: Comparison) -> list[Path]:
 
 
 def _figures(folder: Path, found: Comparison) -> list[Path]:
-    """Write plan and errors of all tracks, and the innovations of the main one."""
+    """Write plan and errors of all tracks, and the filter's innovations."""
     name, truth, tracks = found.sequence.name, found.sequence.truth, found.aligned()
-    track = found.tracks[found.main]
+    track = found.track
     figures = {"plan.png": plan_view(tracks, truth, name, shown_positions(found.sequence, track))}
     if truth is not None:
-        shown = {k: v for k, v in tracks.items() if k != "inertial"}
+        shown = {k: v for k, v in tracks.items() if k != "dead_reckoning"}
         figures["error.png"] = error_over_time(shown, truth, f"{name}: position error")
     drawn = track.innovations
     if drawn is not None and len(drawn.time):

@@ -38,15 +38,15 @@ def _columns(over: Callable[..., Any]) -> list[Column]:
         "pdr": "steps (PDR)",
         "network_true_attitude": "network, true attitude",
         "network": "network, own attitude",
-        "ekf": "EKF",
-        "graph": "graph",
+        "filtered": "filtered",
+        "track": "track",
     }
-    others = (("ekf", "nis_mean", "EKF NIS"), ("ekf", "nees_median", "EKF NEES"))
+    others = (("filtered", "nis_mean", "NIS"), ("filtered", "nees_median", "filtered NEES"))
     return [
         *(_WithFit(title, "ate_m", ".2f", over, {"track": t}) for t, title in errors.items()),
         *(
             Column(title, metric, ".2f", over, {"track": track})
-            for track, metric, title in (*others, ("graph", "nees_median", "graph NEES"))
+            for track, metric, title in (*others, ("track", "nees_median", "track NEES"))
         ),
     ]
 

@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
-from stario.fusion.evaluation.compare import FULL_COVERAGE, METRIC_TITLES, Comparison
+import numpy as np
+
+from stario.fusion.evaluation.compare import (
+    FULL_COVERAGE,
+    METRIC_TITLES,
+    METRIC_WORDS,
+    TRACK_WORDS,
+    Comparison,
+    Metrics,
+)
+from stario.fusion.evaluation.known_positions import position_error_words
+from stario.sequences.drawing.figures import distance
 from stario.sequences.drawing.text_table import aligned, figure
 
 if TYPE_CHECKING:
@@ -99,34 +112,24 @@ _UNTRACKED = 1.5
 """Time at a recording's ends without a track [s] below which all of it counts as tracked: a track
 starts where the attitude is known, up to a second after the first sample."""
 
-_EXPLAINED = (
-    *("ate_m", "horizontal", "alignment", "ate_fit_m", "rte_m", "pde", "aye_rad"),
-    *("nees_median", "nis_mean", "seconds_filter"),
-)
-"""Figures explained below a table, or below several."""
+_SHOWN_FACTORS = {"pde": 100.0, "aye_rad": math.degrees(1.0)}
+"""Factors from a figure's unit to that of its column in `METRIC_TITLES`."""
+
+
+def shown_value(metrics: Metrics, key: str) -> float | None:
+    """Return a figure in the unit of its column; None if it is unknown."""
+    value = metrics.get(key)
+    return None if value is None else _SHOWN_FACTORS.get(key, 1.0) * value
 
 
 def track_table(found: Comparison) -> str:
-    """Format a table with a row of known metrics per track; `column_words` explains it."""
-    metrics, truth, columns = found.metrics, found.sequence.truth, _known_columns(found)
+    """Format a table with a row of known metrics per track; `EXPLANATION` explains it."""
+    columns = _known_columns(found)
     rows = [
-        [name, *(figure(values.get(key)) for key in columns)] for name, values in metrics.items()
+        [name, *(figure(shown_value(values, key), ".2f") for key in columns)]
+        for name, values in found.metrics.items()
     ]
-    lines = aligned([["", *columns.values()], *rows])
-    if truth is None:
-        return "\n".join(lines)
-    covered = float(truth.covers(found.tracks[found.main].time).mean())
-    if covered < FULL_COVERAGE:
-        lines.append(f"The truth covers {covered:.0%} of the track; metrics refer to that part.")
-    return "\n".join(lines)
-
-
-def column_words(found: Comparison) -> dict[str, str]:
-    """Return the meaning of the columns of a table by their titles without units."""
-    titles, words = _known_columns(found), found.words
-    if found.sequence.truth is not None:
-        titles |= {"horizontal": "horizontal", "alignment": "alignment"}
-    return {titles[key].partition(" [")[0]: words[key] for key in _EXPLAINED if key in titles}
+    return "\n".join(aligned([["", *columns.values()], *rows]))
 
 
 def _known_columns(found: Comparison) -> dict[str, str]:
@@ -140,10 +143,65 @@ def _known_columns(found: Comparison) -> dict[str, str]:
     return {key: title for key, title in METRIC_TITLES.items() if key in known}
 
 
-def tracked_words(found: Comparison) -> str:
-    """Return how much of a recording is tracked: less where a sensor stopped, for example."""
-    time = found.tracks[found.main].time
-    recorded, tracked = found.sequence.duration, float(time[-1] - time[0])
-    if recorded - tracked < _UNTRACKED:
-        return f"{recorded:.1f} s"
-    return f"{tracked:.1f} of {recorded:.1f} s tracked"
+def track_words(found: Comparison) -> str:
+    """Return in one line the length of the track, where it ends, and how sure that is."""
+    track, time, recorded = found.track, found.track.time, found.sequence.duration
+    tracked = float(time[-1] - time[0])
+    duration = f"{recorded:.1f} s"
+    if recorded - tracked >= _UNTRACKED:
+        duration = f"{tracked:.1f} of {recorded:.1f} s tracked"
+    ends = np.linalg.norm(np.diff(track.trajectory.position_W[[0, -1], :2], axis=0))
+    words = (
+        f"{track.trajectory.path_length():.1f} m in {duration}, ending {ends:.1f} m from its start"
+    )
+    sigma = {} if track.health is None else track.health.final_sigma
+    if sigma:
+        words += (
+            f" (sigma there {sigma['position_m']:.1f} m, height {sigma['height_m']:.1f} m, "
+            f"yaw {math.degrees(sigma['yaw_rad']):.1f} deg)"
+        )
+    return words
+
+
+def error_words(found: Comparison, name: str = "track") -> str:
+    """Return in one line how far a track is from the truth or the known positions.
+
+    Empty if nothing is known.
+    """
+    metrics, path = found.metrics[name], found.path_m
+    if metrics["ate_m"] is None or metrics["ate_fit_m"] is None or path is None:
+        positions = found.sequence.positions
+        if found.sequence.truth is not None or positions is None:
+            return ""
+        return position_error_words(found.tracks[name], positions)
+    share = 100.0 * metrics["ate_m"] / max(path, 1e-9)
+    if share >= 100.0:
+        return f"{distance(metrics['ate_m'])} rms from the truth"
+    words = (
+        f"{metrics['ate_m']:.2f} m rms from the truth ({share:.1f} % of its {path:.1f} m), "
+        f"{metrics['ate_fit_m']:.2f} m after a yaw fit"
+    )
+    covariance = found.aligned()[name].position_covariance_W
+    if covariance is not None:
+        sigma = math.sqrt(float(np.mean(covariance[:, 0, 0] + covariance[:, 1, 1])))
+        words += f"; its sigma says {sigma:.2f} m"
+    if (metrics["coverage"] or 0.0) < FULL_COVERAGE:
+        words += f"; the truth covers {metrics['coverage']:.0%} of it"
+    return words
+
+
+def _without_unit(words: str) -> str:
+    """Return words without the units of JSON, which are not always those of the tables."""
+    return re.sub(r" \[[^]]*\]", "", words)
+
+
+EXPLANATION = "\n".join(
+    [
+        *(f"{name}: {words}." for name, words in TRACK_WORDS.items()),
+        "length: along chords of one second, so that neither sway nor noise adds to it.",
+        "sigma: one standard deviation, horizontal unless said.",
+        *(f"{title}: {_without_unit(METRIC_WORDS[key])}." for key, title in METRIC_TITLES.items()),
+        *(f"{key}: {METRIC_WORDS[key]}." for key in ("horizontal", "alignment")),
+    ]
+)
+"""Definitions of all that `run` and `compare` print."""

@@ -18,6 +18,7 @@ from stario.fusion.filter.jacobians import (
     CLONE,
     CLONED,
     CORE,
+    OFFSET,
     plain_covariance,
     symmetric,
 )
@@ -74,9 +75,9 @@ class EkfState:
             for the gains, which take the network's errors for white, and as it is, given these
             gains and the errors' correlation (README.md, "Correlated errors").
         clone_times: times of the clones [s]; None for an empty slot.
+        offset_W: (3,) steady error of the displacements since one that contradicted the filter [m];
+            its rows of the covariances are zero while there is none.
         considered_time: time up to which the considered errors are propagated [s].
-        network_turn: yaw error (turn) of the network's displacements, positive left [rad]; fixed at
-            zero until fixes determine the direction (`network_errors.py`).
         field: the magnetic field; None before its first measurement.
     """
 
@@ -88,7 +89,7 @@ class EkfState:
     covariances: FloatArray
     clone_times: tuple[float | None, ...]
     considered_time: float
-    network_turn: float = 0.0
+    offset_W: FloatArray
     field: FieldState | None = None
 
     @classmethod
@@ -97,13 +98,13 @@ class EkfState:
         origin_W = state.p_W if np.linalg.norm(state.p_W) > _MAX_ORIGIN_DISTANCE else np.zeros(3)
         X = np.tile(np.eye(3, 5), (slots + 1, 1, 1))
         X[0, :, :3], X[0, :, 3], X[0, :, 4] = state.R_WB, state.v_W, state.p_W - origin_W
-        turn_row = CORE + CLONE * slots
-        n = turn_row + 1 + len(CONSIDERED_SECONDS)
+        clones_end = CORE + CLONE * slots
+        n = clones_end + OFFSET + len(CONSIDERED_SECONDS)
         P = np.zeros((2, n, n))
         P[:, :CORE, :CORE] = plain_covariance(state.covariance, -X[0, :, 3:].T)
-        P[ACTUAL, turn_row + 1 :, turn_row + 1 :] = np.eye(len(CONSIDERED_SECONDS))
+        P[ACTUAL, clones_end + OFFSET :, clones_end + OFFSET :] = np.eye(len(CONSIDERED_SECONDS))
         times = (None,) * slots, state.time
-        return cls(state.time, X, origin_W, state.b_g, state.b_a, P, *times)
+        return cls(state.time, X, origin_W, state.b_g, state.b_a, P, *times, np.zeros(OFFSET))
 
     @property
     def P(self) -> FloatArray:
@@ -143,30 +144,31 @@ class EkfState:
         return nav_states([self.estimate()])[0]
 
     @property
-    def turn_row(self) -> int:
-        """Row of the network's turn in the error state."""
-        return CORE + CLONE * len(self.clone_times)
-
-    @property
-    def has_turn(self) -> bool:
-        """Whether the network's turn is estimated; until then it is fixed at zero."""
-        return bool(self.P[self.turn_row, self.turn_row] > 0.0)
+    def offset_rows(self) -> slice:
+        """Rows of the displacements' steady error."""
+        first = CORE + CLONE * len(self.clone_times)
+        return slice(first, first + OFFSET)
 
     @property
     def considered_rows(self) -> slice:
         """Rows of the network's errors that are considered and never estimated."""
-        return slice(self.turn_row + 1, self.field_row)
+        first = self.offset_rows.stop
+        return slice(first, first + len(CONSIDERED_SECONDS))
 
     @property
     def field_row(self) -> int:
         """First row of the magnetic field's error: azimuth, wander, hard iron (3)."""
-        return self.turn_row + 1 + len(CONSIDERED_SECONDS)
+        return CORE + CLONE * len(self.clone_times) + OFFSET + len(CONSIDERED_SECONDS)
 
     @property
     def clone_slots(self) -> list[int]:
         """Slots that hold a clone, oldest first."""
         taken = [(time, k) for k, time in enumerate(self.clone_times) if time is not None]
         return [slot for _, slot in sorted(taken)]
+
+    def clone_rows(self, slot: int) -> slice:
+        """Return the rows of a clone in the error state."""
+        return slice(CORE + CLONE * slot, CORE + CLONE * (slot + 1))
 
     def time_of_clone(self, slot: int) -> float:
         """Return the time at which a clone was taken [s].
@@ -203,8 +205,7 @@ class EkfState:
         Raises:
             InputError: the slot holds no clone.
         """
-        time, first, zero = self.time_of_clone(slot), CORE + CLONE * slot, np.zeros(3)
-        rows = slice(first, first + CLONE)
+        time, rows, zero = self.time_of_clone(slot), self.clone_rows(slot), np.zeros(3)
         covariances = np.zeros((2, CORE, CORE))
         covariances[:, CLONED[:, None], CLONED] = self.covariances[:, rows, rows]
         X = self.X[1 + slot].copy()
@@ -214,7 +215,7 @@ class EkfState:
         """Return the state moved by an error (n,), X <- exp(error) X, with its covariances."""
         xi = np.zeros((len(self.X), 3, 3))  # rows theta, rho_v, rho_p of each pose
         xi[0] = error[:9].reshape(3, 3)
-        xi[1:, ::2] = error[CORE : self.turn_row].reshape(-1, 2, 3)
+        xi[1:, ::2] = error[CORE : self.offset_rows.start].reshape(-1, 2, 3)
         field = self.field
         if field is not None:
             azimuth, wander, *_ = error[self.field_row :].tolist()
@@ -225,7 +226,7 @@ class EkfState:
             X=exp_times(xi[:, 0], xi[:, 1:].transpose(0, 2, 1), self.X),
             b_g=self.b_g + error[9:12],
             b_a=self.b_a + error[12:15],
-            network_turn=self.network_turn + float(error[self.turn_row]),
+            offset_W=self.offset_W + error[self.offset_rows],
             field=field,
         )
 
@@ -249,12 +250,26 @@ class EkfState:
             A[first : first + 3, first : first + 3] = R
             A[rho : rho + 3, rho : rho + 3] = R
             A[rho : rho + 3, first : first + 3] = skew(shift) @ R
-        A[3:6, 3:6] = R
+        A[3:6, 3:6] = A[self.offset_rows, self.offset_rows] = R
         P = symmetric(A @ self.covariances @ A.T)
         field = self.field
         if field is not None:
             field = changed(field, azimuth=field.azimuth + math.atan2(R[1, 0], R[0, 0]))
-        return changed(self, X=X, origin_W=origin_W, covariances=P, field=field)
+        offset_W = R @ self.offset_W
+        return changed(self, X=X, origin_W=origin_W, covariances=P, offset_W=offset_W, field=field)
+
+    def with_offset_widened(self, variance: float) -> EkfState:
+        """Return the state with more variance [m^2] of the displacements' steady error."""
+        P, rows = self.covariances.copy(), self.offset_rows
+        P[:, rows, rows] += variance * np.eye(OFFSET)
+        return changed(self, covariances=P)
+
+    def without_offset(self) -> EkfState:
+        """Return the state without a steady error, which then is in no displacement."""
+        P = self.covariances.copy()
+        P[:, self.offset_rows] = 0.0
+        P[:, :, self.offset_rows] = 0.0
+        return changed(self, covariances=P, offset_W=np.zeros(OFFSET))
 
     def with_yaw_inflated(self, about_W: FloatArray, sigma: float) -> EkfState:
         """Return the state with its covariances inflated by a turn of the frame about a vertical.

@@ -14,13 +14,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stario.fusion.filter.jacobians import CORE, POSITION
 from stario.fusion.filter.planar_alignment import PlanarAlignment, without_yaw
 from stario.fusion.lie import UNKNOWN_YAW, e3_cross
 from stario.fusion.state import NavState, changed
-from stario.sequences.sequence import FloatArray, Trajectory
+from stario.sequences.sequence import FloatArray
 
 _HORIZONTAL = np.diag([1.0, 1.0, 0.0])
 
@@ -198,18 +197,3 @@ def with_undirected(states: list[NavState], undirected: Sequence[FrameTransform]
     for stretch in undirected:
         states = [changed(stretch.state(s), map_frame=s.map_frame) for s in states]
     return states
-
-
-def smoothed_track(
-    poses: list[NavState], transforms: Sequence[FrameTransform]
-) -> Trajectory | None:
-    """Return smoothed poses as a track in its final frame; None if there are none."""
-    if not poses:
-        return None
-    states = to_final_frame(poses, transforms)
-    return Trajectory(
-        time=np.array([s.time for s in states]),
-        position_W=np.array([s.p_W for s in states]),
-        attitude_WB=Rotation.from_matrix(np.array([s.R_WB for s in states])),
-        position_covariance_W=np.array([s.position_covariance for s in states]),
-    )

@@ -13,11 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.config import MIN_PRIOR_SIGMA, NavigatorConfig
-from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.engine import with_gain
-from stario.fusion.filter.hypotheses import HypothesisPair
+from stario.fusion.config import MIN_PRIOR_SIGMA, FilterConfig
+from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, GYRO_BIAS
+from stario.fusion.filter.kalman import corrected
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
 from stario.fusion.state import changed
 from stario.sequences.sequence import FloatArray
@@ -56,67 +55,36 @@ class GyroBiasPrior:
         """
         return changed(self, variance=self._mean(float(b_g @ b_g + np.trace(P)) - 3.0 * wander))
 
+    def widest(self) -> GyroBiasPrior:
+        """Return the prior with its mean variance, before anything is known of the bias."""
+        nu = _DEGREES_OF_FREEDOM
+        return changed(self, variance=nu / (nu - 2.0) * self.sigma**2)
+
     def _mean(self, squared: float) -> float:
         nu = _DEGREES_OF_FREEDOM
         return max((nu * self.sigma**2 + squared) / (nu + 1.0), self.sigma**2)
 
 
-class AdaptiveBiasPrior:
-    """Adaptive prior of the bias in a filter and its alternative.
+def first_prior(f: FilterConfig) -> GyroBiasPrior:
+    """Return the prior of the bias with which the filter is initialised."""
+    sigma = max(f.gyro_bias_sigma, MIN_PRIOR_SIGMA)
+    return GyroBiasPrior(sigma, sigma**2)
 
-    Args:
-        hypotheses: the filter and its alternative.
-        config: settings and noise.
-        start: time of the first state [s].
 
-    Attributes:
-        prior: prior as currently applied in the filter.
+def is_due(interval: ImuInterval, start: float) -> bool:
+    """Return whether a half second since the start, or a gap, ends in an interval.
+
+    The information changes no faster.
     """
 
-    def __init__(self, hypotheses: HypothesisPair, config: NavigatorConfig, start: float) -> None:
-        self._hypotheses, self._config, self._start = hypotheses, config, start
-        sigma = max(config.filter.gyro_bias_sigma, MIN_PRIOR_SIGMA)
-        self.prior = GyroBiasPrior(sigma, sigma**2)
+    def half_seconds(time: float) -> int:
+        return math.floor(2.0 * (time - start) + SAME_TIME)
 
-    def begin(self) -> None:
-        """Widen the prior to its mean variance before anything is known of the bias."""
-        if self._config.filter.adaptive:
-            nu = _DEGREES_OF_FREEDOM
-            variance = nu / (nu - 2.0) * self.prior.sigma**2
-            self._replace_prior(changed(self.prior, variance=variance))
-
-    def update(self, interval: ImuInterval) -> None:
-        """Adapt the prior after an interval to what the data show about the bias."""
-        if not self._config.filter.adaptive:
-            return
-        if not interval.gap and self._half_seconds(interval.stop) == self._half_seconds(
-            interval.start
-        ):
-            return
-        s = self._hypotheses.ekf.state
-        P = s.P[GYRO_BIAS, GYRO_BIAS]
-        self._replace_prior(self.prior.updated(s.b_g, P, self._wander))
-
-    def _replace_prior(self, updated: GyroBiasPrior) -> None:
-        """Replace the prior in both filters as if the new one had been used from the start."""
-        old, new = self.prior.variance + self._wander, updated.variance + self._wander
-        ekf = self._hypotheses.ekf
-        self._hypotheses.apply_to_both(lambda: replace_prior(ekf, old, new))
-        self.prior = updated
-
-    def _half_seconds(self, time: float) -> int:
-        """Return the whole half seconds since the start; the information changes no faster."""
-        return math.floor(2.0 * (time - self._start) + SAME_TIME)
-
-    @property
-    def _wander(self) -> float:
-        """Variance by which the bias may have changed since the start."""
-        seconds = max(0.0, self._hypotheses.ekf.state.time - self._start)
-        return float(self._config.noise.gyro_walk**2 * seconds)
+    return interval.gap or half_seconds(interval.stop) != half_seconds(interval.start)
 
 
-def replace_prior(ekf: StateCloningEkf, old: float, new: float) -> None:
-    """Replace the gyroscope bias's zero-mean prior as if the new one had been used throughout.
+def with_prior_replaced(s: EkfState, old: float, new: float) -> EkfState:
+    """Return the state as if the gyroscope bias's zero-mean prior had always been another one.
 
     The old prior's information is removed and the new one's added: an update by a measurement of
     zero, with negative variance if the prior widens; exact as far as the filter is linear and the
@@ -124,21 +92,20 @@ def replace_prior(ekf: StateCloningEkf, old: float, new: float) -> None:
     information can be removed than there is, both priors are then widened by one factor.
 
     Args:
-        ekf: the filter.
+        s: the state.
         old: variance per axis of the previous prior [rad^2/s^2].
         new: variance per axis of the new prior [rad^2/s^2].
     """
     if new > (1.0 + _PRIOR_TOLERANCE) * old:
-        widest = float(np.linalg.eigvalsh(ekf.state.P[GYRO_BIAS, GYRO_BIAS])[-1])
+        widest = float(np.linalg.eigvalsh(s.P[GYRO_BIAS, GYRO_BIAS])[-1])
         old, new = max(old, widest), new * max(1.0, widest / old)
     while abs(new - old) > _PRIOR_TOLERANCE * old:
         step = min(new, 2.0 * old)  # a larger one would be badly conditioned
-        P, HP = ekf.covariances, ekf.covariances[:, GYRO_BIAS]
-        S = HP[:, :, GYRO_BIAS] + old * step / (old - step) * np.eye(3)
-        K = np.asarray(np.linalg.solve(S[ASSUMED], HP[ASSUMED]).T, dtype=np.float64)
-        updated = with_gain(P, K, HP, S)
+        before, R = s.covariances, old * step / (old - step) * np.eye(3)
+        H = np.eye(3, before.shape[1], k=GYRO_BIAS.start)
+        s = corrected(s, -s.b_g, H, np.array((R, R)))
         if step > old:  # the error gains what the gains forget, however large it is
-            updated[ACTUAL] = P[ACTUAL] + updated[ASSUMED] - P[ASSUMED]
-        ekf.x = (K @ -ekf.state.b_g)[:, None]
-        ekf.inject(updated)
+            actual = before[ACTUAL] + s.P - before[ASSUMED]
+            s = changed(s, covariances=np.array((s.P, actual)))
         old = step
+    return s

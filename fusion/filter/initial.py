@@ -9,7 +9,8 @@ import numpy as np
 
 from stario.fusion.checked import checked, checked_rotation
 from stario.fusion.config import MIN_PRIOR_SIGMA, NavigatorConfig
-from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter.ekf import initialised
+from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.lie import UNKNOWN_YAW, yaw_rotation
@@ -76,10 +77,8 @@ def tilt_sigma(start: Start, config: NavigatorConfig) -> float:
     return STILL_TILT_SIGMA if start.still else start.liveliness * config.filter.tilt_sigma
 
 
-def initialise(
-    ekf: StateCloningEkf, start: Start, prior: PriorPose | None, config: NavigatorConfig
-) -> None:
-    """Set the first state: the prior if given, else levelled by gravity, at rest, at the origin.
+def first_state(start: Start, prior: PriorPose | None, config: NavigatorConfig) -> EkfState:
+    """Return the first state: the prior if given, else levelled by gravity, at rest, at the origin.
 
     Raises:
         InputError: gravity contradicts the prior's attitude.
@@ -95,7 +94,7 @@ def initialise(
     sigma += [f.gyro_bias_sigma] * 3 + [f.accel_bias_sigma] * 3
     covariance = np.diag(np.square(np.maximum(sigma, MIN_PRIOR_SIGMA)))
     state = NavState(start.time, pose.R_WB, pose.v_W, pose.p_W, zero, zero, covariance)
-    ekf.initialise(state)
+    return initialised(state, f.window_updates)
 
 
 def _check_tilt(prior: PriorPose, start: Start) -> None:
@@ -112,9 +111,9 @@ def _check_tilt(prior: PriorPose, start: Start) -> None:
         raise InputError("prior: R_WB", found, expected, "R_WB maps vectors from B to W")
 
 
-def reinitialise(ekf: StateCloningEkf, interval: ImuInterval, config: NavigatorConfig) -> None:
-    """Reset the state after a long gap: tilt from gravity, velocity and yaw unknown."""
-    f, s, start = config.filter, ekf.state, interval.levelled
+def state_after_loss(s: EkfState, interval: ImuInterval, config: NavigatorConfig) -> EkfState:
+    """Return the state after a long gap: tilt from gravity, velocity and yaw unknown."""
+    f, start = config.filter, interval.levelled
     assert start is not None  # no gap is that long without
     covariance, seconds = s.nav_state().covariance, interval.duration
     # The position stays correlated with the biases that led there.
@@ -129,4 +128,5 @@ def reinitialise(ekf: StateCloningEkf, interval: ImuInterval, config: NavigatorC
     drift = np.minimum(seconds * np.square(walks), np.square(turn_on_sigma))
     covariance[9:, 9:] += np.diag(drift)
     R_WB, v_W = yaw_rotation(s.R_WB) @ start.R_WB, np.zeros(3)
-    ekf.initialise(NavState(interval.stop, R_WB, v_W, s.p_W, s.b_g, s.b_a, covariance))
+    state = NavState(interval.stop, R_WB, v_W, s.p_W, s.b_g, s.b_a, covariance)
+    return initialised(state, len(s.clone_times))

@@ -17,7 +17,7 @@ import numpy as np
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.gap import gap_covariance
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.lie import e3_cross, twist
+from stario.fusion.lie import twist
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.sequence import FloatArray
 
@@ -30,6 +30,9 @@ POSITION, GYRO_BIAS = slice(6, 9), slice(9, 12)
 CLONE = 6
 """Size of the error state of one cloned pose."""
 
+OFFSET = 3
+"""Size of the steady error of displacements."""
+
 CLONED = np.array([0, 1, 2, 6, 7, 8])
 """Rows of theta and rho_p, which a clone copies."""
 
@@ -39,7 +42,6 @@ ASSUMED, ACTUAL = 0, 1
 Block = tuple[int, FloatArray]
 """First column of a Jacobian block in the error state, and the block (m, width)."""
 
-_ACCEL_BIAS = 12
 _EYE = np.eye(3)
 _LAST_EYE = np.eye(3, CLONE, k=3)
 _LAST_MINUS_EYE = -_LAST_EYE
@@ -47,7 +49,7 @@ _LAST_EYE_CORE = np.eye(3, 9, k=6)
 
 
 def displacement_jacobian(p_i_W: FloatArray, p_j_W: FloatArray, slot: int) -> list[Block]:
-    """Return the Jacobian of the residual of `StateCloningEkf.update_displacement`.
+    """Return the Jacobian of the residual of `ekf.update_displacement`.
 
     theta_i: [p_i]x - (e3 x (p_j - p_i)) e3^T, rho_pi: -I, theta_j: -[p_j]x, rho_pj: I. The third
     column of the first block equals that of [p_j]x; written so, H times yaw is exactly zero.
@@ -58,31 +60,6 @@ def displacement_jacobian(p_i_W: FloatArray, p_j_W: FloatArray, slot: int) -> li
     H_j = _LAST_EYE_CORE.copy()
     H_j[:, :3] -= P_j
     return [(CORE + CLONE * slot, H_i), (0, H_j)]
-
-
-def turn_jacobian(d_W: FloatArray, turn_row: int) -> Block:
-    """Return the block for the network's turn in that Jacobian: e3 x d, d (3,) displacement [m]."""
-    return turn_row, e3_cross(d_W)[:, None]
-
-
-def mean_velocity_jacobian(
-    v_W: FloatArray, force_W: FloatArray, R_WB: FloatArray, seconds: float
-) -> list[Block]:
-    """Return the Jacobian of the residual of `StateCloningEkf.update_mean_velocity`.
-
-    With the mean m = v - gain and the force's part F of the gain, whose errors are -[F]x theta and
-    -R T/2 d_ba: theta -[v]x + [F]x - (e3 x m) e3^T, rho_v I, d_ba R T/2. Since gravity is vertical,
-    the yaw column is zero.
-
-    Args:
-        v_W: (3,) current velocity [m/s].
-        force_W: (3,) F [m/s].
-        R_WB: (3, 3) attitude.
-        seconds: length T of the window [s].
-    """
-    H = np.zeros((3, CLONE))
-    H[:, :2], H[:, 3:] = skew(force_W - v_W)[:, :2], _EYE
-    return [(0, H), (_ACCEL_BIAS, 0.5 * seconds * R_WB)]
 
 
 def position_jacobian(p_W: FloatArray) -> list[Block]:

@@ -20,17 +20,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stario.fusion.filter.ekf import StateCloningEkf
+from stario.fusion.filter import ekf
 from stario.fusion.filter.ekf_state import EkfState, FieldState
-from stario.fusion.filter.engine import UpdateResult, gauss_markov
 from stario.fusion.filter.field_rotation import FieldRotation
-from stario.fusion.filter.hypotheses import HypothesisPair
+from stario.fusion.filter.kalman import UpdateResult, gauss_markov
 from stario.fusion.fixes import Fix, yaw_fix
-from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
+from stario.fusion.imu.intervals import SAME_TIME
 from stario.fusion.lie import yaw_twist
 from stario.fusion.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
-from stario.sequences.inspection.magnetic import HELD_CHANGE
 from stario.sequences.sequence import FloatArray
 
 WANDER_METRES, WANDER_SECONDS = 5.0, 60.0
@@ -41,8 +39,7 @@ HARD_IRON_SIGMA = 10.0
 """Sigma of the hard iron that a phone's calibration leaves, per axis [uT]."""
 
 BEARING_SIGMA = 0.3
-"""White noise of one bearing [rad] if the wander's sigma is `WANDER_SIGMA`, else in proportion:
-steel within a step's length, late samples while the device turns."""
+"""White noise of one bearing [rad]: steel within a step's length, late samples while it turns."""
 
 _FIRST_AZIMUTH_SIGMA = math.pi
 """Initial standard deviation of c [rad]."""
@@ -63,12 +60,6 @@ NORTH_SIGMA = 0.1
 _MIN_NORTH_COUNT = 20
 """Number of bearings before north is determined: those of ten seconds."""
 
-_EXTRAPOLATED_FACTOR = 10.0
-"""Factor on the variance of a field that the device has extrapolated by its own gyroscope."""
-
-_MIN_SPEED = 0.3
-"""Speed below which the spread is not updated [m/s]: in one spot the field hardly varies."""
-
 _PERIOD = 0.5
 """Time between two bearings [s]."""
 
@@ -76,24 +67,15 @@ _NEW_PLACE, _NEW_TURN = 0.3, 0.2
 """Distance [m] or rotation [rad] since the last bearing from which on the next one is used."""
 
 WANDER_SIGMA = 0.4
-"""Maximum sigma of the wander, the azimuth about its mean [rad]: buildings turn it by 5 to 30
-degrees."""
-
-_MIN_WANDER_SIGMA = 0.1
-"""Minimum sigma of the wander, in a field that hardly varies [rad]."""
-
-_WANDER_PER_SPREAD = 2.0
-"""Sigma of the wander per unit of `MagneticReference.spread` [rad]: 1 to 2 according to the true
-attitude of OxIOD, RIDI, KIPD and tyrex."""
+"""Sigma of the wander, the azimuth about its mean [rad]: buildings turn it by 5 to 30 degrees. One
+that follows how size and dip vary along the path changed no error on OxIOD, RIDI, KIPD and tyrex by
+more than 1 %."""
 
 _SIZE_TOLERANCE, _DIP_TOLERANCE = 0.05, 0.05
 """Deviations from the place's usual size (fraction) and dip [rad] that double the variance."""
 
 _AVERAGING_COUNT = 120
-"""Number of bearings that determine the place's usual size, dip and spread: those of a minute."""
-
-_FIRST_SPREAD, _FIRST_COUNT = 0.2, 20
-"""Initial spread, as in a building, and the number of bearings it counts as."""
+"""Number of bearings that determine the place's usual size and dip: those of a minute."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +87,6 @@ class MagneticReference:
         count: number of bearings so far.
         size: usual size of the field [uT].
         dip: usual angle below the horizontal [rad].
-        spread: mean deviation of size (fraction) and dip [rad] from their usual values in motion.
-        moving_count: number of bearings averaged in `spread`.
-        measured: size of the last measured field, including hard iron [uT].
         rotation: how the field has changed while the device rotated.
         pose: attitude R_WB (3, 3) and position p_W (3,) [m] at the last bearing.
     """
@@ -116,16 +95,8 @@ class MagneticReference:
     count: int = 0
     size: float = 0.0
     dip: float = 0.0
-    spread: float = _FIRST_SPREAD
-    moving_count: int = 0
-    measured: float = 0.0
     rotation: FieldRotation = field(default_factory=FieldRotation)
     pose: tuple[FloatArray, FloatArray] | None = None
-
-    @property
-    def wander_sigma(self) -> float:
-        """Sigma of the azimuth about its mean [rad], from the variation of size and dip."""
-        return min(max(_WANDER_PER_SPREAD * self.spread, _MIN_WANDER_SIGMA), WANDER_SIGMA)
 
     def unusual(self, size: float, dip: float) -> float:
         """Return how far a field's size [uT] and dip [rad] are from usual; 1 doubles a variance."""
@@ -148,59 +119,23 @@ class MagneticReference:
         turned = s.R_WB @ R_WB.T
         return math.hypot(x, y) > _NEW_PLACE or np.trace(turned) < 1.0 + 2.0 * math.cos(_NEW_TURN)
 
-    def updated(self, time: float, size: float, dip: float, new_place: bool) -> MagneticReference:
+    def updated(self, time: float, size: float, dip: float) -> MagneticReference:
         """Return the reference after one more bearing: clipped means, as robust as medians.
 
         Args:
             time: time of the bearing [s].
             size: size of the field [uT].
             dip: angle below the horizontal [rad].
-            new_place: whether the field was newly measured while moving.
         """
         count = self.count + 1
         if count == 1:
             return changed(self, time=time, count=1, size=size, dip=dip)
-        mean_gain = 1.0 / min(count, _AVERAGING_COUNT)
-        size_clip = 2.0 * _SIZE_TOLERANCE * self.size
-        usual_size = self.size + mean_gain * min(max(size - self.size, -size_clip), size_clip)
+        gain = 1.0 / min(count, _AVERAGING_COUNT)
+        clip = 2.0 * _SIZE_TOLERANCE * self.size
+        size_change = min(max(size - self.size, -clip), clip)
         dip_change = min(max(dip - self.dip, -2.0 * _DIP_TOLERANCE), 2.0 * _DIP_TOLERANCE)
-        usual_dip = self.dip + mean_gain * dip_change
-        means = changed(self, time=time, count=count, size=usual_size, dip=usual_dip)
-        if not new_place:
-            return means
-        distance = min(math.hypot(size / usual_size - 1.0, dip - usual_dip), 1.0)
-        moving_count = self.moving_count + 1
-        gain = 1.0 / min(moving_count + _FIRST_COUNT, _AVERAGING_COUNT)
-        return changed(
-            means, spread=self.spread + gain * (distance - self.spread), moving_count=moving_count
-        )
-
-
-class MagneticUpdates:
-    """Updates with the bearings of the magnetic field.
-
-    Args:
-        hypotheses: the filter and its alternative; bearings are applied to both.
-
-    Attributes:
-        reference: usual properties of the field, and its last measurement.
-    """
-
-    def __init__(self, hypotheses: HypothesisPair) -> None:
-        self._hypotheses = hypotheses
-        self.reference = MagneticReference()
-
-    def update(self, interval: ImuInterval) -> UpdateResult | None:
-        """Update with the interval's field; return None if it has none, or none is due."""
-        field_B, ekf = interval.field_B, self._hypotheses.ekf
-        if field_B is None or not self.reference.is_due(interval.stop, ekf.state):
-            return None
-        result, self.reference = self._hypotheses.apply_to_both(
-            lambda: update_bearing(ekf, self.reference, field_B)
-        )
-        s = ekf.state
-        self.reference = changed(self.reference, pose=(s.R_WB, s.p_W))
-        return result
+        usual = self.size + gain * size_change, self.dip + gain * dip_change
+        return changed(self, time=time, count=count, size=usual[0], dip=usual[1])
 
 
 def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> Fix | None:
@@ -233,53 +168,38 @@ def with_field(s: EkfState, m_B: FloatArray) -> EkfState:
     return changed(s, covariances=P, field=FieldState(math.atan2(y, x), 0.0, np.zeros(3)))
 
 
-def propagated_field(s: EkfState, seconds: float, sigma: float) -> EkfState:
-    """Return the state with its azimuth propagated for a time at the current speed.
-
-    Args:
-        s: state before.
-        seconds: duration [s].
-        sigma: standard deviation of the azimuth about its mean [rad].
-    """
+def propagated_field(s: EkfState, seconds: float) -> EkfState:
+    """Return the state with its azimuth propagated for a time [s] at the current speed."""
     assert s.field is not None  # set by `with_field`
     metres = seconds * math.hypot(s.v_W[0], s.v_W[1])
     row = s.field_row + 1
     correlation = math.exp(-metres / WANDER_METRES - seconds / WANDER_SECONDS)
-    P = gauss_markov(s.covariances, slice(row, row + 1), np.array([correlation]), sigma)
+    P = gauss_markov(s.covariances, slice(row, row + 1), np.array([correlation]), WANDER_SIGMA)
     return changed(s, covariances=P, field=changed(s.field, wander=correlation * s.field.wander))
 
 
 def update_bearing(
-    ekf: StateCloningEkf, reference: MagneticReference, m_B: FloatArray
-) -> tuple[UpdateResult, MagneticReference]:
-    """Update with the field (3,) [uT] in B at the filter's time.
-
-    Returns:
-        The outcome, and the reference after this field.
-    """
-    now, measured = ekf.state.time, float(np.linalg.norm(m_B))
+    s: EkfState, reference: MagneticReference, m_B: FloatArray
+) -> tuple[EkfState, UpdateResult, MagneticReference]:
+    """Update with the field (3,) [uT] in B at the state's time; return the reference after it."""
+    now, measured = s.time, float(np.linalg.norm(m_B))
     if measured > _STRONGEST:
-        return UpdateResult("too strong to be in uT"), changed(reference, time=now)
-    if ekf.state.field is None:
-        ekf.state = with_field(ekf.state, m_B)
+        return s, UpdateResult("too strong to be in uT"), changed(reference, time=now)
+    if s.field is None:
+        s = with_field(s, m_B)
     elif math.isfinite(reference.time):
-        ekf.state = propagated_field(ekf.state, now - reference.time, reference.wander_sigma)
-    s = ekf.state
+        s = propagated_field(s, now - reference.time)
     assert s.field is not None
     m_W = s.R_WB @ (m_B - s.field.hard_iron_B)
     horizontal = math.hypot(m_W[0], m_W[1])
     size, dip = math.hypot(horizontal, m_W[2]), math.atan2(-m_W[2], horizontal)
     if horizontal < _MIN_HORIZONTAL:
         reason = "too weak to be in uT" if measured < _WEAKEST else "no horizontal field"
-        return UpdateResult(reason), changed(reference, time=now)
+        return s, UpdateResult(reason), changed(reference, time=now)
     rotation = reference.rotation.updated(s, m_B, now - reference.time)
     reference = changed(reference, rotation=rotation)
     if rotation.contradicts_gyro:
-        return UpdateResult("contradicts the gyroscope"), changed(reference, time=now)
-    extrapolated = abs(measured - reference.measured) < HELD_CHANGE * measured
-    new_place = not extrapolated and math.hypot(s.v_W[0], s.v_W[1]) > _MIN_SPEED
-    reference = changed(reference.updated(now, size, dip, new_place), measured=measured)
-    factor = _EXTRAPOLATED_FACTOR if extrapolated else 1.0
-    sigma = BEARING_SIGMA * reference.wander_sigma / WANDER_SIGMA
-    variance = sigma**2 * (1.0 + reference.unusual(size, dip) ** 2) * factor
-    return ekf.update_bearing(m_B, variance, chi2_quantile(_GATE, 1)), reference
+        return s, UpdateResult("contradicts the gyroscope"), changed(reference, time=now)
+    reference = reference.updated(now, size, dip)
+    variance = BEARING_SIGMA**2 * (1.0 + reference.unusual(size, dip) ** 2)
+    return *ekf.update_bearing(s, m_B, variance, chi2_quantile(_GATE, 1)), reference

@@ -13,14 +13,15 @@ measurement, for the whole second.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from stario.fusion.config import FilterConfig
-from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.filter.engine import UpdateResult
-from stario.fusion.filter.hypotheses import HypothesisPair
+from stario.fusion.filter.ekf import Updated
+from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.filter.kalman import Linear, update
 from stario.fusion.imu.intervals import ImuInterval
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.inspection.stillness import looks_still, scatter_bound
@@ -53,38 +54,29 @@ class ZeroVelocity(NamedTuple):
     measurement of the whole last second."""
 
 
-class StillnessDetector:
-    """Detects whether the device was still over the last second.
-
-    Args:
-        intervals: number of intervals per second.
-        scale: factor on the noise densities of a phone's IMU; 0 never detects.
+@dataclass(frozen=True, eq=False)
+class Stillness:
+    """Whether the device was still over the last second.
 
     Attributes:
-        rested: number of intervals for which it has been still without interruption.
         window: for each interval of the last second (14,): number of samples, seconds, sums of gyro
             and accel, sums of their squares; None if it moves more than a still second may.
+        rested: number of intervals for which it has been still without interruption.
     """
 
-    def __init__(self, intervals: int, scale: float) -> None:
-        self._intervals, self._scale = intervals, scale
-        self.rested = 0
-        self.window: tuple[FloatArray | None, ...] = ()
+    window: tuple[FloatArray | None, ...] = ()
+    rested: int = 0
 
-    def is_still(self, interval: ImuInterval) -> bool:
-        """Add an interval; return whether the device was still over the second ending with it."""
-        still = self._scale > 0.0 and self._add(interval)
-        self.rested = self.rested + 1 if still else 0
-        return still
-
-    def _add(self, interval: ImuInterval) -> bool:
-        if interval.gap:
-            self.window = ()
-            return False
-        sums = None if self._moves(interval) else _sums_of(interval)
-        self.window = (*self.window, sums)[-self._intervals :]
-        calm = [sums for sums in self.window if sums is not None]
-        return len(calm) == self._intervals and self._is_quiet(np.sum(calm, axis=0))
+    def after(self, interval: ImuInterval, f: FilterConfig) -> Stillness:
+        """Return it after one more interval."""
+        if interval.gap or f.stillness_noise == 0.0:
+            return Stillness()
+        intervals = round(f.output_rate * WINDOW_SECONDS)
+        sums = None if _moves(interval, intervals, f.stillness_noise) else _sums_of(interval)
+        window = (*self.window, sums)[-intervals:]
+        calm = [sums for sums in window if sums is not None]
+        still = len(calm) == intervals and _is_quiet(np.sum(calm, axis=0), f.stillness_noise)
+        return Stillness(window, self.rested + 1 if still else 0)
 
     def measurement(self) -> ZeroVelocity:
         """Return the measurement of a still second.
@@ -98,28 +90,29 @@ class StillnessDetector:
         hidden_variance = _HIDDEN_MOTION_NOISE**2 * WINDOW_SECONDS
         white_variance = PHONE_NOISE.gyro_noise**2 / float(table[:, 1].mean())
         excess = max(float(rates.var(axis=0).sum()) - 3.0 * white_variance, 0.0)
-        seconds = 1.0 + (self.rested - 1) / self._intervals
+        seconds = 1.0 + (self.rested - 1) / n
         swaying = (_SWAY_RATE / seconds) ** 2
         rate_variance = np.full(3, white_variance + _SWAY * excess + swaying)
         variances = [*[n * hidden_variance] * 3, *(n * rate_variance)]
         return ZeroVelocity(rates[n // 2], np.diag(variances))
 
-    def _moves(self, interval: ImuInterval) -> bool:
-        """Return whether an interval's specific force scatters more than a still second's may."""
-        accel = interval.accel[1:]
-        count = len(accel)
-        total = accel.sum(axis=0)
-        scatter = float(np.vdot(accel, accel) - total @ total / count)
-        seconds = (interval.stop - interval.start) * self._intervals
-        bound = scatter_bound(count * self._intervals, seconds, self._scale)
-        return not looks_still(0.0, scatter, bound)
 
-    def _is_quiet(self, sums: FloatArray) -> bool:
-        """Return whether a second with these sums scatters no more than a still one may."""
-        count = float(sums[0])
-        scatter = sums[8:14] - np.square(sums[2:8]) / count
-        bound = scatter_bound(count, float(sums[1]), self._scale)
-        return looks_still(float(scatter[:3].sum()), float(scatter[3:].sum()), bound)
+def _moves(interval: ImuInterval, intervals: int, scale: float) -> bool:
+    """Return whether an interval's specific force scatters more than a still second's may."""
+    accel = interval.accel[1:]
+    count = len(accel)
+    total = accel.sum(axis=0)
+    scatter = float(np.vdot(accel, accel) - total @ total / count)
+    seconds = (interval.stop - interval.start) * intervals
+    return not looks_still(0.0, scatter, scatter_bound(count * intervals, seconds, scale))
+
+
+def _is_quiet(sums: FloatArray, scale: float) -> bool:
+    """Return whether a second with these sums scatters no more than a still one may."""
+    count = float(sums[0])
+    scatter = sums[8:14] - np.square(sums[2:8]) / count
+    bound = scatter_bound(count, float(sums[1]), scale)
+    return looks_still(float(scatter[:3].sum()), float(scatter[3:].sum()), bound)
 
 
 def _sums_of(interval: ImuInterval) -> FloatArray:
@@ -128,36 +121,9 @@ def _sums_of(interval: ImuInterval) -> FloatArray:
     return np.concatenate([(len(rows), interval.stop - interval.start), *totals])
 
 
-def update_zero_velocity(ekf: StateCloningEkf, measured: ZeroVelocity, gate: float) -> UpdateResult:
+def update_zero_velocity(s: EkfState, measured: ZeroVelocity, f: FilterConfig) -> Updated:
     """Update a filter; an outlier is rejected, not inflated: an even glide also looks still."""
-    s = ekf.state
     residual = np.concatenate([-s.v_W, measured.b_g - s.b_g])
     blocks = [(3, _H_VELOCITY), (9, _H_BIAS)]
-    return ekf.update_linear(residual, blocks, measured.covariance, gate, None)
-
-
-class ZeroVelocityUpdates:
-    """Updates of a device at rest.
-
-    Args:
-        hypotheses: the filter and its alternative, which ends where rest is measured.
-        config: settings of the filter.
-
-    Attributes:
-        detector: detects rest.
-    """
-
-    def __init__(self, hypotheses: HypothesisPair, config: FilterConfig) -> None:
-        self._hypotheses, self._gate = hypotheses, chi2_quantile(config.gate, 6)
-        intervals = round(config.output_rate * WINDOW_SECONDS)
-        self.detector = StillnessDetector(intervals, config.stillness_noise)
-
-    def update(self, interval: ImuInterval) -> tuple[UpdateResult, ZeroVelocity] | None:
-        """Update if the second that ends with an interval was still; None if the device moved."""
-        if not self.detector.is_still(interval):
-            return None
-        measured = self.detector.measurement()
-        result = update_zero_velocity(self._hypotheses.ekf, measured, self._gate)
-        if result.accepted:
-            self._hypotheses.alternative = None
-        return result, measured
+    limit = chi2_quantile(f.gate, 6)
+    return update(s, Linear(residual, blocks, measured.covariance), limit, None)

@@ -8,14 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.engine import fault_of
 from stario.fusion.filter.initial import tilt_sigma
-from stario.fusion.filter.network_errors import TurnEstimate
+from stario.fusion.filter.record import Record
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Fix
 from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Tilt, Velocity, Yaw
 from stario.fusion.graph.keyframe_state import KeyframeState
-from stario.fusion.graph.keyframes import KeyframeGraph
+from stario.fusion.graph.keyframes import KeyframeGraph, shallow_copy
 from stario.fusion.imu.gap import gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval, split_at
 from stario.fusion.imu.preintegration import Segment, segment_of
@@ -42,9 +41,6 @@ class GraphBuilder:
         config: noise, filter and graph settings.
         first: the first state; its covariance is the prior.
         count: number of intervals since the start or the last gap, for a graph that begins later.
-        estimates_turn: whether the network's turn is a state: where fixes distinguish it from the
-            yaw.
-        turn: estimate of the turn at the first state; None if it is new.
         streaming: rely on the filter's gating of fixes, and of displacements if it weights them
             equally. A robust loss in the graph starts from the IMU's prediction: while the speed
             was still unknown it rejected correct displacements, one after the other, and in 2 of
@@ -54,7 +50,6 @@ class GraphBuilder:
         graph: the graph so far.
         segments: for each keyframe, the intervals' segments up to the next keyframe or now.
         count: number of intervals since the start or the last gap.
-        estimates_turn: whether the network's turn is a state.
     """
 
     def __init__(
@@ -62,15 +57,12 @@ class GraphBuilder:
         config: NavigatorConfig,
         first: NavState,
         count: int = 0,
-        estimates_turn: bool = False,
-        turn: TurnEstimate | None = None,
         streaming: bool = False,
     ) -> None:
         self._config = config
-        self.graph = KeyframeGraph(first, config.filter.gate, turn)
-        self.segments: dict[int, list[Segment]] = {0: []}
+        self.graph = KeyframeGraph(first, config.filter.gate)
+        self.segments: dict[int, tuple[Segment, ...]] = {0: ()}
         self.count = count
-        self.estimates_turn = estimates_turn
         f = config.filter
         self._streaming = streaming
         self._overlap = 2 if f.update_rate % 2 == 0 else 1
@@ -78,34 +70,37 @@ class GraphBuilder:
         self._gated_by_filter = streaming and f.update_rate == self._overlap
         self._window = round(f.output_rate * WINDOW_SECONDS)  # intervals
         self._spacing = self._window // self._overlap  # intervals
-        self._pending: list[ImuInterval] = []
+        self._pending: list[Record] = []
         # Keyframes where windows begin and end, by the count of intervals; cleared at a gap.
         self._window_keyframes: dict[int, int] = {count: 0} if count % self._spacing == 0 else {}
         self._gaps: dict[int, ImuInterval] = {}  # by the keyframe before them
 
+    def copied(self) -> GraphBuilder:
+        """Return a copy that may be changed; what both hold is never modified."""
+        copy = shallow_copy(self)
+        copy.graph = self.graph.copied()
+        return copy
+
     def step(
         self,
-        interval: ImuInterval,
+        record: Record,
         displacement: WindowDisplacement | None,
-        fixes: Sequence[Fix] = (),
-        zero_velocity: ZeroVelocity | None = None,
+        fixes: Sequence[Fix],
         guess: NavState | None = None,
-        segment: Segment | None = None,
     ) -> bool:
         """Add an interval and its measurements.
 
         Args:
-            interval: the next interval.
-            displacement: measured over the window that ends with it; None if there is none.
-            fixes: fixes within the interval, in order.
-            zero_velocity: measurement at rest; None if the device moved.
-            guess: initial guess of the state at its end; None predicts it from the IMU, except
-                across a gap.
-            segment: its preintegrated samples, if available.
+            record: of the next interval.
+            displacement: its displacement, weighted as the graph needs it; None if there is none.
+            fixes: its fixes, relative to the graph's origin, in order.
+            guess: initial guess of the state at its end, and the filter's segment is used; None
+                predicts it from the IMU, except across a gap.
 
         Returns:
             Whether a keyframe was added.
         """
+        interval = record.interval
         if interval.gap:
             assert guess is not None  # a stream's graph begins again after each gap
             self._cross(interval, guess)
@@ -115,22 +110,20 @@ class GraphBuilder:
             return True
         before = self.graph.last
         self.count += 1
-        if segment is None:
-            start = self.graph.keyframe(before)
-            segment = segment_of([interval], start.b_g, start.b_a, self._config)
-        self.segments[self.graph.last].append(segment)
-        self._pending.append(interval)
+        segment = record.segment
+        if guess is None or segment is None:
+            segment = self._segment_of([record])
+        self.segments[before] = (*self.segments[before], segment)
+        self._pending.append(record)
         due = self.count % self._spacing == 0
         if due:
             self.close(guess)
-            if self.estimates_turn:
-                self.graph.add_turn(self._config.filter.network_turn_sigma)
             window_start = self._window_keyframes.get(self.count - self._window)
             if displacement is not None and window_start is not None:
                 self._add_displacement(window_start, displacement)
             self._window_keyframes[self.count] = self.graph.last
-            if zero_velocity is not None:
-                self._add_zero_velocity(zero_velocity)
+            if record.zero_velocity is not None:
+                self._add_zero_velocity(record.zero_velocity)
         for fix in fixes:
             self.fix(fix)
         return self.graph.last > before
@@ -143,13 +136,19 @@ class GraphBuilder:
         pieces = self.segments[graph.last]
         segment, start = pieces[0], graph.keyframe(graph.last)
         if len(pieces) > 1:
-            segment = segment_of(self._pending, start.b_g, start.b_a, self._config)
+            segment = self._segment_of(self._pending)
         if guess is None:
             state = KeyframeState(*self.dead_reckoned(graph.last), start.b_g, start.b_a)
         else:
             state = KeyframeState.from_nav(guess)
         self._pending = []
-        self.segments[graph.add_keyframe(segment, state)] = []
+        self.segments[graph.add_keyframe(segment, state)] = ()
+
+    def _segment_of(self, records: Sequence[Record]) -> Segment:
+        """Preintegrate the samples of records since the last keyframe, with its biases."""
+        start = self.graph.keyframe(self.graph.last)
+        intervals, factors = [r.interval for r in records], [r.accel_factor for r in records]
+        return segment_of(intervals, factors, start.b_g, start.b_a, self._config)
 
     def fix(self, fix: Fix) -> bool:
         """Add a fix up to now to the keyframe before it; return False if there is none."""
@@ -174,7 +173,7 @@ class GraphBuilder:
 
     def dead_reckoned(self, k: int, time: float = math.inf) -> Pose:
         """Dead-reckon from a keyframe to a time [s], or to the end of its data if earlier."""
-        R, v, p, b_g, b_a, _ = self.graph.keyframe(k)
+        R, v, p, b_g, b_a = self.graph.keyframe(k)
         if k in self._gaps:
             gap = self._gaps[k]
             until = min(time, gap.stop)
@@ -203,14 +202,12 @@ class GraphBuilder:
             variance = tilt_sigma(interval.levelled, self._config) ** 2
             graph.add(Tilt(graph.last, interval.levelled.up_B, variance * np.eye(3)), gated=False)
         self.count = 0
-        self.segments[graph.last] = []
+        self.segments[graph.last] = ()
         self._window_keyframes = {0: graph.last}
 
     def _add_displacement(self, i: int, displacement: WindowDisplacement) -> None:
         d_N, covariance_N, R_NB = displacement
         covariance = covariance_N * (self._overlap * self._config.filter.covariance_scale)
-        if fault_of(d_N, covariance):
-            return
         term = Displacement(i, self.graph.last, d_N, R_NB, covariance)
         self.graph.add(term, gated=not self._gated_by_filter)
 

@@ -7,7 +7,7 @@ only: none models a displacement that turns with the yaw of a pose and not with 
 "Graph factors").
 
 Tangent of a keyframe, as in gtsam: pose R exp(w), p + R dp in the order w, dp; velocity additive;
-biases additive, accelerometer first. Keys: x pose, v velocity, b biases, t the network's turn (1,).
+biases additive, accelerometer first. Keys: x pose, v velocity, b biases.
 """
 
 from __future__ import annotations
@@ -17,13 +17,12 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from gtsam.symbol_shorthand import B, T, V, X
+from gtsam.symbol_shorthand import B, V, X
 
 from stario.fusion.filter.jacobians import plain_covariance, yaw_jacobian
-from stario.fusion.filter.network_errors import TurnEstimate
 from stario.fusion.graph.covariances import root_information
-from stario.fusion.graph.keyframe_state import KeyframeState, turn_at
-from stario.fusion.lie import about_vertical, e3_cross, twist, yaw_rotation
+from stario.fusion.graph.keyframe_state import KeyframeState
+from stario.fusion.lie import e3_cross, twist, yaw_rotation
 from stario.fusion.state import NavState
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.sequence import FloatArray
@@ -96,13 +95,11 @@ class Prior:
     offset: FloatArray
 
     @classmethod
-    def of(cls, k: int, state: NavState, turn: TurnEstimate | None = None) -> Prior:
-        """Return the prior of keyframe k from a state and the network's turn, if estimated."""
-        reference, covariance = KeyframeState.from_nav(state), state.covariance
-        if turn is not None:
-            reference, covariance = reference._replace(turn=turn.turn), turn.covariance
-        root = root_information(plain_covariance(covariance, -np.stack([state.v_W, state.p_W])))
-        return cls(k, (reference,), root, np.zeros(len(root)))
+    def of(cls, k: int, state: NavState) -> Prior:
+        """Return the prior of keyframe k from a state."""
+        vectors = np.stack([state.v_W, state.p_W])
+        root = root_information(plain_covariance(state.covariance, -vectors))
+        return cls(k, (KeyframeState.from_nav(state),), root, np.zeros(len(root)))
 
     @property
     def keyframes(self) -> tuple[int, ...]:
@@ -133,9 +130,7 @@ class Displacement(Between):
     The network is given the window in a levelled frame N, whose yaw psi relative to W is that of
     R_WB R_NB^T at the window's start: p_j - p_i = R_z(psi) (d_N + n). It turns with the yaw of
     pose i alone, as in the filter's `update_displacement`; a `BetweenFactorPose3` would also infer
-    tilt from it, which on some recordings doubles the error. Where the network's turn tau at
-    keyframe j is estimated, d_N = R_z(tau) R_z(psi)^T (p_j - p_i) - n, as in the filter (README.md,
-    "Fixes").
+    tilt from it, which on some recordings doubles the error.
 
     Attributes:
         d_N: (3,) displacement [m].
@@ -151,18 +146,12 @@ class Displacement(Between):
         """Linearise in the axes of N."""
         (R_i, p_i), (R_j, p_j) = _pose(values, self.i), _pose(values, self.j)
         R_NW = yaw_rotation(R_i @ self.R_NB.T).T
-        turned = values.exists(T(self.j))
-        if turned:
-            R_NW = about_vertical(turn_at(values, self.j)) @ R_NW
         d_W = p_j - p_i
         H_i, H_j = np.zeros((3, 6)), np.zeros((3, 6))
         H_i[:, :3] = -np.outer(R_NW @ e3_cross(d_W), R_i[2])
         H_i[:, 3:] = -R_NW @ R_i
         H_j[:, 3:] = R_NW @ R_j
-        predicted, blocks = R_NW @ d_W, [(X(self.i), H_i), (X(self.j), H_j)]
-        if turned:
-            blocks.append((T(self.j), e3_cross(predicted)[:, None]))
-        return self.d_N - predicted, blocks
+        return self.d_N - R_NW @ d_W, [(X(self.i), H_i), (X(self.j), H_j)]
 
 
 @dataclass(frozen=True, eq=False)

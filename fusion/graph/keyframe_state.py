@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, T, V, X
-from scipy.linalg import block_diag
+from gtsam.symbol_shorthand import B, V, X
 
 from stario.fusion.filter.jacobians import invariant_from_local
 from stario.fusion.lie import log_se23
@@ -28,8 +27,6 @@ class KeyframeState(NamedTuple):
     """Gyroscope bias (3,) [rad/s]."""
     b_a: FloatArray
     """Accelerometer bias (3,) [m/s^2]."""
-    turn: float | None = None
-    """The network's turn [rad]; None if it is not estimated here."""
 
     @classmethod
     def from_nav(cls, state: NavState) -> KeyframeState:
@@ -46,7 +43,6 @@ class KeyframeState(NamedTuple):
             pose.translation(),
             bias.gyroscope(),
             bias.accelerometer(),
-            turn_at(values, k) if values.exists(T(k)) else None,
         )
 
     def insert_into(self, values: Any, k: int) -> None:
@@ -54,34 +50,23 @@ class KeyframeState(NamedTuple):
         values.insert(X(k), gtsam.Pose3(gtsam.Rot3(self.R_WB), self.p_W))
         values.insert(V(k), self.v_W)
         values.insert(B(k), gtsam.imuBias.ConstantBias(self.b_a, self.b_g))
-        if self.turn is not None:
-            values.insert(T(k), np.array([self.turn]))
 
     def keys(self, k: int) -> list[int]:
         """Return gtsam's keys of this state as keyframe k."""
-        return [X(k), V(k), B(k), *([] if self.turn is None else [T(k)])]
+        return [X(k), V(k), B(k)]
 
     def blocks(self, k: int, H: FloatArray) -> list[tuple[int, FloatArray]]:
         """Split a Jacobian (m, n) with respect to this state, keyframe k, by gtsam's keys."""
-        return list(zip(self.keys(k), np.split(H, [6, 9, 15], axis=1), strict=False))
+        return list(zip(self.keys(k), np.split(H, [6, 9], axis=1), strict=True))
 
     def error_from(self, other: KeyframeState) -> FloatArray:
-        """Return the right-invariant error (n,) from another: theta, rho_v, rho_p, b_g, b_a, turn.
-
-        n is 16 with the network's turn and 15 without.
-        """
+        """Return the right-invariant error (15,) from another: theta, rho_v, rho_p, b_g, b_a."""
         R = self.R_WB @ other.R_WB.T
         pose = log_se23(R, self.v_W - R @ other.v_W, self.p_W - R @ other.p_W)
-        turn = [] if self.turn is None or other.turn is None else [self.turn - other.turn]
-        return np.concatenate([pose, self.b_g - other.b_g, self.b_a - other.b_a, turn])
+        return np.concatenate([pose, self.b_g - other.b_g, self.b_a - other.b_a])
 
     def invariant_from_local(self) -> FloatArray:
-        """Return the map (n, n) from gtsam's w, dp, dv, b_a, b_g, turn to the invariant error."""
+        """Return the map (15, 15) from gtsam's w, dp, dv, b_a, b_g to the invariant error."""
         matrix = invariant_from_local(self.R_WB, self.v_W, self.p_W)
         matrix[3:6, 6:9] = np.eye(3)  # a graph's velocities are in W
-        return matrix if self.turn is None else np.asarray(block_diag(matrix, 1.0))
-
-
-def turn_at(values: Any, k: int) -> float:
-    """Return the network's turn at a keyframe [rad]."""
-    return float(values.atVector(T(k))[0])
+        return matrix

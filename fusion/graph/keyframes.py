@@ -13,8 +13,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any
+from copy import copy
+from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
@@ -23,11 +23,10 @@ from scipy.linalg import block_diag
 
 from stario.fusion.checked import check_covariance
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.network_errors import TURN_SECONDS, TurnEstimate
 from stario.fusion.graph.factors import Prior, Term
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.marginals import LinearSolution
-from stario.fusion.graph.processes import Coasting, TurnProcess
+from stario.fusion.graph.processes import Coasting
 from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_factor
 from stario.fusion.imu.gap import gap_covariance, gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import ImuInterval
@@ -44,20 +43,18 @@ _UNDETERMINED_SIGMA = 1e5
 """A state this uncertain [m, m/s, rad, ...] is undetermined: no walk is so far, fast or biased."""
 
 _GROUPS = ("attitude", "velocity", "position", "gyroscope bias", "accelerometer bias")
-_NAMES = {"x": "pose", "v": "velocity", "b": "bias", "t": "turn"}
+_NAMES = {"x": "pose", "v": "velocity", "b": "bias"}
 
 
-@dataclass(frozen=True)
-class Solution:
-    """Outcome of an optimisation.
+Held = TypeVar("Held")
 
-    Attributes:
-        rounds: number of times that the measurements were linearised.
-        down_weighted: number of measurements weighted less than their covariance implies.
-    """
 
-    rounds: int
-    down_weighted: int
+def shallow_copy(held: Held) -> Held:
+    """Return a copy of an object with copies of its lists and dictionaries."""
+    new = copy(held)
+    parts = {k: v.copy() for k, v in vars(held).items() if isinstance(v, dict | list)}
+    vars(new).update(parts)
+    return new
 
 
 class KeyframeGraph:
@@ -67,10 +64,9 @@ class KeyframeGraph:
         first: the first keyframe; its covariance is the prior.
         gate: probability beyond which a residual counts as an outlier and is down-weighted, unless
             it is added with `gated` false.
-        turn: estimate of the network's turn at the first keyframe; None if that is no state.
     """
 
-    def __init__(self, first: NavState, gate: float, turn: TurnEstimate | None = None) -> None:
+    def __init__(self, first: NavState, gate: float) -> None:
         self._gate = gate
         self._states: dict[int, KeyframeState] = {}
         self._time: dict[int, float] = {}
@@ -78,7 +74,7 @@ class KeyframeGraph:
         self._terms: list[Whitened] = []
         self._solution: LinearSolution | None = None  # of the last round
         self.last = -1
-        self.add_disconnected(first, turn)
+        self.add_disconnected(first)
 
     def __getstate__(self) -> dict[str, Any]:
         """Return all but the solution: after restoring, call `solve` before `state`."""
@@ -89,10 +85,9 @@ class KeyframeGraph:
         """Numbers of the keyframes held, in order."""
         return list(self._time)
 
-    @property
-    def is_solved(self) -> bool:
-        """Whether `solve` has been called since the last change."""
-        return self._solution is not None
+    def copied(self) -> KeyframeGraph:
+        """Return an unsolved copy that may be changed; what both hold is never modified."""
+        return shallow_copy(self)
 
     def time(self, k: int) -> float:
         """Return the time of a keyframe [s]."""
@@ -113,9 +108,9 @@ class KeyframeGraph:
         self.add(Coasting(i, self.last, t, rotation, covariance), gated=False)
         return self.last
 
-    def add_disconnected(self, state: NavState, turn: TurnEstimate | None = None) -> int:
+    def add_disconnected(self, state: NavState) -> int:
         """Add a disconnected keyframe with its covariance as prior; return its number."""
-        prior = Prior.of(self.last + 1, state, turn)
+        prior = Prior.of(self.last + 1, state)
         self._insert(state.time, prior.reference[0])
         self.add(prior, gated=False)
         return self.last
@@ -126,22 +121,13 @@ class KeyframeGraph:
         self._terms.append(Whitened.of(term, limit))
         self._solution = None
 
-    def add_turn(self, sigma: float) -> None:
-        """Make the network's turn at the newest keyframe a state with a stationary sigma [rad]."""
-        j = self.last
-        turns = {k: state.turn for k, state in self._states.items() if state.turn is not None}
-        i = max(turns, default=j)
-        correlation = math.exp((self._time[i] - self._time[j]) / TURN_SECONDS) if i != j else 0.0
-        turn = correlation * turns.get(i, 0.0)
-        self._states[j] = self._states[j]._replace(turn=turn)
-        covariance = np.array([[(1.0 - correlation**2) * sigma**2]])
-        self.add(TurnProcess(i, j, correlation, covariance), gated=False)
-
-    def solve(self, max_rounds: int = 50) -> Solution:
+    def solve(self, max_rounds: int = 50, trusted_rounds: int = 0) -> None:
         """Optimise the keyframes by Gauss-Newton steps.
 
         Args:
             max_rounds: maximum number of linearisations of the measurements.
+            trusted_rounds: number of first rounds in which none is down-weighted: a poor start must
+                not decide which of them are false.
 
         Raises:
             IndeterminateError: a state is not determined, or the optimisation diverged; the
@@ -149,17 +135,15 @@ class KeyframeGraph:
         """
         start = self._states
         try:
-            rounds, values = self._optimise(max_rounds)
+            values = self._optimise(max_rounds, trusted_rounds)
             self._states = {k: KeyframeState.of(values, k) for k in self._time}
             self._check_determined()
-            down_weighted = sum(term.weighted(values)[2] < 1.0 for term in self._terms)
         except (RuntimeError, IndeterminateError) as error:
             self._states, self._solution = start, None
             if isinstance(error, IndeterminateError):
                 raise
             # gtsam's way to report it
             raise IndeterminateError(self._undetermined_state(str(error))) from error
-        return Solution(rounds, down_weighted)
 
     def keyframe(self, k: int) -> KeyframeState:
         """Return a keyframe without its covariance."""
@@ -167,9 +151,9 @@ class KeyframeGraph:
 
     def state(self, k: int) -> NavState:
         """Return a keyframe with its marginal covariance; call after `solve`."""
-        R, v, p, b_g, b_a, _ = self.keyframe(k)
+        R, v, p, b_g, b_a = self.keyframe(k)
         assert self._solution is not None  # solved
-        joint = self._solution.covariance(k)
+        joint = self._solution.covariances[k]
         to_world = KeyframeState(R, np.zeros(3), np.zeros(3), b_g, b_a).invariant_from_local()
         return NavState(self._time[k], R, v, p, b_g, b_a, to_world @ joint @ to_world.T)
 
@@ -222,7 +206,7 @@ class KeyframeGraph:
         to_local = [np.linalg.inv(state.invariant_from_local()) for state in reference]
         for k, state in zip(keyframes, reference, strict=True):
             # A window may reach only a pose: add the other columns, without information.
-            nothing = state.blocks(k, np.zeros((1, 16)))
+            nothing = state.blocks(k, np.zeros((1, 15)))
             remaining.push_back(linear_factor(nothing, np.zeros(1)))
         A, b = remaining.jacobian(self._ordering(keyframes))
         table = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))[: A.shape[1]]
@@ -232,7 +216,7 @@ class KeyframeGraph:
         self.last += 1
         self._time[self.last], self._states[self.last], self._solution = time, state, None
 
-    def _optimise(self, max_rounds: int) -> tuple[int, Any]:
+    def _optimise(self, max_rounds: int, trusted_rounds: int) -> Any:
         """Take full Gauss-Newton steps, which follow the IMU's stiff factors as a filter does.
 
         From a poor start, a correct step may increase their error by its second-order terms.
@@ -242,7 +226,7 @@ class KeyframeGraph:
         for _round in range(max_rounds):
             linear = factors.linearize(values)
             for term in self._terms:
-                linear.push_back(term.factor(values))
+                linear.push_back(term.factor(values, trusted=_round < trusted_rounds))
             self._solution = LinearSolution(linear, ordering)
             before = self._positions(values)
             values = values.retract(self._solution.step())
@@ -251,7 +235,7 @@ class KeyframeGraph:
                 break
         if not np.isfinite(change):
             raise IndeterminateError("the optimisation diverged")
-        return _round + 1, values
+        return values
 
     def _positions(self, values: Any) -> FloatArray:
         return np.array([values.atPose3(X(k)).translation() for k in self._time])
@@ -281,7 +265,7 @@ class KeyframeGraph:
 
     def _undetermined_state(self, message: str) -> str:
         """Return the name and time of the state that gtsam's message concerns."""
-        match = re.search(r"Symbol: ([xvbt])(\d+)", message)
+        match = re.search(r"Symbol: ([xvb])(\d+)", message)
         if match is None:
             return message.strip().splitlines()[0]
         return f"{_NAMES[match[1]]} at {self._time[int(match[2])]:.1f} s is undetermined"

@@ -6,11 +6,11 @@ gtsam's own marginals use Cholesky's algorithm, which calls a pose undetermined 
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
 from scipy.linalg import solve_triangular
 
 from stario.fusion.filter.jacobians import symmetric
@@ -21,7 +21,7 @@ _KEYS = 3
 
 
 class LinearSolution:
-    """Solution of a linear graph by multifrontal QR.
+    """Solution of a linear graph by QR.
 
     Args:
         linear: gtsam's Gaussian factors.
@@ -30,31 +30,20 @@ class LinearSolution:
     """
 
     def __init__(self, linear: Any, ordering: Any) -> None:
-        self._linear, self._ordering = linear, ordering
-        self._tree = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
-        self._covariances: dict[int, FloatArray] = {}
+        self._net = linear.eliminateSequential(ordering, gtsam.EliminateQR)
 
     def step(self) -> Any:
         """Return the solution as gtsam's vector values."""
-        return self._tree.optimize()
+        return self._net.optimize()
 
-    def covariance(self, k: int) -> FloatArray:
-        """Return the covariance (15, 15) of keyframe k's pose, velocity and biases.
+    @cached_property
+    def covariances(self) -> dict[int, FloatArray]:
+        """Covariance (15, 15) of every keyframe's pose, velocity and biases.
 
         Raises:
             RuntimeError: they are not determined.
         """
-        try:
-            joint = self._tree.jointMarginalCovariance([X(k), V(k), B(k)])
-            return np.asarray(joint.fullMatrix())
-        except RuntimeError as error:
-            if not self._covariances:
-                net = self._linear.eliminateSequential(self._ordering, gtsam.EliminateQR)
-                try:
-                    self._covariances = marginal_covariances(net)
-                except np.linalg.LinAlgError:
-                    raise error from None
-            return self._covariances[k]
+        return marginal_covariances(self._net)
 
 
 def marginal_covariances(net: Any) -> dict[int, FloatArray]:
@@ -69,7 +58,7 @@ def marginal_covariances(net: Any) -> dict[int, FloatArray]:
         net: gtsam's Bayes net, with one conditional per variable, in order of time.
 
     Raises:
-        numpy.linalg.LinAlgError: a variable is not determined.
+        RuntimeError: a variable is not determined; names it as gtsam does.
     """
     conditionals = [net.at(n) for n in range(net.size())]
     place = {c.keys()[0]: n for n, c in enumerate(conditionals)}
@@ -85,12 +74,15 @@ def marginal_covariances(net: Any) -> dict[int, FloatArray]:
         S = np.zeros((here - begin[n], len(P)))
         if columns:
             S[:, np.concatenate(columns)] = c.S()
-        root = solve_triangular(c.R(), np.column_stack([np.eye(len(S)), S]))
+        symbol = gtsam.Symbol(c.keys()[0])
+        try:
+            root = solve_triangular(c.R(), np.column_stack([np.eye(len(S)), S]))
+        except np.linalg.LinAlgError as error:
+            raise RuntimeError(f"Symbol: {chr(symbol.chr())}{symbol.index()}") from error
         by_noise, by_later = root[:, : len(S)], -root[:, len(S) :]
         cross = by_later @ P
         own = symmetric(by_noise @ by_noise.T + cross @ by_later.T)
         P = np.block([[own, cross], [cross.T, P]])
-        symbol = gtsam.Symbol(c.keys()[0])
         if chr(symbol.chr()) == "x":
             size = begin[n + _KEYS] - begin[n]
             covariances[symbol.index()] = P[:size, :size]

@@ -1,4 +1,4 @@
-"""Terms between keyframes that no measurement gives: a gap, and the network's turn."""
+"""The term between two keyframes that no measurement gives: a gap."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from gtsam.symbol_shorthand import B, T, V, X
+from gtsam.symbol_shorthand import B, V, X
 
 from stario.fusion.filter.jacobians import yaw_jacobian
 from stario.fusion.graph.factors import Between, Linearised
-from stario.fusion.graph.keyframe_state import KeyframeState, turn_at
+from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.lie import about_vertical, twist
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.sequence import FloatArray
@@ -65,24 +65,3 @@ class Coasting(Between):
         before = [(X(self.i), pose_i), (V(self.i), by_v_i), (B(self.i), -bias)]
         after = [(X(self.j), pose_j), (V(self.j), by_v_j), (B(self.j), bias)]
         return -np.concatenate([[psi], changes.T.ravel(), *biases]), before + after
-
-
-@dataclass(frozen=True, eq=False)
-class TurnProcess(Between):
-    """Gauss-Markov model of the network's turn: tau_j = correlation tau_i + n.
-
-    Attributes:
-        correlation: correlation of the two turns; 0 for the first turn, where i is j.
-        covariance: (1, 1) covariance of n [rad^2].
-    """
-
-    correlation: float
-    covariance: FloatArray
-
-    def linearise(self, values: Any) -> Linearised:
-        """Linearise about the vertical."""
-        now, before = turn_at(values, self.j), turn_at(values, self.i)
-        blocks = [(T(self.j), np.eye(1))]
-        if self.i != self.j:
-            blocks.append((T(self.i), -self.correlation * np.eye(1)))
-        return np.array([self.correlation * before - now]), blocks

@@ -53,9 +53,11 @@ class Whitened:
         power = _DISPLACEMENT_POWER if isinstance(self.term, Displacement) else _OUTLIER_POWER
         return residual, blocks, (self.limit / squared) ** power
 
-    def factor(self, values: Any) -> Any:
-        """Return the linear factor, linearised and weighted at gtsam `Values`."""
+    def factor(self, values: Any, trusted: bool = False) -> Any:
+        """Return the factor, linearised and, unless `trusted`, weighted at gtsam `Values`."""
         residual, blocks, weight = self.weighted(values)
+        if trusted:
+            weight = 1.0
         scaled = weight * self.whitener
         return linear_factor([(key, scaled @ H) for key, H in blocks], scaled @ residual)
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 import statistics
-from typing import Any
 
 import numpy as np
 
@@ -39,7 +38,6 @@ from stario.fusion.imu.intervals import (
 )
 from stario.fusion.imu.stateful import WindowBuffer
 from stario.fusion.imu.units import SensorCheck, warn_of_field
-from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
@@ -194,7 +192,7 @@ class FrontEnd:
         turn = gap_rotation(ends, first - ends[0, 0], self._attitude.b_g)
         self._attitude.level(turn, start)
         self._before_gap = None
-        gap = _interval(ends, self._attitude, gap=True, levelled=start)
+        gap = ImuInterval(ends, True, self._attitude.R_NB, levelled=start)
         return [gap, *self._complete()]
 
     def _check_time_unit(self) -> None:
@@ -226,7 +224,9 @@ class FrontEnd:
         if len(before) == 1:
             return []
         table = np.array(before)
-        return [_interval(table, self._attitude, flags=self._flag_outliers(table))]
+        flags = self._flag_outliers(table)
+        self._attitude.advance(table[:, 0], table[:, 1:4], table[:, 4:])
+        return [ImuInterval(table, False, self._attitude.R_NB, flags=flags)]
 
     def _complete(self) -> list[ImuInterval]:
         intervals = []
@@ -267,17 +267,7 @@ class FrontEnd:
         # _cut() has already counted this interval.
         update = (self._index - 1) % self._config.filter.intervals_per_update == 0
         field_B = self._fields.at(table[-1, 0])
-        interval = _interval(table, self._attitude, update=update, flags=flags, field_B=field_B)
-        self._windows.add(interval)
-        return changed(interval, window=self._windows.window()) if update else interval
-
-
-def _interval(
-    table: FloatArray, attitude: LevelledAttitude, gap: bool = False, **measured: Any
-) -> ImuInterval:
-    time, gyro, accel = table[:, 0], table[:, 1:4], table[:, 4:7]
-    if gap:
-        attitudes = np.stack([attitude.R_NB, attitude.R_NB])
-    else:
-        attitudes = attitude.advance(time, gyro, accel)
-    return ImuInterval(time, gyro, accel, gap, attitudes, attitude.R_NB, **measured)
+        attitudes = self._attitude.advance(table[:, 0], table[:, 1:4], table[:, 4:])
+        self._windows.add(table, attitudes, flags)
+        window = self._windows.window() if update else None
+        return ImuInterval(table, False, self._attitude.R_NB, update, window, field_B, flags=flags)

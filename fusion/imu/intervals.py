@@ -80,37 +80,30 @@ class ImuInterval:
     """IMU samples between two times of the grid.
 
     Attributes:
-        time: (n + 1,) sample times [s]; the first and the last are on the grid.
-        gyro: (n + 1, 3) [rad/s] in B, interpolated at both ends.
-        accel: (n + 1, 3) [m/s^2] in B, likewise.
+        table: (n + 1, 7) samples: time [s], gyro [rad/s] and accel [m/s^2] in B, interpolated at
+            both ends, which are on the grid.
         gap: whether this is a gap too long to be bridged; its samples then carry no information.
-        attitudes: (n + 1, 3, 3) levelled attitude R_NB at the samples.
         R_NB: (3, 3) levelled attitude at the end, after its correction by gravity.
         update: whether windows begin and end at this interval's end.
         window: the window that ends here; None if there is none.
         field_B: (3,) magnetic field at its end [uT]; None if none was measured.
-        accel_factor: factor on the accelerometer's noise density, estimated by the filter.
         levelled: attitude from gravity after a gap, estimated as at the first sample; None
             elsewhere.
         flags: whether samples of either sensor are saturated, missing, or were spikes.
     """
 
-    time: FloatArray
-    gyro: FloatArray
-    accel: FloatArray
+    table: FloatArray
     gap: bool
-    attitudes: FloatArray
     R_NB: FloatArray
     update: bool = False
     window: Window | None = None
     field_B: FloatArray | None = None
-    accel_factor: float = 1.0
     levelled: Start | None = None
     flags: Flags = NO_FLAGS
 
     def without_window(self) -> ImuInterval:
-        """Return a copy without the window and attitudes, which an estimator does not need."""
-        return changed(self, window=None, attitudes=_NO_ATTITUDES)
+        """Return a copy without the window, which an estimator does not need."""
+        return changed(self, window=None)
 
     @property
     def lost(self) -> bool:
@@ -118,27 +111,35 @@ class ImuInterval:
         return self.gap and self.duration > _LOST_SECONDS
 
     @property
-    def table(self) -> FloatArray:
-        """Samples (n + 1, 7): time, gyro and accel."""
-        return np.column_stack([self.time, self.gyro, self.accel])
+    def time(self) -> FloatArray:
+        """Sample times (n + 1,) [s]."""
+        return self.table[:, 0]
+
+    @property
+    def gyro(self) -> FloatArray:
+        """Gyroscope (n + 1, 3) [rad/s] in B."""
+        return self.table[:, 1:4]
+
+    @property
+    def accel(self) -> FloatArray:
+        """Specific force (n + 1, 3) [m/s^2] in B."""
+        return self.table[:, 4:]
 
     @property
     def start(self) -> float:
         """Time of the first sample [s]."""
-        return float(self.time[0])
+        return float(self.table[0, 0])
 
     @property
     def stop(self) -> float:
         """Time of the last sample [s]."""
-        return float(self.time[-1])
+        return float(self.table[-1, 0])
 
     @property
     def duration(self) -> float:
         """Time from the first to the last sample [s]."""
         return self.stop - self.start
 
-
-_NO_ATTITUDES = np.empty((0, 3, 3))
 
 SAME_TIME = 1e-6
 """Times that differ by no more than this [s] count as the same."""
@@ -177,14 +178,9 @@ def split_at(interval: ImuInterval, time: float) -> tuple[ImuInterval, ImuInterv
     k = int(np.searchsorted(table[:, 0], time))
     boundary = interpolated_sample(table[k - 1], table[k], time)
     later = table[k:] if table[k, 0] - time >= 1e-9 else table[k + 1 :]
-    first = _with_samples(interval, np.vstack([table[:k], boundary]))
-    second = _with_samples(interval, np.vstack([boundary, later]))
-    return changed(first, update=False, window=None), second
-
-
-def _with_samples(interval: ImuInterval, table: FloatArray) -> ImuInterval:
-    """Return an interval with other samples: rows of time, gyro and accel (n, 7)."""
-    return changed(interval, time=table[:, 0], gyro=table[:, 1:4], accel=table[:, 4:])
+    before, after = np.vstack([table[:k], boundary]), np.vstack([boundary, later])
+    first = changed(interval, table=before, update=False, window=None)
+    return first, changed(interval, table=after)
 
 
 def interpolated_sample(before: FloatArray, after: FloatArray, time: float) -> FloatArray:

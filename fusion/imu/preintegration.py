@@ -103,7 +103,11 @@ class Segment:
 
 
 def segment_of(
-    intervals: Sequence[ImuInterval], b_g: FloatArray, b_a: FloatArray, config: NavigatorConfig
+    intervals: Sequence[ImuInterval],
+    accel_factors: Sequence[float],
+    b_g: FloatArray,
+    b_a: FloatArray,
+    config: NavigatorConfig,
 ) -> Segment:
     """Preintegrate consecutive intervals, none of them a gap, each with its own noise.
 
@@ -112,21 +116,24 @@ def segment_of(
 
     Args:
         intervals: the samples.
+        accel_factors: factor on the accelerometer's noise density in each of them.
         b_g: (3,) gyroscope bias [rad/s].
         b_a: (3,) accelerometer bias [m/s^2].
         config: noise and gravity.
     """
-    noise = [_noise_of(e, config) for e in intervals]
+    pairs = list(zip(intervals, accel_factors, strict=True))
+    noise = [_noise_of(e, factor, config) for e, factor in pairs]
     first, *rest = intervals
-    if not rest:
-        return preintegrate(first.time, first.gyro, first.accel, b_g, b_a, noise[0], config.gravity)
-    table = np.vstack([first.table, *(e.table[1:] for e in rest)])  # without the shared samples
+    steps: ImuNoise | list[ImuNoise] = noise[0]
+    table = first.table
+    if rest:
+        table = np.vstack([table, *(e.table[1:] for e in rest)])  # without the shared samples
+        steps = [d for e, d in zip(intervals, noise, strict=True) for _ in e.table[1:]]
     time, gyro, accel = table[:, 0], table[:, 1:4], table[:, 4:]
-    steps = [d for e, d in zip(intervals, noise, strict=True) for _ in range(len(e.time) - 1)]
     return preintegrate(time, gyro, accel, b_g, b_a, steps, config.gravity)
 
 
-def _noise_of(interval: ImuInterval, config: NavigatorConfig) -> ImuNoise:
+def _noise_of(interval: ImuInterval, accel_factor: float, config: NavigatorConfig) -> ImuNoise:
     """Return the white noise of an interval, which grows with its rate.
 
     A rotation that is off by `gyro_scale` of what was turned over a duration t is that of white
@@ -134,7 +141,7 @@ def _noise_of(interval: ImuInterval, config: NavigatorConfig) -> ImuNoise:
     """
     rate = rms(interval.gyro) * math.sqrt(interval.duration)
     steps = round(rate / _RATE_STEP) if config.noise.gyro_scale else 0
-    return _widened_noise(config, interval.accel_factor, interval.flags, steps)
+    return _widened_noise(config, accel_factor, interval.flags, steps)
 
 
 @lru_cache(maxsize=256)  # successive intervals repeat it, and validating settings is slow

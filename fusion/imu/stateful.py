@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stario.fusion.checked import floored
-from stario.fusion.health import SampleCounts
-from stario.fusion.imu.intervals import ImuInterval, Window
+from stario.fusion.imu.intervals import Flags, Window
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
@@ -99,17 +98,16 @@ class WindowBuffer:
         self._blocks.clear()
         self._tail = None
 
-    def add(self, interval: ImuInterval) -> None:
-        """Add the samples of the next interval."""
-        attitudes, flags = interval.attitudes, interval.flags
-        rows = np.empty((len(interval.time), 7))
-        rows[:, 0] = interval.time
-        rows[:, 1:4] = (attitudes @ interval.gyro[:, :, None])[:, :, 0]
-        rows[:, 4:] = (attitudes @ interval.accel[:, :, None])[:, :, 0]
+    def add(self, table: FloatArray, attitudes: FloatArray, flags: Flags) -> None:
+        """Add the next interval's samples (n, 7) with their levelled attitudes (n, 3, 3)."""
+        rows = np.empty_like(table)
+        rows[:, 0] = table[:, 0]
+        rows[:, 1:4] = (attitudes @ table[:, 1:4, None])[:, :, 0]
+        rows[:, 4:] = (attitudes @ table[:, 4:, None])[:, :, 0]
         tail, self._tail = self._tail, rows[-_TAIL_SAMPLES - 1 : -1]
         # The first average reaches half a grid step back, into the tail.
         samples = rows if tail is None else np.concatenate([tail, rows])
-        imu_N = resample(samples[:, 0], samples[:, 1:], interval.start + self._grid)
+        imu_N = resample(samples[:, 0], samples[:, 1:], table[0, 0] + self._grid)
         flagged = flags.gyro or flags.accel or flags.missing
         self._blocks.append(Block(imu_N.astype(np.float32).T, attitudes[0], flagged))
 
@@ -148,10 +146,13 @@ class StatefulInference:
     Args:
         model: the model; its network may remember earlier windows.
         updates: number of windows that begin within the length of one.
+
+    Attributes:
+        updates: that number.
     """
 
     def __init__(self, model: Predictor, updates: int) -> None:
-        self._model, self._updates = model, updates
+        self._model, self.updates = model, updates
         self.restart()
 
     @property
@@ -162,7 +163,7 @@ class StatefulInference:
     def restart(self) -> None:
         """Clear the memory of windows before a gap."""
         begin = getattr(self._model, "stateful_inference", None)
-        self._stretch: Any = self._model if begin is None else begin(self._updates)
+        self._stretch: Any = self._model if begin is None else begin(self.updates)
 
     def predict(
         self, windows_N: NDArray[np.float32], heading: FloatArray
@@ -186,11 +187,6 @@ class StatefulInference:
         with np.errstate(invalid="ignore"):  # the estimator refuses values that are not finite
             mean_N: FloatArray = (R_NH @ mean_H[:, :, None])[:, :, 0]
             return mean_N, R_NH @ covariance_H @ R_NH.transpose(0, 2, 1)
-
-    def unfamiliar(self, windows: NDArray[np.float32]) -> int:
-        """Count the windows (B, 6, 200) that move unlike anything the weights were trained on."""
-        known_motion = getattr(getattr(self._model, "card", None), "known_motion", None)
-        return 0 if known_motion is None else int(known_motion.is_unfamiliar(windows).sum())
 
     @property
     def memory(self) -> Any:
@@ -231,15 +227,10 @@ def _checked(answer: Any, count: int) -> tuple[FloatArray, FloatArray]:
 
 
 def displacements_of(
-    network: StatefulInference, windows: Sequence[Window], counts: SampleCounts
+    network: StatefulInference, windows: Sequence[Window]
 ) -> list[WindowDisplacement]:
-    """Predict the displacements of windows, with inflated and floored covariances.
-
-    Also count the windows, and those that move unlike anything the weights were trained on.
-    """
+    """Predict the displacements of windows, with inflated and floored covariances."""
     windows_N = np.stack([window.imu_N for window in windows])
-    counts.windows += len(windows_N)
-    counts.unfamiliar += network.unfamiliar(windows_N)
     heading = np.array([window.heading for window in windows])
     mean_N, covariance_N = network.predict(windows_N, heading)
     flagged = np.array([window.flagged for window in windows])

@@ -15,7 +15,8 @@ import numpy as np
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval, Start
 from stario.sequences.clean_samples import MAX_RATE, MIN_RATE
 from stario.sequences.errors import InputError
-from stario.sequences.inspection.checks import check_gyro, warn_if_downward
+from stario.sequences.findings import warn
+from stario.sequences.inspection.checks import check_gyro, downward
 from stario.sequences.inspection.constant_values import check_not_dead
 from stario.sequences.sequence import FloatArray
 from stario.sequences.units import magnetic_advice
@@ -44,7 +45,7 @@ def check_start(start: Start, gravity: float, table: FloatArray) -> None:
         InputError: the rate is not about 50 Hz to 1 kHz, the mean force cannot be gravity, or the
             gyroscope cannot be in rad/s.
     """
-    warn_if_downward("stream", table[:, 4:7])
+    warn("stream", downward(table[:, 4:7]))
     if not MIN_RATE <= start.rate <= MAX_RATE:
         raise InputError("time", f"{start.rate:.3g} samples a second", "50 to 1000")
     if not _START_FORCE[0] <= start.force <= _START_FORCE[1]:
@@ -119,13 +120,14 @@ class SensorCheck:
     def _check_piece(self, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> None:
         try:
             check_not_dead("stream", time, gyro, accel)
-            check_gyro("stream", time, gyro, accel, [slice(0, len(time))], _DEG_S)
+            *_, doubts = check_gyro("stream", time, gyro, accel, [slice(0, len(time))], _DEG_S)
         except InputError as error:
             self._wrong += 1
             if self._wrong >= _MIN_FAILED_PIECES:
                 field = "accel" if error.field.endswith("accelerometer") else "gyro"
                 raise InputError(field, error.found, error.expected, error.fix) from None
         else:
+            warn("stream", doubts)
             speed = np.percentile(np.linalg.norm(gyro, axis=1), 95)
             if speed < _DOUBTFUL_RAD_S:
                 self._wrong = 0

@@ -17,9 +17,10 @@ from stario.fusion.live.payload import Batch, Vector
 from stario.fusion.live.storage import LiveFile
 from stario.fusion.live.times import with_credible_time
 from stario.fusion.navigator import Navigator
-from stario.fusion.report.health import findings
+from stario.fusion.report.health import health_findings
 from stario.fusion.state import NavState
 from stario.sequences.errors import InputError
+from stario.sequences.findings import verdict
 from stario.sequences.time_order import MAX_IMU_GAP
 
 _MAX_UNWRITTEN = 6000
@@ -233,7 +234,7 @@ class LiveTrack:
         health, late = self._navigator.health, self.dropped().get("late", 0)
         # The navigator never sees them; if the clock was set back a little, it sees no gap either.
         health = replace(health, samples=health.samples | {"late": late})
-        self.words = [asdict(finding) for finding in findings(health)]
+        self.words = [asdict(finding) for finding in verdict(health_findings(health))]
 
     def _count(self, first_ns: int, last_ns: int, count: int) -> None:
         """Update the number of samples and their rate, smoothed over some batches."""

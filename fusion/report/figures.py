@@ -12,8 +12,9 @@ from plotly.subplots import make_subplots
 
 from stario.fusion.filter.corrections import Correction
 from stario.fusion.report.panels import FAINT, GRID, INK, TRUTH, Panel, numbers, style
-from stario.fusion.report.series import Series, clock, ellipse
+from stario.fusion.report.series import Series, ellipse
 from stario.sequences.arrays import evenly_spaced, interpolated
+from stario.sequences.drawing.figures import clock
 from stario.sequences.sequence import FloatArray, PositionTrack
 
 _ELLIPSES = 8
@@ -273,8 +274,8 @@ def _shown_rows(series: Series, most: int) -> NDArray[np.intp]:
 def _frame(
     tracks: Mapping[str, Series], truth: Series | None, known: PositionTrack | None
 ) -> FloatArray:
-    """Return limits (2, 2) of x and y of known positions and all tracks but the inertial."""
-    bounded = [s for name, s in tracks.items() if name != "inertial"]
+    """Return limits (2, 2) of x and y that fit known positions and all but dead reckoning."""
+    bounded = [s for name, s in tracks.items() if name != "dead_reckoning"]
     points = np.vstack([s.position[:, :2] for s in ([truth] if truth else []) + bounded])
     if truth is not None:  # a diverged track must not shrink the truth to a dot
         low, high = np.nanmin(truth.position, axis=0)[:2], np.nanmax(truth.position, axis=0)[:2]

@@ -1,24 +1,20 @@
-"""The health report in words: what stands out, and what to do about it.
+"""Findings of a run's health: what stands out in its counts, and what to do about it.
 
 Counts alone do not help a first-time user. Each finding states what was observed, in numbers, and
-the next thing to try; `stario live` shows the same text during a walk.
+the next thing to try. `stario.sequences.findings.verdict` joins them with those of the recording.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
 
 from stario.fusion.health import Health
 from stario.fusion.imu.front_end import BRIDGED
 from stario.fusion.imu.gap import INTERPOLATED
 from stario.sequences.attitude.levelling import START_SECONDS
-
-Level = Literal["good", "note", "warning"]
-"""Severity: nothing to do, good to know, or worth acting on."""
+from stario.sequences.findings import TOO_EARLY, Finding
 
 DROPPED_SHARE = 0.01
 """Share of dropped samples above which to warn."""
@@ -29,15 +25,24 @@ FLAGGED_SHARE = 1e-3
 GATED_SHARE = 0.1
 """Share of updates treated as outliers above which to warn."""
 
+BEARINGS_SHARE = 0.25
+"""Share of the magnetic bearings that contradict the gyroscope above which to warn."""
+
 MIN_UPDATES = 20
-"""Number of the network's displacements below which nothing is said about network and motion: ten
-seconds of them."""
+"""Number of the network's displacements, or of bearings, below which nothing is said about them:
+ten seconds."""
 
 _RESTING = 100
 """Number of zero-velocity updates that are as good: ten seconds of rest."""
 
 NIS_RATIO = 2.0
 """Factor between mean NIS and expectation, in either direction, above which to report it."""
+
+_LATE_S, _FIELDS_DROPPED = 0.5, 50
+"""Late samples in a row [s], and dropped magnetic fields, beyond which to tell of them."""
+
+_TURNED_RAD = math.radians(45.0)
+"""Turn of the network's direction, beyond three sigmas, that is reported [rad]."""
 
 YAW_SIGMA = math.radians(15.0)
 """Standard deviation of yaw [rad] above which the track bends."""
@@ -49,101 +54,57 @@ _APART = "at least six times their sigma apart"
 """How far apart two positions determine the direction (`filter.map_frame.MAX_POSITION_YAW_SIGMA`):
 the root of two over that sigma, and some more for the drift between them."""
 
-
-@dataclass(frozen=True)
-class Finding:
-    """One observation that stands out.
-
-    Attributes:
-        level: severity.
-        text: what was observed.
-        advice: what to do; empty if nothing.
-    """
-
-    level: Level
-    text: str
-    advice: str = ""
+_CARRY = "carry the device as walkers usually do, or judge the track by known positions"
 
 
-def findings(health: Health) -> list[Finding]:
-    """Return what stands out in a run so far, warnings first; never empty."""
-    early = health.updates < MIN_UPDATES
-    notes = health.notes
-    if early or _is_invalid(health):
-        notes = [note for note in notes if not _is_unfamiliar(note)]
-    if not early and _is_invalid(health):
-        reasons = [_invalid_data(health), *_samples(health), *_gaps(health)]
-    else:
-        reasons = [*_samples(health), *_flagged(health), *_gaps(health)]
-        reasons += [*([] if early else _updates(health)), *_corrections(health), *_field(health)]
-    found = [*reasons, *_fixes(health), *_direction(health), *map(_noted, notes)]
-    if early and health.zero_velocity.get("applied", 0) < _RESTING:
-        found.append(Finding("note", "Too early to judge the motion: it takes ten seconds of it."))
-    elif not notes and not any(finding.level == "warning" for finding in found):
-        found.insert(0, Finding("good", "Sensors, filter and network agree; nothing to do."))
-    order = ("warning", "good", "note")
-    return sorted(found, key=lambda finding: order.index(finding.level))
+def health_findings(health: Health) -> list[Finding]:
+    """Return what stands out in a run so far."""
+    found = [*_clock(health), *_stopped(health), *_samples(health), *_gaps(health)]
+    if health.updates >= MIN_UPDATES:
+        found += [*_flagged(health), *_network(health)]
+    elif health.zero_velocity.get("applied", 0) < _RESTING:
+        text = "Too early to judge the motion: it takes ten seconds of it."
+        found += [*_flagged(health), Finding(TOO_EARLY, text, level="note")]
+    found += [*_corrections(health), *_field(health), *_fixes(health), *_direction(health)]
+    notes = (f"{note[:1].upper()}{note[1:]}." for note in health.notes)
+    return found + [Finding(f"note_{k}", note, level="note") for k, note in enumerate(notes)]
 
 
-def health_lines(health: Health) -> list[str]:
-    """Return one line of text per finding; those to act on begin with "!"."""
-    return [
-        f"{'! ' if finding.level == 'warning' else '  '}{finding.text} {finding.advice}".rstrip()
-        for finding in findings(health)
-    ]
-
-
-def _is_invalid(health: Health) -> bool:
-    """Return whether sensor, weights and filter all disagree: then the data are at fault."""
-    return (
-        _has_flagged(health)
-        and any(map(_is_unfamiliar, health.notes))
-        and health.gated > GATED_SHARE * health.updates
-    )
-
-
-def _invalid_data(health: Health) -> Finding:
-    text = (
-        "This track cannot be trusted: the device was shaken or struck, not carried ("
-        f"{_counted(health.flagged)} samples; most of the motion is unlike a pedestrian's; "
-        f"{health.gated / health.updates:.0%} of the network's displacements contradict the IMU)."
-    )
-    return Finding("warning", text, "Record a walk with the device held or strapped firmly.")
-
-
-def _is_unfamiliar(note: str) -> bool:
-    return "weights were trained on" in note
-
-
-def _is_set_back(note: str) -> bool:
-    return "clock was set back" in note
-
-
-def _is_stopped(note: str) -> bool:
-    return " stopped: it repeats" in note
-
-
-def _noted(note: str) -> Finding:
-    text = f"{note[:1].upper()}{note[1:]}."
-    if _is_set_back(note):
-        return Finding("warning", text, "Split the recording there and run each part separately.")
-    if _is_stopped(note):
-        advice = (
-            "Restart the device and record again; if it recurs, the sensor or the app is faulty."
+def _clock(health: Health) -> Iterator[Finding]:
+    if health.set_back:
+        yield Finding(
+            "clock_set_back",
+            f"The recording's clock was set back by {health.set_back:.3g} s: the track ends there.",
+            "Split the recording there and run each part separately.",
+            values={"by_s": health.set_back},
         )
-        return Finding("warning", text, advice)
-    if not _is_unfamiliar(note):
-        return Finding("note", text)
-    advice = "Fine-tune the weights on recordings of this kind: `stario train --start-from`."
-    return Finding("warning", text, advice)
+    elif health.longest_late > _LATE_S:
+        text = (
+            f"Samples arrived late for {health.longest_late:.1f} s in a row: logged twice, or "
+            "from a clock that was set back; if so, that time is missing and no sigma covers it."
+        )
+        values = {"longest_s": health.longest_late}
+        yield Finding("samples_late", text, level="note", values=values)
+
+
+def _stopped(health: Health) -> Iterator[Finding]:
+    for sensor, count in health.stopped.items():
+        other = "accelerometer" if sensor == "gyroscope" else "gyroscope"
+        yield Finding(
+            f"{sensor}_stopped",
+            f"The {sensor} stopped: it repeats its value in {count} samples in which the {other} "
+            "shows motion; they were dropped.",
+            "Restart the device and record again; if it recurs, the sensor or the app is faulty.",
+            values={"samples": count},
+        )
 
 
 def _samples(health: Health) -> Iterator[Finding]:
     used = health.samples.get("used", 0)
     dropped = {name: n for name, n in health.samples.items() if name != "used" and n}
-    if any(map(_is_set_back, health.notes)):
-        dropped.pop("out_of_order", None)  # explained by that note
-    if any(map(_is_stopped, health.notes)):
+    if health.set_back:
+        dropped.pop("out_of_order", None)  # told already
+    if health.stopped:
         dropped.pop("frozen", None)
     count = sum(dropped.values())
     share = count / max(1, used + count)
@@ -151,27 +112,34 @@ def _samples(health: Health) -> Iterator[Finding]:
     text = f"{amount} of the samples were dropped ({_counted(dropped)})."
     if share > DROPPED_SHARE:
         advice = "Log gyroscope and accelerometer at the same rate, and close other apps."
-        if dropped.get("frozen", 0) > 0.5 * count:  # both sensors: of one alone there is a note
+        if dropped.get("frozen", 0) > 0.5 * count:  # both sensors: of one alone it is told above
             advice = (
                 "The sensors repeat their values: log them at their own rate; if they stopped for "
                 "good, restart the device and record again."
             )
         elif dropped.get("out_of_order", 0) > 0.5 * count:
             advice = "`stario inspect` says when: sort the rows, or split the recording there."
-        yield Finding("warning", text, advice)
+        yield Finding("samples_dropped", text, advice, values=dropped)
     elif dropped:
-        yield Finding("note", text)
-
-
-def _has_flagged(health: Health) -> bool:
-    return sum(health.flagged.values()) > FLAGGED_SHARE * max(1, health.samples.get("used", 0))
+        yield Finding("samples_dropped", text, level="note", values=dropped)
 
 
 def _flagged(health: Health) -> Iterator[Finding]:
-    if _has_flagged(health):
-        text = f"Samples that motion cannot explain: {_counted(health.flagged)}."
+    """Report samples beyond the sensors; a track that contradicts them as well is not trusted."""
+    if sum(health.flagged.values()) <= FLAGGED_SHARE * max(1, health.samples.get("used", 0)):
+        return
+    counted = _counted(health.flagged)
+    if health.updates >= MIN_UPDATES and health.gated > GATED_SHARE * health.updates:
+        text = (
+            f"This track cannot be trusted: the device was shaken or struck beyond its sensors' "
+            f"range ({counted} samples), and {health.gated / health.updates:.0%} of the network's "
+            "displacements contradict the IMU."
+        )
+        advice = "Record a walk with the device held or strapped firmly."
+    else:
+        text = f"Samples that motion cannot explain: {counted}."
         advice = "Hold or strap the device more firmly, or choose a larger sensor range."
-        yield Finding("warning", text, advice)
+    yield Finding("samples_flagged", text, advice, values=health.flagged)
 
 
 def _gaps(health: Health) -> Iterator[Finding]:
@@ -179,12 +147,13 @@ def _gaps(health: Health) -> Iterator[Finding]:
         return
     amount = f"{health.gap_count} gaps" if health.gap_count > 1 else "1 gap"
     text = f"{amount} in the samples (longest: {health.longest_gap:.2f} s)."
+    values = {"count": health.gap_count, "longest_s": health.longest_gap}
     logger = "Keep the logger in the foreground and exempt it from battery saving"
     if health.longest_gap > INTERPOLATED:
         restore = "a yaw fix or position fixes after the gap restore the heading"
-        yield Finding("warning", text, f"{logger}; {restore}.")
+        yield Finding("gaps", text, f"{logger}; {restore}.", values=values)
     else:
-        yield Finding("note", text)
+        yield Finding("gaps", text, level="note", values=values)
     gaps = [(start, length) for start, length in health.gaps if length > BRIDGED]
     between = [b - (a + length) for (a, length), (b, _) in pairwise(gaps)]
     if short := sum(seconds < START_SECONDS for seconds in between):
@@ -192,35 +161,42 @@ def _gaps(health: Health) -> Iterator[Finding]:
             f"{short} of the stretches between gaps are shorter than a second, which does not "
             "suffice to level the attitude: the track leaves them out."
         )
-        yield Finding("warning", text, f"{logger}; over Bluetooth, lower the rate.")
+        advice = f"{logger}; over Bluetooth, lower the rate."
+        yield Finding("short_stretches", text, advice, values={"count": short})
 
 
-def _updates(health: Health) -> Iterator[Finding]:
-    if health.gated > GATED_SHARE * health.updates:
-        gated = health.gated / health.updates
+def _network(health: Health) -> Iterator[Finding]:
+    gated = health.gated / health.updates
+    if gated > GATED_SHARE:
         text = f"{gated:.0%} of the network's displacements contradict the IMU."
         advice = (
-            "Check that both sensors have the same axes and signs (`stario inspect`). "
-            "If so, the motion may differ from the training data (carrying, running, wheels): "
-            "fine-tune the weights on recordings of this kind with `stario train`."
+            "If the sensors' axes and signs are right, the weights do not know this motion "
+            f"(carrying, running, wheels): {_CARRY}."
         )
-        yield Finding("warning", text, advice)
+        yield Finding("network_contradicts", text, advice, values={"share": gated})
     ratio = health.mean_nis / health.nis_expected
     nis = f"mean NIS {health.mean_nis:.2g}, expected {health.nis_expected:.0f}"
     if ratio > NIS_RATIO:
         text = f"The network and the IMU disagree by more than their sigmas allow ({nis})."
-        advice = (
-            f"The track's sigmas are too small by a factor of about {math.sqrt(ratio):.1f}: "
-            "fine-tune the weights on recordings of this kind with `stario train --start-from`."
-        )
-        yield Finding("warning", text, advice)
+        advice = f"The track's sigmas are too small by a factor of about {math.sqrt(ratio):.1f}."
+        yield Finding("network_sigma", text, advice, values={"nis_ratio": ratio})
     elif ratio < 1.0 / NIS_RATIO:
         text = (
             f"The network and the IMU agree more closely than their sigmas suggest ({nis}). It "
             "does not mean that the track's sigmas are too large: errors that last as long as the "
             "track do not show here."
         )
-        yield Finding("note", text)
+        yield Finding("network_sigma", text, level="note", values={"nis_ratio": ratio})
+    turn, sigma = health.network_turn, health.network_turn_sigma
+    if abs(turn) > max(_TURNED_RAD, 3.0 * sigma):
+        degrees, spread = math.degrees(turn), math.degrees(sigma)
+        yield Finding(
+            "network_direction",
+            f"The network's direction differs from the accelerometer's by {degrees:.0f} "
+            f"(+-{spread:.0f}) degrees: its track is turned by as much.",
+            f"The weights do not know this motion: {_CARRY}.",
+            values={"turn_deg": degrees, "sigma_deg": spread},
+        )
 
 
 def _corrections(health: Health) -> Iterator[Finding]:
@@ -233,19 +209,35 @@ def _corrections(health: Health) -> Iterator[Finding]:
         f"{at_once} corrected by more than 1 m or 10 degrees (the largest by {metres:.1f} m and "
         f"{math.degrees(turn):.0f} degrees at {time:.1f} s: {cause})."
     )
-    advice = "Until then it was wrong by as much; the track of `--backend graph` has no such steps."
-    yield Finding("warning", text, advice)
+    advice = "Until then a stream's track was wrong by as much; a recording's is smoothed."
+    values = {"count": count, "largest_m": metres, "turn_deg": math.degrees(turn), "at_s": time}
+    yield Finding("corrections", text, advice, values=values)
 
 
 def _field(health: Health) -> Iterator[Finding]:
-    bearings = sum(n for name, n in health.bearings.items() if name != "gated")
-    useless = bearings - health.bearings.get("applied", 0)
-    if useless > 0.5 * bearings:
+    offered = sum(n for name, n in health.bearings.items() if name != "gated")
+    against = health.bearings.get("contradicts the gyroscope", 0)
+    if offered >= MIN_UPDATES and against > BEARINGS_SHARE * offered:
+        yield Finding(
+            "bearings_contradict",
+            f"{against} of {offered} bearings of the magnetic field contradict the gyroscope and "
+            "were not used.",
+            "Iron, a current or the device disturbs the field: walk elsewhere, or calibrate it.",
+            values={"contradicting": against, "offered": offered},
+        )
+    elif offered - health.bearings.get("applied", 0) > 0.5 * offered:
         text = f"The magnetic field was of little use ({_counted(health.bearings)})."
-        advice = "`stario inspect` reports its magnitude, unit and problems."
-        yield Finding("note", text, advice)
+        yield Finding("field_useless", text, level="note", values=health.bearings)
+    if health.fields_dropped > _FIELDS_DROPPED:
+        text = (
+            f"{health.fields_dropped} magnetic fields were dropped: the sensor repeated its last "
+            "value, or their times or values are wrong."
+        )
+        values = {"count": health.fields_dropped}
+        yield Finding("fields_dropped", text, level="note", values=values)
     if refused := _counted(health.refused):
-        yield Finding("note", f"Displacements not used: {refused}.")
+        text = f"Displacements not used: {refused}."
+        yield Finding("displacements_refused", text, level="note", values=health.refused)
 
 
 def _fixes(health: Health) -> Iterator[Finding]:
@@ -255,16 +247,16 @@ def _fixes(health: Health) -> Iterator[Finding]:
     other = {name: n for name, n in health.fixes.items() if name != "applied" and n}
     text = "1 fix applied" if applied == 1 else f"{applied} fixes applied"
     if not other:
-        yield Finding("note", f"{text}.")
+        yield Finding("fixes", f"{text}.", level="note", values=health.fixes)
         return
-    reasons = _counted(other)
     harmless = ("gated", "waiting", "yaw not known")
     refused = sum(n for name, n in other.items() if name not in harmless)
     wrong = refused or other.get("gated", 0) > GATED_SHARE * applied
     advice = "Check the fixes' clock, frame, units and sigmas." if wrong else ""
     if not wrong and other.get("yaw not known", 0) > applied:
         advice = f"Two positions {_APART} give the heading; so does a yaw fix."
-    yield Finding("warning" if wrong else "note", f"{text}; {reasons}.", advice)
+    text = f"{text}; {_counted(other)}."
+    yield Finding("fixes", text, advice, "warning" if wrong else "note", health.fixes)
 
 
 def _direction(health: Health) -> Iterator[Finding]:
@@ -277,7 +269,7 @@ def _direction(health: Health) -> Iterator[Finding]:
                 "Keep still for two seconds now and then; a yaw fix or two position fixes "
                 f"{_APART} help too."
             )
-        yield Finding("warning", text, advice)
+        yield Finding("yaw_unknown", text, advice, values={"sigma_deg": math.degrees(yaw)})
 
 
 def _counted(counts: dict[str, int]) -> str:

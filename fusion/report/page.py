@@ -17,8 +17,8 @@ from plotly.offline import get_plotlyjs
 
 from stario.fusion.evaluation.compare import METRIC_TITLES, Comparison
 from stario.fusion.evaluation.known_positions import shown_positions
+from stario.fusion.evaluation.text import shown_value
 from stario.fusion.report.figures import map_figure, time_figure
-from stario.fusion.report.health import Finding, findings
 from stario.fusion.report.panels import (
     bias_panels,
     innovation_panels,
@@ -26,14 +26,16 @@ from stario.fusion.report.panels import (
     numbers,
     style,
 )
-from stario.fusion.report.series import Series, clock, track_series, trajectory_series
+from stario.fusion.report.series import Series, track_series, trajectory_series
 from stario.fusion.state import Track
+from stario.sequences.drawing.figures import clock
 from stario.sequences.drawing.text_table import figure
 from stario.sequences.files import atomic_write
+from stario.sequences.findings import Finding
 from stario.sequences.sequence import ImuSequence, PositionTrack
 
 _LEVEL_WORDS = {"warning": "To do", "good": "Good", "note": "Note"}
-_DIGITS = {"ate_m": 2, "ate_fit_m": 2, "rte_m": 2, "aye_rad": 3, "nees_median": 1, "nis_mean": 1}
+_DIGITS = {"ate_m": 2, "ate_fit_m": 2, "rte_m": 2, "aye_rad": 1, "nees_median": 1, "nis_mean": 1}
 """Decimals of the table's columns."""
 
 
@@ -42,8 +44,8 @@ def write_report(path: Path, found: Comparison) -> Path:
 
     Args:
         path: the HTML file; its folder must exist.
-        found: tracks and metrics of `compare`, or of a run's only track, `ekf` or `graph`; the
-            ground truth is drawn if the recording has one.
+        found: tracks and metrics of `compare` or of a run; the ground truth is drawn if the
+            recording has one.
 
     Returns:
         The path.
@@ -59,9 +61,9 @@ def write_report(path: Path, found: Comparison) -> Path:
         for name, aligned in found.aligned().items()
     }
     true_series = None if truth is None else trajectory_series(truth, start)
-    main = found.main
-    # The inertial-only track is kilometres off within a minute: no axis fits it and the others.
-    drawn = {name: s for name, s in series.items() if name != "inertial"}
+    main = "track"
+    # Dead reckoning is kilometres off within a minute: no axis fits it and the others.
+    drawn = {name: s for name, s in series.items() if name != "dead_reckoning"}
     panels = motion_panels(drawn, true_series, main) + bias_panels(main, series[main])
     innovations = tracks[main].innovations
     if innovations is not None and len(innovations.time):
@@ -85,7 +87,7 @@ def write_report(path: Path, found: Comparison) -> Path:
         "LEGEND": _legend(
             [*([] if truth is None else ["truth"]), *mapped], known, len(corrections)
         ),
-        "HEALTH": "" if health is None else _health(findings(health)),
+        "HEALTH": _health(found.verdict),
         "TABLE": "" if truth is None else _table(found),
         "STYLE": _asset("report.css"),
         "SCRIPT": _asset("report.js"),
@@ -177,7 +179,8 @@ def _table(found: Comparison) -> str:
     head = "".join(f"<th>{METRIC_TITLES[key].replace(' ', '<br>')}</th>" for key in _DIGITS)
     rows = []
     for name, figures in found.metrics.items():
-        cells = (_cell(figures.get(key), digits) for key, digits in _DIGITS.items())
+        shown = {key: shown_value(figures, key) for key in _DIGITS}
+        cells = (_cell(shown[key], digits) for key, digits in _DIGITS.items())
         row = "".join(f"<td>{cell}</td>" for cell in cells)
         rows.append(f"<tr><th>{html.escape(style(name)[0])}</th>{row}</tr>")
     words = found.words

@@ -16,7 +16,7 @@ from stario.sequences.sequence import BoolArray, FloatArray
 
 INK, GRID, FAINT = "#222222", "#E3E6EA", "#767676"
 TRUTH = "truth"
-_DASHES = {"ekf": "solid", "graph": "dash", "network": "dot", "network_true_attitude": "dashdot"}
+_DASHES = {"filtered": "dash", "network": "dot", "network_true_attitude": "dashdot"}
 _MAX_INNOVATIONS = 600
 _MAX_POINTS = 600
 """Maximum number of points of a curve: a panel is as many pixels wide, and the file stays small."""

@@ -122,12 +122,6 @@ def ellipse(covariance: FloatArray) -> FloatArray:
     return outline.T
 
 
-def clock(seconds: float) -> str:
-    """Return a time as minutes and seconds."""
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes}:{rest:02d}"
-
-
 def _rows(
     trajectory: Trajectory,
 ) -> tuple[FloatArray, np.ndarray[tuple[int], np.dtype[np.intp]], BoolArray]:

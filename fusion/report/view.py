@@ -34,7 +34,7 @@ def write_view(path: Path, run: Comparison) -> Path:
 
     Args:
         path: file to write, ending in .rrd; its folder must exist.
-        run: the recording, with its sensors and ground truth, and its only track.
+        run: the recording, with its sensors and ground truth, and its track.
 
     Returns:
         The path.
@@ -42,7 +42,7 @@ def write_view(path: Path, run: Comparison) -> Path:
     Raises:
         InputError: the file cannot be written.
     """
-    sequence, [track], [aligned] = run.sequence, run.tracks.values(), run.aligned().values()
+    sequence, track, aligned = run.sequence, run.track, run.aligned()["track"]
     stream = rr.RecordingStream("stario", recording_id=None)
     try:
         stream.save(path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -12,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from stario.network.card import Calibration
-from stario.network.known_motion import known_motion
 from stario.network.model import DisplacementModel
 from stario.network.training.augment import WindowSampler
 from stario.network.training.config import TrainingConfig
@@ -55,7 +55,7 @@ def train(
         folder: folder for `checkpoint.safetensors`, `model.safetensors`, its card and `log.json`.
         on_step: called after each step with the step and its mean squared error [m^2], for a
             progress bar.
-        on_epoch: called after each validation.
+        on_epoch: called after each validation; for initial weights before the first epoch, too.
         trained_on: description of the training data, for the card; that of the initial weights is
             added to it.
         start_from: model that provides the initial weights.
@@ -97,7 +97,9 @@ def train(
         before: dict[str, float] = {}
         if start_from is not None:
             run.start_from(start_from)
-            before = held_out.errors(run.averaged) if processes.is_leader else {}
+            if processes.is_leader:
+                before = held_out.errors(run.averaged)
+                on_epoch(EpochReport(0, math.nan, held_out.selection_error(before), before))
         run.resume()
         if run.step >= config.steps:
             log.warning("%s: all %d epochs are done, nothing left to train", folder, config.epochs)
@@ -107,17 +109,12 @@ def train(
                 on_epoch(report)
         if before and (words := held_out.worse(before, run.history.best().validation_by_recording)):
             log.warning("%s: %s", folder, words)
-        known = known_motion(streams, legs)
-        if config.learned < 1.0 and start_from is not None and start_from.card.known_motion:
-            known = start_from.card.known_motion.extended(known)
         path = folder / "model.safetensors"
         if processes.is_leader:
             sources = [*trained_on, *_inherited(start_from)]
             validating = {id(stream) for stream in (*validation, *validation_legs)}
             learned = any(id(stream) in validating for stream in (*streams, *legs))
-            write_result(
-                path, run.best_network(), config, held_out, sources, calibration, known, learned
-            )
+            write_result(path, run.best_network(), config, held_out, sources, calibration, learned)
         return path
 
 

@@ -10,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 
 from stario.network.displacement import DisplacementNetwork
-from stario.network.known_motion import KnownMotion
 from stario.network.training.augment import UNVARIED
 from stario.network.training.config import LEAST_SECONDS, TrainingConfig
 from stario.network.training.legs import LegBatch, LegSampler, by_kind
@@ -18,7 +17,6 @@ from stario.network.training.weak_truth import leg_loss
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.legs import LegStream
-from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import (
     WINDOW_SAMPLES,
     WorldStream,
@@ -107,16 +105,6 @@ class ValidationSet:
                 errors.append(mean.cpu() - torch.from_numpy(target))
                 log_sigmas.append(log_sigma.cpu())
         return torch.cat(errors).double().numpy(), torch.cat(log_sigmas).double().numpy()
-
-    def variance_factors(self, known: KnownMotion) -> FloatArray:
-        """Return the factors (M,) on the predicted variance of the windows of `residuals`."""
-        return np.concatenate(
-            [
-                known.variance_factor(windows)
-                for stream in self.streams
-                for windows, _ in self._cut(stream, _BATCH)
-            ]
-        )
 
     def _cut(
         self, stream: WorldStream, batch: int

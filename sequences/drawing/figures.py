@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 BLUE, ORANGE, GREEN, PINK = "#0072B2", "#E69F00", "#009E73", "#CC79A7"
 RED, SKY, GREY, INK, BROWN = "#D55E00", "#56B4E9", "#999999", "#333333", "#7F5539"
 TRACK_STYLES = {
-    "inertial": ("inertial", GREY),
-    "pdr": ("steps (PDR)", BROWN),
-    "network": ("network", ORANGE),
+    "track": ("StarIO", BLUE),
+    "filtered": ("filter, as in a stream", PINK),
+    "network": ("network alone", ORANGE),
     "network_true_attitude": ("network, true attitude", GREEN),
-    "ekf": ("EKF", BLUE),
-    "graph": ("factor graph", PINK),
+    "pdr": ("steps (PDR)", BROWN),
+    "dead_reckoning": ("dead reckoning (IMU alone)", GREY),
 }
 _SPARE_COLOURS = (RED, SKY, "#6A4C93")
 LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 9}
@@ -118,7 +118,15 @@ def indices_after_gaps(time: FloatArray, max_gap: float) -> NDArray[np.intp]:
 
 def distance(metres: float) -> str:
     """Format a distance in metres, or in kilometres from 1000 m on."""
-    return f"{metres / 1000:.1f} km" if metres >= 1000 else f"{metres:.0f} m"
+    if metres >= 1000:
+        return f"{metres / 1000:.1f} km"
+    return f"{metres:.0f} m" if metres >= 10 else f"{metres:.3g} m"
+
+
+def clock(seconds: float) -> str:
+    """Format a time as minutes and seconds."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02d}"
 
 
 def draw_samples(axes: Axes, time: FloatArray, value: FloatArray, label: str, colour: str) -> None:

@@ -12,19 +12,25 @@ from stario.sequences.drawing.figures import (
     INK,
     LEGEND,
     RED,
+    apply_style,
+    clock,
     distance,
     indices_after_gaps,
     new_figure,
-    panels_of,
     split_at_gaps,
     style_of,
 )
+from stario.sequences.drawing.plots import draw_error
+from stario.sequences.drawing.timed_path import draw_scale_bar, draw_timed_path, round_times
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, PositionTrack, Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+_TRUTH = "#B8B8B8"
+"""Colour of the truth: below the tracks, wide and pale."""
 
 _CROWDED = 12.0
 """Length of a path over the size of its box above which lines are drawn thinner."""
@@ -41,13 +47,14 @@ def plan_view(
 ) -> Figure:
     """Draw all tracks from above, on equal axes that fit the ground truth and the tracks near it.
 
-    A track that drifts far beyond these is cut at the frame, and the legend states how far it goes.
-    Invalid poses and gaps appear as breaks; the first pose after a gap of more than a second is
-    marked. Tracks are drawn as given: align them first.
+    The first track is coloured by time; where the truth is known, its error and sigma are drawn
+    beside. A track that drifts far beyond the others is cut at the frame, and the legend states how
+    far it goes. Invalid poses and gaps appear as breaks; the first pose after a gap of more than a
+    second is marked. Tracks are drawn as given: align them first.
 
     Args:
-        tracks: tracks by name; "inertial", "pdr", "network", "network_true_attitude", "ekf" and
-            "graph" have fixed colours.
+        tracks: tracks by name, the most important one first; those of `TRACK_STYLES` have fixed
+            colours.
         truth: the true track in the same frame, or None.
         title: title of the figure.
         known: positions or waypoints (n, 2) in the same frame, if there is no true track.
@@ -58,7 +65,8 @@ def plan_view(
     paths = {name: _path_of(track) for name, track in tracks.items()}
     true_path = np.empty((0, 2)) if truth is None else _path_of(truth)
     boxes = {name: _box_of(path) for name, path in paths.items() if np.isfinite(path).any()}
-    if np.isfinite(true_path).any():
+    has_truth = truth is not None and bool(np.isfinite(true_path).any())
+    if has_truth:
         typical = true_path
     elif boxes:
         # Drift only makes a track larger, so the lower median is a track without large drift.
@@ -73,40 +81,52 @@ def plan_view(
     if known is not None:
         near.append(_box_of(known.position_W))
     frame = _frame_around(np.array([home, *near]))
-    width, height = np.ptp(frame, axis=0) / np.ptp(frame, axis=0).max()
-    fig = new_figure(7.0 * width + 1.0, 7.0 * height + 1.0, title)
-    (axes,) = panels_of(fig)
+    fig, axes, beside = _new_plan(frame, title, with_error=has_truth and bool(boxes))
     length = float(np.nansum(np.linalg.norm(np.diff(typical, axis=0), axis=1)))
     fine = 0.6 if length / _size_of(home) > _CROWDED else 1.0
-    if typical is true_path:
-        _draw_path(axes, true_path, "truth", "black", width=2.2 * fine, order=2)
+    if has_truth:
+        axes.plot(*true_path.T, color=_TRUTH, lw=6.0 * fine, label="truth", zorder=2)
+        end = true_path[np.isfinite(true_path).all(axis=1)][-1]
+        axes.plot(*end, "s", ms=11, mfc=_TRUTH, mec=INK, mew=1.0, zorder=3.2)
     for k, name in enumerate(boxes):
         label, colour = style_of(name, k)
         if name in leaves:
             label += f" (leaves the figure by {distance(beyond[name])})"
-        _draw_path(axes, paths[name], label, colour, width=1.3 * fine, order=3)
+        if k == 0:
+            colours, main_colour = draw_timed_path(axes, tracks[name], label, fine)
+            ticks = round_times(float(np.ptp(tracks[name].time)))
+            bar = fig.colorbar(colours, ax=axes, shrink=0.5, aspect=30, pad=0.02, ticks=ticks)
+            bar.ax.set_yticklabels([clock(tick) for tick in ticks])
+            bar.set_label("time [min:s]", fontsize=9)
+            bar.ax.tick_params(labelsize=8)
+        else:
+            axes.plot(*paths[name].T, color=colour, lw=1.3 * fine, label=label, zorder=3)
     _mark_gaps(axes, tracks, frame)
     if known is not None:
         _draw_known(axes, known)
     axes.set(xlim=frame[:, 0], ylim=frame[:, 1], xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    draw_scale_bar(axes, frame)
     axes.plot([], [], "o", mfc="white", mec=INK, label="start")
     axes.plot([], [], "s", mfc=INK, mec="white", label="end")
-    _add_legend(fig)
+    _add_legend(fig, axes)
+    if beside is not None and truth is not None:
+        draw_error(beside, tracks, truth, main_colour)
     return fig
+
+
+def _new_plan(frame: FloatArray, title: str, with_error: bool) -> tuple[Figure, Axes, Axes | None]:
+    """Return a figure with axes that fit the frame, and axes beside them for the error."""
+    width, height = 7.0 * np.ptp(frame, axis=0) / np.ptp(frame, axis=0).max()
+    beside = [5.0] if with_error else []
+    fig = new_figure(width + 1.8 + sum(beside), height + 1.0, title)
+    panels = list(fig.subplots(1, 1 + len(beside), squeeze=False, width_ratios=[width, *beside])[0])
+    for panel in panels:
+        apply_style(panel)
+    return fig, panels[0], panels[1] if with_error else None
 
 
 def _path_of(track: Trajectory) -> FloatArray:
     return split_at_gaps(track.time, track.position_W[:, :2], track.valid)[1]
-
-
-def _draw_path(
-    axes: Axes, path: FloatArray, label: str, colour: str, width: float, order: int
-) -> None:
-    """Draw a path (N, 2) [m] with its start and end marked."""
-    axes.plot(path[:, 0], path[:, 1], color=colour, lw=width, label=label, zorder=order)
-    known = path[np.isfinite(path).all(axis=1)]
-    axes.plot(*known[0], "o", ms=8, mfc="white", mec=colour, mew=1.5, zorder=order + 3)
-    axes.plot(*known[-1], "s", ms=8, mfc=colour, mec="white", mew=1.0, zorder=order + 3)
 
 
 def _draw_known(axes: Axes, known: PositionTrack) -> None:
@@ -133,10 +153,11 @@ def _mark_gaps(axes: Axes, tracks: Mapping[str, Trajectory], frame: FloatArray) 
             label = ""
 
 
-def _add_legend(fig: Figure) -> None:
+def _add_legend(fig: Figure, axes: Axes) -> None:
     """Add a legend below the axes, in as many columns as fit the width; the figure grows by it."""
+    handles = axes.get_legend_handles_labels()
     for columns in (3, 2, 1):
-        legend = fig.legend(loc="outside lower center", ncols=columns, **LEGEND)
+        legend = fig.legend(*handles, loc="outside lower center", ncols=columns, **LEGEND)
         extent = legend.get_window_extent()
         if columns == 1 or extent.width < fig.bbox.width:
             fig.set_figheight(fig.get_figheight() + extent.height / fig.dpi)

@@ -100,6 +100,45 @@ def error_over_time(
     return fig
 
 
+def draw_error(
+    axes: Axes, tracks: Mapping[str, Trajectory], truth: Trajectory, colour: str
+) -> None:
+    """Draw the horizontal error of tracks over time, and the sigma of the first one.
+
+    The sigma is that of the distance, (P_xx + P_yy)^1/2. The axes fit the first track; another may
+    leave them.
+
+    Args:
+        axes: empty axes.
+        tracks: tracks by name, in the truth's frame.
+        truth: the true track.
+        colour: the first one's colour.
+    """
+    reach = 0.0
+    for k, (name, track) in enumerate(tracks.items()):
+        errors = pose_errors(track, truth)
+        elapsed, P = errors.estimate.time - truth.time[0], errors.estimate.position_covariance_W
+        norm = np.linalg.norm(errors.position_W[:, :2], axis=1)
+        if k == 0:
+            reach = float(norm.max())
+            if P is not None:
+                sigma = np.sqrt(P[:, 0, 0] + P[:, 1, 1])
+                reach = max(reach, float(sigma.max()))
+                axes.plot(*_unbroken(elapsed, sigma), "--", color=INK, lw=1.2, label="its sigma")
+        shade, width = (colour, 2.0) if k == 0 else (style_of(name, k)[1], 1.2)
+        axes.plot(*_unbroken(elapsed, norm), color=shade, lw=width)
+    axes.set(xlabel="time [s]", ylabel="distance from the truth [m]")
+    axes.set_ylim(0.0, 1.3 * reach or 1.0)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(**ABOVE_LEFT)
+
+
+def _unbroken(time: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return times and values (N,), NaN in gaps."""
+    ticks, values = split_at_gaps(time, value[:, None])
+    return ticks, values[:, 0]
+
+
 def innovations(
     time: FloatArray,
     residual: FloatArray,

@@ -10,7 +10,6 @@ looks like a device held still.
 
 from __future__ import annotations
 
-import logging
 import math
 
 import numpy as np
@@ -19,16 +18,14 @@ from stario.sequences.arrays import check_type
 from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.clean_samples import clean_samples, unbroken
 from stario.sequences.errors import InputError
+from stario.sequences.findings import Finding, warn
 from stario.sequences.inspection.constant_values import check_not_dead
-from stario.sequences.inspection.samples import LARGE_M_S2, limit_words
-from stario.sequences.inspection.times import check_time
+from stario.sequences.inspection.samples import LARGE_M_S2, check_time, limit_words
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 from stario.sequences.truth.fit import TruthFit, fit_truth
 from stario.sequences.truth.part import without_spikes
 from stario.sequences.truth.positions import fit_positions
 from stario.sequences.units import FAST_RAD_S, GYRO_UNITS
-
-log = logging.getLogger(__name__)
 
 MIN_SECONDS = 1.5
 """Shortest recording that holds a window and a margin around it [s]."""
@@ -89,17 +86,26 @@ _MAX_TILT_RAD = math.radians(20.0)
 
 
 def check_units(sequence: ImuSequence) -> None:
-    """Check that a recording's numbers can be in s, rad/s and m/s^2.
+    """Check that a recording's numbers can be in s, rad/s and m/s^2; log what stays in doubt.
 
-    Warns of an accelerometer that may have Apple's sign, which nothing in the file tells.
+    Raises:
+        InputError: as for `unit_findings`.
+    """
+    check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
+    warn(sequence.name, unit_findings(sequence))
+
+
+def unit_findings(sequence: ImuSequence) -> list[Finding]:
+    """Check a recording's units, and return what nothing in the file tells.
+
+    These are a gyroscope that turns about the vertical only, fast enough for deg/s, and an
+    accelerometer that may have Apple's sign.
 
     Raises:
         InputError: it is too short or holds no number, time is in another unit, a sensor is dead,
             the gyroscope is in deg/s, the accelerometer is in g, lacks gravity or has the opposite
-            sign (detected only with a true attitude). The text names the option that fixes it. Or
-            `sequence` has the wrong type.
+            sign (detected only with a true attitude). The text names the option that fixes it.
     """
-    check_type("sequence", sequence, ImuSequence, "read_recording(path) returns one")
     _check_content(sequence)
     check_time(sequence)
     time, gyro, accel = clean_samples(sequence)
@@ -108,31 +114,36 @@ def check_units(sequence: ImuSequence) -> None:
             f"{sequence.name}: duration", f"{time[-1] - time[0]:.2f} s", f"at least {MIN_SECONDS} s"
         )
     check_not_dead(sequence.name, time, gyro, accel)
-    pieces = _pieces(time)
+    pieces, found = _pieces(time), list[Finding]()
     if pieces:  # otherwise gaps leave nothing to average over
         fix = _UNIT_NAMED if "gyro" in sequence.converted else _advice(sequence, "gyro", "deg/s")
-        force, average = check_gyro(sequence.name, time, gyro, accel, pieces, fix)
+        force, average, found = check_gyro(sequence.name, time, gyro, accel, pieces, fix)
         saturated = limit_words("accelerometer", accel, "m/s^2", LARGE_M_S2)
-        _check_force(sequence, force, average, saturated)
+        found += _check_force(sequence, force, average, saturated)
     _check_direction(sequence, time, accel)
     if sequence.maybe_apple and sequence.truth is None:
-        log.warning(
-            "%s: gravity was logged apart, as Sensor Logger does on iPhones, whose sign is "
-            "inverted: if it is from an iPhone, pass `--accel-sign apple`", sequence.name,
-        )  # fmt: skip
+        text = (
+            "accelerometer: gravity was logged apart, as Sensor Logger does on iPhones, whose sign "
+            "is inverted"
+        )
+        fix = "if it is from an iPhone, pass `--accel-sign apple`"
+        found.append(Finding("apple_sign_open", text, fix, level="note"))
     if not sequence.source:  # a reader would have told the sign, or asked
-        warn_if_downward(sequence.name, accel)
+        found += downward(accel)
+    return found
 
 
-def warn_if_downward(name: str, accel: FloatArray) -> None:
-    """Warn of forces (N, 3) that point along -z on average: a sign that no other check can tell."""
+def downward(accel: FloatArray) -> list[Finding]:
+    """Report forces (N, 3) that point along -z on average: a sign that no other check can tell."""
     mean = accel.mean(axis=0)
-    if mean[2] < _DOWNWARD * np.linalg.norm(mean):
-        log.warning(
-            "%s: accelerometer: found %.1f m/s^2 along z on average; right for a device face down "
-            "or axes with z down; if it lay face up, give -accel: specific force points up at rest",
-            name, mean[2],
-        )  # fmt: skip
+    if mean[2] >= _DOWNWARD * np.linalg.norm(mean):
+        return []
+    text = f"accelerometer: found {mean[2]:.1f} m/s^2 along z on average"
+    fix = (
+        "right for a device face down or axes with z down; if it lay face up, give -accel: "
+        "specific force points up at rest"
+    )
+    return [Finding("downward_open", text, fix, level="note", values={"z_m_s2": float(mean[2])})]
 
 
 def _advice(sequence: ImuSequence, sensor: str, unit: str) -> str:
@@ -175,7 +186,7 @@ def check_gyro(
     accel: FloatArray,
     pieces: list[slice],
     fix: str,
-) -> tuple[float, float]:
+) -> tuple[float, float, list[Finding]]:
     """Check the gyroscope's rotations against the accelerometer.
 
     Args:
@@ -187,7 +198,8 @@ def check_gyro(
         fix: what to do if it is in deg/s.
 
     Returns:
-        Median magnitude of the force, and of its average over a piece [m/s^2].
+        Median magnitude of the force, and of its average over a piece [m/s^2]; a finding if the
+        accelerometer cannot tell the gyroscope's unit.
 
     Raises:
         InputError: the gyroscope cannot be in rad/s.
@@ -208,11 +220,13 @@ def check_gyro(
     elif speed <= FAST_RAD_S:
         undecided = abs(force - in_degrees - lost) < _UNDECIDED * force
         if speed > _SUSTAINED_RAD_S and undecided and fix != _UNIT_NAMED:
-            log.warning(
-                "%s: gyroscope: found rotations of %.3g rad/s, all about the vertical, of which "
-                "the accelerometer tells nothing: %s", name, speed, fix,
-            )  # fmt: skip
-        return force, average
+            text = (
+                f"gyroscope: found rotations of {speed:.3g} rad/s, all about the vertical, of "
+                "which the accelerometer tells nothing"
+            )
+            values = {"rate_rad_s": speed}
+            return force, average, [Finding("gyro_unit_open", text, fix, values=values)]
+        return force, average, []
     if speed <= FAST_RAD_S:  # plausible by hand; in deg/s, a stationary device
         fix = "are its axes and signs the accelerometer's? If the device lay still, is it in deg/s?"
     elif fix != _UNIT_NAMED and speed * GYRO_UNITS["deg/s"] > FAST_RAD_S:
@@ -235,15 +249,16 @@ def _check_swapped(
         raise InputError(f"{name}: gyroscope", found, "rad/s", fix)
 
 
-def _check_force(sequence: ImuSequence, force: float, average: float, saturated: str) -> None:
+def _check_force(
+    sequence: ImuSequence, force: float, average: float, saturated: str
+) -> list[Finding]:
     field, found = f"{sequence.name}: accelerometer", f"an average of {average:.3g}"
     expected = f"about {STANDARD_GRAVITY:.2f} m/s^2"
     # Shaking makes samples exceed gravity: an average that equals gravity is accepted anyway. In
     # the hand of a runner both sensors saturate, and the average loses a fourth.
     off = abs(average / STANDARD_GRAVITY - 1.0)
     if saturated and _SHAKEN_OFF_GRAVITY < off <= _SATURATED_OFF_GRAVITY:
-        log.warning("%s: %s, and %s instead of gravity", sequence.name, saturated, found)
-        return
+        return [Finding("accelerometer_limit", f"{saturated}: {found} instead of gravity")]
     gravity = off <= _SHAKEN_OFF_GRAVITY
     if not (gravity or average > _COHERENT * force) or average < _NO_GRAVITY:
         found += f" from samples of {force:.3g}"
@@ -266,7 +281,7 @@ def _check_force(sequence: ImuSequence, force: float, average: float, saturated:
         if _G_RANGE[0] <= average / STANDARD_GRAVITY**2 <= _G_RANGE[1]:
             fix = "it seems to be in m/s^2 already: omit the unit g"
     else:
-        return
+        return []
     raise InputError(field, found, expected, fix)
 
 

@@ -7,17 +7,14 @@ into it.
 
 from __future__ import annotations
 
-import logging
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import runs, scatter
 from stario.sequences.clean_samples import MIN_RATE, usable
 from stario.sequences.errors import InputError
+from stario.sequences.findings import Finding
 from stario.sequences.sequence import STANDARD_GRAVITY, BoolArray, FloatArray, ImuSequence
-
-_log = logging.getLogger(__name__)
 
 _STUCK_S = 1.0
 """Time [s] for which a stuck sensor's values repeat exactly; those of others repeat for 0.1 s."""
@@ -33,25 +30,24 @@ _VARIES_RAD_S = 0.01
 _REMEDY = "is another column meant, or is the sensor broken?"
 
 
-def dead_axis_problems(sequence: ImuSequence) -> list[str]:
-    """Return one line for each sensor with a dead axis."""
+def dead_axes(sequence: ImuSequence) -> list[Finding]:
+    """Return a finding for each sensor with dead axes: data simulated in a plane may be meant."""
     given = usable(sequence)
     gyro, accel = sequence.gyro[given], sequence.accel[given]
     if len(gyro) < 2:
         return []
-    found = {"gyroscope": _dead_gyro_axes(gyro), "accelerometer": _dead_accel_axes(gyro, accel)}
+    dead = {"gyroscope": _dead_gyro_axes(gyro), "accelerometer": _dead_accel_axes(gyro, accel)}
+    found = {sensor: " and ".join(np.array(["x", "y", "z"])[axes]) for sensor, axes in dead.items()}
     return [
-        f"{sequence.name}: {sensor}: its {axis} axis never changes, although the device turns: "
-        f"{_REMEDY}"
-        for sensor, dead in found.items()
-        for axis in np.array(["x", "y", "z"])[dead]
+        Finding(
+            f"{sensor}_dead_axis",
+            f"{sensor}: its {axes} axis never changes, although the device turns",
+            _REMEDY,
+            values={"axes": axes},
+        )
+        for sensor, axes in found.items()
+        if axes
     ]
-
-
-def warn_of_dead_axes(sequence: ImuSequence) -> None:
-    """Log a warning for each sensor with a dead axis: data simulated in a plane may be meant."""
-    for problem in dead_axis_problems(sequence):
-        _log.warning("%s", problem)
 
 
 def _dead_gyro_axes(gyro: FloatArray) -> BoolArray:
@@ -72,9 +68,9 @@ def _constant(values: FloatArray) -> BoolArray:
     return np.asarray((values == values[0]).all(axis=0))
 
 
-def stuck_problems(name: str, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> list[str]:
+def stuck_findings(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> list[Finding]:
     """Report a sensor that repeats while the other moves; `check_units` refuses a dead one."""
-    problems = []
+    found = []
     for sensor, values, other, moves in (
         ("gyroscope", gyro, "accelerometer", shaken),
         ("accelerometer", accel, "gyroscope", tilting),
@@ -89,12 +85,18 @@ def stuck_problems(name: str, time: FloatArray, gyro: FloatArray, accel: FloatAr
         ]
         if stuck and not repeated.all():
             start, stop = max(stuck, key=lambda stretch: stretch[1] - stretch[0])
-            problems.append(
-                f"{name}: {sensor}: its values repeat exactly for "
-                f"{sum(b - a for a, b in stuck):.1f} s while the {other} shows motion, "
-                f"longest from {start:.1f} to {stop:.1f} s"
+            seconds = sum(b - a for a, b in stuck)
+            found.append(
+                Finding(
+                    f"{sensor}_stopped",
+                    f"{sensor}: its values repeat exactly for {seconds:.1f} s while the {other} "
+                    f"shows motion, longest from {start:.1f} to {stop:.1f} s",
+                    "restart the device and record again; if it recurs, the sensor or app is "
+                    "faulty",
+                    values={"seconds": seconds, "start_s": start, "stop_s": stop},
+                )
             )
-    return problems
+    return found
 
 
 def check_not_dead(name: str, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> None:

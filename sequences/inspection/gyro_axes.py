@@ -9,13 +9,14 @@ much as they do in the device's axes. A wrong sign of the whole accelerometer ch
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from stario.sequences.arrays import samples_in
 from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.clean_samples import clean_samples, unbroken
+from stario.sequences.findings import Finding
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 
 _MIN_TILT = 0.2
@@ -54,14 +55,19 @@ class GyroAxes:
         """Whether the device tilted often enough for a verdict."""
         return self.tilts >= _MIN_TILTS
 
-    def problems(self, name: str) -> list[str]:
-        """Return a line if the axes differ, for the recording of this name."""
+    def findings(self) -> list[Finding]:
+        """Return a finding if the axes differ."""
         if not self.compared or self.unexplained <= _MAX_UNEXPLAINED:
             return []
         return [
-            f"{name}: gyroscope: leaves {self.unexplained:.0%} of gravity's changes in "
-            f"{self.tilts} tilts unexplained, expected less than half: are its axes and signs the "
-            "accelerometer's? (On rides, accelerations look like tilts.)"
+            Finding(
+                "gyro_axes",
+                f"gyroscope: leaves {self.unexplained:.0%} of gravity's changes in {self.tilts} "
+                "tilts unexplained, expected less than half",
+                "are its axes and signs the accelerometer's? (On rides, accelerations look like "
+                "tilts.)",
+                values=asdict(self),
+            )
         ]
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stario.sequences.findings import Finding
 from stario.sequences.sequence import FloatArray
 from stario.sequences.units import magnetic_advice
 
@@ -133,27 +134,26 @@ def certain_iron(iron: FloatArray | None, sigma: FloatArray | None) -> FloatArra
     return iron if np.linalg.norm(iron[sure]) > _IRON_UT else None
 
 
-def magnetic_problems(name: str, findings: MagneticFindings) -> list[str]:
-    """Return problems of the magnetometer of recording `name`, one line each."""
-    field, problems = f"{name}: magnetometer", []
-    iron = certain_iron(findings.hard_iron_uT, findings.hard_iron_sigma_uT)
-    agreement = findings.correlation_with_gyroscope
-    if not _SIZES_UT[0] < findings.size_median_uT < _SIZES_UT[1]:
-        advice = magnetic_advice(findings.size_median_uT)
-        advice = advice or "is it uncalibrated, in another unit or near a magnet?"
-        found = f"found {findings.size_median_uT:.3g} uT, expected the earth's 25 to 65"
-        problems.append(f"{field}: {found}; {advice}")
+def magnetic_findings(found: MagneticFindings) -> list[Finding]:
+    """Return what stands out about a magnetometer."""
+    result = []
+    iron = certain_iron(found.hard_iron_uT, found.hard_iron_sigma_uT)
+    agreement, size = found.correlation_with_gyroscope, found.size_median_uT
+    if not _SIZES_UT[0] < size < _SIZES_UT[1]:
+        text = f"magnetometer: found {size:.3g} uT, expected the earth's 25 to 65"
+        fix = magnetic_advice(size) or "is it uncalibrated, in another unit or near a magnet?"
+        result.append(Finding("field_size", text, fix, values={"size_uT": size}))
     if agreement is not None and agreement < _VERDICTS[-1][2]:
-        problems.append(
-            f"{field}: does not follow the gyroscope (correlation {agreement:.2f}): "
-            "a disturbed field, stale readings or different axes"
-        )
+        text = f"magnetometer: does not follow the gyroscope (correlation {agreement:.2f})"
+        fix = "a disturbed field, stale readings or different axes"
+        result.append(Finding("field_axes", text, fix, values={"correlation": agreement}))
     if iron is not None:
         offset = ", ".join(f"{b:+.0f}" for b in iron)
-        problems.append(f"{field}: the device adds a constant field of {offset} uT (hard iron)")
-    if findings.dip_rad < -_UP_RAD:
-        problems.append(
-            f"{field}: points up by {math.degrees(-findings.dip_rad):.0f} degrees, as south of the "
-            "magnetic equator; elsewhere, the accelerometer has Apple's sign: --accel-sign apple"
-        )
-    return problems
+        text = f"magnetometer: the device adds a constant field of {offset} uT (hard iron)"
+        result.append(Finding("hard_iron", text, level="note", values={"iron_uT": iron.tolist()}))
+    if found.dip_rad < -_UP_RAD:
+        up = math.degrees(-found.dip_rad)
+        text = f"magnetometer: points up by {up:.0f} degrees, as south of the magnetic equator"
+        fix = "elsewhere, the accelerometer has Apple's sign: pass `--accel-sign apple`"
+        result.append(Finding("field_up", text, fix, values={"up_deg": up}))
+    return result

@@ -10,14 +10,18 @@ import numpy as np
 from stario.sequences.arrays import check_type
 from stario.sequences.clean_samples import finite_samples, usable
 from stario.sequences.errors import InputError
-from stario.sequences.inspection.checks import check_units
-from stario.sequences.inspection.constant_values import dead_axis_problems
+from stario.sequences.findings import Finding, verdict
+from stario.sequences.inspection.checks import unit_findings
+from stario.sequences.inspection.constant_values import dead_axes
 from stario.sequences.inspection.gyro_axes import GyroAxes, compare_gyro_axes
 from stario.sequences.inspection.magnetic import assess_magnetometer
-from stario.sequences.inspection.magnetic_findings import MagneticFindings, magnetic_problems
-from stario.sequences.inspection.samples import sample_problems, without_times_ahead
+from stario.sequences.inspection.magnetic_findings import MagneticFindings, magnetic_findings
+from stario.sequences.inspection.samples import (
+    magnetometer_time,
+    sample_findings,
+    without_times_ahead,
+)
 from stario.sequences.inspection.stillness import Rest, find_rest
-from stario.sequences.inspection.times import magnetometer_time_problems
 from stario.sequences.sequence import (
     GAP_STEPS,
     STANDARD_GRAVITY,
@@ -25,14 +29,15 @@ from stario.sequences.sequence import (
     Trajectory,
     is_gap,
 )
-from stario.sequences.truth.findings import fit_as_dict, fit_lines, scale_problem
-from stario.sequences.truth.fit import TruthFit
-from stario.sequences.truth.position_findings import (
-    jump_problems,
+from stario.sequences.truth.findings import (
+    fit_as_dict,
+    fit_lines,
+    known_position_findings,
     position_line,
-    position_time_problems,
     positions_as_dict,
+    scale_findings,
 )
+from stario.sequences.truth.fit import TruthFit
 from stario.sequences.truth.positions import PositionFit
 from stario.sequences.truth.problems import examine_truth
 from stario.sequences.truth.yaw_drift import YawDrift, yaw_drift
@@ -99,7 +104,7 @@ class Inspection:
         coverage: coverage by ground truth; None without one.
         fit: fit of truth and gyroscope; None if they cannot be compared.
         positions: comparison of the truth's positions with the accelerometer, likewise.
-        problems: problems found, one line each, with a remedy if there is one.
+        findings: what stands out.
         truth: description of the ground truth.
         device_attitude: number of attitudes logged by the device's own sensor fusion.
         magnetic: findings about the magnetometer; None without one or with too few samples.
@@ -115,7 +120,7 @@ class Inspection:
     coverage: Coverage | None
     fit: TruthFit | None
     positions: PositionFit | None
-    problems: tuple[str, ...]
+    findings: tuple[Finding, ...]
     truth: str
     magnetic: MagneticFindings | None
     device_attitude: int
@@ -146,7 +151,7 @@ class Inspection:
             "device_attitudes": self.device_attitude,
             "known_of_truth": self.truth,
             "magnetometer": self.magnetic and self.magnetic.as_dict(),
-            "problems": list(self.problems),
+            "verdict": [asdict(finding) for finding in verdict(self.findings)],
         }
 
     def lines(self) -> list[str]:
@@ -159,14 +164,18 @@ class Inspection:
             *(self.magnetic.lines() if self.magnetic else []),
             *([f"device's own attitudes: {self.device_attitude}"] if self.device_attitude else []),
             *self._truth_lines(),
-            *(f"! {problem}" for problem in self.problems),
-            *([] if self.problems else [self._good_line()]),
+            *([] if self.refused else [self._axes_line()]),
         ]
 
-    def _good_line(self) -> str:
+    @property
+    def refused(self) -> bool:
+        """Whether no track can be computed: units or samples are wrong."""
+        return any(found.code == "refused" for found in self.findings)
+
+    def _axes_line(self) -> str:
         if self.fit or (self.axes and self.axes.compared):
-            return "units, signs and axes: no problems found"
-        return "units: no problems found; the device tilts too seldom to compare the sensors' axes"
+            return "units, signs and axes: compared"
+        return "units: compared; the device tilts too seldom to compare the sensors' axes"
 
     def _timing_lines(self) -> list[str]:
         t = self.timing
@@ -218,7 +227,7 @@ class Inspection:
 
 
 def inspect_recording(sequence: ImuSequence) -> Inspection:
-    """Inspect a recording; problems are returned, not raised.
+    """Inspect a recording; what is wrong is returned, not raised.
 
     Raises:
         InputError: the recording holds no finite sample, or `sequence` has the wrong type.
@@ -229,26 +238,28 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
     if not finite.any():
         raise InputError(f"{sequence.name}: samples", "no finite sample", "numbers")
     valid = finite & usable(sequence) if (finite & usable(sequence)).any() else finite
-    problems, axes = sample_problems(sequence) + dead_axis_problems(sequence), None
+    findings, axes, refusal = sample_findings(sequence) + dead_axes(sequence), None, ""
     try:
-        check_units(sequence)
+        findings += unit_findings(sequence)
         axes = compare_gyro_axes(sequence)
-        problems += axes.problems(sequence.name)
+        findings += axes.findings()
     except InputError as error:
-        problems.append(str(error))
-    truth = examine_truth(sequence, " ".join(problems))
-    problems += [problem.line(sequence.name) for problem in truth.problems]
+        field = error.field.removeprefix(f"{sequence.name}: ")
+        text = f"{field}: found {error.found}, expected {error.expected}"
+        findings.append(Finding("refused", text, error.fix))
+        refusal = error.fix or text
+    truth = examine_truth(sequence, refusal)
+    findings += truth.findings
     yaw = None
-    if truth.fit is not None:
+    if truth.fit is not None and not truth.fit.one_axis:
         yaw = yaw_drift(replace(sequence, truth=truth.truth), truth.fit)
-        problems += scale_problem(sequence.name, truth.fit, yaw)
+        findings += scale_findings(truth.fit, yaw)
     try:
         rest, magnetic = find_rest(sequence), assess_magnetometer(sequence)
-    except InputError:  # an invalid rate, which `check_units` reports
+    except InputError:  # an invalid rate, which was reported
         rest = magnetic = None
-    problems += magnetic_problems(sequence.name, magnetic) if magnetic else ()
-    problems += magnetometer_time_problems(sequence)
-    problems += position_time_problems(sequence) + jump_problems(sequence)
+    findings += magnetic_findings(magnetic) if magnetic else ()
+    findings += magnetometer_time(sequence) + known_position_findings(sequence)
     return Inspection(
         name=sequence.name,
         timing=_timing(sequence, given, int((~finite).sum())),
@@ -258,7 +269,7 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         coverage=None if sequence.truth is None else _coverage(sequence, sequence.truth),
         fit=truth.fit,
         positions=truth.positions,
-        problems=tuple(problems),
+        findings=tuple(findings),
         truth=sequence.truth_summary(),
         device_attitude=0 if sequence.device_attitude is None else len(sequence.device_attitude),
         magnetic=magnetic,

@@ -1,4 +1,4 @@
-"""Samples that are invalid by themselves: by their times, or by values that no sensor measures."""
+"""Samples that are invalid by themselves: order, rate, unit and rounding of times; values."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ import logging
 import numpy as np
 
 from stario.sequences.arrays import runs
-from stario.sequences.clean_samples import usable
-from stario.sequences.inspection.constant_values import stuck_problems
+from stario.sequences.clean_samples import MAX_RATE, MIN_RATE, SHARED_TIMES, usable
+from stario.sequences.errors import InputError
+from stario.sequences.findings import Finding
+from stario.sequences.inspection.constant_values import stuck_findings
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.time_order import MAX_IMU_GAP, ahead_mask, increasing_mask
+from stario.sequences.units import TIME_UNITS
 
 _log = logging.getLogger(__name__)
 
@@ -35,24 +38,28 @@ _PILED_SHARE, _PILED = 0.02, 4.0
 Of 427 axes of recordings that reach 15 m/s^2 or 3 rad/s, the seven with both are runners' phones
 whose accelerometers end at 2 g; a sine has a ratio of 2.4."""
 
+_INSIDE = 0.5
+"""Share of the magnetometer's samples during the IMU's below which its clock is another."""
+
 _MIN_LIMIT_SHARE, _MIN_LIMIT_COUNT = 0.005, 3
 """Minimum share and number of samples at the limit for a report."""
 
 
-def sample_problems(sequence: ImuSequence) -> list[str]:
-    """Return problems of the samples, one line each; `disorder` reports rows out of order."""
-    problems = _late_problems(sequence)
+def sample_findings(sequence: ImuSequence) -> list[Finding]:
+    """Return findings about the samples; `disorder` reports rows out of order."""
+    found = _late(sequence)
     values = np.column_stack([sequence.gyro, sequence.accel])
     invalid = int((np.isfinite(values).all(axis=1) & ~usable(sequence)).sum())
     if invalid:
         count = "1 sample" if invalid == 1 else f"{invalid} samples"
-        problems.append(f"{sequence.name}: values that no sensor can measure, in {count}")
+        text = f"values that no sensor can measure, in {count}"
+        found.append(Finding("values_impossible", text, values={"samples": invalid}))
     given = usable(sequence) & np.isfinite(sequence.time)
     samples = sequence.time[given], sequence.gyro[given], sequence.accel[given]
-    return problems + stuck_problems(sequence.name, *samples) + _limit_problems(sequence)
+    return found + stuck_findings(*samples) + _at_limit(sequence)
 
 
-def _late_problems(sequence: ImuSequence) -> list[str]:
+def _late(sequence: ImuSequence) -> list[Finding]:
     """Report the longest run of late samples, as the health of a run does."""
     time = sequence.time[np.isfinite(sequence.time)]
     if disorder(time):
@@ -63,28 +70,32 @@ def _late_problems(sequence: ImuSequence) -> list[str]:
     if seconds < _LATE_SECONDS:
         return []
     by, at = float(newest[first] - time[first]), float(time[first - 1] - time[0])
+    values = {"by_s": by, "at_s": at, "longest_s": seconds}
     if by > _SET_BACK:
-        return [
-            f"{sequence.name}: time: the clock jumps back by {by:.3g} s at {at:.1f} s; "
-            "split the recording there"
-        ]
+        text = f"time: the clock jumps back by {by:.3g} s at {at:.1f} s"
+        return [Finding("clock_set_back", text, "split the recording there", values=values)]
     return [
-        f"{sequence.name}: time: samples come late for {seconds:.1f} s in a row after {at:.1f} s: "
-        f"logged twice, or from a clock that was set back by {by:.3g} s; if so, that time is "
-        "missing: split the recording there"
+        Finding(
+            "samples_late",
+            f"time: samples come late for {seconds:.1f} s in a row after {at:.1f} s: logged twice, "
+            f"or from a clock that was set back by {by:.3g} s; if so, that time is missing",
+            "split the recording there",
+            values=values,
+        )
     ]
 
 
-def _limit_problems(sequence: ImuSequence) -> list[str]:
+def _at_limit(sequence: ImuSequence) -> list[Finding]:
     """Report a sensor at its limit, as streams do (`fusion.imu.faults`)."""
     given = usable(sequence)
+    advice = "choose a larger range of the sensor, if the logger offers one"
     return [
-        f"{sequence.name}: {words}"
-        for words in (
-            limit_words("gyroscope", sequence.gyro[given], "rad/s", _LARGE_RAD_S),
-            limit_words("accelerometer", sequence.accel[given], "m/s^2", LARGE_M_S2),
+        Finding(f"{sensor}_limit", words, advice)
+        for sensor, values, unit, large in (
+            ("gyroscope", sequence.gyro[given], "rad/s", _LARGE_RAD_S),
+            ("accelerometer", sequence.accel[given], "m/s^2", LARGE_M_S2),
         )
-        if words
+        if (words := limit_words(sensor, values, unit, large))
     ]
 
 
@@ -153,3 +164,66 @@ def without_times_ahead(sequence: ImuSequence) -> ImuSequence:
     keep = np.ones(len(sequence), dtype=np.bool_)
     keep[given[ahead]] = False
     return sequence.select(keep)
+
+
+def check_time(sequence: ImuSequence) -> None:
+    """Check order, rate and unit of a recording's times.
+
+    Raises:
+        InputError: they are out of order, or there are not 50 to 1000 different ones a second.
+    """
+    if found := disorder(sequence.time):
+        raise InputError(
+            f"{sequence.name}: time", found, "increasing times", "sort the rows by time"
+        )
+    rate = sequence.rate
+    if MIN_RATE <= rate <= MAX_RATE:
+        return
+    times = sequence.time[np.isfinite(sequence.time)]
+    shared = len(times) / len(np.unique(times))
+    if shared >= SHARED_TIMES:
+        raise InputError(
+            f"{sequence.name}: time", f"{shared:.3g} samples on average at each time",
+            "a time for each sample",
+            "a logger or spreadsheet rounded the times: export them with fractions of a second",
+        )  # fmt: skip
+    mean = (len(times) - 1) / float(times[-1] - times[0])
+    if rate > MAX_RATE and MIN_RATE <= mean <= MAX_RATE:
+        raise InputError(
+            f"{sequence.name}: time",
+            f"batches: {mean:.3g} samples/s, most {1.0 / rate:.2g} s apart",
+            "a time for each sample",
+            "these are the times at which batches arrived: space their samples evenly",
+        )  # fmt: skip
+    fix = "set the app to 50 Hz or more" if 1.0 <= rate < MIN_RATE else ""
+    for unit, ns in TIME_UNITS.items():
+        per_second = 10**9 // ns
+        if rate and unit != "s" and MIN_RATE <= rate * per_second <= MAX_RATE:
+            fix = f"time seems to be in {unit}: convert it, or write `t [{unit}]` in a CSV's header"
+        if rate and unit != "s" and MIN_RATE <= rate / per_second <= MAX_RATE:
+            fix = (
+                f"its steps are {per_second:.0e} times too short for its unit: convert it, or name "
+                "another in a CSV's header, such as `t [s]`"
+            )
+    raise InputError(f"{sequence.name}: time", f"{rate:.4g} samples/s", "50 to 1000", fix)
+
+
+def magnetometer_time(sequence: ImuSequence) -> list[Finding]:
+    """Report a magnetometer of which most samples are at other times than the IMU's."""
+    field, times = sequence.magnetometer, sequence.time[np.isfinite(sequence.time)]
+    if field is None or not len(times):
+        return []
+    start, stop = float(times.min()), float(times.max())
+    if ((field.time >= start) & (field.time <= stop)).mean() >= _INSIDE:
+        return []
+    longer = float(np.ptp(field.time)) / max(stop - start, 1e-9)
+    units = (u for u, ns in TIME_UNITS.items() if u != "s" and 0.5 < longer * ns / 1e9 < 2.0)
+    unit = next(units, None)
+    return [
+        Finding(
+            "field_clock",
+            f"magnetometer: found times from {field.time[0]:.6g} to {field.time[-1]:.6g} s, "
+            f"expected most during the samples, {start:.6g} to {stop:.6g} s",
+            f"they seem to be in {unit}" if unit else "use one clock for both",
+        )
+    ]

@@ -27,11 +27,9 @@ from stario.sequences.readers.joined import is_joined, is_untimed, unpack_joined
 from stario.sequences.readers.lines import may_be_read
 from stario.sequences.readers.lists import is_list, list_entries
 from stario.sequences.readers.phones.event_lines import is_event_lines, read_event_lines
-from stario.sequences.readers.phones.files import unmatched_files
 from stario.sequences.readers.phones.json_export import is_json_export, unpack_json
 from stario.sequences.readers.phones.long_form import is_long_form, unpack_long_form
 from stario.sequences.readers.phones.phone import is_phone, is_wide, read_phone, read_wide
-from stario.sequences.readers.poses import pose_files
 from stario.sequences.readers.published.advio import is_advio, read_advio
 from stario.sequences.readers.published.euroc import is_euroc, read_euroc
 from stario.sequences.readers.published.imunet import is_imunet, read_imunet
@@ -40,9 +38,8 @@ from stario.sequences.readers.published.ridi import is_ridi, read_ridi
 from stario.sequences.readers.published.rnin import is_rnin, read_rnin
 from stario.sequences.readers.published.ronin import is_ronin, read_ronin
 from stario.sequences.readers.published.tlio import is_tlio, read_tlio
-from stario.sequences.readers.unpacked_names import named_after
-from stario.sequences.readers.unrecognised import has_some_sensors, unrecognised
-from stario.sequences.readers.zipped import is_zip, unpack_zip
+from stario.sequences.readers.unpacking import is_zip, named_after, unpack_zip
+from stario.sequences.readers.unrecognised import unrecognised
 from stario.sequences.sequence import ImuSequence
 
 __all__ = ["FORMATS", "Format", "find_recordings", "read_recording", "write_csv"]
@@ -196,9 +193,7 @@ def find_recordings(
         return _listed(path, on_error, where)
     found = [path] if path.is_file() else sorted(_below(path))
     if not found:
-        if pose_files(path) or has_some_sensors(path) or unmatched_files(path):
-            raise unrecognised(path, [], _KNOWN)
-        raise ReadError(path, "folder", "no recording", f"recordings in {_KNOWN}")
+        raise unrecognised(path, [], _KNOWN)
     return _with_attributes(found, where)
 
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import product
-from pathlib import Path
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.lines import is_row, read_lines, unquoted
 from stario.sequences.readers.phones.sensor_words import words_of
-from stario.sequences.readers.text import is_missing
+from stario.sequences.readers.text import Table, is_missing
 
 _TITLES = {
     *map("".join, product(("device", "imu", "node"), ("", "id", "name", "number", "address"))),
@@ -22,16 +20,12 @@ _MOST = 9
 """Number of different values above which a column says something else."""
 
 
-def refuse_several_devices(
-    path: Path, titles: Sequence[str], skip: int, delimiter: str | None, column: int
-) -> None:
+def refuse_several_devices(table: Table, titles: Sequence[str], column: int) -> None:
     """Refuse rows of several devices, whose samples must not be mixed.
 
     Args:
-        path: the file, which is read if a title is that of such a column.
-        titles: titles of its columns.
-        skip: number of lines above its rows.
-        delimiter: separator of the cells; None for blanks.
+        table: the rows.
+        titles: titles of the file's columns.
         column: index of a column of the sensor; rows in which it is blank do not count.
 
     Raises:
@@ -40,14 +34,9 @@ def refuse_several_devices(
     for index, title in enumerate(titles):
         if "".join(words_of(title)) not in _TITLES:
             continue
-        devices: dict[str, None] = {}
-        for line in filter(is_row, read_lines(path)[skip:]):
-            cells = unquoted(line, delimiter).split(delimiter)
-            if max(index, column) < len(cells) and not is_missing(cells[column]):
-                devices.setdefault(cells[index].strip())
-            if len(devices) > _MOST:
-                break
+        pairs = zip(table.cells(index), table.cells(column), strict=True)
+        devices = dict.fromkeys(device for device, cell in pairs if not is_missing(cell))
         if 1 < len(devices) <= _MOST:
             names = ", ".join(name or "blank" for name in devices)
             found = f"several devices ({names})"
-            raise ReadError(path, title.strip(), found, "one", "keep the rows of one")
+            raise ReadError(table.path, title.strip(), found, "one", "keep the rows of one")

@@ -24,8 +24,8 @@ A sample written as `nan` stays NaN; other columns are ignored.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -35,20 +35,36 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
-from stario.sequences.readers.clocks import resample_to_gyro, source_words
+from stario.sequences.readers.clocks import (
+    LATEST_S,
+    assumed_unit,
+    refuse_counts_and_dates,
+    resample_to_gyro,
+    source_words,
+    time_unit,
+)
 from stario.sequences.readers.columns import (
     IMU,
+    QUANTITIES,
     SIGMA,
     TRUTH,
+    Column,
     Header,
     columns_named,
     read_header,
     unit_factor,
 )
-from stario.sequences.readers.csv_rows import Rows, read_rows
+from stario.sequences.readers.dates import with_seconds
 from stario.sequences.readers.devices import refuse_several_devices
-from stario.sequences.readers.lines import first_lines, read_lines
-from stario.sequences.readers.text import seconds
+from stario.sequences.readers.lines import (
+    decimal_mark,
+    ends_within_a_row,
+    first_lines,
+    is_row,
+    read_lines,
+    unquoted,
+)
+from stario.sequences.readers.text import RowFormat, Table, is_missing, read_table, seconds
 from stario.sequences.sequence import (
     BoolArray,
     FloatArray,
@@ -57,7 +73,7 @@ from stario.sequences.sequence import (
     Trajectory,
 )
 from stario.sequences.time_order import increasing_mask
-from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS
+from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS, TIME_UNITS
 
 _log = logging.getLogger(__name__)
 
@@ -82,9 +98,7 @@ def read_generic_csv(path: Path) -> ImuSequence:
     """Read a generic CSV in the format that the module's docstring describes."""
     lines = read_lines(path)
     header = read_header(path, lines)
-    gx = header.columns["gx"].index
-    refuse_several_devices(path, header.titles, header.lines, header.separator, gx)
-    rows = read_rows(path, lines, header)
+    rows = _read_rows(path, lines, header)
     gyro, gyro_factors = _vectors(path, header, rows, "g", GYRO_UNITS)
     accel, accel_factors = _vectors(path, header, rows, "a", ACCEL_UNITS)
     rows, time, gyro, accel = _samples(path, rows, gyro, accel)
@@ -121,9 +135,88 @@ def named_columns(path: Path) -> set[str]:
     return columns_named(first_lines(path, _HEAD_LINES, comments=True))
 
 
+@dataclass(frozen=True)
+class _Rows:
+    """Content of the rows.
+
+    Attributes:
+        table: columns (N,) by canonical name.
+        time: (N,) times [s].
+        is_imu: (N,) mask of IMU samples.
+        line_numbers: line number of each row.
+        assumed_unit: unit that times without one were taken for; empty if it is certain.
+    """
+
+    table: dict[str, FloatArray]
+    time: FloatArray
+    is_imu: BoolArray
+    line_numbers: Sequence[int]
+    assumed_unit: str = ""
+
+
+def _read_rows(path: Path, lines: list[str], header: Header) -> _Rows:
+    """Return the rows of a file, given its lines and its header.
+
+    Raises:
+        ReadError: there is none, or one is malformed; names its line and column.
+    """
+    separator, columns, clock = header.separator, header.columns, header.columns["t"]
+    decimal = decimal_mark(lines[header.lines :], separator)
+    cells = _first_cells(path, lines, header, decimal)
+    dated = with_seconds(cells[clock.index : clock.index + 1])
+    row_format = RowFormat(header.lines, separator, decimal, dated != cells[clock.index :][:1])
+    names = ["t", *(name for name in QUANTITIES if name in columns)]
+    used, titles = [columns[n].index for n in names], [columns[n].title for n in names]
+    table = read_table(path, used, row_format, titles, killed=ends_within_a_row(path, separator))
+    refuse_several_devices(table, header.titles, columns["gx"].index)
+    is_imu = _imu_rows(table, [names.index(name) for name in IMU])
+    if not is_imu.any():
+        raise ReadError(path, "gx", "no row with IMU samples", "numbers in every IMU column")
+    finite = table.values[np.isfinite(table.values[:, 0]), 0]
+    unit_ns, assumed = (10**9, "") if row_format.dated else _unit_ns(path, clock, finite)
+    time = table.seconds(clock.index, clock.title, unit_ns, int(np.argmax(is_imu)))
+    values = dict(zip(names[1:], table.values[:, 1:].T, strict=True))
+    return _Rows(values, time, is_imu, table.line_numbers, assumed)
+
+
+def _first_cells(path: Path, lines: list[str], header: Header, decimal: str) -> list[str]:
+    """Return the cells of the first row, checked to be no more than there are titles."""
+    numbered = enumerate(lines[header.lines :], header.lines + 1)
+    number, first = next(((k, line) for k, line in numbered if is_row(line)), (0, ""))
+    cells = unquoted(first, header.separator, decimal).rstrip(f"{header.separator} ")
+    count = cells.count(header.separator) + 1
+    if count > len(header.titles):
+        found, expected = f"{count} values", f"{len(header.titles)} as in the header"
+        fix = "name every column, and write decimal points"
+        raise ReadError(path, f"line {number}", found, expected, fix)
+    return cells.split(header.separator)
+
+
+def _imu_rows(table: Table, imu: list[int]) -> BoolArray:
+    """Return the mask (N,) of IMU samples: rows whose IMU cells are not all blank."""
+    is_imu = np.ones(len(table.values), dtype=np.bool_)
+    if len(empty := np.flatnonzero(np.isnan(table.values[:, imu]).all(axis=1))):
+        texts = [table.cells(table.columns[k]) for k in imu]
+        is_imu[empty] = [not all(is_missing(text[k]) for text in texts) for k in empty.tolist()]
+    return is_imu
+
+
+def _unit_ns(path: Path, column: Column, time: FloatArray) -> tuple[int, str]:
+    """Return the unit of times [ns], and the one assumed by the rate if the header names none."""
+    if not column.unit:
+        refuse_counts_and_dates(path, column.title, time)
+        try:
+            unit_ns = time_unit(path, time)
+            return unit_ns, assumed_unit(unit_ns, float(time[0]))
+        except ReadError:
+            if len(time) and abs(float(time[0])) > LATEST_S:
+                raise
+    return unit_factor(path, column, TIME_UNITS), ""
+
+
 def _samples(
-    path: Path, rows: Rows, gyro: FloatArray, accel: FloatArray
-) -> tuple[Rows, FloatArray, FloatArray, FloatArray]:
+    path: Path, rows: _Rows, gyro: FloatArray, accel: FloatArray
+) -> tuple[_Rows, FloatArray, FloatArray, FloatArray]:
     """Return the rows, and times (N,), gyroscope and accelerometer (N, 3) of the IMU samples.
 
     If the sensors are mostly in different rows, the accelerometer is interpolated to those of the
@@ -164,7 +257,7 @@ def _in_separate_rows(shared: BoolArray) -> bool:
 
 
 def _vectors(
-    path: Path, header: Header, rows: Rows, letter: str, known: Mapping[str, float]
+    path: Path, header: Header, rows: _Rows, letter: str, known: Mapping[str, float]
 ) -> tuple[FloatArray, FloatArray]:
     """Return three columns (N, 3) in the first unit of `known`, and the factors (3,) to it."""
     names = [letter + axis for axis in "xyz"]
@@ -179,7 +272,7 @@ def kind_of_positions(time: FloatArray) -> Literal["positions", "waypoints"]:
     return "waypoints" if sparse else "positions"
 
 
-def _ground_truth(path: Path, rows: Rows) -> tuple[Trajectory | None, PositionTrack | None]:
+def _ground_truth(path: Path, rows: _Rows) -> tuple[Trajectory | None, PositionTrack | None]:
     """Return the poses, or else the positions; None if fewer than two rows hold them."""
     names = [name for name in (*TRUTH, SIGMA) if name in rows.table]
     if not names:

@@ -23,7 +23,7 @@ from stario.sequences.readers.lines import is_row, read_lines
 from stario.sequences.readers.phones.files import is_complete, may_hold, names_both_sensors
 from stario.sequences.readers.phones.sensor_layout import clock_of
 from stario.sequences.readers.phones.sensor_words import sensor_of, words_of
-from stario.sequences.readers.table_head import TableHead, cells_of, table_heads
+from stario.sequences.readers.table_head import TableHead, table_heads
 from stario.sequences.readers.text import IntArray
 
 _log = logging.getLogger(__name__)
@@ -177,9 +177,9 @@ def _rewritten(head: TableHead, title: str, times: Iterator[str], dropped: set[i
         kept = (cell.replace(",", " ") for k, cell in enumerate(cells) if k not in dropped)
         return ",".join([time, *kept])
 
-    rows = (cells_of(row, head.layout.delimiter, head.layout.decimal) if is_row(row) else []
-            for row in read_lines(head.file)[head.layout.skip :])  # fmt: skip
-    above = ["#"] * (head.layout.skip - 1)
+    rows = (head.row_format.cells(row) if is_row(row) else []
+            for row in read_lines(head.file)[head.row_format.skip :])  # fmt: skip
+    above = ["#"] * (head.row_format.skip - 1)
     titles = line(title, _titles(head))
     return [*above, titles, *(line(next(times, ""), row) if row else "#" for row in rows)]
 
@@ -212,8 +212,8 @@ def _texts(file: Path, least: int = 3) -> list[list[str]]:
     width = head.rows.shape[1]
     titles = head.titles or (["time"] if least == 1 else list("xyz")[:width])
     name = "" if least == 1 else f"{file.stem} "
-    rows = (row for row in read_lines(file)[head.layout.skip :] if is_row(row))
-    texts = [cells_of(row, head.layout.delimiter, head.layout.decimal) for row in rows]
+    rows = (row for row in read_lines(file)[head.row_format.skip :] if is_row(row))
+    texts = [head.row_format.cells(row) for row in rows]
     return [[name + title for title in titles], *(cells for cells in texts if len(cells) == width)]
 
 

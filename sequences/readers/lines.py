@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import csv
+import json
 import logging
 import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from stario.sequences.errors import ReadError
-from stario.sequences.files import opened
+from stario.sequences.files import opened, opened_text
 
 _log = logging.getLogger(__name__)
 
@@ -44,6 +46,21 @@ def read_lines(path: Path) -> list[str]:
     if not any(line.strip() for line in lines):
         raise ReadError(path, "file", "no lines", "rows of numbers", "is the download complete?")
     return lines
+
+
+def read_json(path: Path) -> Any:
+    """Return the content of a JSON file.
+
+    Raises:
+        ReadError: the file is missing or not JSON.
+    """
+    try:
+        return json.loads(opened_text(path))
+    except FileNotFoundError:
+        raise ReadError(path, "file", "no such file", "a JSON file") from None
+    except (OSError, ValueError, RecursionError) as error:
+        found = " ".join(str(error).split())
+        raise ReadError(path, "file", found, "JSON", "is the download complete?") from None
 
 
 def _without_padding(path: Path, content: bytes) -> bytes:

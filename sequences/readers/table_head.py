@@ -18,12 +18,13 @@ from stario.sequences.readers.columns import Column, with_units_below
 from stario.sequences.readers.dates import with_seconds
 from stario.sequences.readers.lines import head_lines, unquoted
 from stario.sequences.readers.phones.sensor_words import axis_of, is_time
-from stario.sequences.readers.text import Layout, Table, is_missing, read_table
+from stario.sequences.readers.text import RowFormat, Table, is_missing, read_table
 from stario.sequences.sequence import FloatArray
 
-_FORMS: tuple[tuple[str | None, str], ...] = (
-    *((";", "."), (";", ","), ("\t", "."), ("\t", ","), (",", "."), (",", ",")),
-    *((None, "."), (None, ",")),
+_FORMATS = tuple(
+    RowFormat(delimiter=delimiter, decimal=decimal)
+    for delimiter in (";", "\t", ",", None)
+    for decimal in (".", ",")
 )
 """Separators (None for blanks) and decimal marks in the order in which they are tried; commas may
 be both if cells are quoted."""
@@ -41,14 +42,14 @@ class TableHead:
 
     Attributes:
         file: the file.
-        layout: how its rows are written.
+        row_format: how its rows are written.
         titles: titles of the columns; empty without any.
         rows: (N, K) first rows, NaN where a cell is not a number.
         dates: indices of the columns with dates or times of day, which become seconds.
     """
 
     file: Path
-    layout: Layout
+    row_format: RowFormat
     titles: list[str]
     rows: FloatArray
     dates: frozenset[int] = frozenset()
@@ -59,7 +60,7 @@ class TableHead:
         Raises:
             ReadError: a row is malformed.
         """
-        return read_table(self.file, columns, self.layout, killed=True)
+        return read_table(self.file, columns, self.row_format, killed=True)
 
     def clock(self, column: Column) -> Column:
         """Return a clock's column with its unit, seconds if it holds dates."""
@@ -78,10 +79,10 @@ def table_heads(file: Path, least: int = 4) -> Iterator[TableHead]:
         yield head
     in_seconds = with_seconds(written)
     if in_seconds != written and (head := _head(file, numbers, in_seconds, least)):
-        layout = head.layout
-        cells = cells_of(written[numbers.index(layout.skip)], layout.delimiter, layout.decimal)
+        row_format = head.row_format
+        cells = row_format.cells(written[numbers.index(row_format.skip)])
         dates = frozenset(k for k, cell in enumerate(cells) if math.isnan(number_of(cell)))
-        yield replace(head, dates=dates, layout=replace(layout, dated=bool(dates)))
+        yield replace(head, dates=dates, row_format=replace(row_format, dated=bool(dates)))
 
 
 def _head(file: Path, numbers: list[int], lines: list[str], least: int) -> TableHead | None:
@@ -89,16 +90,16 @@ def _head(file: Path, numbers: list[int], lines: list[str], least: int) -> Table
     found = first_row(lines, least)
     if found is None:
         return None
-    first, delimiter, decimal = found
-    rows = [cells_of(line, delimiter, decimal) for line in lines[first:]]
+    first, delimiter = found.skip, found.delimiter
+    rows = [found.cells(line) for line in lines[first:]]
     rows = (rows[:-1] if len(rows) > 2 else rows)[:_HEAD_ROWS]  # the last line may be cut
     width = max(set(map(len, rows)), key=list(map(len, rows)).count)
     above = lines[:first]
-    while above and _is_incomplete_row(cells_of(above[-1], delimiter, decimal)):
+    while above and _is_incomplete_row(found.cells(above[-1])):
         above.pop()
     titles = _titles(above, delimiter, width)
     values = np.array([[number_of(cell) for cell in row] for row in rows if len(row) == width])
-    return TableHead(file, Layout(numbers[first], delimiter, decimal), titles[:width], values)
+    return TableHead(file, replace(found, skip=numbers[first]), titles[:width], values)
 
 
 def _titles(above: list[str], delimiter: str | None, width: int) -> list[str]:
@@ -133,25 +134,20 @@ def _titles_at(above: list[str], delimiter: str | None) -> list[str]:
     return [title.strip(" #\"'\ufeff") for title in titles]
 
 
-def first_row(lines: list[str], least: int = 4) -> tuple[int, str | None, str] | None:
-    """Return the index of the first row of `least` numbers, its delimiter and its decimal mark.
+def first_row(lines: list[str], least: int = 4) -> RowFormat | None:
+    """Return how rows are written, from the first one of `least` numbers; None without one.
 
     There must be no blank line.
     """
     for k, line in enumerate(lines):
         if line.lstrip().startswith("#"):
             continue
-        for delimiter, decimal in _FORMS:
-            cells = cells_of(line, delimiter, decimal)
+        for row_format in _FORMATS:
+            cells = row_format.cells(line)
             numbers = _count_numbers(cells)
             if numbers >= least and 2 * numbers >= sum(bool(cell.strip()) for cell in cells):
-                return k, delimiter, _decimal_mark(lines[k : k + _MARK_ROWS], delimiter, decimal)
+                return replace(_with_most_numbers(lines[k : k + _MARK_ROWS], row_format), skip=k)
     return None
-
-
-def cells_of(line: str, delimiter: str | None, decimal: str) -> list[str]:
-    """Return a line's cells without quotes, with decimal points."""
-    return unquoted(line, delimiter, decimal).split(delimiter)
 
 
 def number_of(cell: str) -> float:
@@ -163,12 +159,12 @@ def _count_numbers(cells: list[str]) -> int:
     return sum(math.isfinite(number_of(cell)) for cell in cells)
 
 
-def _decimal_mark(rows: list[str], delimiter: str | None, first: str) -> str:
-    """Return the mark that gives the most numbers: a row of integers (0;0;0;0) fits either."""
-    if delimiter == ",":
+def _with_most_numbers(rows: list[str], first: RowFormat) -> RowFormat:
+    """Return the decimal mark that gives the most numbers: a row of integers fits either."""
+    if first.delimiter == ",":
         return first
 
-    def numbers(decimal: str) -> int:
-        return sum(_count_numbers(cells_of(line, delimiter, decimal)) for line in rows)
+    def numbers(row_format: RowFormat) -> int:
+        return sum(_count_numbers(row_format.cells(line)) for line in rows)
 
-    return max((first, "." if first == "," else ","), key=numbers)
+    return max(first, replace(first, decimal="." if first.decimal == "," else ","), key=numbers)

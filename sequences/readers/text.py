@@ -29,7 +29,7 @@ _LARGE_BYTES = 2_000_000
 
 
 @dataclass(frozen=True)
-class Layout:
+class RowFormat:
     """How the rows of a file are written.
 
     Attributes:
@@ -43,6 +43,10 @@ class Layout:
     delimiter: str | None = ","
     decimal: str = "."
     dated: bool = False
+
+    def cells(self, line: str) -> list[str]:
+        """Return a line's cells without quotes, with decimal points."""
+        return unquoted(line, self.delimiter, self.decimal).split(self.delimiter)
 
     def rows(self, path: Path) -> list[Row]:
         """Return the rows of a file, without quotes.
@@ -64,7 +68,7 @@ class Table:
 
     Attributes:
         path: the file.
-        layout: how it is written.
+        row_format: how it is written.
         columns: indices of the columns in the file.
         values: (N, K) their numbers; `nan` and empty cells are NaN.
         line_numbers: number of each row's line.
@@ -73,7 +77,7 @@ class Table:
     """
 
     path: Path
-    layout: Layout
+    row_format: RowFormat
     columns: list[int]
     values: FloatArray
     line_numbers: Sequence[int]
@@ -81,10 +85,11 @@ class Table:
     frame: Any = None
 
     def cells(self, column: int) -> list[str]:
-        """Return the text of a column of the file."""
-        rows = self.layout.rows(self.path) if self.rows is None else self.rows
-        mark = self.layout.delimiter
-        return [line.split(mark, column + 1)[column].strip() for _, line in rows]
+        """Return the text of a column of the file, empty in rows that are too short."""
+        rows = self.row_format.rows(self.path) if self.rows is None else self.rows
+        mark = self.row_format.delimiter
+        after = ((*line.split(mark, column + 1), *[""] * (column + 1)) for _, line in rows)
+        return [cells[column].strip() for cells in after]
 
     def stamps_ns(
         self, column: int = 0, unit_ns: int = 1, kept: IntArray | None = None
@@ -163,7 +168,7 @@ class Table:
 def read_table(
     path: Path,
     columns: int | list[int],
-    layout: Layout = Layout(),
+    row_format: RowFormat = RowFormat(),
     titles: Sequence[str] = (),
     killed: bool = False,
 ) -> Table:
@@ -172,7 +177,7 @@ def read_table(
     Args:
         path: the file.
         columns: number of columns to return, or the indices of those to return.
-        layout: how the rows are written.
+        row_format: how the rows are written.
         titles: titles of these columns, for errors.
         killed: whether to skip a last row that is cut short because the recorder was killed.
 
@@ -180,45 +185,45 @@ def read_table(
         ReadError: a row is cut short or holds something that is not a number.
     """
     wanted = list(range(columns)) if isinstance(columns, int) else columns
-    cut = killed and ends_within_a_row(path, layout.delimiter)
-    if not cut and (quick := _read_quickly(path, layout, wanted)) is not None:
+    cut = killed and ends_within_a_row(path, row_format.delimiter)
+    if not cut and (quick := _read_quickly(path, row_format, wanted)) is not None:
         return quick
-    rows = layout.rows(path)
+    rows = row_format.rows(path)
     titles = titles or [f"column {k + 1}" for k in wanted]
-    if killed and len(rows) > 1 and (cut or not _is_whole(path, layout, rows[-1], wanted)):
+    if killed and len(rows) > 1 and (cut or not _is_whole(path, row_format, rows[-1], wanted)):
         _log.warning("%s: skipped the last row, line %d, which is cut short", path, rows.pop()[0])
-    values = np.array([numbers_in_row(path, layout, row, wanted, titles) for row in rows])
-    return Table(path, layout, wanted, values, [number for number, _ in rows], rows)
+    values = np.array([numbers_in_row(path, row_format, row, wanted, titles) for row in rows])
+    return Table(path, row_format, wanted, values, [number for number, _ in rows], rows)
 
 
-def _read_quickly(path: Path, layout: Layout, wanted: list[int]) -> Table | None:
+def _read_quickly(path: Path, row_format: RowFormat, wanted: list[int]) -> Table | None:
     """Read a large file with pandas, five times as fast; return None if it cannot.
 
     It reads neither small files, for which importing pandas takes longer, nor dates, nor blank or
     malformed cells or rows cut short.
     """
     try:
-        if path.stat().st_size < _LARGE_BYTES or layout.dated or _has_mark_within_a_row(path):
+        if path.stat().st_size < _LARGE_BYTES or row_format.dated or _has_mark_within_a_row(path):
             return None
         import pandas as pd  # half a second, which small files do not need
 
         frame = pd.read_csv(
             path,
-            sep=r"\s+" if layout.delimiter is None else layout.delimiter,
+            sep=r"\s+" if row_format.delimiter is None else row_format.delimiter,
             header=None,
-            skiprows=layout.skip,
+            skiprows=row_format.skip,
             usecols=sorted(wanted),
             comment="#",
-            decimal=layout.decimal,
+            decimal=row_format.decimal,
             na_filter=False,
         )
     except (OSError, ValueError):
         return None
     if not all(kind.kind in "if" for kind in frame.dtypes) or not len(frame):
         return None
-    lines = range(layout.skip + 1, layout.skip + 1 + len(frame))
+    lines = range(row_format.skip + 1, row_format.skip + 1 + len(frame))
     values = frame[wanted].to_numpy(dtype=np.float64)
-    return Table(path, layout, wanted, values, lines, frame=frame)
+    return Table(path, row_format, wanted, values, lines, frame=frame)
 
 
 def _has_mark_within_a_row(path: Path) -> bool:
@@ -227,23 +232,27 @@ def _has_mark_within_a_row(path: Path) -> bool:
     return content.count(b"#") > content.startswith(b"#") + content.count(b"\n#")
 
 
-def _is_whole(path: Path, layout: Layout, row: Row, wanted: list[int]) -> bool:
+def _is_whole(path: Path, row_format: RowFormat, row: Row, wanted: list[int]) -> bool:
     try:
-        numbers_in_row(path, layout, row, wanted, [""] * len(wanted))
+        numbers_in_row(path, row_format, row, wanted, [""] * len(wanted))
     except ReadError:
         return False
     return True
 
 
 def numbers_in_row(
-    path: Path, layout: Layout, row: Row, wanted: list[int], titles: Sequence[str]
+    path: Path, row_format: RowFormat, row: Row, wanted: list[int], titles: Sequence[str]
 ) -> list[float]:
     """Return the numbers in some columns of a row, NaN where a cell holds none.
 
     Raises:
         ReadError: the row is cut short or holds something that is not a number.
     """
-    number, cells = row[0], row[1].split(layout.delimiter)
+    number, cells = row[0], row[1].split(row_format.delimiter)
+    try:
+        return [float(cells[column] or "nan") for column in wanted]
+    except (ValueError, IndexError):
+        pass  # explained below
     if len(cells) <= max(wanted):
         fix = "is the file cut short?"
         if len(cells) == 1:

@@ -11,7 +11,7 @@ from stario.sequences.arrays import check_type
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.files import atomic_write
-from stario.sequences.readers.text import Layout, numbers_in_row
+from stario.sequences.readers.text import RowFormat, numbers_in_row
 from stario.sequences.sequence import Trajectory
 
 _REMEDY = "pass track.trajectory, or Track.from_states(states).trajectory"
@@ -44,14 +44,14 @@ def read_tum(path: Path | str) -> Trajectory:
         ReadError: the file cannot be read, or a line does not hold eight finite numbers with
             increasing time and a unit quaternion; the error names line and field.
     """
-    path, layout, count = Path(path), Layout(delimiter=None), len(_FIELDS)
-    numbered = layout.rows(path)
+    path, row_format, count = Path(path), RowFormat(delimiter=None), len(_FIELDS)
+    numbered = row_format.rows(path)
     for number, line in numbered:
         if (cells := len(line.split())) != count:
             expected = f"{count}: {' '.join(_FIELDS)}"
             raise ReadError(path, f"line {number}", f"{cells} values", expected)
     wanted = list(range(count))
-    rows = np.array([numbers_in_row(path, layout, row, wanted, _FIELDS) for row in numbered])
+    rows = np.array([numbers_in_row(path, row_format, row, wanted, _FIELDS) for row in numbered])
 
     def refusal(k: int, field: str, found: str, expected: str) -> ReadError:
         return ReadError(path, f"line {numbered[k][0]}, {field}", found, expected)

@@ -12,8 +12,8 @@ there too (kinetic energy has become potential), and every heel strike brakes it
 1976).
 
 Bounce, strength, resonance and damping of each mode are those that `stario check simulation` finds
-in recordings carried so: phones in pockets, hands and at the ear (tyrex), in bags (RIDI), flat in
-front (Indoor Location).
+in recordings carried so: phones in pockets, read, swung and at the ear (tyrex), in bags (RIDI), in
+a hand in front (KIPD, RIDI, rfbr) and flat on it (Indoor Location).
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def trunk(gait: Gait, bounce: float) -> FloatArray:
     `bounce` [m/s^2] is the root mean square of the vertical acceleration at effort 1.
     """
     rng, phi = gait.rng, gait.phase
-    size, sway, surge, limp = rng.uniform([0.75, 0.5, 0.4, 0.0], [1.25, 1.4, 1.2, 0.25])
+    size, sway, surge, limp = rng.uniform([0.85, 0.5, 0.4, 0.0], [1.15, 1.4, 1.2, 0.25])
     per_acceleration = np.sqrt(2.0) * gait.effort / (2.0 * np.pi * gait.step_rate) ** 2
     rise = size * bounce * per_acceleration
     shift = rng.uniform(-np.pi, np.pi, 4)
@@ -160,11 +160,18 @@ def _held(gait: Gait, bounce: float, strike: Strike, tremor: float, wobble: floa
 
 
 def _handheld(gait: Gait) -> CarryMotion:
-    """Return the motion of a device flat in front: the forearm bounces more than the trunk."""
+    """Return the motion of a device held in front, not quite as lively as the trunk."""
     rng = gait.rng
-    bounce = 1.9 * np.exp(rng.uniform(0.0, 0.9))
-    strike = Strike(rng.uniform(1.0, 2.8), *_ARM)
-    motion = _held(gait, bounce, strike, rng.uniform(0.05, 0.15), rng.uniform(0.03, 0.07))
+    strike, wobble = Strike(rng.uniform(0.3, 0.6), *_ARM), rng.uniform(0.02, 0.04)
+    motion = _held(gait, rng.uniform(1.2, 2.0), strike, rng.uniform(0.05, 0.15), wobble)
+    return _displaced(motion, rng.uniform(0.2, 0.45), rng.uniform(-0.2, 0.2), 0.7 * gait.height)
+
+
+def _in_front(gait: Gait) -> CarryMotion:
+    """Return the motion of a device laid flat on a hand, which bounces more than the trunk."""
+    rng = gait.rng
+    strike, wobble = Strike(rng.uniform(1.2, 2.4), *_ARM), rng.uniform(0.03, 0.07)
+    motion = _held(gait, rng.uniform(2.6, 4.2), strike, rng.uniform(0.05, 0.15), wobble)
     return _displaced(motion, rng.uniform(0.2, 0.45), rng.uniform(-0.2, 0.2), 0.7 * gait.height)
 
 
@@ -196,13 +203,14 @@ def _call(gait: Gait) -> CarryMotion:
 def _swinging(gait: Gait) -> CarryMotion:
     rng, n = gait.rng, len(gait)
     amplitude = np.radians(rng.uniform(22.0, 40.0)) * np.sqrt(gait.vigor)
-    forward = np.radians(rng.uniform(0.0, 12.0))
-    angle = _pendulum(gait, amplitude, forward, harmonic=0.12)
+    forward = np.radians(rng.uniform(8.0, 24.0))
+    angle = _pendulum(gait, amplitude, forward, harmonic=0.04)
     side = rng.choice([-1.0, 1.0])
-    arm = np.array([0.0, 0.0, -0.38 * gait.height])
-    shoulder = np.array([0.0, side * 0.13 * gait.height, 0.81 * gait.height])
-    ring = heel_strikes(gait, Strike(rng.uniform(0.8, 1.6), *_ARM))
-    offset = shoulder + _about(1, -angle, arm) + trunk(gait, rng.uniform(0.8, 2.0))
+    # Elbow and shoulder give: the hand swings about a point below the shoulder.
+    arm = np.array([0.0, 0.0, -0.27 * gait.height])
+    pivot = np.array([0.0, side * 0.13 * gait.height, 0.7 * gait.height])
+    ring = heel_strikes(gait, Strike(rng.uniform(0.9, 1.7), *_ARM))
+    offset = pivot + _about(1, -angle, arm) + trunk(gait, rng.uniform(1.4, 2.8))
     offset += ring.offset_H + 0.008 * drift(rng, n, gait.rate, 0.5, 3)
     twist = rng.uniform(0.1, 0.5) * angle + 0.08 * drift(rng, n, gait.rate, 0.7)
     roll = 0.08 * drift(rng, n, gait.rate, 0.7)
@@ -294,6 +302,7 @@ def _rig(gait: Gait) -> CarryMotion:
 
 CARRIES: dict[str, Callable[[Gait], CarryMotion]] = {
     "handheld": _handheld,
+    "in-front": _in_front,
     "texting": _texting,
     "call": _call,
     "swinging": _swinging,

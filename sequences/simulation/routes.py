@@ -50,7 +50,12 @@ class _Command(NamedTuple):
 
 
 def random_route(
-    rng: np.random.Generator, count: int, rate: float, preferred_speed: float, wheels: bool = False
+    rng: np.random.Generator,
+    count: int,
+    rate: float,
+    preferred_speed: float,
+    wheels: bool = False,
+    corridors: bool = False,
 ) -> Route:
     """Draw a route of `count` samples at `rate` [Hz].
 
@@ -60,10 +65,14 @@ def random_route(
         rate: sampling rate [Hz].
         preferred_speed: preferred speed [m/s]; actual speeds are 0.3 to 2.2 m/s, 0 when standing.
         wheels: whether the person pushes a trolley: no stairs, no steps sideways or backward.
+        corridors: whether the person walks along the corridors of a floor instead of anywhere.
     """
     commands: list[_Command] = []
     while sum(command.duration for command in commands) < count / rate:
-        commands += _activity(rng, preferred_speed, wheels)
+        if corridors:
+            commands += _corridor(rng, preferred_speed)
+        else:
+            commands += _activity(rng, preferred_speed, wheels)
     table = np.array(commands)
     repeats = np.diff(np.round(np.cumsum([0.0, *table[:, 0]]) * rate))
     held = np.repeat(table[:, 1:], repeats.astype(np.int64), axis=0)[:count]
@@ -71,7 +80,10 @@ def random_route(
     velocity_H = held[:, :1] * np.stack([np.cos(held[:, 2]), np.sin(held[:, 2])], axis=1)
     sigma = rng.uniform(0.2, 0.35)
     velocity_H = smoothed(velocity_H, rate, sigma)
-    turn_rate = smoothed(held[:, 1], rate, sigma) + 0.08 * drift(rng, count, rate, 1.5)
+    wander = drift(rng, count, rate, 1.5)
+    # Walls keep the heading, not only the rate of turn, near what was commanded.
+    wander = 0.1 * np.gradient(wander, 1.0 / rate) if corridors else 0.08 * wander
+    turn_rate = smoothed(held[:, 1], rate, sigma) + wander
     climb = smoothed(held[:, 3], rate, sigma)
     heading = rng.uniform(-np.pi, np.pi) + integral(turn_rate, rate)
     c, s = np.cos(heading), np.sin(heading)
@@ -119,6 +131,18 @@ def _activity(rng: np.random.Generator, preferred: float, wheels: bool) -> list[
     if kind == "slow":
         return [_Command(rng.uniform(2.0, 5.0), rng.uniform(0.3, 0.6))]
     return [_Command(rng.uniform(1.5, 7.0), speed)]
+
+
+def _corridor(rng: np.random.Generator, preferred: float) -> list[_Command]:
+    """Draw a straight of 5 to 20 m, a pause at one of seven doors, and a corner."""
+    speed = float(np.clip(preferred * rng.uniform(0.85, 1.15), 0.3, 2.2))
+    turn_rate = rng.uniform(1.2, 2.2)
+    pause = [_Command(rng.uniform(1.0, 5.0), 0.0)] if rng.random() < 1.0 / 7.0 else []
+    return [
+        _Command(rng.uniform(5.0, 20.0) / speed, speed),
+        *pause,
+        _Command(0.5 * np.pi / turn_rate, 0.7 * speed, float(rng.choice([-1.0, 1.0])) * turn_rate),
+    ]
 
 
 def integral(values: FloatArray, rate: float) -> FloatArray:

@@ -103,12 +103,16 @@ _RANGES = (
     ("vigor", 0.0, 3.0),
 )
 
-_ODDS = (0.18, 0.1, 0.09, 0.15, 0.08, 0.06, 0.1, 0.1, 0.14)
+_ODDS = (0.16, 0.07, 0.07, 0.08, 0.14, 0.08, 0.06, 0.1, 0.1, 0.14)
 """Probability of each carrying mode, in the order of `CARRYING_MODES`."""
 
 
 def generate_walk(
-    seed: int, duration: float = 60.0, rate: float = 100.0, style: WalkStyle | None = None
+    seed: int,
+    duration: float = 60.0,
+    rate: float = 100.0,
+    style: WalkStyle | None = None,
+    corridors: bool = False,
 ) -> Trajectory:
     """Generate the trajectory of a carried device.
 
@@ -117,6 +121,7 @@ def generate_walk(
         duration: duration [s], minimum 1.
         rate: rate of the poses [Hz], minimum 50, so that heel strikes are resolved and not aliased.
         style: person and carrying mode; None draws them.
+        corridors: whether to walk along the corridors of a floor instead of anywhere.
 
     Returns:
         Poses of the device in a world frame whose origin is the start on the floor.
@@ -133,7 +138,7 @@ def generate_walk(
     style = WalkStyle.random(rng) if style is None else style
     count = round(duration * rate) + 1
     wheels = style.carry == "trolley"
-    route = random_route(rng, count, rate, style.preferred_speed, wheels)
+    route = random_route(rng, count, rate, style.preferred_speed, wheels, corridors)
     gait = _gait(rng, rate, route, style)
     motion = _carried(gait, style)
     R_WH = about_z(route.heading)

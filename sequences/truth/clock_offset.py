@@ -80,7 +80,9 @@ def _correlations(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]
     power_a = convolved(values[0] ** 2, masks[1][::-1])
     power_b = convolved(masks[0], values[1][::-1] ** 2)
     enough = common >= 0.5 * min(masks[0].sum(), masks[1].sum())
-    scores = products / np.sqrt(np.maximum(power_a * power_b, 1e-12))
+    # An even gait resembles itself some steps later: of equal correlations the longest counts.
+    longest = np.sqrt(np.maximum(common, 0.0) / max(float(common.max()), 1.0))
+    scores = longest * products / np.sqrt(np.maximum(power_a * power_b, 1e-12))
     return lags[enough], np.asarray(scores[enough], dtype=np.float64)
 
 

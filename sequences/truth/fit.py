@@ -13,13 +13,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import even_grid, interpolated
+from stario.sequences.attitude.rotations import GyroIntegral
 from stario.sequences.attitude.stacks import composed
 from stario.sequences.conventions import SAME_AXES, axes_matrix, axes_named
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
+from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence
 from stario.sequences.time_order import MAX_IMU_GAP
-from stario.sequences.truth.alignment import align_tracked_body
-from stario.sequences.truth.clock_offset import convolved
+from stario.sequences.truth.alignment import BodyAlignment, align_tracked_body
+from stario.sequences.truth.clock_offset import clock_offset
+from stario.sequences.truth.mounts import turns_about_one_axis
 from stario.sequences.truth.part import compared_samples
 
 MAX_OFFSET_S = 5.0
@@ -27,13 +29,13 @@ MAX_OFFSET_S = 5.0
 
 _RATE = 100.0
 _NEAR_RAD = np.deg2rad(20.0)
-_GLITCH_RAD_S = 12.0
-"""A truth that rotates faster than this [rad/s] has jumped."""
-
 _MIN_CORRELATION, _MIN_AGREEING = 0.9, 0.7
 """Correlation, and share of agreeing truth samples, below which gyroscope and truth did not measure
 the same rotations; published recordings have at least 0.97 and 0.999. An even gait correlates with
 itself a few steps later by up to 0.94, but with a lower share."""
+
+_JUMPED_RAD, _REMOUNTED_RAD = np.deg2rad(15.0), np.deg2rad(30.0)
+"""Change of the world, and of the mount, that the gyroscope did not measure: a jump."""
 
 EDGE_S = 0.05
 """An offset this close [s] to the largest one searched is the end of the search, not a maximum."""
@@ -52,6 +54,8 @@ class TruthFit:
         jumps: number of jumps of the truth's attitude that the gyroscope did not measure.
         accel_against: loss of the mean vertical force if `R_TB` is applied, as a share of the mean
             force: if it is large, the accelerometer agrees with the truth, not the gyroscope.
+        one_axis: whether the device turns about a single axis, which determines neither the offset
+            nor `R_TB`.
         applied_axes: the recording's `axes`, in which `R_TB` is given.
         times: (M,) [s] on the IMU's clock, for a figure.
         speed: (M,) angular rate of the truth at `times` [rad/s], NaN where unknown.
@@ -64,6 +68,7 @@ class TruthFit:
     agreeing: float
     jumps: int
     accel_against: float
+    one_axis: bool
     applied_axes: str
     times: FloatArray
     speed: FloatArray
@@ -112,33 +117,50 @@ def fit_truth(sequence: ImuSequence) -> TruthFit:
         raise InputError(f"{sequence.name}: truth", "none", "a true trajectory to compare with")
     time, gyro, accel = compared_samples(sequence)
     truth = sequence.truth
-    coarse = _coarse_offset(time, gyro, truth)
+    pose = truth.at(_grid(truth.time[0], truth.time[-1]))
+    coarse = clock_offset(time, gyro, pose.time, pose.attitude_WB, pose.valid)
     truth = replace(truth, time=truth.time + coarse)
     grid = _grid(max(time[0], truth.time[0]), min(time[-1], truth.time[-1]))
     pose = truth.at(grid)
     gaps = np.flatnonzero(np.diff(time) > MAX_IMU_GAP)
     valid = pose.valid & ~np.isin(np.searchsorted(time, grid) - 1, gaps)
     aligned = align_tracked_body(time, gyro, accel, grid, pose.attitude_WB, valid)
-    mount = max(aligned.mounts, key=lambda piece: piece[1] - piece[0])[2]
+    gyro_B = GyroIntegral(time, gyro)
+    begin, end, mount = max(aligned.mounts, key=lambda piece: piece[1] - piece[0])
+    piece = np.searchsorted(grid + aligned.lag, [begin, end])
     return TruthFit(
         time_offset=coarse + aligned.lag,
         correlation=aligned.correlation,
         R_TB=mount,
         tilt=float(aligned.leveling_WW.magnitude()),
         agreeing=float(aligned.valid.sum() / max(valid.sum(), 1)),
-        jumps=sum(
-            not ((time[gaps] > before - 1.0) & (time[gaps] < after)).any()
-            for (_, before, _), (after, _, _) in pairwise(aligned.mounts)
-        ),
+        jumps=_jumps(gyro_B, time[gaps], aligned, grid + aligned.lag),
         accel_against=_accel_against(
             interpolated(grid + aligned.lag, time, accel)[aligned.valid],
             pose.attitude_WB[aligned.valid],
             mount,
         ),
+        one_axis=turns_about_one_axis(
+            grid + aligned.lag, pose.attitude_WB, gyro_B, (piece[0], piece[1])
+        ),
         applied_axes=sequence.axes,
         times=grid + aligned.lag,
         speed=_speed(pose.attitude_WB, pose.valid),
     )
+
+
+def _jumps(gyro_B: GyroIntegral, gaps: FloatArray, aligned: BodyAlignment, time: FloatArray) -> int:
+    """Count changes of mount or world that no gyroscope measured, outside its `gaps` [s]."""
+    count = 0
+    for (_, before, mount), (after, _, other) in pairwise(aligned.mounts):
+        if ((gaps > before - 1.0) & (gaps < after)).any():
+            continue
+        ends = np.searchsorted(time, [before, after])
+        true, measured = aligned.attitude_WB[ends], gyro_B.attitude(time[ends])
+        turned = (true[0].inv() * true[1]) * (measured[0].inv() * measured[1]).inv()
+        jumped = turned.magnitude() > _JUMPED_RAD
+        count += bool(jumped or (mount.inv() * other).magnitude() > _REMOUNTED_RAD)
+    return count
 
 
 def _accel_against(force_B: FloatArray, attitude_WT: Rotation, R_TB: Rotation) -> float:
@@ -164,20 +186,3 @@ def _speed(attitude: Rotation, valid: BoolArray) -> FloatArray:
         known = valid[:-stride] & valid[stride:]
         speed[half : half + len(angle)] = np.where(known, angle * _RATE / stride, np.nan)
     return speed
-
-
-def _coarse_offset(time: FloatArray, gyro: FloatArray, truth: Trajectory) -> float:
-    """Return the offset at which both angular speeds correlate best, to a hundredth of a second."""
-    grid = _grid(time[0] - MAX_OFFSET_S, time[-1] + MAX_OFFSET_S)
-    pose = truth.at(grid)
-    speed_T = _speed(pose.attitude_WB, pose.valid)
-    known = speed_T < _GLITCH_RAD_S
-    if not known.any():
-        return 0.0
-    turning = np.where(known, speed_T - speed_T[known].mean(), 0.0)
-    speed = np.interp(grid, time, np.linalg.norm(gyro, axis=1))
-    speed = np.where((grid < time[0]) | (grid > time[-1]), 0.0, speed - speed.mean())
-    score = convolved(speed, turning[::-1])
-    lags = np.arange(-len(grid) + 1, len(grid)) / _RATE
-    near = np.abs(lags) <= MAX_OFFSET_S
-    return float(lags[near][np.argmax(score[near])])

@@ -8,8 +8,9 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from stario.sequences.arrays import rms, runs, scatter
+from stario.sequences.findings import Finding
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory, is_gap
-from stario.sequences.truth.findings import TruthProblem
+from stario.sequences.truth.findings import truth_finding
 
 _JUMP_M, _FASTEST_M_S = 0.5, 15.0
 """Length [m] and speed [m/s] above which a step between successive poses may be a jump."""
@@ -69,30 +70,26 @@ def without_lost(truth: Trajectory, faults: TrackingFaults) -> Trajectory:
     return replace(truth, valid=truth.valid & ~faults.lost) if faults.lost.any() else truth
 
 
-def tracking_problems(faults: TrackingFaults) -> list[TruthProblem]:
-    """Return a problem for each kind of fault."""
-    problems = []
+def tracking_findings(faults: TrackingFaults) -> list[Finding]:
+    """Return a finding for each kind of fault."""
+    found = []
     if faults.frozen:
         start, stop = max(faults.frozen, key=lambda stretch: stretch[1] - stretch[0])
         seconds = sum(stop - start for start, stop in faults.frozen)
-        problems.append(
-            TruthProblem(
-                f"a position that repeats exactly for {seconds:.1f} s while the device moves, "
-                f"longest from {start:.1f} to {stop:.1f} s",
-                "leave the truth's cells blank where its tracking is lost",
-            )
+        text = (
+            f"a position that repeats exactly for {seconds:.1f} s while the device moves, "
+            f"longest from {start:.1f} to {stop:.1f} s"
         )
+        fix = "leave the truth's cells blank where its tracking is lost"
+        found.append(truth_finding("frozen", text, fix, seconds=seconds, start_s=start))
     if faults.jumps:
         at, length = max(faults.jumps, key=lambda jump: jump[1])
         count = len(faults.jumps)
         others = f", the longest of {count} jumps" if count > 1 else ""
-        problems.append(
-            TruthProblem(
-                f"a position that jumps by {length:.3g} m at {at:.2f} s{others}",
-                "leave the truth's cells blank around a glitch, or split the recording there",
-            )
-        )
-    return problems
+        text = f"a position that jumps by {length:.3g} m at {at:.2f} s{others}"
+        fix = "leave the truth's cells blank around a glitch, or split the recording there"
+        found.append(truth_finding("jumps", text, fix, count=count, longest_m=length))
+    return found
 
 
 def _jumps(time: FloatArray, position: FloatArray) -> tuple[tuple[float, float], ...]:

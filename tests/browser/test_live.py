@@ -57,7 +57,7 @@ def test_page_draws_two_phones_and_ends_where_a_run_on_their_files_does(show, se
         session = server.hub.sessions[name]
         end = session.track.drawn.points[-1]
         shown.page.wait_for_function(f"([id, t]) => ({LAST})(id)?.[0] >= t", arg=[name, end[0]])
-        track = Navigator(load_model()).run(read_recording(session.track.path))
+        track = Navigator(load_model(), backend="ekf").run(read_recording(session.track.path))
         drawn = shown.page.evaluate(LAST, name)
         np.testing.assert_allclose(drawn[1:4], track.trajectory.position_W[-1], atol=1e-4)
         assert shown.page.is_visible(f"[data-device='{name}'] .figures")

@@ -53,11 +53,11 @@ def test_slider_moves_the_cursor_on_the_map_and_every_panel(show, report, compar
     slide += " s.dispatchEvent(new Event('input')); }"
     cursor = "() => ({at: +document.body.dataset.time,"
     cursor += (
-        " x: document.getElementById('map').layout.shapes.find(s => s.name === 'graph').xanchor,"
+        " x: document.getElementById('map').layout.shapes.find(s => s.name === 'filtered').xanchor,"
     )
     cursor += " lines: document.getElementById('time').layout.shapes.map(s => s.x0)})"
     seen = []
-    times = [0.0, 0.25 * comparison.tracks["ekf"].time[-1], comparison.tracks["ekf"].time[-1]]
+    times = [0.0, 0.25 * comparison.tracks["track"].time[-1], comparison.tracks["track"].time[-1]]
     for value, time in zip((0, 250, 1000), times, strict=True):
         shown.page.evaluate(slide, value)
         moved = "v => Math.abs(document.body.dataset.time - v) < 0.05"
@@ -66,7 +66,7 @@ def test_slider_moves_the_cursor_on_the_map_and_every_panel(show, report, compar
     for one in seen:
         assert one["lines"] == [pytest.approx(one["at"], abs=1e-3)] * len(one["lines"])
         assert len(one["lines"]) == 14
-    end = comparison.aligned()["graph"].position_W[-1, 0]
+    end = comparison.aligned()["filtered"].position_W[-1, 0]
     assert seen[-1]["x"] == pytest.approx(end, abs=0.05)
     assert shown.problems == []
 
@@ -74,9 +74,9 @@ def test_slider_moves_the_cursor_on_the_map_and_every_panel(show, report, compar
 def test_the_button_of_a_track_hides_it_on_map_and_panels(show, report):
     shown = show(report.as_uri())
     visible = "() => ['map', 'time'].map(id => document.getElementById(id).data"
-    visible += ".filter(t => t.legendgroup === 'ekf' && t.visible !== false).length)"
+    visible += ".filter(t => t.legendgroup === 'track' && t.visible !== false).length)"
     assert all(shown.page.evaluate(visible))
-    shown.page.click("[data-track=ekf]")
+    shown.page.click("[data-track=track]")
     shown.page.wait_for_function(f"() => ({visible})().every(n => n === 0)", timeout=10_000)
 
 
@@ -146,14 +146,14 @@ def test_report_of_ten_minutes_is_below_two_megabytes(tmp_path, comparison):
     updates = Innovations(time, noise, abs(noise), noise[:, 0] ** 2, noise[:, 0] > 2.0)
     track = Track(path, b_g=noise, b_a=noise, covariance=P, innovations=updates)
     walk = ImuSequence("ten minutes", time, noise, noise, truth=path)
-    found = Comparison(walk, {"ekf": track}, {"ekf": comparison.metrics["ekf"]})
+    found = Comparison(walk, {"track": track}, {"track": comparison.metrics["track"]})
     assert write_report(tmp_path / "r.html", found).stat().st_size < 2_000_000
 
 
 def test_report_of_a_run_without_truth_has_no_table(tmp_path):
     sequence = start_of(demonstration(), "bare").without_truth()
     track = Navigator(load_model()).run(sequence)
-    path = write_report(tmp_path / "r.html", Comparison(sequence, {"ekf": track}, {"ekf": {}}))
+    path = write_report(tmp_path / "r.html", Comparison(sequence, {"track": track}, {"track": {}}))
     assert "Accuracy against ground truth" not in path.read_text()
 
 

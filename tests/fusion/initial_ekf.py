@@ -1,15 +1,68 @@
-"""A filter with a tilted, turned and moving initial state."""
+"""A filter's state under test, which the functions of `filter.ekf` replace one after the other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
 
-from stario.fusion.filter.ekf import StateCloningEkf
-from stario.fusion.state import NavState
+from stario.fusion.filter import ekf, kalman
+from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.state import NavState, changed
 from stario.sequences.attitude.so3 import exp_so3
 
+ZERO = np.zeros(3)
+NOTHING = NavState(math.nan, np.eye(3), ZERO, ZERO, ZERO, ZERO, np.zeros((15, 15)))
 
-def initialised(slots: int, engine: type[StateCloningEkf] = StateCloningEkf) -> StateCloningEkf:
+
+class Driven:
+    """Each function of `filter.ekf` is a method: it replaces the state and returns the outcome."""
+
+    def __init__(self, slots: int, state: NavState = NOTHING) -> None:
+        self.state = EkfState.initial(state, slots)
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        return partial(self._apply, getattr(ekf, name))
+
+    def _apply(self, function: Callable[..., Any], *args: Any, **options: Any) -> Any:
+        answer = function(self.state, *args, **options)
+        self.state, result = answer if isinstance(answer, tuple) else (answer, None)
+        return result
+
+    def initialise(self, state: NavState) -> None:
+        self.state = ekf.initialised(state, len(self.state.clone_times))
+
+    def clone(self, instead_of: int | None = None) -> int:
+        free = self.state.clone_times.index(None) if instead_of is None else instead_of
+        self._apply(ekf.clone, instead_of)
+        return free
+
+    def update_linear(self, residual: Any, blocks: Any, covariance: Any) -> kalman.UpdateResult:
+        return self._apply(kalman.update, kalman.Linear(residual, blocks, covariance))
+
+    @property
+    def covariances(self) -> np.ndarray:
+        return self.state.covariances
+
+    @covariances.setter
+    def covariances(self, value: np.ndarray) -> None:
+        self.state = changed(self.state, covariances=value)
+
+    @property
+    def P(self) -> np.ndarray:
+        return self.state.P
+
+    @P.setter
+    def P(self, value: np.ndarray) -> None:
+        self.covariances = np.stack([value, value])
+
+
+def initialised(slots: int) -> Driven:
+    """A filter with a tilted, turned and moving initial state."""
     sigma = np.repeat([0.05, 0.3, 0.1, 0.003, 0.05], 3)
-    ekf = engine(slots)
     state = NavState(
         10.0,
         exp_so3(np.array([0.5, -0.7, 2.0])),
@@ -19,5 +72,4 @@ def initialised(slots: int, engine: type[StateCloningEkf] = StateCloningEkf) -> 
         np.array([0.02, -0.01, 0.03]),
         np.diag(sigma**2),
     )
-    ekf.initialise(state)
-    return ekf
+    return Driven(slots, state)

@@ -26,7 +26,7 @@ def test_health_counts_bad_samples_gaps_and_updates(walk: ImuSequence, make_orac
     time[900], time[1100], time[1101] = time[899], time[1000], time[1000]
     bad = replace(walk, time=time, gyro=gyro, accel=accel)
     oracle = make_oracle(bad, walk.truth, CONFIG)
-    track = Navigator(oracle).run(bad)
+    track = Navigator(oracle, backend="ekf").run(bad)
     health = track.health
     assert health.samples == {
         "used": len(walk) - 34,
@@ -101,18 +101,18 @@ def test_invalid_predictions_are_refused_and_counted(
     walk: ImuSequence, make_oracle: Make, mean: float, variance: float, reason: str
 ) -> None:
     model = Broken(make_oracle(walk, walk.truth, CONFIG), mean, variance)
-    track = Navigator(model).run(walk)
+    track = Navigator(model, backend="ekf").run(walk)
     assert track.health.refused == {reason: track.health.updates // 3}
     assert ate(track, walk) < 0.3
 
 
 def test_outliers_are_gated_and_do_little_harm(walk: ImuSequence, make_oracle: Make) -> None:
     model = Broken(make_oracle(walk, walk.truth, CONFIG), 5.0, 0.02**2)
-    track = Navigator(model, CONFIG).run(walk)
+    track = Navigator(model, CONFIG, backend="ekf").run(walk)
     assert 0.5 * track.health.updates / 3 < track.health.gated
     open_gate = NavigatorConfig(NOISE, replace(FILTER, gate=1.0 - 1e-16))
     model = Broken(make_oracle(walk, walk.truth, open_gate), 5.0, 0.02**2)
-    assert ate(track, walk) < 0.5 * ate(Navigator(model, open_gate).run(walk), walk)
+    assert ate(track, walk) < 0.5 * ate(Navigator(model, open_gate, backend="ekf").run(walk), walk)
 
 
 @pytest.mark.parametrize("length", [0.5, 3.0])
@@ -123,7 +123,7 @@ def test_after_a_gap_speed_recovers_and_sigma_covers_the_error(
     for seed in range(4):
         walk = make_walk(seed, 20.0)
         holed = without(walk, (walk.time > 8.0) & (walk.time < 8.0 + length))
-        track = Navigator(make_oracle(holed, walk.truth, CONFIG), CONFIG).run(holed)
+        track = Navigator(make_oracle(holed, walk.truth, CONFIG), CONFIG, backend="ekf").run(holed)
         assert (~track.trajectory.valid).sum() == 1
         assert track.health.gaps[0][1] == pytest.approx(length, abs=0.03)
         truth = walk.truth.at(np.clip(track.time, 0.0, walk.time[-1]))
@@ -151,7 +151,7 @@ def test_a_recording_that_is_too_short_raises_a_clear_error(
     walk: ImuSequence, still_model: Any, seconds: float
 ) -> None:
     with pytest.raises(InputError, match="at least") as caught:
-        Navigator(still_model).run(walk.slice(0.0, seconds))
+        Navigator(still_model, backend="ekf").run(walk.slice(0.0, seconds))
     assert walk.name in str(caught.value)
 
 
@@ -160,7 +160,7 @@ def test_a_recording_of_pieces_shorter_than_a_window_raises_a_clear_error(
 ) -> None:
     holed = without(walk, walk.time % 0.9 > 0.7)
     with pytest.raises(InputError, match="unbroken stretch"):
-        Navigator(still_model).run(holed)
+        Navigator(still_model, backend="ekf").run(holed)
 
 
 @pytest.mark.parametrize(
@@ -217,7 +217,7 @@ def test_wild_timestamps_do_not_block_a_stream(
     oracle = make_oracle(expected, walk.truth, CONFIG)
     navigator = Navigator(oracle)
     states = stream(navigator, bad)
-    assert stream_deviation(states, Navigator(oracle).run(expected)) < 1e-9
+    assert stream_deviation(states, Navigator(oracle, backend="ekf").run(expected)) < 1e-9
     assert navigator.health.samples["future"] == jumped.sum()
     assert navigator.health.samples["out_of_order"] == 0
     assert navigator.health.gaps == []
@@ -235,7 +235,7 @@ def test_a_stream_may_start_with_a_wild_timestamp(
     oracle = make_oracle(expected, walk.truth, CONFIG)
     navigator = Navigator(oracle)
     states = stream(navigator, replace(walk, time=time))
-    assert stream_deviation(states, Navigator(oracle).run(expected)) < 1e-9
+    assert stream_deviation(states, Navigator(oracle, backend="ekf").run(expected)) < 1e-9
     assert navigator.health.samples["future"] == 2
 
 
@@ -261,7 +261,10 @@ def test_after_a_long_gap_the_navigator_restarts_where_it_was(
     truth = replace(turned.truth, time=time)
     broken = replace(turned, time=time, truth=truth)
     oracle = make_oracle(broken, truth, CONFIG)
-    track, navigator = Navigator(oracle, CONFIG).run(broken), Navigator(oracle, CONFIG)
+    track, navigator = (
+        Navigator(oracle, CONFIG, backend="ekf").run(broken),
+        Navigator(oracle, CONFIG),
+    )
     assert stream_deviation(stream(navigator, broken), track) < 1e-9
     assert track.health.gaps == [(pytest.approx(10.0), pytest.approx(seconds + 0.01, rel=1e-6))]
     after = track.time > 10.0 + seconds + 4.0
@@ -344,7 +347,7 @@ def test_a_network_that_claims_to_be_exact_is_not_trusted(
     walk: ImuSequence, make_oracle: Make
 ) -> None:
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.01, sigma=1e-9)
-    track = Navigator(oracle, CONFIG).run(walk)
+    track = Navigator(oracle, CONFIG, backend="ekf").run(walk)
     assert np.isfinite(track.covariance).all()
     assert np.sqrt(track.covariance[-1, 6, 6]) > 5e-3
     assert ate(track, walk) < 0.3
@@ -356,13 +359,13 @@ def test_a_tenth_of_a_second_without_samples_hardly_changes_the_end(
     """Wherever they are missing: no output may depend on a marginal decision."""
     walk = make_walk(4, 40.0, 100.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
-    whole = Navigator(oracle, CONFIG).run(walk).trajectory
+    whole = Navigator(oracle, CONFIG, backend="ekf").run(walk).trajectory
     for start in (8.0, 15.0, 22.0, 29.0):
         keep = (walk.time < start) | (walk.time > start + 0.12)
         rows = (walk.time[keep], walk.gyro[keep], walk.accel[keep])
         holed = replace(walk, time=rows[0], gyro=rows[1], accel=rows[2])
         holed_oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.1, sigma=0.1)
-        track = Navigator(holed_oracle, CONFIG).run(holed).trajectory
+        track = Navigator(holed_oracle, CONFIG, backend="ekf").run(holed).trajectory
         off = np.linalg.norm(track.position_W[-1] - whole.position_W[-1])
         assert off < 0.02 * walk.truth.path_length()
         turned = track.attitude_WB[-1] * whole.attitude_WB[-1].inv()
@@ -372,5 +375,5 @@ def test_a_tenth_of_a_second_without_samples_hardly_changes_the_end(
 def test_a_dead_axis_is_logged_once_per_run(
     walk: ImuSequence, still_model: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
-    Navigator(still_model).run(replace(walk, gyro=walk.gyro * [1.0, 1.0, 0.0]))
+    Navigator(still_model, backend="ekf").run(replace(walk, gyro=walk.gyro * [1.0, 1.0, 0.0]))
     assert caplog.text.count("its z axis never changes") == 1

@@ -102,7 +102,7 @@ def test_predictions_of_other_shapes_are_refused(
             return predict(len(windows))
 
     with pytest.raises(InputError, match=f"model.*{named}"):
-        Navigator(Custom()).run(walk)
+        Navigator(Custom(), backend="ekf").run(walk)
 
 
 def test_predictions_may_be_lists(walk: ImuSequence) -> None:
@@ -110,6 +110,6 @@ def test_predictions_may_be_lists(walk: ImuSequence) -> None:
         def predict(self, windows: Any) -> Any:
             return zeros(len(windows)).tolist(), variances(len(windows)).tolist()
 
-    track = Navigator(Custom()).run(walk)
+    track = Navigator(Custom(), backend="ekf").run(walk)
     assert track.health is not None
     assert track.health.updates > 0

@@ -92,7 +92,7 @@ def test_a_fix_is_applied_at_its_own_time_however_late(
     walk: ImuSequence, make_oracle: Make, late: float
 ) -> None:
     model, fixes = make_oracle(walk, walk.truth, CONFIG), fixes_of(walk)
-    track = Navigator(model, CONFIG).run(walk, fixes=fixes)
+    track = Navigator(model, CONFIG, backend="ekf").run(walk, fixes=fixes)
     navigator = Navigator(model, CONFIG)
     state = streamed(navigator, walk, fixes, late)
     assert_same(state, track)
@@ -110,7 +110,7 @@ def test_fixes_that_are_too_old_are_refused_and_counted(walk: ImuSequence, model
     assert navigator.health.fixes == {"too late": 4}
     np.testing.assert_array_equal(navigator.state.p_W, untouched.state.p_W)
     before, after = (position_fix(t, np.zeros(3), EYE) for t in (walk.time[0] - 1.0, 1e6))
-    track = Navigator(model, CONFIG).run(walk, fixes=[after, before])
+    track = Navigator(model, CONFIG, backend="ekf").run(walk, fixes=[after, before])
     assert track.health.fixes == {"before the start": 1, "after the end": 1}
 
 
@@ -133,7 +133,7 @@ def test_future_fixes_wait_for_their_time(walk: ImuSequence, model: Any) -> None
     assert navigator.health.fixes == {"waiting": 5}
     state = streamed(navigator, walk, [], 0.0)
     assert navigator.health.fixes == {"applied": 4, "waiting": 1}
-    assert_same(state, Navigator(model, CONFIG).run(walk, fixes=fixes_of(walk)))
+    assert_same(state, Navigator(model, CONFIG, backend="ekf").run(walk, fixes=fixes_of(walk)))
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
@@ -178,7 +178,7 @@ def test_two_positions_determine_the_position_and_direction_of_a_track(
         position_fix(t, R @ truth_at(walk, t)[0] + shift, 1e-4 * EYE)
         for t in (4.0, 6.0, 28.0, 29.6)
     ]
-    track = Navigator(model, CONFIG).run(walk, fixes=fixes)
+    track = Navigator(model, CONFIG, backend="ekf").run(walk, fixes=fixes)
     truth = walk.truth.at(track.time.clip(0.0, walk.time[-1]))
     error = track.trajectory.position_W - (truth.position_W @ R.T + shift)
     assert np.linalg.norm(error[-1]) < 0.05  # half a second after a fix of 1 cm
@@ -200,7 +200,7 @@ def test_the_covariance_in_the_map_frame_is_consistent(make_walk: Make, make_ora
             position_fix(t, turn.apply(truth_at(walk, t)[0]) + rng.normal(0.0, 0.2, 3), 0.04 * EYE)
             for t in (3.0, 25.0)
         ]
-        track = Navigator(oracle, CONFIG).run(walk, fixes=fixes)
+        track = Navigator(oracle, CONFIG, backend="ekf").run(walk, fixes=fixes)
         if track.health.fixes != {"applied": 2}:
             continue  # too little motion to determine the yaw
         truth = walk.truth.at(track.time[-1:].clip(0.0, walk.time[-1]))
@@ -227,7 +227,7 @@ def test_a_heading_or_a_velocity_determines_the_yaw_too(
             fixes += [yaw_fix(t, yaw + 2.0 - 2.0 * np.pi, 0.02)]
         else:
             fixes += [velocity_fix(t, turn.apply(v), 1e-4 * EYE)]
-    track = Navigator(model, CONFIG).run(walk, fixes=fixes)
+    track = Navigator(model, CONFIG, backend="ekf").run(walk, fixes=fixes)
     assert track.health.fixes["applied"] >= 3  # a slow velocity does not determine it
     truth = walk.truth.at(track.time.clip(0.0, walk.time[-1]))
     off = turn.apply(truth.position_W) - track.trajectory.position_W
@@ -246,7 +246,7 @@ def test_a_track_with_a_known_start_is_corrected_without_a_frame_change(
         (3.0, 0.01, {"applied": 1, "gated": 1}),
     ):
         fix = position_fix(25.0, [*p[:2], p[2] + off], sigma**2 * EYE)
-        track = Navigator(model, CONFIG, prior).run(walk, fixes=[fix])
+        track = Navigator(model, CONFIG, prior, backend="ekf").run(walk, fixes=[fix])
         assert track.health.fixes == counts
         error = track.trajectory.position_W[-1] - truth
         assert np.linalg.norm(error) < 0.5 + 0.8 * off
@@ -256,7 +256,7 @@ def test_positions_too_close_together_do_not_turn_the_map_frame(
     walk: ImuSequence, model: Any
 ) -> None:
     fixes = [position_fix(t, truth_at(walk, t)[0], 9.0 * EYE) for t in (5.0, 6.0, 7.0)]
-    track = Navigator(model, CONFIG).run(walk, fixes=fixes)
+    track = Navigator(model, CONFIG, backend="ekf").run(walk, fixes=fixes)
     assert track.health.fixes == {"applied": 1, "yaw not known": 2}
 
 
@@ -317,7 +317,9 @@ def test_invalid_fixes_are_refused_and_counted(
     walk: ImuSequence, model: Any, value: list[float], covariance: np.ndarray, reason: str
 ) -> None:
     bad = position_fix(5.0, value, covariance)
-    assert Navigator(model, CONFIG).run(walk, fixes=[bad]).health.fixes == {reason: 1}
+    assert Navigator(model, CONFIG, backend="ekf").run(walk, fixes=[bad]).health.fixes == {
+        reason: 1
+    }
     navigator = Navigator(model, CONFIG)
     streamed(navigator, walk.slice(0.0, 6.0), [bad], 0.2)
     assert navigator.health.fixes == {reason: 1}
@@ -357,7 +359,9 @@ def test_a_heading_with_an_invalid_sigma_is_refused_and_counted(
     walk: ImuSequence, model: Any, sigma: float, reason: str
 ) -> None:
     bad = yaw_fix(5.0, 0.0, sigma)
-    assert Navigator(model, CONFIG).run(walk, fixes=[bad]).health.fixes == {reason: 1}
+    assert Navigator(model, CONFIG, backend="ekf").run(walk, fixes=[bad]).health.fixes == {
+        reason: 1
+    }
     navigator = Navigator(model, CONFIG)
     streamed(navigator, walk.slice(0.0, 2.0), [], 0.0)
     navigator.update_yaw(1.5, 0.0, sigma)
@@ -376,7 +380,9 @@ def test_a_wrong_shape_raises_an_error_that_names_the_argument(model: Any) -> No
 
 def test_the_covariance_of_an_exact_fix_has_a_floor(walk: ImuSequence, model: Any) -> None:
     p = truth_at(walk, 10.0)[0]
-    track = Navigator(model, CONFIG).run(walk, fixes=[position_fix(10.0, p, 1e-30 * EYE)])
+    track = Navigator(model, CONFIG, backend="ekf").run(
+        walk, fixes=[position_fix(10.0, p, 1e-30 * EYE)]
+    )
     assert track.health.fixes == {"applied": 1}
     assert np.isfinite(track.covariance).all()
     assert np.linalg.eigvalsh(track.covariance).min() > -1e-9

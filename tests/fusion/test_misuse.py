@@ -41,7 +41,7 @@ LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
         (lambda model: Navigator(model, backend=["ekf"]), "backend"),
         (lambda model: Navigator("default"), "model"),
         (lambda model: Navigator(type(model)), "model"),
-        (lambda model: Navigator(model).run("walk.csv"), "sequence"),
+        (lambda model: Navigator(model, backend="ekf").run("walk.csv"), "sequence"),
         (lambda model: Navigator(model).restore("text"), "snapshot"),
         (lambda model: Navigator(model).update_yaw("x", 0.0, 0.1), "time.*expected a number"),
         (lambda model: Navigator(model).update_yaw(1.0, [0, 0], 0.1), "yaw.*expected a number"),
@@ -113,7 +113,7 @@ def test_a_recording_may_have_more_fixes_than_may_wait_in_a_stream(
 ) -> None:
     times = [*np.linspace(1.0, walk.duration - 0.01, 50), *np.linspace(1e3, 2e3, 10_001)]
     fixes = [position_fix(t, np.zeros(3), 1e4 * np.eye(3)) for t in times]
-    counts = Navigator(still_model).run(walk, fixes=fixes).health.fixes
+    counts = Navigator(still_model, backend="ekf").run(walk, fixes=fixes).health.fixes
     assert sum(counts.values()) == len(fixes)
     assert "too many waiting" not in counts
 
@@ -168,7 +168,7 @@ def test_a_stream_that_is_too_slow_or_too_fast_is_refused(still_model: Any, rate
 def test_misplaced_arguments_are_named(still_model: Any, make_walk: Make) -> None:
     walk = make_walk(1, 3.0)
     with pytest.raises(InputError, match=r"progress.*fixes="):
-        Navigator(still_model).run(walk, [yaw_fix(1.0, 0.0, 0.1)])  # type: ignore[arg-type]
+        Navigator(still_model, backend="ekf").run(walk, [yaw_fix(1.0, 0.0, 0.1)])  # type: ignore[arg-type]
     for wrong in (None, 3):
         with pytest.raises(InputError, match="path"):
             read_recording(wrong)  # type: ignore[arg-type]
@@ -194,4 +194,4 @@ def test_a_prior_attitude_that_gravity_contradicts_is_refused(
     np.testing.assert_allclose(refused_at, [1.0, 2.01], atol=0.02)
     assert wrong.state is None
     unknown = PriorPose(on_its_side @ first, *LEVEL[1:], tilt_sigma=1.0)
-    assert Navigator(still_model, prior=unknown).run(walk).health is not None
+    assert Navigator(still_model, prior=unknown, backend="ekf").run(walk).health is not None

@@ -1,10 +1,7 @@
 """A stream that is stopped and continued elsewhere gives the same states as without a stop."""
 
-import io
-import json
 import subprocess
 import sys
-import zipfile
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,8 +14,8 @@ from support import stream
 
 from stario.fusion import Navigator, NavigatorConfig, NavState, PriorPose
 from stario.fusion.config import FilterConfig
-from stario.fusion.filter.hypotheses import AlternativeHypothesis
-from stario.fusion.snapshot import VERSION, pack, unpack
+from stario.fusion.filter.contradiction import Contradiction
+from stario.fusion.snapshot import VERSION, plain, unpack
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 
@@ -108,7 +105,7 @@ def test_another_process_can_continue_a_stream(tmp_path: Path, still_model: Any)
     navigator = Navigator(still_model)
     walk = simulate_imu(generate_walk(0, 6.0), 100.0)
     stream(navigator, walk.select(np.arange(len(walk)) < 350))
-    data, result = tmp_path / "stream.npz", str(tmp_path / "result.npy")
+    data, result = tmp_path / "stream.bin", str(tmp_path / "result.npy")
     data.write_bytes(navigator.snapshot())
     subprocess.run([sys.executable, "-c", SCRIPT, str(data), result], check=True, timeout=60)
     stream(navigator, walk.select(np.arange(len(walk)) >= 350))
@@ -148,66 +145,33 @@ def test_bytes_that_are_not_a_snapshot_are_refused(walk: ImuSequence, still_mode
     data, before = navigator.snapshot(), navigator.state.p_W
     flipped = bytearray(data)
     flipped[data.index(b"front end")] ^= 0x01
-    other = io.BytesIO()
-    np.savez(other, tree=np.frombuffer(b'{"format": "else"}', dtype=np.uint8))
-    for bad in (b"", b"nonsense", data[:1000], data[:-30], bytes(flipped), other.getvalue()):
+    for bad in (b"", b"nonsense", data[:1000], data[:-30], bytes(flipped)):
         with pytest.raises(InputError, match="snapshot") as caught:
             navigator.restore(bad)
         assert "\n" not in str(caught.value)
         np.testing.assert_array_equal(navigator.state.p_W, before)
 
 
-def edited(data: bytes, change: Callable[[dict[str, Any]], None]) -> bytes:
-    with np.load(io.BytesIO(data)) as file:
-        members = dict(file)
-    change(members)
-    changed = io.BytesIO()
-    np.savez(changed, **members)
-    return changed.getvalue()
-
-
 def test_an_edited_snapshot_is_refused_with_the_remedy(walk: ImuSequence, still_model: Any) -> None:
-    """Its structure is valid: it would be restored, and fail or give other states later."""
+    """Its structure may be valid: it would be restored, and give other states later."""
     navigator = Navigator(still_model, CONFIG)
     push(navigator, walk, 0.0, 3.0)
     data, before = navigator.snapshot(), navigator.state.p_W
-
-    def change_a_value(members: dict[str, Any]) -> None:
-        name = next(name for name in members if members[name].dtype == np.float64)
-        members[name] = members[name] + 1.0
-
-    def change_a_shape(members: dict[str, Any]) -> None:
-        members["a0"] = members["a0"][..., None]
-
-    def change_a_type(members: dict[str, Any]) -> None:
-        name = next(name for name in members if members[name].dtype == np.float64)
-        members[name] = members[name].astype(np.float32)
-
-    def change_the_tree(members: dict[str, Any]) -> None:
-        text = members["tree"].tobytes().replace(b"false", b"true ", 1)
-        members["tree"] = np.frombuffer(text, dtype=np.uint8)
-
-    def drop_a_member(members: dict[str, Any]) -> None:
-        del members["a0"]
-
-    unchanged = edited(data, lambda members: None)
-    Navigator(still_model, CONFIG).restore(unchanged)
-    for change in (change_a_value, change_a_shape, change_a_type, change_the_tree, drop_a_member):
+    for old, new in ((b"false", b"true "), (b"<f8", b"<i8")):
+        assert old in data
         with pytest.raises(InputError, match=r"snapshot: found edited.*begin a new stream"):
-            navigator.restore(edited(data, change))
+            navigator.restore(data.replace(old, new, 1))
         np.testing.assert_array_equal(navigator.state.p_W, before)
 
 
 def test_a_snapshot_of_another_version_is_refused(walk: ImuSequence, still_model: Any) -> None:
     navigator = Navigator(still_model, CONFIG)
-    data = pack(unpack(navigator.snapshot()) | {"version": 1})
-    without_checksum = edited(data, lambda members: members.pop("sha256"))
-    for other in (data, without_checksum):
-        with pytest.raises(InputError, match=f"version: found 1, expected {VERSION}"):
-            navigator.restore(other)
+    data = navigator.snapshot().replace(f" {VERSION}\n".encode(), b" 1\n", 1)
+    with pytest.raises(InputError, match=f"version: found 1, expected {VERSION}"):
+        navigator.restore(data)
 
 
-LAYOUTS = {27: "66b73efc"}
+LAYOUTS = {29: "abed7485"}
 """CRC of the classes and attributes in a snapshot, by version."""
 
 
@@ -220,7 +184,8 @@ def test_a_snapshot_with_other_classes_or_attributes_has_another_version(
     def visit(value: Any) -> None:
         if isinstance(value, dict):
             if "is" in value:
-                found.add(f"{value['is']}: {', '.join(sorted(value['has']))}")
+                names = sorted(name for name, _ in value["has"]["map"])
+                found.add(f"{value['is']}: {', '.join(names)}")
             list(map(visit, value.values()))
         elif isinstance(value, list):
             list(map(visit, value))
@@ -237,28 +202,16 @@ def test_a_snapshot_with_other_classes_or_attributes_has_another_version(
         for row in zip(*(part[:400] for part in (walk.time, walk.gyro, walk.accel)), strict=True):
             navigator.push_magnetometer(row[0], np.array([20.0 + row[0], 5.0, -40.0]))
             navigator.push(*row)
-        with np.load(io.BytesIO(navigator.snapshot())) as file:
-            visit(json.loads(file["tree"].tobytes()))
+        visit(plain(unpack(navigator.snapshot()), {}))
     rare = [
-        AlternativeHypothesis(navigator._stream.estimator._filter.ekf.state, zero, (0.0,)),
+        Contradiction((0.0,)),
         PriorPose(np.eye(3), zero, zero),
     ]
-    with np.load(io.BytesIO(pack({"rare": rare}))) as file:
-        visit(json.loads(file["tree"].tobytes()))
+    visit(plain(rare, {}))
     names = {line.partition(":")[0] for line in found}
     assert names >= {"FieldState", "FrameTransform", "Fix", "Bearing", "Position", "Yaw"}
     layout = format(zlib.crc32("\n".join(sorted(found)).encode()), "08x")
     assert LAYOUTS.get(VERSION) == layout, f"raise VERSION, and note its layout {layout} here"
-
-
-def test_a_snapshot_contains_no_pickles(walk: ImuSequence, still_model: Any) -> None:
-    navigator = Navigator(still_model, CONFIG)
-    push(navigator, walk, 0.0, 3.0)
-    with zipfile.ZipFile(io.BytesIO(navigator.snapshot())) as file:
-        for name in file.namelist():
-            header = file.read(name)[:128]
-            assert header.startswith(b"\x93NUMPY")
-            assert b"|O" not in header
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Literal
@@ -21,8 +21,9 @@ from stario.sequences.datasets.array_cache import Part, read_parts, write_parts
 from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.datasets.cache_files import recording_file
 from stario.sequences.errors import InputError
+from stario.sequences.findings import Finding, warn
 from stario.sequences.inspection.checks import check_units
-from stario.sequences.inspection.constant_values import warn_of_dead_axes
+from stario.sequences.inspection.constant_values import dead_axes
 from stario.sequences.legs import gaps_and_jumps
 from stario.sequences.levelled_stream import LevelledStream, levelled_streams
 from stario.sequences.sequence import (
@@ -33,7 +34,7 @@ from stario.sequences.sequence import (
     Trajectory,
     is_gap,
 )
-from stario.sequences.truth.problems import truth_problems, warn_of_problems
+from stario.sequences.truth.problems import truth_findings
 
 Kind = Literal["poses", "positions", "waypoints"]
 
@@ -78,7 +79,7 @@ class Aligned:
         kind: kind of its ground truth.
         attributes: person, device, place and similar, where known.
         pieces: its unbroken stretches.
-        problems: problems of its ground truth, one line each.
+        problems: findings about its ground truth.
     """
 
     path: Path
@@ -86,7 +87,7 @@ class Aligned:
     kind: Kind
     attributes: dict[str, str]
     pieces: list[AlignedPiece]
-    problems: tuple[str, ...]
+    problems: tuple[Finding, ...]
 
 
 def aligned_recording(sequence: ImuSequence, path: Path) -> Aligned:
@@ -97,7 +98,7 @@ def aligned_recording(sequence: ImuSequence, path: Path) -> Aligned:
             unbroken stretch of 2 s, or a wrong unit.
     """
     check_units(sequence)
-    warn_of_dead_axes(sequence)
+    warn(sequence.name, dead_axes(sequence))
     streams = levelled_streams(sequence)
     if not streams:
         raise InputError(f"{sequence.name}: samples", "no unbroken stretch", "one of 2 s")
@@ -118,7 +119,7 @@ def aligned_recording(sequence: ImuSequence, path: Path) -> Aligned:
     else:
         raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
     attributes = {name: str(value) for name, value in sequence.attributes.items()}
-    problems = tuple(problem.line(sequence.name) for problem in truth_problems(sequence))
+    problems = tuple(truth_findings(sequence))
     return Aligned(path, sequence.name, kind, attributes, pieces, problems)
 
 
@@ -151,7 +152,7 @@ def _cached(
         parts = _parts(aligned_recording(read(path), path))
         write_parts(file, parts)
     found = _from_parts(path, parts)
-    warn_of_problems(found.problems)
+    warn(found.name, found.problems)
     return found
 
 
@@ -201,6 +202,7 @@ def _code() -> str:
 
 def _parts(aligned: Aligned) -> list[Part]:
     shared = {name: getattr(aligned, name) for name in _SHARED}
+    shared["problems"] = [asdict(found) for found in aligned.problems]
     parts = []
     for piece in aligned.pieces:
         arrays = {name: getattr(piece.stream, name) for name in _STREAM}
@@ -218,4 +220,6 @@ def _from_parts(path: Path, parts: Sequence[Part]) -> Aligned:
         stream = LevelledStream(values["start"], *(arrays[name] for name in _STREAM))
         pieces.append(AlignedPiece(stream, *(arrays[name] for name in _TRUTH)))
     name, kind, attributes, problems = (parts[0][0][key] for key in _SHARED)
-    return Aligned(path, name, kind, attributes, pieces, tuple(problems))
+    return Aligned(
+        path, name, kind, attributes, pieces, tuple(Finding(**each) for each in problems)
+    )

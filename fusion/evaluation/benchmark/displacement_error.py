@@ -20,9 +20,9 @@ from typing import NamedTuple
 import numpy as np
 
 from stario.fusion.evaluation.benchmark.aligned import Aligned, AlignedPiece, Complex
-from stario.fusion.evaluation.benchmark.direction import Direction, direction
 from stario.fusion.evaluation.benchmark.network_alone import Predictions
-from stario.sequences.levelled_stream import TICK_SECONDS
+from stario.fusion.imu.direction import Direction, direction, weighted_force
+from stario.sequences.levelled_stream import TICK_SECONDS, TICKS_PER_SECOND
 from stario.sequences.sequence import BoolArray, FloatArray
 
 HORIZONS = (1, 10, 30)
@@ -148,7 +148,8 @@ def recording_errors(aligned: Aligned, found: Sequence[Predictions]) -> Recordin
         before = sums.path
         add_errors(piece, predictions, sums)
         paths.append(sums.path - before)
-        total_direction += direction(piece.stream, predictions.displacement_N)
+        weighted = weighted_force(piece.stream.windows())
+        total_direction += direction(weighted, predictions.displacement_N, TICKS_PER_SECOND)
     if sums.path < _MIN_PATH_M:
         unknown = dict.fromkeys(FIGURES, float("nan"))
         return RecordingErrors(0.0, unknown, {})

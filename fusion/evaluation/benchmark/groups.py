@@ -173,7 +173,8 @@ def _errors(
 ) -> RecordingErrors:
     found = recording_errors(aligned, predictions(model, aligned))
     if read is not None and not isinstance(model, RecordingPredictor):
-        found.figures["nis_ekf"] = Navigator(model).run(read(aligned.path)).nis or np.nan
+        navigator = Navigator(model, backend="ekf")
+        found.figures["nis_ekf"] = navigator.run(read(aligned.path)).nis or np.nan
     return found
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from time import process_time
 from typing import Any, get_args
@@ -17,11 +16,11 @@ from stario.fusion.evaluation.checks.faults import (
     matched_config,
     with_true_displacements,
 )
-from stario.fusion.evaluation.scores import Column, parts, scored
+from stario.fusion.evaluation.scores import Column, parts, scored, wide
 from stario.fusion.evaluation.text import table
 from stario.fusion.evaluation.tracks import true_poses
-from stario.fusion.filter.estimator_state import innovations_of
-from stario.fusion.graph.fixed_lag import FixedLagEstimator
+from stario.fusion.filter.record import innovations_of
+from stario.fusion.graph import fixed_lag
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.recording import PreprocessedRecording
@@ -90,21 +89,26 @@ def score_recording(
 
 
 def summary(scores: pd.DataFrame) -> dict[str, object]:
-    """Return medians over recordings, and errors relative to the filter's, as plain values."""
+    """Return medians over recordings, and errors relative to the filter's, as plain values.
 
-    def by_name(values: FloatArray) -> dict[str, float]:
-        return dict(zip(ESTIMATORS, values.tolist(), strict=True))
-
-    errors, nees, seconds = (_by_estimator(scores, metric) for metric in _FIELDS)
-    medians, (ratios, deviations) = np.median(errors, axis=0), _mean_ratios(errors)
+    Ratios are geometric means with their standard errors, without which two similar estimators seem
+    to differ: the ratio of their medians changes by a tenth with another twenty walks.
+    """
+    table = wide(scores).set_index(["recording", "track"])[[*_FIELDS]].unstack("track")
+    medians, errors = table.median(), table["ate_m"]
+    logs = np.log(errors.div(errors["ekf"], axis=0))
+    ratios = np.exp(logs.mean())
+    figures = {
+        "median_ate_m": medians["ate_m"],
+        "median_ate_to_ekf": medians["ate_m"] / medians["ate_m"]["ekf"],
+        "mean_ratio_to_ekf": ratios,
+        "mean_ratio_error": ratios * logs.sem().fillna(0.0),
+        "median_nees": medians["nees"],
+        "s_per_min": medians["s_per_min"],
+    }
     return {
         "recordings": len(errors),
-        "median_ate_m": by_name(medians),
-        "median_ate_to_ekf": by_name(medians / medians[0]),
-        "mean_ratio_to_ekf": by_name(ratios),
-        "mean_ratio_error": by_name(deviations),
-        "median_nees": by_name(np.median(nees, axis=0)),
-        "s_per_min": by_name(np.median(seconds, axis=0)),
+        **{name: found[[*ESTIMATORS]].to_dict() for name, found in figures.items()},
         "slowest_update_ms": replace(_SLOWEST, over=np.max).value(scores),
     }
 
@@ -127,23 +131,6 @@ def score_table(scores: pd.DataFrame) -> str:
     )
     rows = [*parts(scores, "recording", whole=None), ("median", scores)]
     return table(rows, _COLUMNS, ("",), notes)
-
-
-def _by_estimator(scores: pd.DataFrame, metric: str) -> FloatArray:
-    """Return a metric (recordings, estimators)."""
-    found = scores[scores["metric"] == metric].pivot(index="recording", columns="track")["value"]
-    return np.asarray(found[list(ESTIMATORS)])
-
-
-def _mean_ratios(ate: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the geometric mean (3,) of the ratios of errors (N, 3) to the EKF's, and its error.
-
-    Without the standard error (3,), two similar estimators seem to differ: the ratio of their
-    medians changes by a tenth with another twenty walks.
-    """
-    logs = np.log(ate / ate[:, :1])
-    mean = np.exp(logs.mean(axis=0))
-    return mean, mean * logs.std(axis=0) / math.sqrt(max(len(logs) - 1, 1))
 
 
 def _scored(
@@ -176,14 +163,14 @@ def _streamed(
     preprocessed: PreprocessedRecording, config: NavigatorConfig
 ) -> tuple[Track, FloatArray]:
     """Return the newest states of the fixed-lag graph, and the processor time of each step [s]."""
-    estimator = FixedLagEstimator(config, preprocessed.start)
-    states, times = [estimator.nav_state()], []
+    state = fixed_lag.begin(config, preprocessed.start)
+    states, times = [state.nav_state()], []
     for interval, measurement in zip(
         preprocessed.intervals, preprocessed.measurements, strict=True
     ):
         began = process_time()
-        estimator.step(interval, measurement)
-        states.append(estimator.nav_state())
+        state, _ = fixed_lag.step(state, interval, measurement, (), config)
+        states.append(state.nav_state())
         times.append(process_time() - began)
-    health = estimator.health(preprocessed.front_end.counts)
+    health = state.health(preprocessed.front_end.counts, config.filter)
     return track_from_states(states, innovations_of([]), health), np.array(times)

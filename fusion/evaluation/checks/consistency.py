@@ -1,16 +1,16 @@
 """Monte Carlo check that the filter's covariance matches its errors.
 
-Walks are analytic, so their IMU is exact; the sensor's noise, its biases, the displacements' noise
-and the initial state's errors are drawn with a configuration's standard deviations. The navigator's
-own filter runs on them, with its rates, windows and gates. For a consistent filter the NEES of n
-states averages to n, and its mean over N independent runs follows chi-square with n N degrees of
-freedom, divided by N.
+The IMU of simulated walks is exact; the sensor's noise, its biases and scale, the displacements'
+noise and the initial state's errors are drawn with a configuration's standard deviations. The
+navigator's own filter runs on them, with its rates, windows and gates. For a consistent filter the
+NEES of n states averages to n, and its mean over N independent runs follows chi-square with n N
+degrees of freedom, divided by N.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,13 +18,13 @@ import pandas as pd
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.scores import Column, joined, scored
+from stario.fusion.filter import estimator
+from stario.fusion.filter.correlated_errors import ACCEL_SHARE, displacement_errors
 from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
 from stario.fusion.filter.estimates import Estimate
-from stario.fusion.filter.estimator import Estimator
-from stario.fusion.filter.estimator_state import innovations_of
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import ACTUAL, CORE
-from stario.fusion.filter.network_errors import ACCEL_SHARE, displacement_errors
+from stario.fusion.filter.record import innovations_of
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.stateful import WindowDisplacement, slope_variance
 from stario.fusion.lie import log_se23, yaw_rotation
@@ -32,7 +32,9 @@ from stario.fusion.recording import Progress, cut_recording, silent
 from stario.sequences.accuracy.nees import nees_bounds
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import WINDOW_SECONDS
 
 RATE = 200.0
@@ -47,6 +49,10 @@ _DISPLACEMENT_SIGMA = 0.1
 """Standard deviation of the displacements per axis [m], as of a good network. Far smaller values
 reveal that an unknown initial speed and an unknown yaw interact beyond first order: with 0.03 m the
 NEES of the first minute is 19 instead of 16."""
+
+
+_STYLE = WalkStyle(carry="rig")
+"""Carried smoothly: strapdown integration of 200 Hz has errors far below those that are drawn."""
 
 
 def _rms(values: FloatArray) -> float:
@@ -127,111 +133,58 @@ def consistency(
     return joined(found)
 
 
-@dataclass(frozen=True, eq=False)
-class AnalyticWalk:
-    """Closed-form walk along a bending path with the bounce and sway of steps.
-
-    Attributes:
-        time: (N,) times [s].
-        R_WB: (N, 3, 3) attitude.
-        velocity_W: (N, 3) velocity [m/s].
-        position_W: (N, 3) position [m].
-        gyro: (N, 3) exact rate in B [rad/s].
-        accel: (N, 3) exact specific force in B [m/s^2].
-    """
-
-    time: FloatArray
-    R_WB: FloatArray
-    velocity_W: FloatArray
-    position_W: FloatArray
-    gyro: FloatArray
-    accel: FloatArray
-
-
-# Axis, amplitude [m] and frequency [Hz] of the sines that add up to a walk's position.
-_SINES = (
-    (0, 6.0, 0.021),
-    (1, 8.0, 0.017),
-    (0, 1.0, 0.11),
-    (1, 1.2, 0.09),
-    (2, 0.03, 1.9),
-    (0, 0.02, 0.95),
-)
-
-
-def analytic_walk(seconds: float, rng: np.random.Generator, gravity: float) -> AnalyticWalk:
-    """Draw a walk: a sum of sines with random phases, with its analytic derivatives."""
-    t = np.arange(round(seconds * RATE) + 1) / RATE
-    phase = rng.uniform(0.0, 2.0 * np.pi, 8)
-    p, v, a = np.zeros((3, len(t), 3))
-    for (axis, amplitude, frequency), shift in zip(_SINES, phase, strict=False):
-        w = 2.0 * np.pi * frequency
-        p[:, axis] += amplitude * np.sin(w * t + shift)
-        v[:, axis] += amplitude * w * np.cos(w * t + shift)
-        a[:, axis] -= amplitude * w * w * np.sin(w * t + shift)
-    h = 1e-4
-    R = _attitude(t, phase)
-    turn = _attitude(t - h, phase).transpose(0, 2, 1) @ _attitude(t + h, phase)
-    odd = turn - turn.transpose(0, 2, 1)
-    gyro = np.stack([odd[:, 2, 1], odd[:, 0, 2], odd[:, 1, 0]], axis=1) / (4.0 * h)
-    force = (R.transpose(0, 2, 1) @ (a + gravity * _VERTICAL)[..., None])[..., 0]
-    return AnalyticWalk(t, R, v, p, gyro, force)
-
-
-def _attitude(t: FloatArray, phase: FloatArray) -> FloatArray:
-    yaw = 1.2 * np.sin(0.4 * t + phase[6]) + 0.05 * t
-    roll = 0.15 * np.sin(2.0 * np.pi * 0.95 * t + phase[7])
-    pitch = 0.6 + 0.1 * np.sin(2.0 * np.pi * 1.9 * t)
-    sway = np.stack([roll, pitch, np.zeros_like(t)], axis=1)
-    attitude: FloatArray = exp_so3(yaw[:, None] * _VERTICAL) @ exp_so3(sway)
-    return attitude
-
-
-_VERTICAL = np.array([0.0, 0.0, 1.0])
-
-
 def _run(config: NavigatorConfig, yaw_sigma: float, seconds: float, seed: int) -> dict[str, float]:
     """Return the figures of a run, of the errors at every second."""
     rng = np.random.default_rng(seed)
-    walk = analytic_walk(seconds, rng, config.gravity)
+    track = generate_walk(seed, seconds, style=_STYLE)
+    exact = simulate_imu(track, RATE, PERFECT_IMU, gravity=config.gravity)
+    walk = exact.truth
+    assert walk is not None  # simulated recordings have one
     prior, b_g, b_a = _drawn_start(walk, config, yaw_sigma, rng)
     white, noise = math.sqrt(RATE), config.noise
     for bias, density in ((b_g, noise.gyro_walk), (b_a, noise.accel_walk)):
         bias += density * rng.normal(size=bias.shape).cumsum(axis=0) / white
-    gyro = walk.gyro + b_g + noise.gyro_noise * white * rng.normal(size=b_g.shape)
+    gyro = exact.gyro + b_g + noise.gyro_noise * white * rng.normal(size=b_g.shape)
+    # Errors of scale and alignment are independent from one interval to the next, as assumed.
+    part = np.arange(len(exact)) * config.filter.output_rate // round(RATE)
+    rate = np.linalg.norm(exact.gyro, axis=1, keepdims=True)
+    gyro += noise.gyro_scale * rate * rng.normal(size=(part[-1] + 1, 3))[part]
     share = ACCEL_SHARE if config.filter.correlated_errors else 1.0
     accel_noise = math.sqrt(share) * noise.accel_noise
-    accel = walk.accel + b_a + accel_noise * white * rng.normal(size=b_a.shape)
+    accel = exact.accel + b_a + accel_noise * white * rng.normal(size=b_a.shape)
 
-    intervals, front_end = cut_recording(ImuSequence("walk", walk.time, gyro, accel), config)
+    intervals, front_end = cut_recording(ImuSequence("walk", exact.time, gyro, accel), config)
     assert front_end.start is not None  # two seconds are enough
-    estimator = Estimator(config, front_end.start, prior)
+    state = estimator.begin(config, front_end.start, prior)
     network = _DrawnNetwork(walk, config, rng)
-    rows, steps = [], []
+    rows, records = [], []
     for count, interval in enumerate(intervals, 1):
-        steps.append(estimator.step(interval, network.displacement(interval)))
+        measured = network.displacement(interval)
+        state, record = estimator.step(state, interval, measured, (), config)
+        records.append(record)
         if count % config.filter.output_rate == 0:
             k = round(interval.stop * RATE)
-            rows.append(_errors(estimator.estimate(), walk, k, b_g[k], b_a[k]))
+            rows.append(_errors(record.estimate, walk, k, b_g[k], b_a[k]))
     nees, yaw_square, yaw_variance = np.array(rows).T
     return {
         "nees": float(nees.mean()),
         "nees_end": float(nees[-1]),
         "yaw": float((yaw_square / yaw_variance).mean()),
-        "nis": float(innovations_of(steps).nis.mean()),
+        "nis": float(innovations_of(records).nis.mean()),
         "yaw_sigma": math.sqrt(yaw_variance[-1]),
         "yaw_error": math.sqrt(yaw_square[-1]),
     }
 
 
 def _drawn_start(
-    walk: AnalyticWalk, config: NavigatorConfig, yaw_sigma: float, rng: np.random.Generator
+    walk: Trajectory, config: NavigatorConfig, yaw_sigma: float, rng: np.random.Generator
 ) -> tuple[PriorPose, FloatArray, FloatArray]:
     """Draw the prior on the first pose and the true biases (N, 3)."""
     f = config.filter
     sigmas = np.array([f.tilt_sigma, f.tilt_sigma, yaw_sigma])
+    assert walk.velocity_W is not None  # those of simulated walks are known
     prior = PriorPose(
-        R_WB=exp_so3(-sigmas * rng.normal(size=3)) @ walk.R_WB[0],
+        R_WB=exp_so3(-sigmas * rng.normal(size=3)) @ walk.attitude_WB[0].as_matrix(),
         v_W=walk.velocity_W[0] - f.velocity_sigma * rng.normal(size=3),
         p_W=walk.position_W[0] - _POSITION_SIGMA * rng.normal(size=3),
         tilt_sigma=f.tilt_sigma,
@@ -255,9 +208,7 @@ class _DrawnNetwork:
         rng: source of the errors.
     """
 
-    def __init__(
-        self, walk: AnalyticWalk, config: NavigatorConfig, rng: np.random.Generator
-    ) -> None:
+    def __init__(self, walk: Trajectory, config: NavigatorConfig, rng: np.random.Generator) -> None:
         self._walk, self._config, self._rng = walk, config, rng
         self._lasting = rng.normal(size=len(CONSIDERED_SECONDS))
         self._time = 0.0
@@ -277,22 +228,23 @@ class _DrawnNetwork:
         covariance = _DISPLACEMENT_SIGMA**2 * np.eye(3)
         covariance[2, 2] += slope_variance(d_W)
         if f.correlated_errors:
-            errors = displacement_errors(d_W, covariance, 1.0, False, f)
+            errors = displacement_errors(d_W, covariance, 1.0, f)
             d_W = d_W + errors.considered @ self._lasting
             white = errors.white
         else:  # overlapping windows count as less certain than each one is
             white = f.overlap_scale * covariance
         d_W = d_W + np.linalg.cholesky(white) @ rng.normal(size=3)
-        R_WN = yaw_rotation(walk.R_WB[start] @ interval.window.R_NB.T)
+        R_WN = yaw_rotation(walk.attitude_WB[start].as_matrix() @ interval.window.R_NB.T)
         return WindowDisplacement(R_WN.T @ d_W, covariance, interval.window.R_NB)
 
 
 def _errors(
-    now: Estimate, walk: AnalyticWalk, k: int, b_g: FloatArray, b_a: FloatArray
+    now: Estimate, walk: Trajectory, k: int, b_g: FloatArray, b_a: FloatArray
 ) -> tuple[float, float, float]:
     """Return the NEES, the squared yaw error and the yaw's variance at sample k."""
     X, P = now.X, now.covariances[ACTUAL]
-    R = walk.R_WB[k] @ X[:, :3].T
+    assert walk.velocity_W is not None  # those of simulated walks are known
+    R = walk.attitude_WB[k].as_matrix() @ X[:, :3].T
     pose = log_se23(R, walk.velocity_W[k] - R @ X[:, 3], walk.position_W[k] - R @ X[:, 4])
     error = np.concatenate([pose, b_g - now.b_g, b_a - now.b_a])
     return float(error @ np.linalg.solve(P, error)), float(error[2] ** 2), float(P[2, 2])

@@ -65,7 +65,7 @@ def fusion_gain(
     if truth is None and sequence.positions is None:
         raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
     preprocessed = Navigator(model, config).observe(sequence)
-    alone = _error(measure(network_track(preprocessed), sequence))
+    alone = fitted_error(measure(network_track(preprocessed), sequence))
     if math.isnan(alone):
         raise InputError(
             f"{sequence.name}: positions",
@@ -77,7 +77,7 @@ def fusion_gain(
     for name in backends:
         track = Navigator(model, config, backend=name).track(preprocessed)
         found = measure(track, sequence)
-        error = _error(found)
+        error = fitted_error(found)
         figures[name] = {"error_m": error, "percent": 100.0 * error / path if path else None}
         figures[name] |= {"ratio": error / alone, "nis": found["nis_mean"]}
         if truth is not None:
@@ -127,7 +127,7 @@ def _yaw_at_the_end(track: Track, truth: Trajectory) -> dict[str, float]:
     }
 
 
-def _error(figures: Metrics) -> float:
+def fitted_error(figures: Metrics) -> float:
     """Return the horizontal error after a fit of yaw and position [m]; NaN if unknown."""
     fitted = figures["ate_fit_m"]
     found = figures["known_positions_m"] if fitted is None else fitted

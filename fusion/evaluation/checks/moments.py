@@ -18,6 +18,7 @@ from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.benchmark.aligned import Complex
 from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position
+from stario.fusion.evaluation.checks.simulation import simulated_walk
 from stario.fusion.evaluation.scores import Column, geometric_mean, joined, parts, scored
 from stario.fusion.evaluation.text import table
 from stario.fusion.evaluation.tracks import network_track
@@ -30,11 +31,8 @@ from stario.sequences.attitude.stacks import composed
 from stario.sequences.clean_samples import clean_samples
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence
-from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.insertion import Inserted, insert_moment
-from stario.sequences.simulation.magnetometer import INDOOR_FIELD
 from stario.sequences.simulation.moments import MOMENTS
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 PLACES = {"start": 0.0, "middle": 0.5, "end": 0.85}
 """Instants of a moment, as shares of the recording."""
@@ -78,12 +76,7 @@ _COLUMNS = (
 
 def simulated_walks() -> list[ImuSequence]:
     """Simulate a walk of each carrying mode, with a phone's sensors in a building."""
-    walks = []
-    for k, carry in enumerate(_CARRIES):
-        walk = generate_walk(k, 120.0, style=WalkStyle(carry=carry))
-        imu = simulate_imu(walk, 100.0, PHONE_IMU, k, name=carry, magnetic_field=INDOOR_FIELD)
-        walks.append(imu)
-    return walks
+    return [simulated_walk(carry, seed) for seed, carry in enumerate(_CARRIES)]
 
 
 def moment_costs(

@@ -61,7 +61,7 @@ def end_shifts(
     Raises:
         InputError: the recording cannot be run, or its track is shorter than a metre.
     """
-    navigator = Navigator(model, config)
+    navigator = Navigator(model, config, backend="ekf")
     unmodified = navigator.run(sequence)
     steps = np.diff(unmodified.trajectory.position_W[:, :2], axis=0)
     path = float(np.linalg.norm(steps, axis=1).sum())

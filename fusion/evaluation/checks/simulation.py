@@ -14,6 +14,7 @@ import pandas as pd
 from scipy.signal import butter, sosfiltfilt, welch
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.checks.fusion_gain import fitted_error
 from stario.fusion.evaluation.compare import Metrics, measure
 from stario.fusion.evaluation.scores import Column, scored
 from stario.fusion.evaluation.text import table
@@ -34,7 +35,8 @@ CARRIED = {
     "handheld (at the ear)": "call",
     "swinging": "swinging",
     "bag": "bag",
-    "handheld (flat in front)": "handheld",
+    "handheld": "handheld",
+    "handheld (flat in front)": "in-front",
 }
 """The simulator's carrying mode for an archive's attribute `carry`."""
 
@@ -46,6 +48,7 @@ SPEEDS = {
     "swinging": 0.9,
     "bag": 1.25,
     "handheld": 1.2,
+    "in-front": 1.2,
 }
 """Preferred speeds [m/s] of the simulated walks: the archives' medians while walking, since bands
 grow with the speed."""
@@ -104,9 +107,7 @@ def motion_scores(
     figures: Metrics = dict(motion(sequence))
     figures["speed"] = length / sequence.duration
     for name, track in (("network", network_track(observed)), ("graph", navigator.track(observed))):
-        found = measure(track, sequence)
-        error = found["known_positions_m"] if found["ate_fit_m"] is None else found["ate_fit_m"]
-        figures[name] = None if error is None else 100.0 * error / length
+        figures[name] = 100.0 * fitted_error(measure(track, sequence)) / length
     return scored(sequence.name, {kind: figures}, carry)
 
 
@@ -129,7 +130,7 @@ def _in_band(values: FloatArray, low: float, high: float) -> FloatArray:
 
 def _step_rates(force: FloatArray) -> FloatArray:
     """Return the strongest frequency (M,) [Hz] of the force's norm in each window."""
-    count = round(_STEP_WINDOW * _RATE)
+    count = min(round(_STEP_WINDOW * _RATE), len(force))
     windows = force[: len(force) // count * count].reshape(-1, count)
     f, power = welch(windows, _RATE, nperseg=count, nfft=4 * count)
     possible = (f > _STEP_RATES[0]) & (f < _STEP_RATES[1])

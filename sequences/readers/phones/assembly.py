@@ -22,8 +22,7 @@ from stario.sequences.readers.clocks import resample_to_gyro, source_words
 from stario.sequences.readers.lines import may_be_read
 from stario.sequences.readers.phones.attitude import device_attitude, logged_attitude
 from stario.sequences.readers.phones.files import NO_SAMPLES, PhoneFiles, app_of
-from stario.sequences.readers.phones.reference_points import reference_points
-from stario.sequences.readers.phones.satellites import satellite_positions
+from stario.sequences.readers.phones.known_positions import reference_points, satellite_positions
 from stario.sequences.readers.phones.sensor_table import Samples, SensorTable, read_samples
 from stario.sequences.readers.phones.sensor_words import Sensor
 from stario.sequences.readers.phones.sign import accel_sign, is_in_g

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.json_file import read_json
-from stario.sequences.readers.lines import head_lines
+from stario.sequences.readers.lines import head_lines, read_json
 
 _FIRST = re.compile(r"\ufeff?\s*\[\s*\{[^{}]*\"sensor\"\s*:")
 _NAME = re.compile(r"\w+")

@@ -10,27 +10,18 @@ The rows are sorted into a file for each sensor, to be read as the folder of a p
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.lines import head_lines, is_row, read_lines, unquoted
+from stario.sequences.readers.lines import head_lines, is_row, read_lines
 from stario.sequences.readers.phones.files import SUFFIXES
 from stario.sequences.readers.phones.sensor_words import sensor_of, words_of
 from stario.sequences.readers.table_head import first_row
+from stario.sequences.readers.text import RowFormat
 
 _HEAD_ROWS = 50
 _MIN_SHARE = 0.5
 """Share of the first rows that must name a known sensor; others are of other sensors."""
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """Index of the first row, separator of the cells, and index of the column of sensors."""
-
-    first: int
-    delimiter: str | None
-    column: int
 
 
 def is_long_form(path: Path) -> bool:
@@ -38,7 +29,7 @@ def is_long_form(path: Path) -> bool:
     if path.suffix.lower() not in SUFFIXES or not path.is_file():
         return False
     lines = [line for line in head_lines(path)[:-1] if is_row(line)]
-    return not is_echo(lines) and _layout(lines) is not None
+    return not is_echo(lines) and _column_of_sensors(lines) is not None
 
 
 def is_echo(lines: list[str]) -> bool:
@@ -53,39 +44,33 @@ def unpack_long_form(path: Path, folder: Path) -> None:
         ReadError: the file cannot be read or has another form.
     """
     lines = [line for line in read_lines(path) if is_row(line)]
-    layout = _layout(lines)
-    if layout is None:
+    found = _column_of_sensors(lines)
+    if found is None:
         raise ReadError(path, "rows", "none that name a sensor", "a column of sensors' names")
-    above, below = lines[max(layout.first - 1, 0) : layout.first], lines[layout.first :]
-    titles = [_cells(line, layout.delimiter) for line in above]
+    written, column = found
+    rows = [[cell.strip() for cell in written.cells(line)] for line in lines]
+    titles, below = rows[max(written.skip - 1, 0) : written.skip], rows[written.skip :]
     sensors: dict[str, list[list[str]]] = {}
-    for row in (_cells(line, layout.delimiter) for line in below):
-        name = "".join(row[layout.column : layout.column + 1])
-        stem = re.sub(r"\W+", "_", name) or "unnamed"
+    for row in below:
+        stem = re.sub(r"\W+", "_", "".join(row[column : column + 1])) or "unnamed"
         sensors.setdefault(stem, []).append(row)
     for stem, own in sensors.items():
-        kept = ([cell for k, cell in enumerate(row) if k != layout.column]
-                for row in [*titles, *own])  # fmt: skip
-        text = "".join((layout.delimiter or " ").join(row) + "\n" for row in kept)
+        kept = ([*row[:column], *row[column + 1 :]] for row in [*titles, *own])
+        text = "".join((written.delimiter or " ").join(row) + "\n" for row in kept)
         (folder / f"{stem}.csv").write_text(text, encoding="utf-8")
 
 
-def _layout(lines: list[str]) -> _Layout | None:
-    """Return how lines without blank ones are written, None if they are not of this form."""
-    found = first_row(lines[:_HEAD_ROWS], least=3)  # the time may be a date
-    if found is None:
+def _column_of_sensors(lines: list[str]) -> tuple[RowFormat, int] | None:
+    """Return how rows among non-blank lines are written, and the column that names sensors."""
+    written = first_row(lines[:_HEAD_ROWS], least=3)  # the time may be a date
+    if written is None:
         return None
-    first, delimiter, _ = found
-    rows = [_cells(line, delimiter) for line in lines[first : first + _HEAD_ROWS]]
+    rows = [written.cells(line) for line in lines[written.skip : written.skip + _HEAD_ROWS]]
     rows = [row for row in rows if len(row) == len(rows[0])]
     for column, cells in enumerate(zip(*rows, strict=True)):
         if len(rows) > 1 and sum(map(_names_sensor, cells)) >= _MIN_SHARE * len(cells):
-            return _Layout(first, delimiter, column)
+            return written, column
     return None
-
-
-def _cells(line: str, delimiter: str | None) -> list[str]:
-    return [cell.strip() for cell in unquoted(line, delimiter).split(delimiter)]
 
 
 def _names_sensor(cell: str) -> bool:

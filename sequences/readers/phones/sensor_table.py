@@ -17,25 +17,15 @@ from stario.sequences.readers.clocks import assumed_unit, refuse_counts_and_date
 from stario.sequences.readers.columns import Column, unit_factor
 from stario.sequences.readers.devices import refuse_several_devices
 from stario.sequences.readers.phones.sensor_layout import Layout, by_header, by_rows
+from stario.sequences.readers.phones.sensor_words import SENSORS, Sensor
 from stario.sequences.readers.table_head import TableHead, table_heads
 from stario.sequences.readers.text import IntArray, Table
 from stario.sequences.sequence import BoolArray, FloatArray
-from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS
 
 _log = logging.getLogger(__name__)
 
-UNITS = {
-    "accel": ACCEL_UNITS,
-    "linear": ACCEL_UNITS,
-    "gravity": ACCEL_UNITS,
-    "gyro": GYRO_UNITS,
-    "mag": MAGNETIC_UNITS,
-}
-_LIMITS = {"accel": 2e3, "linear": 2e3, "gravity": 2e3, "gyro": 1e4, "mag": 1e5}
-"""Maximum values of any sensor, in m/s^2, deg/s and uT."""
-
 _WILD = 100.0
-"""Factor beyond these limits at which one sample would spoil integrals and interpolation."""
+"""Factor beyond a sensor's limit at which one sample would spoil integrals and interpolation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +74,7 @@ def sensor_table(file: Path) -> SensorTable | None:
     return None
 
 
-def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
+def read_samples(table: SensorTable, sensor: Sensor, axes: str) -> Samples:
     """Read a sensor's samples in the columns `table.axes[axes]`.
 
     They are in rad/s, m/s^2 or uT if the file names a unit.
@@ -97,12 +87,9 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
         fix = "keep the columns of one"
         raise ReadError(table.file, "header", f"several IMUs ({table.conflict})", "one", fix)
     places, clock = table.axes[axes], table.clocks.get(axes, table.clock)
-    head = table.head
-    refuse_several_devices(
-        table.file, head.titles, head.layout.skip, head.layout.delimiter, places[0].index
-    )
     titles = ", ".join(p.title or f"column {p.index + 1}" for p in places)
     rows = table.read([clock, *places, *table.biases])
+    refuse_several_devices(rows, table.head.titles, places[0].index)
     kept = _complete_rows(table.file, sensor, titles, rows.values[:, 1:])
     if not clock.unit:
         refuse_counts_and_dates(table.file, clock.title or "time", rows.values[:, 0])
@@ -110,7 +97,7 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
     if table.biases:
         values = values - rows.values[kept, 4:7]
     named = next((place for place in places if place.unit), places[0])
-    values = unit_factor(table.file, named, UNITS[sensor]) * values
+    values = unit_factor(table.file, named, SENSORS[sensor].units) * values
     sound = _sound_samples(table.file, sensor, titles, values)
     kept, time, values = kept[sound], time[sound], values[sound]
     unit_ns = time_unit(table.file, time, clock.unit)
@@ -119,7 +106,7 @@ def read_samples(table: SensorTable, sensor: str, axes: str) -> Samples:
     return Samples(stamps, values, named.unit, assumed)
 
 
-def _complete_rows(file: Path, sensor: str, titles: str, values: FloatArray) -> IntArray:
+def _complete_rows(file: Path, sensor: Sensor, titles: str, values: FloatArray) -> IntArray:
     """Return the rows without a blank cell, and warn of those that have some values.
 
     Rows without any are those of other sensors in a wide file.
@@ -133,7 +120,7 @@ def _complete_rows(file: Path, sensor: str, titles: str, values: FloatArray) -> 
     return kept
 
 
-def _sound_samples(file: Path, sensor: str, titles: str, values: FloatArray) -> BoolArray:
+def _sound_samples(file: Path, sensor: Sensor, titles: str, values: FloatArray) -> BoolArray:
     """Return which samples (N,) are not wild, such as infinite, and warn of those that are.
 
     Raises:
@@ -141,13 +128,13 @@ def _sound_samples(file: Path, sensor: str, titles: str, values: FloatArray) -> 
     """
     size = np.abs(values).max(axis=1)
     typical = float(np.median(size))
-    if typical > _LIMITS[sensor]:
-        unit = next(iter(UNITS[sensor]))
+    if typical > SENSORS[sensor].limit:
+        unit = next(iter(SENSORS[sensor].units))
         raise ReadError(
             file, titles, f"{typical:.3g} on average", f"a plausible value in {unit}",
             "is one of these columns a clock or of another sensor?",
         )  # fmt: skip
-    sound = size <= _WILD * _LIMITS[sensor]
+    sound = size <= _WILD * SENSORS[sensor].limit
     if not sound.all():
         _log.warning("%s: dropped %d wild samples of the %s", file, (~sound).sum(), sensor)
     return np.asarray(sound)

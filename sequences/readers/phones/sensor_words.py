@@ -7,11 +7,19 @@ which are then looked up, so that order, case and surrounding characters do not 
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
-from stario.sequences.units import TIME_UNITS, unit_named
+from stario.sequences.units import (
+    ACCEL_UNITS,
+    GYRO_UNITS,
+    MAGNETIC_UNITS,
+    TIME_UNITS,
+    unit_named,
+)
 
 Sensor = Literal["accel", "gyro", "mag", "gravity", "linear", "attitude"]
 
@@ -22,20 +30,34 @@ _WITHOUT_G = re.compile(r"\bwithout[-_ ]g\b", flags=re.IGNORECASE)
 _ANG_VEL = re.compile(r"(?<![a-z])ang[-_ ]?vel(?![a-z])", flags=re.IGNORECASE)
 _GLUED = re.compile(r"(?P<stem>[a-z]*?)(?P<axis>[xyz])")
 
-_BEGINNINGS: dict[Sensor, tuple[str, ...]] = {
-    "linear": ("lin", "user", "free"),
-    "gravity": ("grav",),
-    "gyro": ("gyr", "giro", "angular", "omega"),
-    "mag": ("mag",),
-    "accel": ("acc", "aceler", "beschleunig"),
-    "attitude": ("quat", "orient", "attitude", "rotation", "game"),
+
+@dataclass(frozen=True)
+class SensorKind:
+    """What tells a sensor, and what its values can be.
+
+    Attributes:
+        beginnings: beginnings of words that name it.
+        words: whole words that do.
+        units: its units by name, with their factors to the first.
+        limit: largest value of any such sensor, in deg/s for gyroscopes.
+    """
+
+    beginnings: tuple[str, ...]
+    words: tuple[str, ...] = ()
+    units: Mapping[str, float] = field(default_factory=dict)
+    limit: float = math.inf
+
+
+SENSORS: dict[Sensor, SensorKind] = {
+    "linear": SensorKind(("lin", "user", "free"), (), ACCEL_UNITS, 2e3),
+    "gravity": SensorKind(("grav",), (), ACCEL_UNITS, 2e3),
+    "gyro": SensorKind(("gyr", "giro", "angular", "omega"), ("g", "w"), GYRO_UNITS, 1e4),
+    "mag": SensorKind(("mag",), ("m", "b"), MAGNETIC_UNITS, 1e5),
+    "accel": SensorKind(("acc", "aceler", "beschleunig"), ("a", "gf", "force"), ACCEL_UNITS, 2e3),
+    "attitude": SensorKind(("quat", "orient", "attitude", "rotation", "game"), ("rv", "ori")),
 }
-_WHOLE: dict[Sensor, tuple[str, ...]] = {
-    "accel": ("a", "gf", "force"),
-    "gyro": ("g", "w"),
-    "mag": ("m", "b"),
-    "attitude": ("rv", "ori"),
-}
+"""The sensors of phones, in the order in which words are looked up."""
+
 _VARIANTS = ("total", "uncal", "calibrated", "field", "vector", "rate", "measurement")
 _NOT_SAMPLES = {
     *("bias", "drift", "offset", "calib", "calibration", "accuracy", "std", "variance"),
@@ -125,8 +147,8 @@ def _sensors(words: Iterable[str]) -> set[Sensor]:
 
 
 def _sensor(word: str) -> Sensor | None:
-    for sensor, beginnings in _BEGINNINGS.items():
-        if word.startswith(beginnings) or word in _WHOLE.get(sensor, ()):
+    for sensor, kind in SENSORS.items():
+        if word.startswith(kind.beginnings) or word in kind.words:
             return sensor
     return None
 

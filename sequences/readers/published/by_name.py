@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import finite_rows, magnetometer, rotations
-from stario.sequences.readers.json_file import read_json
-from stario.sequences.readers.lines import first_line, read_lines
-from stario.sequences.readers.text import Layout, read_table, seconds
+from stario.sequences.readers.lines import first_line, read_json, read_lines
+from stario.sequences.readers.text import RowFormat, read_table, seconds
 from stario.sequences.sequence import FloatArray, Magnetometer
 
 
@@ -47,7 +46,7 @@ class NamedColumns:
         read = [*names, *(axes_of(self._magnetic) if self._magnetic else [])]
         self._places = {name: k for k, name in enumerate(read)}
         self._columns = [header.index(name) for name in read]
-        self._table = read_table(path, self._columns, Layout(skip=1))
+        self._table = read_table(path, self._columns, RowFormat(skip=1))
         values = self._table.values[:, : len(names)]
         damaged = np.flatnonzero(~np.isfinite(values).all(axis=0))
         self._rows = finite_rows(path, ", ".join(read[k] for k in damaged), values)

@@ -26,7 +26,7 @@ from stario.sequences.readers.clocks import resample_to_gyro
 from stario.sequences.readers.lines import first_line
 from stario.sequences.readers.poses import pose_files, with_pose
 from stario.sequences.readers.published.ridi import UPRIGHT, is_ridi, read_ridi, y_is_up
-from stario.sequences.readers.text import IntArray, Layout, read_table, seconds
+from stario.sequences.readers.text import IntArray, RowFormat, read_table, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Magnetometer, Trajectory
 
 _FILES = ("acce.txt", "gyro.txt", "orientation.txt", "pose.txt")
@@ -61,12 +61,12 @@ def is_imunet(path: Path) -> bool:
 def _magnetometer(path: Path, start_ns: np.int64) -> Magnetometer | None:
     if not path.is_file() or first_line(path) is None:
         return None
-    table = read_table(path, 4, Layout(delimiter=None))
+    table = read_table(path, 4, RowFormat(delimiter=None))
     return magnetometer(seconds(table.stamps_ns(), start_ns), table.values[:, 1:])
 
 
 def _rows(path: Path, width: int) -> tuple[IntArray, FloatArray]:
-    table = read_table(path, 1 + width, Layout(delimiter=None))
+    table = read_table(path, 1 + width, RowFormat(delimiter=None))
     rows = finite_rows(path, "values", table.values)
     return table.stamps_ns(kept=rows), table.values[rows, 1:]
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import logging
 import socket
 import sys
+from itertools import count
 
 import pytest
 from phone_exports import androsensor
 
+from stario.fusion.commands.common import training_progress
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
 
@@ -16,11 +18,11 @@ from stario.sequences.readers.generic_csv import read_generic_csv
 def test_run_writes_a_report_only_on_request(stario, recording, tmp_path, no_figures):
     assert stario("run", recording, "--out", "plain").code == 0
     assert not (tmp_path / "plain/report.html").exists()
-    done = stario("run", recording, "--out", "told", "--report", "--backend", "graph")
+    done = stario("run", recording, "--out", "told", "--report", "--filtered")
     assert done.code == 0
     text = (tmp_path / "told/report.html").read_text()
     assert "<h1>walk</h1>" in text
-    assert "factor graph" in text
+    assert "filter, as in a stream" in text
     assert "Accuracy against ground truth" in text
     assert "in x and y only" in text
 
@@ -38,20 +40,24 @@ def test_a_warning_is_shown_once_however_often_a_file_is_read(
 
 
 def test_compare_writes_a_report_next_to_the_tracks(stario, recording, tmp_path, no_figures):
-    assert stario("compare", recording, "--out", "told", "--report").code == 0
+    done = stario("compare", recording, "--out", "told", "--report", "--tracks", "network")
+    assert done.code == 0
     text = (tmp_path / "told/walk/report.html").read_text()
-    for label in ("inertial", "network", "EKF", "factor graph", "truth"):
+    for label in ("dead reckoning (IMU alone)", "network alone", "StarIO", "truth"):
         assert f"</svg>{label}</button>" in text
+    assert "filter, as in a stream" not in text
 
 
 def test_compare_without_truth_shows_only_what_is_known(stario, recording, no_figures, tmp_path):
     write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
-    done = stario("compare", "blind.csv", "--out", "told", "--report")
+    done = stario("compare", "blind.csv", "--out", "told", "--report", "--tracks", "network")
     assert "ATE" not in done.out
-    assert "NIS: mean NIS" in done.out
+    assert "NIS" in done.out
     text = (tmp_path / "told/blind/report.html").read_text()
-    assert "</svg>EKF</button>" in text
-    assert "</svg>inertial</button>" not in text  # the map without truth leaves it out
+    assert "</svg>StarIO</button>" in text
+    assert (
+        "</svg>dead reckoning (IMU alone)</button>" not in text
+    )  # the map without truth leaves it out
 
 
 def test_view_writes_a_file_and_opens_it(stario, recording, tmp_path, no_figures, monkeypatch):
@@ -87,3 +93,17 @@ def test_live_refuses_a_port_in_use(stario):
 
 def test_live_refuses_an_invalid_address_of_a_phone(stario):
     stario("live", "--port", 0, "--phyphox", "file:///etc/passwd").assert_one_line_error("phyphox")
+
+
+def test_training_without_a_terminal_tells_its_progress_and_the_time_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Steps of four seconds: a line every third of them, none of seconds that had no step."""
+    clock = count(0.0, 4.0)
+    monkeypatch.setattr("stario.fusion.commands.common.monotonic", lambda: next(clock))
+    with training_progress(100) as progress:
+        for step in range(1, 8):
+            progress(step, 0.05)
+    lines = capsys.readouterr().err.split("\n")
+    assert lines[0] == "step 3 of 100, about 06:28 left, error 0.0500 m^2"
+    assert [line.split()[1] for line in lines if line.startswith("step")] == ["3", "6"]

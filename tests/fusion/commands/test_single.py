@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 import subprocess
@@ -36,7 +37,6 @@ COMMANDS = (
     *("run", "live", "compare", "evaluate", "inspect"),
     *("convert", "train", "simulate", "export"),
 )
-BOTH = ["ekf", "graph"]
 CHECKS = ("models", "backends", "faults", "consistency", "benchmark")
 
 
@@ -61,7 +61,7 @@ def test_every_command_prints_its_help(command: str) -> None:
 def test_help_shows_a_commands_own_options_first_and_names_every_format() -> None:
     result = CliRunner().invoke(app, ["run", "--help"], terminal_width=200)
     options, reading, estimation = re.split("─ (?:Reading|Estimation) ─", result.output)
-    assert "--backend" in options
+    assert "--filtered" in options
     assert re.search(r"--report +Also", options)  # a flag takes no value
     assert "--model" in estimation
     words = re.findall(r"\w+", reading)
@@ -157,13 +157,25 @@ def test_run_writes_a_track_and_prints_a_summary(stario, recording: Path, tmp_pa
     assert done.code == 0
     assert done.err == ""
     for words in (
-        *("walk: 12.0 s", "ATE [m]", "in x and y only"),
-        *("samples used 1201", "updates", "9 files in out"),
+        *("walk: generic CSV, 12.0 s at 100.0 Hz", "m in 12.0 s, ending", "m rms from the truth"),
+        *("height", "deg)", "out: track.tum, track.npz"),
     ):
         assert words in done.out
-    track = read_tum(tmp_path / "out" / "ekf.tum")
+    for words in ("rad", "refused none", "root mean square", "0.0%"):
+        assert words not in done.out
+    track = read_tum(tmp_path / "out" / "track.tum")
     assert track.time[-1] - track.time[0] == pytest.approx(12.0, abs=0.11)
     assert len(list((tmp_path / "out").iterdir())) == 9
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_the_printed_length_is_that_of_the_file(stario, recording: Path, tmp_path: Path) -> None:
+    done = stario("run", recording, "--out", "out")
+    (printed,) = re.findall(r"track: ([\d.]+) m in", done.out)
+    track = read_tum(tmp_path / "out/track.tum")
+    assert float(printed) == pytest.approx(track.path_length(), abs=0.051)
+    steps = np.linalg.norm(np.diff(track.position_W, axis=0), axis=1)
+    assert float(printed) == pytest.approx(steps.sum(), rel=0.06)  # the phone sways, and no more
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -171,21 +183,41 @@ def test_run_prints_json(stario, recording: Path, tmp_path: Path) -> None:
     done = stario("run", recording, "--json")
     figures = json.loads(done.out)
     assert figures["recording"] == "walk"
-    assert figures["ekf"]["ate_m"] > 0.0
+    assert figures["track"]["ate_m"] > 0.0
     assert (tmp_path / figures["folder"] / "metrics.json").exists()
 
 
 @pytest.mark.usefixtures("no_figures")
 def test_run_warns_of_a_truth_whose_positions_are_wrong(
-    stario, recording: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    stario, recording: Path, tmp_path: Path
 ) -> None:
-    assert stario("run", recording, "--json").code == 0
-    assert "unreliable" not in caplog.text
+    def codes(path: Path) -> set[str]:
+        return {found["code"] for found in json.loads(stario("run", path, "--json").out)["verdict"]}
+
+    assert "truth_positions_scale" not in codes(recording)
     walk = read_generic_csv(recording)
     truth = replace(walk.truth, position_W=1e3 * walk.truth.position_W)
     write_csv(tmp_path / "mm.csv", replace(walk, truth=truth))
-    assert stario("run", "mm.csv", "--json").code == 0
-    assert "errors are unreliable: mm: truth: positions that seem to be in mm" in caplog.text
+    assert "truth_positions_scale" in codes(tmp_path / "mm.csv")
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_run_inspect_and_report_give_one_verdict(stario, recording: Path, tmp_path: Path) -> None:
+    """Here on positions that contradict accelerometer and track."""
+    pytest.importorskip("plotly")
+    walk = read_generic_csv(recording)
+    truth = replace(walk.truth, position_W=3.0 * walk.truth.position_W)
+    write_csv(tmp_path / "wrong.csv", replace(walk, truth=truth))
+    run, inspection = (
+        json.loads(stario(*words, "--json").out)["verdict"]
+        for words in (("run", "wrong.csv", "--report"), ("inspect", "wrong.csv"))
+    )
+    assert run == inspection
+    page = (tmp_path / "runs/wrong/report.html").read_text()
+    assert all(html.escape(finding["text"]) in page for finding in run)
+    assert not any(finding["code"] == "nothing" for finding in run)
+    told = stario("run", "wrong.csv").out
+    assert all(told.count(finding["text"]) == 1 for finding in run)
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -193,8 +225,8 @@ def test_run_gives_the_same_track_without_truth(stario, recording: Path, tmp_pat
     write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
     assert stario("run", recording, "--out", "seen").code == 0
     done = stario("run", "blind.csv", "--out", "blind", "--json")
-    assert json.loads(done.out)["ekf"]["ate_m"] is None
-    seen, blind = ((tmp_path / name / "ekf.tum").read_bytes() for name in ("seen", "blind"))
+    assert json.loads(done.out)["track"]["ate_m"] is None
+    seen, blind = ((tmp_path / name / "track.tum").read_bytes() for name in ("seen", "blind"))
     assert seen == blind
 
 
@@ -218,13 +250,13 @@ def test_a_track_with_fixes_is_aligned_by_least_squares_and_not_by_its_first_yaw
     for yaw in (0.0, 1.0):
         fixes = write_fixes(tmp_path / "fixes.csv", truth, yaw)
         done = stario("run", recording, "--fixes", fixes, "--out", "fixed", "--json")
-        assert json.loads(done.out)["ekf"]["ate_m"] < 0.3
+        assert json.loads(done.out)["track"]["ate_m"] < 0.3
     words = json.loads((tmp_path / "fixed/metrics.json").read_text())["conventions"]
     assert "least squares" in words["alignment"]
     done = stario("compare", recording, "--fixes", fixes, "--out", "compared", "--json")
     compared = json.loads(done.out)
     assert words.items() <= compared["conventions"].items()
-    assert compared["recordings"]["walk"]["tracks"]["ekf"]["ate_m"] < 0.3
+    assert compared["recordings"]["walk"]["tracks"]["track"]["ate_m"] < 0.3
 
 
 def test_fixes_on_another_clock_are_refused(stario, recording: Path, tmp_path: Path) -> None:
@@ -246,7 +278,7 @@ def test_a_single_row_of_truth_counts_as_none(stario, recording: Path, tmp_path:
     path.write_text("\n".join(lines) + "\n")
     done = stario("run", path, "--out", "one", "--json")
     assert done.code == 0
-    assert json.loads(done.out)["ekf"]["ate_m"] is None
+    assert json.loads(done.out)["track"]["ate_m"] is None
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -254,14 +286,14 @@ def test_run_tells_how_much_of_a_recording_it_tracked(stario, recording: Path) -
     """The sensors stop after 7 s of 12 and repeat their values."""
     head, *lines = recording.read_text().splitlines()
     whole = stario("run", recording)
-    assert "walk: 12.0 s, " in whole.out
+    assert " m in 12.0 s, " in whole.out
     stopped = lines[700].split(",")[1:7]
     for k in range(701, len(lines)):
         cells = lines[k].split(",")
         lines[k] = ",".join([cells[0], *stopped, *cells[7:]])
     Path("stopped.csv").write_text("\n".join([head, *lines]) + "\n")
     done = stario("run", "stopped.csv")
-    assert "stopped: 7.0 of 12.0 s tracked, " in done.out
+    assert " m in 7.0 of 12.0 s tracked, " in done.out
     assert "restart the device" in done.out
 
 
@@ -277,7 +309,7 @@ def test_settings_are_read_from_a_file_and_saved(stario, recording: Path, tmp_pa
 def test_run_compare_and_evaluate_state_what_produced_their_results(
     stario, recording: Path, tmp_path: Path
 ) -> None:
-    for command, backends in (("run", ["ekf"]), *((c, BOTH) for c in ("compare", "evaluate"))):
+    for command in ("run", "compare", "evaluate"):
         done = stario(command, recording, "--axes", "x,y,z", "--accel-sign", "up", "--out", command)
         assert done.code == 0, done.err
         origin = json.loads((tmp_path / command / "run.json").read_text())
@@ -286,7 +318,6 @@ def test_run_compare_and_evaluate_state_what_produced_their_results(
             "stario": version("stario"),
             "model": "default",
             "weights_sha256": load_model("default").card.sha256,
-            "backends": backends,
             "inputs": [str(recording)],
             "reading": {},
             "fixes": None,
@@ -296,7 +327,7 @@ def test_run_compare_and_evaluate_state_what_produced_their_results(
 def test_what_produced_a_run_names_fixes_and_changed_reading_options(tmp_path: Path) -> None:
     reading = ReadingOptions(gyro_unit="deg/s", where=["person=dan"])
     estimating, fixes = EstimatorOptions(), tmp_path / "fixes.csv"
-    origin = origin_of(["graph"], [], reading, estimating, estimating.network(), fixes)
+    origin = origin_of([], reading, estimating, estimating.network(), fixes)
     assert origin["reading"] == {"gyro_unit": "deg/s", "where": ["person=dan"]}
     assert origin["fixes"] == str(tmp_path / "fixes.csv")
 
@@ -315,7 +346,7 @@ def test_run_accepts_a_folder_or_a_list(stario, recording: Path, tmp_path: Path)
     assert done.code == 1
     assert "skipped" in done.err
     assert "all/c.csv" in done.err
-    assert (tmp_path / "alone/ekf.tum").exists()
+    assert (tmp_path / "alone/track.tum").exists()
 
 
 # --- conventions -------------------------------------------------------------------------------
@@ -351,7 +382,7 @@ def test_inspect_names_the_option_that_helps(stario, recording: Path, tmp_path: 
     assert "--accel-unit g" in done.out
     assert (tmp_path / "out/inspection.png").stat().st_size > 10_000
     corrected = json.loads(stario("inspect", "g.csv", "--accel-unit", "g", "--json").out)
-    assert corrected["problems"] == []
+    assert all(each["code"] != "refused" for each in corrected["verdict"])
     assert corrected == json.loads((tmp_path / "runs/g/inspection.json").read_text())
     assert corrected["rate_hz"] == pytest.approx(100.0)
 

@@ -85,7 +85,6 @@ def test_a_line_that_is_cut_short_is_named(stario, recording: Path, tmp_path: Pa
         (["convert", "RECORDING", "a.csv", "--to", "fax"], ["layout", "fax"]),
         (["convert", "missing.csv", "a.csv"], ["missing.csv", "no such file"]),
         (["convert", "RECORDING", "no/such/a.csv"], ["folder"]),
-        (["run", "RECORDING", "--backend", "ukf"], ["--backend: found 'ukf'"]),
         (["check", "fixes", "RECORDING", "--backend", "ukf"], ["--backend: found 'ukf'"]),
         (["run", "RECORDING", "--out", "RECORDING"], ["found a file, expected a folder"]),
         (["compare", "RECORDING", "--out", "RECORDING"], ["found a file, expected a folder"]),

@@ -112,24 +112,24 @@ def test_a_fit_gives_no_larger_ate_than_the_first_pose(compared: Comparison) -> 
 def test_fixes_may_come_from_a_generator(walk: ImuSequence, still_model: Any) -> None:
     fixes = (position_fix(t, np.zeros(3), np.eye(3)) for t in (5.0, 6.0))
     tracks = compare(still_model, walk, fixes=fixes).tracks
-    assert [sum(tracks[name].health.fixes.values()) for name in ("ekf", "graph")] == [2, 2]
+    assert [sum(tracks[name].health.fixes.values()) for name in ("track", "filtered")] == [2, 2]
 
 
 def test_figures_with_fixes_are_those_after_a_fit(compared: Comparison) -> None:
-    sequence, track = compared.sequence, compared.tracks["ekf"]
+    sequence, track = compared.sequence, compared.tracks["track"]
     figures = measure(track, sequence, "yaw")
     assert figures["ate_m"] == figures["ate_fit_m"]
     fitted = position_nees(track.trajectory, sequence.truth, "yaw").median
-    assert figures["nees_median"] == fitted != compared.metrics["ekf"]["nees_median"]
+    assert figures["nees_median"] == fitted != compared.metrics["track"]["nees_median"]
 
 
 def test_waypoints_replace_poses_in_the_error(compared: Comparison, blind: Comparison) -> None:
-    track, truth = compared.tracks["ekf"].trajectory, compared.sequence.truth
+    track, truth = compared.tracks["track"].trajectory, compared.sequence.truth
     assert truth is not None
     fitted = evaluate_track(track, truth, alignment="yaw", horizontal=True).ate_m
-    error = blind.metrics["ekf"]["known_positions_m"]
+    error = blind.metrics["track"]["known_positions_m"]
     assert error == pytest.approx(fitted, rel=0.2)
-    assert blind.metrics["ekf"]["ate_m"] is None
+    assert blind.metrics["track"]["ate_m"] is None
 
 
 def test_metrics_json_has_the_documented_keys(folder: Path, walk: ImuSequence) -> None:
@@ -139,7 +139,7 @@ def test_metrics_json_has_the_documented_keys(folder: Path, walk: ImuSequence) -
     for entry in content["recordings"].values():
         assert set(entry) == {"duration_s", "path_m", "tracks"}
         assert set(entry["tracks"]) == {
-            "inertial", "pdr", "network", "network_true_attitude", "ekf", "graph",
+            "dead_reckoning", "pdr", "network", "network_true_attitude", "track", "filtered",
         }  # fmt: skip
         for figures in entry["tracks"].values():
             assert set(figures) == KEYS
@@ -159,16 +159,16 @@ def test_metrics_that_cannot_be_computed_are_null(folder: Path, walk: ImuSequenc
         known = {"known_positions_m", "nis_mean", "seconds_network", "seconds_filter"}
         assert all(figures[k] is None for k in KEYS - known)
     assert all(v is None for v in blind["tracks"]["network_true_attitude"].values())
-    assert blind["tracks"]["ekf"]["nis_mean"] == content[walk.name]["tracks"]["ekf"]["nis_mean"]
+    assert blind["tracks"]["track"]["nis_mean"] == content[walk.name]["tracks"]["track"]["nis_mean"]
     with_truth = content[walk.name]["tracks"]
-    assert all(v is not None for k, v in with_truth["ekf"].items() if k != "known_positions_m")
-    for name in ("inertial", "pdr", "network", "network_true_attitude"):
+    assert all(v is not None for k, v in with_truth["track"].items() if k != "known_positions_m")
+    for name in ("dead_reckoning", "pdr", "network", "network_true_attitude"):
         unknown = {k for k, v in with_truth[name].items() if v is None}
         assert unknown == {"known_positions_m", "nees_median", "nis_mean"}
 
 
 def test_ground_truth_affects_no_track(compared: Comparison, blind: Comparison) -> None:
-    for name in ("inertial", "pdr", "network", "ekf"):
+    for name in ("dead_reckoning", "pdr", "network", "track"):
         ours, theirs = compared.tracks[name].trajectory, blind.tracks[name].trajectory
         np.testing.assert_array_equal(ours.position_W, theirs.position_W)
 
@@ -184,12 +184,12 @@ def test_metrics_match_the_written_tracks(folder: Path, walk: ImuSequence) -> No
 
 
 def test_npz_holds_covariance_velocity_and_biases(folder: Path, compared: Comparison) -> None:
-    with np.load(folder / compared.sequence.name / "ekf.npz", allow_pickle=False) as arrays:
+    with np.load(folder / compared.sequence.name / "track.npz", allow_pickle=False) as arrays:
         n = len(arrays["time"])
         assert arrays["covariance"].shape == (n, 15, 15)
         for name in ("velocity_W", "gyro_bias_B", "accel_bias_B"):
             assert arrays[name].shape == (n, 3)
-        np.testing.assert_array_equal(arrays["time"], compared.tracks["ekf"].time)
+        np.testing.assert_array_equal(arrays["time"], compared.tracks["track"].time)
 
 
 def test_figures_are_png_files(folder: Path, walk: ImuSequence) -> None:
@@ -215,11 +215,11 @@ def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("blank_figures")
 def test_a_run_writes_its_files(tmp_path: Path, compared: Comparison, walk: ImuSequence) -> None:
-    track = compared.tracks["ekf"]
-    alone = Comparison(walk, {"ekf": track}, {"ekf": compared.metrics["ekf"]})
+    track = compared.tracks["track"]
+    alone = Comparison(walk, {"track": track}, {"track": compared.metrics["track"]})
     files = write_run(tmp_path / "run", alone, CONFIG, ORIGIN)
     assert {p.name for p in files} == {
-        "ekf.tum", "ekf.npz", "metrics.json", "config.json", "run.json", "health.json",
+        "track.tum", "track.npz", "metrics.json", "config.json", "run.json", "health.json",
         "plan.png", "error.png", "innovations.png",
     }  # fmt: skip
     words = json.loads((tmp_path / "run/metrics.json").read_text())["conventions"]
@@ -233,16 +233,34 @@ def test_a_run_writes_its_files(tmp_path: Path, compared: Comparison, walk: ImuS
 def test_files_of_an_earlier_run_do_not_pass_for_those_of_a_later_one(
     tmp_path: Path, compared: Comparison, walk: ImuSequence
 ) -> None:
-    """The first has truth, a report and the other back end; a file of the user's stays."""
-    track = compared.tracks["ekf"]
-    write_run(tmp_path, Comparison(walk, {"graph": track}, {"graph": {}}), CONFIG, ORIGIN)
+    """The first has truth, a report and the filter's track; a file of the user's stays."""
+    track = compared.tracks["track"]
+    two = {"track": track, "filtered": compared.tracks["filtered"]}
+    write_run(tmp_path, Comparison(walk, two, {name: {} for name in two}), CONFIG, ORIGIN)
     (tmp_path / "report.html").touch()
     (tmp_path / "notes.txt").touch()
     (tmp_path / "truth.tum").touch()  # no result of a run
-    blind = Comparison(walk.without_truth(), {"ekf": track}, {"ekf": {}})
+    blind = Comparison(walk.without_truth(), {"track": track}, {"track": {}})
     files = write_run(tmp_path, blind, CONFIG, ORIGIN)
     mine = {tmp_path / "notes.txt", tmp_path / "truth.tum"}
     assert {*files, *mine} == set(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_a_report_that_cannot_be_written_leaves_the_earlier_run_whole(
+    tmp_path: Path, compared: Comparison, walk: ImuSequence
+) -> None:
+    alone = Comparison(walk, {"ekf": compared.tracks["ekf"]}, {"ekf": {}})
+
+    def full_disk(path: Path, run: Comparison) -> None:
+        path.write_text("half")
+        raise OSError(28, "No space left on device")
+
+    write_run(tmp_path, alone, CONFIG, {"first": 1}, {"r.html": lambda path, _: path.touch()})
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    with pytest.raises(StarioError, match="No space left"):
+        write_run(tmp_path, alone, CONFIG, {"second": 2}, {"r.html": full_disk})
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
 @pytest.mark.usefixtures("blank_figures")
@@ -291,10 +309,10 @@ def test_truth_that_ends_early_is_compared_up_to_its_end(
 ) -> None:
     half = replace(walk, truth=walk.truth.slice(0.0, 10.0))
     result = compare(model, half, CONFIG)
-    assert result.metrics["ekf"]["ate_m"] is not None
+    assert result.metrics["track"]["ate_m"] is not None
     np.testing.assert_array_equal(
-        result.tracks["ekf"].trajectory.position_W,
-        compared.tracks["ekf"].trajectory.position_W,
+        result.tracks["track"].trajectory.position_W,
+        compared.tracks["track"].trajectory.position_W,
     )
 
 
@@ -303,9 +321,9 @@ def test_truth_shorter_than_a_window_loses_only_the_true_attitude_track(
 ) -> None:
     short_truth = replace(walk, truth=walk.truth.slice(3.0, 3.8))
     result = compare(model, short_truth, CONFIG)
-    assert set(result.tracks) == {"inertial", "pdr", "network", "ekf", "graph"}
-    assert "no track with true attitude" in caplog.text
-    assert result.metrics["ekf"]["rte_m"] is None  # it would be extrapolated 75 times
+    assert set(result.tracks) == {"dead_reckoning", "pdr", "network", "track", "filtered"}
+    assert "no track network_true_attitude" in caplog.text
+    assert result.metrics["track"]["rte_m"] is None  # it would be extrapolated 75 times
 
 
 def test_a_recording_with_little_truth_counts_in_no_median(
@@ -329,28 +347,28 @@ def test_a_truth_that_cannot_be_compared_leaves_the_tracks(
     if late:
         truth = replace(walk.truth, time=walk.truth.time + 100.0)
     result = compare(model, replace(walk, truth=truth), CONFIG)
-    assert {"network", "ekf", "graph"} <= set(result.tracks)
+    assert {"network", "track", "filtered"} <= set(result.tracks)
     assert result.path_m is None
-    assert result.metrics["ekf"]["ate_m"] is None
+    assert result.metrics["track"]["ate_m"] is None
     assert "no errors are computed" in caplog.text
 
 
 def test_summary_has_median_and_mean_over_recordings(
     compared: Comparison, walk: ImuSequence
 ) -> None:
-    ekf = compared.metrics["ekf"]
+    ekf = compared.metrics["track"]
     ate = ekf["ate_m"]
     scores = [
-        scores_of(replace(compared, metrics=compared.metrics | {"ekf": ekf | {"ate_m": error}}))
+        scores_of(replace(compared, metrics=compared.metrics | {"track": ekf | {"ate_m": error}}))
         for error in (ate, 3.0, 8.0)
     ]
-    over_recordings = summary(scores)["over_recordings"]["ekf"]["ate_m"]
+    over_recordings = summary(scores)["over_recordings"]["track"]["ate_m"]
     assert over_recordings["median"] == pytest.approx(3.0)
     assert over_recordings["mean"] == pytest.approx((ate + 11.0) / 3.0)
     table = summary_table(scores)
     lines = table.splitlines()
     assert [line.split()[0] for line in lines[1:6]] == [walk.name] * 3 + ["median", "mean"]
-    fitted = compared.metrics["ekf"]["ate_fit_m"]
+    fitted = compared.metrics["track"]["ate_fit_m"]
     assert f"3.00 ({fitted:.2f})" in lines[4]
     assert "in x and y only" in table
 
@@ -368,7 +386,7 @@ def test_demonstration_is_reproducible_with_a_seed_outside_the_training_range() 
     np.testing.assert_array_equal(first.gyro, second.gyro)
     np.testing.assert_array_equal(first.truth.position_W, second.truth.position_W)
     assert compare_module.DEMONSTRATION_SEED >= 2**31
-    assert first.duration == pytest.approx(120.0)
+    assert first.duration == pytest.approx(150.0)
 
 
 def test_a_wrong_truth_is_warned_of(

@@ -50,7 +50,7 @@ def test_a_run_that_fails_at_any_write_leaves_what_was_there(
 
 def test_a_later_set_replaces_results_and_removes_those_without_a_successor(tmp_path: Path) -> None:
     write_set(tmp_path / "out", 1)
-    for name in ("walk/plan.png", "walk/graph.tum", "walk/notes.txt", "other/health.json"):
+    for name in ("walk/plan.png", "walk/filtered.tum", "walk/notes.txt", "other/health.json"):
         path = tmp_path / "out" / name
         path.parent.mkdir(exist_ok=True)
         path.write_text("1")

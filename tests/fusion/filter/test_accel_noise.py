@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from stario.fusion import Navigator, NavigatorConfig
-from stario.fusion.filter.engine import UpdateResult
-from stario.fusion.filter.estimator import Estimator
-from stario.fusion.filter.network_errors import InnovationStatistics
+from stario.fusion.filter import estimator
+from stario.fusion.filter.innovations import InnovationStatistics
+from stario.fusion.filter.kalman import UpdateResult
 from stario.sequences.sequence import ImuSequence
 
 
@@ -20,14 +20,16 @@ def final_factor(
     """Factor with accelerometer errors `shake` [m/s^2] of 0.1 s each and `false` displacements."""
     config, rng = NavigatorConfig(), np.random.default_rng(3)
     preprocessed = Navigator(oracle, config).observe(walk)
-    estimator = Estimator(config, preprocessed.start)
+    state = estimator.begin(config, preprocessed.start)
     pairs = zip(preprocessed.intervals, preprocessed.measurements, strict=True)
     for k, (interval, measured) in enumerate(pairs):
-        shaken = replace(interval, accel=interval.accel + rng.normal(0.0, shake, 3))
+        table = interval.table.copy()
+        table[:, 4:] += rng.normal(0.0, shake, 3)
         if measured is not None and k in false:
             measured = measured._replace(d_N=measured.d_N + np.eye(3)[0])
-        estimator.step(shaken, measured)
-    return estimator.state.statistics.accel_factor
+        shaken = replace(interval, table=table)
+        state, _ = estimator.step(state, shaken, measured, (), config)
+    return state.statistics.accel_factor
 
 
 def test_the_factor_rises_for_a_bad_accelerometer_but_not_for_a_good_one(

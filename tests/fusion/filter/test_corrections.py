@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from initial_ekf import Driven
+from told import health_verdict
 
 from stario.fusion import Navigator, NavigatorConfig
 from stario.fusion.filter.corrections import correction
-from stario.fusion.filter.ekf import StateCloningEkf
 from stario.fusion.health import Health
 from stario.fusion.lie import about_vertical
-from stario.fusion.report.health import findings
 
 
 @pytest.mark.parametrize(
@@ -20,7 +20,7 @@ from stario.fusion.report.health import findings
 def test_a_step_beyond_a_metre_or_ten_degrees_is_a_correction(
     turn: float, shift: float, recorded: bool
 ) -> None:
-    before = StateCloningEkf(slots=1).state
+    before = Driven(slots=1).state
     before = before.plus(np.zeros(len(before.P)))
     after = before.transformed(about_vertical(turn), np.array([shift, 0.0, 0.0]))
     found = correction(before, after, "rest")
@@ -39,7 +39,7 @@ def test_a_good_walk_has_none(make_walk, make_oracle) -> None:
 
 def test_a_track_with_a_large_correction_is_not_called_good() -> None:
     health = Health(updates=100, mean_nis=3.0, corrections=[(93.2, 4.0, 0.5, "magnetic field")])
-    first = findings(health)[0]
+    first = health_verdict(health)[0]
     assert first.level == "warning"
     assert "4.0 m" in first.text
     assert "magnetic field" in first.text

@@ -89,7 +89,7 @@ def test_states_before_the_first_position_are_as_uncertain_as_the_motion_until_i
     fixes = [f for f in true_fixes(walk.truth, 2.0, 0.2, 0) if f.time > 32.0]
     if yaw_first:
         fixes.insert(0, yaw_fix(31.0, yaw_of(walk.truth.at(np.array([31.0])).attitude_WB)[0], 0.1))
-    track = Navigator(oracle, CONFIG).run(holed, fixes=fixes)
+    track = Navigator(oracle, CONFIG, backend="ekf").run(holed, fixes=fixes)
     early = np.flatnonzero((track.time > 1.0) & (track.time < 19.0))[::20]
     assert max(position_nees(track, walk, row) for row in early) < 16.0
     off = track.trajectory.position_W - walk.truth.at(track.time).position_W
@@ -104,7 +104,9 @@ def test_a_first_yaw_that_was_off_is_off_about_the_position_that_places_the_trac
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     yaw = yaw_of(walk.truth.at(np.array([5.0])).attitude_WB)[0] + 0.3
     fixes = [f for f in true_fixes(walk.truth, 2.0, 0.2, 0) if f.time > 30.0]
-    track = Navigator(oracle, CONFIG).run(walk, fixes=[yaw_fix(5.0, yaw, 0.4), *fixes])
+    track = Navigator(oracle, CONFIG, backend="ekf").run(
+        walk, fixes=[yaw_fix(5.0, yaw, 0.4), *fixes]
+    )
     early = np.flatnonzero((track.time > 1.0) & (track.time < 29.0))[::20]
     assert max(position_nees(track, walk, row) for row in early) < 12.0
 
@@ -119,7 +121,9 @@ def test_short_gaps_after_a_long_one_do_not_lose_the_position(
     gone |= (walk.time > 18.0) & (walk.time % 4.0 < 0.3)
     holed = without(walk, gone)
     oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
-    track = Navigator(oracle, CONFIG).run(holed, fixes=true_fixes(walk.truth, 5.0, 0.5, 0))
+    track = Navigator(oracle, CONFIG, backend="ekf").run(
+        holed, fixes=true_fixes(walk.truth, 5.0, 0.5, 0)
+    )
     late = (track.time > 40.0) & (track.time < walk.time[-1])
     off = track.trajectory.position_W[late] - walk.truth.at(track.time[late]).position_W
     assert np.sqrt(np.mean(np.sum(off[:, :2] ** 2, axis=1))) < 1.0
@@ -137,7 +141,7 @@ def test_a_track_not_yet_placed_stays_in_one_piece_across_a_gap(
     for fix in true_fixes(walk.truth, 3.0, 0.3, 0):
         if fix.time > 35.0:
             fixes.append(position_fix(fix.time, fix.value + shift, fix.covariance))
-    track = Navigator(oracle, CONFIG).run(holed, fixes=fixes)
+    track = Navigator(oracle, CONFIG, backend="ekf").run(holed, fixes=fixes)
     early = int(np.searchsorted(track.time, 2.0))
     truth = walk.truth.at(track.time[early : early + 1]).position_W[0] + shift
     error = track.trajectory.position_W[early] - truth
@@ -153,7 +157,7 @@ def test_fixes_after_a_gap_do_not_determine_the_yaw_before_it(
     holed = without(walk, (walk.time > 20.0) & (walk.time < 35.0))
     oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     fixes = [f for f in true_fixes(walk.truth, 3.0, 0.3, 0) if f.time > 35.0]
-    track = Navigator(oracle, CONFIG).run(holed, fixes=fixes)
+    track = Navigator(oracle, CONFIG, backend="ekf").run(holed, fixes=fixes)
     before = int(np.searchsorted(track.time, 15.0))
     assert track.covariance[before, 2, 2] > 1.0
     assert position_nees(track, walk, before) < 20.0
@@ -175,7 +179,7 @@ def test_the_graph_is_no_more_certain_of_the_turn_in_a_gap_than_the_filter(
     def sigma(track: Track) -> float:
         return float(np.sqrt(track.covariance[np.searchsorted(track.time, after), 2, 2]))
 
-    expected = sigma(Navigator(oracle, CONFIG).run(holed))
+    expected = sigma(Navigator(oracle, CONFIG, backend="ekf").run(holed))
     assert expected > 0.45 * min(gap, 3.0)
     assert sigma(Navigator(oracle, CONFIG, backend="graph").run(holed)) > 0.85 * expected
     states = stream(Navigator(oracle, CONFIG, backend="graph"), holed)
@@ -256,7 +260,7 @@ def test_a_yaw_that_is_not_an_angle_is_refused_and_counted(
 ) -> None:
     walk = make_walk(3, 12.0)
     oracle = make_oracle(walk, walk.truth, CONFIG)
-    track = Navigator(oracle, CONFIG).run(walk, fixes=[yaw_fix(6.0, 1.7e9, 0.1)])
+    track = Navigator(oracle, CONFIG, backend="ekf").run(walk, fixes=[yaw_fix(6.0, 1.7e9, 0.1)])
     assert track.health.fixes == {"yaw not in radians": 1}
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stario.fusion import Navigator, NavigatorConfig
-from stario.fusion.filter.estimator import Estimator
+from stario.fusion.filter import estimator
 from stario.sequences import ImuSequence
 
 RAW = np.array([0.04, -0.03, 0.05])
@@ -22,7 +22,7 @@ def biased(walk: ImuSequence, bias: np.ndarray) -> ImuSequence:
 def test_a_raw_bias_is_within_its_sigma_on_every_axis(make_walk, make_oracle) -> None:
     config = NavigatorConfig()
     walk = biased(make_walk(seed=2, seconds=40.0), RAW)
-    track = Navigator(make_oracle(walk, walk.truth, config), config).run(walk)
+    track = Navigator(make_oracle(walk, walk.truth, config), config, backend="ekf").run(walk)
     error = track.arrays()["gyro_bias_B"][-1] - RAW
     sigma = np.sqrt(np.diagonal(track.covariance[-1])[9:12])
     # Forty seconds do not determine it well; a prior of 2.5e-3 rad/s would have excluded it.
@@ -36,10 +36,10 @@ def test_a_corrected_gyroscope_keeps_its_prior(make_walk, make_oracle, size: flo
     config = NavigatorConfig()
     walk = biased(make_walk(seed=4, seconds=20.0), np.array([size, 0.0, 0.0]))
     preprocessed = Navigator(make_oracle(walk, walk.truth, config), config).observe(walk)
-    estimator = Estimator(config, preprocessed.start)
+    state = estimator.begin(config, preprocessed.start)
     for interval, measured in zip(preprocessed.intervals, preprocessed.measurements, strict=True):
-        estimator.step(interval, measured)
-    assert 1e-3 <= np.sqrt(estimator.bias.prior.variance) < max(2.5e-3, size)
+        state, _ = estimator.step(state, interval, measured, (), config)
+    assert 1e-3 <= np.sqrt(state.bias_prior.variance) < max(2.5e-3, size)
 
 
 def test_the_track_changes_continuously_with_the_bias(make_walk, make_oracle) -> None:
@@ -48,7 +48,7 @@ def test_the_track_changes_continuously_with_the_bias(make_walk, make_oracle) ->
     for size in (0.030, 0.0302):
         walk = biased(make_walk(seed=2, seconds=30.0), np.array([size, 0.0, 0.0]))
         config = NavigatorConfig()
-        track = Navigator(make_oracle(walk, walk.truth, config), config).run(walk)
+        track = Navigator(make_oracle(walk, walk.truth, config), config, backend="ekf").run(walk)
         ends.append(track.trajectory.position_W[-1])
     assert np.linalg.norm(ends[1] - ends[0]) < 0.1
 

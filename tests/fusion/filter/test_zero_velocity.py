@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -13,7 +14,8 @@ from recorded import DATA
 from stario.fusion import Navigator, PriorPose, Track
 from stario.fusion.backends import BackendName
 from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.fusion.filter.zero_velocity import StillnessDetector
+from stario.fusion.filter.zero_velocity import Stillness
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.recording import cut_recording
 from stario.network import load_model
 from stario.sequences import read_recording
@@ -43,8 +45,15 @@ def lying(
 
 def fraction_at_rest(sequence: ImuSequence) -> float:
     intervals, _ = cut_recording(sequence, CONFIG)
-    detector = StillnessDetector(10, CONFIG.filter.stillness_noise)
-    return float(np.mean([detector.is_still(interval) for interval in intervals]))
+    return float(np.mean(at_rest(intervals)))
+
+
+def at_rest(intervals: list[ImuInterval]) -> list[bool]:
+    """Whether the device was at rest at the end of each interval."""
+    states = itertools.accumulate(
+        intervals, lambda state, each: state.after(each, CONFIG.filter), initial=Stillness()
+    )
+    return [state.rested > 0 for state in states][1:]
 
 
 @pytest.mark.parametrize("rate", [50.0, 100.0, 200.0, 1000.0])
@@ -56,8 +65,7 @@ def test_a_device_on_a_table_is_at_rest_after_a_second(rate: float) -> None:
 def test_a_moving_device_is_not_at_rest(make_walk: Make, carry: str) -> None:
     walk = make_walk(5, 20.0, 100.0, PHONE_IMU, carry=carry)
     intervals, _ = cut_recording(walk, CONFIG)
-    detector = StillnessDetector(10, CONFIG.filter.stillness_noise)
-    still = np.array([e.stop for e in intervals if detector.is_still(e)])
+    still = np.array([e.stop for e in intervals])[at_rest(intervals)]
     if len(still):
         moved = walk.truth.at(still).position_W - walk.truth.at(still - 1.0).position_W
         assert np.linalg.norm(moved, axis=1).max() < 0.1  # a simulated trolley creeps smoothly
@@ -66,8 +74,7 @@ def test_a_moving_device_is_not_at_rest(make_walk: Make, carry: str) -> None:
 def test_rest_needs_a_whole_second_and_a_gap_ends_it() -> None:
     intervals, _ = cut_recording(lying(6.0), CONFIG)
     intervals[30] = replace(intervals[30], gap=True)
-    detector = StillnessDetector(10, CONFIG.filter.stillness_noise)
-    found = [detector.is_still(interval) for interval in intervals]
+    found = at_rest(intervals)
     assert not any(found[:9])
     assert all(found[9:30])
     assert not any(found[30:40])
@@ -81,8 +88,8 @@ def yaw_drift(track: Track) -> float:
 
 def test_rest_measures_the_bias_and_holds_yaw_and_position(still_model: Any) -> None:
     table = lying(30.0)
-    with_zero_velocity = Navigator(still_model, CONFIG).run(table)
-    without = Navigator(still_model, NO_STILLNESS).run(table)
+    with_zero_velocity = Navigator(still_model, CONFIG, backend="ekf").run(table)
+    without = Navigator(still_model, NO_STILLNESS, backend="ekf").run(table)
     assert with_zero_velocity.health.zero_velocity == {"applied": 291}
     assert without.health.zero_velocity == {}
     np.testing.assert_allclose(with_zero_velocity.b_g[-1], BIAS, atol=1e-4)
@@ -108,14 +115,14 @@ def test_a_standing_person_who_sways_teaches_no_bias(still_model: Any) -> None:
     table = lying(40.0, bias=np.zeros(3))
     sway = np.radians(1.5) * np.sin(2.0 * np.pi * 0.2 * table.time)
     swaying = replace(table, gyro=table.gyro + np.outer(sway, [0.0, 0.0, 1.0]))
-    track = Navigator(still_model, CONFIG).run(swaying)
+    track = Navigator(still_model, CONFIG, backend="ekf").run(swaying)
     assert track.health.zero_velocity["applied"] > 5
     assert np.abs(track.b_g[:, 2]).max() < 2e-3
 
 
 def test_rest_gives_no_information_about_yaw(still_model: Any) -> None:
     prior = PriorPose(exp_so3(np.array([0.0, 0.0, 1.0])), np.zeros(3), np.zeros(3), yaw_sigma=0.3)
-    track = Navigator(still_model, CONFIG, prior).run(lying(10.0))
+    track = Navigator(still_model, CONFIG, prior, backend="ekf").run(lying(10.0))
     assert np.sqrt(track.covariance[-1, 2, 2]) > 0.3
 
 
@@ -124,14 +131,16 @@ def test_a_steady_glide_is_not_stopped(still_model: Any) -> None:
     fast = PriorPose(np.eye(3), np.array([1.5, 0.0, 0.0]), np.zeros(3), 1e-3, 0.02, 0.05)
     quiet = replace(CONFIG.filter, accel_bias_sigma=0.02)
     config = replace(CONFIG, noise=PHONE_IMU.noise, filter=quiet)
-    track = Navigator(still_model, config, fast).run(lying(3.0, bias=np.zeros(3)))
+    track = Navigator(still_model, config, fast, backend="ekf").run(lying(3.0, bias=np.zeros(3)))
     assert track.health.zero_velocity == {"gated": 21}
     assert track.trajectory.velocity_W[-1, 0] > 1.2
 
 
 def test_a_slow_turn_is_not_mistaken_for_bias(still_model: Any) -> None:
     """Unless it lasts for longer than anybody turns so evenly."""
-    track = Navigator(still_model, CONFIG).run(lying(3.0, turn=0.05, bias=np.zeros(3)))
+    track = Navigator(still_model, CONFIG, backend="ekf").run(
+        lying(3.0, turn=0.05, bias=np.zeros(3))
+    )
     assert np.abs(track.b_g[-1]).max() < 0.01
 
 
@@ -152,8 +161,7 @@ def test_rest_is_detected_only_where_the_ground_truth_rests(name: str, found: bo
     start = recording.time[0]
     recording = recording.slice(start, start + 40.0)
     intervals, _ = cut_recording(recording, NavigatorConfig(filter=FilterConfig()))
-    detector = StillnessDetector(10, CONFIG.filter.stillness_noise)
-    still = np.array([e.stop for e in intervals if detector.is_still(e)])
+    still = np.array([e.stop for e in intervals])[at_rest(intervals)]
     assert (len(still) > 10) == found
     if not found:
         return

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 from support import CONFIG, stream
+from told import health_lines
 
 from stario.fusion import Navigator
 from stario.fusion.imu.faults import FrozenSensorDetector
-from stario.fusion.report.health import health_lines
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 
@@ -24,7 +24,7 @@ def test_a_sensor_that_stops_makes_a_gap(walk: ImuSequence, make_oracle: Make, h
     last = np.argmax(dead) - 1
     gyro[dead], accel[dead] = (gyro[last], accel[last]) if held == "last" else (0.0, 0.0)
     stopped = replace(walk, gyro=gyro, accel=accel)
-    track = Navigator(make_oracle(stopped, walk.truth, CONFIG)).run(stopped)
+    track = Navigator(make_oracle(stopped, walk.truth, CONFIG), backend="ekf").run(stopped)
     assert track.health.samples["frozen"] > 0.9 * dead.sum()
     assert track.health.gap_count == 1
     ((start, length),) = track.health.gaps
@@ -38,7 +38,7 @@ def test_a_sensor_at_rest_may_repeat_its_values(still_model: Any) -> None:
     still = ImuSequence(
         "still", np.arange(n) / 100.0, np.zeros((n, 3)), np.tile([0.0, 0.0, 9.81], (n, 1))
     )
-    health = Navigator(still_model).run(still).health
+    health = Navigator(still_model, backend="ekf").run(still).health
     assert health.samples["frozen"] == 0
 
 
@@ -70,7 +70,7 @@ def test_one_sensor_that_stops_makes_a_gap_and_is_named(
     walk: ImuSequence, make_oracle: Make, sensor: str
 ) -> None:
     stopped = held(walk, sensor, 8.0, 12.0)
-    track = Navigator(make_oracle(stopped, walk.truth, CONFIG)).run(stopped)
+    track = Navigator(make_oracle(stopped, walk.truth, CONFIG), backend="ekf").run(stopped)
     ((start, length),) = track.health.gaps
     assert 8.4 < start < 9.1
     assert start + length == pytest.approx(12.0, abs=0.05)
@@ -85,7 +85,12 @@ def test_a_slow_sensor_may_be_repeated_at_the_rate_of_the_other(
     walk: ImuSequence, still_model: Any, sensor: str
 ) -> None:
     slow = getattr(walk, sensor)[np.arange(len(walk)) // 10 * 10]
-    assert Navigator(still_model).run(replace(walk, **{sensor: slow})).health.samples["frozen"] == 0
+    assert (
+        Navigator(still_model, backend="ekf")
+        .run(replace(walk, **{sensor: slow}))
+        .health.samples["frozen"]
+        == 0
+    )
 
 
 def frozen_samples(time: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> int:

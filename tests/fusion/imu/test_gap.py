@@ -39,10 +39,10 @@ def test_a_long_gap_keeps_the_attitude() -> None:
 
 def gap_of(length: float, turn_rate: float) -> ImuInterval:
     """Return a gap before a second in which the device turns at a rate [rad/s]."""
-    zeros = np.zeros((2, 3))
     after = Start(np.eye(3), False, 9.81, turn_rate, time=length, rate=100.0)
-    eyes = np.tile(np.eye(3), (2, 1, 1))
-    return ImuInterval(np.array([0.0, length]), zeros, zeros, True, eyes, np.eye(3), levelled=after)
+    ends = np.zeros((2, 7))
+    ends[1, 0] = length
+    return ImuInterval(ends, True, np.eye(3), levelled=after)
 
 
 @pytest.mark.parametrize("length", [0.3, 0.9, 3.0])

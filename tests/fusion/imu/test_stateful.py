@@ -69,7 +69,7 @@ def test_memory_is_kept_between_gaps_separately_for_each_series(walk, without, r
 
 def test_a_stream_equals_the_batch_also_after_a_restore(walk, without) -> None:
     sequence = with_gap(walk, without)
-    track = Navigator(Counting()).run(sequence).trajectory
+    track = Navigator(Counting(), backend="ekf").run(sequence).trajectory
     navigator = Navigator(Counting())
     states = []
     for k, sample in enumerate(zip(sequence.time, sequence.gyro, sequence.accel, strict=True)):

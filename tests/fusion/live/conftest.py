@@ -1,6 +1,8 @@
 """Pushes of a recording as a phone sends them, and a navigator with a cheap network."""
 
 import json
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -75,6 +77,22 @@ def serve(tmp_path, new_navigator):
     for server, thread in running:
         server.stop()
         thread.join(20.0)
+
+
+@pytest.fixture
+def process(tmp_path):
+    """`stario live` as a process of its own, and the address of its pushes."""
+    command = "from stario.fusion.commands.cli import main; main()"
+    options = ["live", "--port", "0", "--out", str(tmp_path)]
+    with subprocess.Popen(
+        [sys.executable, "-c", command, *options], stderr=subprocess.PIPE, text=True
+    ) as server:
+        watchdog = threading.Timer(120.0, server.kill)
+        watchdog.start()
+        lines = [server.stderr.readline() for _ in range(2)]
+        yield server, lines[1].split()[-1]
+        watchdog.cancel()
+        server.kill()
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ import os
 import re
 import signal
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -110,22 +109,13 @@ def test_a_push_waits_no_longer_for_a_missing_one_though_no_other_comes(serve, p
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGTERM on this system")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_loses_nothing_that_was_acknowledged(tmp_path, pushes, number):
-    command = "from stario.fusion.commands.cli import main; main()"
-    options = ["live", "--port", "0", "--out", str(tmp_path)]
-    with subprocess.Popen(
-        [sys.executable, "-c", command, *options], stderr=subprocess.PIPE, text=True
-    ) as server:
-        watchdog = threading.Timer(120.0, server.kill)
-        watchdog.start()
-        lines = [server.stderr.readline() for _ in range(2)]
-        url = lines[1].split()[-1]
-        for k, body in enumerate(pushes(seconds=4.0)):
-            if k != 17:  # the last two wait for it
-                push(url, body)
-        server.send_signal(number)
-        assert server.wait() == 0
-        watchdog.cancel()
+def test_a_signal_loses_nothing_that_was_acknowledged(tmp_path, pushes, process, number):
+    server, url = process
+    for k, body in enumerate(pushes(seconds=4.0)):
+        if k != 17:  # the last two wait for it
+            push(url, body)
+    server.send_signal(number)
+    assert server.wait() == 0
     (path,) = tmp_path.glob("*.csv")
     assert len(read_recording(path)) == 380
 

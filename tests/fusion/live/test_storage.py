@@ -4,8 +4,6 @@ import json
 import logging
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 import urllib.request
@@ -63,27 +61,19 @@ def test_recording_truncated_at_any_byte_keeps_every_complete_sample(tmp_path, c
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on this system")
-def test_a_killed_server_leaves_all_samples_that_it_acknowledged(tmp_path, pushes):
-    command = "from stario.fusion.commands.cli import main; main()"
-    options = ["live", "--port", "0", "--out", str(tmp_path)]
-    with subprocess.Popen(
-        [sys.executable, "-c", command, *options], stderr=subprocess.PIPE, text=True
-    ) as server:
-        watchdog = threading.Timer(120.0, server.kill)
-        watchdog.start()
-        lines = [server.stderr.readline() for _ in range(2)]
-        url = lines[1].split()[-1]
-        acknowledged = 0
-        for body in pushes(seconds=4.0):
-            request = urllib.request.Request(url, body, {"content-type": "application/json"})
-            with urllib.request.urlopen(request) as answer:
-                acknowledged += json.load(answer)["samples"]
-        sender = threading.Thread(target=_push_on, args=(url, pushes(seconds=8.0)[20:]))
-        sender.start()
-        time.sleep(0.3)
-        os.kill(server.pid, signal.SIGKILL)
-        watchdog.cancel()
-        sender.join()
+def test_a_killed_server_leaves_all_samples_that_it_acknowledged(tmp_path, pushes, process):
+    server, url = process
+    acknowledged = 0
+    for body in pushes(seconds=4.0):
+        request = urllib.request.Request(url, body, {"content-type": "application/json"})
+        with urllib.request.urlopen(request) as answer:
+            acknowledged += json.load(answer)["samples"]
+    sender = threading.Thread(target=_push_on, args=(url, pushes(seconds=8.0)[20:]))
+    sender.start()
+    time.sleep(0.3)
+    os.kill(server.pid, signal.SIGKILL)
+    server.wait()
+    sender.join()
     (path,) = tmp_path.glob("*.csv")
     recording = read_recording(path)
     assert len(recording) >= acknowledged >= 380

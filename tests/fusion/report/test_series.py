@@ -74,16 +74,18 @@ def test_an_ellipse_reaches_three_sigma_along_its_axes() -> None:
 def test_yaws_on_both_sides_of_half_a_turn_are_drawn_next_to_each_other() -> None:
     shown = {
         name: trajectory_series(along_y(np.radians(yaw)).trajectory, 0.0)
-        for name, yaw in (("ekf", 179.0), ("graph", -179.0))
+        for name, yaw in (("track", 179.0), ("filtered", -179.0))
     }
     yaw = {
-        trace.name: trace.y for trace in motion_panels(shown, None, "ekf")[2].traces if trace.name
+        trace.name: trace.y for trace in motion_panels(shown, None, "track")[2].traces if trace.name
     }
-    np.testing.assert_allclose(np.subtract(yaw["factor graph"], yaw["EKF"]), 2.0, atol=1e-3)
+    np.testing.assert_allclose(
+        np.subtract(yaw["filter, as in a stream"], yaw["StarIO"]), 2.0, atol=1e-3
+    )
 
 
 def test_the_band_of_a_line_is_three_sigma_wide() -> None:
-    height = motion_panels({"ekf": series_of(along_y())}, None, "ekf")[0]
+    height = motion_panels({"track": series_of(along_y())}, None, "track")[0]
     band, line = height.traces
     edge = np.asarray(band.y, dtype=float)
     assert np.nanmax(edge) == pytest.approx(3.0 * 0.6)
@@ -93,8 +95,8 @@ def test_the_band_of_a_line_is_three_sigma_wide() -> None:
 
 def test_the_slider_moves_ellipses_of_the_horizontal_covariance() -> None:
     series = series_of(along_y())
-    other, main = _cursors({"graph": series, "ekf": series}, "ekf")[::-1]
-    assert (main["name"], other["name"]) == ("ekf", "graph")
+    other, main = _cursors({"filtered": series, "track": series}, "track")[::-1]
+    assert (main["name"], other["name"]) == ("track", "filtered")
     assert [main[key][5] for key in ("xx", "xy", "yy")] == [0.16, 0.05, 0.25]
     assert main["y"][10] == pytest.approx(1.5 * TIME[10])
 
@@ -112,6 +114,6 @@ def test_yaws_are_drawn_within_half_a_turn_of_the_truth_where_both_exist(
     stop: float, turns: int
 ) -> None:
     track = turning(stop, 5.0 + 360.0 * turns)
-    panel = motion_panels({"ekf": track}, turning(120.0, 0.0), "ekf")[-1]
-    drawn = next(trace for trace in panel.traces if trace.legendgroup == "ekf")
+    panel = motion_panels({"track": track}, turning(120.0, 0.0), "track")[-1]
+    drawn = next(trace for trace in panel.traces if trace.legendgroup == "track")
     np.testing.assert_allclose(drawn.y, 6.0 * np.array(drawn.x) + 5.0, atol=1e-3)

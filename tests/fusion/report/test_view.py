@@ -21,7 +21,9 @@ def test_file_holds_every_quantity_over_time(tmp_path, view, walk, still_model):
 
     reader = pytest.importorskip("rerun.chunk", reason="requires rerun 0.41 or newer").RrdReader
     track = Navigator(still_model).run(walk)
-    path = view.write_view(tmp_path / "track.rrd", Comparison(walk, {"ekf": track}, {"ekf": {}}))
+    path = view.write_view(
+        tmp_path / "track.rrd", Comparison(walk, {"track": track}, {"track": {}})
+    )
     entities = {str(chunk.entity_path) for chunk in reader(str(path)).stream()}
     for name in ("world/track", "world/truth", "world/device", "NIS", "bias", "force", "yaw"):
         assert any(name in entity for entity in entities), (name, entities)

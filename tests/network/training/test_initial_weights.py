@@ -8,7 +8,6 @@ import torch
 from training_runs import STREAMS, TINY, VALIDATION, run
 
 from stario.network.card import Calibration
-from stario.network.known_motion import KnownMotion
 from stario.network.model import load_model
 from stario.network.training.train import train
 from stario.network.training.validation import ValidationSet
@@ -45,18 +44,6 @@ def test_fine_tuned_weights_lie_between_the_initial_and_the_learned(
         torch.testing.assert_close(none[name], before, atol=0.0, rtol=0.0)
         torch.testing.assert_close(half[name], 0.5 * (before + all_learned[name]))
     assert any(not torch.equal(all_learned[name], before) for name, before in initial.items())
-
-
-def test_fine_tuned_weights_still_know_the_motion_of_the_initial_ones(
-    model: Path, tmp_path: Path
-) -> None:
-    """Weights of which none remain know that of their own training only: here, too little."""
-    first = load_model(model)
-    first.card = replace(first.card, known_motion=KnownMotion(((0.0,) * 5,), 1.0, {}))
-    for learned, known in ((0.3, first.card.known_motion), (1.0, None)):
-        config = replace(TINY, epochs=1, epoch_windows=16, learned=learned)
-        path = run(tmp_path / str(learned), config, start_from=first)
-        assert load_model(path).card.known_motion == known
 
 
 def test_a_last_stage_starts_from_weights_and_adopts_a_calibration(

@@ -63,7 +63,7 @@ def test_wrong_entries_are_named_and_the_others_kept(tmp_path: Path) -> None:
     assert [text.split(", expected")[0] for text in messages] == [
         "/list.txt: line 3: found an empty entry",
         "/list.txt: line 4: found 'gone.csv', which does not exist",
-        "/empty: folder: found no recording",
+        "/empty: content: found a folder with nothing",
         "/list.txt: list: found another list, list.txt",
     ]
     path.write_text("# nothing\n\n")

@@ -38,9 +38,9 @@ def tracks(truth: Trajectory) -> dict[str, Trajectory]:
     sigma = 0.02 * truth.time + 0.01
     covariance = np.einsum("n,ij->nij", sigma**2, np.eye(3))
     return {
-        "inertial": with_growing_error(truth, 0.5, power=2),
+        "track": replace(with_growing_error(truth, 0.01), position_covariance_W=covariance),
         "network": with_growing_error(truth, 0.03),
-        "ekf": replace(with_growing_error(truth, 0.01), position_covariance_W=covariance),
+        "dead_reckoning": with_growing_error(truth, 0.5, power=2),
     }
 
 
@@ -54,29 +54,88 @@ def line(axes, label: str):
 
 def test_plan_view_fits_the_truth_and_labels_tracks_that_leave_it(truth, tracks):
     fig = plan_view(tracks, truth, "a walk")
-    (axes,) = fig.axes
-    assert axes.get_xlim()[1] - axes.get_xlim()[0] < 40.0  # the inertial track runs to 1.8 km
+    axes = fig.axes[0]
+    assert axes.get_xlim()[1] - axes.get_xlim()[0] < 40.0  # dead reckoning runs to 1.8 km
     assert axes.get_aspect() == 1.0
     legend = labels(fig.legends[0])
-    assert legend[:2] == ["truth", "inertial (leaves the figure by 1.8 km)"]
-    assert legend[2:] == ["network", "EKF", "start", "end"]
-    for track in (truth, tracks["network"], tracks["ekf"]):
+    assert legend[:3] == ["truth", "StarIO", "network alone"]
+    assert legend[3:] == [
+        "dead reckoning (IMU alone) (leaves the figure by 1.8 km)", "start", "end",
+    ]  # fmt: skip
+    for track in (truth, tracks["network"], tracks["track"]):
         assert (track.position_W[:, 0] < axes.get_xlim()[1]).all()
         assert (track.position_W[:, 1] > axes.get_ylim()[0]).all()
 
 
 def test_plan_view_without_truth_is_not_stretched_by_a_diverging_track(tracks):
-    (axes,) = plan_view(tracks, None, "a walk").axes
+    axes = plan_view(tracks, None, "a walk").axes[0]
     assert axes.get_xlim()[1] - axes.get_xlim()[0] < 40.0
 
 
 def test_colours_depend_on_the_track_name_only(truth, tracks):
-    (all_axes,) = plan_view(tracks, truth, "").axes
-    (one_axes,) = plan_view({"ekf": tracks["ekf"]}, truth, "").axes
-    assert line(all_axes, "EKF").get_color() == line(one_axes, "EKF").get_color()
-    assert line(all_axes, "truth").get_color() == "black"
-    colours = {line(all_axes, name).get_color() for name in ("inertial", "network", "EKF")}
-    assert len(colours) == 3
+    all_axes = plan_view(tracks, truth, "").axes[0]
+    two_axes = plan_view({name: tracks[name] for name in ("track", "network")}, None, "").axes[0]
+    for label in ("StarIO", "network alone"):
+        assert line(all_axes, label).get_color() == line(two_axes, label).get_color()
+    shown = ("truth", "StarIO", "network alone", "dead reckoning")
+    assert len({line(all_axes, label).get_color() for label in shown}) == len(shown)
+
+
+def luminance(colours: np.ndarray) -> np.ndarray:
+    """Return the brightness of colours (n, 4), which every eye sees."""
+    return colours[:, :3] @ [0.2126, 0.7152, 0.0722]
+
+
+def test_a_way_back_differs_from_the_way_out_in_brightness_and_width():
+    """Out and back on one line: the second half lies on the first and leaves its edges visible."""
+    t = np.arange(0.0, 120.0, 0.1)
+    x = np.where(t < 60.0, t, 120.0 - t)
+    there_and_back = Trajectory(t, np.outer(x, [1.0, 0.5, 0.0]), Rotation.identity(len(t)))
+    axes = plan_view({"track": there_and_back}, None, "").axes[0]
+    (path,) = axes.collections
+    bright, width = luminance(path.get_colors()), np.asarray(path.get_linewidths())
+    half = len(bright) // 2
+    assert np.abs(np.diff(bright)).max() < 0.05
+    assert bright[half:].min() > bright[:half].max() - 0.05
+    assert (bright[::-1] - bright)[: half // 2].min() > 0.2
+    assert (np.diff(width) < 0.0).all()
+    assert width[-1] < 0.5 * width[0]
+
+
+def test_arrows_point_along_the_walk_and_its_ends_have_times():
+    t = np.arange(0.0, 125.0, 0.1)
+    x = np.interp(t, [0.0, 40.0, 70.0, 125.0], [0.0, 40.0, 40.0, 95.0])  # a stop of 30 s
+    along = Trajectory(t, np.outer(x, [0.6, -0.8, 0.0]), Rotation.identity(len(t)))
+    axes = plan_view({"track": along}, None, "").axes[0]
+    arrows = [text for text in axes.texts if getattr(text, "arrow_patch", None)]
+    assert len(arrows) == 4  # one in each half minute but in the stop
+    for arrow in arrows:
+        step = np.subtract(arrow.xy, arrow.xyann)
+        np.testing.assert_allclose(step / np.linalg.norm(step), [0.6, -0.8], atol=1e-6)
+    assert {"0:00", "2:05"} <= {text.get_text() for text in axes.texts}
+
+
+@pytest.mark.parametrize("size", [0.3, 7.0, 260.0, 4000.0])
+def test_the_scale_bar_is_as_long_as_it_says(truth, size):
+    walk = replace(truth, position_W=truth.position_W * size / 20.0)
+    axes = plan_view({"track": walk}, None, "").axes[0]
+    (bar,) = (item for item in axes.lines if item.get_linewidth() == 3.0)
+    (text,) = (text.get_text() for text in axes.texts if text.get_text().endswith("m"))
+    number, unit = text.split()
+    length = float(number) * {"cm": 0.01, "m": 1.0, "km": 1000.0}[unit]
+    assert np.ptp(bar.get_xdata()) == pytest.approx(length)
+    assert 0.1 < length / np.ptp(axes.get_xlim()) < 0.35
+
+
+def test_the_error_and_its_sigma_are_drawn_beside_a_plan_with_truth(truth, tracks):
+    assert len(plan_view(tracks, None, "").axes) == 2  # the map and its bar of times
+    beside = plan_view(tracks, truth, "").axes[1]
+    error, sigma = beside.lines[1], line(beside, "its sigma")
+    np.testing.assert_allclose(error.get_ydata(), 0.01 * truth.time * np.hypot(1, 0.5), atol=1e-9)
+    np.testing.assert_allclose(
+        sigma.get_ydata(), np.sqrt(2.0) * (0.02 * truth.time + 0.01), atol=1e-9
+    )
+    assert beside.get_ylim()[1] < 3.0  # dead reckoning leaves it
 
 
 @pytest.mark.parametrize("kind", ["marked", "missing"])
@@ -86,7 +145,7 @@ def test_gaps_in_the_truth_break_the_line(truth, kind):
         cut = replace(truth, valid=keep)
     else:
         cut = Trajectory(truth.time[keep], truth.position_W[keep], truth.attitude_WB[keep])
-    (axes,) = plan_view({}, cut, "").axes
+    axes = plan_view({}, cut, "").axes[0]
     x = np.asarray(line(axes, "truth").get_xdata())
     assert np.isnan(x).sum() == 1
     assert np.isnan(x[np.searchsorted(truth.time, 20.0)])
@@ -101,9 +160,11 @@ def test_error_panels_show_the_error_and_three_sigma(truth, tracks):
         line(top, "network").get_ydata(), 0.03 * truth.time * np.hypot(1, 0.5), atol=1e-9
     )
     assert top.get_ylim()[1] < 5.0
-    assert "inertial (leaves the figure, up to 2.0 km)" in labels(top.get_legend())
+    assert "dead reckoning (IMU alone) (leaves the figure, up to 2.0 km)" in labels(
+        top.get_legend()
+    )
     # The panels per axis show only the track with a covariance, within a three-sigma band.
-    assert labels(in_x.get_legend()) == ["EKF", "EKF, 3 sigma"]
+    assert labels(in_x.get_legend()) == ["StarIO", "StarIO, 3 sigma"]
     (band,) = in_x.collections
     edge = np.abs(band.get_paths()[0].vertices[:, 1]).max()
     assert edge == pytest.approx(3 * (0.02 * truth.time[-1] + 0.01))
@@ -173,7 +234,7 @@ def test_figures_are_saved_whole_as_png(truth, tracks, tmp_path):
 def test_what_cannot_be_drawn_is_refused(truth):
     nowhere = replace(truth, valid=np.zeros(len(truth), dtype=bool))
     with pytest.raises(InputError, match="no valid pose"):
-        plan_view({"ekf": nowhere}, None, "")
+        plan_view({"track": nowhere}, None, "")
     with pytest.raises(InputError, match="at least one track"):
         error_over_time({}, truth)
 
@@ -195,7 +256,7 @@ assert "matplotlib.pyplot" not in sys.modules
 
 
 def test_a_track_is_marked_where_it_resumes_after_a_gap(tracks):
-    whole = tracks["ekf"]
+    whole = tracks["track"]
     keep = np.ones(len(whole.time), dtype=bool)
     keep[len(keep) // 2 : len(keep) // 2 + round(2.5 / np.median(np.diff(whole.time)))] = False
     broken = Trajectory(whole.time[keep], whole.position_W[keep], whole.attitude_WB[keep])
@@ -203,9 +264,9 @@ def test_a_track_is_marked_where_it_resumes_after_a_gap(tracks):
     half = round(0.5 / float(np.median(np.diff(whole.time))))
     rows = np.r_[0, 2 * half : len(whole.time) : half]
     delayed = Trajectory(whole.time[rows], whole.position_W[rows], whole.attitude_WB[rows])
-    cases = (("ekf", whole, 0), ("ekf", broken, 1), ("pdr", broken, 0), ("network", delayed, 0))
+    cases = (("track", whole, 0), ("track", broken, 1), ("pdr", broken, 0), ("network", delayed, 0))
     for name, track, marks in cases:
-        (axes,) = plan_view({name: track}, None, "").axes
+        axes = plan_view({name: track}, None, "").axes[0]
         found = [line for line in axes.lines if line.get_label() == "after a gap"]
         assert len(found) == marks
 
@@ -215,34 +276,34 @@ def test_the_mark_after_a_gap_is_at_the_first_valid_pose_and_only_within_the_fra
     cut = Trajectory(truth.time[keep], truth.position_W[keep], truth.attitude_WB[keep])
     resumed = int(np.argmax(cut.time > 34.0))
     usable = np.arange(len(cut.time)) != resumed  # the pose right after the gap is unknown
-    (axes,) = plan_view({"ekf": replace(cut, valid=usable)}, truth, "").axes
+    axes = plan_view({"track": replace(cut, valid=usable)}, truth, "").axes[0]
     mark = line(axes, "after a gap")
     assert (mark.get_xdata()[0], mark.get_ydata()[0]) == tuple(cut.position_W[resumed + 1, :2])
     far = with_growing_error(cut, 0.5, power=2)
-    fig = plan_view({"inertial": far, "ekf": truth}, truth, "")
+    fig = plan_view({"track": truth, "dead_reckoning": far}, truth, "")
     assert "after a gap" not in labels(fig.legends[0])
 
 
 def test_positions_are_drawn_below_the_tracks_and_waypoints_above(tracks):
-    ekf = tracks["ekf"]
+    ekf = tracks["track"]
     for kind, above in (("positions", False), ("waypoints", True)):
         known = PositionTrack(ekf.time, ekf.position_W[:, :2], kind=kind)
-        (axes,) = plan_view({"ekf": ekf}, None, "", known).axes
-        assert (line(axes, kind).get_zorder() > line(axes, "EKF").get_zorder()) == above
+        axes = plan_view({"track": ekf}, None, "", known).axes[0]
+        assert (line(axes, kind).get_zorder() > axes.collections[0].get_zorder()) == above
 
 
 def test_the_axes_of_a_tall_plan_fill_its_figure(truth):
     tall = replace(truth, position_W=np.outer(truth.time, [0.1, 1.2, 0.0]))
-    names = ("inertial", "pdr", "network", "network_true_attitude", "ekf", "graph")
+    names = ("track", "filtered", "network", "network_true_attitude", "pdr", "dead_reckoning")
     for shown in (names[:1], names):  # with a legend of one row or of several
         fig = plan_view(dict.fromkeys(shown, tall), None, "")
         fig.canvas.draw()
-        assert fig.axes[0].get_tightbbox().x1 > 0.95 * fig.bbox.x1
+        assert fig.axes[1].get_tightbbox().x1 > 0.95 * fig.bbox.x1  # the bar of times
 
 
 def test_the_legend_of_many_distant_tracks_fits_the_figure(truth, tracks):
     straight = replace(truth, position_W=np.outer(truth.time, [0.0, 1.2, 0.0]))
-    names = ("inertial", "pdr", "network", "network_true_attitude", "ekf")
+    names = ("dead_reckoning", "pdr", "network", "network_true_attitude", "track")
     distant = {name: with_growing_error(straight, 0.5, power=2) for name in names}
     fig = plan_view(distant, straight, "")
     fig.canvas.draw()

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from recorded import DATA
 from scipy.spatial.transform import Rotation
+from told import told
 
 from stario.sequences.conventions import SAME_AXES, with_axes, with_conventions
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
-from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.readers import find_recordings, read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
@@ -139,7 +139,7 @@ def test_a_truth_with_z_down_is_told_from_a_reversed_sign_by_its_positions(
     assert "write px,-py,-pz,qw,-qz,qy,-qx as px,py,pz,qx,qy,qz,qw" in text
     position, quat_xyzw = np.column_stack([px, -py, -pz]), np.column_stack([w, -z, y, -x])
     right = replace(truth, position_W=position, attitude_WB=Rotation.from_quat(quat_xyzw))
-    assert inspect_recording(replace(walk, truth=right)).problems == ()
+    assert told(replace(walk, truth=right)) == []
     at_rest = replace(down, position_W=0.0 * down.position_W)
     undecided = refusal(replace(walk, truth=at_rest))
     assert "--accel-sign apple" in undecided
@@ -269,7 +269,7 @@ def test_a_constant_gyroscope_is_refused_while_the_accelerometer_varies(
     for value in (0.0, 0.3):
         dead = replace(walk, gyro=np.full_like(walk.gyro, value))
         assert "gyroscope: found values that never change" in refusal(dead)
-        assert len(inspect_recording(dead.without_truth()).problems) == 1
+        assert len(told(dead.without_truth())) == 1
 
 
 @pytest.mark.parametrize("value", [0.0, 5.66])
@@ -278,7 +278,7 @@ def test_a_constant_accelerometer_is_refused_while_the_device_tilts(
 ) -> None:
     dead = replace(walk, accel=np.full_like(walk.accel, value)).without_truth()
     assert "accelerometer: found values that never change" in refusal(dead)
-    assert len(inspect_recording(dead).problems) == 1
+    assert len(told(dead)) == 1
 
 
 def test_a_constant_rate_without_noise_and_a_device_at_rest_pass() -> None:
@@ -294,7 +294,7 @@ def test_a_constant_rate_without_noise_and_a_device_at_rest_pass() -> None:
         gyro = np.tile(rate, (len(time), 1)).astype(np.float64)
         even = ImuSequence("even", time, gyro, accel)
         check_units(even)
-        assert inspect_recording(even).problems == ()
+        assert told(even) == []
 
 
 @pytest.mark.parametrize("sensor", ["gyro", "accel"])
@@ -302,13 +302,13 @@ def test_a_sensor_stuck_for_seconds_is_named(walk: ImuSequence, sensor: str) -> 
     values = getattr(walk, sensor).copy()
     values[2000:2800], values[4000:4300] = values[2000], values[4000]
     stuck = replace(walk, **{sensor: values}).without_truth()
-    (problem,) = (p for p in inspect_recording(stuck).problems if "repeat exactly" in p)
+    (problem,) = (p for p in told(stuck) if "repeat exactly" in p)
     assert {"gyro": "gyroscope", "accel": "accelerometer"}[sensor] + ": its values" in problem
     assert "from 10.0 to 14.0 s" in problem
     assert "for 5.5 s" in problem
     held = getattr(walk, sensor)[np.arange(len(walk)) // 2 * 2]
     in_ms = replace(walk, time=1e3 * walk.time, truth=None, **{sensor: held})
-    assert "repeat" not in " ".join(inspect_recording(in_ms).problems)
+    assert "repeat" not in " ".join(told(in_ms))
 
 
 def test_swapped_gyroscope_axes_are_not_mistaken_for_degrees() -> None:
@@ -342,11 +342,11 @@ def test_a_sensor_at_its_limit_is_named_with_the_share_of_samples() -> None:
         share = float((np.abs(values) > limit).any(axis=1).mean())
         assert share > 0.02
         clipped = replace(free, **{sensor: np.clip(values, -limit, limit)})
-        (problem,) = (p for p in inspect_recording(clipped).problems if "limit" in p)
+        (problem,) = (p for p in told(clipped) if "limit" in p)
         assert f"limit of {limit:.3g}" in problem
         reported = float(problem.split("%")[0].split()[-1]) / 100.0
         assert 0.5 * share < reported < share
-    assert not [p for p in inspect_recording(free).problems if "limit" in p]
+    assert not [p for p in told(free) if "limit" in p]
 
 
 def test_one_huge_value_neither_refuses_nor_warns(walk: ImuSequence) -> None:
@@ -356,7 +356,7 @@ def test_one_huge_value_neither_refuses_nor_warns(walk: ImuSequence) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_units(sequence)
-        text = "\n".join(inspect_recording(sequence).lines())
+        (text,) = told(sequence)
     assert text.endswith("in 1 sample")
 
 

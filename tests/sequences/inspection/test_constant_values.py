@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from told import told
 
+from stario.sequences.findings import warn
 from stario.sequences.inspection.constant_values import (
-    dead_axis_problems,
-    stuck_problems,
-    warn_of_dead_axes,
+    dead_axes,
+    stuck_findings,
 )
-from stario.sequences.inspection.report import inspect_recording
-from stario.sequences.inspection.samples import sample_problems
+from stario.sequences.inspection.samples import sample_findings
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
@@ -32,19 +32,19 @@ def walk() -> ImuSequence:
 def test_a_dead_axis_is_named(walk: ImuSequence, sensor: str, axis: int, value: float) -> None:
     values = getattr(walk, sensor).copy()
     values[:, axis] = value
-    (problem,) = dead_axis_problems(replace(walk, **{sensor: values}))
+    (problem,) = dead_axes(replace(walk, **{sensor: values}))
     name = {"gyro": "gyroscope", "accel": "accelerometer"}[sensor]
-    assert f"{name}: its {'xyz'[axis]} axis never changes" in problem
+    assert f"{name}: its {'xyz'[axis]} axis never changes" in str(problem)
 
 
 def test_inspect_reports_it_and_the_log_warns_once(
     walk: ImuSequence, caplog: pytest.LogCaptureFixture
 ) -> None:
     dead = replace(walk, gyro=walk.gyro * [1.0, 1.0, 0.0])
-    assert any("its z axis" in problem for problem in inspect_recording(dead).problems)
+    assert any("its z axis" in problem for problem in told(dead))
     assert "axis" not in caplog.text
     with caplog.at_level(logging.WARNING):
-        warn_of_dead_axes(dead)
+        warn(dead.name, dead_axes(dead))
     assert caplog.text.count("its z axis") == 1
 
 
@@ -59,20 +59,20 @@ def test_motion_in_a_plane_is_no_problem() -> None:
     rest = [*(0.002 * rng.standard_normal((2, len(t)))), zero], [zero, zero, up]
     for gyro, accel in (floor, swing, rest):
         planar = ImuSequence("planar", t, np.column_stack(gyro), np.column_stack(accel))
-        assert dead_axis_problems(planar) == []
+        assert dead_axes(planar) == []
 
 
 def test_two_equal_samples_are_not_stuck_for_the_seconds_of_a_wrong_unit(walk: ImuSequence) -> None:
     gyro, accel = walk.gyro.copy(), walk.accel.copy()
     gyro[501] = gyro[500]
     accel[501, 0] += 9.0
-    assert stuck_problems("w", 1e3 * walk.time, gyro, accel) == []
+    assert stuck_findings(1e3 * walk.time, gyro, accel) == []
 
 
 def test_few_or_coarsely_rounded_maxima_are_no_limit(walk: ImuSequence) -> None:
     short = walk.slice(0.0, 4.0)
     accel = short.accel.copy()
     accel[100:103, 0] = 40.0  # twice a repetition: a knock
-    assert not [p for p in sample_problems(replace(short, accel=accel)) if "limit" in p]
+    assert not [f for f in sample_findings(replace(short, accel=accel)) if "limit" in f.code]
     rounded = replace(walk, gyro=np.clip(np.round(walk.gyro), -1.0, 1.0))
-    assert not [p for p in sample_problems(rounded) if "limit" in p]
+    assert not [f for f in sample_findings(rounded) if "limit" in f.code]

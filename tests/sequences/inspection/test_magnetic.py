@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from recorded import DATA
 from scipy.spatial.transform import Rotation
+from told import told
 
 from stario.sequences import (
     ImuSequence,
@@ -22,8 +23,8 @@ from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.clean_samples import clean_samples
 from stario.sequences.inspection.magnetic import assess_magnetometer
-from stario.sequences.inspection.magnetic_findings import magnetic_problems
-from stario.sequences.inspection.times import magnetometer_time_problems
+from stario.sequences.inspection.magnetic_findings import magnetic_findings
+from stario.sequences.inspection.samples import magnetometer_time
 from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
@@ -48,7 +49,7 @@ def test_correlation_lag_hard_iron_dip_and_drift_are_recovered() -> None:
     np.testing.assert_allclose(found.hard_iron_uT, IRON, atol=3.0)
     assert found.dip_rad == pytest.approx(math.radians(63.0), abs=0.1)
     assert found.gyroscope_drift_rad_s == pytest.approx(drift, rel=0.15)
-    assert "hard iron" in magnetic_problems("walk", found)[0]
+    assert "hard iron" in str(magnetic_findings(found)[0])
 
 
 def test_a_short_recording_gives_no_verdict_and_its_span_is_named() -> None:
@@ -84,13 +85,11 @@ def test_magnets_wrong_axes_apples_sign_and_wrong_units_are_detected() -> None:
     turned = Magnetometer(good.magnetometer.time, good.magnetometer.field[:, [1, 2, 0]])
     wrong = assess_magnetometer(replace(good, magnetometer=turned))
     assert wrong.verdict == "not usable"
-    assert "does not follow the gyroscope" in " ".join(magnetic_problems("walk", wrong))
-    lines = inspect_recording(replace(good, truth=None, accel=-good.accel)).lines()
+    assert "does not follow the gyroscope" in " ".join(map(str, magnetic_findings(wrong)))
+    lines = told(replace(good, truth=None, accel=-good.accel))
     assert any("points up by" in line and "--accel-sign apple" in line for line in lines)
     unit = Magnetometer(good.magnetometer.time, 1e3 * good.magnetometer.field)
-    assert "if in nT, give 0.001" in " ".join(
-        inspect_recording(replace(good, magnetometer=unit)).problems
-    )
+    assert "if in nT, give 0.001" in " ".join(told(replace(good, magnetometer=unit)))
 
 
 def test_a_field_extrapolated_by_the_device_is_detected_by_its_constant_norm() -> None:
@@ -116,7 +115,7 @@ def test_a_magnetometer_that_starts_with_zeros_is_assessed() -> None:
 
 def test_inspection_reports_a_good_magnetometer_and_a_missing_one() -> None:
     good = inspect_recording(walk(MagneticField()))
-    assert not good.problems
+    assert not good.findings
     assert any(line.startswith("magnetometer: ") and "dip 63 deg" in line for line in good.lines())
     report = good.as_dict()["magnetometer"]
     assert isinstance(report, dict)
@@ -167,9 +166,9 @@ def test_a_magnetometer_at_other_times_than_the_samples_is_reported(
     sequence = walk(MagneticField())
     field = sequence.magnetometer
     assert field is not None
-    assert magnetometer_time_problems(sequence) == []
+    assert magnetometer_time(sequence) == []
     elsewhere = replace(sequence, magnetometer=replace(field, time=factor * field.time + offset))
-    problems = [p for p in inspect_recording(elsewhere).problems if "found times from" in p]
+    problems = [p for p in told(elsewhere) if "found times from" in p]
     assert len(problems) == 1
-    assert problems[0].startswith(f"{sequence.name}: magnetometer: ")
+    assert problems[0].startswith("magnetometer: ")
     assert problems[0].endswith(words)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from recorded import DATA
 from scipy.spatial.transform import Rotation
+from told import told
 
 from stario.sequences.conventions import SAME_AXES, with_axes
 from stario.sequences.drawing.plots import imu_overview
@@ -25,9 +26,7 @@ def walk() -> ImuSequence:
 
 
 def problem(sequence: ImuSequence) -> str:
-    found = inspect_recording(sequence)
-    (text,) = found.problems
-    assert text in "\n".join(found.lines())
+    (text,) = told(sequence)
     return text
 
 
@@ -42,18 +41,18 @@ def test_a_gyroscope_with_other_axes_or_signs_contradicts_gravity(axes: np.ndarr
     tilting = Trajectory(time, np.zeros((len(time), 3)), attitude_WB)
     right = replace(simulate_imu(tilting, 100.0, seed=2), truth=None)
     found = inspect_recording(right)
-    assert found.problems == ()
+    assert found.findings == ()
     assert found.axes is not None
     assert found.axes.compared
-    assert "axes: no problems found" in found.lines()[-1]
-    wrong = inspect_recording(replace(right, gyro=right.gyro @ axes.T))
-    assert "axes and signs the accelerometer's?" in wrong.problems[-1]
+    assert "signs and axes: compared" in found.lines()[-1]
+    wrong = told(replace(right, gyro=right.gyro @ axes.T))
+    assert "axes and signs the accelerometer's?" in wrong[-1]
 
 
 def test_axes_are_not_called_right_where_the_device_hardly_tilts(walk: ImuSequence) -> None:
     still = replace(walk, gyro=0.0 * walk.gyro + 1e-3, accel=0.0 * walk.accel + [0.0, 0.0, 9.8])
     assert (
-        "axes: no problems found" not in inspect_recording(replace(still, truth=None)).lines()[-1]
+        "signs and axes: compared" not in inspect_recording(replace(still, truth=None)).lines()[-1]
     )
 
 
@@ -64,29 +63,29 @@ def test_jumps_of_satellite_positions_are_a_problem(walk: ImuSequence) -> None:
     outdoors = replace(walk, truth=None, positions=known)
     taps = replace(outdoors, positions=replace(known, kind="waypoints"))
     path[5] += [0.0, 12.0]  # within the stated errors
-    assert inspect_recording(outdoors).problems == ()
+    assert told(outdoors) == []
     path[10:15] += [0.0, 100.0]
     assert "positions: found jumps of up to 100 m" in problem(outdoors)
-    assert inspect_recording(taps).problems == ()  # no source of positions jumps there
+    assert told(taps) == []  # no source of positions jumps there
 
 
 def test_positions_on_another_clock_are_a_problem(walk: ImuSequence) -> None:
     taps = PositionTrack(np.array([1000.0, 9000.0]), np.zeros((2, 2)), "waypoints")
-    problems = inspect_recording(replace(walk, truth=None, positions=taps)).problems
+    problems = told(replace(walk, truth=None, positions=taps))
     assert any("positions: found times from 1000 to 9000 s" in problem for problem in problems)
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_truth_of_hardly_any_poses_is_a_problem(walk: ImuSequence, count: int) -> None:
     valid = np.arange(len(walk.truth)) < count
-    found = inspect_recording(replace(walk, truth=replace(walk.truth, valid=valid))).problems
+    found = told(replace(walk, truth=replace(walk.truth, valid=valid)))
     assert any(f"truth: only {count} usable pose" in problem for problem in found)
 
 
 def test_a_good_recording_has_no_problems(walk: ImuSequence) -> None:
     found = inspect_recording(walk)
-    assert found.problems == ()
-    assert "no problems found" in found.lines()[-1]
+    assert found.findings == ()
+    assert "compared" in found.lines()[-1]
     assert found.timing.samples == len(walk)
     assert found.timing.rate_hz == pytest.approx(100.0)
     assert found.timing.gaps == ()
@@ -124,7 +123,7 @@ def test_one_wild_time_is_counted_and_nothing_else(
         time = walk.time.copy()
         time[1000] = wild
         found = inspect_recording(replace(walk, time=time))
-        assert found.problems == ()
+        assert found.findings == ()
         assert found.timing.times_ahead + found.timing.times_backward == 1
         assert found.timing.samples == len(walk)
         assert "ahead" not in caplog.text
@@ -137,7 +136,7 @@ def test_one_wild_time_is_counted_and_nothing_else(
 @pytest.mark.parametrize("by", [3.0, 100.0])
 def test_a_clock_set_back_is_a_problem(walk: ImuSequence, by: float) -> None:
     time = np.where(walk.time >= 10.0, walk.time - by, walk.time)
-    text = " ".join(inspect_recording(replace(walk.without_truth(), time=time)).problems)
+    text = " ".join(told(replace(walk.without_truth(), time=time)))
     assert f"back by {by - 0.01:.3g} s" in text
     assert "split the recording there" in text
 
@@ -172,8 +171,8 @@ def test_a_truth_too_slow_to_compare_is_named_as_such(walk: ImuSequence) -> None
     """Its attitude between two poses is unknown, so neither clock nor axes may be blamed."""
     truth = walk.truth
     found = inspect_recording(replace(walk, truth=truth.at(np.arange(0.0, truth.time[-1], 0.2))))
-    (problem,) = found.problems
-    assert "5 Hz; at least 10 Hz" in problem
+    (problem,) = found.findings
+    assert "5 Hz; at least 10 Hz" in problem.text
     assert found.fit is None
 
 
@@ -239,7 +238,7 @@ def test_the_figure_shows_rest_gaps_and_the_rotation_of_the_truth(walk: ImuSeque
 @pytest.mark.parametrize("name", ["tumvi/dataset-room1_512_16", "oxiod/trolley/data2/syn/imu4.csv"])
 def test_real_recordings_have_no_problems(name: str) -> None:
     found = inspect_recording(read_recording(DATA / name))
-    assert found.problems == ()
+    assert found.findings == ()
     assert found.fit.correlation > 0.95
     assert abs(found.fit.time_offset) < 0.01
     assert np.degrees(found.fit.misalignment) < 2.0

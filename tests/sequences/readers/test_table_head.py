@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from stario.sequences.readers.table_head import TableHead, first_row, table_heads
+from stario.sequences.readers.text import RowFormat
 
 
 def head_of(folder: Path, *lines: str) -> TableHead:
@@ -19,9 +20,9 @@ def head_of(folder: Path, *lines: str) -> TableHead:
 
 def test_a_first_row_of_integers_has_the_decimal_mark_of_the_rows_below() -> None:
     rows = ["Zeit;x;y;z", "0;0;0;0", "0,01;0,5;-0,25;9,8", "0,02;0,5;-0,25;9,8"]
-    assert first_row(rows) == (1, ";", ",")
+    assert first_row(rows) == RowFormat(1, ";", ",")
     points = [row.replace(",", ".") for row in rows]
-    assert first_row(points) == (1, ";", ".")
+    assert first_row(points) == RowFormat(1, ";", ".")
 
 
 def test_titles_are_those_above_a_row_of_their_units(tmp_path: Path) -> None:
@@ -29,7 +30,7 @@ def test_titles_are_those_above_a_row_of_their_units(tmp_path: Path) -> None:
         tmp_path, "# by a logger", "t;x;y;z", "s;rad/s;rad/s;rad/s", "0;1;2;3", "1;1;2;3"
     )
     assert head.titles == ["t [s]", "x [rad/s]", "y [rad/s]", "z [rad/s]"]
-    assert (head.layout.skip, head.layout.delimiter) == (3, ";")
+    assert (head.row_format.skip, head.row_format.delimiter) == (3, ";")
 
 
 def test_words_above_rows_with_blanks_are_no_titles(tmp_path: Path) -> None:
@@ -44,7 +45,7 @@ def test_titles_may_be_separated_in_another_way_than_the_rows(tmp_path: Path) ->
 
 def test_quoted_numbers_have_decimal_commas_between_commas(tmp_path: Path) -> None:
     head = head_of(tmp_path, "t,x,y,z", '0,"0,5","-0,25","9,8"', '1,"0,5","-0,25","9,8"')
-    assert (head.layout.delimiter, head.layout.decimal) == (",", ",")
+    assert (head.row_format.delimiter, head.row_format.decimal) == (",", ",")
     np.testing.assert_array_equal(head.read(4).values[1], [1.0, 0.5, -0.25, 9.8])
 
 
@@ -81,7 +82,7 @@ def test_incomplete_rows_and_remarks_may_follow_the_titles(
     """Without its titles, columns z, y, x would be read as x, y, z."""
     head = head_of(tmp_path, "by a logger", "time,z,y,x", *between, "2,1,2,3", "3,1,2,3")
     assert head.titles == ["time", "z", "y", "x"]
-    assert head.layout.skip == 2 + len(between)
+    assert head.row_format.skip == 2 + len(between)
 
 
 def test_incomplete_rows_without_titles_are_none(tmp_path: Path) -> None:

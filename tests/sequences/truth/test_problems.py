@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from told import told
 
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.report import inspect_recording
@@ -13,7 +14,7 @@ from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence,
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk
 from stario.sequences.truth.positions import fit_positions
-from stario.sequences.truth.problems import check_truth, examine_truth, truth_problems
+from stario.sequences.truth.problems import check_truth, examine_truth, truth_findings
 from stario.sequences.truth.tracking import tracking_faults
 
 LATE_S = 20.0
@@ -59,11 +60,11 @@ POSITIONS = {
 def test_wrong_positions_are_named_with_the_remedy(walk: ImuSequence, found: str) -> None:
     change, fix = POSITIONS[found]
     wrong = moved(walk, change)
-    (problem,) = inspect_recording(wrong).problems
-    assert problem.startswith("w: truth: ")
+    (problem,) = told(wrong)
+    assert problem.startswith("truth: ")
     assert found in problem
     assert fix in problem
-    assert [p.line("w") for p in truth_problems(wrong)] == [problem]
+    assert [str(found) for found in truth_findings(wrong)] == [problem]
     with pytest.raises(
         InputError, match=r"w: truth: found a? ?position.*expected poses that agree"
     ):
@@ -77,7 +78,7 @@ def test_right_positions_raise_nothing_however_the_device_is_carried(carry: str)
     kept = (walk.time % 9.0) > 0.5
     gappy = walk.select(kept)
     for recording in (walk, gappy, replace(walk, truth=walk.truth.at(np.arange(0.0, 40.0, 0.1)))):
-        assert truth_problems(recording) == []
+        assert truth_findings(recording) == []
         found = examine_truth(recording)
         assert found.positions is not None
         assert found.positions.scale == pytest.approx(1.0, abs=0.2)
@@ -92,7 +93,7 @@ def test_positions_of_a_device_that_hardly_accelerates_are_not_compared() -> Non
     mirrored = moved(rolling, lambda truth: -truth.position_W)
     assert examine_truth(mirrored).positions is None
     assert any("positions not compared" in line for line in inspect_recording(mirrored).lines())
-    assert truth_problems(mirrored) == []
+    assert truth_findings(mirrored) == []
 
 
 def test_lost_tracking_written_as_zeros_is_not_taken_for_a_wrong_clock(walk: ImuSequence) -> None:
@@ -101,7 +102,7 @@ def test_lost_tracking_written_as_zeros_is_not_taken_for_a_wrong_clock(walk: Imu
     quat_xyzw = np.where(lost[:, None], [0.0, 0.0, 0.0, 1.0], truth.quat_xyzw)
     position_W = np.where(lost[:, None], 0.0, truth.position_W)
     zeros = replace(truth, position_W=position_W, attitude_WB=Rotation.from_quat(quat_xyzw))
-    (problem,) = inspect_recording(replace(walk, truth=zeros)).problems
+    (problem,) = told(replace(walk, truth=zeros))
     assert "repeats exactly for 7.9 s" in problem
 
 
@@ -111,7 +112,7 @@ def test_a_jump_of_the_attitude_is_not_taken_for_an_error_of_the_gyroscope(
     truth = walk.truth
     turn = Rotation.from_euler("z", np.where(truth.time > LATE_S, 3.0, 0.0)[:, None])
     flipped = replace(walk, truth=replace(truth, attitude_WB=turn * truth.attitude_WB))
-    (problem,) = inspect_recording(flipped).problems
+    (problem,) = told(flipped)
     assert "an attitude that jumps once" in problem
     with pytest.raises(InputError, match="jumps once"):
         check_truth(flipped)
@@ -122,7 +123,7 @@ def test_a_jump_of_the_attitude_is_not_taken_for_an_error_of_the_gyroscope(
 )
 def test_a_truth_on_a_distant_clock_is_named(walk: ImuSequence, late: float, named: str) -> None:
     shifted = replace(walk, truth=replace(walk.truth, time=walk.truth.time + late))
-    (problem,) = inspect_recording(shifted).problems
+    (problem,) = told(shifted)
     assert named in problem
     with pytest.raises(InputError, match="expected poses that agree with the IMU"):
         check_truth(shifted)
@@ -159,7 +160,7 @@ def test_a_shift_while_tracking_is_lost_is_not_a_jump(walk: ImuSequence) -> None
 
 def test_a_truth_too_short_to_compare_is_no_problem(walk: ImuSequence) -> None:
     assert walk.truth is not None
-    assert examine_truth(replace(walk, truth=walk.truth.slice(10.0, 18.0))).problems == ()
+    assert examine_truth(replace(walk, truth=walk.truth.slice(10.0, 18.0))).findings == ()
 
 
 def test_only_poses_whose_attitude_repeats_as_well_are_lost(walk: ImuSequence) -> None:
@@ -174,9 +175,9 @@ def test_a_wrong_unit_of_the_accelerometer_is_not_blamed_on_the_positions(
     walk: ImuSequence,
 ) -> None:
     in_mg = replace(walk, accel=1e3 * walk.accel / STANDARD_GRAVITY)
-    (problem,) = examine_truth(in_mg).problems
-    assert problem.found.startswith("positions that")
-    assert examine_truth(in_mg, known="w: accelerometer: found an average of 1").problems == ()
+    (problem,) = examine_truth(in_mg).findings
+    assert problem.text.startswith("truth: positions that")
+    assert examine_truth(in_mg, "if it is in mg, ...").findings == ()
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
@@ -188,7 +189,7 @@ def test_the_truth_of_a_device_at_rest_is_not_called_wrong(noise: float) -> None
     attitude_WB = Rotation.from_rotvec(noise * rng.normal(size=(len(time), 3)))
     truth = Trajectory(time, 1e-4 * rng.normal(size=(len(time), 3)), attitude_WB)
     resting = ImuSequence("rest", time, gyro, accel, truth=truth)
-    assert truth_problems(resting) == []
+    assert truth_findings(resting) == []
     check_truth(resting)
     shaken = replace(resting, gyro=gyro + np.outer(np.sin(7.0 * time), [0.5, 0.0, 0.0]))
-    assert any("disagrees" in problem.found for problem in truth_problems(shaken))
+    assert any(problem.code == "truth_disagrees" for problem in truth_findings(shaken))

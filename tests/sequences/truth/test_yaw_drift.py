@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from told import told
 
 from stario.sequences import ImuSequence, inspect_recording
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
@@ -69,6 +70,6 @@ def test_without_rotation_no_yaw_drift_is_estimated(walk: ImuSequence) -> None:
     [(1.3, r"(29|30)\.\d % too high"), (1 / 57.3, r"98\.\d % too low"), (1.04, "")],
 )
 def test_an_implausible_scale_is_a_problem(walk: ImuSequence, scale: float, words: str) -> None:
-    reported = "\n".join(inspect_recording(replace(walk, gyro=scale * walk.gyro)).problems)
+    reported = "\n".join(told(replace(walk, gyro=scale * walk.gyro)))
     assert ("gyroscope: reads" in reported) is bool(words)
     assert re.search(words, reported)

@@ -56,13 +56,13 @@ def test_aligned_recordings_are_cached(walk: ImuSequence, tmp_path: Path) -> Non
 
 
 def test_a_wrong_truth_is_warned_of_also_from_the_cache(
-    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    stepping: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    truth = walk.truth
-    wrong = replace(walk, truth=replace(truth, position_W=truth.position_W * [-1.0, 1.0, 1.0]))
+    truth = stepping.truth
+    wrong = replace(stepping, truth=replace(truth, position_W=truth.position_W * [-1.0, 1.0, 1.0]))
     path = tmp_path / "walk.csv"
     path.touch()
     for _ in range(2):
         caplog.clear()
         next(aligned_recordings([path], lambda _: wrong, {}, tmp_path / "cache", 1))
-        assert "walk: truth: positions mirrored" in caplog.text
+        assert "steps: truth: positions mirrored" in caplog.text

@@ -153,18 +153,18 @@ def test_pedestrian_dead_reckoning_is_near_the_truth_on_real_recordings(
     assert found.figures[error] < 15.0
 
 
-def test_pedestrian_dead_reckoning_is_judged_like_a_network(walk: ImuSequence) -> None:
-    [predicted] = PedestrianDeadReckoning().predictions(aligned_once(walk))
+def test_pedestrian_dead_reckoning_is_judged_like_a_network(stepping: ImuSequence) -> None:
+    [predicted] = PedestrianDeadReckoning().predictions(aligned_once(stepping))
     np.testing.assert_allclose(predicted.covariance_N[0], 0.3**2 * np.eye(3))  # its usual error
-    found = errors_of(walk, PedestrianDeadReckoning())
+    found = errors_of(stepping, PedestrianDeadReckoning())
     assert 0.5 < found.figures["length_ratio"] < 1.6
 
 
-def test_the_share_of_the_path_is_that_of_the_pieces_between_gaps(walk: ImuSequence) -> None:
+def test_the_share_of_the_path_is_that_of_the_pieces_between_gaps(stepping: ImuSequence) -> None:
     """Pieces are fitted one by one: a share of the whole path would shrink with every gap."""
-    kept = np.abs(walk.time - walk.time.mean()) > 0.5
-    samples = {name: getattr(walk, name)[kept] for name in ("time", "gyro", "accel")}
-    found = errors_of(replace(walk, **samples), PedestrianDeadReckoning())
+    kept = np.abs(stepping.time - stepping.time.mean()) > 0.5
+    samples = {name: getattr(stepping, name)[kept] for name in ("time", "gyro", "accel")}
+    found = errors_of(replace(stepping, **samples), PedestrianDeadReckoning())
     share = 100.0 * found.figures["ate_fit_m"] / (0.5 * found.path_m)
     assert found.figures["ate_fit_percent"] == pytest.approx(share, rel=0.1)
 

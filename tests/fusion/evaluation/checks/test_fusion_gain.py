@@ -74,7 +74,7 @@ def test_the_yaw_error_is_that_since_the_start_next_to_the_sigma_of_yaw(
     )
     assert of(rotated, "yaw_error") == pytest.approx(of(found, "yaw_error"), abs=1e-9)
     assert abs(of(found, "yaw_error")) < 0.1
-    track = Navigator(oracle, CONFIG).run(walk)
+    track = Navigator(oracle, CONFIG, backend="ekf").run(walk)
     assert of(found, "yaw_sigma") == pytest.approx(np.sqrt(track.covariance[-1, 2, 2]))
     half = truth.slice(truth.time[0], 0.5 * truth.time[-1])
     shorter = fusion_gain(oracle, replace(walk, truth=half), CONFIG, "walks", ("ekf",))

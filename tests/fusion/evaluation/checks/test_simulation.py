@@ -31,7 +31,8 @@ MEASURED = {
     "call": (0.46, 0.48, 0.26, 0.12, 0.8),
     "swinging": (1.77, 0.64, 0.41, 0.17, 1.9),
     "bag": (1.83, 0.86, 0.57, 0.43, 0.9),
-    "handheld": (3.0, 1.4, 0.7, 0.4, 0.85),
+    "handheld": (1.3, 0.33, 0.2, 0.11, 0.5),
+    "in-front": (3.0, 1.4, 0.7, 0.4, 0.85),
 }
 """Medians of the archives: force by band [m/s^2], and angular rate [rad/s]."""
 
@@ -58,6 +59,8 @@ def test_motion_is_that_of_a_known_vibration() -> None:
     assert found["force_10"] < 0.02
     assert found["rate"] == pytest.approx(0.5)
     assert found["step_rate"] == pytest.approx(2.0, abs=0.06)
+    short = motion(ImuSequence("short", time[:400], gyro[:400], accel[:400]))
+    assert short["step_rate"] == pytest.approx(2.0, abs=0.1)
 
 
 def test_a_recording_without_a_known_carry_is_refused() -> None:

@@ -36,7 +36,7 @@ def test_a_second_session_in_the_same_files_does_not_mix_with_the_first(
     read = read_recording(folder)
     first = slice(0, 498)
     force = interpolated(read.time[first] + 0.01, walk.time, walk.accel)
-    np.testing.assert_allclose(read.accel[first], force, atol=0.5)  # interpolated twice
+    np.testing.assert_allclose(read.accel[first], force, atol=0.8)  # interpolated twice
     assert "accelerometer: dropped 499 of 1000 samples whose times go back" in caplog.text
 
 

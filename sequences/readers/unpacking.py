@@ -1,13 +1,18 @@
-"""Recordings exported by apps as a zip of the files of a folder, or as a zip of such zips."""
+"""Recordings in a zip of a folder's files, or of such zips; names in messages about them."""
 
 from __future__ import annotations
 
+import logging
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.lines import first_bytes
+
+_PACKAGE = "stario.sequences"
 
 _SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".json", ".properties", ".zip")
 _MAX_BYTES = 4 * 2**30
@@ -66,3 +71,35 @@ def _is_wanted(info: zipfile.ZipInfo) -> bool:
     parts = PurePosixPath(info.filename).parts
     hidden = any(part.startswith((".", "__MACOSX")) for part in parts)
     return not info.is_dir() and not hidden and info.filename.lower().endswith(_SUFFIXES)
+
+
+@contextmanager
+def named_after(path: Path, folder: Path) -> Iterator[None]:
+    """Let errors and log records of the block name `path` instead of where it is unpacked to.
+
+    `walk.zip/Gyroscope.csv` is the file of that name in the zip.
+    """
+
+    def shown(text: str) -> str:
+        for inside in (folder / f"{path.stem}.csv", folder):  # the only file is `path` itself
+            text = text.replace(str(inside), str(path))
+        return text.replace(folder.name, path.stem)
+
+    def rename(record: logging.LogRecord) -> bool:
+        record.msg, record.args = shown(record.getMessage()), ()
+        return True
+
+    known = logging.root.manager.loggerDict
+    # A filter sees only its own logger's records, not those of the loggers below it.
+    loggers = [logging.getLogger(name) for name in known if name.startswith(_PACKAGE)]
+    for logger in loggers:
+        logger.addFilter(rename)
+    try:
+        yield
+    except ReadError as error:
+        field = error.field.removeprefix(f"{error.path}: ")
+        found, fix = (text.replace(f"{folder}/", "") for text in (error.found, error.fix))
+        raise ReadError(shown(str(error.path)), field, found, error.expected, fix) from None
+    finally:
+        for logger in loggers:
+            logger.removeFilter(rename)

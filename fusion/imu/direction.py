@@ -14,17 +14,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from stario.fusion.evaluation.benchmark.aligned import Complex
-from stario.sequences.levelled_stream import TICK_SECONDS, LevelledStream
 from stario.sequences.sequence import FloatArray
-from stario.sequences.windows import VELOCITY_WEIGHTS, WINDOW_SECONDS
+from stario.sequences.windows import VELOCITY_WEIGHTS
 
-_STRETCH = round(20.0 / TICK_SECONDS)
-_SECOND = round(WINDOW_SECONDS / TICK_SECONDS)
+_STRETCH_S = 20
+
+Complex = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
@@ -66,29 +65,33 @@ class Direction:
         return min(math.pi, math.sqrt((1.0 - coherence) / (2.0 * coherence * self.count)))
 
 
-def direction(stream: LevelledStream, displacement_N: FloatArray) -> Direction:
-    """Compare the direction of a network's displacements along a stretch with the accelerometer's.
+def weighted_force(windows_N: NDArray[np.float32]) -> Complex:
+    """Return (M, 2): the horizontal force of windows (M, 6, 200), rising and falling weights."""
+    force = windows_N[:, 3].astype(np.float64) + 1j * windows_N[:, 4].astype(np.float64)
+    return np.column_stack([force @ VELOCITY_WEIGHTS, force @ VELOCITY_WEIGHTS[::-1]])
+
+
+def direction(weighted: Complex, displacement_N: FloatArray, per_second: int) -> Direction:
+    """Compare the direction of displacements along an unbroken stretch with the accelerometer's.
 
     Args:
-        stream: IMU in N.
-        displacement_N: (M, 3) displacements over the second from each tick [m].
+        weighted: (M, 2) of successive windows, as `weighted_force`.
+        displacement_N: (M, 3) displacements over these windows [m].
+        per_second: number of windows that begin within a second.
     """
-    accel_N = stream.windows()[:, 3:5].astype(np.float64)
-    if len(accel_N) <= 3 * _SECOND:
+    if len(weighted) <= 3 * per_second:
         return Direction()
-    accel_change = (
-        accel_N[:-_SECOND] @ VELOCITY_WEIGHTS + accel_N[_SECOND:] @ VELOCITY_WEIGHTS[::-1]
-    )
-    accel_change = accel_change[:-_SECOND] + accel_change[_SECOND:]
-    network_change = displacement_N[2 * _SECOND :, :2] - displacement_N[: -2 * _SECOND, :2]
-    a, d = (_without_slow(v[:, 0] + 1j * v[:, 1]) for v in (accel_change, network_change))
-    count = len(d) / (3.0 * _SECOND)  # a change spans three seconds
+    change = weighted[:-per_second, 0] + weighted[per_second:, 1]
+    moved = displacement_N[:, 0] + 1j * displacement_N[:, 1]
+    a = _without_slow(change[:-per_second] + change[per_second:], _STRETCH_S * per_second)
+    d = _without_slow(moved[2 * per_second :] - moved[: -2 * per_second], _STRETCH_S * per_second)
+    count = len(d) / (3.0 * per_second)  # a change spans three seconds
     return Direction(complex(np.vdot(d, a)), _square(d), _square(a), count)
 
 
-def _without_slow(changes: Any) -> Complex:
-    """Return the changes minus their mean over each 20 s."""
-    parts = np.array_split(changes, max(1, len(changes) // _STRETCH))
+def _without_slow(changes: Complex, count: int) -> Complex:
+    """Return the changes minus the mean of each `count` of them."""
+    parts = np.array_split(changes, max(1, len(changes) // count))
     return np.concatenate([part - part.mean() for part in parts])
 
 

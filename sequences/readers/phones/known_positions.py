@@ -1,7 +1,8 @@
-"""Satellite positions that a phone logged alongside its IMU: `Location.csv`, `GPS.csv`, columns.
+"""Positions next to a phone's IMU: from satellites (`Location.csv`, `GPS.csv`, columns), or points.
 
 A header names latitude and longitude, and usually the accuracy: the radius that holds the true
-position with a probability of 68 % on Android, and about that on iOS.
+position with a probability of 68 % on Android, and about that on iOS. Reference points are places
+that the user passed at known times.
 """
 
 from __future__ import annotations
@@ -25,6 +26,17 @@ from stario.sequences.time_order import increasing_mask
 from stario.sequences.units import TIME_UNITS
 
 _log = logging.getLogger(__name__)
+
+_POINT_NAMES = {
+    "ref",
+    "reference",
+    "references",
+    "waypoints",
+    "waypoint",
+    "checkpoints",
+    "landmarks",
+}
+"""Words of which the name of a file of reference points has one."""
 
 _NAMES = {"location", "locations", "gps", "gnss"}
 """Words of which the name of a file of satellite positions has one."""
@@ -183,3 +195,32 @@ def _within(
         raise ReadError(table.path, "time", found, f"times from 0 to {stop:.0f} s", fix)
     inside &= increasing_mask(time)
     return rows[inside], time[inside]
+
+
+def reference_points(
+    folder: Path, key: str, start_ns: np.int64, stop_ns: np.int64
+) -> PositionTrack | None:
+    """Return the waypoints of a file such as `*_ref.csv` (time, x, y [m]), or None without one.
+
+    Args:
+        folder: the folder to search.
+        key: the words that the names of all files of the recording share.
+        start_ns: time of the recording's first sample on the sensors' clock [ns].
+        stop_ns: time of its last sample [ns].
+
+    Raises:
+        ReadError: a row is malformed.
+    """
+    for file in sorted(folder.iterdir()):
+        words = set(words_of(file.stem))
+        if file.suffix.lower() not in (".csv", ".txt") or not _POINT_NAMES & words:
+            continue
+        head = next(table_heads(file, least=3), None)
+        if head is None or not set(key.split()) <= words:
+            continue
+        table = head.read(3)
+        unit = unit_within(file, table.values[:, 0], start_ns, stop_ns)
+        time = seconds(table.stamps_ns(0, unit), start_ns)
+        kept = increasing_mask(time)
+        return PositionTrack(time[kept], table.values[kept, 1:3], "waypoints")
+    return None

@@ -1,0 +1,183 @@
+"""filterpy's prediction and update of an error state, with gates and a second covariance.
+
+filterpy predicts and updates the covariance P that the gains assume. Beside it is the covariance of
+the error that these gains leave (Gelb 1974, ch. 7: covariance analysis of a filter whose model is
+not the truth). They differ only by errors that updates consider without estimating them, whose rows
+of P are zero, and by white noise that is smaller than assumed. README.md, "Correlated errors".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+from filterpy.kalman import predict as filterpy_predict
+from scipy.linalg.lapack import dposv, dpotrf
+
+from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CORE, Block, symmetric
+from stario.fusion.state import changed
+from stario.sequences.sequence import FloatArray
+
+
+class UpdateResult(NamedTuple):
+    """Outcome of one measurement.
+
+    Attributes:
+        reason: why the measurement was rejected; empty if it was accepted.
+        nis: normalised innovation squared under the covariance of the error, before any
+            inflation; its expectation is m. NaN if it could not be computed.
+        scale: factor by which the measurement covariance was inflated (1: not gated).
+        residual: (m,) measured minus predicted; None if the measurement was invalid.
+        sigma: (m,) standard deviations of the residual under the covariance of the error; None
+            likewise.
+        gate_nis: the same NIS under the covariance that determined the gain (`gains_from`), which
+            is what gates.
+    """
+
+    reason: str = ""
+    nis: float = math.nan
+    scale: float = 1.0
+    residual: FloatArray | None = None
+    sigma: FloatArray | None = None
+    gate_nis: float = math.nan
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the state was updated; a rejected measurement leaves it unchanged."""
+        return not self.reason
+
+    @property
+    def gated(self) -> bool:
+        """Whether it counts as an outlier, rejected or inflated."""
+        return self.reason == "gated" or self.scale > 1.0
+
+    @property
+    def outcomes(self) -> tuple[str, ...]:
+        """What reports count: "applied", if inflated also "gated"; otherwise the reason."""
+        if not self.accepted:
+            return (self.reason,)
+        return ("applied", "gated") if self.gated else ("applied",)
+
+
+class Linear(NamedTuple):
+    """A measurement that is linear in the error: residual = H error + noise."""
+
+    residual: FloatArray
+    """(m,) measured minus predicted."""
+    blocks: Sequence[Block]
+    """H, as blocks (first column, (m, width)); columns in no block are zero."""
+    covariance: FloatArray
+    """(m, m) R, as assumed for the gains."""
+    noise: FloatArray | None = None
+    """(m, m) R as it is, if that is another: R then also stands for considered errors."""
+
+    def jacobian(self, n: int) -> FloatArray:
+        """Return H (m, n)."""
+        H = np.zeros((len(self.residual), n))
+        for first, block in self.blocks:
+            H[:, first : first + block.shape[1]] = block
+        return H
+
+
+def predict(covariances: FloatArray, transition: FloatArray, noise: FloatArray) -> FloatArray:
+    """Return covariances (2, n, n) after a transition (15, 15) with noises (2, 15, 15)."""
+    n = covariances.shape[1]
+    zero, F, Q = np.zeros(n), np.eye(n), np.zeros((2, n, n))
+    F[:CORE, :CORE], Q[:, :CORE, :CORE] = transition, noise
+    pairs = zip(covariances, Q, strict=True)
+    return symmetric(np.array([filterpy_predict(zero, P, F, q)[1] for P, q in pairs]))
+
+
+def update(
+    s: EkfState,
+    measured: Linear,
+    gate: float | None = None,
+    inflation: float | None = 1.0,
+    gains_from: int = ASSUMED,
+) -> tuple[EkfState, UpdateResult]:
+    """Update a state with a measurement.
+
+    Args:
+        s: the state.
+        measured: the measurement.
+        gate: NIS above which it counts as an outlier; None for no gate.
+        inflation: an outlier's covariance is multiplied by this power of NIS / gate, so that a run
+            of outliers can still correct a wrong filter; None rejects outliers.
+        gains_from: which covariance determines the gains: `ASSUMED` or `ACTUAL`.
+
+    Returns:
+        The state and the outcome. Values that are not finite and covariances that are not positive
+        definite are rejected with a reason; the state is then the one given.
+    """
+    residual, _, covariance, noise = measured
+    if reason := _fault_of(residual, covariance):
+        return s, UpdateResult(reason)
+    H = measured.jacobian(s.covariances.shape[1])
+    R = np.array((covariance, covariance if noise is None else noise))
+    S = H @ s.covariances @ H.T + R
+    nis, gate_nis = _nis(residual, S[ACTUAL]), _nis(residual, S[gains_from])
+    if not math.isfinite(gate_nis):
+        return s, UpdateResult("innovation covariance not invertible")
+    sigma, scale = np.sqrt(S[ACTUAL].diagonal()), 1.0
+    if gate is not None and gate_nis > gate:
+        if inflation is None:
+            return s, UpdateResult("gated", nis, 1.0, residual, sigma, gate_nis)
+        scale = (gate_nis / gate) ** inflation
+    after = corrected(s, residual, H, scale * R, gains_from)
+    return after, UpdateResult("", nis, scale, residual, sigma, gate_nis)
+
+
+def corrected(
+    s: EkfState, residual: FloatArray, H: FloatArray, R: FloatArray, gains_from: int = ASSUMED
+) -> EkfState:
+    """Return the state after a measurement with H (m, n) and R (2, m, m), whatever they are.
+
+    Errors that are only considered have no gain (Schmidt 1966).
+    """
+    filter_ = ExtendedKalmanFilter(H.shape[1], len(H))
+    filter_.P = s.covariances[gains_from]
+    filter_.update(residual[:, None], lambda x: H, lambda x: H @ x, R[gains_from])
+    K = filter_.K
+    K[s.considered_rows] = 0.0
+    A = np.eye(len(K)) - K @ H
+    P = s.covariances.copy()
+    P[ASSUMED] = filter_.P
+    for which in (ACTUAL,) if gains_from == ASSUMED else (ASSUMED, ACTUAL):
+        # With any gain, Joseph's form gives the covariance of the error that it leaves.
+        P[which] = A @ s.covariances[which] @ A.T + K @ R[which] @ K.T
+    return changed(s.plus(K @ residual), covariances=symmetric(P))
+
+
+def gauss_markov(
+    covariances: FloatArray, rows: slice, kept: FloatArray, sigma: float
+) -> FloatArray:
+    """Return covariances (..., n, n) after errors have taken a Gauss-Markov step.
+
+    Args:
+        covariances: before the step.
+        rows: the k rows of the errors, which vary about zero, independently of each other.
+        kept: (k,) correlation of each error with its value before the step.
+        sigma: stationary standard deviation of the errors.
+    """
+    P = covariances.copy()
+    P[..., rows, :] *= kept[:, None]
+    P[..., :, rows] *= kept
+    P[..., rows, rows] += np.diag((1.0 - kept * kept) * sigma**2)
+    return P
+
+
+def _fault_of(value: FloatArray, covariance: FloatArray) -> str:
+    """Return why a measurement cannot be used; empty if it can."""
+    if not math.isfinite(np.vdot(value, value) + np.vdot(covariance, covariance)):
+        return "value that is not finite"
+    return "covariance not positive definite" if dpotrf(covariance, lower=1)[1] else ""
+
+
+def _nis(residual: FloatArray, S: FloatArray) -> float:
+    """Return the normalised innovation squared; NaN if S is not positive definite."""
+    _, solved, failed = dposv(S, residual)
+    return math.nan if failed else float(residual @ solved.ravel())

@@ -1,0 +1,33 @@
+"""The one verdict on findings."""
+
+from __future__ import annotations
+
+from stario.sequences.findings import TOO_EARLY, Finding, verdict
+
+
+def codes(*findings: Finding) -> list[str]:
+    return [finding.code for finding in verdict(findings)]
+
+
+NOTE = Finding("gaps", "1 gap.", level="note")
+AXES = Finding("gyro_axes", "gyroscope: differs", "turn it", values={"tilts": 7})
+
+
+def test_nothing_to_do_is_said_only_if_nothing_was_found_and_there_was_motion_to_judge() -> None:
+    assert codes() == ["nothing"]
+    assert codes(NOTE) == ["nothing", "gaps"]
+    assert codes(NOTE, AXES) == ["gyro_axes", "gaps"]
+    assert codes(Finding(TOO_EARLY, "Too early.", level="note")) == [TOO_EARLY]
+
+
+def test_one_fault_is_told_once() -> None:
+    again = Finding("gyro_axes", "another inspection of the same")
+    follows = Finding("network_contradicts", "30% of the displacements contradict the IMU.")
+    assert verdict([AXES, again, follows]) == [AXES]
+    assert codes(follows) == ["network_contradicts"]
+
+
+def test_a_line_joins_observation_and_advice() -> None:
+    assert AXES.line() == "! gyroscope: differs: turn it"
+    assert NOTE.line() == "  1 gap."
+    assert str(Finding("gaps", "1 gap.", "Log on.")) == "1 gap. Log on."
