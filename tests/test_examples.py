@@ -37,6 +37,7 @@ def test_every_example_is_tested_here():
         "live_latency",
         "fine_tune",
         "ros2_node",
+        "sets_left_out",
     }
     assert {p.stem for p in FOLDER.glob("*.py")} == tested
 
@@ -226,3 +227,10 @@ def test_ros2_node_runs_on_recorded_bags(bag):
     assert len(outputs) > 20
     # Shaking saturates the razor's accelerometer: no track can be computed from it.
     check_odometry(outputs, np.inf if "razor" in bag.stem else 0.3)
+
+
+def test_sets_left_out_says_what_it_needs(capsys, monkeypatch):
+    monkeypatch.delenv("STARIO_DATA", raising=False)
+    monkeypatch.setattr("sys.argv", ["sets_left_out.py"])
+    load("sets_left_out").main()
+    assert "--data FOLDER" in capsys.readouterr().out

@@ -13,11 +13,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from stario.network.training.lever_arm import Swing, apply_swing, sample_swing
+from stario.network.training.stretches import Stretches
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.settings import check_number
@@ -25,6 +25,8 @@ from stario.sequences.windows import HEADING_STEP, WINDOW_RATE, WINDOW_SAMPLES, 
 
 log = logging.getLogger(__name__)
 
+
+CPU = torch.device("cpu")
 
 _SHARES = ("replayed", "swung", "mirrored", "any_yaw")
 
@@ -91,14 +93,13 @@ def reach_of(augmentation: Augmentation, successive: int = 1) -> int:
 class WindowSampler:
     """Sampler of augmented training batches from weighted streams.
 
-    Streams may be memory-mapped: a batch reads the stretches it is cut from and keeps nothing.
-
     Args:
         streams: streams; those shorter than the windows at the fastest replay are skipped.
         weights: relative frequency of each stream, per second of its length.
         augmentation: extent of the random variation.
         seed: seed of all draws.
         successive: consecutive windows, one second apart, that are drawn and varied as one.
+        device: device on which batches are drawn and varied; its draws differ from another's.
 
     Raises:
         InputError: no stream is long enough.
@@ -111,6 +112,7 @@ class WindowSampler:
         augmentation: Augmentation,
         seed: int,
         successive: int = 1,
+        device: torch.device = CPU,
     ) -> None:
         self.augmentation = augmentation
         self._successive = successive
@@ -124,27 +126,35 @@ class WindowSampler:
                 "skipping %d of %d stretches, shorter than the %.1f s that windows span",
                 len(streams) - len(pairs), len(streams), reach / WINDOW_RATE,
             )  # fmt: skip
-        self._streams, kept = zip(*pairs, strict=True)
-        self._starts = torch.tensor([len(s) - reach + 1 for s in self._streams])
-        share = self._starts.double() * torch.tensor(kept, dtype=torch.float64)
+        kept = [weight for _, weight in pairs]
+        self._starts = torch.tensor([len(s) - reach + 1 for s, _ in pairs], device=device)
+        share = self._starts.double() * torch.tensor(kept, dtype=torch.float64, device=device)
         self._cumulative = (share / share.sum()).cumsum(0)
-        self.generator = torch.Generator().manual_seed(seed)
+        self._imu_W = Stretches([s.imu_W for s, _ in pairs], device)
+        self._position_W = Stretches([s.position_W for s, _ in pairs], device)
+        self._facing_W = Stretches([s.facing_W for s, _ in pairs], device)
+        self.generator = torch.Generator(device).manual_seed(seed)
 
     def batch(self, size: int) -> tuple[Tensor, Tensor]:
         """Draw augmented windows (size, 6, 200) and displacements (size, 3) [m].
 
         K > 1 successive windows have shapes (size, K, 6, 200) and (size, K, 3).
         """
-        uniform = torch.rand(size, generator=self.generator, dtype=torch.float64)
-        stream = torch.searchsorted(self._cumulative, uniform).clamp(max=len(self._streams) - 1)
+        device = self.generator.device
+        uniform = torch.rand(size, generator=self.generator, dtype=torch.float64, device=device)
+        stream = torch.searchsorted(self._cumulative, uniform).clamp(max=len(self._starts) - 1)
         # Whole samples: at speed 1, interpolation would smooth data that is not smoothed otherwise.
         offset = (self._uniform(size).double() * self._starts[stream]).floor()
         low, high = self.augmentation.speeds
         speed = low + (high - low) * self._uniform(size)
         speed = torch.where(self._uniform(size) < self.augmentation.replayed, speed, 1.0)
-        steps = torch.arange(self._successive * WINDOW_SAMPLES + 1, dtype=torch.float64)
+        count = self._successive * WINDOW_SAMPLES + 1
+        steps = torch.arange(count, dtype=torch.float64, device=device)
         at = offset.double()[:, None] + steps * speed[:, None].double()
-        imu_W, position_W, facing_W = self._pieces(stream.tolist(), offset.long().tolist())
+        imu_W, position_W, facing_W = (
+            part.gathered(stream, offset.long(), self._reach)
+            for part in (self._imu_W, self._position_W, self._facing_W)
+        )
         imu = _replayed(_lerp(imu_W, offset, at[:, :-1]), speed)
         ends = _lerp(position_W, offset, at[:, ::WINDOW_SAMPLES])
         facing = _lerp(facing_W, offset, at[:, :-1:HEADING_STEP])
@@ -153,17 +163,6 @@ class WindowSampler:
             return imu.transpose(1, 2).contiguous(), displacement.squeeze(1)
         windows = imu.view(size, self._successive, WINDOW_SAMPLES, 6)
         return windows.transpose(2, 3).contiguous(), displacement
-
-    def _pieces(self, streams: list[int], offsets: list[int]) -> list[Tensor]:
-        """Return IMU, position, facing (B, reach, K): the only read from memory-mapped files."""
-        arrays = [np.empty((len(streams), self._reach, k), dtype=np.float32) for k in (6, 3, 2)]
-        for row, (index, offset) in enumerate(zip(streams, offsets, strict=True)):
-            stream, part = self._streams[index], slice(offset, offset + self._reach)
-            for array, values in zip(
-                arrays, (stream.imu_W, stream.position_W, stream.facing_W), strict=True
-            ):
-                array[row] = values[part]
-        return [torch.from_numpy(array) for array in arrays]
 
     def _vary(self, imu: Tensor, displacement: Tensor, facing: Tensor) -> tuple[Tensor, Tensor]:
         """Add swings in W, then apply `augmented`, which rotates each second into its frame H.
@@ -183,13 +182,13 @@ class WindowSampler:
         return imu.view(size, -1, 6), displacement.view(size, seconds, 3)
 
     def _uniform(self, *shape: int) -> Tensor:
-        return torch.rand(*shape, generator=self.generator)
+        return torch.rand(*shape, generator=self.generator, device=self.generator.device)
 
 
 def _replayed(imu: Tensor, speed: Tensor) -> Tensor:
     """Scale rates by s and linear accelerations by s^2; gravity is unchanged."""
     s = speed[:, None, None]
-    gravity = torch.tensor([0.0, 0.0, STANDARD_GRAVITY])
+    gravity = imu.new_tensor([0.0, 0.0, STANDARD_GRAVITY])
     accel = (imu[..., 3:] - gravity) * s**2 + gravity
     return torch.cat([imu[..., :3] * s, accel], dim=2)
 
@@ -217,10 +216,10 @@ def augmented(
         Windows (B, 200, 6) as presented to the network, and R_WH (B, 3, 3), which maps vectors such
         as its displacements to W and undoes the mirroring.
     """
-    a, groups = augmentation, len(imu) // together
+    a, groups, device = augmentation, len(imu) // together, generator.device
 
     def uniform(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator)
+        return torch.rand(*shape, generator=generator, device=device)
 
     def symmetric(*shape: int) -> Tensor:
         return 2.0 * uniform(*shape) - 1.0
@@ -229,7 +228,7 @@ def augmented(
         return values.repeat_interleave(together, dim=0)
 
     # Drawn for every window: the yaw fit of a stretch of weak truth removes a common error.
-    error = a.yaw * torch.randn(len(imu), generator=generator)
+    error = a.yaw * torch.randn(len(imu), generator=generator, device=device)
     anywhere = uniform(len(imu)) < a.any_yaw
     R_HW = _about_z(torch.where(anywhere, symmetric(len(imu)) * torch.pi, error) - heading)
     sign = torch.where(uniform(groups) < a.mirrored, -1.0, 1.0)
@@ -238,10 +237,10 @@ def augmented(
     R_tilt = of_each(_small_tilt(symmetric(groups, 2) * a.tilt / 2**0.5))
     turned = (imu.view(len(imu), -1, 2, 3) @ R_HW.mT.unsqueeze(1)).reshape(imu.shape)
     tilted = (turned * mirror.unsqueeze(1)).view(len(imu), -1, 2, 3) @ R_tilt.mT.unsqueeze(1)
-    limits = torch.tensor([a.gyro_bias] * 3 + [a.accel_bias] * 3)
-    deviations = torch.tensor([a.gyro_noise] * 3 + [a.accel_noise] * 3)
+    limits = imu.new_tensor([a.gyro_bias] * 3 + [a.accel_bias] * 3)
+    deviations = imu.new_tensor([a.gyro_noise] * 3 + [a.accel_noise] * 3)
     imu = tilted.reshape(imu.shape) + of_each(symmetric(groups, 6) * limits).unsqueeze(1)
-    white = torch.randn(imu.shape, generator=generator)
+    white = torch.randn(imu.shape, generator=generator, device=device)
     imu = imu + white * of_each(uniform(groups)[:, None, None] ** 2 * deviations)
     return imu, R_HW.mT * mirror[:, None, 3:]
 
@@ -251,7 +250,7 @@ def heading_of(facing: Tensor, swings: Swing | None = None) -> Tensor:
     size, seconds, instants, _ = facing.shape
     angle = torch.atan2(facing[..., 1], facing[..., 0])
     if swings is not None:
-        time = torch.arange(seconds * instants) * (HEADING_STEP / WINDOW_RATE)
+        time = torch.arange(seconds * instants, device=facing.device) * (HEADING_STEP / WINDOW_RATE)
         turn = swings.angle(time)[0] * swings.axis[:, 2:]
         angle = angle + turn.view(size, seconds, instants)
     length = facing.norm(dim=-1)
@@ -265,12 +264,13 @@ def _about_z(yaw: Tensor) -> Tensor:
 
 
 def _small_tilt(angles: Tensor) -> Tensor:
-    """Return the rotations by horizontal rotation vectors (B, 2) [rad]."""
+    """Return the rotations by horizontal rotation vectors (B, 2) [rad], by Rodrigues' formula."""
     zero = torch.zeros_like(angles[:, 0])
     x, y = angles[:, 0], angles[:, 1]
     skew = torch.stack([zero, zero, y, zero, zero, -x, -y, x, zero], dim=1).view(-1, 3, 3)
-    R: Tensor = torch.linalg.matrix_exp(skew)
-    return R
+    half = torch.sinc(angles.norm(dim=1) / (2.0 * torch.pi))[:, None, None]
+    sine = torch.sinc(angles.norm(dim=1) / torch.pi)[:, None, None]
+    return torch.eye(3, device=angles.device) + sine * skew + 0.5 * half**2 * skew @ skew
 
 
 def _lerp(pieces: Tensor, start: Tensor, at: Tensor) -> Tensor:
@@ -283,7 +283,8 @@ def _lerp(pieces: Tensor, start: Tensor, at: Tensor) -> Tensor:
     last = start.long()[:, None] + reach - 2
     left = at.floor().long().minimum(last)
     weight = (at - left).float().unsqueeze(-1)
-    local = left - start.long()[:, None] + reach * torch.arange(size)[:, None]
+    row = torch.arange(size, device=at.device)[:, None]
+    local = left - start.long()[:, None] + reach * row
     rows = pieces.view(size * reach, -1)
     here, there = (rows.index_select(0, k.flatten()).view(*k.shape, -1) for k in (local, local + 1))
     return here * (1.0 - weight) + there * weight

@@ -34,8 +34,8 @@ _SIMULATED_SHARE = 0.4
 
 _WALK_SECONDS = 60.0
 
-_DEVICES = 4
-"""Virtual devices on each clip of motion capture."""
+_NOT_CARRIED = ("foot",)
+"""Places at which nobody carries a phone."""
 
 _SHORTEST = 400
 """Minimum number of samples of a stretch, 2 s; shorter ones are dropped."""
@@ -43,11 +43,19 @@ _SHORTEST = 400
 
 @dataclass(frozen=True)
 class RecordingStreams:
-    """Streams of a recording, and the licence named in its file."""
+    """Streams of a recording.
+
+    Attributes:
+        path: path of the recording.
+        streams: its unbroken stretches.
+        licence: licence named in its file.
+        is_virtual: whether a virtual device on motion capture recorded it.
+    """
 
     path: Path
     streams: Sequence[Stream]
     licence: str = ""
+    is_virtual: bool = False
 
 
 def recording_streams(
@@ -124,11 +132,13 @@ def mix_sources(
     sources = [(f"recorded, {name}", (1.0 - simulated) * share / (present or 1.0), members)
                for name, share, members in named]  # fmt: skip
     sources.append(("simulated walks", simulated, list(generated)))
+    # Errors are large where motion is wild; of motion capture, that is not worth learning most.
+    real = {id(s) for recording in recorded if not recording.is_virtual for s in recording.streams}
     words = []
     for name, share, members in sources:
         if not members:
             continue
-        lively = [_liveliness(s) if name.startswith("recorded") else 1.0 for s in members]
+        lively = [_liveliness(s) if id(s) in real else 1.0 for s in members]
         starts = [max(0, len(s) - reach + 1) for s in members]
         whole = sum(v * n for v, n in zip(lively, starts, strict=True)) / WINDOW_RATE
         streams += members
@@ -237,7 +247,7 @@ def cached_walks(count: int, seed: int, folder: Path, attitude: Attitude) -> lis
 
 
 def virtual_recordings(files: Iterable[Path], seed: int, folder: Path) -> list[RecordingStreams]:
-    """Return streams of virtual devices at random places on each clip of motion capture.
+    """Return streams of virtual devices, one at each place on the body, for each clip.
 
     They are along the true attitude: a clip of a few seconds is too short to be levelled. Clips
     below two seconds are left out. Streams are cached in `folder`.
@@ -248,25 +258,23 @@ def virtual_recordings(files: Iterable[Path], seed: int, folder: Path) -> list[R
     recordings: list[RecordingStreams] = []
     for index, clip in enumerate(clip for file in files for clip in body_clips(file)):
         stamps = recording_stamps(clip)
-        key = {"kind": "virtual", "values": [str(clip), stamps, seed, index, _DEVICES]}
+        key = {"kind": "virtual", "values": [str(clip), stamps, seed, index]}
         try:
             found = cached(key, partial(_devices_on, clip, (seed, index)), folder)
         except InputError as error:
             log.info("%s: %s", clip, error)
             continue
         licence = str(archive_attributes(clip).get("licence", ""))
-        recordings.append(RecordingStreams(clip, found, licence))
+        recordings.append(RecordingStreams(clip, found, licence, is_virtual=True))
     return recordings
 
 
 def _devices_on(clip: Path, seed: tuple[int, int]) -> list[WorldStream]:
     motion = read_body(clip)
     rng = np.random.default_rng(seed)
-    known = places_on(motion)
-    drawn = list(rng.permutation(known))
-    drawn.sort(key=lambda place: place != "in-front")  # where most phones are: on every clip
     streams = []
-    for place in drawn[:_DEVICES]:
-        device = virtual_imu(motion, str(place), 200.0, PHONE_IMU, int(rng.integers(2**31)))
-        streams += world_streams(device, attitude="true")
+    for place in places_on(motion):
+        if place not in _NOT_CARRIED:
+            device = virtual_imu(motion, place, 200.0, PHONE_IMU, int(rng.integers(2**31)))
+            streams += world_streams(device, attitude="true")
     return streams

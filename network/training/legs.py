@@ -17,6 +17,7 @@ from torch import Tensor
 from stario.network.training.augment import Augmentation, WindowSampler, augmented, heading_of
 from stario.network.training.config import TrainingConfig
 from stario.network.training.parallel import Workers
+from stario.network.training.stretches import Stretches
 from stario.sequences.arrays import runs
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.legs import LegStream
@@ -27,6 +28,9 @@ log = logging.getLogger(__name__)
 
 VARIANCE_RATE = 0.05
 """Variance per axis that a second of the network's displacements adds, q [m^2/s]."""
+
+_BANK = 4096
+"""Stretches drawn once for a GPU, which then draws among them: 22 hours of them."""
 
 _SETTINGS = {"waypoints": "waypoint", "positions": "track"}
 """How the recipe's settings for stretches of each kind begin: `waypoint_seconds`, for example."""
@@ -100,33 +104,54 @@ class LegSampler:
                 streams[0].kind, found.count([]), len(found), seconds,
             )  # fmt: skip
         self._runs = [
-            (stream, first, count)
-            for stream, beginnings in zip(streams, found, strict=True)
+            (index, first, count)
+            for index, beginnings in enumerate(found)
             for first, count in beginnings
         ]
         counts = torch.tensor([count for _, _, count in self._runs], dtype=torch.float64)
         self._cumulative = (counts / counts.sum()).cumsum(0)
-        self._generator = generator
+        self._streams, self._generator = list(streams), generator
+        device = generator.device
+        self._imu_N = Stretches([stream.imu_N for stream in streams], device)
+        self._facing_N = Stretches([stream.facing_N for stream in streams], device)
+        self._bank: list[Tensor] | None = None
+        if device.type == "cuda":
+            seeded = torch.Generator().manual_seed(generator.initial_seed())
+            self._bank = [part.to(device) for part in self._drawn(_BANK, seeded)]
 
     def batch(self, size: int) -> LegBatch:
         """Draw stretches that hold two or more legs each."""
-        drawn = [self._draw() for _ in range(size)]
-        imu_N = torch.from_numpy(np.stack([part.imu_N for part in drawn]))
-        facing_N = torch.from_numpy(np.stack([part.facing_N[::HEADING_STEP] for part in drawn]))
-        heading = heading_of(facing_N.view(size, self._seconds, -1, 2)).flatten()
+        if self._bank is None:
+            drawn = self._drawn(size, self._generator)
+        else:
+            device = self._generator.device
+            rows = torch.randint(_BANK, (size,), generator=self._generator, device=device)
+            drawn = [part[rows] for part in self._bank]
+        stream, begin, share, displacement, whitening, variance, seconds, known = drawn
+        length = self._seconds * WINDOW_SAMPLES
+        imu_N = self._imu_N.gathered(stream, begin, length)
+        facing_N = self._facing_N.gathered(stream, begin, length)[:, ::HEADING_STEP]
+        heading = heading_of(facing_N.reshape(size, self._seconds, -1, 2)).flatten()
         change = velocity_change(imu_N[..., 3:5].view(size, self._seconds, WINDOW_SAMPLES, 2))
         imu_N = imu_N.view(-1, WINDOW_SAMPLES, 6)
         imu, R_NH = augmented(imu_N, heading, self.augmentation, self._generator, self._seconds)
         windows = imu.transpose(1, 2).reshape(size, self._seconds, 6, WINDOW_SAMPLES)
-        leg_tensors = [*_padded(drawn, self._seconds), change]
-        return LegBatch(windows.contiguous(), R_NH.view(size, -1, 3, 3), *leg_tensors)
+        return LegBatch(
+            windows.contiguous(), R_NH.view(size, -1, 3, 3),
+            share, displacement, whitening, variance, seconds, known, change,
+        )  # fmt: skip
 
-    def _draw(self) -> LegStream:
-        uniform = torch.rand(2, generator=self._generator, dtype=torch.float64)
-        index = int(torch.searchsorted(self._cumulative, uniform[0]))
-        stream, first, count = self._runs[min(index, len(self._runs) - 1)]
-        begin = first + int(uniform[1] * count)
-        return stream.part(begin, begin + self._seconds * WINDOW_SAMPLES)
+    def _drawn(self, size: int, generator: torch.Generator) -> list[Tensor]:
+        """Return the streams' numbers and first samples of stretches (S,), and their legs."""
+        places = []
+        for _ in range(size):
+            uniform = torch.rand(2, generator=generator, dtype=torch.float64)
+            index = int(torch.searchsorted(self._cumulative, uniform[0]))
+            stream, first, count = self._runs[min(index, len(self._runs) - 1)]
+            places.append((stream, first + int(uniform[1] * count)))
+        length = self._seconds * WINDOW_SAMPLES
+        parts = [self._streams[stream].part(begin, begin + length) for stream, begin in places]
+        return [*torch.tensor(places).unbind(1), *_padded(parts, self._seconds)]
 
 
 def _beginnings(stream: LegStream, seconds: int) -> list[tuple[int, int]]:
@@ -229,7 +254,7 @@ def velocity_change(accel_N: Tensor) -> Tensor:
     Returns:
         (S, K - 2, 2), minus the mean over the stretch.
     """
-    weights = torch.from_numpy(VELOCITY_WEIGHTS).float()
+    weights = torch.from_numpy(VELOCITY_WEIGHTS).to(accel_N)
     before = torch.einsum("skic,i->skc", accel_N[:, :-1], weights)
     after = torch.einsum("skic,i->skc", accel_N[:, 1:], weights.flip(0))
     change = before + after

@@ -62,13 +62,16 @@ def sample_swing(
         lever: maximum lever arm [m].
         generator: generator of the draws.
     """
+    device = generator.device
 
     def uniform(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator)
+        return torch.rand(*shape, generator=generator, device=device)
 
-    axis = torch.randn(size, 3, generator=generator) * torch.tensor([0.5, 0.5, 0.0])
-    axis = torch.nn.functional.normalize(axis + torch.tensor([0.0, 0.0, 1.0]), dim=1)
-    arm = torch.nn.functional.normalize(torch.randn(size, 3, generator=generator), dim=1)
+    spread = torch.randn(size, 3, generator=generator, device=device)
+    spread = spread * spread.new_tensor([0.5, 0.5, 0.0])
+    axis = torch.nn.functional.normalize(spread + spread.new_tensor([0.0, 0.0, 1.0]), dim=1)
+    arm = torch.randn(size, 3, generator=generator, device=device)
+    arm = torch.nn.functional.normalize(arm, dim=1)
     swings = (uniform(size) < share).float()
     low, high = (2.0 * math.pi * f for f in _FREQUENCIES)
     frequency = low + (high - low) * uniform(size, _SINES)
@@ -81,7 +84,7 @@ def sample_swing(
 def apply_swing(imu: Tensor, displacement: Tensor, swing: Swing) -> tuple[Tensor, Tensor]:
     """Add a swing to the IMU (B, 200 K, 6) in W and to displacements (B, K, 3) [m]."""
     length = imu.shape[1]
-    time = torch.arange(length + 1) / WINDOW_RATE
+    time = torch.arange(length + 1, device=imu.device) / WINDOW_RATE
     angle, rate, growth = (values[..., None] for values in swing.angle(time))
 
     axis = swing.axis[:, None, :].expand(-1, length + 1, -1)

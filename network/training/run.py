@@ -199,11 +199,13 @@ class TrainingRun:
     def _average(self) -> None:
         decay = min(self.config.average, (1 + self.step) / (10 + self.step))
         current = self.network.state_dict()
-        for name, value in self.averaged.state_dict().items():
-            if value.is_floating_point():
-                value.lerp_(current[name], 1.0 - decay)
-            else:
-                value.copy_(current[name])
+        averaged = self.averaged.state_dict()
+        moving = [name for name, value in averaged.items() if value.is_floating_point()]
+        torch._foreach_lerp_(  # one kernel instead of one for each tensor
+            [averaged[name] for name in moving], [current[name] for name in moving], 1.0 - decay
+        )
+        for name in averaged.keys() - moving:
+            averaged[name].copy_(current[name])
 
     def validate(self, training_error: float, held_out: ValidationSet) -> EpochReport:
         """Validate an epoch in the leading process, which shares the error with the others.

@@ -84,7 +84,7 @@ def train(
         exclusive(folder) if processes.is_leader else nullcontext(),
     ):
         sampler = WindowSampler(
-            streams, weights, config.augmentation, config.seed, config.successive
+            streams, weights, config.augmentation, config.seed, config.successive, processes.device
         )
         material = _material([streams, validation, legs, validation_legs], weights, start_from)
         run = TrainingRun(

@@ -146,8 +146,9 @@ def test_the_direction_loss_rotates_displacements_back_to_the_true_direction() -
         assert angle.grad is not None
         assert float(angle.grad) * degrees > 0.0
         losses.append(float(loss.detach()))
-    assert losses == sorted(losses)
-    assert right < 0.2 * losses[0]
+    by_size = np.reshape(losses, (3, 2)).mean(axis=1)  # to either side
+    assert (np.diff(by_size) > 0.0).all()
+    assert right < 0.2 * min(losses)
 
 
 def test_a_waypoint_tapped_late_moves_two_legs_in_opposite_directions() -> None:
