@@ -250,7 +250,7 @@ def test_files_of_an_earlier_run_do_not_pass_for_those_of_a_later_one(
 def test_a_report_that_cannot_be_written_leaves_the_earlier_run_whole(
     tmp_path: Path, compared: Comparison, walk: ImuSequence
 ) -> None:
-    alone = Comparison(walk, {"track": compared.tracks["ekf"]}, {"ekf": {}})
+    alone = Comparison(walk, {"track": compared.tracks["track"]}, {"track": {}})
 
     def full_disk(path: Path, run: Comparison) -> None:
         path.write_text("half")
