@@ -156,9 +156,11 @@ def track_words(found: Comparison) -> str:
     )
     sigma = {} if track.health is None else track.health.final_sigma
     if sigma:
+        yaw = f"yaw {math.degrees(sigma['yaw_rad']):.1f} deg"
+        if sigma["yaw_rad"] > math.pi:
+            yaw = "yaw lost"
         words += (
-            f" (sigma there {sigma['position_m']:.1f} m, height {sigma['height_m']:.1f} m, "
-            f"yaw {math.degrees(sigma['yaw_rad']):.1f} deg)"
+            f" (sigma there {sigma['position_m']:.1f} m, height {sigma['height_m']:.1f} m, {yaw})"
         )
     return words
 

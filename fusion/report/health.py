@@ -263,6 +263,8 @@ def _direction(health: Health) -> Iterator[Finding]:
     yaw = health.final_sigma.get("yaw_rad", 0.0)
     if yaw > YAW_SIGMA:
         text = f"The heading is known only to {math.degrees(yaw):.0f} degrees (1 sigma)."
+        if yaw >= LOST_YAW_SIGMA:
+            text = "The heading is lost."
         advice = f"A yaw fix or two position fixes {_APART} determine it."
         if health.longest_gap <= INTERPOLATED and yaw < LOST_YAW_SIGMA:
             advice = (
