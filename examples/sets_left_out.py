@@ -20,8 +20,6 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
-from stario.network.training.splits import read_packaged_list
-
 SETS = ("tyrex", "ilc", "rocip", "ridi", "kipd", "rfbr")
 RECIPE = {
     "epochs": 2, "epoch_windows": 120_000, "batch": 160, "rate": 7e-4, "dropout": 0.2,
@@ -58,13 +56,9 @@ def trained(data: Path, out: Path, task: tuple[str, bool]) -> None:
 
 def judged(data: Path, out: Path, left_out: str) -> None:
     """Print errors, lengths and directions on the set, by way of carrying."""
-    entries = [e for e in read_packaged_list("all", data) if e.within(left_out)]
-    split = out / f"{left_out}.txt"
-    lines = [f"{entry.path.relative_to(data)}, {entry.group}" for entry in entries]
-    split.write_text("\n".join(lines) + "\n")
     with_body, without = (out / f"{left_out}-{k}/model.safetensors" for k in ("with", "without"))
     stario(
-        "evaluate", "--data", data, "--split", split, "--by", "carry",
+        "evaluate", data / "archives" / f"{left_out}.h5", "--by", "carry",
         "--model", with_body, "--against", without,
     )  # fmt: skip
 

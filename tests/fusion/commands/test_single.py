@@ -315,7 +315,7 @@ def test_run_compare_and_evaluate_state_what_produced_their_results(
         origin = json.loads((tmp_path / command / "run.json").read_text())
         assert datetime.fromisoformat(origin.pop("date")).utcoffset() == timedelta()
         assert origin == {
-            "stario": version("stario"),
+            "stario": version("stario-nav"),
             "model": "default",
             "weights_sha256": load_model("default").card.sha256,
             "inputs": [str(recording)],
