@@ -89,7 +89,7 @@ def test_wrong_usage_exits_with_code_2(stario, arguments: list[str]) -> None:
 
 def test_the_version_is_that_of_the_distribution(stario) -> None:
     done = stario("--version")
-    assert (done.code, done.out, done.err) == (0, f"{version('stario')}\n", "")
+    assert (done.code, done.out, done.err) == (0, f"{version('stario-nav')}\n", "")
 
 
 def test_the_installed_command_has_the_same_exit_codes(tmp_path: Path) -> None:
