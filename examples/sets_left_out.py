@@ -31,9 +31,8 @@ VIRTUAL = {"cmu.h5": 0.15, "bandai.h5": 0.12}
 
 def stario(*arguments: object) -> None:
     """Run a command of StarIO."""
-    subprocess.run(
-        [sys.executable, "-m", "stario.fusion.commands.cli", *map(str, arguments)], check=True
-    )
+    command = Path(sys.executable).with_name("stario")
+    subprocess.run([str(command), *map(str, arguments)], check=True)
 
 
 def trained(data: Path, out: Path, task: tuple[str, bool]) -> None:
