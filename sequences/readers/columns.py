@@ -218,9 +218,13 @@ def _names(titles: list[str]) -> list[str]:
     """Return the canonical name of each title, empty for one of no interest."""
     plain = [_cell(text)[0] for text in titles]
     temperature = sum(map(is_time, plain)) > 1  # what `T` is next to a clock, as in ArduPilot's
-    return [
-        "" if title == "T" and temperature else _ALIASES.get(title.lower(), "") for title in plain
-    ]
+    return ["" if title == "T" and temperature else _name(title.lower()) for title in plain]
+
+
+def _name(title: str) -> str:
+    """Return the canonical name of a title; a magnetometer's may be spelled as phones do."""
+    loose = _ALIASES.get(re.sub(r"[ .]", "_", re.sub(r"^imu\(\d+\):", "", title)), "")
+    return _ALIASES.get(title) or (loose if loose in MAGNETIC else "")
 
 
 def _titles(line: str) -> list[str]:
