@@ -79,6 +79,7 @@ METRIC_TITLES = {
     "rte_m": "RTE [m]",
     "pde": "PDE [%]",
     "aye_rad": "AYE [deg]",
+    "known_positions_m": "positions [m]",
     "nees_median": "NEES",
     "nis_mean": "NIS",
 }

@@ -87,6 +87,19 @@ def test_a_folder_with_one_recording_is_converted(stario, recording: Path) -> No
 
 
 @pytest.mark.usefixtures("no_figures")
+def test_every_track_is_compared_with_positions_half_a_second_apart(stario, tmp_path: Path) -> None:
+    walk = simulate_imu(generate_walk(3, 8.0), 100.0, seed=1, name="taps")
+    time = np.arange(1.0, 7.0, 0.5)
+    known = PositionTrack(time, walk.truth.at(time).position_W, "positions")
+    write_archive(tmp_path / "taps.h5", [replace(walk, truth=None, positions=known)])
+    head, *rows = stario("compare", "taps.h5", "--tracks", "all").out.splitlines()[1:7]
+    assert head.split()[:2] == ["positions", "[m]"]
+    errors = {row.split()[0]: float(row.split()[1]) for row in rows}
+    assert {"track", "pdr", "dead_reckoning"} <= set(errors)
+    assert errors["track"] < 2.0
+
+
+@pytest.mark.usefixtures("no_figures")
 def test_waypoints_are_reported_and_do_not_count_as_poses(stario, tmp_path: Path) -> None:
     walk = simulate_imu(generate_walk(3, 8.0), 100.0, seed=1, name="taps")
     taps = PositionTrack(np.array([1.0, 6.0]), np.zeros((2, 2)), "waypoints")
