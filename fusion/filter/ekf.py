@@ -19,7 +19,6 @@ from stario.fusion.filter.jacobians import (
     ACTUAL,
     CLONED,
     CORE,
-    OFFSET,
     Propagation,
     bearing_jacobian,
     displacement_jacobian,
@@ -169,12 +168,11 @@ def update_displacement(
     s.time_of_clone(slot)
     p_i, p_j = s.X[1 + slot, :, 4], s.X[0, :, 4]
     blocks = displacement_jacobian(p_i, p_j, slot)
-    blocks.append((s.offset_rows.start, np.eye(OFFSET)))
     before, noise = s, None
     if errors is not None:
         noise, s = errors.white, with_considered_propagated(s)
         blocks.append((s.considered_rows.start, errors.considered))
-    measured = Linear(d_W - (p_j - p_i) - s.offset_W, blocks, covariance, noise)
+    measured = Linear(d_W - (p_j - p_i), blocks, covariance, noise)
     after, result = update(s, measured, gate, inflation)
     return (after if result.accepted else before), result
 

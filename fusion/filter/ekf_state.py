@@ -18,7 +18,6 @@ from stario.fusion.filter.jacobians import (
     CLONE,
     CLONED,
     CORE,
-    OFFSET,
     plain_covariance,
     symmetric,
 )
@@ -75,8 +74,6 @@ class EkfState:
             for the gains, which take the network's errors for white, and as it is, given these
             gains and the errors' correlation (README.md, "Correlated errors").
         clone_times: times of the clones [s]; None for an empty slot.
-        offset_W: (3,) steady error of the displacements since one that contradicted the filter [m];
-            its rows of the covariances are zero while there is none.
         considered_time: time up to which the considered errors are propagated [s].
         field: the magnetic field; None before its first measurement.
     """
@@ -89,7 +86,6 @@ class EkfState:
     covariances: FloatArray
     clone_times: tuple[float | None, ...]
     considered_time: float
-    offset_W: FloatArray
     field: FieldState | None = None
 
     @classmethod
@@ -99,12 +95,12 @@ class EkfState:
         X = np.tile(np.eye(3, 5), (slots + 1, 1, 1))
         X[0, :, :3], X[0, :, 3], X[0, :, 4] = state.R_WB, state.v_W, state.p_W - origin_W
         clones_end = CORE + CLONE * slots
-        n = clones_end + OFFSET + len(CONSIDERED_SECONDS)
+        n = clones_end + len(CONSIDERED_SECONDS)
         P = np.zeros((2, n, n))
         P[:, :CORE, :CORE] = plain_covariance(state.covariance, -X[0, :, 3:].T)
-        P[ACTUAL, clones_end + OFFSET :, clones_end + OFFSET :] = np.eye(len(CONSIDERED_SECONDS))
+        P[ACTUAL, clones_end:, clones_end:] = np.eye(len(CONSIDERED_SECONDS))
         times = (None,) * slots, state.time
-        return cls(state.time, X, origin_W, state.b_g, state.b_a, P, *times, np.zeros(OFFSET))
+        return cls(state.time, X, origin_W, state.b_g, state.b_a, P, *times)
 
     @property
     def P(self) -> FloatArray:
@@ -144,21 +140,15 @@ class EkfState:
         return nav_states([self.estimate()])[0]
 
     @property
-    def offset_rows(self) -> slice:
-        """Rows of the displacements' steady error."""
-        first = CORE + CLONE * len(self.clone_times)
-        return slice(first, first + OFFSET)
-
-    @property
     def considered_rows(self) -> slice:
         """Rows of the network's errors that are considered and never estimated."""
-        first = self.offset_rows.stop
+        first = CORE + CLONE * len(self.clone_times)
         return slice(first, first + len(CONSIDERED_SECONDS))
 
     @property
     def field_row(self) -> int:
         """First row of the magnetic field's error: azimuth, wander, hard iron (3)."""
-        return CORE + CLONE * len(self.clone_times) + OFFSET + len(CONSIDERED_SECONDS)
+        return CORE + CLONE * len(self.clone_times) + len(CONSIDERED_SECONDS)
 
     @property
     def clone_slots(self) -> list[int]:
@@ -215,7 +205,7 @@ class EkfState:
         """Return the state moved by an error (n,), X <- exp(error) X, with its covariances."""
         xi = np.zeros((len(self.X), 3, 3))  # rows theta, rho_v, rho_p of each pose
         xi[0] = error[:9].reshape(3, 3)
-        xi[1:, ::2] = error[CORE : self.offset_rows.start].reshape(-1, 2, 3)
+        xi[1:, ::2] = error[CORE : self.considered_rows.start].reshape(-1, 2, 3)
         field = self.field
         if field is not None:
             azimuth, wander, *_ = error[self.field_row :].tolist()
@@ -226,7 +216,6 @@ class EkfState:
             X=exp_times(xi[:, 0], xi[:, 1:].transpose(0, 2, 1), self.X),
             b_g=self.b_g + error[9:12],
             b_a=self.b_a + error[12:15],
-            offset_W=self.offset_W + error[self.offset_rows],
             field=field,
         )
 
@@ -250,26 +239,12 @@ class EkfState:
             A[first : first + 3, first : first + 3] = R
             A[rho : rho + 3, rho : rho + 3] = R
             A[rho : rho + 3, first : first + 3] = skew(shift) @ R
-        A[3:6, 3:6] = A[self.offset_rows, self.offset_rows] = R
+        A[3:6, 3:6] = R
         P = symmetric(A @ self.covariances @ A.T)
         field = self.field
         if field is not None:
             field = changed(field, azimuth=field.azimuth + math.atan2(R[1, 0], R[0, 0]))
-        offset_W = R @ self.offset_W
-        return changed(self, X=X, origin_W=origin_W, covariances=P, offset_W=offset_W, field=field)
-
-    def with_offset_widened(self, variance: float) -> EkfState:
-        """Return the state with more variance [m^2] of the displacements' steady error."""
-        P, rows = self.covariances.copy(), self.offset_rows
-        P[:, rows, rows] += variance * np.eye(OFFSET)
-        return changed(self, covariances=P)
-
-    def without_offset(self) -> EkfState:
-        """Return the state without a steady error, which then is in no displacement."""
-        P = self.covariances.copy()
-        P[:, self.offset_rows] = 0.0
-        P[:, :, self.offset_rows] = 0.0
-        return changed(self, covariances=P, offset_W=np.zeros(OFFSET))
+        return changed(self, X=X, origin_W=origin_W, covariances=P, field=field)
 
     def with_yaw_inflated(self, about_W: FloatArray, sigma: float) -> EkfState:
         """Return the state with its covariances inflated by a turn of the frame about a vertical.

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter import displacements, ekf, magnetic, map_frame
 from stario.fusion.filter.correlated_errors import ACCEL_SHARE
+from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.estimator_state import EstimatorState, rewound, with_step
 from stario.fusion.filter.gained import Gained, gained_information
 from stario.fusion.filter.gyro_bias import GyroBiasPrior, first_prior, is_due, with_prior_replaced
 from stario.fusion.filter.initial import PriorPose, first_state, state_after_loss, tilt_sigma
-from stario.fusion.filter.innovations import InnovationStatistics
 from stario.fusion.filter.jacobians import GYRO_BIAS
 from stario.fusion.filter.kalman import UpdateResult
 from stario.fusion.filter.map_frame import Mapped
@@ -77,14 +77,14 @@ def step(
     accel_factor = s.statistics.accel_factor
     s = changed(with_step(s, interval, displacement, fixes), in_gap=interval.gap)
     if interval.gap or fixes:
-        s = s.uncontradicted()
+        s = changed(s, alternative=None)
     s, segment, accepted = _propagated(s, interval, accel_factor, fixes, config)
     before = s.ekf
     s, zero_velocity = _with_rest(s, interval, config)
     s, before = s.with_correction(before, "rest"), s.ekf
     # Zero velocity is more accurate than a network trained on walks, off by 1 cm/s at rest.
     offered = displacement if zero_velocity is None else None
-    s, outcome, fits, revoked = _with_displacement(s, offered, config)
+    s, outcome, revoked = _with_displacement(s, offered, config)
     s, before = s.with_correction(before, "network"), s.ekf
     s, bearing = _with_bearing(s, interval)
     s = s.with_correction(before, "magnetic field")
@@ -103,7 +103,6 @@ def step(
         segment,
         offered,
         outcome,
-        fits,
         revoked,
         zero_velocity,
         bearing,
@@ -191,12 +190,18 @@ def _integrated(
     accel_factor: float,
     config: NavigatorConfig,
 ) -> tuple[EstimatorState, Segment]:
-    """Propagate through a piece of an interval; return its segment, too."""
+    """Propagate through a piece of an interval; return the filter's segment, too."""
     # The noise of faulty samples is what it may be.
     correlated = config.filter.correlated_errors
     accel_share = ACCEL_SHARE if correlated and not any(interval.flags) else 1.0
-    segment = segment_of([piece], [accel_factor], s.ekf.b_g, s.ekf.b_a, config)
-    return changed(s, ekf=ekf.propagate(s.ekf, segment, accel_share)), segment
+    segments = []
+
+    def propagated(state: EkfState) -> EkfState:
+        segment = segment_of([piece], [accel_factor], state.b_g, state.b_a, config)
+        segments.append(segment)
+        return ekf.propagate(state, segment, accel_share)
+
+    return s.both(propagated), segments[0]
 
 
 def _with_fix(
@@ -204,9 +209,6 @@ def _with_fix(
 ) -> tuple[EstimatorState, list[Accepted]]:
     (state, frame), result = map_frame.update_with(fix, Mapped(s.ekf, s.map_frame), config.filter)
     s = changed(s, ekf=state, map_frame=frame).counted("fixes", *result.outcomes)
-    if result.gated:  # a displacement that contradicts the filter now need not be false
-        doubtful = InnovationStatistics().outlier_share
-        s = changed(s, statistics=changed(s.statistics, outlier_share=doubtful))
     return s, [Accepted(fix, result.scale)] if result.accepted else []
 
 
@@ -222,24 +224,20 @@ def _with_rest(
     s = changed(s, ekf=state).counted("zero_velocity", *result.outcomes)
     if not result.accepted:
         return s, None
-    return s.uncontradicted(), measured
+    return changed(s, alternative=None), measured
 
 
 def _with_displacement(
     s: EstimatorState, displacement: WindowDisplacement | None, config: NavigatorConfig
-) -> tuple[EstimatorState, UpdateResult | None, bool, tuple[float, ...]]:
-    """Update with a displacement.
-
-    Return the outcome, whether it fits, and the times of earlier false ones, too.
-    """
+) -> tuple[EstimatorState, UpdateResult | None, tuple[float, ...]]:
+    """Update with a displacement; return the outcome and the times of earlier false ones, too."""
     if displacement is None:
-        return s, None, True, ()
-    after, contradiction, statistics, result, fits, revoked = displacements.update_with(
-        displacement, s.ekf, s.contradiction, s.statistics, config.filter
+        return s, None, ()
+    after, statistics, result, revoked = displacements.update_with(
+        displacement, s.hypotheses, s.statistics, config.filter
     )
-    counts = s.counts.add_displacement(result)
-    s = changed(s, ekf=after, contradiction=contradiction, statistics=statistics, counts=counts)
-    return s, result, fits, revoked
+    s = changed(s, statistics=statistics, counts=s.counts.add_displacement(result))
+    return s.with_hypotheses(after), result, revoked
 
 
 def _with_bearing(s: EstimatorState, interval: ImuInterval) -> tuple[EstimatorState, Gained | None]:
@@ -248,6 +246,9 @@ def _with_bearing(s: EstimatorState, interval: ImuInterval) -> tuple[EstimatorSt
     if m_B is None or not reference.is_due(interval.stop, before):
         return s, None
     after, result, updated = magnetic.update_bearing(before, reference, m_B)
+    if s.alternative is not None:
+        other, *_ = magnetic.update_bearing(s.alternative.ekf, reference, m_B)
+        s = changed(s, alternative=changed(s.alternative, ekf=other))
     updated = changed(updated, pose=(after.R_WB, after.p_W))
     s = changed(s, ekf=after, magnetic=updated).counted("bearings", *result.outcomes)
     return s, gained_information(before, after)
@@ -267,14 +268,15 @@ def _with_north(
     s = changed(s, ekf=state, map_frame=frame)
     if not result.accepted:
         return s, []
-    return s.counted("bearings", "north"), [Accepted(fix, result.scale)]
+    # The alternative is in the old frame.
+    return changed(s, alternative=None).counted("bearings", "north"), [Accepted(fix, result.scale)]
 
 
 def _with_prior(s: EstimatorState, prior: GyroBiasPrior, config: NavigatorConfig) -> EstimatorState:
-    """Replace the bias's prior as if it had been used from the start."""
+    """Replace the bias's prior in both filters as if it had been used from the start."""
     wander = _wander(s, config)
     old, new = s.bias_prior.variance + wander, prior.variance + wander
-    return changed(s, ekf=with_prior_replaced(s.ekf, old, new), bias_prior=prior)
+    return changed(s.both(lambda state: with_prior_replaced(state, old, new)), bias_prior=prior)
 
 
 def _wander(s: EstimatorState, config: NavigatorConfig) -> float:
@@ -289,4 +291,4 @@ def _with_clone(s: EstimatorState) -> EstimatorState:
         oldest = slots[0]
         released = s.ekf.clone_estimate(oldest, len(s.map_frame.transforms))
         s = changed(s, released=released)
-    return changed(s, ekf=ekf.clone(s.ekf, oldest).with_lost_yaw_forgotten())
+    return s.both(lambda state: ekf.clone(state, oldest).with_lost_yaw_forgotten())

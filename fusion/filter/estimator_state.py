@@ -6,13 +6,13 @@ README.md, "Fixes".
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from stario.fusion.config import FilterConfig
-from stario.fusion.filter.contradiction import Contradiction
+from stario.fusion.filter.alternative import AlternativeHypothesis, Hypotheses
 from stario.fusion.filter.corrections import correction
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.estimates import Estimate, nav_states, smoothed_pose
@@ -57,7 +57,7 @@ class EstimatorState:
         stillness: whether the device has been at rest.
         magnetic: usual size, dip and spread of the magnetic field.
         statistics: what the innovations of displacements tell.
-        contradiction: the latest displacements, if they do not fit as they are; None if they do.
+        alternative: the alternative hypothesis; None while all displacements fit.
         counts: updates by outcome.
         in_gap: whether the last interval had no samples.
         released: newest pose that left the window, corrected by the whole window; None at first.
@@ -71,16 +71,23 @@ class EstimatorState:
     stillness: Stillness = field(default_factory=Stillness)
     magnetic: MagneticReference = field(default_factory=MagneticReference)
     statistics: InnovationStatistics = field(default_factory=InnovationStatistics)
-    contradiction: Contradiction | None = None
+    alternative: AlternativeHypothesis | None = None
     counts: UpdateCounts = field(default_factory=UpdateCounts)
     in_gap: bool = False
     released: Estimate | None = None
 
-    def uncontradicted(self) -> EstimatorState:
-        """Return the state without a steady error of the displacements."""
-        if self.contradiction is None:
-            return self
-        return changed(self, contradiction=None, ekf=self.ekf.without_offset())
+    @property
+    def hypotheses(self) -> Hypotheses:
+        """The filter and its alternative."""
+        return Hypotheses(self.ekf, self.alternative)
+
+    def with_hypotheses(self, after: Hypotheses) -> EstimatorState:
+        """Return the state with another filter and alternative."""
+        return changed(self, ekf=after.ekf, alternative=after.alternative)
+
+    def both(self, work: Callable[[EkfState], EkfState]) -> EstimatorState:
+        """Return the state after the same work on the filter and its alternative."""
+        return self.with_hypotheses(self.hypotheses.both(work))
 
     def counted(self, kind: str, *outcomes: str) -> EstimatorState:
         """Return the state with outcomes of a kind of update counted."""

@@ -30,9 +30,6 @@ POSITION, GYRO_BIAS = slice(6, 9), slice(9, 12)
 CLONE = 6
 """Size of the error state of one cloned pose."""
 
-OFFSET = 3
-"""Size of the steady error of displacements."""
-
 CLONED = np.array([0, 1, 2, 6, 7, 8])
 """Rows of theta and rho_p, which a clone copies."""
 

@@ -34,10 +34,8 @@ class Record(NamedTuple):
     """Predicted displacement of the window ending here; None if no window ends, or at rest."""
     outcome: UpdateResult | None
     """Outcome of the update with it; None without one."""
-    fits: bool
-    """Whether the displacement is taken as it is, not for false."""
     revoked: tuple[float, ...]
-    """Times of earlier displacements that were false [s] (README.md, "Gates")."""
+    """Times of earlier displacements that were false after all [s] (README.md, "Gates")."""
     zero_velocity: ZeroVelocity | None
     """Measurement at rest; None if the device moved or the measurement was rejected."""
     bearing: Gained | None
@@ -51,10 +49,8 @@ class Record(NamedTuple):
 
     @property
     def displacement(self) -> WindowDisplacement | None:
-        """The displacement with its inflated covariance; None if it is none, refused or false."""
+        """The displacement with its inflated covariance; None if there is none or it is refused."""
         if self.offered is None or self.outcome is None or not self.outcome.accepted:
-            return None
-        if not self.fits:
             return None
         covariance_N = self.outcome.scale * self.offered.covariance_N
         return self.offered._replace(covariance_N=covariance_N)

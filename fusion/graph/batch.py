@@ -62,8 +62,7 @@ def smooth(
     for record, state in zip(records, local[1:], strict=True):
         # Neither is inflated as by the filter: the graph weights outliers by the whole track.
         fixes = [accepted.fix.shifted(-origin) for accepted in record.fixes]
-        valid = record.outcome is not None and record.outcome.accepted
-        valid &= record.interval.stop not in revoked
+        valid = record.displacement is not None and record.interval.stop not in revoked
         builder.step(record, record.offered if valid else None, fixes, state)
     builder.close(local[-1])
     if gyro_bias is not None:

@@ -130,7 +130,7 @@ def step(
     after, record = estimator.step(s.filter, interval, displacement, fixes, config)
     builder = s.builder.copied()
     s = _with_prior_narrowed(changed(s, filter=after, builder=builder))
-    if s.is_stale or interval.gap:
+    if s.is_stale or interval.gap or record.revoked:
         return _restarted(s, 0 if interval.gap else builder.count + 1, config), record
     local_fixes = [_in_graph_frame(accepted, s) for accepted in record.fixes]
     new_keyframe = builder.step(record, record.displacement, local_fixes)

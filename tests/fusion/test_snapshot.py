@@ -14,7 +14,7 @@ from support import stream
 
 from stario.fusion import Navigator, NavigatorConfig, NavState, PriorPose
 from stario.fusion.config import FilterConfig
-from stario.fusion.filter.contradiction import Contradiction
+from stario.fusion.filter.alternative import AlternativeHypothesis
 from stario.fusion.snapshot import VERSION, plain, unpack
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
@@ -171,7 +171,7 @@ def test_a_snapshot_of_another_version_is_refused(walk: ImuSequence, still_model
         navigator.restore(data)
 
 
-LAYOUTS = {29: "abed7485"}
+LAYOUTS = {30: "71cff956"}
 """CRC of the classes and attributes in a snapshot, by version."""
 
 
@@ -204,7 +204,7 @@ def test_a_snapshot_with_other_classes_or_attributes_has_another_version(
             navigator.push(*row)
         visit(plain(unpack(navigator.snapshot()), {}))
     rare = [
-        Contradiction((0.0,)),
+        AlternativeHypothesis(navigator._stream.state.filter.ekf, zero, (0.0,)),
         PriorPose(np.eye(3), zero, zero),
     ]
     visit(plain(rare, {}))
