@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -65,13 +64,13 @@ def judged(data: Path, out: Path, left_out: str) -> None:
 def main() -> None:
     """Train, then judge, set by set."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, default=os.environ.get("STARIO_DATA"))
+    parser.add_argument("--data", type=Path)
     parser.add_argument("--out", type=Path, default=Path("runs/left-out"))
     parser.add_argument("--sets", nargs="+", default=SETS, choices=SETS)
     parser.add_argument("--jobs", type=int, default=1)
     options = parser.parse_args()
     if options.data is None:
-        print("needs the development recordings: --data FOLDER, or STARIO_DATA")
+        print("trains for hours on the development recordings: name their folder, --data FOLDER")
         return
     options.out.mkdir(parents=True, exist_ok=True)
     tasks = [(left_out, body) for left_out in options.sets for body in (False, True)]
