@@ -2,8 +2,8 @@
 
 Read and write: `read_recording`, `find_recordings`, `write_csv`, `read_tum`, `write_tum`.
 
-A recording: `ImuSequence`, `Trajectory`, `PositionTrack`, `Magnetometer`, `DeviceAttitude`,
-`STANDARD_GRAVITY`.
+A recording: `ImuSequence`, `Trajectory`, `PositionTrack`, `Magnetometer`, `Barometer`,
+`Satellites`, `DeviceAttitude`, `STANDARD_GRAVITY`.
 
 Inspect: `inspect_recording`, `Inspection`, `Finding`, `verdict`, `truth_findings`, `check_units`.
 

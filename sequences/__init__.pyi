@@ -29,10 +29,12 @@ from stario.sequences.readers.csv_writer import write_csv as write_csv
 from stario.sequences.readers.tum import read_tum as read_tum
 from stario.sequences.readers.tum import write_tum as write_tum
 from stario.sequences.sequence import STANDARD_GRAVITY as STANDARD_GRAVITY
+from stario.sequences.sequence import Barometer as Barometer
 from stario.sequences.sequence import DeviceAttitude as DeviceAttitude
 from stario.sequences.sequence import ImuSequence as ImuSequence
 from stario.sequences.sequence import Magnetometer as Magnetometer
 from stario.sequences.sequence import PositionTrack as PositionTrack
+from stario.sequences.sequence import Satellites as Satellites
 from stario.sequences.sequence import Trajectory as Trajectory
 from stario.sequences.simulation.imu import GOOD_IMU as GOOD_IMU
 from stario.sequences.simulation.imu import PERFECT_IMU as PERFECT_IMU

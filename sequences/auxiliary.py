@@ -1,4 +1,4 @@
-"""Data recorded alongside an IMU: positions, the magnetic field, the device's own attitude."""
+"""Data recorded alongside an IMU: positions, magnetic field, pressure, satellites, own attitude."""
 
 from __future__ import annotations
 
@@ -68,6 +68,9 @@ class PositionTrack(Timed):
         valid: (N,) bool, False where the position must not be used; all True by default.
         sigma: (N,) standard deviations [m] per horizontal axis that their source states, for
             example a satellite receiver; None if it states none.
+        latlon_deg: (N, 2) latitude and longitude on WGS 84 [deg], NaN where unknown; None if the
+            source has none.
+        floor: (N,) floors as the source counts them, NaN where unknown; None if it has none.
 
     Raises:
         InputError: lengths differ, time does not increase, a valid value is not finite, a valid
@@ -78,6 +81,8 @@ class PositionTrack(Timed):
     kind: Kind
     valid: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
     sigma: FloatArray | None = None
+    latlon_deg: FloatArray | None = None
+    floor: FloatArray | None = None
 
     def __post_init__(self) -> None:
         check_choice("positions' kind", self.kind, get_args(Kind))
@@ -91,6 +96,8 @@ class PositionTrack(Timed):
             if sigma[valid].min(initial=math.inf) <= 0.0:
                 raise InputError("positions' sigma", f"{sigma[valid].min():g}", "above 0 m")
             vars(self).update(sigma=sigma)
+        rest = {"latlon_deg": (len(time), 2), "floor": time.shape}
+        vars(self).update(_optional_arrays(self, "positions'", rest))
         vars(self).update(time=time, position_W=position_W, valid=valid)
 
     @property
@@ -119,6 +126,77 @@ class Magnetometer(Timed):
         time = checked_time("magnetometer's time", self.time)
         field = checked_array("magnetic field", self.field, (len(time), 3))
         vars(self).update(time=time, field=field)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Barometer(Timed):
+    """Pressure of the air measured alongside the IMU, at its own times.
+
+    Attributes:
+        time: (M,) [s], on the IMU's clock, strictly increasing.
+        pressure_hPa: (M,) [hPa], about 1013 at sea level.
+
+    Raises:
+        InputError: the lengths differ, time does not increase or a value is not finite.
+    """
+
+    pressure_hPa: FloatArray
+
+    def __post_init__(self) -> None:
+        time = checked_time("barometer's time", self.time)
+        pressure_hPa = checked_array("pressure_hPa", self.pressure_hPa, time.shape)
+        vars(self).update(time=time, pressure_hPa=pressure_hPa)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Satellites(Timed):
+    """Positions that a satellite receiver reported alongside the IMU, as it reported them.
+
+    Attributes:
+        time: (M,) [s], on the IMU's clock, strictly increasing.
+        latlon_deg: (M, 2) latitude and longitude on WGS 84 [deg].
+        altitude_m: (M,) [m]; like all below NaN where unknown, None if never reported.
+        radius_m: (M,) accuracy as phones state it: the radius [m] that holds 68 % of positions.
+        speed_m_s: (M,) speed over ground [m/s], from Doppler shifts.
+        bearing_deg: (M,) direction of that speed, clockwise from north [deg].
+
+    Raises:
+        InputError: the lengths differ, time does not increase, or a latitude or longitude is not
+            finite or not within 90 or 360 degrees.
+    """
+
+    latlon_deg: FloatArray
+    altitude_m: FloatArray | None = None
+    radius_m: FloatArray | None = None
+    speed_m_s: FloatArray | None = None
+    bearing_deg: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        time = checked_time("satellites' time", self.time)
+        latlon_deg = checked_array("satellites' latlon_deg", self.latlon_deg, (len(time), 2))
+        beyond = np.abs(latlon_deg) > [90.0, 360.0]
+        if beyond.any():
+            row, column = np.argwhere(beyond)[0]
+            raise InputError(
+                f"satellites' latlon_deg, row {row}",
+                f"{latlon_deg[row, column]:g}",
+                "latitude within 90 and longitude within 360 degrees",
+                "give latitude first",
+            )
+        rest = dict.fromkeys(("altitude_m", "radius_m", "speed_m_s", "bearing_deg"), time.shape)
+        vars(self).update(_optional_arrays(self, "satellites'", rest))
+        vars(self).update(time=time, latlon_deg=latlon_deg)
+
+
+def _optional_arrays(
+    owner: Timed, words: str, shapes: dict[str, tuple[int, ...]]
+) -> dict[str, FloatArray]:
+    """Return the attributes of `shapes` that are known, checked; they may hold NaN."""
+    return {
+        name: checked_array(f"{words} {name}", value, shape, where=False)
+        for name, shape in shapes.items()
+        if (value := getattr(owner, name)) is not None
+    }
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -27,9 +27,11 @@ from stario.sequences.arrays import (
     some_times,
 )
 from stario.sequences.attitude.stacks import slerp
+from stario.sequences.auxiliary import Barometer as Barometer
 from stario.sequences.auxiliary import DeviceAttitude as DeviceAttitude
 from stario.sequences.auxiliary import Magnetometer as Magnetometer
 from stario.sequences.auxiliary import PositionTrack as PositionTrack
+from stario.sequences.auxiliary import Satellites as Satellites
 from stario.sequences.auxiliary import Timed
 from stario.sequences.errors import InputError
 from stario.sequences.time_order import ahead_mask, increasing_mask
@@ -185,6 +187,8 @@ class ImuSequence:
         positions: known positions if there are no poses (`truth`): a track or waypoints, or None.
         attributes: other metadata of the recording (person, device, place, carry, ...).
         device_attitude: attitude estimated by the device's own sensor fusion, or None.
+        barometer: pressure of the air measured alongside the IMU, or None.
+        satellites: positions reported by a satellite receiver, as measurements, or None.
         source: format or app of the recording, for display.
         axes: the axes x, y, z of all sensors in those of the file, see `with_axes`.
         maybe_apple: whether the accelerometer may have Apple's sign, which nothing in the file
@@ -205,6 +209,8 @@ class ImuSequence:
     positions: PositionTrack | None = None
     attributes: Mapping[str, str | float] = field(default_factory=dict)
     device_attitude: DeviceAttitude | None = None
+    barometer: Barometer | None = None
+    satellites: Satellites | None = None
     source: str = ""
     axes: str = "x,y,z"
     maybe_apple: bool = False
@@ -247,6 +253,8 @@ class ImuSequence:
         parts.append(f"{self.duration:.1f} s at {self.rate:.1f} Hz")
         parts.append("no magnetometer" if field is None else f"magnetometer at {field.rate:.0f} Hz")
         parts += [] if own is None else ["the device's own attitude"]
+        parts += [] if self.barometer is None else [f"pressure at {self.barometer.rate:.0f} Hz"]
+        parts += [] if self.satellites is None else [f"{len(self.satellites)} satellite positions"]
         return f"{self.name}: {', '.join(parts)}, truth: {self.truth_summary()}"
 
     def truth_summary(self) -> str:
@@ -284,6 +292,8 @@ _PARTS: dict[str, type[Timed]] = {
     "magnetometer": Magnetometer,
     "positions": PositionTrack,
     "device_attitude": DeviceAttitude,
+    "barometer": Barometer,
+    "satellites": Satellites,
 }
 
 

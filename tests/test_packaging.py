@@ -132,7 +132,12 @@ def called(folder: Path, *command: str | Path) -> str:
 def outside(tmp_path_factory):
     """A folder outside the tree, with the built distributions and an environment of the wheel."""
     folder = tmp_path_factory.mktemp("outside")
-    called(folder, sys.executable, "-m", "build", "--outdir", folder / "dist", ROOT)
+    # A copy, since building writes into the tree: two workers would do so at once.
+    skipped = shutil.ignore_patterns(
+        ".git", ".venv*", "*.egg-info", "build", "__pycache__", ".*_cache"
+    )
+    shutil.copytree(ROOT, folder / "source", ignore=skipped)
+    called(folder, sys.executable, "-m", "build", "--outdir", folder / "dist", folder / "source")
     called(folder, sys.executable, "-m", "venv", "fresh")
     [wheel] = (folder / "dist").glob("*.whl")
     called(folder, "fresh/bin/pip", "install", "-q", "-c", ROOT / "constraints.txt", wheel)

@@ -12,10 +12,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from stario.sequences.auxiliary import Timed
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_path, unused_name
 from stario.sequences.lazy import optional_package
-from stario.sequences.readers.archive import SUFFIXES
+from stario.sequences.readers.archive import POSITIONS_OPTIONAL, SATELLITES_OPTIONAL, SUFFIXES
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
 
 _log = logging.getLogger(__name__)
@@ -62,6 +63,12 @@ def _write(group: Any, sequence: ImuSequence) -> None:
     if sequence.device_attitude is not None:
         columns["attitude/t"] = sequence.device_attitude.time
         columns["attitude/quat_xyzw"] = sequence.device_attitude.attitude_WB.as_quat()
+    if sequence.barometer is not None:
+        columns["pressure/t"] = sequence.barometer.time
+        columns["pressure/hPa"] = sequence.barometer.pressure_hPa
+    if sequence.satellites is not None:
+        names = ("latlon_deg", *SATELLITES_OPTIONAL)
+        columns |= _known_columns("satellites", sequence.satellites, names)
     if sequence.truth is not None:
         columns |= _pose_columns(sequence.truth)
     if sequence.positions is not None:
@@ -92,9 +99,15 @@ def _position_columns(sequence: ImuSequence, track: PositionTrack) -> dict[str, 
     else:
         _log.warning("%s: positions alongside true poses are not written", sequence.name)
         return {}
-    columns: dict[str, Any] = {f"{stem}/t": track.time, f"{stem}/{place}": track.position_W}
+    columns = _known_columns(stem, track, POSITIONS_OPTIONAL)
+    columns[f"{stem}/{place}"] = track.position_W
     if not track.valid.all():
         columns[f"{stem}/valid"] = track.valid
-    if track.sigma is not None:
-        columns[f"{stem}/sigma"] = track.sigma
     return columns
+
+
+def _known_columns(stem: str, part: Timed, names: Iterable[str]) -> dict[str, Any]:
+    """Return the time and the known attributes of a part, by the names of their datasets."""
+    columns = {f"{stem}/{name}": getattr(part, name) for name in names}
+    known = {name: values for name, values in columns.items() if values is not None}
+    return {f"{stem}/t": part.time, **known}

@@ -1,14 +1,16 @@
 """StarIO's archive: an HDF5 file with a group per recording; `file.h5:name` names a recording.
 
-A group holds `imu/{t,gyro,accel}`, `mag/{t,field}` if known, and one of three kinds of truth:
-`truth/{t,p,quat_xyzw}` (poses), `truth/{t,p}` (positions) or `waypoints/{t,xy}` (or `p`). Units are
-s, rad/s, m/s^2, uT and m; all clocks of a recording have the same zero. Its attributes record who
-carried which device where. Poses may come with `truth/{velocity,position_covariance,valid}`.
+A group holds `imu/{t,gyro,accel}`, if known `mag/{t,field}`, `pressure/{t,hPa}` and
+`satellites/{t,latlon_deg,altitude_m,radius_m,speed_m_s,bearing_deg}`, and one of three kinds of
+truth: `truth/{t,p,quat_xyzw}` (poses), `truth/{t,p}` (positions) or `waypoints/{t,xy}` (or `p`).
+Units are s, rad/s, m/s^2, uT and m; all clocks of a recording have the same zero. Its attributes
+record who carried which device where. Poses may come with
+`truth/{velocity,position_covariance,valid}`, positions with `sigma`, `latlon_deg` and `floor`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal
@@ -21,12 +23,14 @@ from stario.sequences.lazy import optional_package
 from stario.sequences.readers.checked import checked, pose_mask, rotations
 from stario.sequences.readers.hdf5 import DAMAGED, is_hdf5, opened_hdf5
 from stario.sequences.sequence import (
+    Barometer,
     BoolArray,
     DeviceAttitude,
     FloatArray,
     ImuSequence,
     Magnetometer,
     PositionTrack,
+    Satellites,
     Trajectory,
 )
 from stario.sequences.time_order import increasing_mask
@@ -42,6 +46,9 @@ _OPTIONAL = {
     "velocity_W": ("truth/velocity", (3,)),
     "position_covariance_W": ("truth/position_covariance", (3, 3)),
 }
+
+POSITIONS_OPTIONAL = ("sigma", "latlon_deg", "floor")
+SATELLITES_OPTIONAL = ("altitude_m", "radius_m", "speed_m_s", "bearing_deg")
 
 
 def split_name(path: Path) -> tuple[Path, str | None]:
@@ -176,6 +183,8 @@ def _sequence(path: Path, name: str, group: Any) -> ImuSequence:
         magnetometer=_magnetometer(path, group),
         positions=positions,
         device_attitude=_device_attitude(path, group),
+        barometer=_barometer(path, group),
+        satellites=_satellites(path, group),
         attributes=_attributes(group),
     )
 
@@ -196,6 +205,37 @@ def _device_attitude(path: Path, group: Any) -> DeviceAttitude | None:
     quat = _column(path, group, "attitude/quat_xyzw", (len(time), 4))
     keep = increasing_mask(time)
     return DeviceAttitude(time[keep], rotations(path, "attitude/quat_xyzw", quat[keep], "xyzw"))
+
+
+def _barometer(path: Path, group: Any) -> Barometer | None:
+    if "pressure" not in group:
+        return None
+    time = _column(path, group, "pressure/t")
+    pressure_hPa = _column(path, group, "pressure/hPa", (len(time),))
+    keep = increasing_mask(time)
+    return Barometer(time[keep], pressure_hPa[keep])
+
+
+def _satellites(path: Path, group: Any) -> Satellites | None:
+    if "satellites" not in group:
+        return None
+    time = _column(path, group, "satellites/t")
+    latlon_deg = _column(path, group, "satellites/latlon_deg", (len(time), 2))
+    keep = increasing_mask(time)
+    rest = _optional(path, group, "satellites", SATELLITES_OPTIONAL, time)
+    return Satellites(time[keep], latlon_deg[keep], **{k: v[keep] for k, v in rest.items()})
+
+
+def _optional(
+    path: Path, group: Any, stem: str, names: Iterable[str], time: FloatArray
+) -> dict[str, FloatArray]:
+    """Return the columns of a part that are there, which may hold NaN."""
+    shapes = {"latlon_deg": (len(time), 2)}
+    return {
+        name: _column(path, group, f"{stem}/{name}", shapes.get(name, time.shape), finite=False)
+        for name in names
+        if f"{stem}/{name}" in group
+    }
 
 
 def _truth(path: Path, group: Any) -> tuple[Trajectory | None, PositionTrack | None]:
@@ -237,14 +277,9 @@ def _positions(
     valid = _valid(path, group, stem, time)
     position_W = _column(path, group, field, (len(time), 2), (len(time), 3), finite=False)
     _check_known(path, field, position_W, valid)
-    sigma = f"{stem}/sigma"
-    return PositionTrack(
-        time[keep],
-        position_W[keep],
-        kind,
-        valid[keep],
-        _column(path, group, sigma, (len(time),), finite=False)[keep] if sigma in group else None,
-    )
+    rest = _optional(path, group, stem, POSITIONS_OPTIONAL, time)
+    known = {name: values[keep] for name, values in rest.items()}
+    return PositionTrack(time[keep], position_W[keep], kind, valid[keep], **known)
 
 
 def _valid(path: Path, group: Any, stem: str, time: FloatArray) -> BoolArray:

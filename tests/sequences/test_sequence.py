@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -5,9 +7,11 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.attitude.rotations import about_z, tilt_aligning, yaw_of
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import (
+    Barometer,
     FloatArray,
     ImuSequence,
     PositionTrack,
+    Satellites,
     Trajectory,
     low_rate_message,
     whole_seconds,
@@ -220,3 +224,15 @@ def test_tilt_aligning_rotates_up_to_z_by_the_smallest_angle() -> None:
         assert yaw_of(R_WB)[0] == pytest.approx(0.0, abs=1e-9)
     for up in ([0.0, 0.0, 2.0], [0.0, 0.0, -2.0], [1e-9, 0.0, -1.0]):
         assert np.allclose(tilt_aligning(np.array(up)).apply(up)[2], np.linalg.norm(up))
+
+
+def test_latitude_and_longitude_given_the_other_way_round_are_refused() -> None:
+    swapped, given = np.array([[144.9, -37.8]]), np.array([[-37.8, 144.9]])
+    with pytest.raises(InputError, match="give latitude first"):
+        Satellites(np.zeros(1), swapped)
+    assert len(Satellites(np.zeros(1), given, radius_m=np.array([math.nan]))) == 1
+
+
+def test_a_pressure_that_is_not_finite_is_refused() -> None:
+    with pytest.raises(InputError, match="pressure_hPa"):
+        Barometer(np.array([0.0, 1.0]), np.array([1013.2, math.nan]))

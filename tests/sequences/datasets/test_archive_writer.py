@@ -10,11 +10,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.sequences import (
+    Barometer,
     DeviceAttitude,
     ImuSequence,
     InputError,
     Magnetometer,
     PositionTrack,
+    Satellites,
     find_recordings,
     read_recording,
     simulate_imu,
@@ -34,6 +36,7 @@ def walk() -> ImuSequence:
     gyro[17, 1] = np.nan
     time = sequence.time[::3]
     waypoints = np.array([[1.0, 2.0], [3.0, 4.0]])
+    latlon_deg = np.array([[48.1, 11.5], [48.1, 11.6]])
     return replace(
         sequence,
         gyro=gyro,
@@ -43,7 +46,15 @@ def walk() -> ImuSequence:
             position_covariance_W=np.tile(np.eye(3), (len(truth), 1, 1)),
         ),
         magnetometer=Magnetometer(time + 1e-3, rng.normal(0.0, 40.0, (len(time), 3))),
-        positions=PositionTrack(np.array([0.5, 3.0]), waypoints, "waypoints"),
+        positions=PositionTrack(
+            np.array([0.5, 3.0]),
+            waypoints,
+            "waypoints",
+            latlon_deg=latlon_deg,
+            floor=np.array([0.0, np.nan]),
+        ),
+        barometer=Barometer(time, rng.normal(980.0, 0.1, len(time))),
+        satellites=Satellites(np.array([1.0, 2.0]), latlon_deg, radius_m=np.array([4.0, np.nan])),
         attributes={"person": "ann", "minutes": 0.1},
         device_attitude=DeviceAttitude(time, Rotation.random(len(time), random_state=2)),
     )
@@ -59,12 +70,14 @@ def assert_equal(found: ImuSequence, given: ImuSequence) -> None:
         np.testing.assert_allclose(found.truth.quat_xyzw, given.truth.quat_xyzw, rtol=0, atol=1e-10)
     for part, columns in (
         ("magnetometer", ("time", "field")),
-        ("positions", ("time", "position_W", "valid", "sigma")),
+        ("positions", ("time", "position_W", "valid", "sigma", "latlon_deg", "floor")),
+        ("barometer", ("time", "pressure_hPa")),
+        ("satellites", ("time", "latlon_deg", "radius_m", "speed_m_s")),
     ):
         read_back, original = getattr(found, part), getattr(given, part)
         assert (read_back is None) == (original is None)
         for name in columns if original is not None else ():
-            np.testing.assert_array_equal(getattr(read_back, name), getattr(original, name))
+            np.testing.assert_equal(getattr(read_back, name), getattr(original, name))
     assert dict(found.attributes) == dict(given.attributes)
     if given.device_attitude is not None:
         assert found.device_attitude is not None
@@ -77,7 +90,8 @@ def test_recordings_are_read_back_as_written(walk: ImuSequence, tmp_path: Path) 
     sigma = np.where(walk.time > 1.0, 2.0 + walk.time, np.nan)
     known = PositionTrack(walk.time, walk.accel, "positions", walk.time > 1.0, sigma)
     tracked = replace(walk, truth=None, positions=known)
-    bare = replace(tracked, positions=None, magnetometer=None, attributes={}, device_attitude=None)
+    others = ("positions", "magnetometer", "device_attitude", "barometer", "satellites")
+    bare = replace(tracked, attributes={}, **dict.fromkeys(others))
     given = [walk, tracked, bare]
     names = write_archive(path, given)
     assert names == ["hall-walk", "hall-walk-2", "hall-walk-3"]
