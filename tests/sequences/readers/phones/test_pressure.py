@@ -151,7 +151,7 @@ def test_lines_of_pressure_satellites_and_floors_are_read(
         ("canlang_logger", 10.0),
         ("pyojinkim_android", 25.0),
         ("ipin21_hcu", 100.0),
-        ("advio/advio-15", 1.0),
+        ("advio/advio-15", 0.9),
     ],
 )
 def test_the_apps_own_pressure_stays_within_a_floor_of_a_level_walk(name: str, rate: float) -> None:
