@@ -48,7 +48,7 @@ def barometer(
     pressure_hPa = values * _factor(path, title, float(np.median(values)), unit)
     steps = np.abs(np.diff(pressure_hPa))
     step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
-    if step > _LARGEST_STEP_HPA:
+    if not unit and step > _LARGEST_STEP_HPA:
         found = f"steps of {step:.2g} hPa, which is {8.4 * step:.0f} m of height"
         raise ReadError(path, title, found, *_expected())
     return Barometer(time, pressure_hPa)

@@ -9,8 +9,13 @@ import numpy as np
 from stario.sequences.sequence import BoolArray, FloatArray, Satellites
 from stario.sequences.time_order import increasing_mask
 
-OPTIONAL = ("altitude_m", "radius_m", "speed_m_s", "bearing_deg")
-"""Optional attributes of `Satellites`."""
+OPTIONAL = {
+    "alt": "altitude_m",
+    "acc": "radius_m",
+    "speed": "speed_m_s",
+    "bearing": "bearing_deg",
+}
+"""Optional attributes of `Satellites` by their columns in a generic CSV."""
 
 _LARGEST_DEGREES = 90.0, 180.0
 """Largest latitude and longitude."""
@@ -32,7 +37,7 @@ def satellites(
     Args:
         time: (N,) [s].
         latlon_deg: (N, 2) latitude and longitude [deg].
-        rest: (N,) each of the attributes of `OPTIONAL` that the file has. Phones write a negative
+        rest: (N,) those of the attributes of `OPTIONAL` that the file has. Phones write a negative
             accuracy, speed or bearing, or an accuracy of 0, where they know none: it becomes NaN.
     """
     kept = known_places(latlon_deg) & np.isfinite(time)
@@ -46,3 +51,10 @@ def satellites(
         stated[name] = np.where(stated[name] >= 0.0, stated[name], np.nan)
     told = {name: values for name, values in stated.items() if np.isfinite(values).any()}
     return Satellites(time[kept], latlon_deg[kept], **told)
+
+
+def satellite_columns(reported: Satellites) -> tuple[list[str], FloatArray]:
+    """Return names and values (N, K) of a generic CSV's columns for what a receiver reported."""
+    known = {name: getattr(reported, attribute) for name, attribute in OPTIONAL.items()}
+    known = {name: values for name, values in known.items() if values is not None}
+    return ["lat", "lon", *known], np.column_stack([reported.latlon_deg, *known.values()])
