@@ -72,7 +72,7 @@ from stario.sequences.readers.lines import (
     unquoted,
 )
 from stario.sequences.readers.pressure import barometer
-from stario.sequences.readers.satellites import OPTIONAL, satellites
+from stario.sequences.readers.satellites import OPTIONAL, in_degrees, satellites
 from stario.sequences.readers.text import RowFormat, Table, is_missing, read_table, seconds
 from stario.sequences.sequence import (
     Barometer,
@@ -138,7 +138,7 @@ def read_generic_csv(path: Path) -> ImuSequence:
         positions=positions,
         magnetometer=field,
         barometer=_barometer(path, header, rows),
-        satellites=_satellites(header, rows),
+        satellites=_satellites(path, header, rows),
         source=source_words("generic CSV", rows.assumed_unit),
         converted=frozenset(sensor for sensor, done in converted.items() if done.any()),
     )
@@ -312,7 +312,7 @@ def _barometer(path: Path, header: Header, rows: _Rows) -> Barometer | None:
         return None
 
 
-def _satellites(header: Header, rows: _Rows) -> Satellites | None:
+def _satellites(path: Path, header: Header, rows: _Rows) -> Satellites | None:
     known = {
         name: RARE_UNITS[name][unit_named(header.columns[name].unit)] * rows.table[name]
         for name in SATELLITE_HEADER
@@ -320,7 +320,11 @@ def _satellites(header: Header, rows: _Rows) -> Satellites | None:
     }
     if not known:
         return None
-    latlon_deg = np.stack([known["lat"], known["lon"]], axis=1)
+    try:
+        latlon_deg = in_degrees(path, np.stack([known["lat"], known["lon"]], axis=1))
+    except ReadError as error:  # satellites are optional
+        _log.warning("satellites skipped: %s", error)
+        return None
     rest = {attribute: known[name] for name, attribute in OPTIONAL.items() if name in known}
     return satellites(rows.time, latlon_deg, rest)
 

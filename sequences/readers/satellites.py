@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
+from stario.sequences.errors import ReadError
 from stario.sequences.sequence import BoolArray, FloatArray, Satellites
 from stario.sequences.time_order import increasing_mask
+
+_log = logging.getLogger(__name__)
 
 OPTIONAL = {
     "alt": "altitude_m",
@@ -27,6 +32,29 @@ def known_places(latlon_deg: FloatArray) -> BoolArray:
     Some apps write zeros until there is a position.
     """
     return np.asarray((np.abs(latlon_deg) <= _LARGEST_DEGREES).all(axis=1) & latlon_deg.any(axis=1))
+
+
+def in_degrees(path: Path, latlon_deg: FloatArray) -> FloatArray:
+    """Return latitudes and longitudes (N, 2), exchanged if only that makes them places.
+
+    A few rows may hold anything; a single one proves nothing.
+
+    Raises:
+        ReadError: no row is in degrees.
+    """
+    present = latlon_deg[np.isfinite(latlon_deg).all(axis=1) & latlon_deg.any(axis=1)]
+    if len(present) < 2 or known_places(present).any():
+        return latlon_deg
+    if known_places(present[:, ::-1]).all():
+        _log.warning("%s: latitude and longitude are exchanged: read the other way round", path)
+        return latlon_deg[:, ::-1]
+    found, fix = f"{present[0, 0]:.10g} and {present[0, 1]:.10g}", ""
+    degrees, minutes = np.divmod(np.abs(present), 100.0)
+    if (minutes < 60.0).all() and known_places(degrees).all():
+        latitude = np.sign(present[0, 0]) * (degrees[0, 0] + minutes[0, 0] / 60.0)
+        fix = f"NMEA's degrees and minutes? That latitude is {latitude:.6f}"
+    expected = "degrees, as in 48.137 and 11.575"
+    raise ReadError(path, "latitude, longitude", found, expected, fix)
 
 
 def satellites(
