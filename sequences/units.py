@@ -51,6 +51,9 @@ PRESSURE_UNITS = {
 }
 """`mbar` is hPa as well."""
 
+METRES_PER_HPA = 8.43
+"""Height that a hectopascal is worth near the sea."""
+
 LOWEST_HPA, HIGHEST_HPA = 300.0, 1100.0
 """Range of phones' barometers, from 9 km above the sea to 0.7 km below it."""
 

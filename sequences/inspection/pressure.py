@@ -11,10 +11,7 @@ from scipy.ndimage import binary_closing, median_filter
 from stario.sequences.arrays import even_grid, runs
 from stario.sequences.findings import Finding
 from stario.sequences.sequence import Barometer, FloatArray
-from stario.sequences.units import HIGHEST_HPA, LOWEST_HPA, pressure_unit_of
-
-METRES_PER_HPA = 8.43
-"""Height that a hectopascal is worth near the sea."""
+from stario.sequences.units import HIGHEST_HPA, LOWEST_HPA, METRES_PER_HPA, pressure_unit_of
 
 _THINNED_S = 0.2
 """Step [s] over which the noise is measured: some phones interpolate or repeat samples in less."""
