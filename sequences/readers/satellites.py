@@ -22,6 +22,9 @@ OPTIONAL = {
 }
 """Optional attributes of `Satellites` by their columns in a generic CSV."""
 
+RADIUS_PER_SIGMA = 1.51
+"""Radius that holds 68 % of a Gaussian in the plane, in standard deviations per axis."""
+
 _LARGEST_DEGREES = 90.0, 180.0
 """Largest latitude and longitude."""
 

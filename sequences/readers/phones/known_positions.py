@@ -18,7 +18,12 @@ from stario.sequences.readers.columns import Column
 from stario.sequences.readers.geodesy import east_north
 from stario.sequences.readers.phones.alongside import Columns, Recording, tables_alongside
 from stario.sequences.readers.phones.sensor_words import sensor_of, unit_of, words_of
-from stario.sequences.readers.satellites import in_degrees, known_places, satellites
+from stario.sequences.readers.satellites import (
+    RADIUS_PER_SIGMA,
+    in_degrees,
+    known_places,
+    satellites,
+)
 from stario.sequences.readers.table_head import TableHead, table_heads
 from stario.sequences.readers.text import seconds
 from stario.sequences.sequence import PositionTrack, Satellites
@@ -66,9 +71,6 @@ _ADVIO = "platform-locations.csv"
 _OF_ADVIO = ["time", "latitude", "longitude", "accuracy", "altitude", "vertical accuracy"]
 """Columns of a file of ADVIO, which names none."""
 
-_RADIUS_PER_SIGMA = 1.51
-"""Radius that holds 68 % of a Gaussian in the plane, in standard deviations per axis."""
-
 _USUAL_RADIUS = 10.0
 """Radius [m] where a file states none."""
 
@@ -114,7 +116,7 @@ def as_known_positions(reported: Satellites) -> PositionTrack | None:
         east_north(degrees)[1:],
         "positions",
         valid,
-        radius / _RADIUS_PER_SIGMA,
+        radius / RADIUS_PER_SIGMA,
         latlon_deg=reported.latlon_deg,
     )
 
