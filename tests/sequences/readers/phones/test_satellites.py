@@ -123,6 +123,12 @@ def test_each_recording_of_a_folder_has_its_own_positions(
         np.testing.assert_allclose(found.position_W, speed * (METRES - METRES[0]), atol=0.02)
 
 
+def test_a_latitude_that_grows_is_no_clock(walk: ImuSequence, tmp_path: Path) -> None:
+    phyphox(tmp_path / "p", walk)
+    save(tmp_path / "p/gps.csv", "lat,lon,alt", np.stack([TIME, TIME, TIME], axis=1))
+    assert read_recording(tmp_path / "p").satellites is None
+
+
 def test_lateral_forces_are_no_positions(walk: ImuSequence, tmp_path: Path) -> None:
     phyphox(tmp_path / "p", walk)
     header = "time (s),acc_lat,acc_long,gps speed"
