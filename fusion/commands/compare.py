@@ -69,8 +69,7 @@ def compare(
     """
     from stario.fusion.evaluation.compare import TRACKS, compare_recordings, demonstration
     from stario.fusion.evaluation.folders import check_folder
-    from stario.fusion.evaluation.results import scores_dict, write_comparison
-    from stario.fusion.evaluation.summary import scores_of
+    from stario.fusion.evaluation.results import metrics_dict, write_comparison
     from stario.fusion.fix_file import read_fixes
     from stario.sequences.arrays import check_choice
     from stario.sequences.datasets.batch import without_skipped
@@ -115,8 +114,8 @@ def compare(
         lines.append(f"figures and tracks: {first} and {len(written) - 1} other files")
         if not paths:
             lines.append(f"next: {_command()} run FILE --report, with a phone's recording")
-        scores = [scores_of(comparison) for comparison in comparisons]
-        print_result(as_json, scores_dict(scores), "\n".join(lines))
+        records = {found.sequence.name: found.as_dict() for found in comparisons}
+        print_result(as_json, metrics_dict(records, comparisons[0].words), "\n".join(lines))
     exit_if_skipped(skipped)
 
 

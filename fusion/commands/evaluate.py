@@ -183,7 +183,7 @@ def _tracks(
             recordings.append(scores_of(comparison))
     if recordings:
         if out is not None:
-            write_summary(out, recordings, settings, origin)
+            write_summary(out, {r.name: r.record for r in recordings}, settings, origin)
         print_result(as_json, summary(recordings), summary_table(recordings))
     return skipped
 
@@ -201,8 +201,7 @@ def _networks(
 ) -> list[Skipped]:
     """Write and print the table of networks; return the recordings that were skipped."""
     from stario.fusion.evaluation.figures import write_table
-    from stario.fusion.evaluation.networks import compare_networks, table_dict
-    from stario.fusion.evaluation.text import networks_text
+    from stario.fusion.evaluation.networks import compare_networks, networks_text, table_dict
     from stario.network.model import load_model, weights_named
     from stario.sequences.accuracy.metrics import Convention
     from stario.sequences.arrays import check_choice
@@ -239,11 +238,14 @@ def _groups(
 ) -> list[Skipped]:
     """Write and print the table of groups; return the recordings that were skipped."""
     from stario.fusion.evaluation.benchmark.aligned import aligned_recordings
-    from stario.fusion.evaluation.benchmark.groups import By, benchmark, benchmark_dict
+    from stario.fusion.evaluation.benchmark.groups import (
+        By,
+        benchmark,
+        benchmark_dict,
+        benchmark_text,
+    )
     from stario.fusion.evaluation.figures import write_benchmark
-    from stario.fusion.evaluation.text import benchmark_text
     from stario.sequences.arrays import check_choice
-    from stario.sequences.datasets.cache_files import cache_folder
 
     grouping: By = check_choice("--by", by, get_args(By))
     names = [ours] if theirs is None else [ours, theirs]
@@ -252,7 +254,7 @@ def _groups(
         if _GROUP not in name and _SET not in name:
             _for_group(name, "")  # fail on unloadable weights before preparing anything
     paths = [entry.path for entry in recordings]
-    aligned = aligned_recordings(paths, reading.read, reading.as_read(), cache_folder(), jobs)
+    aligned = aligned_recordings(paths, reading.read, jobs)
     groups = {entry.path: entry.group for entry in recordings}
     shown = with_bar("benchmark", aligned, len(recordings))
     found, skipped = benchmark(shown, models, groups, reading.read if ekf else None)

@@ -20,8 +20,8 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, find_peaks, hilbert, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.benchmark.aligned import Aligned, Complex
-from stario.fusion.evaluation.benchmark.network_alone import UPDATES, Predictions
+from stario.fusion.evaluation.benchmark.aligned import UPDATES, Aligned, Predictions
+from stario.fusion.imu.direction import Complex
 from stario.fusion.state import Track
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError

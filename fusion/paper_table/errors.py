@@ -6,12 +6,13 @@ own attitude, by `stario.fusion.evaluation.benchmark.displacement_error`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.benchmark.aligned import Aligned, aligned_recordings
+from stario.fusion.evaluation.benchmark.aligned import aligned_recording, predictions
 from stario.fusion.evaluation.benchmark.displacement_error import block_sums, recording_errors
-from stario.fusion.evaluation.benchmark.network_alone import predictions
 from stario.fusion.evaluation.networks import (
     MAX_DRAWN,
     OWN_ATTITUDE,
@@ -23,10 +24,9 @@ from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.paper_table.training import ReaderConfig
 from stario.network.model import DisplacementModel
 from stario.sequences.accuracy.metrics import Convention
-from stario.sequences.datasets.batch import Skipped, skipped, without_skipped
+from stario.sequences.datasets.batch import Skipped, each, without_skipped
 from stario.sequences.datasets.splits import ListEntry
-from stario.sequences.errors import StarioError
-from stario.sequences.sequence import FloatArray
+from stario.sequences.sequence import FloatArray, ImuSequence
 
 CONVENTION: Convention = "ronin"
 """How errors are averaged: as in the paper."""
@@ -50,28 +50,26 @@ def test_errors(
     """
     found: list[dict[str, object]] = []
     left_out: list[Skipped] = []
-    paths = [entry.path for entry in test]
-    outcomes = aligned_recordings(paths, reading.read, reading.options, reading.cache, 1)
-    groups = {entry.path: entry.group for entry in test}
     drawn = 0
-    for aligned in without_skipped(outcomes, left_out):
-        try:
-            row, track = _recording(model, aligned, reading)
-        except StarioError as error:
-            left_out.append(skipped(aligned.path, error))
-            continue
+    groups = {entry.path: entry.group for entry in test}
+    outcomes = each(partial(_recording, model=model, read=reading.read, groups=groups), groups, 1)
+    for row, track in without_skipped(outcomes, left_out):
         if track and drawn < MAX_DRAWN:
             row["drawn"], drawn = track, drawn + 1
-        found.append({"path": str(aligned.path), "group": groups[aligned.path], **row})
+        found.append(row)
     return found, left_out
 
 
 def _recording(
-    model: Model, aligned: Aligned, reading: ReaderConfig
+    path: Path, model: Model, read: Callable[[Path], ImuSequence], groups: Mapping[Path, str]
 ) -> tuple[dict[str, object], dict[str, FloatArray]]:
+    sequence = read(path)
+    aligned = aligned_recording(sequence, path)
     alone = recording_errors(aligned, predictions(model, aligned))
     blocks = {"10": alone.blocks["10"].tolist()} if "10" in alone.blocks else {}
     row: dict[str, object] = {
+        "path": str(path),
+        "group": groups[path],
         "recording": aligned.name,
         "kind": aligned.kind,
         "path_m": alone.path_m,
@@ -81,7 +79,6 @@ def _recording(
     }
     if aligned.kind != "poses":
         return row, {}
-    sequence = reading.read(aligned.path)
     if isinstance(model, PedestrianDeadReckoning):
         track = pedestrian_track(sequence).trajectory
         row["tracks"] = {OWN_ATTITUDE: metrics_of(track, true_poses(sequence), CONVENTION)}

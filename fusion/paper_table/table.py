@@ -25,8 +25,7 @@ from stario.fusion.evaluation.networks import (
     add_track,
 )
 from stario.fusion.evaluation.pedestrian import NAME as PDR
-from stario.fusion.evaluation.scores import Spread, joined, scored
-from stario.fusion.evaluation.text import rows_of
+from stario.fusion.evaluation.scores import Spread, joined, rows_of, scored
 from stario.fusion.paper_table.errors import CONVENTION
 from stario.fusion.paper_table.published import published
 from stario.fusion.paper_table.runs import Run, read_run

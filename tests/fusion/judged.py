@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from stario.fusion.evaluation.benchmark.aligned import Aligned, aligned_recording
+from stario.fusion.evaluation.benchmark.aligned import Aligned, aligned_recording, predictions
 from stario.fusion.evaluation.benchmark.displacement_error import (
     RecordingErrors,
     recording_errors,
 )
-from stario.fusion.evaluation.benchmark.network_alone import predictions
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
 from stario.sequences.sequence import ImuSequence, PositionTrack
 

@@ -1,31 +1,31 @@
-"""Recordings aligned with their truth, at ticks, for the benchmark of networks; cached on disk.
+"""Recordings aligned with their truth at ticks, and a network's predictions along them.
 
-Everything here depends on the recording alone, so several sets of weights share it, and later calls
-read it from the cache.
+The alignment depends on the recording alone: several sets of weights share it. A network predicts
+along the IMU's own levelled attitude. Windows overlap by half: each contributes the mean velocity
+over its second, and the velocity between two ticks is the mean over the windows that cover them.
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import cache, partial
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.fusion.imu.direction import Complex
+from stario.fusion.imu.stateful import Predictor, StatefulInference
 from stario.sequences.attitude.rotations import yaw_of
-from stario.sequences.datasets.array_cache import Part, read_parts, write_parts
 from stario.sequences.datasets.batch import Skipped, each
-from stario.sequences.datasets.cache_files import recording_file
 from stario.sequences.errors import InputError
-from stario.sequences.findings import Finding, warn
+from stario.sequences.findings import warn
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.inspection.constant_values import dead_axes
 from stario.sequences.legs import gaps_and_jumps
-from stario.sequences.levelled_stream import LevelledStream, levelled_streams
+from stario.sequences.levelled_stream import TICK_SECONDS, LevelledStream, levelled_streams
 from stario.sequences.sequence import (
     BoolArray,
     FloatArray,
@@ -34,17 +34,15 @@ from stario.sequences.sequence import (
     Trajectory,
     is_gap,
 )
-from stario.sequences.truth.problems import truth_findings
+from stario.sequences.truth.problems import warn_of_truth
+from stario.sequences.windows import WINDOW_SECONDS
 
 Kind = Literal["poses", "positions", "waypoints"]
 
-Complex = np.ndarray[tuple[int], np.dtype[np.complex128]]
-"""Horizontal positions or vectors x + iy."""
+UPDATES = round(WINDOW_SECONDS / TICK_SECONDS)
+"""Number of windows that begin within the length of one."""
 
-_SHARED = ("name", "kind", "attributes", "problems")
-_STREAM = ("imu_N", "facing_N", "R_NB")
-_TRUTH = ("position_W", "breaks", "yaw_WN", "waypoint_time", "waypoint_W")
-_COMPLEX = ("position_W", "waypoint_W")
+_BATCH = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +77,6 @@ class Aligned:
         kind: kind of its ground truth.
         attributes: person, device, place and similar, where known.
         pieces: its unbroken stretches.
-        problems: findings about its ground truth.
     """
 
     path: Path
@@ -87,7 +84,6 @@ class Aligned:
     kind: Kind
     attributes: dict[str, str]
     pieces: list[AlignedPiece]
-    problems: tuple[Finding, ...]
 
 
 def aligned_recording(sequence: ImuSequence, path: Path) -> Aligned:
@@ -119,41 +115,19 @@ def aligned_recording(sequence: ImuSequence, path: Path) -> Aligned:
     else:
         raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
     attributes = {name: str(value) for name, value in sequence.attributes.items()}
-    problems = tuple(truth_findings(sequence))
-    return Aligned(path, sequence.name, kind, attributes, pieces, problems)
+    warn_of_truth(sequence)
+    return Aligned(path, sequence.name, kind, attributes, pieces)
 
 
 def aligned_recordings(
-    paths: Sequence[Path],
-    read: Callable[[Path], ImuSequence],
-    options: dict[str, object],
-    folder: Path,
-    jobs: int | None = 1,
+    paths: Sequence[Path], read: Callable[[Path], ImuSequence], jobs: int | None = 1
 ) -> Iterator[Aligned | Skipped]:
-    """Yield each recording aligned, from the cache or newly read, in the order of the paths.
-
-    Args:
-        paths: paths of the recordings.
-        read: function that reads a path; must be picklable.
-        options: plain values that the result of `read` depends on besides the path.
-        folder: folder of the cache.
-        jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
-    """
-    work = partial(_cached, read=read, options=options, folder=folder)
-    yield from each(work, paths, jobs)
+    """Yield each recording aligned, in order; `read` is picklable, `jobs` is as for `each`."""
+    yield from each(partial(_read_aligned, read=read), paths, jobs)
 
 
-def _cached(
-    path: Path, read: Callable[[Path], ImuSequence], options: dict[str, object], folder: Path
-) -> Aligned:
-    file = recording_file(folder, path, {**options, "preparation": _code()})
-    parts = read_parts(file)
-    if parts is None:
-        parts = _parts(aligned_recording(read(path), path))
-        write_parts(file, parts)
-    found = _from_parts(path, parts)
-    warn(found.name, found.problems)
-    return found
+def _read_aligned(path: Path, read: Callable[[Path], ImuSequence]) -> Aligned:
+    return aligned_recording(read(path), path)
 
 
 def _with_poses(stream: LevelledStream, truth: Trajectory) -> AlignedPiece:
@@ -194,32 +168,54 @@ def _with_waypoints(stream: LevelledStream, track: PositionTrack) -> AlignedPiec
     )
 
 
-@cache
-def _code() -> str:
-    """Return a digest of this module, so that files of its other versions are not reused."""
-    return hashlib.blake2b(Path(__file__).read_bytes(), digest_size=20).hexdigest()
+@dataclass(frozen=True, eq=False)
+class Predictions:
+    """Predictions of a network for the M windows of a piece.
+
+    Attributes:
+        displacement_N: (M, 3) displacement over the second from tick m [m].
+        covariance_N: (M, 3, 3) covariance [m^2].
+    """
+
+    displacement_N: FloatArray
+    covariance_N: FloatArray
+
+    def track(self) -> Complex:
+        """Return the horizontal position x + iy (M + 2,) [m] at the ticks, 0 at the first."""
+        steps = (self.displacement_N[:, 0] + 1j * self.displacement_N[:, 1]) / UPDATES
+        cover = np.ones(UPDATES)
+        total, count = np.convolve(steps, cover), np.convolve(np.ones(len(steps)), cover)
+        return np.concatenate([[0.0], np.cumsum(total / count)])
 
 
-def _parts(aligned: Aligned) -> list[Part]:
-    shared = {name: getattr(aligned, name) for name in _SHARED}
-    shared["problems"] = [asdict(found) for found in aligned.problems]
-    parts = []
-    for piece in aligned.pieces:
-        arrays = {name: getattr(piece.stream, name) for name in _STREAM}
-        arrays |= {name: getattr(piece, name) for name in _TRUTH}
-        for name in _COMPLEX:  # the file's format has no double complex numbers
-            arrays[name] = arrays[name].view(np.float64)
-        parts.append(({**shared, "start": piece.stream.start}, arrays))
-    return parts
+@runtime_checkable
+class RecordingPredictor(Protocol):
+    """Predictor of a whole recording that needs no network."""
+
+    def predictions(self, recording: Aligned) -> list[Predictions]:
+        """Return a predictor's predictions for every piece, in N; a network begins each anew."""
+        ...
 
 
-def _from_parts(path: Path, parts: Sequence[Part]) -> Aligned:
-    pieces = []
-    for values, arrays in parts:
-        arrays = arrays | {name: arrays[name].view(np.complex128) for name in _COMPLEX}
-        stream = LevelledStream(values["start"], *(arrays[name] for name in _STREAM))
-        pieces.append(AlignedPiece(stream, *(arrays[name] for name in _TRUTH)))
-    name, kind, attributes, problems = (parts[0][0][key] for key in _SHARED)
-    return Aligned(
-        path, name, kind, attributes, pieces, tuple(Finding(**each) for each in problems)
-    )
+def predictions(model: Predictor | RecordingPredictor, recording: Aligned) -> list[Predictions]:
+    """Return a network's predictions for every piece of a recording, in frame N.
+
+    Args:
+        model: network, its memory reset at every piece; or another predictor.
+        recording: the recording, aligned with its truth.
+    """
+    if isinstance(model, RecordingPredictor):
+        return model.predictions(recording)
+    return [predict_stream(model, piece.stream) for piece in recording.pieces]
+
+
+def predict_stream(model: Predictor, stream: LevelledStream) -> Predictions:
+    """Return a network's predictions along an unbroken stretch, in frame N."""
+    network = StatefulInference(model, UPDATES)
+    windows, heading = stream.windows(), stream.headings
+    parts = [
+        network.predict(windows[first : first + _BATCH], heading[first : first + _BATCH])
+        for first in range(0, len(windows), _BATCH)
+    ]
+    displacement, covariance = zip(*parts, strict=True)
+    return Predictions(np.concatenate(displacement), np.concatenate(covariance))

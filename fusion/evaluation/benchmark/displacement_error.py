@@ -19,9 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stario.fusion.evaluation.benchmark.aligned import Aligned, AlignedPiece, Complex
-from stario.fusion.evaluation.benchmark.network_alone import Predictions
-from stario.fusion.imu.direction import Direction, direction, weighted_force
+from stario.fusion.evaluation.benchmark.aligned import Aligned, AlignedPiece, Predictions
+from stario.fusion.imu.direction import Complex, Direction, direction, weighted_force
 from stario.sequences.levelled_stream import TICK_SECONDS, TICKS_PER_SECOND
 from stario.sequences.sequence import BoolArray, FloatArray
 

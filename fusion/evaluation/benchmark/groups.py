@@ -15,14 +15,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 import pandas as pd
 
-from stario.fusion.evaluation.benchmark.aligned import Aligned
+from stario.fusion.evaluation.benchmark.aligned import Aligned, RecordingPredictor, predictions
 from stario.fusion.evaluation.benchmark.displacement_error import (
     FIGURES,
     HORIZONS,
     RecordingErrors,
     recording_errors,
 )
-from stario.fusion.evaluation.benchmark.network_alone import RecordingPredictor, predictions
 from stario.fusion.evaluation.bootstrap import (
     CONFIDENCE,
     REPLICATES,
@@ -34,6 +33,7 @@ from stario.fusion.evaluation.scores import joined, parts, records, scored, wide
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.sequences.datasets.batch import Skipped, without_skipped
+from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.readers.archive import split_name
 from stario.sequences.sequence import ImuSequence
 
@@ -138,21 +138,21 @@ def benchmark(
     scores: list[pd.DataFrame] = []
     blocks = [block_rows([], **dict.fromkeys(("set", "group", "recording", "network", "metric")))]
     still: list[Path] = []
-    for aligned in without_skipped(recordings, skipped):
-        named = labels(aligned.path, aligned.attributes, groups.get(aligned.path, ""))
-        unit = {"set": named["set"], "group": named["group"], "recording": str(aligned.path)}
-        errors = {n: _errors(model(named["group"]), aligned, read) for n, model in models.items()}
+    for recording in without_skipped(recordings, skipped):
+        named = labels(recording.path, recording.attributes, groups.get(recording.path, ""))
+        unit = {"set": named["set"], "group": named["group"], "recording": str(recording.path)}
+        errors = {n: _errors(model(named["group"]), recording, read) for n, model in models.items()}
         figures = {n: {"path_m": found.path_m, **found.figures} for n, found in errors.items()}
         others = {key: name for key, name in named.items() if key != "group"}
         scores.append(
-            scored(str(aligned.path), figures, named["group"], **others, truth=aligned.kind)
+            scored(str(recording.path), figures, named["group"], **others, truth=recording.kind)
         )
         for name, found in errors.items():
             for horizon, sums in found.blocks.items():
                 metric = f"rms_{horizon}s_m"
                 blocks.append(block_rows(sums, **unit, network=name, seed=0, metric=metric))
         if not any(found.path_m > 0.0 for found in errors.values()):
-            still.append(aligned.path)
+            still.append(recording.path)
     _warn_of_not_compared(still, len(scores))
     return Benchmark(joined(scores), joined(blocks)) if scores else None, skipped
 
@@ -228,3 +228,40 @@ def benchmark_dict(
         "recordings": records(found.scores.rename(columns={"track": "weights"})),
         "words": WORDS,
     }
+
+
+_TITLES = {
+    "ate_fit_m": ("fit [m]", ".2f"),
+    "ate_fit_percent": ("fit [%]", ".2f"),
+    "ate_first_m": ("first [m]", ".2f"),
+    "stretch_percent": ("20 s [%]", ".2f"),
+    "length_ratio": ("length", ".3f"),
+    "rms_1s_m": ("1 s [m]", ".3f"),
+    "rms_10s_m": ("10 s [m]", ".2f"),
+    "rms_30s_m": ("30 s [m]", ".2f"),
+    "direction_deg": ("direction [deg]", ".0f"),
+    "nis": ("NIS", ".2f"),
+    "nis_ekf": ("EKF NIS", ".2f"),
+}
+"""Titles and formats of the figures of a benchmark."""
+
+
+def benchmark_text(rows: pd.DataFrame, ours: str, theirs: str | None) -> str:
+    """Return for every group rows "theirs" and "ours", then the ratios, the verdict, the words."""
+    cells = [["", "", "n", "km", *(title for title, _ in _TITLES.values())]]
+    for row in rows.to_dict("records"):
+        known = [row["group"], row["role"], str(row["recordings"])]
+        found = [figure(row[key], form) for key, (_, form) in _TITLES.items()]
+        cells.append([*known, f"{row['path_km']:.2f}", *found])
+    head, *body = aligned(cells)
+    lines = [head]
+    for line, row in zip(body, rows.to_dict("records"), strict=True):
+        lines.append(line)
+        for key, metric in RATIOS.items():
+            if isinstance(row[key], Interval):
+                title = _TITLES[metric][0].split(" [")[0]
+                lines.append(f"{row['group']}: ratio over {title}: {row[key]:.3f}")
+    if conclusion := verdict(rows):
+        lines.append(conclusion)
+    lines += [f"ours: {ours}", *([f"theirs: {theirs}"] if theirs else [])]
+    return "\n".join([*lines, *(f"{key}: {words}." for key, words in WORDS.items())])

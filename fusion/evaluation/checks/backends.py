@@ -16,8 +16,7 @@ from stario.fusion.evaluation.checks.faults import (
     matched_config,
     with_true_displacements,
 )
-from stario.fusion.evaluation.scores import Column, parts, scored, wide
-from stario.fusion.evaluation.text import table
+from stario.fusion.evaluation.scores import Column, parts, scored, table, wide
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.filter.record import innovations_of
 from stario.fusion.graph import fixed_lag

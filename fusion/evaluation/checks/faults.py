@@ -20,8 +20,7 @@ from scipy.spatial.transform import Rotation
 from stario.fusion.backends import BackendName
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.checks.corruption import Fault, ModifyPredictions, faults
-from stario.fusion.evaluation.scores import Column, joined, scored
-from stario.fusion.evaluation.text import rows_of
+from stario.fusion.evaluation.scores import Column, joined, rows_of, scored
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.health import Health
 from stario.fusion.imu.stateful import Predictor, WindowDisplacement

@@ -17,8 +17,14 @@ from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import Metrics, measure
 from stario.fusion.evaluation.known_positions import MIN_POSITIONS
-from stario.fusion.evaluation.scores import Column, geometric_mean, median_degrees, parts, scored
-from stario.fusion.evaluation.text import table
+from stario.fusion.evaluation.scores import (
+    Column,
+    geometric_mean,
+    median_degrees,
+    parts,
+    scored,
+    table,
+)
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator

@@ -16,12 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.benchmark.aligned import Complex
 from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position
 from stario.fusion.evaluation.checks.simulation import simulated_walk
-from stario.fusion.evaluation.scores import Column, geometric_mean, joined, parts, scored
-from stario.fusion.evaluation.text import table
+from stario.fusion.evaluation.scores import Column, geometric_mean, joined, parts, scored, table
 from stario.fusion.evaluation.tracks import network_track
+from stario.fusion.imu.direction import Complex
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.state import Track

@@ -13,8 +13,7 @@ import pandas as pd
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks.corruption import drops, gap
-from stario.fusion.evaluation.scores import Column, parts, quantile, scored
-from stario.fusion.evaluation.text import table
+from stario.fusion.evaluation.scores import Column, parts, quantile, scored, table
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.lie import yaw_twist
 from stario.fusion.navigator import Navigator

@@ -16,8 +16,7 @@ from scipy.signal import butter, sosfiltfilt, welch
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks.fusion_gain import fitted_error
 from stario.fusion.evaluation.compare import Metrics, measure
-from stario.fusion.evaluation.scores import Column, scored
-from stario.fusion.evaluation.text import table
+from stario.fusion.evaluation.scores import Column, scored, table
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator

@@ -14,8 +14,7 @@ import pandas as pd
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks.fusion_gain import SIGMA_BOUND
-from stario.fusion.evaluation.scores import Column, median_degrees, parts, scored
-from stario.fusion.evaluation.text import table
+from stario.fusion.evaluation.scores import Column, median_degrees, parts, scored, table
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.fixes import Fix, position_fix
 from stario.fusion.imu.stateful import Predictor

@@ -18,12 +18,12 @@ from stario.fusion.evaluation.benchmark.groups import (
     RATIOS,
     Benchmark,
     benchmark,
+    benchmark_text,
     labels,
     verdict,
 )
 from stario.fusion.evaluation.figures import groups_figure, write_benchmark
 from stario.fusion.evaluation.scores import values
-from stario.fusion.evaluation.text import benchmark_text
 from stario.sequences.datasets.batch import Skipped
 from stario.sequences.sequence import ImuSequence
 

@@ -11,14 +11,13 @@ from judged import Stub, aligned_once, errors_of, horizontal_path, with_waypoint
 from recorded import DATA
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.benchmark.aligned import aligned_recording
+from stario.fusion.evaluation.benchmark.aligned import Predictions, aligned_recording, predictions
 from stario.fusion.evaluation.benchmark.displacement_error import (
     _AtTicks,
     _stretches,
     _Sums,
     recording_errors,
 )
-from stario.fusion.evaluation.benchmark.network_alone import Predictions, predictions
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.readers import read_recording
