@@ -21,6 +21,7 @@ from stario.fusion.commands.common import (
     training_command,
 )
 from stario.fusion.commands.options import (
+    READING,
     CompareOutOption,
     EstimatorOptions,
     ExplainOption,
@@ -30,9 +31,8 @@ from stario.fusion.commands.options import (
     OptionalPathsArgument,
     ReadingOptions,
     ReportOption,
-    changed,
     expand_option_groups,
-    refuse_unused,
+    refuse,
 )
 from stario.sequences.errors import InputError
 
@@ -46,6 +46,7 @@ _SHOWN = ("track", "dead_reckoning")
 
 @expand_option_groups
 def compare(
+    context: typer.Context,
     reading: ReadingOptions,
     estimating: EstimatorOptions,
     paths: OptionalPathsArgument = None,
@@ -76,7 +77,7 @@ def compare(
     from stario.sequences.lazy import optional_package
 
     if not paths:
-        refuse_unused(changed(reading), "without PATH", "use with a recording to read")
+        refuse(context, "without PATH", "use with a recording to read", *READING)
     if report:
         optional_package("plotly", "report")
     chosen = TRACKS if tracks == "all" else [*_SHOWN, *(names_in(tracks) if tracks else [])]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stario.fusion.commands.common import check_new, print_result
-from stario.fusion.commands.options import JsonOption, OverwriteOption, flag, refuse_unused
+from stario.fusion.commands.options import JsonOption, OverwriteOption, flag, refuse
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 
 def simulate(
+    context: typer.Context,
     path: Annotated[Path, typer.Argument(help="CSV file to write.")],
     seconds: Annotated[
         float | None, typer.Option(min=1.0, help="Duration in s. Default: 60, or the clip's.")
@@ -65,7 +66,8 @@ def simulate(
     sensors = {"phone": PHONE_IMU, "good": GOOD_IMU, "perfect": PERFECT_IMU}
     errors = sensors[check_choice("--imu", imu, sensors)]
     if body is not None:
-        sequence = _on_body(body, carry, seconds, magnetometer, rate, errors, seed)
+        refuse(context, "with --body", "use without", "seconds", "magnetometer")
+        sequence = _on_body(body, carry, rate, errors, seed)
     else:
         seconds = 60.0 if seconds is None else seconds
         check_choice("--carry", carry, (*CARRYING_MODES, "random"))
@@ -89,8 +91,6 @@ def simulate(
 def _on_body(
     body: Path,
     carry: str,
-    seconds: float | None,
-    magnetometer: bool,
     rate: float,
     errors: ImuErrors,
     seed: int,
@@ -100,8 +100,6 @@ def _on_body(
     from stario.sequences.simulation.body import places_on, virtual_imu
     from stario.sequences.simulation.motion_capture import read_body
 
-    unused = {"--seconds": seconds is not None, "--magnetometer": magnetometer}
-    refuse_unused(unused, "with --body", "use without")
     motion = read_body(body)
     place = str(generator(seed).choice(places_on(motion))) if carry == "random" else carry
     return virtual_imu(motion, place, rate, errors, seed)

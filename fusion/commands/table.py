@@ -13,7 +13,7 @@ from stario.fusion.commands.options import (
     CacheOption,
     ReadingOptions,
     assignment,
-    refuse_unused,
+    refuse,
 )
 from stario.sequences.errors import InputError
 
@@ -21,10 +21,8 @@ if TYPE_CHECKING:
     from stario.fusion.paper_table.sets import DataSet
 
 
-_PER_GROUP = 2
-
-
 def table(
+    context: typer.Context,
     out: Annotated[
         Path, typer.Option(help="Folder of the finished runs; a repetition resumes there.")
     ],
@@ -53,7 +51,7 @@ def table(
     split_seed: Annotated[int, typer.Option(min=0, help="Seed of the recording split.")] = 0,
     per_group: Annotated[
         int, typer.Option(min=1, help="Maximum test recordings per group in the set all.")
-    ] = _PER_GROUP,
+    ] = 2,
     config: Annotated[
         Path | None, typer.Option(help="JSON file with the recipe. Default: the package's.")
     ] = None,
@@ -79,6 +77,8 @@ def table(
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.cache_files import cache_folder
 
+    if data is None:
+        refuse(context, "without --data", "use with --data", "sets", "per_group")
     datasets = _data_sets(data, sets, published or [], split_seed, per_group)
     chosen = None if networks is None else names_in(networks)
     runs = table_runs(datasets, _recipe(config), steps, chosen, seeds)
@@ -111,10 +111,7 @@ def _data_sets(
     if data is None and not published:
         raise InputError("data", "none", "recordings", "pass --data or --set NAME=FOLDER")
     datasets: list[DataSet] = []
-    if data is None:
-        unused = {"--sets": sets is not None, "--per-group": per_group != _PER_GROUP}
-        refuse_unused(unused, "without --data", "use with --data")
-    else:
+    if data is not None:
         names = None if sets is None else names_in(sets)
         datasets += development_sets(data, seed, per_group, names)
     for word in published:
