@@ -25,7 +25,7 @@ from stario.fusion.evaluation.networks import (
     add_track,
 )
 from stario.fusion.evaluation.pedestrian import NAME as PDR
-from stario.fusion.evaluation.scores import Spread, joined, rows_of, scored
+from stario.fusion.evaluation.scores import Spread, joined, scored
 from stario.fusion.paper_table.errors import CONVENTION
 from stario.fusion.paper_table.published import published
 from stario.fusion.paper_table.runs import Run, read_run
@@ -85,7 +85,8 @@ class SetTable:
             network alone are those of a track that is called by the kind of truth, errors of the
             training those of a track "trained".
         rows: networks, in order, with their `seeds`, the number of test recordings that given
-            weights were trained on (`learned`), and the columns of `bootstrap.ranks`.
+            weights were trained on (`learned`), mean and standard error over seeds of each of
+            `COLUMNS` ("ate", "ate_sem"; NaN if unknown), and the columns of `bootstrap.ranks`.
         tested: number of tested recordings.
         path_m: total length of their true paths [m].
         measure: the error that networks are ranked by, in words.
@@ -100,27 +101,8 @@ class SetTable:
     measure: str
     skipped: list[str]
 
-    def parts(self) -> list[tuple[str, pd.DataFrame]]:
-        """Return each network's scores, in order."""
-        names = self.scores["network"]
-        return [(name, self.scores[names == name]) for name in self.rows["network"]]
-
-    def means(self) -> list[dict[str, Any]]:
-        """Return a row for each network: mean over seeds of each column, NaN if unknown; rank."""
-        return [
-            {"network": row["network"], "seeds": row["seeds"], "rank": row["rank"]}
-            | {key: column.mean_and_spread(part)[0] for key, column in COLUMNS.items()}
-            for row, (_, part) in zip(self.rows.to_dict("records"), self.parts(), strict=True)
-        ]
-
     def as_dict(self) -> dict[str, object]:
         """Return the set's part of `table.json`."""
-        rows = [
-            row | mean | {f"{key}_sem": c.mean_and_spread(part)[1] for key, c in COLUMNS.items()}
-            for row, mean, (_, part) in zip(
-                self.rows.to_dict("records"), self.means(), self.parts(), strict=True
-            )
-        ]
         return {
             "split": self.dataset.words,
             "training": len(self.dataset.training),
@@ -128,7 +110,7 @@ class SetTable:
             "tested": self.tested,
             "path_m": self.path_m,
             "ranks_by": self.measure,
-            "rows": rows,
+            "rows": self.rows.to_dict("records"),
             "skipped": self.skipped,
         }
 
@@ -161,12 +143,11 @@ def set_table(
     measure = "ate" if poses else "10"
     order = sorted(completed, key=[PDR, *ARCHITECTURES, *completed].index)
     test = {entry.path for entry in dataset.test}
+    scores = _scores(completed)
     rows = pd.DataFrame(
-        {
-            "network": name,
-            "seeds": sorted(completed[name]),
-            "learned": len(test & learned.get(name, set())),
-        }
+        {"network": name, "seeds": sorted(completed[name])}
+        | {"learned": len(test & learned.get(name, set()))}
+        | _means(scores[scores["network"] == name])
         for name in order
     )
     skipped = [
@@ -176,13 +157,20 @@ def set_table(
     ]
     return SetTable(
         dataset,
-        _scores(completed),
+        scores,
         rows.merge(ranks(_blocks(completed, measure, dataset), REFERENCE_NETWORK), "left"),
         len(recordings),
         float(sum(recording["path_m"] for recording in recordings)),
         _MEASURES[measure],
         list(dict.fromkeys(skipped)),
     )
+
+
+def _means(scores: pd.DataFrame) -> dict[str, float | None]:
+    found: dict[str, float | None] = {}
+    for key, column in COLUMNS.items():
+        found[key], found[f"{key}_sem"] = column.mean_and_spread(scores)
+    return found
 
 
 def _scores(completed: Completed) -> pd.DataFrame:
@@ -281,10 +269,10 @@ def write_results(
         "conventions": _WORDS,
     }
     write_json(out / "table.json", content)
-    means = [  # without NaN: a missing cell stays empty
-        {"set": name, **{k: v for k, v in row.items() if v == v}, "seeds": len(row["seeds"])}
+    means = [
+        {"set": name, **row[["network", "rank", *COLUMNS]].dropna(), "seeds": len(row["seeds"])}
         for name, table in tables.items()
-        for row in table.means()
+        for _, row in table.rows.iterrows()
     ]
     write_rows(out / "table.csv", means)
     for name, table in tables.items() if drawn else ():
@@ -316,19 +304,22 @@ def table_text(
 
 
 def _set_text(table: SetTable) -> str:
-    dataset = table.dataset
-    columns = [c for c in COLUMNS.values() if np.isfinite(c.mean_and_spread(table.scores)[0])]
-    cells = rows_of(table.parts(), columns, "network")
-    more = [["seeds", "rank", f"error / {REFERENCE_NETWORK}'s", "paper: ATE, RTE [m]"]]
+    dataset, known = table.dataset, table.rows[[*COLUMNS]].notna().any()
+    columns = [column for key, column in COLUMNS.items() if known[key]]
+    titles = ["network", *(column.title for column in columns), "seeds", "rank"]
+    lines = [[*titles, f"error / {REFERENCE_NETWORK}'s", "paper: ATE, RTE [m]"]]
     for row in table.rows.to_dict("records"):
-        known = not np.isnan(row["rank"])
-        rank = "{rank:.0f} [{rank_low:.0f}, {rank_high:.0f}]".format(**row) if known else "-"
-        ratio = f"{row['ratio']:.2f}" if isinstance(row["ratio"], Interval) else "-"
-        paper = published(dataset.name, row["network"])
-        errors = "-" if paper is None else "{:.3f}, {:.3f}".format(*paper)
-        more.append([str(len(row["seeds"])), rank, ratio, errors])
-    titles = ["network", *(_title(row, table.tested) for row in table.rows.to_dict("records"))]
-    lines = [[title, *c[1:], *m] for title, c, m in zip(titles, cells, more, strict=True)]
+        part = table.scores[table.scores["network"] == row["network"]]
+        rank, ratio, errors = "-", "-", "-"
+        if not np.isnan(row["rank"]):
+            rank = "{rank:.0f} [{rank_low:.0f}, {rank_high:.0f}]".format(**row)
+        if isinstance(row["ratio"], Interval):
+            ratio = f"{row['ratio']:.2f}"
+        if paper := published(dataset.name, row["network"]):
+            errors = "{:.3f}, {:.3f}".format(*paper)
+        cells = [column.text(part) for column in columns]
+        title = _title(row, table.tested)
+        lines.append([title, *cells, str(len(row["seeds"])), rank, ratio, errors])
     return "\n".join(
         [
             f"### {dataset.title}",

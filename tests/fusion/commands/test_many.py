@@ -132,16 +132,6 @@ def test_truth_that_covers_only_a_part_is_reported(stario, recording: Path, tmp_
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_compare_accepts_folders_of_recordings(stario, recording: Path, tmp_path: Path) -> None:
-    for folder in ("a", "b"):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "walk.csv").write_bytes(recording.read_bytes())
-    done = stario("compare", "a", "b", "--out", "out", "--json")
-    assert set(json.loads(done.out)["recordings"]) == {"walk", "walk-2"}
-    assert {p.name for p in (tmp_path / "out").iterdir() if p.is_dir()} == {"walk", "walk-2"}
-
-
-@pytest.mark.usefixtures("no_figures")
 @pytest.mark.parametrize("command", ["run", "compare"])
 def test_figures_of_several_recordings_are_explained_once(
     stario, recording: Path, tmp_path: Path, command: str
@@ -150,24 +140,6 @@ def test_figures_of_several_recordings_are_explained_once(
     done = stario(command, recording, "again.csv", "--out", "out", "--explain")
     assert done.out.count("\nfitted [m]: ATE after") == 1
     assert done.out.count("m rms from the truth") == 2
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_a_bad_recording_in_the_list_is_named_and_the_rest_compared(
-    stario, recording: Path, tmp_path: Path
-) -> None:
-    sequence = read_generic_csv(recording)
-    write_csv(tmp_path / "short.csv", sequence.slice(0.0, 1.0))
-    (tmp_path / "broken.csv").write_text("t,gx,gy,gz,ax,ay,az\n0,0,0,0,x,0,0\n")
-    for bad in ("short.csv", "broken.csv"):
-        done = stario("compare", bad, recording, "--out", "out", "--json")
-        assert done.code == 1
-        assert set(json.loads(done.out)["recordings"]) == {"walk"}
-        (line,) = done.err.splitlines()
-        assert line.startswith("stario: skipped: ")
-        assert bad.removesuffix(".csv") in line
-        stario("compare", bad, "--out", "none").assert_one_line_error(bad.removesuffix(".csv"))
-        assert not (tmp_path / "none").exists()
 
 
 def test_many_recordings_skipped_for_one_reason_take_one_line(
@@ -406,14 +378,6 @@ def test_backends_compares_filter_and_graph(stario) -> None:
     content = json.loads(done.out)
     assert set(content["summary"]["median_ate_m"]) == {"ekf", "graph", "fixed_lag"}
     assert content["scores"][0]["recording"] == "walk 0"
-
-
-def test_backends_continues_after_failures(stario, recording: Path, tmp_path: Path) -> None:
-    write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
-    done = stario("check", "backends", "blind.csv", recording, "--json")
-    assert done.code == 1
-    assert "skipped: blind.csv" in done.err
-    assert {score["recording"] for score in json.loads(done.out)["scores"]} == {"walk"}
 
 
 def test_recordings_too_short_to_hold_out_a_part_require_validation_recordings(
