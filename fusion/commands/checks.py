@@ -187,7 +187,7 @@ def fusion(
     as_json: JsonOption = False,
 ) -> None:
     """Compare the filter's error with the network's by group, with NIS and consistency of yaw."""
-    from stario.fusion.evaluation.checks.fusion_gain import fusion_gain, fusion_gain_table
+    from stario.fusion.evaluation.checks.fusion import fusion_gain, fusion_gain_table
 
     judge = partial(fusion_gain, backends=_backends(graph))
     _check_groups(reading, paths, estimating, by, judge, fusion_gain_table, as_json)
@@ -206,7 +206,7 @@ def fixes(
 ) -> None:
     """Supply periodic true positions; check that position and yaw errors match their sigmas."""
     from stario.fusion.backends import BackendName
-    from stario.fusion.evaluation.checks.with_fixes import fixes_table, track_with_fixes
+    from stario.fusion.evaluation.checks.fusion import fixes_table, track_with_fixes
     from stario.sequences.arrays import check_choice
 
     chosen: BackendName = check_choice("--backend", backend, get_args(BackendName))
@@ -223,7 +223,7 @@ def gaps(
     as_json: JsonOption = False,
 ) -> None:
     """Remove 0.1 s at one of six instants or 5 % of the samples; report how far the end moves."""
-    from stario.fusion.evaluation.checks.sample_loss import end_shift_table, end_shifts
+    from stario.fusion.evaluation.checks.fusion import end_shift_table, end_shifts
 
     _check_groups(reading, paths, estimating, by, end_shifts, end_shift_table, as_json)
 
