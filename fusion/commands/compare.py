@@ -114,7 +114,8 @@ def compare(
         first = folder / comparisons[0].sequence.name / "plan.png"
         lines.append(f"figures and tracks: {first} and {len(written) - 1} other files")
         if not paths:
-            lines.append(f"next: {_command()} run FILE --report, with a phone's recording")
+            command = "stario" if shutil.which("stario") else sys.argv[0]  # in no PATH: its own
+            lines.append(f"next: {command} run FILE --report, with a phone's recording")
         records = {found.sequence.name: found.as_dict() for found in comparisons}
         print_result(as_json, metrics_dict(records, comparisons[0].words), "\n".join(lines))
     exit_if_skipped(skipped)
@@ -132,8 +133,3 @@ def _lines(found: Comparison, as_table: bool) -> list[str]:
     line = f"{found.sequence.name}: StarIO's track: {words}; dead reckoning: {distance(far)}"
     table = [track_table(found)] if as_table else []
     return [line, *table, *(finding.line() for finding in found.verdict)]
-
-
-def _command() -> str:
-    """Return how this command can be typed again: from a virtual environment, with its path."""
-    return "stario" if shutil.which("stario") else sys.argv[0]

@@ -119,6 +119,11 @@ class ReadingOptions:
         ),
     ] = None
 
+    def changed(self) -> dict[str, object]:
+        """Return the options that differ from their defaults."""
+        default = asdict(ReadingOptions())
+        return {name: value for name, value in asdict(self).items() if value != default[name]}
+
     def as_read(self) -> dict[str, object]:
         """Return the options that affect a recording's values: all except `where`."""
         return {name: value for name, value in asdict(self).items() if name != "where"}

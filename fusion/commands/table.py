@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -81,7 +81,8 @@ def table(
         refuse(context, "without --data", "use with --data", "sets", "per_group")
     datasets = _data_sets(data, sets, published or [], split_seed, per_group)
     chosen = None if networks is None else names_in(networks)
-    runs = table_runs(datasets, _recipe(config), steps, chosen, seeds)
+    packaged = importlib.resources.files("stario.network.weights") / "recipe-table.json"
+    runs = table_runs(datasets, recipe_values(config or Path(str(packaged))), steps, chosen, seeds)
     make_folder(out)
     requested = {run.network for run in runs}
     costs = known_costs([name for name in ARCHITECTURES if name in requested], out)
@@ -120,8 +121,3 @@ def _data_sets(
             raise InputError("--set", repr(name), "a name of its own", f"or drop {name} by --sets")
         datasets.append(folder_set(name, Path(folder), seed))
     return datasets
-
-
-def _recipe(path: Path | None) -> dict[str, Any]:
-    packaged = importlib.resources.files("stario.network.weights").joinpath("recipe-table.json")
-    return recipe_values(Path(str(packaged)) if path is None else path)

@@ -35,23 +35,13 @@ def shown_value(metrics: Metrics, key: str) -> float | None:
 
 def track_table(found: Comparison) -> str:
     """Format a table with a row of known metrics per track; `EXPLANATION` explains it."""
-    columns = _known_columns(found)
+    known = [key for values in found.metrics.values() for key, v in values.items() if v is not None]
+    columns = {key: title for key, title in METRIC_TITLES.items() if key in known}
     rows = [
         [name, *(figure(shown_value(values, key), ".2f") for key in columns)]
         for name, values in found.metrics.items()
     ]
     return "\n".join(aligned([["", *columns.values()], *rows]))
-
-
-def _known_columns(found: Comparison) -> dict[str, str]:
-    """Return the titles of the figures that are known of any track."""
-    known = {
-        key
-        for values in found.metrics.values()
-        for key, value in values.items()
-        if value is not None
-    }
-    return {key: title for key, title in METRIC_TITLES.items() if key in known}
 
 
 def track_words(found: Comparison) -> str:
@@ -103,17 +93,17 @@ def error_words(found: Comparison, name: str = "track") -> str:
     return words
 
 
-def _without_unit(words: str) -> str:
-    """Return words without the units of JSON, which are not always those of the tables."""
-    return re.sub(r" \[[^]]*\]", "", words)
-
-
 EXPLANATION = "\n".join(
     [
         *(f"{name}: {words}." for name, words in TRACK_WORDS.items()),
         "length: along chords of one second, so that neither sway nor noise adds to it.",
         "sigma: one standard deviation, horizontal unless said.",
-        *(f"{title}: {_without_unit(METRIC_WORDS[key])}." for key, title in METRIC_TITLES.items()),
+        # Without the units of JSON, which are not always those of the tables.
+        *(
+            f"{title}: {word}."
+            for key, title in METRIC_TITLES.items()
+            for word in [re.sub(r" \[[^]]*\]", "", METRIC_WORDS[key])]
+        ),
         *(f"{key}: {METRIC_WORDS[key]}." for key in ("horizontal", "alignment")),
     ]
 )

@@ -221,7 +221,7 @@ def complete(
     Runs are started in their order; `out` must be writable by every process that takes part.
     `jobs` is as for `stario.sequences.datasets.batch.each`.
     """
-    yield from each(partial(complete_run, out=out, reading=reading), runs, jobs)
+    return each(partial(complete_run, out=out, reading=reading), runs, jobs)
 
 
 @contextmanager

@@ -133,7 +133,7 @@ def _combined(data: Path, seed: int, per_group: int) -> DataSet:
     test = [
         entry
         for members in _by(held_out, lambda entry: entry.group).values()
-        for entry in _spread(members, per_group)
+        for entry in (members[k] for k in evenly_spaced(len(members), per_group))
     ]
     return DataSet(
         ALL,
@@ -158,8 +158,3 @@ def _by(
     for entry in recordings:
         parts.setdefault(key(entry), []).append(entry)
     return parts
-
-
-def _spread(members: Sequence[ListEntry], maximum: int) -> list[ListEntry]:
-    """Return up to `maximum` of them, evenly spaced from the first to the last."""
-    return [members[k] for k in evenly_spaced(len(members), maximum)]

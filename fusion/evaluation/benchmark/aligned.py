@@ -123,7 +123,7 @@ def aligned_recordings(
     paths: Sequence[Path], read: Callable[[Path], ImuSequence], jobs: int | None = 1
 ) -> Iterator[Aligned | Skipped]:
     """Yield each recording aligned, in order; `read` is picklable, `jobs` is as for `each`."""
-    yield from each(partial(_read_aligned, read=read), paths, jobs)
+    return each(partial(_read_aligned, read=read), paths, jobs)
 
 
 def _read_aligned(path: Path, read: Callable[[Path], ImuSequence]) -> Aligned:

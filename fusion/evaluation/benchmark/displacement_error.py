@@ -158,7 +158,7 @@ def recording_errors(aligned: Aligned, found: Sequence[Predictions]) -> Recordin
         "ate_fit_m": fitted,
         "ate_fit_percent": 100.0 * fitted / usual_path,
         "ate_first_m": sums.rms("first"),
-        "length_ratio": _ratio(sums.length, sums.path),
+        "length_ratio": sums.length / sums.path,
         **{f"rms_{h}s_m": sums.rms(str(h)) for h in HORIZONS},
         "stretch_percent": 100.0 * sums.rms("stretch"),
         "direction_deg": abs(np.degrees(total_direction.turn)),
@@ -276,7 +276,3 @@ def _nis(predictions: Predictions, start: np.ndarray, true_N: Complex, sums: _Su
 
 def _windows_xy(predictions: Predictions) -> Complex:
     return np.asarray(predictions.displacement_N[:, 0] + 1j * predictions.displacement_N[:, 1])
-
-
-def _ratio(value: float, by: float) -> float:
-    return value / by if by > 0 else float("nan")

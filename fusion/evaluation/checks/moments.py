@@ -55,10 +55,6 @@ _CARRIES = ("handheld", "pocket", "swinging", "bag")
 """How the device is carried in the simulated walks, one each."""
 
 
-def _small_share(ratio: FloatArray) -> float:
-    return float((ratio < MAX_RATIO).mean())
-
-
 _COLUMNS = (
     Column("n", "step", ".0f", len),
     Column("without [m]", "error_without"),
@@ -66,7 +62,7 @@ _COLUMNS = (
     Column("worst", "ratio", over=np.max),
     Column("joined: mean", "joined_ratio", over=geometric_mean),
     Column("worst", "joined_ratio", over=np.max),
-    Column(f"ratio < {MAX_RATIO:g}", "ratio", ".0%", _small_share),
+    Column(f"ratio < {MAX_RATIO:g}", "ratio", ".0%", lambda ratio: (ratio < MAX_RATIO).mean()),
     Column("step [m]", "step", ".1f", np.max),
     Column("turn [deg]", "turn", ".1f", np.max),
     Column("both small", "small", ".0%", np.mean),
