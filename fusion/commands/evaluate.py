@@ -15,7 +15,6 @@ from stario.fusion.commands.common import (
     origin_of,
     print_result,
     progress_bar,
-    with_bar,
 )
 from stario.fusion.commands.options import (
     DataOption,
@@ -224,7 +223,6 @@ def _groups(
     jobs: int,
 ) -> tuple[_Found | None, list[Skipped]]:
     """Return the table of groups, and the recordings that were skipped."""
-    from stario.fusion.evaluation.benchmark.aligned import aligned_recordings
     from stario.fusion.evaluation.benchmark.groups import (
         By,
         benchmark,
@@ -240,10 +238,9 @@ def _groups(
     for name in names:
         if _GROUP not in name and _SET not in name:
             _for_group(name, "")  # fail on unloadable weights before preparing anything
-    aligned = aligned_recordings([entry.path for entry in recordings], reading.read, jobs)
     groups = {entry.path: entry.group for entry in recordings}
-    shown = with_bar("benchmark", aligned, len(recordings))
-    found, skipped = benchmark(shown, models, groups, reading.read if ekf else None)
+    with progress_bar("evaluate", len(groups)) as progress:
+        found, skipped = benchmark(groups, models, reading.read, jobs, ekf, progress)
     if found is None:
         return None, skipped
     rows = found.rows(grouping, ours, theirs)

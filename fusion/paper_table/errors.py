@@ -11,15 +11,19 @@ from functools import partial
 from pathlib import Path
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.benchmark.aligned import aligned_recording, predictions
-from stario.fusion.evaluation.benchmark.displacement_error import block_sums, recording_errors
+from stario.fusion.evaluation.benchmark.displacement_error import (
+    block_sums,
+    judged_streams,
+    known_truth,
+    recording_errors,
+)
 from stario.fusion.evaluation.networks import (
     MAX_DRAWN,
     OWN_ATTITUDE,
     metrics_of,
     protocol_figures,
 )
-from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning, pedestrian_track
+from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning, pedestrian_track, piece_of
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.paper_table.training import ReaderConfig
 from stario.network.model import DisplacementModel
@@ -27,6 +31,7 @@ from stario.sequences.accuracy.metrics import Convention
 from stario.sequences.datasets.batch import Skipped, each, without_skipped
 from stario.sequences.datasets.splits import ListEntry
 from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.truth.problems import warn_of_truth
 
 CONVENTION: Convention = "ronin"
 """How errors are averaged: as in the paper."""
@@ -64,20 +69,21 @@ def _recording(
     path: Path, model: Model, read: Callable[[Path], ImuSequence], groups: Mapping[Path, str]
 ) -> tuple[dict[str, object], dict[str, FloatArray]]:
     sequence = read(path)
-    aligned = aligned_recording(sequence, path)
-    alone = recording_errors(aligned, predictions(model, aligned))
+    streams, (kind, _) = judged_streams(sequence), known_truth(sequence)
+    warn_of_truth(sequence)
+    alone = recording_errors(sequence, [piece_of(model, stream) for stream in streams])
     blocks = {"10": alone.blocks["10"].tolist()} if "10" in alone.blocks else {}
     row: dict[str, object] = {
         "path": str(path),
         "group": groups[path],
-        "recording": aligned.name,
-        "kind": aligned.kind,
+        "recording": sequence.name,
+        "kind": kind,
         "path_m": alone.path_m,
         "figures": alone.figures,
         "blocks": blocks,
         "tracks": {},
     }
-    if aligned.kind != "poses":
+    if kind != "poses":
         return row, {}
     if isinstance(model, PedestrianDeadReckoning):
         track = pedestrian_track(sequence).trajectory
