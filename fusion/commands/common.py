@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -10,12 +9,12 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import typer
 
 from stario.fusion.commands.options import EstimatorOptions, ReadingOptions
-from stario.sequences.errors import ConfigError, InputError
+from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.fusion.recording import Progress
@@ -217,24 +216,6 @@ def training_command(paths: Sequence[Path], reading: ReadingOptions) -> str:
     ]
     words = ["stario", "train", *map(str, paths), *options, "--start-from", "default"]
     return shlex.join(words)
-
-
-def recipe_values(path: Path) -> dict[str, Any]:
-    """Read the settings of a training recipe from a JSON file.
-
-    Raises:
-        ConfigError: the file cannot be read, or is not a table of settings.
-    """
-    from stario.sequences.files import opened_text
-
-    try:
-        values = json.loads(opened_text(path))
-    except (OSError, ValueError) as error:
-        found = "no such file" if isinstance(error, FileNotFoundError) else str(error)
-        raise ConfigError(str(path), found, "a JSON file with settings") from error
-    if not isinstance(values, dict):
-        raise ConfigError(str(path), type(values).__name__, "a table of settings")
-    return values
 
 
 def names_in(text: str) -> list[str]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import exit_if_skipped, names_in, recipe_values
+from stario.fusion.commands.common import exit_if_skipped, names_in
 from stario.fusion.commands.options import (
     CacheOption,
     ReadingOptions,
@@ -53,7 +53,7 @@ def table(
         int, typer.Option(min=1, help="Maximum test recordings per group in the set all.")
     ] = 2,
     config: Annotated[
-        Path | None, typer.Option(help="JSON file with the recipe. Default: the package's.")
+        Path | None, typer.Option(help="TOML or JSON file with the recipe. Default: the package's.")
     ] = None,
     cache: CacheOption = None,
     jobs: Annotated[
@@ -76,13 +76,15 @@ def table(
     from stario.network.training.splits import learned_from
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.cache_files import cache_folder
+    from stario.sequences.settings import read_settings
 
     if data is None:
         refuse(context, "without --data", "use with --data", "sets", "per_group")
     datasets = _data_sets(data, sets, published or [], split_seed, per_group)
     chosen = None if networks is None else names_in(networks)
     packaged = importlib.resources.files("stario.network.weights") / "recipe-table.json"
-    runs = table_runs(datasets, recipe_values(config or Path(str(packaged))), steps, chosen, seeds)
+    recipe = read_settings(config or Path(str(packaged)))
+    runs = table_runs(datasets, recipe, steps, chosen, seeds)
     make_folder(out)
     requested = {run.network for run in runs}
     costs = known_costs([name for name in ARCHITECTURES if name in requested], out)

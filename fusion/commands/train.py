@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import list_skipped, recipe_values, training_progress
+from stario.fusion.commands.common import list_skipped, training_progress
 from stario.fusion.commands.options import (
     READING,
     CacheOption,
@@ -101,7 +101,9 @@ def train(
             "recipe may name the file. Repeatable."
         ),
     ] = None,
-    config: Annotated[Path | None, typer.Option(help="JSON file with recipe settings.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="TOML or JSON file with recipe settings.")
+    ] = None,
     epochs: Annotated[int | None, typer.Option(min=1, help="Epochs; overrides --config.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed; overrides --config.")] = None,
     start_from: Annotated[
@@ -253,10 +255,11 @@ def _recipe(
     path: Path | None, first: DisplacementModel | None, **over: int | str | None
 ) -> TrainingConfig:
     from stario.network.training.config import FINE_TUNING, training_config
+    from stario.sequences.settings import read_settings
 
     values = {} if first is None else FINE_TUNING
     if path is not None:
-        values = recipe_values(path)
+        values = read_settings(path)
     if first is not None:
         values = {"architecture": first.card.architecture, **values}
     recipe = training_config(values | {k: v for k, v in over.items() if v is not None})
