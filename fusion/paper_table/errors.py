@@ -13,9 +13,11 @@ from pathlib import Path
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.benchmark.displacement_error import (
     block_sums,
-    judged_streams,
     known_truth,
     recording_errors,
+)
+from stario.fusion.evaluation.benchmark.pieces import (
+    judged_streams,
 )
 from stario.fusion.evaluation.networks import (
     MAX_DRAWN,

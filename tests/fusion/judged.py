@@ -10,8 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.benchmark.displacement_error import (
     RecordingErrors,
-    judged_streams,
     recording_errors,
+)
+from stario.fusion.evaluation.benchmark.pieces import (
+    judged_streams,
 )
 from stario.fusion.evaluation.pedestrian import Model, piece_of
 from stario.sequences.attitude.rotations import yaw_of

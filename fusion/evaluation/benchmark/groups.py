@@ -19,9 +19,11 @@ import pandas as pd
 from stario.fusion.evaluation.benchmark.displacement_error import (
     FIGURES,
     HORIZONS,
-    judged_streams,
     known_truth,
     recording_errors,
+)
+from stario.fusion.evaluation.benchmark.pieces import (
+    judged_streams,
 )
 from stario.fusion.evaluation.bootstrap import (
     CONFIDENCE,

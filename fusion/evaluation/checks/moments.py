@@ -16,7 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position
+from stario.fusion.evaluation.benchmark.displacement_error import (
+    fit_yaw_and_position,
+)
 from stario.fusion.evaluation.checks.simulation import simulated_walk
 from stario.fusion.evaluation.scores import Column, geometric_mean, joined, parts, scored, table
 from stario.fusion.evaluation.tracks import network_track

@@ -12,12 +12,14 @@ from recorded import DATA
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.benchmark.displacement_error import (
-    Piece,
     _AtTicks,
     _interpolated,
     _stretches,
     _Sums,
     known_truth,
+)
+from stario.fusion.evaluation.benchmark.pieces import (
+    Piece,
 )
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
 from stario.sequences.attitude.rotations import about_z
