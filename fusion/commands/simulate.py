@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stario.fusion.commands.common import check_new, print_result
-from stario.fusion.commands.options import JsonOption, OverwriteOption, flag, refuse_unused
+from stario.fusion.commands.options import JsonOption, OverwriteOption, flag, refuse
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 
 def simulate(
+    context: typer.Context,
     path: Annotated[Path, typer.Argument(help="CSV file to write.")],
     seconds: Annotated[
         float | None,
@@ -71,9 +72,10 @@ def simulate(
     errors = sensors[check_choice("--imu", imu, sensors)]
     stays = []
     if body is not None:
-        refuse_unused({"--floors": floors}, "with --body", "use without")
-        sequence = _on_body(body, carry, seconds, magnetometer, rate, errors, seed)
+        refuse(context, "with --body", "use without", "seconds", "magnetometer", "floors")
+        sequence = _on_body(body, carry, rate, errors, seed)
     elif floors:
+        refuse(context, "with --floors", "use without", "magnetometer")
         walk = _through_house(path.stem, carry, seconds, rate, errors, seed)
         sequence, stays = walk.sequence, walk.stays
     else:
@@ -136,8 +138,6 @@ def _style(carry: str) -> WalkStyle | None:
 def _on_body(
     body: Path,
     carry: str,
-    seconds: float | None,
-    magnetometer: bool,
     rate: float,
     errors: ImuErrors,
     seed: int,
@@ -147,8 +147,6 @@ def _on_body(
     from stario.sequences.simulation.body import places_on, virtual_imu
     from stario.sequences.simulation.motion_capture import read_body
 
-    unused = {"--seconds": seconds is not None, "--magnetometer": magnetometer}
-    refuse_unused(unused, "with --body", "use without")
     motion = read_body(body)
     place = str(generator(seed).choice(places_on(motion))) if carry == "random" else carry
     return virtual_imu(motion, place, rate, errors, seed)

@@ -39,10 +39,9 @@ from stario.sequences.truth.findings import (
     positions_as_dict,
     scale_findings,
 )
-from stario.sequences.truth.fit import TruthFit
+from stario.sequences.truth.fit import TruthFit, YawDrift, yaw_drift
 from stario.sequences.truth.positions import PositionFit
 from stario.sequences.truth.problems import examine_truth
-from stario.sequences.truth.yaw_drift import YawDrift, yaw_drift
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ def stario(
 @pytest.fixture
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Skip figures, which take most of the time, in tests that do not check them."""
-    monkeypatch.setattr("stario.fusion.evaluation.results._figures", lambda *arguments: [])
+    monkeypatch.setattr("stario.fusion.evaluation.results._figures", lambda found: {})
 
 
 @pytest.fixture(scope="session")

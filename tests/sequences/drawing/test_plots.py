@@ -1,4 +1,4 @@
-"""Figures fit the good tracks, break at gaps, label what they cut and change no global state."""
+"""Figures and tables as they are shown."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from stario.sequences.drawing.plots import (
     imu_overview,
     innovations,
 )
+from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
 
@@ -322,3 +323,17 @@ def test_lost_samples_are_marked_at_the_edge_and_only_gaps_are_shaded(truth):
         marks = line(axes, "lost")
         assert len(marks.get_xdata()) == len(lost)
         assert set(marks.get_ydata()) == {1.0}
+
+
+def test_columns_are_as_wide_as_their_widest_cell_with_space_between_them() -> None:
+    lines = aligned([["", "ATE [m]", "n"], ["a walk", "1.5", "12"], ["b", "-", "3"]])
+    assert lines == ["         ATE [m]    n", "a walk       1.5   12", "b              -    3"]
+
+
+def test_unknown_values_are_shown_as_a_dash() -> None:
+    assert [figure(None), figure(float("nan")), figure(0.0), figure(1.25, ".1f")] == [
+        "-",
+        "-",
+        "0.000",
+        "1.2",
+    ]
