@@ -129,6 +129,20 @@ def test_simulate_writes_a_recording_with_truth(stario, tmp_path: Path) -> None:
     assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "w.csv").read_bytes()
 
 
+def test_a_simulated_house_has_floors_pressure_and_satellites(stario, tmp_path: Path) -> None:
+    done = stario("simulate", "h.csv", "--floors", "--seconds", 90, "--rate", 50, "--json")
+    assert done.code == 0
+    stays = json.loads(done.out)["stays"]
+    sequence = read_generic_csv(tmp_path / "h.csv")
+    assert sequence.truth is not None
+    assert sequence.barometer is not None
+    assert sequence.satellites is not None
+    height = sequence.truth.position_W[:, 2]
+    assert np.ptp(height) > 2.9 * max(abs(stay["floor"]) for stay in stays) > 0.0
+    pressure = 8.43 * np.ptp(sequence.barometer.pressure_hPa)
+    assert pressure == pytest.approx(np.ptp(height), abs=2.0)
+
+
 def test_simulate_replaces_a_recording_only_on_request(stario, tmp_path: Path) -> None:
     own = tmp_path / "own.csv"
     own.write_text("own")
