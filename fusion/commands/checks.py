@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, get_args
@@ -95,7 +94,7 @@ def backends(
         refuse(context, "with recordings", "use with simulated walks", "walks", "seconds")
         files = paths or [entry.path for entry in read_packaged_list(split, data or Path())]
         score = partial(score_recording, estimating.network(), config=estimating.settings())
-        found, skipped = _of_recordings("backends", reading, files, lambda path, each: score(each))
+        found, skipped = map_recordings("backends", reading, files, lambda path, each: score(each))
     else:
         unused = (*READING, "config", "model", "magnetometer", "declination")
         refuse(context, "with simulated walks", "use with PATH or --data", *unused)
@@ -248,7 +247,7 @@ def moments(
     model, settings = estimating.network(), estimating.settings()
     judge = partial(moment_costs, model, config=settings, backends=_backends(graph), seed=seed)
     if paths:
-        found, skipped = _of_recordings("moments", reading, paths, lambda path, each: judge(each))
+        found, skipped = map_recordings("moments", reading, paths, lambda path, each: judge(each))
     else:
         refuse(context, "with simulated walks", "use with PATH", *READING)
         walks = simulated_walks()
@@ -292,7 +291,7 @@ def simulation(
     def recorded(path: Path, sequence: ImuSequence) -> pd.DataFrame:
         return judge(sequence, carry=carry_of(sequence), kind=RECORDED)
 
-    more, skipped = _of_recordings("simulation", reading, paths or [], recorded)
+    more, skipped = map_recordings("simulation", reading, paths or [], recorded)
     _print_scores(found + more, skipped, motion_table, as_json)
 
 
@@ -319,24 +318,7 @@ def _check_groups(
     def judged(path: Path, sequence: ImuSequence) -> pd.DataFrame:
         return judge(model, sequence, settings, labels(path, sequence.attributes)[grouping])
 
-    _print_scores(*_of_recordings("check", reading, paths, judged), table, as_json)
-
-
-def _of_recordings(
-    title: str,
-    reading: ReadingOptions,
-    paths: Sequence[Path],
-    score: Callable[[Path, ImuSequence], pd.DataFrame],
-) -> tuple[list[pd.DataFrame], list[Skipped]]:
-    """Score each recording, under a name of its own; return the scores and what was skipped."""
-    from stario.fusion.evaluation.compare import distinct_name
-
-    names: set[str] = set()
-
-    def named(path: Path, sequence: ImuSequence) -> pd.DataFrame:
-        return score(path, replace(sequence, name=distinct_name(sequence.name, names)))
-
-    return map_recordings(title, reading, paths, named)
+    _print_scores(*map_recordings("check", reading, paths, judged), table, as_json)
 
 
 def _print_scores(

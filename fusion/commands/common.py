@@ -6,6 +6,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from time import monotonic
@@ -37,11 +38,21 @@ def map_recordings(
     paths: Sequence[Path],
     work: Callable[[Path, ImuSequence], Result],
 ) -> tuple[list[Result], list[Skipped]]:
-    """Apply `work` to each recording and its path; return results and failures."""
+    """Apply `work` to each path and its recording, under a name of its own.
+
+    Return results and failures.
+    """
+    from stario.fusion.evaluation.compare import distinct_name
     from stario.sequences.datasets.batch import each, without_skipped
 
     files, skipped = reading.recordings(paths)
-    outcomes = each(lambda file: work(file, reading.read(file)), files, jobs=1)
+    names: set[str] = set()
+
+    def of_named(file: Path) -> Result:
+        sequence = reading.read(file)
+        return work(file, replace(sequence, name=distinct_name(sequence.name, names)))
+
+    outcomes = each(of_named, files, jobs=1)
     return list(without_skipped(with_bar(title, outcomes, len(files)), skipped)), skipped
 
 

@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 from recorded import DATA
 
 from stario.fusion.live.merging import MAX_WAIT, Join, Merger
-from stario.fusion.live.ordering import MAX_DELAY, PushOrder
 from stario.fusion.live.payload import GYRO, TOTAL, Batch, Reading, parse_push
-from stario.fusion.live.session import Session
+from stario.fusion.live.session import MAX_DELAY, PushOrder, Session
 from stario.sequences import read_recording
 
 SECOND = 10**9

@@ -16,8 +16,8 @@ import torch
 from training_runs import STREAMS, TINY, VALIDATION, run, swaying
 
 from stario.network.model import load_model
+from stario.network.training.checkpoint import exclusive
 from stario.network.training.history import EpochReport
-from stario.network.training.lock import exclusive
 from stario.network.training.train import train
 from stario.sequences.errors import ConfigError, InputError, ReadError
 
@@ -138,7 +138,7 @@ def test_a_lost_log_is_written_again(
 HOLDING = """
 import sys, time
 from pathlib import Path
-from stario.network.training.lock import exclusive
+from stario.network.training.checkpoint import exclusive
 with exclusive(Path(sys.argv[1])):
     print("locked", flush=True)
     time.sleep(60.0)

@@ -330,7 +330,6 @@ def test_readers_levelling_windows_and_simulation_are_part_of_the_code() -> None
         "readers/generic_csv.py",
         "attitude/levelling.py",
         "simulation/imu.py",
-        "datasets/array_cache.py",
     } <= names
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.plan import plan_view
 from stario.sequences.drawing.plots import (
     error_over_time,
@@ -222,14 +221,6 @@ def test_imu_overview_tolerates_the_bad_samples_that_readers_keep(truth):
     )
     assert tallest == 30.0  # a single spike survives the decimation
     assert len(imu_overview(ImuSequence("walk", time[:50], gyro[:50], accel[:50])).axes) == 2
-
-
-def test_figures_are_saved_whole_as_png(truth, tracks, tmp_path):
-    path = tmp_path / "plan.png"
-    save_figure(plan_view(tracks, truth, "a walk"), path)
-    assert path.read_bytes().startswith(b"\x89PNG")
-    assert path.stat().st_size > 10_000
-    assert [item.name for item in tmp_path.iterdir()] == ["plan.png"]
 
 
 def test_what_cannot_be_drawn_is_refused(truth):
