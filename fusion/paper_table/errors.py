@@ -16,15 +16,8 @@ from stario.fusion.evaluation.benchmark.displacement_error import (
     known_truth,
     recording_errors,
 )
-from stario.fusion.evaluation.benchmark.pieces import (
-    judged_streams,
-)
-from stario.fusion.evaluation.networks import (
-    MAX_DRAWN,
-    OWN_ATTITUDE,
-    metrics_of,
-    protocol_figures,
-)
+from stario.fusion.evaluation.benchmark.pieces import judged_streams
+from stario.fusion.evaluation.networks import MAX_DRAWN, OWN_ATTITUDE, metrics_of, protocol_figures
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning, pedestrian_track, piece_of
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.paper_table.training import ReaderConfig

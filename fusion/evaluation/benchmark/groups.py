@@ -22,9 +22,7 @@ from stario.fusion.evaluation.benchmark.displacement_error import (
     known_truth,
     recording_errors,
 )
-from stario.fusion.evaluation.benchmark.pieces import (
-    judged_streams,
-)
+from stario.fusion.evaluation.benchmark.pieces import judged_streams
 from stario.fusion.evaluation.bootstrap import (
     CONFIDENCE,
     REPLICATES,

@@ -18,9 +18,7 @@ from stario.fusion.evaluation.benchmark.displacement_error import (
     _Sums,
     known_truth,
 )
-from stario.fusion.evaluation.benchmark.pieces import (
-    Piece,
-)
+from stario.fusion.evaluation.benchmark.pieces import Piece
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
