@@ -163,7 +163,7 @@ def test_run_writes_a_track_and_prints_a_summary(stario, recording: Path, tmp_pa
         *("height", "deg)", "out: track.tum, track.npz"),
     ):
         assert words in done.out
-    for words in ("rad", "refused none", "root mean square", "0.0%"):
+    for words in (" rad", "refused none", "root mean square", "0.0%"):
         assert words not in done.out
     track = read_tum(tmp_path / "out" / "track.tum")
     assert track.time[-1] - track.time[0] == pytest.approx(12.0, abs=0.11)
