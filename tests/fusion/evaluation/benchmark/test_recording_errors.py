@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from judged import Stub, errors_of, horizontal_path, streams_of, with_waypoints, yaw_WN
+from displacement_stub import Stub, errors_of, horizontal_path, streams_of, with_waypoints, yaw_WN
 from recorded import DATA
 from scipy.spatial.transform import Rotation
 
