@@ -12,6 +12,7 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import METRIC_WORDS, RECORDING_WORDS, Comparison
 from stario.fusion.evaluation.folders import results_folder
 from stario.fusion.evaluation.known_positions import shown_positions
+from stario.fusion.evaluation.map_files import on_map, write_geojson, write_gpx
 from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.plan import plan_view
 from stario.sequences.drawing.plots import error_over_time, innovations
@@ -37,9 +38,10 @@ def write_run(
 
     These are `track.tum` (9 decimals), `track.npz` (velocity, biases, covariance), `metrics.json`,
     `config.json`, `run.json` (`origin`: what produced them), `health.json` and the figures; with
-    the filter's track also `filtered.tum` and `filtered.npz`. Without truth, known positions in the
-    track's frame (`known_positions.placed`) are drawn. Results of an earlier run into this folder
-    are removed.
+    the filter's track also `filtered.tum` and `filtered.npz`; where it is known where on the earth
+    the track lies, also `track.geojson` and `track.gpx` (`map_files`). Without truth, known
+    positions in the track's frame (`known_positions.placed`) are drawn. Results of an earlier run
+    into this folder are removed.
 
     Raises:
         InputError: the folder cannot be created.
@@ -54,6 +56,7 @@ def write_run(
     with results_folder(folder) as new:
         written = _track_files(new, run)
         written += [*_json_files(new, contents), *_figures(new, run), *_further(new, run, also)]
+        written += _map_files(new, run)
     return [folder / path.relative_to(new) for path in written]
 
 
@@ -147,6 +150,17 @@ def _track_files(folder: Path, found: Comparison) -> list[Path]:
         write_tum(written[-2], track.trajectory)
         write_npz(written[-1], **track.arrays())
     return written
+
+
+def _map_files(folder: Path, run: Comparison) -> list[Path]:
+    """Write the main track for maps, if it is known where on the earth it lies."""
+    if run.georeference is None:
+        return []
+    found, name = on_map(run.track, run.georeference), run.sequence.name
+    return [
+        write_geojson(folder / "track.geojson", name, found),
+        write_gpx(folder / "track.gpx", name, found),
+    ]
 
 
 def _figures(folder: Path, found: Comparison) -> list[Path]:

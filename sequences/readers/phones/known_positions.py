@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ReadError
+from stario.sequences.geodesy import east_north
 from stario.sequences.readers.clocks import unit_within
 from stario.sequences.readers.columns import Column
-from stario.sequences.readers.geodesy import east_north
 from stario.sequences.readers.phones.sensor_layout import clock_of
 from stario.sequences.readers.phones.sensor_words import sensor_of, unit_of, words_of
 from stario.sequences.readers.table_head import TableHead, table_heads

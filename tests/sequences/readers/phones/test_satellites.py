@@ -10,7 +10,7 @@ from phone_exports import androsensor, phyphox, sensor_logger
 from phone_files import START_NS, save
 
 from stario.sequences import ImuSequence, read_recording
-from stario.sequences.readers.geodesy import east_north
+from stario.sequences.geodesy import east_north
 from stario.sequences.sequence import FloatArray, PositionTrack
 
 PHYPHOX = '"Time (s)","Latitude (°)","Longitude (°)","Height (m)","Velocity (m/s)","Direction (°)"'
