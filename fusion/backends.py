@@ -143,8 +143,7 @@ def track_recording(
     """Filter a recording, and smooth it if the back end is the graph.
 
     Raises:
-        InputError: it was preprocessed for another update rate, there are positions in metres
-            beside satellites' but no origin, or an argument has the wrong type.
+        InputError: it was preprocessed for another update rate, or an argument has the wrong type.
     """
     check_type("preprocessed", recording, PreprocessedRecording, "observe(sequence) returns one")
     if recording.update_rate != config.filter.update_rate:
@@ -154,6 +153,9 @@ def track_recording(
             f"this navigator's {config.filter.update_rate}",
             "observe with the same update rate",
         )
+    if backend == "ekf" and config.place.closed:
+        remedy = "leave out the back end"
+        raise InputError("closed", "the EKF", "the graph, which knows the end", remedy)
     began = perf_counter()
     fixes, origin = known_fixes(recording, config.place, fix_list(fixes))
     queue = FixQueue(fixes, most=math.inf)  # all fixes of a recording are known from the start

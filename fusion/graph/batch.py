@@ -12,7 +12,7 @@ from stario.fusion.filter.frame_transform import FrameTransform, MapFrameState, 
 from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.filter.record import Record
 from stario.fusion.graph.builder import GraphBuilder
-from stario.fusion.graph.factors import GyroBias
+from stario.fusion.graph.factors import GyroBias, SamePlace
 from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import UNKNOWN_YAW
@@ -22,6 +22,9 @@ from stario.sequences.sequence import FloatArray
 
 _UNKNOWN_POSITION = 1e4
 """Standard deviation of a position determined by fixes alone [m]."""
+
+_CLOSURE_SIGMA = 1.0
+"""Standard deviation [m] per axis of a walk's end, relative to the start at which it ends."""
 
 _TRUSTED_ROUNDS = 2
 """Rounds before outliers are down-weighted. Headings off by 86 degrees beside accurate positions,
@@ -69,6 +72,9 @@ def smooth(
     builder.close(local[-1])
     if gyro_bias is not None:
         builder.graph.add(GyroBias(builder.graph.last, *gyro_bias), gated=False)
+    if config.place.closed:
+        ends = builder.graph.keyframes[0], builder.graph.last
+        builder.graph.add(SamePlace(*ends, _CLOSURE_SIGMA**2 * np.eye(3)), gated=False)
     builder.graph.solve(trusted_rounds=_TRUSTED_ROUNDS)
     solved = {state.time: state for state in all_states(builder.graph, builder.segments)}
     return [
