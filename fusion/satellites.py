@@ -14,14 +14,8 @@ import numpy as np
 
 from stario.fusion.fixes import Fix, position_fix, velocity_fix
 from stario.sequences.geodesy import Georeference
+from stario.sequences.readers.satellites import LARGEST_RADIUS, RADIUS_PER_SIGMA, USUAL_RADIUS
 from stario.sequences.sequence import BoolArray, FloatArray, Satellites
-
-RADIUS_PER_SIGMA = 1.515
-"""Radius that holds 68 % of a Gaussian in the plane, in standard deviations per axis."""
-
-USUAL_RADIUS_M, LARGEST_RADIUS_M = 10.0, 30.0
-"""Radius [m] where none is stated, and that above which a position is one of the network's cells
-or of a room without reception."""
 
 _RADIUS_FACTOR = 1.5
 """Factor on the stated radius: it held 44 % of the positions of 28 recordings in and around two
@@ -61,8 +55,8 @@ def satellite_fixes(
             east and y north.
     """
     radius = _column(satellites.radius_m, satellites)
-    radius = np.where(np.isnan(radius) | (radius == 0.0), USUAL_RADIUS_M, radius)
-    good = (radius > 0.0) & (radius <= LARGEST_RADIUS_M) & ~_held(satellites)
+    radius = np.where(np.isnan(radius) | (radius == 0.0), USUAL_RADIUS, radius)
+    good = (radius > 0.0) & (radius <= LARGEST_RADIUS) & ~_held(satellites)
     if not good.any():
         return None
     used = satellites.select(good)

@@ -56,18 +56,11 @@ for command in (run, live, compare, evaluate, inspect, convert, train, simulate,
     app.command()(command)
 
 check = typer.Typer(no_args_is_help=True, help="Check estimators and networks on this machine.")
-for command in (
-    *(checks.models, table, checks.fusion, checks.backends, checks.faults),
-    *(
-        checks.gaps,
-        checks.moments,
-        checks.simulation,
-        checks.fixes,
-        checks.consistency,
-        checks.benchmark,
-    ),
-):
+for command in (checks.models, table, checks.fusion, checks.backends, checks.faults, checks.gaps):
     check.command()(command)
+for command in (checks.moments, checks.simulation, checks.fixes, checks.consistency):
+    check.command()(command)
+check.command()(checks.benchmark)
 app.add_typer(check, name="check")
 
 

@@ -51,7 +51,8 @@ def marginal_covariances(net: Any) -> dict[int, FloatArray]:
 
     Its tangent is gtsam's. Variable x of the system R x + S y = d + n, with unit white noise n and
     later variables y of covariance P, has the covariance R^-1 (I + S P S^T) R^-T, and -R^-1 S P
-    with y. So one pass back in time suffices, which keeps the rows of P that earlier variables need.
+    with y. So one pass back in time suffices, which keeps the rows of P that earlier variables
+    need.
 
     Args:
         net: gtsam's Bayes net, with one conditional per variable, in order of time.

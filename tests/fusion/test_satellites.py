@@ -12,9 +12,10 @@ import support
 
 from stario.fusion import Navigator, Track, position_fix
 from stario.fusion.config import PlaceConfig
-from stario.fusion.satellites import RADIUS_PER_SIGMA, satellite_fixes
+from stario.fusion.satellites import satellite_fixes
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.geodesy import Georeference
+from stario.sequences.readers.satellites import RADIUS_PER_SIGMA
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Satellites
 
 Make = Callable[..., Any]

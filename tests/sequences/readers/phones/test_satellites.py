@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from phone_exports import androsensor, phyphox, sensor_logger
 from phone_files import START_NS, save
+from recorded import DATA
 
 from stario.sequences import ImuSequence, read_recording
 from stario.sequences.geodesy import east_north
@@ -122,6 +123,12 @@ def test_each_recording_of_a_folder_has_its_own_positions(
         np.testing.assert_allclose(found.position_W, speed * (METRES - METRES[0]), atol=0.02)
 
 
+def test_a_latitude_that_grows_is_no_clock(walk: ImuSequence, tmp_path: Path) -> None:
+    phyphox(tmp_path / "p", walk)
+    save(tmp_path / "p/gps.csv", "lat,lon,alt", np.stack([TIME, TIME, TIME], axis=1))
+    assert read_recording(tmp_path / "p").satellites is None
+
+
 def test_lateral_forces_are_no_positions(walk: ImuSequence, tmp_path: Path) -> None:
     phyphox(tmp_path / "p", walk)
     header = "time (s),acc_lat,acc_long,gps speed"
@@ -162,8 +169,8 @@ def test_positions_known_no_better_than_a_room_are_skipped_with_a_warning(
     ("titles", "factor", "found"),
     [
         ("lat,lon", 1e7, "found 449999955 and 70000152.19"),
-        ("lat,lon", 100.0, "found 4499.99"),  # degrees and minutes of NMEA
-        ("lat (rad),lon (rad)", math.radians(1.0), "found lat (rad)"),
+        ("lat,lon", 123.0, "found 5534.99"),
+        ("lat (rad),lon (rad)", math.radians(1.0), "found lat (rad), expected degrees"),
     ],
 )
 def test_positions_in_another_unit_than_degrees_are_skipped_with_a_warning(
@@ -178,7 +185,32 @@ def test_positions_in_another_unit_than_degrees_are_skipped_with_a_warning(
     save(tmp_path / "p/gps.csv", f"time,{titles}", TIME, factor * degrees(METRES))
     assert read_recording(tmp_path / "p").positions is None
     assert found in caplog.text
-    assert "expected degrees, as in 48.137 and 11.575" in caplog.text
+    assert "expected degrees" in caplog.text
+
+
+def test_degrees_and_minutes_are_named_in_one_line(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """NMEA's 4807.038 is 48 degrees 7.038 minutes; its hemisphere is in a column of its own."""
+    phyphox(tmp_path / "p", walk)
+    place = np.stack([4807.038 + 0.001 * TIME, 1131.0 - 0.001 * TIME], axis=1)
+    save(tmp_path / "p/gps.csv", "time,lat,lon", TIME, place)
+    assert read_recording(tmp_path / "p").satellites is None
+    [line] = [record.getMessage() for record in caplog.records]
+    assert "found 4807.039 and 1130.999, expected degrees" in line
+    assert line.endswith("NMEA's degrees and minutes? That latitude is 48.117317")
+
+
+def test_latitude_and_longitude_that_can_only_be_exchanged_are(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    phyphox(tmp_path / "p", walk)
+    place = degrees(METRES) + np.array([0.0, 120.0])
+    save(tmp_path / "p/gps.csv", "time,lat,lon", TIME, place[:, ::-1])
+    found = read_recording(tmp_path / "p").satellites
+    assert found is not None
+    np.testing.assert_array_equal(found.latlon_deg, place)
+    assert "latitude and longitude are exchanged: read the other way round" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -208,3 +240,47 @@ def test_positions_that_cannot_be_used_cost_no_recording(
     assert len(recording) > 1000
     assert ("satellite positions skipped" in caplog.text) == (words is not None)
     assert words is None or words in caplog.text
+
+
+def test_what_a_receiver_reports_is_kept_as_measured(walk: ImuSequence, tmp_path: Path) -> None:
+    """Repeated positions too; what it does not know is NaN, in m, m/s and degrees."""
+    phyphox(tmp_path / "p", walk)
+    place = degrees(METRES)
+    place[6:] = place[6]  # indoors
+    radius = np.where(TIME == 2.0, 0.0, 9.0)
+    bearing = np.where(TIME == 3.0, -1.0, 90.0)
+    header = (
+        "time (s),lat,lon,Height (ft),Velocity (km/h),Direction (°),Accuracy (m),Vertical Accuracy"
+    )
+    columns = [place, np.full(12, 100.0), np.full(12, 3.6), bearing, radius, np.full(12, 77.0)]
+    save(tmp_path / "p/Location.csv", header, TIME, *columns)
+    read = read_recording(tmp_path / "p")
+    found = read.satellites
+    assert found is not None
+    np.testing.assert_allclose(found.time, TIME, atol=1e-9)
+    np.testing.assert_allclose(found.latlon_deg, place, atol=1e-12)
+    expected = {
+        "altitude_m": np.full(12, 30.48),
+        "speed_m_s": np.ones(12),
+        "bearing_deg": np.where(TIME == 3.0, np.nan, 90.0),
+        "radius_m": np.where(TIME == 2.0, np.nan, 9.0),
+    }
+    for name, values in expected.items():
+        np.testing.assert_allclose(getattr(found, name), values, err_msg=name)
+    assert read.positions is not None
+    np.testing.assert_allclose(read.positions.time, TIME[:7], atol=1e-9)
+    np.testing.assert_allclose(read.positions.latlon_deg, place[:7], atol=1e-12)
+
+
+def test_a_file_of_advio_without_titles_is_read() -> None:
+    path = DATA / "raw/advio/advio-15"
+    if not path.is_dir():
+        pytest.skip("ADVIO is not here")
+    found = read_recording(path).satellites
+    assert found is not None
+    np.testing.assert_allclose(found.latlon_deg, [[60.187, 24.8215]] * len(found), atol=1e-3)
+    assert found.radius_m is not None
+    assert found.altitude_m is not None
+    assert found.radius_m.min() >= 5.0
+    assert found.radius_m.max() <= 200.0
+    assert np.ptp(found.altitude_m) < 5.0
