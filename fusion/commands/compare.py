@@ -29,6 +29,7 @@ from stario.fusion.commands.options import (
     JobsOption,
     JsonOption,
     OptionalPathsArgument,
+    PlaceOptions,
     ReadingOptions,
     ReportOption,
     expand_option_groups,
@@ -49,6 +50,7 @@ def compare(
     context: typer.Context,
     reading: ReadingOptions,
     estimating: EstimatorOptions,
+    placing: PlaceOptions,
     paths: OptionalPathsArgument = None,
     fixes: FixesOption = None,
     jobs: JobsOption = 1,
@@ -83,7 +85,7 @@ def compare(
     chosen = TRACKS if tracks == "all" else [*_SHOWN, *(names_in(tracks) if tracks else [])]
     for name in chosen:
         check_choice("--tracks", name, TRACKS)
-    settings, network = estimating.settings(), estimating.network()
+    settings, network = placing.settings(estimating.settings()), estimating.network()
     model = estimating.for_processes(network, jobs)
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
     files, skipped = reading.recordings(paths or [])

@@ -65,6 +65,9 @@ _INFLATION_RATIO, _MAX_SIGMA = 1e3, 1e5
 """Sigma of an unknown shift: this many times the sigma that remains after the measurement, but no
 more than this [m], beyond which the covariance keeps no digits for the fix."""
 
+YAW_UNKNOWN = "yaw not known"
+"""Why a position or velocity is refused before the track's direction in the map is known."""
+
 
 class Mapped(NamedTuple):
     """A filter's state and that of its map frame."""
@@ -100,7 +103,7 @@ def update_with(fix: Fix, m: Mapped, f: FilterConfig) -> tuple[Mapped, UpdateRes
     else:
         m, transform = _oriented(fix, m)
     if transform is None:
-        return m, UpdateResult("too coarse" if fix.kind == "yaw" else "yaw not known")
+        return m, UpdateResult("too coarse" if fix.kind == "yaw" else YAW_UNKNOWN)
     m, result = _updated(fix, m, f)
     if places:
         m = _with_alignment_begun(fix, m)

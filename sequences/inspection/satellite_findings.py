@@ -13,7 +13,7 @@ import numpy as np
 
 from stario.sequences.arrays import runs
 from stario.sequences.findings import Finding
-from stario.sequences.readers.geodesy import east_north
+from stario.sequences.geodesy import east_north
 from stario.sequences.sequence import FloatArray, Satellites
 
 _STALE_S, _STALE_ROWS = 8.0, 4
@@ -174,10 +174,14 @@ def _against_doppler(reported: Satellites) -> Doppler | None:
     if used.sum() < _FEWEST:
         return None
     doppler = doppler[used]
-    straight, crossed = (
-        np.diff(east_north(degrees), axis=0)[used] / step[used, None]
-        for degrees in (reported.latlon_deg, reported.latlon_deg[:, ::-1])
-    )
+
+    def velocity(latlon_deg: FloatArray) -> FloatArray:
+        return np.asarray(np.diff(east_north(latlon_deg), axis=0)[used] / step[used, None])
+
+    exchanged = reported.latlon_deg[:, ::-1]
+    straight, crossed = velocity(reported.latlon_deg), np.zeros_like(doppler)
+    if (np.abs(exchanged[:, 0]) <= 90.0).all():  # else they are no latitudes
+        crossed = velocity(exchanged)
     size = float(np.sum(doppler**2))
     scale = float(np.sum(straight * doppler)) / size
     error = float(np.sum((straight - scale * doppler) ** 2)) / (doppler.size - 1.0)

@@ -146,6 +146,10 @@ def test_exchanged_latitude_and_longitude_contradict_the_speed() -> None:
     assert codes(wrong.findings()) == ["satellites_exchanged"]
 
 
+def test_positions_far_to_the_east_are_judged_although_they_cannot_be_exchanged() -> None:
+    assert receiver(simulate_satellites(LEVEL, Sky(sigma=1.0, longitude=118.9))).findings() == []
+
+
 def test_minutes_in_place_of_decimals_contradict_the_speed() -> None:
     """48 degrees 7.038 minutes as 48.07038."""
     reported = simulate_satellites(LEVEL, Sky(sigma=1.0, latitude=48.3, longitude=11.3))

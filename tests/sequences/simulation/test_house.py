@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError
-from stario.sequences.readers.geodesy import east_north, latitude_longitude
+from stario.sequences.geodesy import east_north
 from stario.sequences.sequence import BoolArray, FloatArray, Trajectory
 from stario.sequences.simulation.barometer import Air, simulate_barometer, standard_pressure
 from stario.sequences.simulation.house import SHORTEST, HouseWalk, simulate_house
@@ -135,11 +135,6 @@ def test_doppler_velocity_and_positions_agree_on_where_north_is(walk: HouseWalk)
     assert np.sqrt(np.mean(np.square(moved))) > 0.5
     true = truth.at(found.time).position_W
     np.testing.assert_allclose(place, sky.east_north(true - true[0])[:, :2], atol=0.02)
-
-
-def test_latitudes_and_longitudes_are_the_inverse_of_metres() -> None:
-    origin, metres = np.array([48.0, 11.0]), np.array([[0.0, 0.0], [300.0, -200.0]])
-    np.testing.assert_allclose(east_north(latitude_longitude(origin, metres)), metres, atol=1e-6)
 
 
 def test_other_air_changes_no_other_sensor(walk: HouseWalk) -> None:
