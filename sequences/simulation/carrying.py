@@ -193,7 +193,7 @@ def _texting(gait: Gait) -> CarryMotion:
     """Return the motion of a device that is read: the arms keep it steadier than the trunk."""
     rng = gait.rng
     strike = Strike(rng.uniform(0.9, 2.0), *_ARM, 0.7, 0.5)
-    wobble, tremor = rng.uniform(0.04, 0.09), rng.uniform(0.05, 0.15)
+    wobble, tremor = rng.uniform(0.04, 0.09), rng.uniform(0.02, 0.07)
     motion = _held(gait, rng.uniform(0.75, 1.25), strike, tremor, wobble)
     return _displaced(motion, rng.uniform(0.2, 0.4), rng.uniform(-0.1, 0.1), 0.72 * gait.height)
 
