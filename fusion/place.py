@@ -7,9 +7,9 @@ import logging
 import numpy as np
 
 from stario.fusion.config import PlaceConfig
-from stario.fusion.fixes import Fix, position_fix
+from stario.fusion.fixes import UNKNOWN_HEIGHT, Fix, position_fix
 from stario.fusion.recording import PreprocessedRecording
-from stario.fusion.satellites import UNKNOWN_HEIGHT_M, satellite_fixes
+from stario.fusion.satellites import satellite_fixes
 from stario.sequences.errors import InputError
 from stario.sequences.geodesy import Georeference
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
@@ -71,6 +71,15 @@ def compared_with(sequence: ImuSequence, place: PlaceConfig) -> PositionTrack | 
     return None if of_satellites and place.satellites != "compare" else positions
 
 
+def used_words(sequence: ImuSequence, place: PlaceConfig) -> tuple[str, ...]:
+    """Return which of a recording's own positions are used as fixes, in words."""
+    words = []
+    if place.satellites == "use" and sequence.satellites is not None:
+        words.append("satellite positions")
+    positions = used_positions(sequence.positions, sequence.satellites is not None, place)
+    return (*words, *([positions.kind] if positions is not None else []))
+
+
 def _in_map(
     positions: PositionTrack, origin: Georeference | None
 ) -> tuple[FloatArray, Georeference | None]:
@@ -89,7 +98,7 @@ def _waypoint_fixes(positions: PositionTrack, xy: FloatArray) -> list[Fix]:
     if positions.sigma is not None:
         sigma = positions.sigma
     return [
-        position_fix(time, [x, y, 0.0], np.diag(np.square([s, s, UNKNOWN_HEIGHT_M])))
+        position_fix(time, [x, y, 0.0], np.diag(np.square([s, s, UNKNOWN_HEIGHT])))
         for time, (x, y), s, valid in zip(positions.time, xy, sigma, positions.valid, strict=True)
         if valid
     ]

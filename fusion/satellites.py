@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stario.fusion.fixes import Fix, position_fix, velocity_fix
+from stario.fusion.fixes import UNKNOWN_HEIGHT, Fix, position_fix, velocity_fix
 from stario.sequences.geodesy import Georeference
 from stario.sequences.readers.satellites import LARGEST_RADIUS, RADIUS_PER_SIGMA, USUAL_RADIUS
 from stario.sequences.sequence import BoolArray, FloatArray, Satellites
@@ -33,8 +33,8 @@ _VELOCITY_SIGMA, _VELOCITY_PERIOD_S = 0.3, 5.0
 _LEAST_SPEED = 0.5
 """Speed [m/s] below which its direction is noise."""
 
-UNKNOWN_HEIGHT_M, _VERTICAL_SPEED = 1e3, 10.0
-"""Standard deviations of a height [m] and of a vertical velocity [m/s] that are not given."""
+_VERTICAL_SPEED = 10.0
+"""Standard deviation of a vertical velocity [m/s], which is not given."""
 
 
 class SatelliteFixes(NamedTuple):
@@ -65,7 +65,7 @@ def satellite_fixes(
         origin = Georeference(latitude, longitude, altitude_m=_altitude(used))
     sigma = _RADIUS_FACTOR / RADIUS_PER_SIGMA * radius[good] * np.sqrt(_shared(used.time))
     positions = [
-        position_fix(time, [x, y, 0.0], np.diag(np.square([s, s, UNKNOWN_HEIGHT_M])))
+        position_fix(time, [x, y, 0.0], np.diag(np.square([s, s, UNKNOWN_HEIGHT])))
         for time, (x, y), s in zip(used.time, origin.xy(used.latlon_deg), sigma, strict=True)
     ]
     return SatelliteFixes([*positions, *_velocities(used, origin)], origin)

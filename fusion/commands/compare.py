@@ -125,13 +125,13 @@ def compare(
 
 def _lines(found: Comparison, as_table: bool) -> list[str]:
     """Return how good the track is beside dead reckoning, and perhaps a table of all tracks."""
-    from stario.fusion.evaluation.text import error_words, track_table, track_words
+    from stario.fusion.evaluation.text import error_words, place_words, track_table, track_words
     from stario.sequences.drawing.figures import distance
 
     alone = found.metrics["dead_reckoning"]
     far = alone["ate_m"] or alone["known_positions_m"]
     far = far or found.tracks["dead_reckoning"].trajectory.path_length()
-    words = error_words(found) or track_words(found)
+    words = error_words(found) or place_words(found) or track_words(found)
     line = f"{found.sequence.name}: StarIO's track: {words}; dead reckoning: {distance(far)}"
     table = [track_table(found)] if as_table else []
     return [line, *table, *(finding.line() for finding in found.verdict)]

@@ -124,9 +124,10 @@ def _run(
 
 def _lines(found: Comparison) -> list[str]:
     """Return what was recorded, the track, its errors and the verdict, a fact per line."""
-    from stario.fusion.evaluation.text import error_words, track_words
+    from stario.fusion.evaluation.text import error_words, place_words, track_words
 
     lines = [found.sequence.summary(), f"track: {track_words(found)}"]
+    lines += [f"place: {words}"] if (words := place_words(found)) else []
     for name in found.tracks:
         if words := error_words(found, name):
             lines.append(f"{'error' if name == 'track' else f'{name}, error'}: {words}")

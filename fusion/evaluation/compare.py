@@ -27,7 +27,7 @@ from stario.fusion.fix_file import check_within
 from stario.fusion.fixes import Fix, fix_list
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
-from stario.fusion.place import compared_with
+from stario.fusion.place import compared_with, used_words
 from stario.fusion.recording import Progress, silent
 from stario.fusion.report.health import LOST_YAW_SIGMA
 from stario.fusion.state import Track
@@ -124,6 +124,7 @@ class Comparison:
         metrics: metrics by track name.
         alignment: how tracks are aligned with the truth, for metrics and figures.
         train: command that trains weights on the recording, for the verdict; empty for none.
+        used: what the tracks used of the recording's own positions, so that they are no truth.
     """
 
     sequence: ImuSequence
@@ -131,6 +132,7 @@ class Comparison:
     metrics: dict[str, Metrics]
     alignment: Alignment = "first"
     train: str = ""
+    used: tuple[str, ...] = ()
 
     @cached_property
     def verdict(self) -> list[Finding]:
@@ -242,7 +244,9 @@ def measured(
 
     If the truth is known at no time of the tracks, they are those of a recording without any.
     """
-    sequence = replace(sequence, positions=compared_with(sequence, place or PlaceConfig()))
+    place = place or PlaceConfig()
+    used = used_words(sequence, place)
+    sequence = replace(sequence, positions=compared_with(sequence, place))
     health = tracks["track"].health
     # Where fixes define the frame, the first pose's yaw is the least certain one.
     alignment: Alignment = "yaw" if health and health.fixes else "first"
@@ -253,7 +257,7 @@ def measured(
             raise
         log.warning("%s: no errors are computed: %s", sequence.name, error)
         return measured(replace(sequence, truth=None), tracks, place)
-    return Comparison(sequence, tracks, metrics, alignment)
+    return Comparison(sequence, tracks, metrics, alignment, used=used)
 
 
 def measure(track: Track, sequence: ImuSequence, alignment: Alignment = "first") -> Metrics:

@@ -285,11 +285,14 @@ class EkfState:
         common = N @ (C @ self.covariances @ C.T) @ N.T
         return changed(self, covariances=common + symmetric(rest @ self.covariances @ rest.T))
 
-    def with_position_inflated(self, sigma: float) -> EkfState:
-        """Return the state with its covariances inflated by a shift, `sigma` [m] per axis."""
-        N = np.zeros((self.covariances.shape[1], 3))
+    def with_position_inflated(self, sigma: float, axes: int = 3) -> EkfState:
+        """Return the state with its covariances inflated by a shift, `sigma` [m] per axis.
+
+        With two `axes` the shift is horizontal.
+        """
+        N = np.zeros((self.covariances.shape[1], axes))
         for _, rho in self._poses():
-            N[rho : rho + 3] = np.eye(3)
+            N[rho : rho + axes] = np.eye(axes)
         return changed(self, covariances=self.covariances + sigma**2 * (N @ N.T))
 
     def _poses(self) -> list[tuple[int, int]]:

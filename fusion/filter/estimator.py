@@ -149,8 +149,8 @@ def _propagated(
 ) -> tuple[EstimatorState, Segment | None, list[Accepted], list[Fix]]:
     """Propagate through the fixes and, after a gap, level the attitude.
 
-    Return the segment (None for a gap, and if fixes split it), the fixes applied, and the positions
-    refused for want of a direction, too.
+    Return the segment (None for a gap, and if fixes split it), the fixes applied, and those refused
+    for want of a direction, too.
     """
     if interval.gap:
         for slot in s.ekf.clone_slots:  # no displacement spans a gap
@@ -176,7 +176,7 @@ def _propagated(
             s, result = _with_fix(s, fix, config)
             if result.accepted:
                 accepted.append(Accepted(fix, result.scale))
-            elif result.reason == map_frame.YAW_UNKNOWN and fix.kind == "position":
+            elif result.reason == map_frame.YAW_UNKNOWN:
                 undirected.append(fix)
     if interval.levelled is not None:
         sigma = tilt_sigma(interval.levelled, config)

@@ -43,7 +43,7 @@ class Record(NamedTuple):
     fixes: list[Accepted]
     """Fixes applied, in order."""
     undirected: list[Fix]
-    """Positions refused because the track's direction in the map was not known yet."""
+    """Fixes refused because the track's direction in the map was not known yet."""
     estimate: Estimate
     """The estimate at the end."""
     released: Estimate | None

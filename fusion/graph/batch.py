@@ -93,8 +93,10 @@ def _inflated(first: NavState, prior: NavState, transforms: Sequence[FrameTransf
         return replace(first, covariance=prior.covariance)
     to_last = frame_rotation(first.R_WB @ prior.R_WB.T)
     covariance = to_last @ prior.covariance @ to_last.T
-    if any(transform.placed for transform in transforms):
-        covariance[POSITION, POSITION] += _UNKNOWN_POSITION**2 * np.eye(3)
+    for transform in transforms:
+        if transform.placed:
+            placed = np.diag(transform.position_covariance) > 0.0  # by a height, too, or without
+            covariance[POSITION, POSITION] += np.diag(_UNKNOWN_POSITION**2 * placed)
     if not all(transform.placed for transform in transforms):
         covariance[2, 2] += UNKNOWN_YAW**2
     return replace(first, covariance=covariance)

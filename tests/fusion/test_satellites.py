@@ -137,6 +137,8 @@ def test_a_track_with_satellites_lies_on_the_map_from_its_start(
     assert (error(track, walk) < 3.0 * sigma).all()
     # The smoother uses positions from before the direction was known.
     assert track.health.fixes["applied"] >= 58
+    # They have no height: the track's own is still that above the start.
+    assert track.health.final_sigma["height_m"] < 5.0
 
 
 def test_satellites_that_are_not_used_change_nothing(walk: ImuSequence, model: Any) -> None:
