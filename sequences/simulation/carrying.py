@@ -308,7 +308,7 @@ def _trolley(gait: Gait) -> CarryMotion:
 def _rig(gait: Gait) -> CarryMotion:
     """Return a rig's motion: quick turns to random directions, arms waved by up to their length."""
     rng, n = gait.rng, len(gait)
-    strike = Strike(rng.uniform(0.2, 0.6), *_ARM, 2.0, 1.0)
+    strike = Strike(rng.uniform(0.2, 0.6), *_ARM, 0.8, 0.6)
     motion = _held(gait, _TRUNK_BOUNCE, strike, rng.uniform(0.03, 0.1), rng.uniform(0.01, 0.03))
     reach = np.array([0.2, 0.25, 0.2]) * rng.uniform(0.3, 1.1)
     waved = drift(rng, n, gait.rate, rng.uniform(0.25, 0.5), 3)

@@ -26,7 +26,8 @@ def test_positions_too_close_to_give_a_direction_alone_give_it_together(
     sigma = 0.4 * float(farthest.max())
     fixes = true_fixes(walk.truth, 1.0, sigma, seed=3)
     track = Navigator(oracle, CONFIG).run(walk, fixes=fixes)
-    counts = track.health.fixes
+    assert track.filtered is not None
+    counts = track.filtered.health.fixes
     assert counts["yaw not known"] > 3
     assert counts["applied"] > 10
     yaw = pose_errors(track.trajectory, walk.truth).yaw[-1]
