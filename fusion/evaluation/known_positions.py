@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from stario.fusion.evaluation.benchmark.displacement_error import (
-    fit_yaw_and_position,
-)
+from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position, known_truth
 from stario.fusion.imu.direction import Complex
 from stario.fusion.state import Track
 from stario.sequences.arrays import even_grid, interpolated
-from stario.sequences.errors import InputError
 from stario.sequences.findings import Finding
 from stario.sequences.geodesy import Georeference
 from stario.sequences.legs import jumps
@@ -49,15 +46,12 @@ _SIGMAS = 3.0
 def true_path(sequence: ImuSequence) -> float:
     """Return the length of the true path [m]: with known positions, of the lines between them.
 
-    Raises:
-        InputError: the recording has neither true poses nor known positions.
+    Raises what `known_truth` does.
     """
+    _, known = known_truth(sequence)
     if sequence.truth is not None:
         return sequence.truth.path_length()
-    if sequence.positions is None:
-        raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
-    steps = np.diff(sequence.positions.position_W[sequence.positions.valid], axis=0)
-    return float(np.linalg.norm(steps, axis=1).sum())
+    return float(np.linalg.norm(np.diff(known.position_W, axis=0), axis=1).sum())
 
 
 def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:

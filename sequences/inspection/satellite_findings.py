@@ -71,7 +71,8 @@ class SatelliteFindings:
     Attributes:
         positions: number of reports.
         rate_hz: median rate [Hz].
-        radius_median_m: median of the stated radius [m]; None if there is none.
+        radius_median_m: median of the radius [m] stated of positions that are not repeated; None
+            if there is none.
         stale: start and length [s] of each stretch in which the same position is repeated.
         jumps_m: lengths [m] of steps that no pedestrian takes.
         doppler: comparison with the Doppler velocity; None unless the person walks with both known.
@@ -127,12 +128,13 @@ def assess_satellites(reported: Satellites | None) -> SatelliteFindings | None:
     """Return the findings about a receiver's positions; None without at least two."""
     if reported is None or len(reported) < 2:
         return None
-    radius = reported.radius_m
-    known = radius is not None and np.isfinite(radius).any()
+    new = np.append(True, np.diff(reported.latlon_deg, axis=0).any(axis=1))
+    radius = np.empty(0) if reported.radius_m is None else reported.radius_m[new]
+    radius = radius[np.isfinite(radius)]
     return SatelliteFindings(
         positions=len(reported),
         rate_hz=reported.rate,
-        radius_median_m=float(np.nanmedian(radius)) if radius is not None and known else None,
+        radius_median_m=float(np.median(radius)) if len(radius) else None,
         stale=stale_stretches(reported),
         jumps_m=_jumps(reported),
         doppler=_against_doppler(reported),
