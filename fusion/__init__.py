@@ -3,7 +3,8 @@
 Navigate: `Navigator`, `BackendName`, `NavState`, `Track`, `SmoothedPose`, `ContinuousPose`,
 `Health`, `Innovations`.
 
-Configure: `NavigatorConfig`, `FilterConfig`, `GraphConfig`, `read_config`, `PriorPose`.
+Configure: `NavigatorConfig`, `FilterConfig`, `GraphConfig`, `PlaceConfig`, `read_config`,
+`PriorPose`.
 
 Fixes from outside: `Fix`, `FixOutcome`, `position_fix`, `velocity_fix`, `yaw_fix`, `read_fixes`.
 

@@ -4,6 +4,7 @@ from stario.fusion.backends import BackendName as BackendName
 from stario.fusion.config import FilterConfig as FilterConfig
 from stario.fusion.config import GraphConfig as GraphConfig
 from stario.fusion.config import NavigatorConfig as NavigatorConfig
+from stario.fusion.config import PlaceConfig as PlaceConfig
 from stario.fusion.config import read_config as read_config
 from stario.fusion.evaluation.compare import Comparison as Comparison
 from stario.fusion.evaluation.compare import compare as compare

@@ -30,6 +30,9 @@ _HELD_S = 3.0
 _VELOCITY_SIGMA, _VELOCITY_PERIOD_S = 0.3, 5.0
 """Standard deviation per axis [m/s] of a velocity, and time between those used [s]."""
 
+_SETTLED_S = 3.0
+"""Time [s] after a pause of as much before velocities count: receivers smooth them."""
+
 _LEAST_SPEED = 0.5
 """Speed [m/s] below which its direction is noise."""
 
@@ -102,6 +105,8 @@ def _velocities(used: Satellites, origin: Georeference) -> list[Fix]:
     speed, bearing = _column(used.speed_m_s, used), _column(used.bearing_deg, used)
     # Without a bearing, receivers leave it at zero.
     known = (speed >= _LEAST_SPEED) & np.isfinite(bearing) & (bearing != 0.0)
+    paused = np.diff(used.time, prepend=-math.inf) > _SETTLED_S
+    known &= used.time - np.maximum.accumulate(np.where(paused, used.time, -math.inf)) >= _SETTLED_S
     covariance = np.diag(np.square([_VELOCITY_SIGMA, _VELOCITY_SIGMA, _VERTICAL_SPEED]))
     fixes: list[Fix] = []
     for k in np.flatnonzero(known):

@@ -7,7 +7,7 @@ A recording: `ImuSequence`, `Trajectory`, `PositionTrack`, `Magnetometer`, `Baro
 
 Inspect: `inspect_recording`, `Inspection`, `Finding`, `verdict`, `truth_findings`, `check_units`.
 
-Units and axes: `with_units`, `with_conventions`, `yaw_of`, `about_z`.
+Units, axes, maps: `with_units`, `with_conventions`, `yaw_of`, `about_z`, `Georeference`.
 
 Compare a track with the truth: `align`, `Alignment`, `evaluate_track`, `TrackMetrics`,
 `position_nees`, `PositionNees`.

@@ -17,6 +17,7 @@ from stario.sequences.errors import StarioError as StarioError
 from stario.sequences.errors import WeightsError as WeightsError
 from stario.sequences.findings import Finding as Finding
 from stario.sequences.findings import verdict as verdict
+from stario.sequences.geodesy import Georeference as Georeference
 from stario.sequences.inspection.checks import check_units as check_units
 from stario.sequences.inspection.report import Inspection as Inspection
 from stario.sequences.inspection.report import inspect_recording as inspect_recording

@@ -46,11 +46,11 @@ class Georeference:
         east, north, _ = pymap3d.geodetic2enu(
             latlon_deg[:, 0], latlon_deg[:, 1], 0.0, self.latitude_deg, self.longitude_deg, 0.0
         )
-        return _turned(np.column_stack([east, north]), -self.yaw)
+        return turned(np.column_stack([east, north]), -self.yaw)
 
     def latlon_deg(self, position_W: FloatArray) -> FloatArray:
         """Return latitudes and longitudes (N, 2) [deg] of positions (N, 2 or 3) [m] in the map."""
-        east, north = _turned(position_W[:, :2], self.yaw).T
+        east, north = turned(position_W[:, :2], self.yaw).T
         # The plane leaves the ellipsoid: at 10 km by 8 m, which moves no point sideways.
         latitude, longitude, _ = pymap3d.enu2geodetic(
             east, north, np.zeros_like(east), self.latitude_deg, self.longitude_deg, 0.0
@@ -67,7 +67,7 @@ def east_north(latlon_deg: FloatArray) -> FloatArray:
     return Georeference(*latlon_deg[0].tolist()).xy(latlon_deg)
 
 
-def _turned(xy: FloatArray, angle: float) -> FloatArray:
+def turned(xy: FloatArray, angle: float) -> FloatArray:
     """Turn points (N, 2) counter-clockwise by an angle [rad]."""
     c, s = math.cos(angle), math.sin(angle)
     return np.asarray(xy @ np.array([[c, s], [-s, c]]))

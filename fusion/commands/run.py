@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import typer
+
 from stario.fusion.commands.common import (
     explain,
     origin_of,
@@ -28,6 +30,7 @@ from stario.fusion.commands.options import (
     expand_option_groups,
     flag,
 )
+from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.compare import Comparison
@@ -48,6 +51,14 @@ def run(
         bool, flag("--filtered", help="Also write the filter's track, as a stream gives it.")
     ] = False,
     report: ReportOption = False,
+    tiles: Annotated[
+        str,
+        typer.Option(
+            metavar="URL",
+            help="Map server for the report's background, such as "
+            "https://tile.openstreetmap.org/{z}/{x}/{y}.png; the browser asks it.",
+        ),
+    ] = "",
     view: Annotated[
         bool, flag("--view", help="Open the rerun 3-D viewer; its file is kept in --out.")
     ] = False,
@@ -61,6 +72,12 @@ def run(
 
     if report:
         optional_package("plotly", "report")
+    if tiles:
+        if not report:
+            raise InputError("--tiles", "use without --report", "use with it")
+        from stario.fusion.report.background import check_tiles
+
+        check_tiles(tiles)
     if view:
         optional_package("rerun", "view")
     network = estimating.network()
@@ -75,6 +92,7 @@ def run(
         origin=origin_of(paths, reading, estimating, network, fixes),
         filtered=filtered,
         report=report,
+        tiles=tiles,
         view=view,
         train=training_command(paths, reading),
     )
@@ -89,6 +107,7 @@ def _run(
     origin: dict[str, object],
     filtered: bool,
     report: bool,
+    tiles: str,
     view: bool,
     train: str,
 ) -> tuple[dict[str, object], str]:
@@ -108,7 +127,7 @@ def _run(
     if report:
         from stario.fusion.report.page import write_report
 
-        also["report.html"] = write_report
+        also["report.html"] = partial(write_report, tiles=tiles)
     if view:
         from stario.fusion.report.view import open_view, write_view
 

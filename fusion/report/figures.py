@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
 from stario.fusion.filter.corrections import Correction
+from stario.fusion.report.background import add_north, add_tiles
 from stario.fusion.report.panels import FAINT, GRID, INK, TRUTH, Panel, numbers, style
 from stario.fusion.report.series import Series, ellipse
 from stario.sequences.arrays import evenly_spaced, interpolated
 from stario.sequences.drawing.figures import clock
+from stario.sequences.geodesy import Georeference
 from stario.sequences.sequence import FloatArray, PositionTrack
 
 _ELLIPSES = 8
@@ -54,6 +56,8 @@ def map_figure(
     known: PositionTrack | None,
     main: str,
     corrections: Sequence[Correction] = (),
+    place: Georeference | None = None,
+    tiles: str = "",
 ) -> go.Figure:
     """Draw all tracks from above on equal axes.
 
@@ -64,6 +68,8 @@ def map_figure(
         main: name of the track drawn with 3-sigma ellipses, arrows and times.
         corrections: time since the first sample [s], distance [m], turn [rad] and cause of the main
             track's large corrections.
+        place: where on the earth the frame lies, with x east; None where that is unknown.
+        tiles: address of a map server's tiles as the background, empty for none.
     """
     frame = _frame(tracks, truth, known)
     outlines = _outlines(tracks[main], 0.4 * float(np.ptp(frame, axis=1).max()))
@@ -71,7 +77,7 @@ def map_figure(
         *([] if known is None else [_known(known)]),
         *([] if truth is None else [_path(TRUTH, truth, 3.0)]),
         _ellipses(main, outlines),
-        *(_path(name, series, 2.0) for name, series in tracks.items()),
+        *(_path(name, series, 2.0, place) for name, series in tracks.items()),
         *(_ends(name, series) for name, series in tracks.items() if name != main),
         *([] if truth is None else [_ends(TRUTH, truth)]),
         _arrows(main, tracks[main]),
@@ -87,8 +93,13 @@ def map_figure(
         dragmode="pan",
     )
     x, y = _limits(np.vstack([frame.T, outlines]))
-    figure.update_xaxes(title=_title("x [m]"), range=x, **_AXIS)
-    figure.update_yaxes(title=_title("y [m]"), range=y, scaleanchor="x", scaleratio=1, **_AXIS)
+    titles = ("x [m]", "y [m]") if place is None else ("east [m]", "north [m]")
+    figure.update_xaxes(title=_title(titles[0]), range=x, **_AXIS)
+    figure.update_yaxes(title=_title(titles[1]), range=y, scaleanchor="x", scaleratio=1, **_AXIS)
+    if place is not None:
+        add_north(figure)
+        if tiles:
+            add_tiles(figure, place, tiles)
     return figure
 
 
@@ -128,11 +139,17 @@ def _title(text: str) -> dict[str, object]:
     return {"text": text, "standoff": 6, "font": {"size": 13}}
 
 
-def _path(name: str, series: Series, width: float) -> go.Scatter:
+def _path(name: str, series: Series, width: float, place: Georeference | None = None) -> go.Scatter:
     label, colour, dash = style(name)
     sigma = series.horizontal_sigma
     columns = [series.time, series.speed, *([] if sigma is None else [sigma])]
-    sigma_text = "" if sigma is None else "<br>sigma %{customdata[2]:.2f} m"
+    text = "" if sigma is None else "<br>sigma %{customdata[2]:.2f} m"
+    table = np.column_stack(columns).round(2)
+    if place is not None:
+        k = table.shape[1]
+        text += f"<br>%{{customdata[{k}]:.6f}}, %{{customdata[{k + 1}]:.6f}}"
+        latlon = place.latlon_deg(np.nan_to_num(series.position)).round(7)
+        table = np.column_stack([table, latlon])
     return go.Scatter(
         x=numbers(series.position[:, 0], 2),
         y=numbers(series.position[:, 1], 2),
@@ -140,8 +157,8 @@ def _path(name: str, series: Series, width: float) -> go.Scatter:
         legendgroup=name,
         mode="lines",
         line={"color": colour, "dash": dash, "width": width},
-        customdata=np.column_stack(columns).round(2).tolist(),
-        hovertemplate=f"<b>{label}</b> at %{{customdata[0]:.1f}} s{sigma_text}"
+        customdata=table.tolist(),
+        hovertemplate=f"<b>{label}</b> at %{{customdata[0]:.1f}} s{text}"
         "<br>speed %{customdata[1]:.2f} m/s<br>x %{x:.2f} m, y %{y:.2f} m<extra></extra>",
     )
 

@@ -8,6 +8,7 @@ import html
 import importlib.resources
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -28,10 +29,12 @@ from stario.fusion.report.panels import (
 )
 from stario.fusion.report.series import Series, track_series, trajectory_series
 from stario.fusion.state import Track
+from stario.sequences.accuracy.metrics import moved
 from stario.sequences.drawing.figures import clock
 from stario.sequences.drawing.text_table import figure
 from stario.sequences.files import atomic_write
 from stario.sequences.findings import Finding
+from stario.sequences.geodesy import turned
 from stario.sequences.sequence import ImuSequence, PositionTrack
 
 _LEVEL_WORDS = {"warning": "To do", "good": "Good", "note": "Note"}
@@ -39,13 +42,17 @@ _DIGITS = {"ate_m": 2, "ate_fit_m": 2, "rte_m": 2, "aye_rad": 1, "nees_median": 
 """Decimals of the table's columns."""
 
 
-def write_report(path: Path, found: Comparison) -> Path:
+def write_report(path: Path, found: Comparison, tiles: str = "") -> Path:
     """Write the report of one recording's tracks, completely or not at all.
+
+    Where it is known where on the earth the tracks lie, they are drawn with x east and y north.
 
     Args:
         path: the HTML file; its folder must exist.
         found: tracks and metrics of `compare` or of a run; the ground truth is drawn if the
             recording has one.
+        tiles: address of a map server's tiles, with {z}, {x} and {y}, as the map's background; the
+            browser asks it. Empty for none.
 
     Returns:
         The path.
@@ -56,8 +63,11 @@ def write_report(path: Path, found: Comparison) -> Path:
     sequence, tracks = found.sequence, found.tracks
     start = float(sequence.time[np.isfinite(sequence.time)][0])
     truth = sequence.truth
+    # Beside a true track, those are drawn in its frame, whose place is not known.
+    place = found.georeference if truth is None else None
+    yaw = 0.0 if place is None else place.yaw
     series = {
-        name: track_series(tracks[name], aligned, start)
+        name: track_series(tracks[name], moved(aligned, yaw, np.zeros(3), np.zeros(3)), start)
         for name, aligned in found.aligned().items()
     }
     true_series = None if truth is None else trajectory_series(truth, start)
@@ -70,13 +80,25 @@ def write_report(path: Path, found: Comparison) -> Path:
         panels += innovation_panels(innovations, start)
     mapped = drawn if truth is None else series
     known = shown_positions(sequence, tracks[main])
+    if known is not None:
+        known = replace(known, position_W=turned(known.position_W, yaw))
     health = tracks[main].health
     corrections = [
         (time - start, metres, turn, cause)
         for time, metres, turn, cause in (health.corrections if health else [])
     ]
     data = {
-        "map": json.loads(map_figure(mapped, true_series, known, main, corrections).to_json()),
+        "map": json.loads(
+            map_figure(
+                mapped,
+                true_series,
+                known,
+                main,
+                corrections,
+                place and replace(place, yaw=0.0),
+                tiles,
+            ).to_json()
+        ),
         "time": json.loads(time_figure(panels).to_json()),
         "cursors": _cursors(drawn, main),
     }

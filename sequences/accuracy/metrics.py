@@ -138,14 +138,14 @@ def align(estimate: Trajectory, truth: Trajectory, mode: Alignment) -> Trajector
     errors = pose_errors(estimate, truth)
     estimated, true = errors.estimate.position_W, errors.truth.position_W
     if mode == "first":
-        return _moved(estimate, -float(errors.yaw[0]), estimated[0], true[0])
+        return moved(estimate, -float(errors.yaw[0]), estimated[0], true[0])
     center, target = estimated.mean(axis=0), true.mean(axis=0)
     z, w = ((p - middle)[:, :2] @ [1.0, 1j] for p, middle in ((estimated, center), (true, target)))
     if min(np.abs(z).max(), np.abs(w).max()) < _PLACE_M:
         yaw = -np.angle(np.exp(1j * errors.yaw).mean())
     else:
         yaw = np.angle(np.vdot(z, w))
-    return _moved(estimate, float(yaw), center, target)
+    return moved(estimate, float(yaw), center, target)
 
 
 def evaluate_track(
@@ -230,7 +230,7 @@ def _nearest(time: FloatArray, wanted: FloatArray) -> np.ndarray[tuple[int], np.
     return right - (wanted - time[right - 1] < time[right] - wanted)
 
 
-def _moved(
+def moved(
     trajectory: Trajectory, yaw: float, pivot_W: FloatArray, target_W: FloatArray
 ) -> Trajectory:
     """Rotate by `yaw` [rad] about the vertical through `pivot_W`, then move that to `target_W`."""

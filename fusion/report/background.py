@@ -1,0 +1,125 @@
+"""The map's place on the earth: north arrow, and tiles of a map server as a background."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import product
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import plotly.graph_objects as go
+
+from stario.fusion.report.panels import INK
+from stario.sequences.errors import InputError
+from stario.sequences.geodesy import Georeference
+from stario.sequences.sequence import FloatArray
+
+_EQUATOR_M = 40_075_016.7
+_TILES_ACROSS = 4
+"""Largest number of tiles across the drawn part."""
+
+_LARGEST_ZOOM = 19
+"""Zoom up to which public servers have tiles."""
+
+_MARGIN = 0.5
+"""Width of the background beyond the drawn part, relative to that: what a wide window shows."""
+
+
+def check_tiles(url: str) -> str:
+    """Return the address of a tile server.
+
+    Raises:
+        InputError: it is not one of HTTP, or lacks a place for zoom, column or row.
+    """
+    complete = all(f"{{{name}}}" in url for name in "zxy")
+    if not complete or urlsplit(url).scheme not in ("http", "https"):
+        expected = "an address such as https://tile.openstreetmap.org/{z}/{x}/{y}.png"
+        raise InputError("--tiles", repr(url), expected)
+    return url
+
+
+def add_north(figure: go.Figure) -> None:
+    """Draw an arrow to the north, which is upwards."""
+    figure.add_annotation(
+        text="N",
+        xref="paper",
+        yref="paper",
+        x=0.98,
+        y=0.9,
+        ax=0,
+        ay=-34,
+        showarrow=True,
+        arrowside="start",
+        arrowwidth=2,
+        arrowcolor=INK,
+        bgcolor="white",
+        font={"size": 13, "color": INK},
+    )
+
+
+def add_tiles(figure: go.Figure, place: Georeference, url: str) -> None:
+    """Draw the tiles of a map server below a figure with x east and y north.
+
+    The browser asks the server when it opens the report.
+
+    Args:
+        figure: the figure, with the limits of its axes [m].
+        place: where its origin lies.
+        url: address of a tile, with {z}, {x} and {y}.
+    """
+    limits = np.array([figure.layout.xaxis.range, figure.layout.yaxis.range], dtype=np.float64)
+    half = (0.5 + _MARGIN) * np.ptp(limits, axis=1).max()
+    middle = limits.mean(axis=1)
+    for image in _tiles(place, middle - half, middle + half, url):
+        figure.add_layout_image(image)
+    figure.add_annotation(
+        text=f"map: {urlsplit(url).hostname}",
+        xref="paper",
+        yref="paper",
+        x=1.0,
+        y=0.0,
+        showarrow=False,
+        bgcolor="rgba(255,255,255,0.8)",
+        font={"size": 11, "color": INK},
+    )
+
+
+def _tiles(
+    place: Georeference, low: FloatArray, high: FloatArray, url: str
+) -> Iterator[dict[str, Any]]:
+    """Yield the tiles between two corners (2,) [m] as images in the map's axes."""
+    width = _EQUATOR_M * math.cos(math.radians(place.latitude_deg))
+    across = float((high - low).max()) / (1.0 + 2.0 * _MARGIN)
+    zoom = min(_LARGEST_ZOOM, math.floor(math.log2(_TILES_ACROSS * width / across)))
+    (left, bottom), (right, top) = _tile_of(place.latlon_deg(np.stack([low, high])), zoom)
+    for x, y in product(range(int(left), int(right) + 1), range(int(top), int(bottom) + 1)):
+        corners = place.xy(_latlon_of(np.array([[x, y], [x + 1, y + 1]]), zoom))
+        address = url.replace("{z}", str(zoom)).replace("{x}", str(x)).replace("{y}", str(y))
+        yield {
+            "source": address,
+            "xref": "x",
+            "yref": "y",
+            "x": corners[0, 0],
+            "y": corners[0, 1],
+            "sizex": corners[1, 0] - corners[0, 0],
+            "sizey": corners[0, 1] - corners[1, 1],
+            "sizing": "stretch",
+            "layer": "below",
+        }
+
+
+def _tile_of(latlon_deg: FloatArray, zoom: int) -> FloatArray:
+    """Return column and row (N, 2) of places (N, 2) [deg] in the tiles of a zoom (Web Mercator)."""
+    latitude, longitude = np.radians(latlon_deg).T
+    x = 0.5 * (1.0 + longitude / math.pi)
+    y = 0.5 * (1.0 - np.arcsinh(np.tan(latitude)) / math.pi)
+    return np.asarray(2.0**zoom * np.column_stack([x, y]))
+
+
+def _latlon_of(tile: FloatArray, zoom: int) -> FloatArray:
+    """Return the place (N, 2) [deg] of the upper left corner of tiles (N, 2): the inverse."""
+    x, y = (tile / 2.0**zoom).T
+    latitude = np.arctan(np.sinh(math.pi * (1.0 - 2.0 * y)))
+    return np.asarray(np.degrees(np.column_stack([latitude, math.pi * (2.0 * x - 1.0)])))
