@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter import displacements, ekf, magnetic, map_frame
+from stario.fusion.filter import displacements, ekf, height, magnetic, map_frame
 from stario.fusion.filter.correlated_errors import ACCEL_SHARE
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.estimator_state import EstimatorState, rewound, with_step
@@ -79,11 +79,14 @@ def step(
     if interval.gap or fixes:
         s = changed(s, alternative=None)
     s, segment, accepted = _propagated(s, interval, accel_factor, fixes, config)
+    s = _with_height(s, interval)
     before = s.ekf
     s, zero_velocity = _with_rest(s, interval, config)
     s, before = s.with_correction(before, "rest"), s.ekf
     # Zero velocity is more accurate than a network trained on walks, off by 1 cm/s at rest.
     offered = displacement if zero_velocity is None else None
+    if offered is not None and s.climb_rate:
+        offered = height.climbing(offered)
     s, outcome, revoked = _with_displacement(s, offered, config)
     s, before = s.with_correction(before, "network"), s.ekf
     s, bearing = _with_bearing(s, interval)
@@ -212,6 +215,20 @@ def _with_fix(
     return s, [Accepted(fix, result.scale)] if result.accepted else []
 
 
+def _with_height(s: EstimatorState, interval: ImuInterval) -> EstimatorState:
+    """Update with the height by the pressure, and note whether it climbs."""
+    sample = interval.height
+    if sample is None:
+        return s
+    after, result = height.with_height(s.ekf, sample)
+    if s.alternative is not None:
+        other, _ = height.with_height(s.alternative.ekf, sample)
+        s = changed(s, alternative=changed(s.alternative, ekf=other))
+    s = changed(s, ekf=after, climb_rate=sample.rate)
+    steps = ["steps"] if sample.stepped else []
+    return s.counted("pressures", *result.outcomes, *steps)
+
+
 def _with_rest(
     s: EstimatorState, interval: ImuInterval, config: NavigatorConfig
 ) -> tuple[EstimatorState, ZeroVelocity | None]:
@@ -220,6 +237,8 @@ def _with_rest(
     if not s.stillness.rested:
         return s, None
     measured = s.stillness.measurement()
+    if s.climb_rate:
+        measured = height.resting_in_lift(measured)
     state, result = update_zero_velocity(s.ekf, measured, config.filter)
     s = changed(s, ekf=state).counted("zero_velocity", *result.outcomes)
     if not result.accepted:

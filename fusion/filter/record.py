@@ -67,6 +67,7 @@ class UpdateCounts:
         fixes: numbers of fixes applied (of these gated), and refused by reason.
         zero_velocity: numbers of measurements at rest applied, and refused by reason.
         bearings: numbers of magnetic bearings, likewise; 1 under "north" if they determined it.
+        pressures: numbers of heights by the pressure, likewise; "steps" counts the air's steps.
         nis_sum: sum of the NIS of all valid network measurements.
         nis_count: number of valid network measurements.
         corrections: the latest large corrections.
@@ -78,6 +79,7 @@ class UpdateCounts:
     fixes: Mapping[str, int] = field(default_factory=dict)
     zero_velocity: Mapping[str, int] = field(default_factory=dict)
     bearings: Mapping[str, int] = field(default_factory=dict)
+    pressures: Mapping[str, int] = field(default_factory=dict)
     nis_sum: float = 0.0
     nis_count: int = 0
     corrections: tuple[Correction, ...] = ()
@@ -137,6 +139,7 @@ class UpdateCounts:
             fixes=dict(self.fixes),
             zero_velocity=dict(self.zero_velocity),
             bearings=dict(self.bearings),
+            pressures=dict(self.pressures),
             corrections=list(self.corrections),
             final_sigma={name: math.sqrt(max(value, 0.0)) for name, value in variance.items()},
         )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.imu.intervals import FieldBuffer
+from stario.fusion.imu.buffers import FieldBuffer
 from stario.fusion.recording import cut_recording
 from stario.sequences import PHONE_IMU, generate_walk, simulate_imu
 from stario.sequences.sequence import ImuSequence, Magnetometer
@@ -73,7 +73,7 @@ def test_a_block_of_fields_may_come_before_its_samples_and_what_does_not_fit_is_
     assert kept == [True] * 1000 + [False] * 200
     assert buffer.at(1.0) is None
     assert all(buffer.at(0.1 * k + 0.001) is not None for k in range(21, 119))
-    assert len(buffer._fields) < 50
+    assert len(buffer._waiting) < 50
 
 
 def test_a_field_too_late_for_any_interval_is_refused() -> None:

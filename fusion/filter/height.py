@@ -1,0 +1,90 @@
+"""Height from the air's pressure, relative to the start.
+
+README.md, "Barometer". Pressure tells height but for an offset, which nobody knows at the start,
+which wanders with the weather and steps where a door opens. It is one more state,
+
+    height by the pressure = p_z + offset,   offset a random walk
+
+added with the first height as a clone is: exactly, with the correlations that this measurement
+gives it. So pressure observes changes of height and never height itself. While one climbs, neither
+the network, which learned on level floors, nor a device that lies still (in a lift) says anything
+about the vertical.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stario.fusion.filter.ekf_state import EkfState, PressureOffset
+from stario.fusion.filter.jacobians import position_jacobian, velocity_jacobian
+from stario.fusion.filter.kalman import Linear, UpdateResult, update
+from stario.fusion.filter.zero_velocity import ZeroVelocity
+from stario.fusion.imu.barometer import HeightSample
+from stario.fusion.imu.stateful import WindowDisplacement
+from stario.fusion.state import changed
+from stario.sequences.accuracy.chi_square import chi2_quantile
+from stario.sequences.sequence import FloatArray
+
+WEATHER_WALK = 0.03
+"""Random walk of the offset [m/sqrt(s)]: weather and ventilation (28 level walks of IPIN 2023: 0.3
+m after one minute beyond what changes within seconds)."""
+
+CLIMB_SIGMA = 1.0
+"""Sigma of the height of a displacement while one climbs [m]: of a lift, nothing is known."""
+
+_GATE = 0.99
+"""Probability of the height's chi-square test; outliers are inflated."""
+
+
+def with_height(s: EkfState, sample: HeightSample) -> tuple[EkfState, UpdateResult]:
+    """Update a state with a height; the first one only determines the offset."""
+    residual, H = _linear(s, sample)
+    if s.offset is None:
+        return _with_offset(s, sample, residual, H), UpdateResult()
+    s = _propagated(s, s.offset, sample)
+    blocks = [(0, H), (s.offset_row, np.ones((1, 1)))]
+    R = np.array([[sample.sigma**2]])
+    return update(s, Linear(np.array([residual]), blocks, R), chi2_quantile(_GATE, 1))
+
+
+def climbing(displacement: WindowDisplacement) -> WindowDisplacement:
+    """Return a displacement that says nothing about the height."""
+    covariance_N = displacement.covariance_N.copy()
+    covariance_N[2, 2] += CLIMB_SIGMA**2
+    return displacement._replace(covariance_N=covariance_N)
+
+
+def resting_in_lift(measured: ZeroVelocity) -> ZeroVelocity:
+    """Return a measurement at rest that says nothing about the vertical velocity."""
+    covariance = measured.covariance.copy()
+    covariance[2, 2] += CLIMB_SIGMA**2
+    return measured._replace(covariance=covariance)
+
+
+def _linear(s: EkfState, sample: HeightSample) -> tuple[float, FloatArray]:
+    """Return measured minus predicted height and its Jacobian (1, 9) but for the offset."""
+    ago = s.time - sample.time
+    H = position_jacobian(s.X[0, :, 4])[0][1][2:].copy()
+    H[:, :6] -= ago * velocity_jacobian(s.v_W)[0][1][2:]
+    predicted = s.p_W[2] - ago * s.v_W[2] + (0.0 if s.offset is None else s.offset.metres)
+    return float(sample.height - predicted), H
+
+
+def _with_offset(s: EkfState, sample: HeightSample, residual: float, H: FloatArray) -> EkfState:
+    """Return the state with the offset that a height determines: error -H x + noise."""
+    row, n = s.offset_row, s.covariances.shape[1]
+    A = np.insert(np.eye(n), row, 0.0, axis=0)
+    A[row, : H.shape[1]] = -H
+    P = A @ s.covariances @ A.T
+    P[:, row, row] += sample.sigma**2
+    return changed(s, covariances=P, offset=PressureOffset(residual, sample.time))
+
+
+def _propagated(s: EkfState, offset: PressureOffset, sample: HeightSample) -> EkfState:
+    """Return the state with what may have changed since the last height."""
+    P, row = s.covariances.copy(), s.offset_row
+    P[:, row, row] += WEATHER_WALK**2 * (sample.time - offset.time) + sample.stepped**2
+    if sample.risen:  # a climb that was not known as one before
+        P[:, 5, 5] += sample.rate**2
+        P[:, 8, 8] += sample.risen**2
+    return changed(s, covariances=P, offset=changed(offset, time=sample.time))
