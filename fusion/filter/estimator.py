@@ -85,8 +85,8 @@ def step(
     s, before = s.with_correction(before, "rest"), s.ekf
     # Zero velocity is more accurate than a network trained on walks, off by 1 cm/s at rest.
     offered = displacement if zero_velocity is None else None
-    if offered is not None and s.climb_rate:
-        offered = height.climbing(offered)
+    if offered is not None and s.ekf.offset is not None:
+        offered = height.yielding(offered, s.climb_rate != 0.0)
     s, outcome, revoked = _with_displacement(s, offered, config)
     s, before = s.with_correction(before, "network"), s.ekf
     s, bearing = _with_bearing(s, interval)

@@ -32,6 +32,10 @@ m after one minute beyond what changes within seconds)."""
 CLIMB_SIGMA = 1.0
 """Sigma of the height of a displacement while one climbs [m]: of a lift, nothing is known."""
 
+LEVEL_SIGMA = 0.1
+"""Sigma of the height of other displacements [m], beside the network's: a short stair or a ramp is
+taken from the pressure, too."""
+
 _GATE = 0.99
 """Probability of the height's chi-square test; outliers are inflated."""
 
@@ -47,10 +51,10 @@ def with_height(s: EkfState, sample: HeightSample) -> tuple[EkfState, UpdateResu
     return update(s, Linear(np.array([residual]), blocks, R), chi2_quantile(_GATE, 1))
 
 
-def climbing(displacement: WindowDisplacement) -> WindowDisplacement:
-    """Return a displacement that says nothing about the height."""
+def yielding(displacement: WindowDisplacement, climbs: bool) -> WindowDisplacement:
+    """Return a displacement whose height yields to the pressure's."""
     covariance_N = displacement.covariance_N.copy()
-    covariance_N[2, 2] += CLIMB_SIGMA**2
+    covariance_N[2, 2] += (CLIMB_SIGMA if climbs else LEVEL_SIGMA) ** 2
     return displacement._replace(covariance_N=covariance_N)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -9,11 +10,13 @@ import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.frame_transform import FrameTransform, frame_rotation
+from stario.fusion.filter.height import resting_in_lift, yielding
 from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.filter.record import Record
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.keyframes import KeyframeGraph
+from stario.fusion.imu.barometer import CLIMB_DELAY
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import UNKNOWN_YAW
 from stario.fusion.state import NavState
@@ -58,6 +61,7 @@ def smooth(
     local = [state.shifted(-origin) for state in filtered]
     first = _inflated(local[0], prior, transforms)
     builder = GraphBuilder(config, first)
+    records = _with_climbs(records)
     revoked = {time for record in records for time in record.revoked}
     for record, state in zip(records, local[1:], strict=True):
         # Neither is inflated as by the filter: the graph weights outliers by the whole track.
@@ -73,6 +77,26 @@ def smooth(
         replace(solved[f.time], in_gap=f.in_gap, map_frame=f.map_frame).shifted(origin)
         for f in filtered
     ]
+
+
+def _with_climbs(records: Sequence[Record]) -> list[Record]:
+    """Return the records with climbs known from where they began, which pressure shows later."""
+    until, found = -math.inf, []
+    for record in reversed(records):
+        sample = record.interval.height
+        if sample is not None and sample.risen:
+            until = sample.time - CLIMB_DELAY
+        climbs = record.interval.stop > until > -math.inf
+        found.append(_climbing(record) if climbs else record)
+    return found[::-1]
+
+
+def _climbing(record: Record) -> Record:
+    offered, rest = record.offered, record.zero_velocity
+    return record._replace(
+        offered=offered and yielding(offered, climbs=True),
+        zero_velocity=rest and resting_in_lift(rest),
+    )
 
 
 def _inflated(first: NavState, prior: NavState, transforms: Sequence[FrameTransform]) -> NavState:

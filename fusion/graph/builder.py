@@ -8,13 +8,25 @@ from collections.abc import Sequence
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.filter.height import WEATHER_WALK
 from stario.fusion.filter.initial import tilt_sigma
 from stario.fusion.filter.record import Record
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Fix
-from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Tilt, Velocity, Yaw
+from stario.fusion.graph.factors import (
+    Displacement,
+    GyroBias,
+    Height,
+    OffsetWalk,
+    Position,
+    Term,
+    Tilt,
+    Velocity,
+    Yaw,
+)
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.keyframes import KeyframeGraph, shallow_copy
+from stario.fusion.imu.barometer import HeightSample
 from stario.fusion.imu.gap import gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval, split_at
 from stario.fusion.imu.preintegration import Segment, segment_of
@@ -74,6 +86,7 @@ class GraphBuilder:
         # Keyframes where windows begin and end, by the count of intervals; cleared at a gap.
         self._window_keyframes: dict[int, int] = {count: 0} if count % self._spacing == 0 else {}
         self._gaps: dict[int, ImuInterval] = {}  # by the keyframe before them
+        self._last_height: tuple[int, float] | None = None  # keyframe and time
 
     def copied(self) -> GraphBuilder:
         """Return a copy that may be changed; what both hold is never modified."""
@@ -124,6 +137,8 @@ class GraphBuilder:
             self._window_keyframes[self.count] = self.graph.last
             if record.zero_velocity is not None:
                 self._add_zero_velocity(record.zero_velocity)
+        if interval.height is not None:
+            self._add_height(interval.height)
         for fix in fixes:
             self.fix(fix)
         return self.graph.last > before
@@ -173,7 +188,7 @@ class GraphBuilder:
 
     def dead_reckoned(self, k: int, time: float = math.inf) -> Pose:
         """Dead-reckon from a keyframe to a time [s], or to the end of its data if earlier."""
-        R, v, p, b_g, b_a = self.graph.keyframe(k)
+        R, v, p, b_g, b_a, _ = self.graph.keyframe(k)
         if k in self._gaps:
             gap = self._gaps[k]
             until = min(time, gap.stop)
@@ -217,6 +232,18 @@ class GraphBuilder:
         covariance = zero_velocity.covariance / self._spacing
         self.graph.add(Velocity(k, zero, covariance[:3, :3], zero))
         self.graph.add(GyroBias(k, zero_velocity.b_g, covariance[3:, 3:]))
+
+    def _add_height(self, sample: HeightSample) -> None:
+        graph, before = self.graph, self._last_height
+        k, covariance = graph.last, np.array([[sample.sigma**2]])
+        if before is None or before[0] != k:
+            graph.add_offset(k, sample.height - float(graph.keyframe(k).p_W[2]))
+            self._last_height = k, sample.time
+            # In a stream the one before may have left the graph.
+            if before is not None and before[0] in graph.keyframes:
+                variance = WEATHER_WALK**2 * (sample.time - before[1]) + sample.stepped**2
+                graph.add(OffsetWalk(before[0], k, np.array([[variance]])), gated=False)
+        graph.add(Height(k, sample.height, covariance, sample.time - graph.time(k)))
 
     def _fix_term(self, fix: Fix, k: int) -> Term:
         graph = self.graph

@@ -7,7 +7,7 @@ only: none models a displacement that turns with the yaw of a pose and not with 
 "Graph factors").
 
 Tangent of a keyframe, as in gtsam: pose R exp(w), p + R dp in the order w, dp; velocity additive;
-biases additive, accelerometer first. Keys: x pose, v velocity, b biases.
+biases additive, accelerometer first. Keys: x pose, v velocity, b biases, o barometer's offset.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
+from gtsam.symbol_shorthand import B, O, V, X
 
 from stario.fusion.filter.jacobians import plain_covariance, yaw_jacobian
 from stario.fusion.graph.covariances import root_information
@@ -115,7 +115,7 @@ class Prior:
         """Linearise in the rows of the root."""
         residual, blocks, rest = self.offset, [], self.root
         for k, reference in zip(self.keyframes, self.reference, strict=True):
-            state = KeyframeState.of(values, k)
+            state = KeyframeState.of(values, k).like(reference)
             error = state.error_from(reference)
             root, rest = rest[:, : len(error)], rest[:, len(error) :]
             residual = residual - root @ error
@@ -177,6 +177,45 @@ class Position(AtKeyframe):
         H = np.zeros((3, 6))
         H[:, 3:] = R
         return self.p_W - predicted, [(X(self.k), H), (V(self.k), self.dt * _EYE)]
+
+
+@dataclass(frozen=True, eq=False)
+class Height(AtKeyframe):
+    """The height by the air's pressure shortly before or after a keyframe with an offset.
+
+    Attributes:
+        height: [m].
+        covariance: (1, 1) [m^2].
+        dt: time since the keyframe [s].
+    """
+
+    height: float
+    covariance: FloatArray
+    dt: float
+
+    def linearise(self, values: Any) -> Linearised:
+        """Linearise along the vertical."""
+        (R, p), v, offset = _pose(values, self.k), values.atVector(V(self.k)), _offset(values, self.k)
+        H_x, H_v = np.zeros((1, 6)), np.zeros((1, 3))
+        H_x[0, 3:], H_v[0, 2] = R[2], self.dt
+        residual = np.array([self.height - p[2] - self.dt * v[2] - offset])
+        return residual, [(X(self.k), H_x), (V(self.k), H_v), (O(self.k), np.ones((1, 1)))]
+
+
+@dataclass(frozen=True, eq=False)
+class OffsetWalk(Between):
+    """The barometer's offset wanders from keyframe i to keyframe j.
+
+    Attributes:
+        covariance: (1, 1) [m^2].
+    """
+
+    covariance: FloatArray
+
+    def linearise(self, values: Any) -> Linearised:
+        """Linearise it, which is linear."""
+        residual = np.array([_offset(values, self.i) - _offset(values, self.j)])
+        return residual, [(O(self.i), -np.ones((1, 1))), (O(self.j), np.ones((1, 1)))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,3 +306,7 @@ class GyroBias(AtKeyframe):
 def _pose(values: Any, k: int) -> tuple[FloatArray, FloatArray]:
     pose = values.atPose3(X(k))
     return pose.rotation().matrix(), pose.translation()
+
+
+def _offset(values: Any, k: int) -> float:
+    return float(values.atVector(O(k))[0])

@@ -28,8 +28,8 @@ MIN_CLIMB_RATE = 0.15
 have 0.2 to 0.4, and a phone's pressure on a level floor exceeds it in 1 % of the time (28 walks of
 IPIN 2023)."""
 
-_SPAN = 4.0
-"""Length of that line [s]."""
+CLIMB_DELAY = 4.0
+"""Length of that line [s], and so the longest time before a climb is known to be one."""
 
 _MIN_POINTS = 4
 """Number of heights that a line needs."""
@@ -37,12 +37,19 @@ _MIN_POINTS = 4
 _CLIMB_SIGMAS = 3.0
 """Sigmas of the line's slope from which it means a climb."""
 
+_STILL_CLIMBING = 0.1
+"""Vertical speed below which a climb has ended [m/s]."""
+
 _SUDDEN = 0.45
-"""Change [m] against the median of the heights of `_SPAN` that is not used before it is known what
+"""Change [m] against the median of the heights of `CLIMB_DELAY` that is not used before it is known what
 it was."""
 
 _LONGEST_DOUBT = 3.0
-"""Time [s] after which such a change without a climb is one of the air: a door, a ventilator."""
+"""Time [s] after which it must be known."""
+
+_CLEAR_STEP = 0.4
+"""Squared residuals about a step, relative to those about the line, below which the air has
+stepped: a door, a ventilator. Whoever climbs slowly must not be mistaken for one."""
 
 _FIRST_SCATTER, _MIN_SCATTER = 0.1, 0.02
 """Scatter of averaged heights about their line [m]: assumed at first, and the least."""
@@ -63,7 +70,7 @@ class HeightSample(NamedTuple):
         height: [m].
         sigma: standard deviation of its noise [m].
         rate: vertical speed while it climbs or descends [m/s]; 0 on a floor.
-        risen: on the first height of a climb, height since it began [m]; 0 otherwise.
+        risen: change [m] that was not known to be a climb before; 0 otherwise.
         stepped: step of the air's pressure since the last height [m]; 0 without one.
     """
 
@@ -86,11 +93,17 @@ def pressure_altitude(pressure_hPa: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _Line:
-    """A line through the last heights, and the step that fits them best."""
+    """A line through the last heights.
+
+    Attributes:
+        slope: [m/s].
+        scatter: standard deviation about it [m].
+        step_ratio: squared residuals about the best step, relative to those about the line.
+    """
 
     slope: float
     scatter: float
-    is_step: bool
+    step_ratio: float
 
 
 class HeightBuffer(TimedBuffer[float]):
@@ -136,36 +149,38 @@ class HeightBuffer(TimedBuffer[float]):
     def _judged(self, time: float, height: float) -> HeightSample | None:
         usual = float(np.median([h for _, h in self._past])) if self._past else height
         self._past.append((time, height))
-        while self._past[0][0] < time - _SPAN - 0.5 * HEIGHT_SECONDS:
+        while self._past[0][0] < time - CLIMB_DELAY - 0.5 * HEIGHT_SECONDS:
             self._past.popleft()
         line = _line(np.array(self._past))
-        climbs = line is not None and self._is_climb(line)
-        doubt, began, climbed = self._doubt, self._past[0], self._climbing
-        self._doubt, self._climbing = None, climbs
-        if climbs:
-            assert line is not None
+        climbed, doubt, began = self._climbing, self._doubt, self._past[0]
+        self._climbing, self._doubt = line is not None and self._is_climb(line, climbed), None
+        sample = HeightSample(time, height, self._sigma)
+        if line is not None and self._climbing:
             risen = 0.0 if climbed else height - (doubt or began)[1]
-            return HeightSample(time, height, self._sigma, line.slope, risen=risen)
+            return sample._replace(rate=line.slope, risen=risen)
         if doubt is None and abs(height - usual) > _SUDDEN and not climbed:
             doubt = time, usual
         if doubt is not None and time - doubt[0] < _LONGEST_DOUBT:
             self._doubt = doubt
             return None
         if doubt is not None:
-            return HeightSample(time, height, self._sigma, stepped=height - doubt[1])
+            by_air = line is not None and line.step_ratio < _CLEAR_STEP
+            return sample._replace(**{"stepped" if by_air else "risen": height - doubt[1]})
         if line is not None:
             self._learn(line.scatter)
-        return HeightSample(time, height, self._sigma)
+        return sample
 
     @property
     def _sigma(self) -> float:
         return math.sqrt(_CORRELATION * self._variance)
 
-    def _is_climb(self, line: _Line) -> bool:
+    def _is_climb(self, line: _Line, climbed: bool) -> bool:
+        if climbed:
+            return abs(line.slope) > _STILL_CLIMBING
         # Over n heights at equal steps the slope's sigma is the mean's times sqrt(12) / span.
-        sigma = math.sqrt(12.0 * _CORRELATION * self._variance / len(self._past)) / _SPAN
+        sigma = math.sqrt(12.0 * _CORRELATION * self._variance / len(self._past)) / CLIMB_DELAY
         least = max(MIN_CLIMB_RATE, _CLIMB_SIGMAS * sigma)
-        return abs(line.slope) > least and not line.is_step
+        return abs(line.slope) > least and line.step_ratio > 1.0
 
     def _learn(self, scatter: float) -> None:
         self._count = min(self._count + 1, _SCATTER_COUNT)
@@ -184,5 +199,5 @@ def _line(past: FloatArray) -> _Line | None:
     # Between mean m1 of the first k and m2 of the others: k m1^2 + (n - k) m2^2 is explained.
     k, total = np.arange(1, n), np.cumsum(y)[:-1]
     explained = float((total**2 / k + total**2 / (n - k)).max())
-    is_step = float(y @ y) - explained < about_line
-    return _Line(slope, math.sqrt(about_line / (n - 2)), is_step)
+    ratio = (float(y @ y) - explained) / max(about_line, 1e-9)
+    return _Line(slope, math.sqrt(about_line / (n - 2)), ratio)
