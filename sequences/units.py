@@ -39,6 +39,20 @@ least 41 if deg/s are taken for rad/s."""
 MAGNETIC_UNITS = {"uT": 1.0, "nT": 1e-3, "mT": 1e3, "T": 1e6, "gauss": 100.0, "g": 100.0, "mg": 0.1}
 """`G`, in any case, and `mG` are gauss here."""
 
+PRESSURE_UNITS = {
+    "hPa": 1.0,
+    "Pa": 0.01,
+    "kPa": 10.0,
+    "inHg": 33.8639,
+    "mmHg": 1.33322,
+    "bar": 1e3,
+    "atm": 1013.25,
+    "psi": 68.9476,
+}
+"""`mbar` is hPa as well."""
+
+SPEED_UNITS = {"m/s": 1.0, "km/h": 1.0 / 3.6, "mph": 0.44704, "kn": 1852.0 / 3600.0}
+
 _EARTH_UT = (20.0, 80.0)
 
 
@@ -66,6 +80,14 @@ _SPELLINGS = {
         "m/s^2": ("m/s2", "m/s/s", "m/s\ufffd", "ms2", "ms-2", "mps2", "m/(s2)"),
         "-m/s^2": ("-m/s2",),
         "g": ("g's",),
+        "hPa": ("hpa", "mbar", "mb", "millibar", "millibars", "hectopascal"),
+        "Pa": ("pa", "pascal", "pascals"),
+        "kPa": ("kpa", "kilopascal"),
+        "inHg": ("inhg", '"hg'),
+        "mmHg": ("mmhg", "torr"),
+        "km/h": ("kmh", "kph", "km/hr"),
+        "m/s": ("mps", "ms-1"),
+        "kn": ("kt", "kts", "knot", "knots"),
     }.items()
     for spelling in spellings
 }

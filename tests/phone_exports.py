@@ -172,8 +172,11 @@ def get_sensor_data(folder: Path, walk: ImuSequence) -> None:
     for k, t in enumerate(walk.time.tolist()):
         for code, values in (("ACCE", walk.accel), ("GYRO", walk.gyro), ("MAGN", field(walk))):
             lines.append(";".join([code, f"{t + 5.0:.3f}", f"{t:.4f}", *map(str, values[k]), "3"]))
+    for t in (5.5, 6.5):
+        lines.append(f"PRES;{t};{t + 900.0};{1013.0 + 0.01 * t};3")
+        lines.append(f"GNSS;{t + 0.25};1690000000.0;40.0;-3.0;{t};90.0;4.5;1.25;9;0")
     lines.append("POSI;7.000;1;40.0;-3.0;0;0")
-    lines.append("POSI;9.000;2;40.0001;-3.0;0;0")
+    lines.append("POSI;9.000;2;40.0001;-3.0;-1;0")
     folder.mkdir()
     (folder / "log.txt").write_text("\n".join(lines) + "\n")
 

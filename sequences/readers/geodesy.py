@@ -21,10 +21,22 @@ def east_north(degrees: FloatArray) -> FloatArray:
     Args:
         degrees: (N, 2) latitude and longitude on WGS 84 [deg].
     """
-    latitude = math.radians(degrees[0, 0])
-    w = 1.0 - _ECCENTRICITY_2 * math.sin(latitude) ** 2
-    north = _EQUATOR_M * (1.0 - _ECCENTRICITY_2) / w**1.5  # radius of curvature of the meridian
-    east = _EQUATOR_M / math.sqrt(w) * math.cos(latitude)
     away = degrees - degrees[0]
     away[:, 1] = (away[:, 1] + 180.0) % 360.0 - 180.0
-    return np.asarray(np.radians(away[:, ::-1]) * [east, north])
+    return np.asarray(np.radians(away[:, ::-1]) * _radii(degrees[0, 0]))
+
+
+def latitude_longitude(origin: FloatArray, metres: FloatArray) -> FloatArray:
+    """Return latitude and longitude (N, 2) [deg] of points (N, 2) east and north of an origin [m].
+
+    The inverse of `east_north`; the origin's are (2,) [deg].
+    """
+    return np.asarray(origin + np.degrees(metres / _radii(origin[0]))[:, ::-1])
+
+
+def _radii(latitude_deg: float) -> FloatArray:
+    """Return metres per radian of longitude and of latitude (2,)."""
+    latitude = math.radians(latitude_deg)
+    w = 1.0 - _ECCENTRICITY_2 * math.sin(latitude) ** 2
+    north = _EQUATOR_M * (1.0 - _ECCENTRICITY_2) / w**1.5  # radius of curvature of the meridian
+    return np.array([_EQUATOR_M / math.sqrt(w) * math.cos(latitude), north])

@@ -16,7 +16,7 @@ from scipy.fft import irfft, rfft, rfftfreq
 
 from stario.sequences.sequence import FloatArray
 
-RISER, _TREAD = 0.17, 0.29
+RISER, TREAD = 0.17, 0.29
 """Height and depth of a stair [m]."""
 
 
@@ -39,14 +39,18 @@ class Route:
     climb: FloatArray
 
 
-class _Command(NamedTuple):
-    """Duration [s], speed [m/s], turn rate [rad/s], course from the heading [rad], climb [m/s]."""
+class Command(NamedTuple):
+    """Duration [s], speed [m/s], turn rate [rad/s], course from the heading [rad], climb [m/s].
+
+    `lift` is a vertical speed [m/s] without steps.
+    """
 
     duration: float
     speed: float
     turn_rate: float = 0.0
     course: float = 0.0
     climb: float = 0.0
+    lift: float = 0.0
 
 
 def random_route(
@@ -67,12 +71,19 @@ def random_route(
         wheels: whether the person pushes a trolley: no stairs, no steps sideways or backward.
         corridors: whether the person walks along the corridors of a floor instead of anywhere.
     """
-    commands: list[_Command] = []
+    commands: list[Command] = []
     while sum(command.duration for command in commands) < count / rate:
         if corridors:
-            commands += _corridor(rng, preferred_speed)
+            commands += corridor(rng, preferred_speed)
         else:
             commands += _activity(rng, preferred_speed, wheels)
+    return route_along(rng, commands, count, rate, corridors)
+
+
+def route_along(
+    rng: np.random.Generator, commands: list[Command], count: int, rate: float, walls: bool
+) -> Route:
+    """Return the route (count samples at `rate` [Hz]) of commands; `walls` keep the heading."""
     table = np.array(commands)
     repeats = np.diff(np.round(np.cumsum([0.0, *table[:, 0]]) * rate))
     held = np.repeat(table[:, 1:], repeats.astype(np.int64), axis=0)[:count]
@@ -82,18 +93,19 @@ def random_route(
     velocity_H = smoothed(velocity_H, rate, sigma)
     wander = drift(rng, count, rate, 1.5)
     # Walls keep the heading, not only the rate of turn, near what was commanded.
-    wander = 0.1 * np.gradient(wander, 1.0 / rate) if corridors else 0.08 * wander
+    wander = 0.1 * np.gradient(wander, 1.0 / rate) if walls else 0.08 * wander
     turn_rate = smoothed(held[:, 1], rate, sigma) + wander
     climb = smoothed(held[:, 3], rate, sigma)
     heading = rng.uniform(-np.pi, np.pi) + integral(turn_rate, rate)
     c, s = np.cos(heading), np.sin(heading)
     forward, left = velocity_H.T
-    velocity_W = np.stack([c * forward - s * left, s * forward + c * left, climb], axis=1)
+    up = climb + smoothed(held[:, 4], rate, sigma)
+    velocity_W = np.stack([c * forward - s * left, s * forward + c * left, up], axis=1)
     speed = np.hypot(forward, left)
     return Route(integral(velocity_W, rate), heading, speed, turn_rate, climb)
 
 
-def _activity(rng: np.random.Generator, preferred: float, wheels: bool) -> list[_Command]:
+def _activity(rng: np.random.Generator, preferred: float, wheels: bool) -> list[Command]:
     speed = float(np.clip(preferred * rng.uniform(0.6, 1.4), 0.3, 2.2))
     side = float(rng.choice([-1.0, 1.0]))
     kinds = ["straight", "curve", "corner", "spot", "stand", "sidle", "stairs", "slow"]
@@ -105,43 +117,43 @@ def _activity(rng: np.random.Generator, preferred: float, wheels: bool) -> list[
         radius = rng.uniform(0.8, 6.0)
         turn_rate = min(speed / radius, 1.5)
         angle = rng.uniform(0.3, 2.0) * np.pi
-        return [_Command(min(angle / turn_rate, 12.0), speed, side * turn_rate)]
+        return [Command(min(angle / turn_rate, 12.0), speed, side * turn_rate)]
     if kind == "corner":
         turn_rate = rng.uniform(1.2, 3.0)
         angle = rng.uniform(0.4, 1.6)
         slowed = speed * rng.uniform(0.5, 1.0)
         return [
-            _Command(rng.uniform(0.8, 4.0), speed),
-            _Command(angle / turn_rate, slowed, side * turn_rate),
+            Command(rng.uniform(0.8, 4.0), speed),
+            Command(angle / turn_rate, slowed, side * turn_rate),
         ]
     if kind == "spot":
         turn_rate = rng.uniform(0.8, 2.5)
-        turn = _Command(rng.uniform(0.8, 3.3) / turn_rate, 0.0, side * turn_rate)
-        return [_Command(0.6, 0.0), turn, _Command(rng.uniform(0.2, 1.5), 0.0)]
+        turn = Command(rng.uniform(0.8, 3.3) / turn_rate, 0.0, side * turn_rate)
+        return [Command(0.6, 0.0), turn, Command(rng.uniform(0.2, 1.5), 0.0)]
     if kind == "stand":
-        return [_Command(rng.uniform(1.0, 6.0), 0.0)]
+        return [Command(rng.uniform(1.0, 6.0), 0.0)]
     if kind == "sidle":
         course = side * rng.uniform(0.4, 1.0) * np.pi
-        return [_Command(rng.uniform(1.0, 3.0), rng.uniform(0.3, 0.7), 0.0, course)]
+        return [Command(rng.uniform(1.0, 3.0), rng.uniform(0.3, 0.7), 0.0, course)]
     if kind == "stairs":
         steps_per_second = rng.uniform(1.3, 2.0)
         climb = side * RISER * steps_per_second
         flight = rng.integers(6, 18) / steps_per_second
-        return [_Command(flight, _TREAD * steps_per_second, 0.0, 0.0, climb)]
+        return [Command(flight, TREAD * steps_per_second, 0.0, 0.0, climb)]
     if kind == "slow":
-        return [_Command(rng.uniform(2.0, 5.0), rng.uniform(0.3, 0.6))]
-    return [_Command(rng.uniform(1.5, 7.0), speed)]
+        return [Command(rng.uniform(2.0, 5.0), rng.uniform(0.3, 0.6))]
+    return [Command(rng.uniform(1.5, 7.0), speed)]
 
 
-def _corridor(rng: np.random.Generator, preferred: float) -> list[_Command]:
+def corridor(rng: np.random.Generator, preferred: float) -> list[Command]:
     """Draw a straight of 5 to 20 m, a pause at one of seven doors, and a corner."""
     speed = float(np.clip(preferred * rng.uniform(0.85, 1.15), 0.3, 2.2))
     turn_rate = rng.uniform(1.2, 2.2)
-    pause = [_Command(rng.uniform(1.0, 5.0), 0.0)] if rng.random() < 1.0 / 7.0 else []
+    pause = [Command(rng.uniform(1.0, 5.0), 0.0)] if rng.random() < 1.0 / 7.0 else []
     return [
-        _Command(rng.uniform(5.0, 20.0) / speed, speed),
+        Command(rng.uniform(5.0, 20.0) / speed, speed),
         *pause,
-        _Command(0.5 * np.pi / turn_rate, 0.7 * speed, float(rng.choice([-1.0, 1.0])) * turn_rate),
+        Command(0.5 * np.pi / turn_rate, 0.7 * speed, float(rng.choice([-1.0, 1.0])) * turn_rate),
     ]
 
 

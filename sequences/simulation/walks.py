@@ -139,12 +139,19 @@ def generate_walk(
     count = round(duration * rate) + 1
     wheels = style.carry == "trolley"
     route = random_route(rng, count, rate, style.preferred_speed, wheels, corridors)
+    return carried_along(rng, route, rate, style)
+
+
+def carried_along(
+    rng: np.random.Generator, route: Route, rate: float, style: WalkStyle
+) -> Trajectory:
+    """Return the poses of a device that a person carries along a route sampled at `rate` [Hz]."""
     gait = _gait(rng, rate, route, style)
     motion = _carried(gait, style)
     R_WH = about_z(route.heading)
     R_HD = composed(Rotation.from_rotvec(motion.turn_H), Rotation.from_rotvec(style.mount_rotvec))
     return Trajectory(
-        time=np.arange(count) / rate,
+        time=np.arange(len(gait)) / rate,
         position_W=route.position_W + R_WH.apply(motion.offset_H),
         attitude_WB=composed(R_WH, R_HD),
     )

@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +21,15 @@ from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import resample_to_gyro, source_words
 from stario.sequences.readers.lines import may_be_read
+from stario.sequences.readers.phones.alongside import Recording
 from stario.sequences.readers.phones.attitude import device_attitude, logged_attitude
 from stario.sequences.readers.phones.files import NO_SAMPLES, PhoneFiles, app_of
-from stario.sequences.readers.phones.known_positions import reference_points, satellite_positions
+from stario.sequences.readers.phones.known_positions import (
+    as_known_positions,
+    reference_points,
+    reported_positions,
+)
+from stario.sequences.readers.phones.pressure import recorded_pressure
 from stario.sequences.readers.phones.sensor_table import Samples, SensorTable, read_samples
 from stario.sequences.readers.phones.sensor_words import Sensor
 from stario.sequences.readers.phones.sign import accel_sign, is_in_g
@@ -66,6 +73,9 @@ def assemble_recording(
         folder, gyro.stamps_ns, gyro.values, accel.samples.stamps_ns, accel.samples.values
     )
     converted = {"gyro": gyro.unit not in ("", "rad/s"), **accel.converted}
+    recording = Recording(files.gyro, files.key, stamps[0], stamps[-1])
+    reported = reported_positions(recording)
+    first = next(reported, None)
     sequence = ImuSequence(
         name=name,
         time=seconds(stamps, stamps[0]),
@@ -74,15 +84,18 @@ def assemble_recording(
         converted=frozenset(sensor for sensor, done in converted.items() if done),
         magnetometer=_magnetometer(files, stamps[0], stamps[-1]),
         device_attitude=device_attitude(attitude, stamps[0]),
+        barometer=recorded_pressure(recording),
+        satellites=first,
         source="" if core_motion else source_words(app_of(files), gyro.assumed_time_unit),
         maybe_apple=accel.maybe_apple,
     )
     sequence = with_pose(sequence, stamps[0], poses, orders)
     if sequence.truth is not None:
         return sequence
-    positions = reference_points(folder, files.key, stamps[0], stamps[-1])
-    if positions is None:
-        positions = satellite_positions(files.gyro, files.key, stamps[0], stamps[-1])
+    positions = reference_points(recording)
+    if positions is None and first is not None:
+        tracks = map(as_known_positions, chain([first], reported))
+        positions = next((track for track in tracks if track is not None), None)
     return replace(sequence, positions=positions)
 
 

@@ -4,10 +4,12 @@ Indoor Location's traces (tab-separated): time [ms since 1970], `TYPE_GYROSCOPE`
 `TYPE_ACCELEROMETER` or `TYPE_MAGNETIC_FIELD` and xyz, followed by the biases if uncalibrated;
 `TYPE_WAYPOINT` and x, y [m] on a floor plan, tapped by a surveyor. Some lines lack the line break
 before them. GetSensorData's log files (IPIN's competitions; semicolons, `%` comments): `ACCE`,
-`GYRO` or `MAGN`, the app's and the sensor's time [s] and xyz; `POSI`, the app's time, a count,
-latitude and longitude [deg] of a reference point. Positions are returned as waypoints, horizontal
-and in metres. The device's own attitude is the rotation vector, `TYPE_ROTATION_VECTOR` or the last
-three values of `AHRS`: x, y and z of a quaternion whose w is not negative.
+`GYRO` or `MAGN`, the app's and the sensor's time [s] and xyz; `PRES`, both times and the pressure
+[mbar]; `GNSS`, the app's time and UTC [s], latitude, longitude [deg], altitude [m], bearing [deg],
+accuracy [m] and speed [m/s]; `POSI`, the app's time, a count, latitude and longitude [deg] of a
+reference point and its floor. Reference points are returned as waypoints, horizontal and in metres.
+The device's own attitude is the rotation vector, `TYPE_ROTATION_VECTOR` or the last three values of
+`AHRS`: x, y and z of a quaternion whose w is not negative.
 """
 
 from __future__ import annotations
@@ -29,8 +31,16 @@ from stario.sequences.readers.geodesy import east_north
 from stario.sequences.readers.lines import head_lines, read_lines
 from stario.sequences.readers.phones.attitude import agreeing_attitude, device_attitude
 from stario.sequences.readers.phones.sensor_table import Samples
+from stario.sequences.readers.pressure import barometer
+from stario.sequences.readers.satellites import satellites
 from stario.sequences.readers.text import IntArray, seconds
-from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
+from stario.sequences.sequence import (
+    Barometer,
+    FloatArray,
+    ImuSequence,
+    PositionTrack,
+    Satellites,
+)
 from stario.sequences.time_order import increasing_mask
 
 _log = logging.getLogger(__name__)
@@ -42,19 +52,22 @@ _WAYPOINT, _ROTATION = "TYPE_WAYPOINT", "TYPE_ROTATION_VECTOR"
 
 _EVENT = re.compile(r"(ACCE|GYRO|MAGN);\s*-?\d")
 _CODES = {"accel": "ACCE", "gyro": "GYRO", "mag": "MAGN"}
-_POINT, _AHRS = "POSI", "AHRS"
+_POINT, _AHRS, _PRESSURE = "POSI", "AHRS", "PRES"
+_RARE = ("pressure", _PRESSURE, slice(2, 3)), ("satellites", "GNSS", slice(2, 8))
+"""Codes of optional sensors, and what is used of their lines."""
 
 Rows = tuple[IntArray, FloatArray]
 """Time stamps (N,) [ns] and values (N, K) of one sensor's events."""
 
-Events = tuple[dict[str, Rows], tuple[IntArray, Rotation] | None, Rows | None]
-"""Rows of each sensor, the device's own attitude, and known points."""
+Events = tuple[dict[str, Rows], tuple[IntArray, Rotation] | None]
+"""Rows of each sensor, of "taps" (x, y) and of "places" (latitude, longitude, perhaps floor), and
+the device's own attitude."""
 
 
 def read_event_lines(path: Path) -> ImuSequence:
     """Read a trace or a log file."""
     trace = any(_TRACE.match(line) for line in head_lines(path))
-    sensors, attitude, points = _trace(path) if trace else _logfile(path)
+    sensors, attitude = _trace(path) if trace else _logfile(path)
     for name in ("gyro", "accel"):
         if name not in sensors:
             found = ", ".join(sensors) or "no sensor"
@@ -68,7 +81,9 @@ def read_event_lines(path: Path) -> ImuSequence:
         accel=accel,
         magnetometer=field and magnetometer(seconds(field[0], stamps[0]), field[1]),
         device_attitude=device_attitude(attitude, stamps[0]),
-        positions=None if points is None else _waypoints(points, stamps[0]),
+        positions=_waypoints(sensors, stamps[0]),
+        barometer=_barometer(path, sensors, stamps[0]),
+        satellites=_satellites(sensors, stamps[0]),
     )
 
 
@@ -94,11 +109,42 @@ def _attitude(
     return agreeing_attitude(stamps, np.column_stack([xyz, w]), Samples(*gyro))
 
 
-def _waypoints(points: Rows, start_ns: np.int64) -> PositionTrack | None:
-    order = np.argsort(points[0], kind="stable")
-    time = seconds(points[0][order], start_ns)
+def _waypoints(sensors: dict[str, Rows], start_ns: np.int64) -> PositionTrack | None:
+    kind = next((kind for kind in ("taps", "places") if kind in sensors), None)
+    if kind is None:
+        return None
+    stamps, values = sensors[kind]
+    order = np.argsort(stamps, kind="stable")
+    time = seconds(stamps[order], start_ns)
     keep = increasing_mask(time)
-    return PositionTrack(time[keep], points[1][order][keep], "waypoints") if keep.any() else None
+    if not keep.any():
+        return None
+    time, values = time[keep], values[order][keep]
+    if kind == "taps":
+        return PositionTrack(time, values, "waypoints")
+    degrees, floor = values[:, :2], values[:, 2] if values.shape[1] > 2 else None
+    metres = east_north(degrees)
+    return PositionTrack(time, metres, "waypoints", latlon_deg=degrees, floor=floor)
+
+
+def _barometer(path: Path, sensors: dict[str, Rows], start_ns: np.int64) -> Barometer | None:
+    if "pressure" not in sensors:
+        return None
+    stamps, values = sensors["pressure"]
+    try:
+        return barometer(path, _PRESSURE, seconds(stamps, start_ns), values[:, 0])
+    except ReadError as error:  # the barometer is optional
+        _log.warning("pressure skipped: %s", error)
+        return None
+
+
+def _satellites(sensors: dict[str, Rows], start_ns: np.int64) -> Satellites | None:
+    if "satellites" not in sensors:
+        return None
+    stamps, values = sensors["satellites"]
+    names = ("altitude_m", "bearing_deg", "radius_m", "speed_m_s")
+    rest = dict(zip(names, values[:, 2:].T, strict=True))
+    return satellites(seconds(stamps, start_ns), values[:, :2], rest)
 
 
 def _whole_lines(path: Path, separator: str) -> list[str]:
@@ -133,17 +179,18 @@ def _trace(path: Path) -> Events:
         elif raw is not None:
             stamps, values = _rows(path, kind, raw, 10**6, slice(1, 7))
             sensors[sensor] = stamps, values[:, :3] - values[:, 3:]
-    vectors, taps = events.get(_ROTATION, []), events.get(_WAYPOINT)
+    vectors = events.get(_ROTATION, [])
     attitude = _attitude(path, _ROTATION, vectors, 10**6, slice(1, 4), sensors.get("gyro"))
-    points = None if taps is None else _rows(path, _WAYPOINT, taps, 10**6, slice(1, 3))
-    return sensors, attitude, points
+    if _WAYPOINT in events:
+        sensors["taps"] = _rows(path, _WAYPOINT, events[_WAYPOINT], 10**6, slice(1, 3))
+    return sensors, attitude
 
 
 def _logfile(path: Path) -> Events:
     events: dict[str, list[list[str]]] = {}
     for line in _whole_lines(path, ";"):
         cells = line.strip().split(";")
-        if cells[0] in (*_CODES.values(), _POINT, _AHRS):
+        if cells[0] in (*_CODES.values(), _POINT, _AHRS, *(code for _, code, _ in _RARE)):
             events.setdefault(cells[0], []).append(cells[1:])
     sensors = {
         sensor: _rows(path, code, [row[1:] for row in events[code]], 10**9, slice(1, 4))
@@ -152,13 +199,24 @@ def _logfile(path: Path) -> Events:
     }
     vectors = [row[1:] for row in events.get(_AHRS, [])]
     attitude = _attitude(path, _AHRS, vectors, 10**9, slice(4, 7), sensors.get("gyro"))
-    if _POINT not in events or "ACCE" not in events:
-        return sensors, attitude, None
-    stamps, degrees = _rows(path, _POINT, events[_POINT], 10**9, slice(2, 4))
+    if "ACCE" not in events:
+        return sensors, attitude
     # The app's clock, the first time of an event, differs from the sensors'.
     app, sensor = _rows(path, _CODES["accel"], events[_CODES["accel"]], 10**9, slice(1, 2))
-    stamps = stamps - round(float(np.median(app * 1e-9 - sensor[:, 0])) * 1e9)
-    return sensors, attitude, (stamps, east_north(degrees))
+    offset = round(float(np.median(app * 1e-9 - sensor[:, 0])) * 1e9)
+    if points := events.get(_POINT):
+        stamps, values = _rows(
+            path, _POINT, points, 10**9, slice(2, max(4, min(5, *map(len, points))))
+        )
+        sensors["places"] = stamps - offset, values
+    for kind, code, used in _RARE:
+        try:
+            if code in events:
+                stamps, values = _rows(path, code, events[code], 10**9, used)
+                sensors[kind] = stamps - offset, values
+        except ReadError as error:  # these are optional
+            _log.warning("%s skipped: %s", kind, error)
+    return sensors, attitude
 
 
 def _rows(path: Path, kind: str, rows: Iterable[list[str]], unit_ns: int, used: slice) -> Rows:

@@ -15,7 +15,7 @@ from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.readers import find_recordings
-from stario.sequences.sequence import ImuSequence
+from stario.sequences.sequence import ImuSequence, PositionTrack
 from stario.sequences.truth.alignment import align_tracked_body
 from stario.sequences.truth.clock_offset import clock_offset
 
@@ -128,18 +128,24 @@ def test_a_truncated_event_loses_only_itself(tmp_path: Path, cut: str) -> None:
 def test_reference_points_take_the_time_unit_that_fits_the_recording(
     tmp_path: Path, unit: float
 ) -> None:
+    from stario.sequences.readers.phones.alongside import Recording
     from stario.sequences.readers.phones.known_positions import reference_points
 
     rows = [f"{round(t * unit)},{t},1.0" for t in (0.0, 2.0, 10.0, 28.0)]
     (tmp_path / "walk_ref.csv").write_text("\n".join(["t,x,y", *rows]) + "\n")
-    found = reference_points(tmp_path, "", np.int64(0), np.int64(30 * 10**9))
+
+    def read(start_ns: int) -> PositionTrack | None:
+        start, stop = np.int64(start_ns), np.int64(start_ns + 30 * 10**9)
+        return reference_points(Recording(tmp_path / "gyr.csv", "", start, stop))
+
+    found = read(0)
     assert found is not None
     np.testing.assert_allclose(found.time, [0.0, 2.0, 10.0, 28.0])
     message = (
         r"walk_ref\.csv: time: found .*, expected some within .*, 999999970\.000 to 1000000000"
     )
     with pytest.raises(ReadError, match=message):
-        reference_points(tmp_path, "", np.int64(10**18 - 30 * 10**9), np.int64(10**18))
+        read(10**18 - 30 * 10**9)
 
 
 @pytest.mark.parametrize(("delay", "sorts"), [(2, True), (60, False)])

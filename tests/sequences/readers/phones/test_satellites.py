@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from phone_exports import androsensor, phyphox, sensor_logger
 from phone_files import START_NS, save
+from recorded import DATA
 
 from stario.sequences import ImuSequence, read_recording
 from stario.sequences.readers.geodesy import east_north
@@ -208,3 +209,47 @@ def test_positions_that_cannot_be_used_cost_no_recording(
     assert len(recording) > 1000
     assert ("satellite positions skipped" in caplog.text) == (words is not None)
     assert words is None or words in caplog.text
+
+
+def test_what_a_receiver_reports_is_kept_as_measured(walk: ImuSequence, tmp_path: Path) -> None:
+    """Repeated positions too; what it does not know is NaN, in m, m/s and degrees."""
+    phyphox(tmp_path / "p", walk)
+    place = degrees(METRES)
+    place[6:] = place[6]  # indoors
+    radius = np.where(TIME == 2.0, 0.0, 9.0)
+    bearing = np.where(TIME == 3.0, -1.0, 90.0)
+    header = (
+        "time (s),lat,lon,Height (ft),Velocity (km/h),Direction (°),Accuracy (m),Vertical Accuracy"
+    )
+    columns = [place, np.full(12, 100.0), np.full(12, 3.6), bearing, radius, np.full(12, 77.0)]
+    save(tmp_path / "p/Location.csv", header, TIME, *columns)
+    read = read_recording(tmp_path / "p")
+    found = read.satellites
+    assert found is not None
+    np.testing.assert_allclose(found.time, TIME, atol=1e-9)
+    np.testing.assert_allclose(found.latlon_deg, place, atol=1e-12)
+    expected = {
+        "altitude_m": np.full(12, 30.48),
+        "speed_m_s": np.ones(12),
+        "bearing_deg": np.where(TIME == 3.0, np.nan, 90.0),
+        "radius_m": np.where(TIME == 2.0, np.nan, 9.0),
+    }
+    for name, values in expected.items():
+        np.testing.assert_allclose(getattr(found, name), values, err_msg=name)
+    assert read.positions is not None
+    np.testing.assert_allclose(read.positions.time, TIME[:7], atol=1e-9)
+    np.testing.assert_allclose(read.positions.latlon_deg, place[:7], atol=1e-12)
+
+
+def test_a_file_of_advio_without_titles_is_read() -> None:
+    path = DATA / "raw/advio/advio-15"
+    if not path.is_dir():
+        pytest.skip("ADVIO is not here")
+    found = read_recording(path).satellites
+    assert found is not None
+    np.testing.assert_allclose(found.latlon_deg, [[60.187, 24.8215]] * len(found), atol=1e-3)
+    assert found.radius_m is not None
+    assert found.altitude_m is not None
+    assert found.radius_m.min() >= 5.0
+    assert found.radius_m.max() <= 200.0
+    assert np.ptp(found.altitude_m) < 5.0
