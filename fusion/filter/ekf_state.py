@@ -163,7 +163,7 @@ class EkfState:
     @property
     def offset_row(self) -> int:
         """Row of the error of the barometer's offset, if there is one."""
-        return self.considered_rows.stop
+        return CORE + CLONE * len(self.clone_times) + len(CONSIDERED_SECONDS)
 
     @property
     def field_row(self) -> int:

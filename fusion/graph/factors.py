@@ -195,10 +195,10 @@ class Height(AtKeyframe):
 
     def linearise(self, values: Any) -> Linearised:
         """Linearise along the vertical."""
-        (R, p), v, offset = _pose(values, self.k), values.atVector(V(self.k)), _offset(values, self.k)
+        (R, p), v = _pose(values, self.k), values.atVector(V(self.k))
         H_x, H_v = np.zeros((1, 6)), np.zeros((1, 3))
         H_x[0, 3:], H_v[0, 2] = R[2], self.dt
-        residual = np.array([self.height - p[2] - self.dt * v[2] - offset])
+        residual = np.array([self.height - p[2] - self.dt * v[2] - _offset(values, self.k)])
         return residual, [(X(self.k), H_x), (V(self.k), H_v), (O(self.k), np.ones((1, 1)))]
 
 

@@ -41,11 +41,14 @@ _STILL_CLIMBING = 0.1
 """Vertical speed below which a climb has ended [m/s]."""
 
 _SUDDEN = 0.45
-"""Change [m] against the median of the heights of `CLIMB_DELAY` that is not used before it is known what
-it was."""
+"""Change [m] against the last seconds' median that is not used before it is known what it was."""
 
 _LONGEST_DOUBT = 3.0
 """Time [s] after which it must be known."""
+
+_NO_DOOR, _STILL_MOVING = 1.2, 0.2
+"""Change [m] that is a lift's and no door's, if the last half second has still moved by so much
+[m]."""
 
 _CLEAR_STEP = 0.4
 """Squared residuals about a step, relative to those about the line, below which the air has
@@ -153,7 +156,10 @@ class HeightBuffer(TimedBuffer[float]):
             self._past.popleft()
         line = _line(np.array(self._past))
         climbed, doubt, began = self._climbing, self._doubt, self._past[0]
-        self._climbing, self._doubt = line is not None and self._is_climb(line, climbed), None
+        self._climbing = line is not None and (
+            self._is_climb(line, climbed) or self._is_lift(height - usual)
+        )
+        self._doubt = None
         sample = HeightSample(time, height, self._sigma)
         if line is not None and self._climbing:
             risen = 0.0 if climbed else height - (doubt or began)[1]
@@ -181,6 +187,10 @@ class HeightBuffer(TimedBuffer[float]):
         sigma = math.sqrt(12.0 * _CORRELATION * self._variance / len(self._past)) / CLIMB_DELAY
         least = max(MIN_CLIMB_RATE, _CLIMB_SIGMAS * sigma)
         return abs(line.slope) > least and line.step_ratio > 1.0
+
+    def _is_lift(self, change: float) -> bool:
+        (_, before), (_, now) = self._past[-2], self._past[-1]
+        return abs(change) > _NO_DOOR and (now - before) * change > _STILL_MOVING * abs(change)
 
     def _learn(self, scatter: float) -> None:
         self._count = min(self._count + 1, _SCATTER_COUNT)
