@@ -17,7 +17,6 @@ from stario.fusion.graph.factors import (
     Displacement,
     GyroBias,
     Height,
-    OffsetWalk,
     Position,
     Term,
     Tilt,
@@ -234,16 +233,18 @@ class GraphBuilder:
         self.graph.add(GyroBias(k, zero_velocity.b_g, covariance[3:, 3:]))
 
     def _add_height(self, sample: HeightSample) -> None:
-        graph, before = self.graph, self._last_height
-        k, covariance = graph.last, np.array([[sample.sigma**2]])
+        graph, k, before = self.graph, self.graph.last, self._last_height
+        i, variances = None, [sample.sigma**2]
+        # In a stream the one before may have left the graph.
+        if before is not None and before[0] != k and before[0] in graph.keyframes:
+            i = before[0]
+            walked = WEATHER_WALK**2 * (sample.time - before[1]) + sample.stepped**2
+            variances.append(walked)
         if before is None or before[0] != k:
             graph.add_offset(k, sample.height - float(graph.keyframe(k).p_W[2]))
             self._last_height = k, sample.time
-            # In a stream the one before may have left the graph.
-            if before is not None and before[0] in graph.keyframes:
-                variance = WEATHER_WALK**2 * (sample.time - before[1]) + sample.stepped**2
-                graph.add(OffsetWalk(before[0], k, np.array([[variance]])), gated=False)
-        graph.add(Height(k, sample.height, covariance, sample.time - graph.time(k)))
+        dt = sample.time - graph.time(k)
+        graph.add(Height(i, k, sample.height, dt, np.diag(variances)), gated=False)
 
     def _fix_term(self, fix: Fix, k: int) -> Term:
         graph = self.graph

@@ -180,42 +180,41 @@ class Position(AtKeyframe):
 
 
 @dataclass(frozen=True, eq=False)
-class Height(AtKeyframe):
-    """The height by the air's pressure shortly before or after a keyframe with an offset.
+class Height:
+    """The height by the air's pressure near a keyframe, and its offset's walk since another one.
 
     Attributes:
+        i: the keyframe of the height before; None for the first one, whose offset is free.
+        k: number of the keyframe.
         height: [m].
-        covariance: (1, 1) [m^2].
         dt: time since the keyframe [s].
+        covariance: of the height and, unless it is the first one, of the walk [m^2].
     """
 
+    i: int | None
+    k: int
     height: float
-    covariance: FloatArray
     dt: float
+    covariance: FloatArray
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        """Both keyframes, or the only one."""
+        return (self.k,) if self.i is None else (self.i, self.k)
 
     def linearise(self, values: Any) -> Linearised:
         """Linearise along the vertical."""
         (R, p), v = _pose(values, self.k), values.atVector(V(self.k))
-        H_x, H_v = np.zeros((1, 6)), np.zeros((1, 3))
+        offset = float(values.atVector(O(self.k))[0])
+        rows = len(self.covariance)
+        H_x, H_v, H_o = np.zeros((rows, 6)), np.zeros((rows, 3)), np.ones((rows, 1))
         H_x[0, 3:], H_v[0, 2] = R[2], self.dt
-        residual = np.array([self.height - p[2] - self.dt * v[2] - _offset(values, self.k)])
-        return residual, [(X(self.k), H_x), (V(self.k), H_v), (O(self.k), np.ones((1, 1)))]
-
-
-@dataclass(frozen=True, eq=False)
-class OffsetWalk(Between):
-    """The barometer's offset wanders from keyframe i to keyframe j.
-
-    Attributes:
-        covariance: (1, 1) [m^2].
-    """
-
-    covariance: FloatArray
-
-    def linearise(self, values: Any) -> Linearised:
-        """Linearise it, which is linear."""
-        residual = np.array([_offset(values, self.i) - _offset(values, self.j)])
-        return residual, [(O(self.i), -np.ones((1, 1))), (O(self.j), np.ones((1, 1)))]
+        blocks = [(X(self.k), H_x), (V(self.k), H_v), (O(self.k), H_o)]
+        residual = [self.height - p[2] - self.dt * v[2] - offset]
+        if self.i is not None:
+            residual.append(float(values.atVector(O(self.i))[0]) - offset)
+            blocks.insert(0, (O(self.i), np.array([[0.0], [-1.0]])))
+        return np.array(residual), blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,7 +305,3 @@ class GyroBias(AtKeyframe):
 def _pose(values: Any, k: int) -> tuple[FloatArray, FloatArray]:
     pose = values.atPose3(X(k))
     return pose.rotation().matrix(), pose.translation()
-
-
-def _offset(values: Any, k: int) -> float:
-    return float(values.atVector(O(k))[0])
