@@ -24,6 +24,7 @@ from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import ASSUMED, GYRO_BIAS
 from stario.fusion.filter.record import Record, innovations_of
 from stario.fusion.fixes import Accepted, Fix, FixQueue
+from stario.fusion.floors import FloorChange, floor_changes
 from stario.fusion.graph import fixed_lag
 from stario.fusion.graph.batch import smooth
 from stario.fusion.graph.covariances import with_actual_covariances
@@ -130,6 +131,13 @@ def _smoothed_states(
     return with_undirected(solved, frame.undirected), ""
 
 
+def _floors(states: Sequence[NavState]) -> list[FloorChange]:
+    time, height, speed = np.array(
+        [(s.time, s.p_W[2], math.hypot(s.v_W[0], s.v_W[1])) for s in states]
+    ).T
+    return floor_changes(time, height, speed)[0]
+
+
 def track_recording(
     backend: BackendName,
     recording: PreprocessedRecording,
@@ -158,6 +166,8 @@ def track_recording(
 
     def track(states: list[NavState], note: str = "", filtered: Track | None = None) -> Track:
         health = queue.health(run.last.health(counts, config.filter, states[-1]))
+        if health.pressures:
+            health.floors = _floors(states)
         return track_from_states(
             states,
             innovations,

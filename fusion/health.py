@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+from stario.fusion.floors import FloorChange
+
 Stopped = Literal["both", "gyroscope", "accelerometer"]
 """What has stopped: both sensors, or one alone."""
 
@@ -35,6 +37,7 @@ class Health:
             repeats an earlier one.
         pressures: numbers of heights by the pressure applied (of these gated), of steps of the
             air's pressure, and of refused ones by reason.
+        floors: changes of floor found in the heights of a recording with a barometer.
         pressures_dropped: number of pressures dropped: their value or time is wrong.
         accel_noise_factor: final factor on the accelerometer's configured noise density, estimated
             from the innovations.
@@ -67,6 +70,7 @@ class Health:
     corrections: list[tuple[float, float, float, str]] = field(default_factory=list)
     fields_dropped: int = 0
     pressures: dict[str, int] = field(default_factory=dict)
+    floors: list[FloorChange] = field(default_factory=list)
     pressures_dropped: int = 0
     accel_noise_factor: float = 1.0
     network_error_level: float = 1.0
@@ -107,6 +111,7 @@ class Health:
             text.append(f"magnetometer samples dropped: {self.fields_dropped}")
         if self.pressures:
             text.append(f"heights by the pressure {_counted(self.pressures)}")
+        text += [str(change) for change in self.floors]
         if self.pressures_dropped:
             text.append(f"pressures dropped: {self.pressures_dropped}")
         if self.accel_noise_factor > 1.0:

@@ -60,6 +60,7 @@ for command in (
     *(checks.models, table, checks.fusion, checks.backends, checks.faults),
     *(
         checks.gaps,
+        checks.heights,
         checks.moments,
         checks.simulation,
         checks.fixes,

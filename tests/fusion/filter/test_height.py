@@ -9,9 +9,13 @@ import pytest
 from initial_ekf import Driven
 
 from stario.fusion import Navigator, NavigatorConfig, NavState, Track
+from stario.fusion.evaluation.checks.heights import heights_table, score_heights
+from stario.fusion.evaluation.scores import values
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.height import with_height
 from stario.fusion.imu.barometer import HeightSample
+from stario.fusion.report.panels import motion_panels
+from stario.fusion.report.series import trajectory_series
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import Barometer, ImuSequence
@@ -143,6 +147,36 @@ def test_heights_follow_stairs_and_a_lift(house: HouseWalk, house_track: Track) 
     assert house_track.covariance is not None
     variance = house_track.covariance[:, 8, 8]
     assert 0.05 < np.mean((error - error[0]) ** 2 / variance) < 3.0
+
+
+def test_floors_are_those_of_the_house(house: HouseWalk, house_track: Track) -> None:
+    assert house_track.health is not None
+    found = [(change.after, change.how) for change in house_track.health.floors]
+    assert found == [(stay.floor, stay.way) for stay in house.stays[2:]]
+    for change, before, after in zip(
+        house_track.health.floors, house.stays[1:], house.stays[2:], strict=True
+    ):
+        assert change.start == pytest.approx(before.stop, abs=7.0)  # one waits for the lift
+        assert change.stop == pytest.approx(after.start, abs=4.0)
+    assert any(str(change) in str(house_track.health) for change in house_track.health.floors)
+
+
+def test_the_check_of_heights_tells_with_from_without(house: HouseWalk, level_oracle: Any) -> None:
+    scores = score_heights(level_oracle, house.sequence, CONFIG, "house")
+    assert values(scores, "height_rms", track="pressure")[0] < 0.6
+    assert values(scores, "height_rms", track="none")[0] > 2.0
+    assert values(scores, "floors", track="pressure")[0] == 1.0
+    assert "pressure" in heights_table(scores)
+    with pytest.raises(InputError, match="a recording with one"):
+        score_heights(level_oracle, replace(house.sequence, barometer=None), CONFIG, "house")
+
+
+def test_the_report_draws_floors_along_the_height(house_track: Track) -> None:
+    assert house_track.health is not None
+    series = trajectory_series(house_track.trajectory, 0.0)
+    panels = motion_panels({"track": series}, None, "track", house_track.health.floors)
+    labels = [trace.text[0] for trace in panels[0].traces if trace.text]
+    assert labels == ["floor 0", "floor 1", "floor 4"]
 
 
 def test_without_a_barometer_they_go_unnoticed(house: HouseWalk, level_oracle: Any) -> None:
