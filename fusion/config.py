@@ -6,9 +6,7 @@ saved with its results and can be passed to the next run unchanged.
 
 from __future__ import annotations
 
-import json
 import math
-import tomllib
 from dataclasses import dataclass, field, fields
 from numbers import Real
 from pathlib import Path
@@ -16,10 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ConfigError
-from stario.sequences.files import opened_text
 from stario.sequences.noise import GYRO_SCALE_ERROR, ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
-from stario.sequences.settings import check_number, with_settings
+from stario.sequences.settings import check_number, read_settings, with_settings
 from stario.sequences.windows import WINDOW_SECONDS
 
 UPDATE_RATES = (1, 2, 5, 10, 20)
@@ -182,19 +179,7 @@ def read_config(path: Path | str) -> NavigatorConfig:
     Raises:
         ConfigError: the file is missing or malformed, a key is unknown or a value is invalid.
     """
-    path = Path(path)
-    try:
-        text = opened_text(path)
-        values = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
-    except FileNotFoundError:
-        raise ConfigError(str(path), "no such file", "a TOML or JSON file") from None
-    except OSError as error:
-        found = error.strerror or "an error"
-        raise ConfigError(str(path), found, "a TOML or JSON file") from error
-    except ValueError as error:
-        raise ConfigError(str(path), str(error), "a TOML or JSON file") from error
-    if not isinstance(values, dict):
-        raise ConfigError(str(path), type(values).__name__, "a table of values")
+    values = read_settings(Path(path))
     try:
         return with_settings(NavigatorConfig(), values)
     except ConfigError as error:

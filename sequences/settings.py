@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
+import tomllib
 from dataclasses import fields, is_dataclass, replace
 from numbers import Real
+from pathlib import Path
 from typing import Any, TypeVar
 
 from stario.sequences.errors import ConfigError, InputError
+from stario.sequences.files import opened_text
 
 Group = TypeVar("Group")
 
@@ -22,6 +26,27 @@ def check_number(settings: object, name: str, low: float = 0.0, high: float = ma
     if not (isinstance(value, Real) and math.isfinite(value) and low <= float(value) <= high):
         bounds = f"of at least {low:g}" if high == math.inf else f"from {low:g} to {high:g}"
         raise ConfigError(name, repr(value), f"a finite number {bounds}")
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """Read settings, a table of values, from a TOML or JSON file.
+
+    Raises:
+        ConfigError: the file is missing or malformed.
+    """
+    expected = "a TOML or JSON file"
+    try:
+        text = opened_text(path)
+        values = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
+    except FileNotFoundError:
+        raise ConfigError(str(path), "no such file", expected) from None
+    except OSError as error:
+        raise ConfigError(str(path), error.strerror or "an error", expected) from error
+    except ValueError as error:
+        raise ConfigError(str(path), str(error), expected) from error
+    if not isinstance(values, dict):
+        raise ConfigError(str(path), type(values).__name__, "a table of values")
+    return values
 
 
 def with_settings(default: Group, values: object, name: str = "") -> Group:

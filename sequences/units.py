@@ -51,6 +51,26 @@ PRESSURE_UNITS = {
 }
 """`mbar` is hPa as well."""
 
+METRES_PER_HPA = 8.43
+"""Height that a hectopascal is worth near the sea."""
+
+LOWEST_HPA, HIGHEST_HPA = 300.0, 1100.0
+"""Range of phones' barometers, from 9 km above the sea to 0.7 km below it."""
+
+_PRESSURES = {
+    "hPa": (LOWEST_HPA, HIGHEST_HPA),
+    "Pa": (3e4, 1.1e5),
+    "kPa": (50.0, 110.0),
+    "inHg": (15.0, 32.5),
+}
+"""Values of each unit that are told from those of the others by their size."""
+
+
+def pressure_unit_of(value: float) -> str:
+    """Return the unit in which a value is a plausible pressure, empty if it is in none."""
+    return next((unit for unit, (low, high) in _PRESSURES.items() if low <= value <= high), "")
+
+
 SPEED_UNITS = {"m/s": 1.0, "km/h": 1.0 / 3.6, "mph": 0.44704, "kn": 1852.0 / 3600.0}
 
 _EARTH_UT = (20.0, 80.0)

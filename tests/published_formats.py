@@ -320,10 +320,9 @@ def bag(
             for kind, connection in joined.values():
                 header = ros_header(kinds, stamp, ros1)
                 values = (walk.gyro[k], walk.accel[k], truth.position_W[k], truth.quat_xyzw[k])
-                message = ros_message(kinds, kind, header, *map(np.ndarray.tolist, values))
-                if kind == "sensor_msgs/msg/MagneticField":
-                    tesla = kinds["geometry_msgs/msg/Vector3"](*(1e-6 * field[k]))
-                    message = kinds[kind](header, tesla, np.zeros(9))
+                message = other_message(kinds, kind, header, k, field[k]) or ros_message(
+                    kinds, kind, header, *map(np.ndarray.tolist, values)
+                )
                 writer.write(connection, stamp, pack(message, kind))
     return path
 
@@ -332,6 +331,22 @@ def ros_header(kinds: dict[str, type], stamp: int, ros1: bool) -> object:
     time = kinds["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
     header = kinds["std_msgs/msg/Header"]
     return header(0, time, "base") if ros1 else header(time, "base")
+
+
+def other_message(
+    kinds: dict[str, type], kind: str, header: object, k: int, field: FloatArray
+) -> object | None:
+    """Return the kth message of a magnetometer, barometer or receiver; None for another kind."""
+    if kind == "sensor_msgs/msg/MagneticField":
+        tesla = kinds["geometry_msgs/msg/Vector3"](*(1e-6 * field))
+        return kinds[kind](header, tesla, np.zeros(9))
+    if kind == "sensor_msgs/msg/FluidPressure":
+        return kinds[kind](header, 101_325.0 - k, 0.0)
+    if kind == "sensor_msgs/msg/NavSatFix":
+        status = kinds["sensor_msgs/msg/NavSatStatus"](0, 1)
+        covariance = np.diag([9.0, 9.0, 25.0]).ravel()
+        return kinds[kind](header, status, 48.0, 11.0 + 1e-5 * k, 500.0, covariance, 2)
+    return None
 
 
 def ros_message(

@@ -97,7 +97,7 @@ def test_cluster_distributes_recordings_among_workers_and_skips_a_broken_one(pro
     scores, skipped, workers = example.main(tmp_path, seconds=8.0)
     assert [recording.name for recording in scores] == ["walk-0", "walk-1", "walk-3"]
     for recording in scores:
-        assert recording.metrics["track"]["ate_m"] > 0.0
+        assert recording.record["tracks"]["track"]["ate_m"] > 0.0
     assert [entry.item for entry in skipped] == [str(tmp_path / "walk-2.csv")]
     assert "line 2" in skipped[0].reason
     assert len(workers) == 2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, get_args
@@ -19,6 +18,7 @@ from stario.fusion.commands.common import (
     with_bar,
 )
 from stario.fusion.commands.options import (
+    READING,
     BackendOption,
     ByOption,
     ConfigOption,
@@ -28,10 +28,9 @@ from stario.fusion.commands.options import (
     OptionalPathsArgument,
     PathsArgument,
     ReadingOptions,
-    changed,
     expand_option_groups,
     flag,
-    refuse_unused,
+    refuse,
     refuse_unused_sources,
 )
 
@@ -44,7 +43,7 @@ if TYPE_CHECKING:
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
 
-_WALKS, _SECONDS, _SPLIT = 20, 120.0, "validation"
+GraphOption = Annotated[bool, flag("--graph", help="Also run the graph (slower).")]
 
 
 def models(
@@ -65,13 +64,14 @@ def models(
 
 @expand_option_groups
 def backends(
+    context: typer.Context,
     reading: ReadingOptions,
     estimating: EstimatorOptions,
     paths: OptionalPathsArgument = None,
-    walks: Annotated[int, typer.Option(min=1, help="Number of simulated walks.")] = _WALKS,
-    seconds: Annotated[float, typer.Option(min=5.0, help="Duration of each walk in s.")] = _SECONDS,
+    walks: Annotated[int, typer.Option(min=1, help="Number of simulated walks.")] = 20,
+    seconds: Annotated[float, typer.Option(min=5.0, help="Duration of each walk in s.")] = 120.0,
     data: DataOption = None,
-    split: Annotated[str, typer.Option(help="With --data: split to use.")] = _SPLIT,
+    split: Annotated[str, typer.Option(help="With --data: split to use.")] = "validation",
     as_json: JsonOption = False,
 ) -> None:
     """Compare EKF, graph and fixed-lag graph: accuracy, consistency, speed, slowest update.
@@ -84,38 +84,31 @@ def backends(
         score_walk,
         summary,
     )
-    from stario.fusion.evaluation.scores import joined, records
+    from stario.fusion.evaluation.scores import records
     from stario.network.training.splits import read_packaged_list
 
-    refuse_unused_sources(reading, paths, data, split != _SPLIT)
-    simulated = {"--walks": walks != _WALKS, "--seconds": seconds != _SECONDS}
-    if paths or data is not None:
-        refuse_unused(simulated, "with recordings", "use with simulated walks")
-    else:
-        unused = changed(reading) | changed(estimating)
-        refuse_unused(unused, "with simulated walks", "use with PATH or --data")
-    scores: list[pd.DataFrame] = []
+    refuse_unused_sources(context, paths, data)
+    found: list[pd.DataFrame] = []
     skipped: list[Skipped] = []
     if paths or data is not None:
-        settings, network = estimating.settings(), estimating.network()
-        scores, skipped = _score_each(
-            "backends",
-            reading,
-            paths or [entry.path for entry in read_packaged_list(split, data or Path())],
-            lambda path, sequence: score_recording(network, sequence, settings),
-        )
+        refuse(context, "with recordings", "use with simulated walks", "walks", "seconds")
+        files = paths or [entry.path for entry in read_packaged_list(split, data or Path())]
+        score = partial(score_recording, estimating.network(), config=estimating.settings())
+        found, skipped = map_recordings("backends", reading, files, lambda path, each: score(each))
     else:
-        for seed in with_bar("backends", range(walks), walks):
-            scores.append(score_walk(seed, seconds))
-    if scores:
-        found = joined(scores)
-        record = {"summary": summary(found), "scores": records(found)}
-        print_result(as_json, record, score_table(found))
-    exit_if_skipped(skipped)
+        unused = (*READING, "config", "model", "magnetometer", "declination")
+        refuse(context, "with simulated walks", "use with PATH or --data", *unused)
+        found = [score_walk(seed, seconds) for seed in with_bar("backends", range(walks), walks)]
+
+    def record(scores: pd.DataFrame) -> object:
+        return {"summary": summary(scores), "scores": records(scores)}
+
+    _print_scores(found, skipped, score_table, as_json, record)
 
 
 @expand_option_groups
 def faults(
+    context: typer.Context,
     reading: ReadingOptions,
     estimating: EstimatorOptions,
     path: Annotated[
@@ -139,14 +132,14 @@ def faults(
     from stario.fusion.evaluation.scores import records
 
     if not network:
-        refuse_unused(changed(estimating, "model"), "without --network", "use with --network")
+        refuse(context, "without --network", "use with --network", "model")
     settings = estimating.settings()
     if path is not None:
-        refuse_unused(changed(reading, "where"), "with one recording", "no filter")
+        refuse(context, "with one recording", "no filter", "where")
         sequence = reading.read(path)
     else:
-        unused = changed(reading) | changed(estimating, "magnetometer", "declination")
-        refuse_unused(unused, "with the simulated walk", "use with PATH")
+        unused = (*READING, "magnetometer", "declination")
+        refuse(context, "with the simulated walk", "use with PATH", *unused)
         sequence, matched = matched_walk(seed=seed)
         settings = matched if estimating.config is None else settings
     scores = run_faults(sequence, settings, estimating.network() if network else None, seed)
@@ -189,14 +182,13 @@ def fusion(
     reading: ReadingOptions,
     estimating: EstimatorOptions,
     by: ByOption = "set",
-    graph: Annotated[bool, flag("--graph", help="Also run the graph (slower).")] = False,
+    graph: GraphOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Compare the filter's error with the network's by group, with NIS and consistency of yaw."""
-    from stario.fusion.evaluation.checks.fusion_gain import fusion_gain, fusion_gain_table
+    from stario.fusion.evaluation.checks.fusion import fusion_gain, fusion_gain_table
 
-    backends: tuple[BackendName, ...] = ("ekf", "graph") if graph else ("ekf",)
-    judge = partial(fusion_gain, backends=backends)
+    judge = partial(fusion_gain, backends=_backends(graph))
     _check_groups(reading, paths, estimating, by, judge, fusion_gain_table, as_json)
 
 
@@ -213,7 +205,7 @@ def fixes(
 ) -> None:
     """Supply periodic true positions; check that position and yaw errors match their sigmas."""
     from stario.fusion.backends import BackendName
-    from stario.fusion.evaluation.checks.with_fixes import fixes_table, track_with_fixes
+    from stario.fusion.evaluation.checks.fusion import fixes_table, track_with_fixes
     from stario.sequences.arrays import check_choice
 
     chosen: BackendName = check_choice("--backend", backend, get_args(BackendName))
@@ -223,10 +215,11 @@ def fixes(
 
 @expand_option_groups
 def heights(
+    context: typer.Context,
     reading: ReadingOptions,
     estimating: EstimatorOptions,
     paths: OptionalPathsArgument = None,
-    walks: Annotated[int, typer.Option(min=1, help="Number of simulated walks.")] = 2 * _WALKS,
+    walks: Annotated[int, typer.Option(min=1, help="Number of simulated walks.")] = 40,
     by: ByOption = "set",
     as_json: JsonOption = False,
 ) -> None:
@@ -239,13 +232,10 @@ def heights(
     if paths:
         _check_groups(reading, paths, estimating, by, score_heights, heights_table, as_json)
         return
-    refuse_unused(changed(reading), "with simulated walks", "use with PATH")
-    model, settings = estimating.network(), estimating.settings()
-    found = [
-        score_house(model, seed, settings)
-        for seed in with_bar("check heights", range(walks), walks)
-    ]
-    _print_table(found, [], heights_table, as_json)
+    refuse(context, "with simulated walks", "use with PATH", *READING)
+    judge = partial(score_house, estimating.network(), config=estimating.settings())
+    found = [judge(seed) for seed in with_bar("heights", range(walks), walks)]
+    _print_scores(found, [], heights_table, as_json)
 
 
 @expand_option_groups
@@ -257,17 +247,18 @@ def gaps(
     as_json: JsonOption = False,
 ) -> None:
     """Remove 0.1 s at one of six instants or 5 % of the samples; report how far the end moves."""
-    from stario.fusion.evaluation.checks.sample_loss import end_shift_table, end_shifts
+    from stario.fusion.evaluation.checks.fusion import end_shift_table, end_shifts
 
     _check_groups(reading, paths, estimating, by, end_shifts, end_shift_table, as_json)
 
 
 @expand_option_groups
 def moments(
+    context: typer.Context,
     reading: ReadingOptions,
     estimating: EstimatorOptions,
     paths: OptionalPathsArgument = None,
-    graph: Annotated[bool, flag("--graph", help="Also run the graph (slower).")] = False,
+    graph: GraphOption = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the moments.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -275,36 +266,28 @@ def moments(
 
     Without PATH, use simulated walks in a building.
     """
-    from stario.fusion.evaluation.checks.moments import (
-        moment_costs,
-        moment_table,
-        simulated_walks,
-    )
+    from stario.fusion.evaluation.checks.moments import moment_costs, moment_table, simulated_walks
 
-    backends: tuple[BackendName, ...] = ("ekf", "graph") if graph else ("ekf",)
-    model, settings = estimating.network(), estimating.settings()
     skipped: list[Skipped] = []
-    judge = partial(moment_costs, model, config=settings, backends=backends, seed=seed)
+    model, settings = estimating.network(), estimating.settings()
+    judge = partial(moment_costs, model, config=settings, backends=_backends(graph), seed=seed)
     if paths:
-        found, skipped = _score_each(
-            "check moments", reading, paths, lambda path, sequence: judge(sequence)
-        )
+        found, skipped = map_recordings("moments", reading, paths, lambda path, each: judge(each))
     else:
-        refuse_unused(changed(reading), "with simulated walks", "use with PATH")
+        refuse(context, "with simulated walks", "use with PATH", *READING)
         walks = simulated_walks()
-        found = [judge(walk) for walk in with_bar("check moments", walks, len(walks))]
-    _print_table(found, skipped, moment_table, as_json)
+        found = [judge(walk) for walk in with_bar("moments", walks, len(walks))]
+    _print_scores(found, skipped, moment_table, as_json)
 
 
 @expand_option_groups
 def simulation(
+    context: typer.Context,
     reading: ReadingOptions,
     estimating: EstimatorOptions,
     paths: OptionalPathsArgument = None,
     walks: Annotated[int, typer.Option(min=1, help="Simulated walks of each way.")] = 10,
-    seconds: Annotated[
-        float, typer.Option(min=10.0, help="Duration of each walk in s.")
-    ] = _SECONDS,
+    seconds: Annotated[float, typer.Option(min=10.0, help="Duration of each walk in s.")] = 120.0,
     as_json: JsonOption = False,
 ) -> None:
     """Compare simulated walks with recordings by way of carrying: motion by band, steps, errors.
@@ -322,25 +305,23 @@ def simulation(
     )
 
     if not paths:
-        refuse_unused(changed(reading), "with simulated walks", "use with PATH")
-    model, settings = estimating.network(), estimating.settings()
+        refuse(context, "with simulated walks", "use with PATH", *READING)
+    judge = partial(motion_scores, estimating.network(), config=estimating.settings())
     wanted = [(carry, seed) for carry in SPEEDS for seed in range(walks)]
     found = [
-        motion_scores(model, simulated_walk(carry, seed, seconds), settings, carry, SIMULATED)
-        for carry, seed in with_bar("check simulation", wanted, len(wanted))
+        judge(simulated_walk(carry, seed, seconds), carry=carry, kind=SIMULATED)
+        for carry, seed in with_bar("simulation", wanted, len(wanted))
     ]
-    skipped: list[Skipped] = []
-    if paths:
-        recorded, skipped = _score_each(
-            "check simulation",
-            reading,
-            paths,
-            lambda path, sequence: motion_scores(
-                model, sequence, settings, carry_of(sequence), RECORDED
-            ),
-        )
-        found += recorded
-    _print_table(found, skipped, motion_table, as_json)
+
+    def recorded(path: Path, sequence: ImuSequence) -> pd.DataFrame:
+        return judge(sequence, carry=carry_of(sequence), kind=RECORDED)
+
+    more, skipped = map_recordings("simulation", reading, paths or [], recorded)
+    _print_scores(found + more, skipped, motion_table, as_json)
+
+
+def _backends(graph: bool) -> tuple[BackendName, ...]:
+    return ("ekf", "graph") if graph else ("ekf",)
 
 
 def _check_groups(
@@ -362,38 +343,22 @@ def _check_groups(
     def judged(path: Path, sequence: ImuSequence) -> pd.DataFrame:
         return judge(model, sequence, settings, labels(path, sequence.attributes)[grouping])
 
-    _print_table(*_score_each("check", reading, paths, judged), table, as_json)
+    _print_scores(*map_recordings("check", reading, paths, judged), table, as_json)
 
 
-def _score_each(
-    title: str,
-    reading: ReadingOptions,
-    paths: Sequence[Path],
-    score: Callable[[Path, ImuSequence], pd.DataFrame],
-) -> tuple[list[pd.DataFrame], list[Skipped]]:
-    """Score each recording, under a name of its own; return the scores and what was skipped."""
-    from stario.fusion.evaluation.compare import distinct_name
-
-    names: set[str] = set()
-
-    def named(path: Path, sequence: ImuSequence) -> pd.DataFrame:
-        return score(path, replace(sequence, name=distinct_name(sequence.name, names)))
-
-    return map_recordings(title, reading, paths, named)
-
-
-def _print_table(
+def _print_scores(
     found: Sequence[pd.DataFrame],
     skipped: Sequence[Skipped],
     table: Callable[[pd.DataFrame], str],
     as_json: bool,
+    record: Callable[[pd.DataFrame], object] | None = None,
 ) -> None:
     """Print scores as a table or JSON, and exit with 1 if any recording was skipped."""
     from stario.fusion.evaluation.scores import joined, records
 
     if found:
         scores = joined(found)
-        print_result(as_json, records(scores), table(scores))
+        print_result(as_json, (record or records)(scores), table(scores))
     elif as_json:
         print_result(as_json, [])
     exit_if_skipped(skipped)

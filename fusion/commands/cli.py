@@ -56,18 +56,11 @@ for command in (run, live, compare, evaluate, inspect, convert, train, simulate,
     app.command()(command)
 
 check = typer.Typer(no_args_is_help=True, help="Check estimators and networks on this machine.")
-for command in (
-    *(checks.models, table, checks.fusion, checks.backends, checks.faults),
-    *(
-        checks.gaps,
-        checks.heights,
-        checks.moments,
-        checks.simulation,
-        checks.fixes,
-        checks.consistency,
-        checks.benchmark,
-    ),
-):
+for command in (checks.models, table, checks.fusion, checks.backends, checks.faults, checks.gaps):
+    check.command()(command)
+for command in (checks.moments, checks.heights, checks.simulation, checks.fixes):
+    check.command()(command)
+for command in (checks.consistency, checks.benchmark):
     check.command()(command)
 app.add_typer(check, name="check")
 

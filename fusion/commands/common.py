@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import typer
 
 from stario.fusion.commands.options import EstimatorOptions, ReadingOptions
-from stario.sequences.errors import ConfigError, InputError
+from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.fusion.recording import Progress
@@ -39,11 +38,21 @@ def map_recordings(
     paths: Sequence[Path],
     work: Callable[[Path, ImuSequence], Result],
 ) -> tuple[list[Result], list[Skipped]]:
-    """Apply `work` to each recording and its path; return results and failures."""
+    """Apply `work` to each path and its recording, under a name of its own.
+
+    Return results and failures.
+    """
+    from stario.fusion.evaluation.compare import distinct_name
     from stario.sequences.datasets.batch import each, without_skipped
 
     files, skipped = reading.recordings(paths)
-    outcomes = each(lambda file: work(file, reading.read(file)), files, jobs=1)
+    names: set[str] = set()
+
+    def of_named(file: Path) -> Result:
+        sequence = reading.read(file)
+        return work(file, replace(sequence, name=distinct_name(sequence.name, names)))
+
+    outcomes = each(of_named, files, jobs=1)
     return list(without_skipped(with_bar(title, outcomes, len(files)), skipped)), skipped
 
 
@@ -55,15 +64,10 @@ def process_each(
     as_json: bool,
     single: str = "",
 ) -> None:
-    """Apply `work` to each recording, giving each its own folder for files, and print the results.
+    """Apply `work` to each recording and a folder of its own; print the records or the texts.
 
-    Args:
-        reading: options for reading recordings.
-        paths: recordings, folders or list files.
-        out: folder of a single recording, or parent folder of several; None for `runs`/NAME.
-        work: function of a recording and its folder, distinct for each; returns record and text.
-        as_json: whether to print the records rather than the texts.
-        single: name of an option in use that allows only one recording; empty if none.
+    The folder is `out` for a single recording, else within it; None for `runs`/NAME. An option that
+    allows only one recording is named by `single`.
     """
     from stario.fusion.evaluation.compare import distinct_name
     from stario.fusion.evaluation.folders import check_folder
@@ -200,58 +204,29 @@ def origin_of(
     network: DisplacementModel,
     fixes: Path | None = None,
 ) -> dict[str, object]:
-    """Return the content of `run.json`; the settings are in `config.json`.
-
-    Args:
-        paths: recordings, or the folders or list files that were given.
-        reading: options for reading recordings; those that differ from the defaults are named.
-        estimating: options of the estimator.
-        network: the network that they name.
-        fixes: file of absolute fixes.
-    """
+    """Return the content of `run.json`: what was read, by which network and with which fixes."""
     from importlib.metadata import version
 
-    default = asdict(ReadingOptions())
     return {
         "stario": version("stario-nav"),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "model": estimating.model,
         "weights_sha256": network.card.sha256 or None,
         "inputs": [str(path.absolute()) for path in paths],
-        "reading": {k: v for k, v in asdict(reading).items() if v != default[k]},
+        "reading": reading.changed(),
         "fixes": fixes and str(fixes.absolute()),
     }
 
 
 def training_command(paths: Sequence[Path], reading: ReadingOptions) -> str:
     """Return the command that trains weights on these recordings, read in the same way."""
-    default = asdict(ReadingOptions())
     options = [
         f"--{name.replace('_', '-')}={each}"
-        for name, value in asdict(reading).items()
-        if value != default[name]
+        for name, value in reading.changed().items()
         for each in (value if isinstance(value, list) else [value])
     ]
     words = ["stario", "train", *map(str, paths), *options, "--start-from", "default"]
     return shlex.join(words)
-
-
-def recipe_values(path: Path) -> dict[str, Any]:
-    """Read the settings of a training recipe from a JSON file.
-
-    Raises:
-        ConfigError: the file cannot be read, or is not a table of settings.
-    """
-    from stario.sequences.files import opened_text
-
-    try:
-        values = json.loads(opened_text(path))
-    except (OSError, ValueError) as error:
-        found = "no such file" if isinstance(error, FileNotFoundError) else str(error)
-        raise ConfigError(str(path), found, "a JSON file with settings") from error
-    if not isinstance(values, dict):
-        raise ConfigError(str(path), type(values).__name__, "a table of settings")
-    return values
 
 
 def names_in(text: str) -> list[str]:

@@ -21,6 +21,7 @@ from stario.fusion.commands.common import (
     training_command,
 )
 from stario.fusion.commands.options import (
+    READING,
     CompareOutOption,
     EstimatorOptions,
     ExplainOption,
@@ -30,9 +31,8 @@ from stario.fusion.commands.options import (
     OptionalPathsArgument,
     ReadingOptions,
     ReportOption,
-    changed,
     expand_option_groups,
-    refuse_unused,
+    refuse,
 )
 from stario.sequences.errors import InputError
 
@@ -46,6 +46,7 @@ _SHOWN = ("track", "dead_reckoning")
 
 @expand_option_groups
 def compare(
+    context: typer.Context,
     reading: ReadingOptions,
     estimating: EstimatorOptions,
     paths: OptionalPathsArgument = None,
@@ -69,15 +70,14 @@ def compare(
     """
     from stario.fusion.evaluation.compare import TRACKS, compare_recordings, demonstration
     from stario.fusion.evaluation.folders import check_folder
-    from stario.fusion.evaluation.results import scores_dict, write_comparison
-    from stario.fusion.evaluation.summary import scores_of
+    from stario.fusion.evaluation.results import metrics_dict, write_comparison
     from stario.fusion.fix_file import read_fixes
     from stario.sequences.arrays import check_choice
     from stario.sequences.datasets.batch import without_skipped
     from stario.sequences.lazy import optional_package
 
     if not paths:
-        refuse_unused(changed(reading), "without PATH", "use with a recording to read")
+        refuse(context, "without PATH", "use with a recording to read", *READING)
     if report:
         optional_package("plotly", "report")
     chosen = TRACKS if tracks == "all" else [*_SHOWN, *(names_in(tracks) if tracks else [])]
@@ -114,9 +114,10 @@ def compare(
         first = folder / comparisons[0].sequence.name / "plan.png"
         lines.append(f"figures and tracks: {first} and {len(written) - 1} other files")
         if not paths:
-            lines.append(f"next: {_command()} run FILE --report, with a phone's recording")
-        scores = [scores_of(comparison) for comparison in comparisons]
-        print_result(as_json, scores_dict(scores), "\n".join(lines))
+            command = "stario" if shutil.which("stario") else sys.argv[0]  # in no PATH: its own
+            lines.append(f"next: {command} run FILE --report, with a phone's recording")
+        records = {found.sequence.name: found.as_dict() for found in comparisons}
+        print_result(as_json, metrics_dict(records, comparisons[0].words), "\n".join(lines))
     exit_if_skipped(skipped)
 
 
@@ -132,8 +133,3 @@ def _lines(found: Comparison, as_table: bool) -> list[str]:
     line = f"{found.sequence.name}: StarIO's track: {words}; dead reckoning: {distance(far)}"
     table = [track_table(found)] if as_table else []
     return [line, *table, *(finding.line() for finding in found.verdict)]
-
-
-def _command() -> str:
-    """Return how this command can be typed again: from a virtual environment, with its path."""
-    return "stario" if shutil.which("stario") else sys.argv[0]

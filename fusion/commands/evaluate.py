@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, get_args
+from typing import TYPE_CHECKING, Annotated, NamedTuple, get_args
 
 import typer
 
@@ -14,7 +15,6 @@ from stario.fusion.commands.common import (
     origin_of,
     print_result,
     progress_bar,
-    with_bar,
 )
 from stario.fusion.commands.options import (
     DataOption,
@@ -25,27 +25,33 @@ from stario.fusion.commands.options import (
     OptionalPathsArgument,
     ReadingOptions,
     RunsOption,
-    changed,
     expand_option_groups,
     flag,
-    refuse_unused,
+    refuse,
     refuse_unused_sources,
 )
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
-    from stario.fusion.config import NavigatorConfig
     from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
     from stario.network.model import DisplacementModel
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.splits import ListEntry
 
 _GROUP, _SET = "{group}", "{set}"
-_SPLIT, _RUNS = "test", Path("runs")
+
+
+class _Found(NamedTuple):
+    """An evaluation: its record, its text, and what writes its files into a folder."""
+
+    record: object
+    text: str
+    write: Callable[[Path], object]
 
 
 @expand_option_groups
 def evaluate(
+    context: typer.Context,
     reading: ReadingOptions,
     estimating: EstimatorOptions,
     paths: OptionalPathsArgument = None,
@@ -56,7 +62,7 @@ def evaluate(
             help="With --data: test, validation, training, holdout, all, open, or a list file "
             "with lines of name, group."
         ),
-    ] = _SPLIT,
+    ] = "test",
     by: Annotated[
         str | None,
         typer.Option(
@@ -82,11 +88,10 @@ def evaluate(
             "default, or weights files; several weights of one network are averaged.",
         ),
     ] = None,
-    runs: RunsOption = _RUNS,
+    runs: RunsOption = Path("runs"),
     convention: Annotated[
-        str | None,
-        typer.Option(help="How --models averages position errors: rms (default), ronin or mean."),
-    ] = None,
+        str, typer.Option(help="How --models averages position errors: rms, ronin or mean.")
+    ] = "rms",
     jobs: JobsOption = 1,
     out: EvaluateOutOption = None,
     as_json: JsonOption = False,
@@ -97,46 +102,38 @@ def evaluate(
 
     if out is not None:
         check_folder(out)
-    refuse_unused_sources(reading, paths, data, split != _SPLIT)
-    _refuse_unused(estimating, by, against, ekf, models, convention, runs)
+    refuse_unused_sources(context, paths, data)
+    _refuse_unused(context, by, models)
     listed, skipped = _listed(reading, paths or [], data, split)
     files = [entry.path for entry in listed]
+    named = [estimating.model, against or ""] if models is None else names_in(models)
     if data is not None:
-        names = [estimating.model, against or ""] if models is None else names_in(models)
-        warn_of_learned(names, files, data)
+        warn_of_learned(named, files, data)
     if by is not None:
-        skipped += _groups(listed, reading, by, estimating.model, against, ekf, jobs, out, as_json)
+        found, failed = _groups(listed, reading, by, estimating.model, against, ekf, jobs)
     elif models is not None:
-        settings, averaging = estimating.settings(), convention or "rms"
-        names = names_in(models)
-        skipped += _networks(names, runs, files, settings, reading, averaging, jobs, out, as_json)
+        found, failed = _networks(named, runs, files, reading, estimating, convention, jobs)
     else:
-        skipped += _tracks(files, reading, estimating, jobs, out, as_json)
-    exit_if_skipped(skipped)
+        found, failed = _tracks(files, reading, estimating, jobs, out)
+    if found is not None:
+        if out is not None:
+            found.write(out)
+        print_result(as_json, found.record, found.text)
+    exit_if_skipped(skipped + failed)
 
 
-def _refuse_unused(
-    estimating: EstimatorOptions,
-    by: str | None,
-    against: str | None,
-    ekf: bool,
-    models: str | None,
-    convention: str | None,
-    runs: Path,
-) -> None:
+def _refuse_unused(context: typer.Context, by: str | None, models: str | None) -> None:
     """Refuse options that the chosen kind of evaluation does not use."""
     if by is None:
-        grouped = {"--against": against is not None, "--ekf": ekf}
-        refuse_unused(grouped, "without --by", "a grouping, such as --by set")
+        refuse(context, "without --by", "a grouping, such as --by set", "against", "ekf")
     else:
-        refuse_unused({"--models": models is not None}, "with --by", "--model and --against")
-        settings = changed(estimating, "config", "magnetometer", "declination")
-        refuse_unused(settings, "with --by", "use without: the network alone is judged")
+        refuse(context, "with --by", "--model and --against", "models")
+        alone = "use without: the network alone is judged"
+        refuse(context, "with --by", alone, "config", "magnetometer", "declination")
     if models is None:
-        listed = {"--convention": convention is not None, "--runs": runs != _RUNS}
-        refuse_unused(listed, "without --models", "networks named with --models")
+        refuse(context, "without --models", "networks named with --models", "convention", "runs")
     else:
-        refuse_unused(changed(estimating, "model"), "with --models", "one of the two")
+        refuse(context, "with --models", "one of the two", "model")
 
 
 def _listed(
@@ -160,9 +157,8 @@ def _tracks(
     estimating: EstimatorOptions,
     jobs: int,
     out: Path | None,
-    as_json: bool,
-) -> list[Skipped]:
-    """Write and print the table of recordings; return those that were skipped."""
+) -> tuple[_Found | None, list[Skipped]]:
+    """Return the table of recordings, whose tracks are written one by one, and those skipped."""
     from stario.fusion.evaluation.compare import compare_recordings
     from stario.fusion.evaluation.results import write_recording, write_summary
     from stario.fusion.evaluation.summary import Scores, scores_of, summary, summary_table
@@ -172,7 +168,7 @@ def _tracks(
     model = estimating.for_processes(network, jobs)
     origin = origin_of(files, reading, estimating, network)
     skipped: list[Skipped] = []
-    recordings: list[Scores] = []
+    scores: list[Scores] = []
     with progress_bar("evaluate", 100 * len(files)) as progress:
         outcomes = compare_recordings(
             files, model, settings, reading.read, jobs, truth_needed=True, progress=progress
@@ -180,50 +176,41 @@ def _tracks(
         for comparison in without_skipped(outcomes, skipped):
             if out is not None:
                 write_recording(out, comparison)
-            recordings.append(scores_of(comparison))
-    if recordings:
-        if out is not None:
-            write_summary(out, recordings, settings, origin)
-        print_result(as_json, summary(recordings), summary_table(recordings))
-    return skipped
+            scores.append(scores_of(comparison))
+    if not scores:
+        return None, skipped
+    records = {each.name: each.record for each in scores}
+    write = partial(write_summary, records=records, config=settings, origin=origin)
+    return _Found(summary(scores), summary_table(scores), write), skipped
 
 
 def _networks(
-    names: list[str],
+    names: Sequence[str],
     runs: Path,
     files: list[Path],
-    settings: NavigatorConfig,
     reading: ReadingOptions,
+    estimating: EstimatorOptions,
     convention: str,
     jobs: int,
-    out: Path | None,
-    as_json: bool,
-) -> list[Skipped]:
-    """Write and print the table of networks; return the recordings that were skipped."""
+) -> tuple[_Found | None, list[Skipped]]:
+    """Return the table of networks, and the recordings that were skipped."""
     from stario.fusion.evaluation.figures import write_table
-    from stario.fusion.evaluation.networks import compare_networks, table_dict
-    from stario.fusion.evaluation.text import networks_text
+    from stario.fusion.evaluation.networks import compare_networks, networks_text, table_dict
     from stario.network.model import load_model, weights_named
     from stario.sequences.accuracy.metrics import Convention
     from stario.sequences.arrays import check_choice
 
     averaging: Convention = check_choice("convention", convention, get_args(Convention))
-    networks = {name: load_model(weights_named(name, runs)) for name in names}
+    networks = [(name, load_model(weights_named(name, runs))) for name in names]
+    settings = estimating.settings()
     with progress_bar("evaluate", 100 * len(files)) as progress:
         table, skipped = compare_networks(
-            files,
-            list(networks.items()),
-            settings,
-            reading.read,
-            averaging,
-            jobs,
-            progress=progress,
+            files, networks, settings, reading.read, averaging, jobs, progress
         )
-    if table is not None:
-        if out is not None:
-            write_table(out, table)
-        print_result(as_json, table_dict(table), networks_text(table))
-    return skipped
+    if table is None:
+        return None, skipped
+    write = partial(write_table, table=table)
+    return _Found(table_dict(table), networks_text(table), write), skipped
 
 
 def _groups(
@@ -234,16 +221,16 @@ def _groups(
     theirs: str | None,
     ekf: bool,
     jobs: int,
-    out: Path | None,
-    as_json: bool,
-) -> list[Skipped]:
-    """Write and print the table of groups; return the recordings that were skipped."""
-    from stario.fusion.evaluation.benchmark.aligned import aligned_recordings
-    from stario.fusion.evaluation.benchmark.groups import By, benchmark, benchmark_dict
+) -> tuple[_Found | None, list[Skipped]]:
+    """Return the table of groups, and the recordings that were skipped."""
+    from stario.fusion.evaluation.benchmark.groups import (
+        By,
+        benchmark,
+        benchmark_dict,
+        benchmark_text,
+    )
     from stario.fusion.evaluation.figures import write_benchmark
-    from stario.fusion.evaluation.text import benchmark_text
     from stario.sequences.arrays import check_choice
-    from stario.sequences.datasets.cache_files import cache_folder
 
     grouping: By = check_choice("--by", by, get_args(By))
     names = [ours] if theirs is None else [ours, theirs]
@@ -251,18 +238,15 @@ def _groups(
     for name in names:
         if _GROUP not in name and _SET not in name:
             _for_group(name, "")  # fail on unloadable weights before preparing anything
-    paths = [entry.path for entry in recordings]
-    aligned = aligned_recordings(paths, reading.read, reading.as_read(), cache_folder(), jobs)
     groups = {entry.path: entry.group for entry in recordings}
-    shown = with_bar("benchmark", aligned, len(recordings))
-    found, skipped = benchmark(shown, models, groups, reading.read if ekf else None)
-    if found is not None:
-        rows = found.rows(grouping, ours, theirs)
-        if out is not None:
-            write_benchmark(out, found, rows, ours, theirs)
-        record = benchmark_dict(found, rows, ours, theirs)
-        print_result(as_json, record, benchmark_text(rows, ours, theirs))
-    return skipped
+    with progress_bar("evaluate", len(groups)) as progress:
+        found, skipped = benchmark(groups, models, reading.read, jobs, ekf, progress)
+    if found is None:
+        return None, skipped
+    rows = found.rows(grouping, ours, theirs)
+    write = partial(write_benchmark, found=found, rows=rows, ours=ours, theirs=theirs)
+    record = benchmark_dict(found, rows, ours, theirs)
+    return _Found(record, benchmark_text(rows, ours, theirs), write), skipped
 
 
 @cache
@@ -270,9 +254,7 @@ def _loaded(name: str) -> DisplacementModel | PedestrianDeadReckoning:
     from stario.fusion.evaluation.pedestrian import NAME, PedestrianDeadReckoning
     from stario.network.model import load_model
 
-    if name == NAME:
-        return PedestrianDeadReckoning()
-    return load_model(name)
+    return PedestrianDeadReckoning() if name == NAME else load_model(name)
 
 
 def _for_group(name: str, group: str) -> DisplacementModel | PedestrianDeadReckoning:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -119,6 +119,11 @@ class ReadingOptions:
         ),
     ] = None
 
+    def changed(self) -> dict[str, object]:
+        """Return the options that differ from their defaults."""
+        default = asdict(ReadingOptions())
+        return {name: value for name, value in asdict(self).items() if value != default[name]}
+
     def as_read(self) -> dict[str, object]:
         """Return the options that affect a recording's values: all except `where`."""
         return {name: value for name, value in asdict(self).items() if name != "where"}
@@ -133,9 +138,9 @@ class ReadingOptions:
         from stario.sequences.readers import find_recordings
 
         if self.format != "auto":  # a named format applies to the path itself
-            refuse_unused(
-                changed(self, "where"), "with --format", "use with folders, lists or archives"
-            )
+            if self.where:
+                expected = "use with folders, lists or archives"
+                raise InputError("--where", "use with --format", expected)
             return list(paths), []
         chosen = _attributes(self.where or ())
         files: list[Path] = []
@@ -161,7 +166,7 @@ class ReadingOptions:
         except InputError as error:
             if error.field not in self.as_read():
                 raise
-            field = _option(error.field)
+            field = f"--{error.field.replace('_', '-')}"
             raise InputError(field, error.found, error.expected, error.fix) from None
 
     def _read(self, path: Path) -> ImuSequence:
@@ -214,8 +219,9 @@ class EstimatorOptions:
         if not self.magnetometer:
             chosen = replace(chosen, magnetometer=False)
         if self.declination is not None:
-            unused = {"--declination": not chosen.magnetometer}
-            refuse_unused(unused, "with --no-magnetometer", "use with the magnetometer")
+            if not chosen.magnetometer:
+                found, expected = "use with --no-magnetometer", "use with the magnetometer"
+                raise InputError("--declination", found, expected)
             chosen = replace(chosen, declination=math.radians(self.declination))
         return replace(config, filter=chosen)
 
@@ -230,47 +236,39 @@ class EstimatorOptions:
         return network if jobs == 1 else self.model
 
 
-def changed(group: ReadingOptions | EstimatorOptions, *names: str) -> dict[str, bool]:
-    """Return by command-line option whether these fields, or all, differ from their defaults."""
-    default, negated = type(group)(), {"magnetometer": "no-magnetometer"}
-    return {
-        _option(negated.get(name, name)): value != getattr(default, name)
-        for name, value in asdict(group).items()
-        if not names or name in names
-    }
+READING = tuple(field.name for field in fields(ReadingOptions))
+"""Names of all options of reading, to refuse them where nothing is read."""
 
 
-def _option(name: str) -> str:
-    """Return how a command line spells the option of a field or an argument."""
-    return f"--{name.replace('_', '-')}"
-
-
-def refuse_unused(given: Mapping[str, bool], found: str, expected: str) -> None:
-    """Refuse options that would do nothing, rather than ignore them.
+def refuse(context: typer.Context, found: str, expected: str, *names: str) -> None:
+    """Refuse options of the command line that would do nothing, rather than ignore them.
 
     Args:
-        given: by option, whether it was given.
-        found: why it would do nothing, such as "without PATH".
-        expected: when it does something.
+        context: the command's call.
+        found: why they would do nothing, such as "without PATH".
+        expected: when they do something.
+        names: parameters of the options.
 
     Raises:
         InputError: one was given.
     """
-    for option, used in given.items():
-        if used:
-            raise InputError(option, f"use {found}", expected)
+    for option in context.command.params:
+        source = context.get_parameter_source(str(option.name))
+        if option.name in names and source is not None and source.name == "COMMANDLINE":
+            spelled = option.opts if context.params[option.name] else option.secondary_opts
+            raise InputError((spelled or option.opts)[0], f"use {found}", expected)
 
 
 def refuse_unused_sources(
-    reading: ReadingOptions, paths: list[Path] | None, data: Path | None, split_given: bool
+    context: typer.Context, paths: list[Path] | None, data: Path | None
 ) -> None:
     """Refuse options of recordings that are not read: from PATH, or from a split of --data."""
     if paths:
-        refuse_unused({"--data": data is not None}, "with PATH", "one of the two")
+        refuse(context, "with PATH", "one of the two", "data")
     if data is None:
-        refuse_unused({"--split": split_given}, "without --data", "use with --data")
+        refuse(context, "without --data", "use with --data", "split")
     else:
-        refuse_unused(changed(reading, "where"), "with --data", "use with PATH: name the archive")
+        refuse(context, "with --data", "use with PATH: name the archive", "where")
 
 
 def expand_option_groups(command: Callable[..., None]) -> Callable[..., None]:

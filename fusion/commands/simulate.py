@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from stario.fusion.commands.common import check_new, print_result
-from stario.fusion.commands.options import JsonOption, OverwriteOption, flag, refuse_unused
+from stario.fusion.commands.options import JsonOption, OverwriteOption, flag, refuse
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.sequences.sequence import ImuSequence
+    from stario.sequences.simulation.house import HouseWalk
     from stario.sequences.simulation.imu import ImuErrors
+    from stario.sequences.simulation.walks import WalkStyle
 
 
 def simulate(
+    context: typer.Context,
     path: Annotated[Path, typer.Argument(help="CSV file to write.")],
     seconds: Annotated[
-        float | None, typer.Option(min=1.0, help="Duration in s. Default: 60, or the clip's.")
+        float | None,
+        typer.Option(min=1.0, help="Duration in s. Default: 60, the clip's, or 180 with --floors."),
     ] = None,
     rate: Annotated[float, typer.Option(min=50.0, max=1000.0, help="Sampling rate in Hz.")] = 200.0,
     carry: Annotated[
@@ -42,6 +47,14 @@ def simulate(
     magnetometer: Annotated[
         bool, flag("--magnetometer", help="Also simulate a magnetometer inside a building.")
     ] = False,
+    floors: Annotated[
+        bool,
+        flag(
+            "--floors",
+            help="Walk from the street through a house with stairs and a lift, with magnetometer, "
+            "barometer and satellites.",
+        ),
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of walk and sensor.")] = 0,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
@@ -49,14 +62,7 @@ def simulate(
     """Write a simulated walk, or a device on motion capture, with its truth as a CSV recording."""
     from stario.sequences.arrays import check_choice
     from stario.sequences.readers.csv_writer import write_csv
-    from stario.sequences.simulation.imu import GOOD_IMU, PERFECT_IMU, PHONE_IMU, simulate_imu
-    from stario.sequences.simulation.magnetometer import INDOOR_FIELD
-    from stario.sequences.simulation.walks import (
-        CARRYING_MODES,
-        WalkStyle,
-        check_amount,
-        generate_walk,
-    )
+    from stario.sequences.simulation.imu import GOOD_IMU, PERFECT_IMU, PHONE_IMU
 
     if path.suffix.lower() != ".csv":
         fix = "use `stario convert` for other formats and folders"
@@ -64,33 +70,74 @@ def simulate(
     check_new("path", path, overwrite)
     sensors = {"phone": PHONE_IMU, "good": GOOD_IMU, "perfect": PERFECT_IMU}
     errors = sensors[check_choice("--imu", imu, sensors)]
+    stays = []
     if body is not None:
-        sequence = _on_body(body, carry, seconds, magnetometer, rate, errors, seed)
+        refuse(context, "with --body", "use without", "seconds", "magnetometer", "floors")
+        sequence = _on_body(body, carry, rate, errors, seed)
+    elif floors:
+        refuse(context, "with --floors", "use without", "magnetometer")
+        walk = _through_house(path.stem, carry, seconds, rate, errors, seed)
+        sequence, stays = walk.sequence, walk.stays
     else:
-        seconds = 60.0 if seconds is None else seconds
-        check_choice("--carry", carry, (*CARRYING_MODES, "random"))
-        check_amount(seconds, rate)
-        style = None if carry == "random" else WalkStyle(carry=carry)
-        field = INDOOR_FIELD if magnetometer else None
-        walk = generate_walk(seed, seconds, style=style)
-        sequence = simulate_imu(walk, rate, errors, seed, name=path.stem, magnetic_field=field)
+        sequence = _walk(path.stem, carry, seconds, magnetometer, rate, errors, seed)
     length = 0.0 if sequence.truth is None else sequence.truth.path_length()
     write_csv(path, sequence)
-    figures = {
+    figures: dict[str, object] = {
         "path": str(path),
         "duration_s": sequence.duration,
         "path_m": length,
         "samples": len(sequence),
     }
     amount = f"{len(sequence)} samples, {sequence.duration:.1f} s, {length:.1f} m"
+    if stays:
+        figures["stays"] = [asdict(stay) for stay in stays]
+        amount += f", floors {', '.join(str(stay.floor) for stay in stays[1:])}"
     print_result(as_json, figures, f"{path}: {amount}")
+
+
+def _walk(
+    name: str,
+    carry: str,
+    seconds: float | None,
+    magnetometer: bool,
+    rate: float,
+    errors: ImuErrors,
+    seed: int,
+) -> ImuSequence:
+    from stario.sequences.simulation.imu import simulate_imu
+    from stario.sequences.simulation.magnetometer import INDOOR_FIELD
+    from stario.sequences.simulation.walks import check_amount, generate_walk
+
+    style = _style(carry)
+    seconds = 60.0 if seconds is None else seconds
+    check_amount(seconds, rate)
+    field = INDOOR_FIELD if magnetometer else None
+    walk = generate_walk(seed, seconds, style=style)
+    return simulate_imu(walk, rate, errors, seed, name=name, magnetic_field=field)
+
+
+def _through_house(
+    name: str, carry: str, seconds: float | None, rate: float, errors: ImuErrors, seed: int
+) -> HouseWalk:
+    from stario.sequences.simulation.house import simulate_house
+
+    style = _style(carry)
+    seconds = 180.0 if seconds is None else seconds
+    return simulate_house(seed, seconds, rate, style, errors, name=name)
+
+
+def _style(carry: str) -> WalkStyle | None:
+    """Return the typical person who carries the device so; None to draw both."""
+    from stario.sequences.arrays import check_choice
+    from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle
+
+    check_choice("--carry", carry, (*CARRYING_MODES, "random"))
+    return None if carry == "random" else WalkStyle(carry=carry)
 
 
 def _on_body(
     body: Path,
     carry: str,
-    seconds: float | None,
-    magnetometer: bool,
     rate: float,
     errors: ImuErrors,
     seed: int,
@@ -100,8 +147,6 @@ def _on_body(
     from stario.sequences.simulation.body import places_on, virtual_imu
     from stario.sequences.simulation.motion_capture import read_body
 
-    unused = {"--seconds": seconds is not None, "--magnetometer": magnetometer}
-    refuse_unused(unused, "with --body", "use without")
     motion = read_body(body)
     place = str(generator(seed).choice(places_on(motion))) if carry == "random" else carry
     return virtual_imu(motion, place, rate, errors, seed)

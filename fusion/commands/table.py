@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import importlib.resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import exit_if_skipped, names_in, recipe_values
+from stario.fusion.commands.common import exit_if_skipped, names_in
 from stario.fusion.commands.options import (
     CacheOption,
     ReadingOptions,
     assignment,
-    refuse_unused,
+    refuse,
 )
 from stario.sequences.errors import InputError
 
@@ -21,10 +21,8 @@ if TYPE_CHECKING:
     from stario.fusion.paper_table.sets import DataSet
 
 
-_PER_GROUP = 2
-
-
 def table(
+    context: typer.Context,
     out: Annotated[
         Path, typer.Option(help="Folder of the finished runs; a repetition resumes there.")
     ],
@@ -53,9 +51,9 @@ def table(
     split_seed: Annotated[int, typer.Option(min=0, help="Seed of the recording split.")] = 0,
     per_group: Annotated[
         int, typer.Option(min=1, help="Maximum test recordings per group in the set all.")
-    ] = _PER_GROUP,
+    ] = 2,
     config: Annotated[
-        Path | None, typer.Option(help="JSON file with the recipe. Default: the package's.")
+        Path | None, typer.Option(help="TOML or JSON file with the recipe. Default: the package's.")
     ] = None,
     cache: CacheOption = None,
     jobs: Annotated[
@@ -78,10 +76,15 @@ def table(
     from stario.network.training.splits import learned_from
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.cache_files import cache_folder
+    from stario.sequences.settings import read_settings
 
+    if data is None:
+        refuse(context, "without --data", "use with --data", "sets", "per_group")
     datasets = _data_sets(data, sets, published or [], split_seed, per_group)
     chosen = None if networks is None else names_in(networks)
-    runs = table_runs(datasets, _recipe(config), steps, chosen, seeds)
+    packaged = importlib.resources.files("stario.network.weights") / "recipe-table.json"
+    recipe = read_settings(config or Path(str(packaged)))
+    runs = table_runs(datasets, recipe, steps, chosen, seeds)
     make_folder(out)
     requested = {run.network for run in runs}
     costs = known_costs([name for name in ARCHITECTURES if name in requested], out)
@@ -111,10 +114,7 @@ def _data_sets(
     if data is None and not published:
         raise InputError("data", "none", "recordings", "pass --data or --set NAME=FOLDER")
     datasets: list[DataSet] = []
-    if data is None:
-        unused = {"--sets": sets is not None, "--per-group": per_group != _PER_GROUP}
-        refuse_unused(unused, "without --data", "use with --data")
-    else:
+    if data is not None:
         names = None if sets is None else names_in(sets)
         datasets += development_sets(data, seed, per_group, names)
     for word in published:
@@ -123,8 +123,3 @@ def _data_sets(
             raise InputError("--set", repr(name), "a name of its own", f"or drop {name} by --sets")
         datasets.append(folder_set(name, Path(folder), seed))
     return datasets
-
-
-def _recipe(path: Path | None) -> dict[str, Any]:
-    packaged = importlib.resources.files("stario.network.weights").joinpath("recipe-table.json")
-    return recipe_values(Path(str(packaged)) if path is None else path)

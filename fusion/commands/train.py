@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import list_skipped, recipe_values, training_progress
+from stario.fusion.commands.common import list_skipped, training_progress
 from stario.fusion.commands.options import (
+    READING,
     CacheOption,
     OptionalPathsArgument,
     ReadingOptions,
-    changed,
     expand_option_groups,
     flag,
-    refuse_unused,
+    refuse,
 )
 from stario.fusion.commands.training_data import (
     packaged_lists,
@@ -46,6 +46,7 @@ other recordings, on 80 s of up to 9, and with its own calibration of 2.8 to 5."
 
 @expand_option_groups
 def train(
+    context: typer.Context,
     reading: ReadingOptions,
     paths: OptionalPathsArgument = None,
     model: Annotated[
@@ -100,7 +101,9 @@ def train(
             "recipe may name the file. Repeatable."
         ),
     ] = None,
-    config: Annotated[Path | None, typer.Option(help="JSON file with recipe settings.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="TOML or JSON file with recipe settings.")
+    ] = None,
     epochs: Annotated[int | None, typer.Option(min=1, help="Epochs; overrides --config.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed; overrides --config.")] = None,
     start_from: Annotated[
@@ -140,12 +143,14 @@ def train(
     from stario.network.training.splits import warn_of_learned
     from stario.sequences.datasets.cache_files import cache_folder
 
-    walks = _number_of_walks(generated, recorded_only)
+    if recorded_only and generated:
+        raise InputError("--generated", "use with --recorded-only", "one of the two")
+    walks = 0 if recorded_only else _GENERATED if generated is None else generated
     first = load_model(start_from) if start_from else None  # fails before anything slow starts
     if first is not None:
         _ = first.training_form  # an exported graph has none
     recipe = _recipe(config, first, architecture=model, epochs=epochs, seed=seed)
-    _check_sources(reading, paths, validation, data, generated)
+    _check_sources(context, paths, validation, data, generated)
     folder = cache or cache_folder()
     streams_of = partial(streams_of_files, reading, recipe.attitude, folder, jobs)
     lists = packaged_lists(data, leave_out or [], learn_from)
@@ -179,26 +184,21 @@ def train(
             raise typer.Exit(1)
 
 
-def _number_of_walks(generated: int | None, recorded_only: bool) -> int:
-    if recorded_only:
-        refuse_unused({"--generated": bool(generated)}, "with --recorded-only", "one of the two")
-        return 0
-    return _GENERATED if generated is None else generated
-
-
 def _check_sources(
-    reading: ReadingOptions,
+    context: typer.Context,
     paths: list[Path] | None,
     validation: list[Path] | None,
     data: Path | None,
     generated: int | None,
 ) -> None:
-    """Refuse options of reading that nothing uses, and a run without anything to learn from."""
+    """Refuse options that nothing uses, and a run without anything to learn from."""
     if data is not None:
-        refuse_unused(changed(reading, "where"), "with --data", "use with PATH: name the archive")
+        refuse(context, "with --data", "use with PATH: name the archive", "where")
         return
+    needed = "use with the development recordings"
+    refuse(context, "without --data", needed, "leave_out", "learn_from")
     if not paths and not validation:
-        refuse_unused(changed(reading), "without recordings", "use with PATH")
+        refuse(context, "without recordings", "use with PATH", *READING)
     if not paths and generated is None:
         raise InputError("PATH", "none", "recordings, --data, or --generated for walks only")
 
@@ -255,10 +255,11 @@ def _recipe(
     path: Path | None, first: DisplacementModel | None, **over: int | str | None
 ) -> TrainingConfig:
     from stario.network.training.config import FINE_TUNING, training_config
+    from stario.sequences.settings import read_settings
 
     values = {} if first is None else FINE_TUNING
     if path is not None:
-        values = recipe_values(path)
+        values = read_settings(path)
     if first is not None:
         values = {"architecture": first.card.architecture, **values}
     recipe = training_config(values | {k: v for k, v in over.items() if v is not None})

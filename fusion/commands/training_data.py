@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stario.fusion.commands.common import exit_if_skipped, with_bar
-from stario.fusion.commands.options import ReadingOptions, refuse_unused
+from stario.fusion.commands.options import ReadingOptions
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,15 +28,13 @@ def packaged_lists(
         name: all, open or few.
 
     Raises:
-        InputError: a list or group does not exist, or is named without a folder.
+        InputError: a list or group does not exist.
     """
     from stario.network.training.splits import read_packaged_list, without_holdout
     from stario.sequences.arrays import check_choice
     from stario.sequences.datasets.splits import hold_out_group
 
     if data is None:
-        unused = {"--leave-out": bool(left_out), "--learn-from": name != "all"}
-        refuse_unused(unused, "without --data", "use with the development recordings")
         return [], []
     check_choice("--learn-from", name, ("all", "open", "few"))
     everything = (

@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
+from typing import Any
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.known_positions import MIN_POSITIONS, position_error
@@ -58,21 +59,6 @@ number of the issue that asked for it, so chosen before its result was known."""
 
 Metrics = dict[str, float | None]
 
-METRICS = (
-    "ate_m",
-    "ate_fit_m",
-    "rte_m",
-    "pde",
-    "aye_rad",
-    "coverage",
-    "known_positions_m",
-    "nees_median",
-    "nis_mean",
-    "seconds_network",
-    "seconds_filter",
-)
-"""Figures of a track; null where unknown."""
-
 METRIC_TITLES = {
     "ate_m": "ATE [m]",
     "ate_fit_m": "fitted [m]",
@@ -101,6 +87,9 @@ METRIC_WORDS = {
     "horizontal": "position errors and paths are in x and y only, except in the NEES",
 }
 """Meaning of a track's figures in `metrics.json`."""
+
+METRICS = tuple(name for name in METRIC_WORDS if name not in ("alignment", "horizontal"))
+"""Figures of a track; null where unknown."""
 
 RECORDING_WORDS = {
     "duration_s": "time between the recording's first and last sample [s]",
@@ -311,10 +300,10 @@ def compare_recordings(
     work = partial(
         _compare,
         model=model,
-        config=config,
         read=read,
-        fixes=fix_list(fixes),
         truth_needed=truth_needed,
+        config=config,
+        fixes=fix_list(fixes),
         names=names,
         progress=report_share if jobs == 1 else silent,
     )
@@ -341,18 +330,14 @@ def distinct_name(name: str, taken: set[str]) -> str:
 def _compare(
     path: Path,
     model: Predictor | str,
-    config: NavigatorConfig | None,
     read: Callable[[Path], ImuSequence],
-    fixes: Sequence[Fix],
     truth_needed: bool,
-    progress: Progress,
-    names: Collection[str],
+    **options: Any,
 ) -> Comparison:
     sequence = read(path)
     if truth_needed:
         true_poses(sequence)
-    network = _loaded(model) if isinstance(model, str) else model
-    return compare(network, sequence, config, progress, fixes, names)
+    return compare(_loaded(model) if isinstance(model, str) else model, sequence, **options)
 
 
 @cache
@@ -369,11 +354,6 @@ def demonstration() -> ImuSequence:
     """
     style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.2, 0.9))
     walk = generate_walk(DEMONSTRATION_SEED, duration=150.0, style=style, corridors=True)
-    return simulate_imu(
-        walk,
-        200.0,
-        PHONE_IMU,
-        DEMONSTRATION_SEED,
-        name="demonstration",
-        magnetic_field=INDOOR_FIELD,
-    )
+    name = "demonstration"
+    seed, field = DEMONSTRATION_SEED, INDOOR_FIELD
+    return simulate_imu(walk, 200.0, PHONE_IMU, seed, name=name, magnetic_field=field)

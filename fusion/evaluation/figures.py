@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,7 @@ import pandas as pd
 
 from stario.fusion.evaluation.benchmark.groups import RATIOS, Benchmark, benchmark_dict
 from stario.fusion.evaluation.bootstrap import Interval
-from stario.fusion.evaluation.folders import results_folder
+from stario.fusion.evaluation.folders import Files, figure_files, write_results
 from stario.fusion.evaluation.networks import (
     PROTOCOLS,
     TRUE_ATTITUDE,
@@ -30,7 +31,6 @@ from stario.sequences.drawing.figures import (
     INK,
     apply_style,
     new_figure,
-    save_figure,
     split_at_gaps,
 )
 from stario.sequences.files import json_text, write_json, write_rows
@@ -49,12 +49,13 @@ _BASELINE = "R-ResNet"
 
 
 def write_table(folder: Path, table: NetworkTable) -> None:
-    """Write `networks.csv`, `networks.json` and the figures; raises what `results_folder` does."""
-    with results_folder(folder) as new:
-        write_rows(new / "networks.csv", entries(table))
-        write_json(new / "networks.json", table_dict(table))
-        for name, figure in figures(table).items():
-            save_figure(figure, new / name)
+    """Write `networks.csv`, `networks.json` and the figures; raises what `write_results` does."""
+    files: Files = {
+        "networks.csv": partial(write_rows, rows=entries(table)),
+        "networks.json": partial(write_json, obj=table_dict(table)),
+        **figure_files(figures(table)),
+    }
+    write_results(folder, files)
 
 
 def figures(table: NetworkTable) -> dict[str, Figure]:
@@ -181,17 +182,18 @@ def write_benchmark(
 ) -> None:
     """Write `groups.csv`, `recordings.csv`, `groups.json` and `groups.png` into a folder.
 
-    Raises:
-        InputError: as `results_folder`.
+    Raises what `write_results` does.
     """
     content = benchmark_dict(found, rows, ours, theirs)
-    with results_folder(folder) as new:
-        flat = json.loads(json_text(content["groups"]))  # ratios become tables, unknown values None
-        table = pd.json_normalize(flat, sep="_").drop(columns=[*RATIOS], errors="ignore")
-        table.to_csv(new / "groups.csv", index=False)
-        write_rows(new / "recordings.csv", records(found.scores))
-        write_json(new / "groups.json", content)
-        save_figure(groups_figure(rows, ours, theirs), new / "groups.png")
+    flat = json.loads(json_text(content["groups"]))  # ratios become tables, unknown values None
+    groups = pd.json_normalize(flat, sep="_").drop(columns=[*RATIOS], errors="ignore")
+    files: Files = {
+        "groups.csv": partial(groups.to_csv, index=False),
+        "recordings.csv": partial(write_rows, rows=records(found.scores)),
+        "groups.json": partial(write_json, obj=content),
+        **figure_files({"groups.png": groups_figure(rows, ours, theirs)}),
+    }
+    write_results(folder, files)
 
 
 _BEFORE, _AFTER = "#8C8C8C", BLUE

@@ -4,19 +4,28 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
 from itertools import product
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from stario.fusion.evaluation.compare import TRACKS
+from stario.sequences.drawing.figures import save_figure
 from stario.sequences.errors import InputError
 from stario.sequences.files import temporary_path
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
+
+Files = Mapping[str, Callable[[Path], object]]
+"""Functions that write the files of a set of results, by their paths within its folder."""
 
 _FIGURES = ("plan.png", "error.png", "innovations.png", "report.html")
 _TRACKS = tuple(f"{track}{suffix}" for track, suffix in product(TRACKS, (".tum", ".npz")))
@@ -65,49 +74,45 @@ def make_folder(folder: Path) -> None:
         ) from error
 
 
-@contextmanager
-def results_folder(folder: Path) -> Iterator[Path]:
-    """Yield a new folder for a set of results, which takes the place of an earlier one when whole.
+def write_results(folder: Path, files: Files) -> list[Path]:
+    """Write a set of results, which takes the place of an earlier one when it is whole.
 
-    The block fills a temporary folder. At its end the files move into `folder`,
-    and the `RESULTS` of an earlier run that have no successor are removed, there and in the
-    sub-folders that were written; other files stay. After an exception, or if the process ends,
-    the earlier results are as they were. Of two runs the later one to end stays, whole.
+    All are written into a temporary folder. At the end they move into `folder`, and the `RESULTS`
+    of an earlier run that have no successor are removed, there and in the sub-folders that were
+    written; other files stay. After an exception, or if the process ends, the earlier results are
+    as they were. Of two runs the later one to end stays, whole.
 
     Raises:
         InputError: the folder cannot be created, or a file in it cannot be replaced.
     """
     check_folder(folder)
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(str(folder), error.strerror or "an error", "a writable folder") from error
-    with _moved_into(folder) as new:
-        yield new
-
-
-@contextmanager
-def _moved_into(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder whose files move into `folder`; `OSError`s get a remedy."""
+    make_folder(folder.parent)
     # Within a folder that exists: it may be a mount, to which no file of another one can move.
     place = folder / "results" if folder.is_dir() else folder
     with temporary_path(place, "a folder") as new:
         new.mkdir()
-        yield new
-        inner = [new, *(path for path in new.rglob("*") if path.is_dir())]
+        for name, write in files.items():
+            (new / name).parent.mkdir(exist_ok=True)
+            write(new / name)
         folder.mkdir(exist_ok=True)
         with _locked(folder):
-            for source in inner:
+            for source in [new, *(path for path in new.iterdir() if path.is_dir())]:
                 target = folder / source.relative_to(new)
                 target.mkdir(exist_ok=True)
-                files = [path for path in source.iterdir() if path.is_file()]
+                written = [path for path in source.iterdir() if path.is_file()]
                 stale = _results_in(target)
-                for path in files:
+                for path in written:
                     path.replace(target / path.name)
                 for path in stale:
-                    if path.name not in {file.name for file in files}:
+                    if path.name not in {file.name for file in written}:
                         _remove(path)
         shutil.rmtree(new)
+    return [folder / name for name in files]
+
+
+def figure_files(figures: Mapping[str, Figure]) -> Files:
+    """Return the files of figures by their names."""
+    return {name: partial(save_figure, figure) for name, figure in figures.items()}
 
 
 def _results_in(folder: Path) -> list[Path]:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position
+from stario.fusion.evaluation.benchmark.displacement_error import (
+    fit_yaw_and_position,
+)
 from stario.fusion.imu.direction import Complex
 from stario.fusion.state import Track
 from stario.sequences.arrays import even_grid, interpolated
+from stario.sequences.errors import InputError
 from stario.sequences.findings import Finding
 from stario.sequences.legs import jumps
 from stario.sequences.sequence import MAX_TRUTH_GAP, FloatArray, ImuSequence, PositionTrack
@@ -31,6 +34,20 @@ _MIRRORED, _MIRRORED_M = 0.4, 2.0
 
 _SIGMAS = 3.0
 """Error in standard deviations, both over the whole track, that contradicts the track."""
+
+
+def true_path(sequence: ImuSequence) -> float:
+    """Return the length of the true path [m]: with known positions, of the lines between them.
+
+    Raises:
+        InputError: the recording has neither true poses nor known positions.
+    """
+    if sequence.truth is not None:
+        return sequence.truth.path_length()
+    if sequence.positions is None:
+        raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
+    steps = np.diff(sequence.positions.position_W[sequence.positions.valid], axis=0)
+    return float(np.linalg.norm(steps, axis=1).sum())
 
 
 def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:

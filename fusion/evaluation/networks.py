@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import distinct_name
-from stario.fusion.evaluation.scores import Figures, Spread, joined, records, scored
+from stario.fusion.evaluation.scores import Figures, Spread, joined, records, rows_of, scored
 from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude, true_poses
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
@@ -34,6 +34,7 @@ from stario.sequences.accuracy.metrics import (
     pose_errors,
 )
 from stario.sequences.datasets.batch import Skipped, each
+from stario.sequences.drawing.text_table import aligned
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.truth.problems import warn_of_truth
 
@@ -143,6 +144,17 @@ def table_dict(table: NetworkTable) -> dict[str, object]:
         "entries": entries(table),
         "conventions": table_words(table),
     }
+
+
+def networks_text(table: NetworkTable) -> str:
+    """Return a block for each protocol and metric, recordings by networks."""
+    rows = [*table.scores.groupby("recording", sort=False), ("mean", table.scores)]
+    lines = []
+    for protocol, words in PROTOCOLS.items():
+        for metric, title in METRICS.items():
+            columns = [table.column(name, protocol, metric) for name in table.parameters]
+            lines += [f"{words}: {title}", *aligned(rows_of(rows, columns, "")), ""]
+    return "\n".join([*lines, *(f"{key}: {words}." for key, words in table_words(table).items())])
 
 
 def entries(table: NetworkTable) -> list[dict[str, object]]:

@@ -20,8 +20,13 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, find_peaks, hilbert, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.benchmark.aligned import Aligned, Complex
-from stario.fusion.evaluation.benchmark.network_alone import UPDATES, Predictions
+from stario.fusion.evaluation.benchmark.pieces import (
+    UPDATES,
+    Piece,
+    predicted,
+)
+from stario.fusion.imu.direction import Complex
+from stario.fusion.imu.stateful import Predictor
 from stario.fusion.state import Track
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
@@ -53,11 +58,26 @@ Indices = np.ndarray[tuple[int], np.dtype[np.int64]]
 
 
 class PedestrianDeadReckoning:
-    """Baseline judged like a network: predicts the displacement over the second from each tick."""
+    """Baseline judged like a network, by the displacement over the second from each tick."""
 
-    def predictions(self, recording: Aligned) -> list[Predictions]:
-        """Return predictions for each piece of a recording, in N."""
-        return [_predictions(piece.stream) for piece in recording.pieces]
+    def piece(self, stream: LevelledStream) -> Piece:
+        """Return an unbroken stretch with the displacements of its steps."""
+        track, count = pedestrian_path(stream), stream.window_count
+        # The window that begins at the last tick ends one sample after the stretch.
+        at_tick = np.append(track, track[-1])[::TICK_SAMPLES]
+        moved = at_tick[UPDATES : UPDATES + count] - at_tick[:count]
+        displacement = np.stack([moved.real, moved.imag, np.zeros(count)], axis=1)
+        return Piece(stream, displacement, np.tile(_SIGMA**2 * np.eye(3), (count, 1, 1)))
+
+
+Model = Predictor | PedestrianDeadReckoning
+
+
+def piece_of(model: Model, stream: LevelledStream) -> Piece:
+    """Return an unbroken stretch with the displacements of a network or of steps."""
+    if isinstance(model, PedestrianDeadReckoning):
+        return model.piece(stream)
+    return predicted(model, stream)
 
 
 def pedestrian_track(sequence: ImuSequence) -> Track:
@@ -124,16 +144,6 @@ def _forward(horizontal_N: Complex, vertical: FloatArray, heading: Complex) -> C
     axis = np.sqrt(_unit(uniform_filter1d(horizontal_H**2, samples, mode="nearest")))
     lagging = uniform_filter1d(-horizontal_H * np.imag(hilbert(vertical)), samples, mode="nearest")
     return np.asarray(np.where((np.conj(axis) * lagging).real < 0.0, -axis, axis))
-
-
-def _predictions(stream: LevelledStream) -> Predictions:
-    track = pedestrian_path(stream)
-    # The window that begins at the last tick ends one sample after the stretch.
-    at_tick = np.append(track, track[-1])[::TICK_SAMPLES]
-    count = stream.window_count
-    displacement_xy = at_tick[UPDATES : UPDATES + count] - at_tick[:count]
-    displacement = np.stack([displacement_xy.real, displacement_xy.imag, np.zeros(count)], axis=1)
-    return Predictions(displacement, np.tile(_SIGMA**2 * np.eye(3), (count, 1, 1)))
 
 
 def _unit(values: Complex) -> Complex:

@@ -4,23 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import METRIC_WORDS, RECORDING_WORDS, Comparison
-from stario.fusion.evaluation.folders import results_folder
+from stario.fusion.evaluation.folders import Files, figure_files, write_results
 from stario.fusion.evaluation.known_positions import shown_positions
-from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.plan import plan_view
 from stario.sequences.drawing.plots import error_over_time, innovations
 from stario.sequences.files import write_json, write_npz
 from stario.sequences.readers.tum import write_tum
-
-if TYPE_CHECKING:
-    from stario.fusion.evaluation.summary import Scores
-
 
 Writers = Mapping[str, Callable[[Path, Comparison], object]]
 """Functions that write a recording's further files, by the files' names."""
@@ -38,23 +33,18 @@ def write_run(
     These are `track.tum` (9 decimals), `track.npz` (velocity, biases, covariance), `metrics.json`,
     `config.json`, `run.json` (`origin`: what produced them), `health.json` and the figures; with
     the filter's track also `filtered.tum` and `filtered.npz`. Without truth, known positions in the
-    track's frame (`known_positions.placed`) are drawn. Results of an earlier run into this folder
-    are removed.
-
-    Raises:
-        InputError: the folder cannot be created.
+    track's frame (`known_positions.placed`) are drawn. Raises what `write_results` does.
     """
+    metrics = {"recording": run.sequence.name, **run.metrics, "conventions": run.words}
     health = run.track.health
-    contents = {
-        "metrics.json": {"recording": run.sequence.name, **run.metrics, "conventions": run.words},
-        "config.json": asdict(config),
-        "run.json": origin,
-        "health.json": asdict(health) if health else None,
+    files: Files = {
+        **_tracks(run),
+        **_settings(metrics, config, origin),
+        "health.json": partial(write_json, obj=asdict(health) if health else None),
+        **_figures(run),
+        **_further(run, also),
     }
-    with results_folder(folder) as new:
-        written = _track_files(new, run)
-        written += [*_json_files(new, contents), *_figures(new, run), *_further(new, run, also)]
-    return [folder / path.relative_to(new) for path in written]
+    return write_results(folder, files)
 
 
 def write_comparison(
@@ -66,91 +56,66 @@ def write_comparison(
 ) -> list[Path]:
     """Write what `write_summary` does, and a sub-folder of tracks and figures per recording.
 
-    Results of an earlier run into these folders are removed; other recordings' folders stay.
-
-    Raises:
-        InputError: a folder cannot be created.
+    Other recordings' folders stay. Raises what `write_results` does.
     """
-    from stario.fusion.evaluation.summary import scores_of  # pandas, which a run does not need
-
-    with results_folder(folder) as new:
-        written = write_summary(new, [scores_of(c) for c in comparisons], config, origin)
-        for comparison in comparisons:
-            written += write_recording(new, comparison, also)
-    return [folder / path.relative_to(new) for path in written]
+    records = {found.sequence.name: found.as_dict() for found in comparisons}
+    files = dict(_settings(metrics_dict(records, comparisons[0].words), config, origin))
+    for found in comparisons:
+        inner = _recording(found, also)
+        files |= {f"{found.sequence.name}/{name}": write for name, write in inner.items()}
+    return write_results(folder, files)
 
 
 def write_summary(
     folder: Path,
-    recordings: Sequence[Scores],
+    records: Mapping[str, object],
     config: NavigatorConfig,
     origin: Mapping[str, object],
-) -> list[Path]:
-    """Write `metrics.json`, `config.json` and `run.json` of recordings, in place of earlier ones.
-
-    Raises:
-        InputError: the folder cannot be created.
-    """
-    contents = {
-        "metrics.json": scores_dict(recordings),
-        "config.json": asdict(config),
-        "run.json": origin,
-    }
-    with results_folder(folder) as new:
-        _json_files(new, contents)
-    return [folder / file for file in contents]
+) -> None:
+    """Write `metrics.json`, `config.json` and `run.json` of recordings; raises as `write_run`."""
+    write_results(folder, _settings(metrics_dict(records), config, origin))
 
 
-def _json_files(folder: Path, contents: Mapping[str, object]) -> list[Path]:
-    for file, content in contents.items():
-        write_json(folder / file, content)
-    return [folder / file for file in contents]
+def write_recording(folder: Path, found: Comparison) -> None:
+    """Write tracks and figures of a recording into a sub-folder named after it, as `write_run`."""
+    write_results(folder / found.sequence.name, _recording(found))
 
 
-def _further(folder: Path, run: Comparison, also: Writers) -> list[Path]:
-    for name, write in also.items():
-        write(folder / name, run)
-    return [folder / name for name in also]
+def metrics_dict(
+    records: Mapping[str, object], words: Mapping[str, str] = METRIC_WORDS
+) -> dict[str, object]:
+    """Return the content of `metrics.json` from the entries of recordings (`as_dict`), by name."""
+    return {"recordings": records, "conventions": {**RECORDING_WORDS, **words}}
 
 
-def write_recording(
-    folder: Path, comparison: Comparison, also: Writers = MappingProxyType({})
-) -> list[Path]:
-    """Write tracks and figures of one recording into a sub-folder named after it.
-
-    Raises:
-        InputError: a folder cannot be created.
-    """
-    inner = folder / comparison.sequence.name
-    truth = comparison.sequence.truth
-    with results_folder(inner) as new:
-        written = _track_files(new, comparison)
-        if truth is not None:
-            write_tum(new / "truth.tum", truth)
-            written.append(new / "truth.tum")
-        written += [*_figures(new, comparison), *_further(new, comparison, also)]
-    return [inner / path.relative_to(new) for path in written]
+def _settings(metrics: object, config: NavigatorConfig, origin: Mapping[str, object]) -> Files:
+    contents = {"metrics.json": metrics, "config.json": asdict(config), "run.json": origin}
+    return {name: partial(write_json, obj=content) for name, content in contents.items()}
 
 
-def scores_dict(recordings: Sequence[Scores]) -> dict[str, object]:
-    """Return the content of `metrics.json`."""
-    records = {scores.name: scores.record for scores in recordings}
-    # Fixes change how tracks are aligned; they are given for a single recording only.
-    words = next((scores.words for scores in recordings), METRIC_WORDS)
-    return {"recordings": records, "conventions": RECORDING_WORDS | words}
+def _recording(found: Comparison, also: Writers = MappingProxyType({})) -> Files:
+    truth = found.sequence.truth
+    known = {} if truth is None else {"truth.tum": partial(write_tum, trajectory=truth)}
+    return {**_tracks(found), **known, **_figures(found), **_further(found, also)}
 
 
-def _track_files(folder: Path, found: Comparison) -> list[Path]:
-    written = []
+def _further(found: Comparison, also: Writers) -> Files:
+    def bound(write: Callable[[Path, Comparison], object]) -> Callable[[Path], object]:
+        return lambda path: write(path, found)
+
+    return {name: bound(write) for name, write in also.items()}
+
+
+def _tracks(found: Comparison) -> Files:
+    files: dict[str, Callable[[Path], object]] = {}
     for name, track in found.tracks.items():
-        written += [folder / f"{name}.tum", folder / f"{name}.npz"]
-        write_tum(written[-2], track.trajectory)
-        write_npz(written[-1], **track.arrays())
-    return written
+        files[f"{name}.tum"] = partial(write_tum, trajectory=track.trajectory)
+        files[f"{name}.npz"] = partial(write_npz, **track.arrays())
+    return files
 
 
-def _figures(folder: Path, found: Comparison) -> list[Path]:
-    """Write plan and errors of all tracks, and the filter's innovations."""
+def _figures(found: Comparison) -> Files:
+    """Return plan and errors of all tracks, and the filter's innovations."""
     name, truth, tracks = found.sequence.name, found.sequence.truth, found.aligned()
     track = found.track
     figures = {"plan.png": plan_view(tracks, truth, name, shown_positions(found.sequence, track))}
@@ -161,6 +126,4 @@ def _figures(folder: Path, found: Comparison) -> list[Path]:
     if drawn is not None and len(drawn.time):
         values = drawn.time, drawn.residual_W, drawn.sigma, drawn.nis, drawn.gated
         figures["innovations.png"] = innovations(*values, f"{name}: innovations")
-    for file, figure in figures.items():
-        save_figure(figure, folder / file)
-    return [folder / file for file in figures]
+    return figure_files(figures)

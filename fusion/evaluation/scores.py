@@ -7,14 +7,14 @@ there is more to tell apart. Everything printed, drawn or concluded is a group-b
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from stario.sequences.drawing.text_table import figure
+from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.sequence import FloatArray
 
 COLUMNS = ("recording", "group", "track", "metric", "value")
@@ -149,3 +149,29 @@ def quantile(share: float) -> Callable[[FloatArray], float]:
 def median_degrees(angles: FloatArray) -> float:
     """Return the median size of angles (n,) [rad] in degrees."""
     return math.degrees(np.median(np.abs(angles)))
+
+
+def rows_of(
+    parts: Iterable[tuple[str | tuple[str, ...], pd.DataFrame]],
+    columns: Sequence[Column],
+    *corner: str,
+) -> list[list[str]]:
+    """Return the cells of a table, its titles first: a row for each part of the scores.
+
+    Parts are named by one label or by several, whose titles are `corner`.
+    """
+    rows = [[*corner, *(column.title for column in columns)]]
+    for name, part in parts:
+        names = (name,) if isinstance(name, str) else name
+        rows.append([*names, *(column.text(part) for column in columns)])
+    return rows
+
+
+def table(
+    parts: Iterable[tuple[str | tuple[str, ...], pd.DataFrame]],
+    columns: Sequence[Column],
+    corner: tuple[str, ...] = ("group",),
+    notes: Sequence[str] = (),
+) -> str:
+    """Return a table with a row for each part of the scores, and notes below it."""
+    return "\n".join([*aligned(rows_of(parts, columns, *corner)), *notes])

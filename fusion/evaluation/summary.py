@@ -13,13 +13,11 @@ from stario.fusion.evaluation.compare import (
     FULL_COVERAGE,
     METRIC_WORDS,
     METRICS,
-    RECORDING_WORDS,
     TRACKS,
     Comparison,
-    Metrics,
 )
-from stario.fusion.evaluation.scores import Column, joined, scored, values
-from stario.fusion.evaluation.text import rows_of
+from stario.fusion.evaluation.results import metrics_dict
+from stario.fusion.evaluation.scores import Column, joined, rows_of, scored, values
 from stario.sequences.arrays import check_type
 from stario.sequences.drawing.text_table import aligned, figure
 
@@ -41,13 +39,14 @@ def _columns(over: Callable[..., Any]) -> list[Column]:
         "filtered": "filtered",
         "track": "track",
     }
-    others = (("filtered", "nis_mean", "NIS"), ("filtered", "nees_median", "filtered NEES"))
+    others = {
+        "NIS": ("filtered", "nis_mean"),
+        "filtered NEES": ("filtered", "nees_median"),
+        "track NEES": ("track", "nees_median"),
+    }
     return [
-        *(_WithFit(title, "ate_m", ".2f", over, {"track": t}) for t, title in errors.items()),
-        *(
-            Column(title, metric, ".2f", over, {"track": track})
-            for track, metric, title in (*others, ("track", "nees_median", "track NEES"))
-        ),
+        *(_WithFit(title, "ate_m", over=over, where={"track": t}) for t, title in errors.items()),
+        *(Column(title, m, over=over, where={"track": t}) for title, (t, m) in others.items()),
     ]
 
 
@@ -62,20 +61,16 @@ class Scores:
 
     Attributes:
         name: name of the recording.
-        metrics: metrics by track name.
-        record: entry of the recording in `metrics.json`.
-        words: meaning of the figures.
+        record: its entry in `metrics.json`.
     """
 
     name: str
-    metrics: dict[str, Metrics]
-    record: dict[str, object]
-    words: dict[str, str]
+    record: dict[str, Any]
 
     @property
     def table(self) -> pd.DataFrame:
         """The figures as rows of recording, group, track, metric and value."""
-        return scored(self.name, self.metrics)
+        return scored(self.name, self.record["tracks"])
 
     @property
     def coverage(self) -> float:
@@ -85,8 +80,7 @@ class Scores:
 
 def scores_of(comparison: Comparison) -> Scores:
     """Return the figures of a comparison."""
-    name, record = comparison.sequence.name, comparison.as_dict()
-    return Scores(name, comparison.metrics, record, comparison.words)
+    return Scores(comparison.sequence.name, comparison.as_dict())
 
 
 def summary(recordings: Sequence[Scores]) -> dict[str, object]:
@@ -94,19 +88,17 @@ def summary(recordings: Sequence[Scores]) -> dict[str, object]:
 
     Medians and means leave out recordings whose truth is known for less than half of the track.
     """
-    records = {scores.name: scores.record for scores in recordings}
-    metrics = [metric for metric in METRICS if not metric.startswith("seconds_")]
     counted = _together(_counted(recordings))
     over = {
         track: {
             metric: {"median": float(np.median(known)), "mean": float(np.mean(known))}
-            for metric in metrics
-            if len(known := values(counted, metric, track=track))
+            for metric in METRICS
+            if not metric.startswith("seconds_")
+            and len(known := values(counted, metric, track=track))
         }
         for track in TRACKS
     }
-    words = RECORDING_WORDS | METRIC_WORDS
-    return {"recordings": records, "over_recordings": over, "conventions": words}
+    return metrics_dict({r.name: r.record for r in recordings}) | {"over_recordings": over}
 
 
 def summary_table(recordings: Sequence[Scores]) -> str:

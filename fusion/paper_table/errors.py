@@ -6,27 +6,34 @@ own attitude, by `stario.fusion.evaluation.benchmark.displacement_error`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.benchmark.aligned import Aligned, aligned_recordings
-from stario.fusion.evaluation.benchmark.displacement_error import block_sums, recording_errors
-from stario.fusion.evaluation.benchmark.network_alone import predictions
+from stario.fusion.evaluation.benchmark.displacement_error import (
+    block_sums,
+    known_truth,
+    recording_errors,
+)
+from stario.fusion.evaluation.benchmark.pieces import (
+    judged_streams,
+)
 from stario.fusion.evaluation.networks import (
     MAX_DRAWN,
     OWN_ATTITUDE,
     metrics_of,
     protocol_figures,
 )
-from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning, pedestrian_track
+from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning, pedestrian_track, piece_of
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.paper_table.training import ReaderConfig
 from stario.network.model import DisplacementModel
 from stario.sequences.accuracy.metrics import Convention
-from stario.sequences.datasets.batch import Skipped, skipped, without_skipped
+from stario.sequences.datasets.batch import Skipped, each, without_skipped
 from stario.sequences.datasets.splits import ListEntry
-from stario.sequences.errors import StarioError
-from stario.sequences.sequence import FloatArray
+from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.truth.problems import warn_of_truth
 
 CONVENTION: Convention = "ronin"
 """How errors are averaged: as in the paper."""
@@ -50,38 +57,36 @@ def test_errors(
     """
     found: list[dict[str, object]] = []
     left_out: list[Skipped] = []
-    paths = [entry.path for entry in test]
-    outcomes = aligned_recordings(paths, reading.read, reading.options, reading.cache, 1)
-    groups = {entry.path: entry.group for entry in test}
     drawn = 0
-    for aligned in without_skipped(outcomes, left_out):
-        try:
-            row, track = _recording(model, aligned, reading)
-        except StarioError as error:
-            left_out.append(skipped(aligned.path, error))
-            continue
+    groups = {entry.path: entry.group for entry in test}
+    outcomes = each(partial(_recording, model=model, read=reading.read, groups=groups), groups, 1)
+    for row, track in without_skipped(outcomes, left_out):
         if track and drawn < MAX_DRAWN:
             row["drawn"], drawn = track, drawn + 1
-        found.append({"path": str(aligned.path), "group": groups[aligned.path], **row})
+        found.append(row)
     return found, left_out
 
 
 def _recording(
-    model: Model, aligned: Aligned, reading: ReaderConfig
+    path: Path, model: Model, read: Callable[[Path], ImuSequence], groups: Mapping[Path, str]
 ) -> tuple[dict[str, object], dict[str, FloatArray]]:
-    alone = recording_errors(aligned, predictions(model, aligned))
+    sequence = read(path)
+    streams, (kind, _) = judged_streams(sequence), known_truth(sequence)
+    warn_of_truth(sequence)
+    alone = recording_errors(sequence, [piece_of(model, stream) for stream in streams])
     blocks = {"10": alone.blocks["10"].tolist()} if "10" in alone.blocks else {}
     row: dict[str, object] = {
-        "recording": aligned.name,
-        "kind": aligned.kind,
+        "path": str(path),
+        "group": groups[path],
+        "recording": sequence.name,
+        "kind": kind,
         "path_m": alone.path_m,
         "figures": alone.figures,
         "blocks": blocks,
         "tracks": {},
     }
-    if aligned.kind != "poses":
+    if kind != "poses":
         return row, {}
-    sequence = reading.read(aligned.path)
     if isinstance(model, PedestrianDeadReckoning):
         track = pedestrian_track(sequence).trajectory
         row["tracks"] = {OWN_ATTITUDE: metrics_of(track, true_poses(sequence), CONVENTION)}

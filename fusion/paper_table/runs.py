@@ -103,12 +103,25 @@ def complete_run(run: Run, out: Path, reading: ReaderConfig) -> Run:
         InputError: the network cannot be trained.
     """
     folder = run.folder(out)
-    if _read_if_done(run, folder / "errors.json") is None:
-        folder.mkdir(parents=True, exist_ok=True)
-        recipe = run.recipe
-        if recipe is not None and _read_if_done(run, folder / "trained.json") is None:
-            _train(run, recipe, folder, reading)
-        _evaluate(run, folder, reading)
+    if _read_if_done(run, folder / "errors.json") is not None:
+        return run
+    folder.mkdir(parents=True, exist_ok=True)
+    if run.recipe is not None and _read_if_done(run, folder / "trained.json") is None:
+        trained = train_run(run.dataset, run.recipe, folder, reading)
+        write_json(folder / "trained.json", {"cell": run.digest, **trained})
+        for spare in TEMPORARY_FILES:
+            (folder / spare).unlink(missing_ok=True)
+    began = process_time()
+    found, skipped = test_errors(_model(run, folder), run.dataset.test, reading)
+    content = {
+        "cell": run.digest,
+        "network": run.network,
+        "seed": run.seed,
+        "seconds": process_time() - began,
+        "recordings": found,
+        "skipped": [asdict(failure) for failure in skipped],
+    }
+    write_json(folder / "errors.json", content)
     return run
 
 
@@ -123,28 +136,6 @@ def read_run(run: Run, out: Path) -> dict[str, object] | None:
     if content is None or run.recipe is None:
         return content
     return content | {"trained": _read(folder / "trained.json")}
-
-
-def _train(run: Run, recipe: TrainingConfig, folder: Path, reading: ReaderConfig) -> None:
-    content = train_run(run.dataset, recipe, folder, reading)
-    write_json(folder / "trained.json", {"cell": run.digest, **content})
-    for spare in TEMPORARY_FILES:
-        (folder / spare).unlink(missing_ok=True)
-
-
-def _evaluate(run: Run, folder: Path, reading: ReaderConfig) -> None:
-    began = process_time()
-    model = _model(run, folder)
-    found, skipped = test_errors(model, run.dataset.test, reading)
-    content = {
-        "cell": run.digest,
-        "network": run.network,
-        "seed": run.seed,
-        "seconds": process_time() - began,
-        "recordings": found,
-        "skipped": [asdict(failure) for failure in skipped],
-    }
-    write_json(folder / "errors.json", content)
 
 
 def _model(run: Run, folder: Path) -> Model:
@@ -221,7 +212,7 @@ def complete(
     Runs are started in their order; `out` must be writable by every process that takes part.
     `jobs` is as for `stario.sequences.datasets.batch.each`.
     """
-    yield from each(partial(complete_run, out=out, reading=reading), runs, jobs)
+    return each(partial(complete_run, out=out, reading=reading), runs, jobs)
 
 
 @contextmanager

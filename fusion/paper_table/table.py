@@ -1,10 +1,10 @@
-"""The table as text, JSON, CSV and figures: all from one frame of the scores of completed runs."""
+"""The table's files: Markdown, JSON, CSV and figures, all from the scores of completed runs."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,213 +12,24 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.bootstrap import Interval, block_rows, ranks
 from stario.fusion.evaluation.figures import write_table
 from stario.fusion.evaluation.networks import (
-    EKF,
     METRICS,
-    OWN_ATTITUDE,
     PROTOCOLS,
     TRUE_ATTITUDE,
     NetworkTable,
     Sample,
     add_track,
 )
-from stario.fusion.evaluation.pedestrian import NAME as PDR
-from stario.fusion.evaluation.scores import Spread, joined, scored
-from stario.fusion.evaluation.text import rows_of
 from stario.fusion.paper_table.errors import CONVENTION
-from stario.fusion.paper_table.published import published
-from stario.fusion.paper_table.runs import Run, read_run
-from stario.fusion.paper_table.sets import DataSet, set_of
+from stario.fusion.paper_table.runs import Run
+from stario.fusion.paper_table.scores import COLUMNS, Completed, SetTable, completed_runs, set_table
+from stario.fusion.paper_table.text import WORDS, table_text
 from stario.network.architectures import ARCHITECTURES
 from stario.network.runtime.cost import table_cost
-from stario.network.runtime.survey import BATCHES, ModelRow, survey
-from stario.network.training.config import TrainingConfig
-from stario.sequences.accuracy.metrics import CONVENTIONS
+from stario.network.runtime.survey import ModelRow, survey
 from stario.sequences.files import atomic_write, write_json, write_rows
 from stario.sequences.sequence import Trajectory
-
-REFERENCE_NETWORK = "StarIO"
-"""Reference network that the others' errors are compared with."""
-
-Completed = dict[str, dict[int, Mapping[str, Any]]]
-"""Results (`read_run`) of a set's runs, by network and seed."""
-
-
-def _column(title: str, track: str, name: str, scale: float = 1.0) -> Spread:
-    where = {"track": track}
-    return Spread(title, name, ".3f", where=where, standard_error=True, scale=scale)
-
-
-COLUMNS = {
-    "ate": _column("ATE [m]", TRUE_ATTITUDE, "ate_m"),
-    "rte": _column("RTE [m]", TRUE_ATTITUDE, "rte_m"),
-    "pde": _column("PDE [%]", TRUE_ATTITUDE, "pde", 100.0),
-    "own_ate": _column("own attitude: ATE [m]", OWN_ATTITUDE, "ate_m"),
-    "own_rte": _column("own attitude: RTE [m]", OWN_ATTITUDE, "rte_m"),
-    "ekf_ate": _column("EKF: ATE [m]", EKF, "ate_m"),
-    "ekf_rte": _column("EKF: RTE [m]", EKF, "rte_m"),
-    "waypoints_m": _column("waypoints [m]", "waypoints", "ate_fit_m"),
-    "waypoints_percent": _column("waypoints [%]", "waypoints", "ate_fit_percent"),
-    "waypoints_length": _column("length ratio", "waypoints", "length_ratio"),
-    "positions_percent": _column("positions, 20 s [%]", "positions", "stretch_percent"),
-    "training_error": _column("training error", "trained", "training_error_m2"),
-    "validation_error": _column("validation error", "trained", "validation_error_m2"),
-}
-"""Columns of the table, in order; a column without any value on a set is omitted there."""
-
-_MEASURES = {
-    "ate": "position error under the paper's protocol",
-    "10": "displacement error over 10 s along the own attitude (waypoint residuals where there are "
-    "waypoints)",
-}
-"""Errors that networks may be ranked by, in words."""
-
-
-@dataclass(frozen=True, eq=False)
-class SetTable:
-    """A data set's part of the table.
-
-    Attributes:
-        dataset: name, recordings and split.
-        scores: errors of every run, with labels `path`, `network` and `seed`; figures of the
-            network alone are those of a track that is called by the kind of truth, errors of the
-            training those of a track "trained".
-        rows: networks, in order, with their `seeds`, the number of test recordings that given
-            weights were trained on (`learned`), and the columns of `bootstrap.ranks`.
-        tested: number of tested recordings.
-        path_m: total length of their true paths [m].
-        measure: the error that networks are ranked by, in words.
-        skipped: reasons why recordings were skipped, each once.
-    """
-
-    dataset: DataSet
-    scores: pd.DataFrame
-    rows: pd.DataFrame
-    tested: int
-    path_m: float
-    measure: str
-    skipped: list[str]
-
-    def parts(self) -> list[tuple[str, pd.DataFrame]]:
-        """Return each network's scores, in order."""
-        names = self.scores["network"]
-        return [(name, self.scores[names == name]) for name in self.rows["network"]]
-
-    def means(self) -> list[dict[str, Any]]:
-        """Return a row for each network: mean over seeds of each column, NaN if unknown; rank."""
-        return [
-            {"network": row["network"], "seeds": row["seeds"], "rank": row["rank"]}
-            | {key: column.mean_and_spread(part)[0] for key, column in COLUMNS.items()}
-            for row, (_, part) in zip(self.rows.to_dict("records"), self.parts(), strict=True)
-        ]
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the set's part of `table.json`."""
-        rows = [
-            row | mean | {f"{key}_sem": c.mean_and_spread(part)[1] for key, c in COLUMNS.items()}
-            for row, mean, (_, part) in zip(
-                self.rows.to_dict("records"), self.means(), self.parts(), strict=True
-            )
-        ]
-        return {
-            "split": self.dataset.words,
-            "training": len(self.dataset.training),
-            "validation": len(self.dataset.validation),
-            "tested": self.tested,
-            "path_m": self.path_m,
-            "ranks_by": self.measure,
-            "rows": rows,
-            "skipped": self.skipped,
-        }
-
-
-def completed_runs(runs: Iterable[Run], out: Path) -> dict[str, Completed]:
-    """Return the results of the completed runs, by set.
-
-    Raises:
-        ConfigError: a run was completed with another recipe, other weights or other recordings.
-    """
-    found: dict[str, Completed] = {}
-    for run in runs:
-        content = read_run(run, out)
-        if content is not None:
-            networks = found.setdefault(run.dataset.name, {})
-            networks.setdefault(run.network, {})[run.seed] = content
-    return found
-
-
-def set_table(
-    dataset: DataSet, completed: Completed, learned: Mapping[str, frozenset[Path]]
-) -> SetTable:
-    """Return the table of a set.
-
-    `learned` has the recordings that packaged weights were trained on, by the weights' name.
-    """
-    contents = [content for seeds in completed.values() for content in seeds.values()]
-    recordings = contents[0]["recordings"]
-    poses = all(one["kind"] == "poses" for content in contents for one in content["recordings"])
-    measure = "ate" if poses else "10"
-    order = sorted(completed, key=[PDR, *ARCHITECTURES, *completed].index)
-    test = {entry.path for entry in dataset.test}
-    rows = pd.DataFrame(
-        {
-            "network": name,
-            "seeds": sorted(completed[name]),
-            "learned": len(test & learned.get(name, set())),
-        }
-        for name in order
-    )
-    skipped = [
-        f"{failure['item']}: {failure['reason']}"
-        for c in contents
-        for failure in [*c["skipped"], *c.get("trained", {}).get("skipped", [])]
-    ]
-    return SetTable(
-        dataset,
-        _scores(completed),
-        rows.merge(ranks(_blocks(completed, measure, dataset), REFERENCE_NETWORK), "left"),
-        len(recordings),
-        float(sum(recording["path_m"] for recording in recordings)),
-        _MEASURES[measure],
-        list(dict.fromkeys(skipped)),
-    )
-
-
-def _scores(completed: Completed) -> pd.DataFrame:
-    found = [scored("", {}, path="", network="", seed=0)]
-    for network, seeds in completed.items():
-        for seed, content in seeds.items():
-            labels: dict[str, Any] = {"network": network, "seed": seed}
-            for one in content["recordings"]:
-                figures = {**one["tracks"], one["kind"]: one["figures"]}
-                found.append(
-                    scored(one["recording"], figures, one["group"], path=one["path"], **labels)
-                )
-            if trained := content.get("trained"):
-                errors = {key: trained[key] for key in ("training_error_m2", "validation_error_m2")}
-                found.append(scored("", {"trained": errors}, path="", **labels))
-    return joined(found)
-
-
-def _blocks(completed: Completed, measure: str, dataset: DataSet) -> pd.DataFrame:
-    """Return the blocks of squared errors of networks that have some with every seed."""
-    units = {str(e.path): {"set": set_of(e), "group": e.group} for e in dataset.test}
-    found = [block_rows([], set="", group="", recording="", network="", seed=0)]
-    for network, seeds in completed.items():
-        runs = [
-            [
-                block_rows(sums, **units[path], recording=path, network=network, seed=seed)
-                for one in content["recordings"]
-                for path in [one["path"]]
-                if (sums := one["blocks"].get(measure))
-            ]
-            for seed, content in seeds.items()
-        ]
-        if all(runs):
-            found += [table for run in runs for table in run]
-    return joined(found)
 
 
 def work_of(tables: Iterable[Completed]) -> pd.DataFrame:
@@ -279,13 +90,13 @@ def write_results(
         "sets": {name: table.as_dict() for name, table in tables.items()},
         "costs": [asdict(row) for row in costs],
         "work": work.to_dict("index"),
-        "conventions": _WORDS,
+        "conventions": WORDS,
     }
     write_json(out / "table.json", content)
-    means = [  # without NaN: a missing cell stays empty
-        {"set": name, **{k: v for k, v in row.items() if v == v}, "seeds": len(row["seeds"])}
+    means = [
+        {"set": name, **row[["network", "rank", *COLUMNS]].dropna(), "seeds": len(row["seeds"])}
         for name, table in tables.items()
-        for row in table.means()
+        for _, row in table.rows.iterrows()
     ]
     write_rows(out / "table.csv", means)
     for name, table in tables.items() if drawn else ():
@@ -293,113 +104,6 @@ def write_results(
         if found is not None:
             write_table(out / name / "figures", found)
     return text
-
-
-def table_text(
-    tables: Sequence[SetTable],
-    costs: Sequence[ModelRow],
-    work: pd.DataFrame,
-    recipe: TrainingConfig,
-) -> str:
-    """Return the tables of all sets, the costs and the conventions as Markdown.
-
-    The recipe is common to all networks except for its network and seed.
-    """
-    words = (
-        f"All networks: {recipe.steps} training steps of {recipe.batch} windows, peak learning "
-        f"rate {recipe.rate:g}, {recipe.precision}, {recipe.attitude} attitude. On sets with weak "
-        f"truth, each step also learns from stretches of {recipe.waypoint_seconds} s between "
-        f"waypoints ({recipe.waypoint_stretches} per step) and of {recipe.track_seconds} s along "
-        f"positions ({recipe.track_stretches} per step)."
-    )
-    sets = [_set_text(table) for table in tables]
-    return "\n\n".join([words, *sets, _cost_text(costs, work), _WORDS]) + "\n"
-
-
-def _set_text(table: SetTable) -> str:
-    dataset = table.dataset
-    columns = [c for c in COLUMNS.values() if np.isfinite(c.mean_and_spread(table.scores)[0])]
-    cells = rows_of(table.parts(), columns, "network")
-    more = [["seeds", "rank", f"error / {REFERENCE_NETWORK}'s", "paper: ATE, RTE [m]"]]
-    for row in table.rows.to_dict("records"):
-        known = not np.isnan(row["rank"])
-        rank = "{rank:.0f} [{rank_low:.0f}, {rank_high:.0f}]".format(**row) if known else "-"
-        ratio = f"{row['ratio']:.2f}" if isinstance(row["ratio"], Interval) else "-"
-        paper = published(dataset.name, row["network"])
-        errors = "-" if paper is None else "{:.3f}, {:.3f}".format(*paper)
-        more.append([str(len(row["seeds"])), rank, ratio, errors])
-    titles = ["network", *(_title(row, table.tested) for row in table.rows.to_dict("records"))]
-    lines = [[title, *c[1:], *m] for title, c, m in zip(titles, cells, more, strict=True)]
-    return "\n".join(
-        [
-            f"### {dataset.title}",
-            "",
-            f"{len(dataset.training)} recordings for training, {len(dataset.validation)} for "
-            f"validation, {table.tested} for testing ({table.path_m:.0f} m); {dataset.words}. "
-            "Ranks and ratios are based on the geometric mean over recordings of the "
-            f"{table.measure}.",
-            "",
-            *_markdown(lines),
-            *(["", f"Skipped: {len(table.skipped)} recordings, listed in `table.json`."]
-              if table.skipped else []),
-        ]
-    )  # fmt: skip
-
-
-def _title(row: Mapping[str, Any], tested: int) -> str:
-    if row["network"] == PDR:
-        return "pedestrian dead reckoning (`pdr`)"
-    if row["network"] in ARCHITECTURES:
-        return str(row["network"])
-    note = f", trained on {row['learned']} of these {tested}" if row["learned"] else ""
-    return f"weights `{row['network']}`{note}"
-
-
-def _cost_text(costs: Sequence[ModelRow], work: pd.DataFrame) -> str:
-    times = [f"ms per window, batch {batch}" for batch in BATCHES]
-    titles = ["network", "parameters [10^6] (paper)", "FLOPs [10^6] (paper)", "memory [MB]", *times]
-    rows = [[*titles, "core hours", "training windows / s"]]
-    done = work.reindex([row.name for row in costs])
-    for row, (_, spent) in zip(costs, done.iterrows(), strict=True):
-        milliseconds = row.milliseconds["torch"] or {}
-        hours = spent[["training_s", "evaluation_s"]].sum() / 3600.0
-        speed = spent["windows_per_s"]
-        cells = [f"{milliseconds[str(batch)]:.2f}" for batch in BATCHES]
-        cells = [f"{row.peak_memory_mb:.1f}", *cells, f"{hours:.2f}"]
-        rows.append([row.name, *row.counts(), *cells, "-" if np.isnan(speed) else f"{speed:.0f}"])
-    training, testing = work[["training_s", "evaluation_s"]].sum() / 3600.0
-    return "\n".join(
-        [
-            *("### Costs", "", *_markdown(rows), ""),
-            f"Total: {training + testing:.2f} core hours, {training:.2f} for training and "
-            f"{testing:.2f} for evaluation. Time per window: on this machine, one thread per core "
-            "that PyTorch uses; memory: weights and results of one inference "
-            "(`stario check models`).",
-        ]
-    )
-
-
-def _markdown(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return a table's lines without columns that have no value; the first row holds the titles."""
-    columns = [c for c in zip(*rows, strict=True) if any(cell != "-" for cell in c[1:])]
-    head, *body = (f"| {' | '.join(cells)} |" for cells in zip(*columns, strict=True))
-    return [head, f"|{'---|' * len(columns)}", *body]
-
-
-_WORDS = (
-    "ATE, RTE and PDE: horizontal, means over recordings, first poses aligned in yaw and position; "
-    f"{CONVENTIONS['ate_m']}; {CONVENTIONS['rte_m']}; {CONVENTIONS['pde']}. "
-    "Squares are also averaged over coordinates, as in RoNIN's code and the paper: multiply by "
-    "sqrt(2) for the norm. The first three columns follow the paper's protocol: windows turned "
-    "by the true attitude. Waypoints: residual after a fit in yaw and position, in m and in % "
-    "of the path, and the length of the track over that of the truth. Positions: error within "
-    "stretches of 20 s, each fitted, in % of the path. Training and validation error: mean "
-    "squared displacement error of windows [m^2] in the last epoch and in the best one, whose "
-    "weights are kept (in validation, legs count in m^2/s). +-: standard error over training "
-    "seeds, for one split. Ranks and ratios: equal weights of sets and of the groups (people, "
-    "places) in a set. Intervals (95 %): bootstrap over groups, recordings and blocks of 30 s, "
-    "with the same draws for all networks; seeds are averaged."
-)
 
 
 def _for_figures(table: SetTable, completed: Completed) -> NetworkTable | None:

@@ -68,7 +68,7 @@ def health_findings(health: Health) -> list[Finding]:
     found += [*_floors(health), *_corrections(health), *_field(health)]
     found += [*_fixes(health), *_direction(health)]
     notes = (f"{note[:1].upper()}{note[1:]}." for note in health.notes)
-    return found + [Finding(f"note_{k}", note, level="note") for k, note in enumerate(notes)]
+    return found + [Finding(f"note_{k}", note) for k, note in enumerate(notes)]
 
 
 def _clock(health: Health) -> Iterator[Finding]:

@@ -1,12 +1,17 @@
-"""Checkpoints of a training run: one safetensors file, written atomically."""
+"""Checkpoints of a training run, written atomically, and exclusive use of its folder.
+
+Two runs in one folder would overwrite each other's files.
+"""
 
 from __future__ import annotations
 
+import errno
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import safetensors
 import safetensors.torch
@@ -14,8 +19,8 @@ from torch import Tensor
 
 from stario.network.model import first_mismatch
 from stario.network.training.config import TrainingConfig
-from stario.sequences.errors import ConfigError, ReadError
-from stario.sequences.files import atomic_write
+from stario.sequences.errors import ConfigError, InputError, ReadError
+from stario.sequences.files import atomic_write, remove_abandoned
 
 
 def write_checkpoint(
@@ -97,3 +102,53 @@ def _check_same(path: Path, found: dict[str, Any], config: TrainingConfig) -> No
                 f"{expected[name]!r}, as in this run",
                 "resume with the same settings or train into another folder",
             )
+
+
+LOCK_FILE = ".lock"
+"""Stays in the folder: removing it could let two runs lock two files of that name."""
+
+_ABANDONED_S = 600.0
+"""Age of temporary files that are removed [s]: without locks, younger ones may be in use."""
+_TAKEN = (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
+
+
+@contextmanager
+def exclusive(folder: Path) -> Iterator[None]:
+    """Create a run's folder and keep other runs out of it within the block.
+
+    The system releases the lock when the process ends, even if it is killed. Where it has none
+    (Windows, some network drives), runs are not kept apart. Temporary files that killed runs have
+    left are removed.
+
+    Raises:
+        ConfigError: another run is using the folder.
+        InputError: the folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / LOCK_FILE).open("ab")
+    except OSError as error:
+        found = f"{folder}: {error.strerror or error}"
+        raise InputError("folder", found, "a writable folder", "choose another (--out)") from error
+    with file:
+        _lock(file, folder)
+        remove_abandoned(folder, _ABANDONED_S)
+        yield
+
+
+def _lock(file: IO[bytes], folder: Path) -> None:
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno not in _TAKEN:
+            return
+        raise ConfigError(
+            "folder",
+            f"{folder}, in which another run is training",
+            "a folder for this run alone",
+            "wait for that run or train into another folder (--out)",
+        ) from error

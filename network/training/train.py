@@ -15,10 +15,10 @@ import numpy as np
 from stario.network.card import Calibration
 from stario.network.model import DisplacementModel
 from stario.network.training.augment import WindowSampler
+from stario.network.training.checkpoint import exclusive
 from stario.network.training.config import TrainingConfig
 from stario.network.training.history import EpochReport
 from stario.network.training.legs import leg_samplers
-from stario.network.training.lock import exclusive
 from stario.network.training.parallel import workers
 from stario.network.training.result import write_result
 from stario.network.training.run import TrainingRun

@@ -41,8 +41,9 @@ def convert(sequence: ImuSequence, path: Path, layout: str | None = None) -> lis
     Numbers have enough digits to be read back bit for bit; the EuRoC layout holds times in integer
     nanoseconds. CSV and EuRoC drop the truth's covariance and invalid poses, the device's own
     attitude, attributes, and positions alongside true poses; CSV also drops the truth's velocity,
-    EuRoC all positions and the magnetometer. An archive only drops positions alongside true poses,
-    unless they are waypoints. Warnings name all but the invalid poses.
+    floors and coordinates of waypoints, EuRoC all positions, magnetometer, barometer and
+    satellites. An archive only drops positions alongside true poses, unless they are waypoints.
+    Warnings name all but the invalid poses.
 
     Args:
         sequence: the recording.
@@ -156,11 +157,14 @@ def _lost_positions(positions: PositionTrack, beside_poses: bool) -> list[str]:
     kind, time = positions.kind, positions.time[positions.valid]
     if beside_poses:
         return [f"{kind} alongside true poses have no column in CSV"]
+    lost = []
+    if kind == "waypoints" and not (positions.floor is None and positions.latlon_deg is None):
+        lost.append("floors and coordinates of waypoints have no column in CSV: write .h5")
     if len(time) < 2:
-        return [f"a CSV needs two {kind}: write .h5"]
-    if kind != (read_as := kind_of_positions(time)):
-        return [f"a CSV's reader takes {kind} at such intervals for {read_as}: write .h5"]
-    return []
+        lost.append(f"a CSV needs two {kind}: write .h5")
+    elif kind != (read_as := kind_of_positions(time)):
+        lost.append(f"a CSV's reader takes {kind} at such intervals for {read_as}: write .h5")
+    return lost
 
 
 def _warn_about_losses(sequence: ImuSequence, layout: str) -> None:
@@ -176,8 +180,10 @@ def _warn_about_losses(sequence: ImuSequence, layout: str) -> None:
     if sequence.positions is not None and layout == "euroc":
         kind = sequence.positions.kind
         lost.append(f"{kind} have no file in the EuRoC layout: write .csv or .h5")
-    if sequence.magnetometer is not None and layout == "euroc":
-        lost.append("the magnetometer has no file in the EuRoC layout: write .csv or .h5")
+    for words in ("magnetometer", "barometer", "satellites"):
+        if getattr(sequence, words) is not None and layout == "euroc":
+            verb = "have" if words.endswith("s") else "has"
+            lost.append(f"the {words} {verb} no file in the EuRoC layout: write .csv or .h5")
     if sequence.device_attitude is not None:
         lost.append("the device's own attitude has no column: write .h5")
     if sequence.attributes:

@@ -1,7 +1,16 @@
-"""Training data of recordings: read, checked, cut into streams and kept in the cache."""
+"""Training data of recordings: read, checked, cut into streams and kept in the cache.
+
+A file of the cache holds the streams of a recording in the layout of safetensors: a header, then
+the numbers of all of them, which are memory-mapped, so that they need no memory. It gets its name
+only when it is complete: a killed writer leaves nothing that would be read, and if two write at
+once, the second replaces the first's file by the same content. The folder may be deleted at any
+time.
+"""
 
 from __future__ import annotations
 
+import json
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -9,11 +18,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import safetensors.numpy
+from numpy.typing import NDArray
 
-from stario.sequences.datasets.array_cache import Part, kept, read_parts
 from stario.sequences.datasets.batch import Skipped, each, skipped
-from stario.sequences.datasets.cache_files import cache_file, recording_file
+from stario.sequences.datasets.cache_files import cache_file, recording_file, remove_unused
 from stario.sequences.errors import InputError, StarioError
+from stario.sequences.files import atomic_write, remove_abandoned
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.legs import LegStream, leg_streams
 from stario.sequences.readers.archive import split_name
@@ -81,7 +92,7 @@ def cached(
     The key has plain values that determine the result, except for this package's code.
     """
     file = cache_file(folder, key)
-    streams = kept(file, build, _parts)
+    streams = _kept(file, build)
     return (_opened(file) or build()) if streams is None else streams
 
 
@@ -96,7 +107,7 @@ def _stored(
     if not split_name(path)[0].exists():
         return _streams(read(path), attitude)
     file = recording_file(folder, path, {**options, "attitude": attitude})
-    streams = kept(file, lambda: _streams(read(path), attitude), _parts)
+    streams = _kept(file, lambda: _streams(read(path), attitude))
     return file if streams is None else streams
 
 
@@ -133,7 +144,7 @@ def _parts(streams: Sequence[Stream]) -> list[Part]:
 
 def _opened(file: Path) -> list[Stream] | None:
     """Return memory-mapped streams, or None if the file is missing or incomplete."""
-    parts = read_parts(file)
+    parts = _read_parts(file)
     return None if parts is None else [_stream(*part) for part in parts]
 
 
@@ -141,3 +152,74 @@ def _stream(values: dict[str, Any], arrays: dict[str, Any]) -> Stream:
     if values["kind"] == _POSES:
         return WorldStream(values["name"], **arrays)
     return LegStream(**values, **arrays)
+
+
+log = logging.getLogger(__name__)
+
+Part = tuple[dict[str, Any], dict[str, NDArray[Any]]]
+"""Plain values, and arrays by name; all parts of a file have arrays of the same names."""
+
+_ABANDONED_S = 3600.0
+
+
+def _kept(file: Path, build: Callable[[], Sequence[Stream]]) -> Sequence[Stream] | None:
+    """Build what a file lacks and write it there; return it if it could not be, None if it was."""
+    if _read_parts(file) is not None:
+        return None
+    built = build()
+    return None if _write_parts(file, _parts(built)) else built
+
+
+def _write_parts(file: Path, parts: Sequence[Part]) -> bool:
+    """Write parts to the cache; return False, with a warning, if they cannot be written."""
+    if not parts:
+        return False
+    tables = [arrays for _, arrays in parts]
+    rows = [{name: len(array) for name, array in table.items()} for table in tables]
+    metadata = [{**values, "rows": counts} for (values, _), counts in zip(parts, rows, strict=True)]
+    content = safetensors.numpy.save(
+        {name: np.concatenate([table[name] for table in tables]) for name in tables[0]},
+        metadata={"parts": json.dumps(metadata)},
+    )
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        remove_abandoned(file.parent, _ABANDONED_S, file.name)
+        remove_unused(file.parent)
+        with atomic_write(file, "wb") as target:
+            target.write(content)
+    except (OSError, InputError) as error:
+        log.warning("%s: windows are not kept for the next run: %s", file.parent, error)
+        return False
+    return True
+
+
+def _read_parts(file: Path) -> list[Part] | None:
+    """Return the parts, memory-mapped, or None if the file is missing or incomplete."""
+    try:
+        mapped = np.memmap(file, dtype=np.uint8, mode="r")  # once: each map keeps a file open
+        begin = 8 + int.from_bytes(mapped[:8].tobytes(), "little")
+        header = json.loads(mapped[8:begin].tobytes())
+        metadata = json.loads(header.pop("__metadata__")["parts"])
+        if len(mapped) != begin + max(tensor["data_offsets"][1] for tensor in header.values()):
+            raise ValueError(f"{len(mapped)} bytes")
+        whole = {name: _array(mapped[begin:], tensor) for name, tensor in header.items()}
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        log.warning("%s: incomplete, will be rebuilt: %s", file, error)
+        return None
+    first = dict.fromkeys(whole, 0)
+    parts: list[Part] = []
+    for values in metadata:
+        arrays = {}
+        for name, rows in values.pop("rows").items():
+            arrays[name] = whole[name][first[name] : first[name] + rows]
+            first[name] += rows
+        parts.append((values, arrays))
+    return parts
+
+
+def _array(content: NDArray[np.uint8], tensor: Mapping[str, Any]) -> NDArray[Any]:
+    begin, stop = tensor["data_offsets"]
+    dtype = {"F32": "<f4", "F64": "<f8", "I64": "<i8"}[tensor["dtype"]]
+    return np.asarray(content[begin:stop].view(dtype).reshape(tensor["shape"]))

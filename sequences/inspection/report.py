@@ -16,8 +16,10 @@ from stario.sequences.inspection.constant_values import dead_axes
 from stario.sequences.inspection.gyro_axes import GyroAxes, compare_gyro_axes
 from stario.sequences.inspection.magnetic import assess_magnetometer
 from stario.sequences.inspection.magnetic_findings import MagneticFindings, magnetic_findings
+from stario.sequences.inspection.pressure import PressureFindings, assess_barometer
+from stario.sequences.inspection.receiver import SatelliteFindings, assess_satellites
 from stario.sequences.inspection.samples import (
-    magnetometer_time,
+    clock_findings,
     sample_findings,
     without_times_ahead,
 )
@@ -37,10 +39,9 @@ from stario.sequences.truth.findings import (
     positions_as_dict,
     scale_findings,
 )
-from stario.sequences.truth.fit import TruthFit
+from stario.sequences.truth.fit import TruthFit, YawDrift, yaw_drift
 from stario.sequences.truth.positions import PositionFit
 from stario.sequences.truth.problems import examine_truth
-from stario.sequences.truth.yaw_drift import YawDrift, yaw_drift
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,8 @@ class Inspection:
         truth: description of the ground truth.
         device_attitude: number of attitudes logged by the device's own sensor fusion.
         magnetic: findings about the magnetometer; None without one or with too few samples.
+        pressure: findings about the barometer, likewise.
+        satellites: findings about the satellite positions, likewise.
         yaw: drift of the gyroscope's yaw from the true one; None if it cannot be determined.
         axes: agreement of the gyroscope with gravity; None if units are wrong.
     """
@@ -123,6 +126,8 @@ class Inspection:
     findings: tuple[Finding, ...]
     truth: str
     magnetic: MagneticFindings | None
+    pressure: PressureFindings | None
+    satellites: SatelliteFindings | None
     device_attitude: int
     yaw: YawDrift | None
     axes: GyroAxes | None
@@ -151,6 +156,8 @@ class Inspection:
             "device_attitudes": self.device_attitude,
             "known_of_truth": self.truth,
             "magnetometer": self.magnetic and self.magnetic.as_dict(),
+            "barometer": self.pressure and self.pressure.as_dict(),
+            "satellites": self.satellites and self.satellites.as_dict(),
             "verdict": [asdict(finding) for finding in verdict(self.findings)],
         }
 
@@ -162,6 +169,8 @@ class Inspection:
             f"gyroscope: {self.gyro_norm:.3f} rad/s",
             *self._rest_lines(),
             *(self.magnetic.lines() if self.magnetic else []),
+            *(self.pressure.lines() if self.pressure else []),
+            *(self.satellites.lines() if self.satellites else []),
             *([f"device's own attitudes: {self.device_attitude}"] if self.device_attitude else []),
             *self._truth_lines(),
             *([] if self.refused else [self._axes_line()]),
@@ -259,7 +268,11 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
     except InputError:  # an invalid rate, which was reported
         rest = magnetic = None
     findings += magnetic_findings(magnetic) if magnetic else ()
-    findings += magnetometer_time(sequence) + known_position_findings(sequence)
+    pressure = assess_barometer(sequence.barometer)
+    satellites = assess_satellites(sequence.satellites)
+    findings += pressure.findings() if pressure else ()
+    findings += satellites.findings() if satellites else ()
+    findings += clock_findings(sequence) + known_position_findings(sequence)
     return Inspection(
         name=sequence.name,
         timing=_timing(sequence, given, int((~finite).sum())),
@@ -273,6 +286,8 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         truth=sequence.truth_summary(),
         device_attitude=0 if sequence.device_attitude is None else len(sequence.device_attitude),
         magnetic=magnetic,
+        pressure=pressure,
+        satellites=satellites,
         yaw=yaw,
         axes=axes,
     )

@@ -7,6 +7,7 @@ import logging
 import numpy as np
 
 from stario.sequences.arrays import runs
+from stario.sequences.auxiliary import Timed
 from stario.sequences.clean_samples import MAX_RATE, MIN_RATE, SHARED_TIMES, usable
 from stario.sequences.errors import InputError
 from stario.sequences.findings import Finding
@@ -208,22 +209,30 @@ def check_time(sequence: ImuSequence) -> None:
     raise InputError(f"{sequence.name}: time", f"{rate:.4g} samples/s", "50 to 1000", fix)
 
 
-def magnetometer_time(sequence: ImuSequence) -> list[Finding]:
-    """Report a magnetometer of which most samples are at other times than the IMU's."""
-    field, times = sequence.magnetometer, sequence.time[np.isfinite(sequence.time)]
-    if field is None or not len(times):
-        return []
-    start, stop = float(times.min()), float(times.max())
-    if ((field.time >= start) & (field.time <= stop)).mean() >= _INSIDE:
-        return []
-    longer = float(np.ptp(field.time)) / max(stop - start, 1e-9)
+def clock_findings(sequence: ImuSequence) -> list[Finding]:
+    """Report other sensors of which most samples are at other times than the IMU's."""
+    times = sequence.time[np.isfinite(sequence.time)]
+    parts: dict[str, tuple[str, Timed | None]] = {
+        "field": ("magnetometer", sequence.magnetometer),
+        "pressure": ("barometer", sequence.barometer),
+        "satellites": ("satellites", sequence.satellites),
+    }
+    known = ((code, words, part) for code, (words, part) in parts.items() if part is not None)
+    found = (_clock(code, words, part.time, times) for code, words, part in known if len(times))
+    return [finding for finding in found if finding is not None]
+
+
+def _clock(code: str, words: str, time: FloatArray, imu: FloatArray) -> Finding | None:
+    start, stop = float(imu.min()), float(imu.max())
+    if ((time >= start) & (time <= stop)).mean() >= _INSIDE:
+        return None
+    longer = float(np.ptp(time)) / max(stop - start, 1e-9)
     units = (u for u, ns in TIME_UNITS.items() if u != "s" and 0.5 < longer * ns / 1e9 < 2.0)
     unit = next(units, None)
-    return [
-        Finding(
-            "field_clock",
-            f"magnetometer: found times from {field.time[0]:.6g} to {field.time[-1]:.6g} s, "
-            f"expected most during the samples, {start:.6g} to {stop:.6g} s",
-            f"they seem to be in {unit}" if unit else "use one clock for both",
-        )
-    ]
+    return Finding(
+        f"{code}_clock",
+        f"{words}: found times from {time[0]:.6g} to {time[-1]:.6g} s, "
+        f"expected most during the samples, {start:.6g} to {stop:.6g} s",
+        f"they seem to be in {unit}" if unit else "use one clock for both",
+        values={"first_s": float(time[0]), "last_s": float(time[-1])},
+    )

@@ -22,6 +22,7 @@ from stario.sequences.errors import ReadError
 from stario.sequences.lazy import optional_package
 from stario.sequences.readers.checked import checked, pose_mask, rotations
 from stario.sequences.readers.hdf5 import DAMAGED, is_hdf5, opened_hdf5
+from stario.sequences.readers.satellites import OPTIONAL
 from stario.sequences.sequence import (
     Barometer,
     BoolArray,
@@ -48,7 +49,7 @@ _OPTIONAL = {
 }
 
 POSITIONS_OPTIONAL = ("sigma", "latlon_deg", "floor")
-SATELLITES_OPTIONAL = ("altitude_m", "radius_m", "speed_m_s", "bearing_deg")
+SATELLITES_OPTIONAL = tuple(OPTIONAL.values())
 
 
 def split_name(path: Path) -> tuple[Path, str | None]:

@@ -1,9 +1,10 @@
-"""ROS 1 and ROS 2 bags: Imu messages and, if present, poses as ground truth and MagneticField.
+"""ROS 1 and ROS 2 bags: Imu messages and, if present, poses as ground truth and other sensors.
 
 Reads `.bag` files, rosbag2 folders, `.mcap` and `.db3` files with `rosbags`, without ROS. Only the
-numbers of a message are decoded: a message of the types below ends with a fixed number of doubles,
-whatever precedes them, and has the stamp at byte 4, both in ROS 1's serialisation and in CDR. This
-is fast and needs no type definitions, which older `.db3` files lack.
+numbers of a message are decoded: a message of the types below ends with a fixed number of doubles
+(in NavSatFix, a byte follows them), whatever precedes them, and has the stamp at byte 4, both in
+ROS 1's serialisation and in CDR. This is fast and needs no type definitions, which older `.db3`
+files lack.
 
 Time is the header's stamp, or the bag's time if a driver left all stamps zero. Poses are assumed to
 be those of the IMU in a world with z up; `stario inspect` reports if they are not.
@@ -11,6 +12,7 @@ be those of the IMU in a world with z up; `stario inspect` reports if they are n
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -26,17 +28,25 @@ from stario.sequences.readers.clocks import resample_to_gyro
 from stario.sequences.readers.lines import first_bytes
 from stario.sequences.readers.phones.attitude import agreeing_attitude, device_attitude
 from stario.sequences.readers.phones.sensor_table import Samples
+from stario.sequences.readers.pressure import barometer
+from stario.sequences.readers.satellites import RADIUS_PER_SIGMA, satellites
 from stario.sequences.readers.text import IntArray, seconds
-from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.sequence import Barometer, FloatArray, ImuSequence, Satellites, Trajectory
 from stario.sequences.units import MAGNETIC_UNITS
+
+_log = logging.getLogger(__name__)
 
 _IMU = "sensor_msgs/msg/Imu"
 _MAGNETIC = "sensor_msgs/msg/MagneticField"
+_PRESSURE, _SATELLITES = "sensor_msgs/msg/FluidPressure", "sensor_msgs/msg/NavSatFix"
+_OTHERS = (_MAGNETIC, _PRESSURE, _SATELLITES)
 _APART = "accelerometer"
 """Key of a force that has a topic of its own, as RealSense writes it."""
 _DOUBLES = {
     _IMU: 37,  # orientation, gyroscope and accelerometer, each with its covariance
     _MAGNETIC: 12,  # the field [T] and its covariance
+    _PRESSURE: 2,  # the pressure [Pa] and its variance
+    _SATELLITES: 12,  # latitude, longitude [deg], altitude [m], covariance east, north, up [m^2]
     "geometry_msgs/msg/PoseStamped": 7,  # position xyz, quaternion xyzw
     "geometry_msgs/msg/TransformStamped": 7,
     "geometry_msgs/msg/PoseWithCovarianceStamped": 7 + 36,
@@ -74,7 +84,8 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
         stamps, gyro, accel = resample_to_gyro(
             path, stamps, gyro, force.stamps_ns, force.values[:, _ACCEL]
         )
-    truth = next((m for kind, m in messages.items() if kind not in (_IMU, _APART, _MAGNETIC)), None)
+    sensors = (_IMU, _APART, *_OTHERS)
+    truth = next((m for kind, m in messages.items() if kind not in sensors), None)
     magnetic = None
     if (field := messages.get(_MAGNETIC)) is not None:
         tesla = field.values[:, :3]
@@ -87,7 +98,30 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
         truth=None if truth is None else _truth(path, truth, stamps[0]),
         magnetometer=magnetic,
         device_attitude=device_attitude(_own_attitude(imu), stamps[0]),
+        barometer=_barometer(path, messages.get(_PRESSURE), stamps[0]),
+        satellites=_satellites(messages.get(_SATELLITES), stamps[0]),
     )
+
+
+def _barometer(path: Path, received: _Messages | None, start_ns: np.int64) -> Barometer | None:
+    if received is None:
+        return None
+    time = seconds(received.stamps_ns, start_ns)
+    try:
+        return barometer(path, received.topic, time, received.values[:, 0], "Pa")
+    except ReadError as error:  # the barometer is optional
+        _log.warning("pressure skipped: %s", error)
+        return None
+
+
+def _satellites(received: _Messages | None, start_ns: np.int64) -> Satellites | None:
+    if received is None:
+        return None
+    values = received.values
+    variance = 0.5 * (values[:, 3] + values[:, 7])  # zero if unknown
+    radius = RADIUS_PER_SIGMA * np.sqrt(np.maximum(variance, 0.0))
+    rest = {"altitude_m": values[:, 2], "radius_m": radius}
+    return satellites(seconds(received.stamps_ns, start_ns), values[:, :2], rest)
 
 
 def _own_attitude(imu: _Messages) -> tuple[IntArray, Rotation] | None:
@@ -116,7 +150,7 @@ class _Messages:
 
 
 def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messages]:
-    """Return the messages of the IMU and, if present, ground truth and magnetic field, by type."""
+    """Return the messages of the IMU and, if present, ground truth and other sensors, by type."""
     version = "1" if first_bytes(path).startswith(b"#ROSBAG") else "2"
     reader_type: Any = optional_package(f"rosbags.rosbag{version}", "bags").Reader
     try:
@@ -125,7 +159,8 @@ def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messag
             pair = [] if imu_topic else _sensor_topics(topics)
             chosen = pair or [_imu_topic(path, topics, imu_topic)]
             chosen += _truth_topic(path, topics, truth_topic)
-            chosen += _magnetic_topic(topics, chosen[0])
+            for kind in _OTHERS:
+                chosen += _nearest_topic(topics, kind, chosen[0])
             connections = [c for c in reader.connections if c.topic in chosen]
             received: dict[str, list[tuple[int, bytes]]] = {topic: [] for topic in chosen}
             for connection, time, raw in reader.messages(connections):
@@ -161,7 +196,7 @@ def _sensor_topics(topics: dict[str, str]) -> list[str]:
 
 
 def _truth_topic(path: Path, topics: dict[str, str], wanted: str) -> list[str]:
-    sensors = (_IMU, _MAGNETIC)
+    sensors = (_IMU, *_OTHERS)
     candidates = [t for t, k in sorted(topics.items()) if k in _DOUBLES and k not in sensors]
     if wanted == NO_TRUTH:
         return []
@@ -173,9 +208,9 @@ def _truth_topic(path: Path, topics: dict[str, str], wanted: str) -> list[str]:
     return candidates
 
 
-def _magnetic_topic(topics: dict[str, str], imu_topic: str) -> list[str]:
-    """Return the magnetic field's topic; of several, the one nearest to the IMU's by name."""
-    candidates = [topic for topic, kind in sorted(topics.items()) if kind == _MAGNETIC]
+def _nearest_topic(topics: dict[str, str], wanted: str, imu_topic: str) -> list[str]:
+    """Return the topic of a kind of sensor; of several, the one nearest to the IMU's by name."""
+    candidates = [topic for topic, kind in sorted(topics.items()) if kind == wanted]
     prefixes = set(accumulate(imu_topic.split("/"), "{}/{}".format))
     shared = [len(prefixes & set(accumulate(t.split("/"), "{}/{}".format))) for t in candidates]
     return [candidates[shared.index(max(shared))]] if candidates else []
@@ -199,11 +234,14 @@ def _decoded(
     if shortest < _STAMP.stop + size:
         raise ReadError(path, topic, f"a message of {shortest} bytes", f"a complete {kind}")
     endian = "<" if little_endian or raws[0][1] & 1 else ">"
-    parts = np.frombuffer(b"".join(raw[_STAMP] for raw in raws), f"{endian}u4").reshape(-1, 2)
-    stamps = parts.astype(np.int64) @ np.array([10**9, 1])
+    times = np.frombuffer(b"".join(raw[_STAMP] for raw in raws), f"{endian}u4").reshape(-1, 2)
+    stamps = times.astype(np.int64) @ np.array([10**9, 1])
     if not stamps.any():
         stamps = np.array([time for time, _ in received], dtype=np.int64)
-    doubles = np.frombuffer(b"".join(raw[-size:] for raw in raws), f"{endian}f8")
+    # A NavSatFix ends with a byte; ROS 2 aligns doubles to eight after a head of four bytes.
+    after = 0 if kind != _SATELLITES else 1 if little_endian else (len(raws[0]) - 4) % 8
+    parts = [raw[len(raw) - after - size : len(raw) - after] for raw in raws]
+    doubles = np.frombuffer(b"".join(parts), f"{endian}f8")
     values = doubles.astype(np.float64).reshape(-1, _DOUBLES[kind])
     if kind != _IMU:  # whose order is reported and mended for all formats
         order = np.argsort(stamps, kind="stable")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ from stario.sequences.units import (
     ACCEL_UNITS,
     GYRO_UNITS,
     MAGNETIC_UNITS,
+    PRESSURE_UNITS,
+    SPEED_UNITS,
     TIME_UNITS,
     unit_named,
 )
@@ -36,6 +39,19 @@ SIGMA_HEADER = "sp [m]"
 MAGNETIC_HEADER = "mx [uT],my [uT],mz [uT]"
 """Optional magnetometer columns."""
 
+PRESSURE_HEADER = "p [hPa]"
+"""Optional pressure of the air."""
+
+SATELLITE_HEADER = {
+    "lat": "lat [deg]",
+    "lon": "lon [deg]",
+    "alt": "alt [m]",
+    "acc": "acc [m]",
+    "speed": "speed [m/s]",
+    "bearing": "bearing [deg]",
+}
+"""Optional columns of a satellite receiver by canonical name; all but the first two may lack."""
+
 _log = logging.getLogger(__name__)
 
 Factor = TypeVar("Factor")
@@ -45,7 +61,19 @@ POSITION, QUAT = ("px", "py", "pz"), ("qx", "qy", "qz", "qw")
 TRUTH = POSITION + QUAT
 SIGMA = "sp"
 MAGNETIC = ("mx", "my", "mz")
-QUANTITIES = (*IMU, *MAGNETIC, *TRUTH, SIGMA)
+PRESSURE = "p"
+RARE = (PRESSURE, *SATELLITE_HEADER)
+"""Quantities that some rows hold; a column of one in another unit is not read."""
+QUANTITIES = (*IMU, *MAGNETIC, *TRUTH, SIGMA, *RARE)
+
+_DEGREES, _METRES = {"deg": 1.0, "": 1.0, "°": 1.0}, {"m": 1.0, "": 1.0, "ft": 0.3048}
+RARE_UNITS: dict[str, Mapping[str, float]] = {
+    PRESSURE: PRESSURE_UNITS | {"": math.nan},
+    **dict.fromkeys(("lat", "lon", "bearing"), _DEGREES),
+    **dict.fromkeys(("alt", "acc"), _METRES),
+    "speed": SPEED_UNITS | {"": 1.0},
+}
+"""Factors of their units; that of a pressure without one is told from its size."""
 
 _STEMS = {
     "g": ("gyro", "gyr", "gyroscope", "w", "omega", "angular_velocity", "w_rs_s"),
@@ -56,7 +84,8 @@ _STEMS = {
 }
 _ALIASES = (
     dict.fromkeys(("t", "time", "times", "timestamp", "datetime"), "t")
-    | {SIGMA: SIGMA}
+    | {name: name for name in (SIGMA, *RARE)}
+    | {"pressure": "p", "latitude": "lat", "longitude": "lon", "altitude": "alt"}
     | {
         stem + joint + axis: letter + axis
         for letter, stems in _STEMS.items()
@@ -151,13 +180,18 @@ def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
     ignored = []
     for index, (text, name) in enumerate(zip(titles, _names(titles), strict=True)):
         title, unit = _cell(text)
-        if not name:
+        if not name or (name in RARE and name in columns):
             ignored.append(title)
+        elif name in RARE and unit_named(unit) not in RARE_UNITS[name]:
+            known = ", ".join(filter(None, RARE_UNITS[name]))
+            _log.warning("%s: %s is not read: found unit %r, expected %s", path, title, unit, known)
         elif name in columns:
             found = f"both {title} and {columns[name].title}"
             raise ReadError(path, f"line {number}, {name}", found, "one column")
         else:
             columns[name] = Column(index, title, unit)
+    if not {"lat", "lon"} <= set(columns):
+        ignored += [columns.pop(name).title for name in SATELLITE_HEADER if name in columns]
     missing = [name for name in ("t", *IMU) if name not in columns]
     if not set(POSITION) & set(columns):  # attitude alone is not a track
         ignored += [columns.pop(name).title for name in QUAT if name in columns]

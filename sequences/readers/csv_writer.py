@@ -1,7 +1,8 @@
-"""Writing a generic CSV: samples, magnetometer and truth share rows where their times agree."""
+"""Writing a generic CSV: samples, rarer data and truth share rows where their times agree."""
 
 from __future__ import annotations
 
+from math import isnan
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +13,20 @@ from stario.sequences.readers.columns import (
     HEADER,
     IMU,
     MAGNETIC_HEADER,
+    PRESSURE_HEADER,
+    SATELLITE_HEADER,
     SIGMA_HEADER,
     TRUTH_HEADER,
 )
+from stario.sequences.readers.satellites import satellite_columns
 from stario.sequences.sequence import FloatArray, ImuSequence
 
 
 def write_csv(path: Path | str, sequence: ImuSequence) -> None:
     """Write a recording so that `read_generic_csv` returns the same numbers; never a partial file.
 
-    Magnetometer samples and the truth's valid poses or positions go into the IMU's rows where
+    Samples of magnetometer and barometer, what a satellite receiver reported, and the truth's valid
+    poses or positions go into the IMU's rows where
     their times are equal and into separate rows elsewhere; the truth's velocity and covariance
     have no column. The reader counts time from the first IMU sample.
 
@@ -46,6 +51,13 @@ def write_csv(path: Path | str, sequence: ImuSequence) -> None:
         header += f",{TRUTH_HEADER}"
         poses = np.column_stack([truth.position_W, truth.quat_xyzw])
         rows.add(truth.time[truth.valid], poses[truth.valid])
+    if sequence.barometer is not None:
+        header += f",{PRESSURE_HEADER}"
+        rows.add(sequence.barometer.time, sequence.barometer.pressure_hPa[:, None])
+    if sequence.satellites is not None:
+        names, values = satellite_columns(sequence.satellites)
+        header += "," + ",".join(SATELLITE_HEADER[name] for name in names)
+        rows.add(sequence.satellites.time, values)
     with atomic_write(path) as file:
         file.write("\n".join([header, *rows.merged()]) + "\n")
 
@@ -64,12 +76,12 @@ class _Written:
         self._blank = "," * len(IMU)
 
     def add(self, time: FloatArray, values: FloatArray) -> None:
-        """Append columns on the right, with values (M, K) at increasing times (M,)."""
+        """Append columns on the right: values (M, K) at increasing times (M,), NaN as blank."""
         empty = "," * values.shape[1]
         tails = [empty] * len(self._rows)
         own = []
         for t, row in zip(time.tolist(), values.tolist(), strict=True):
-            text = "," + ",".join(map(repr, row))
+            text = "," + ",".join("" if isnan(value) else repr(value) for value in row)
             if t in self._shared:
                 tails[self._shared[t]] = text
             else:

@@ -12,6 +12,9 @@ separated by commas, semicolons or tabs like the rows below it; comments (`#`) m
 - gyroscope and accelerometer may be in separate rows, with blank cells for the other.
 - `mx,my,mz` magnetic field in uT (or nT, mT, T, gauss), in separate rows or in those of the IMU;
   blank, `NA` or `nan` where it was not sampled.
+- `p` pressure of the air in hPa (or Pa, kPa, inHg, ...), in the rows where it was read.
+- `lat,lon` [deg] a satellite receiver's position on WGS 84, in the rows where it was reported, with
+  `alt` [m], `acc` [m] (radius that holds 68 %), `speed` in m/s (or km/h, kn) and `bearing` [deg].
 - ground truth: `px,py,pz` [m] in a world with z up and `qx,qy,qz,qw`, body to world. A row may
   leave it blank (truth at a lower rate), or gyroscope and accelerometer (truth at other times).
 - or only `px,py` or `px,py,pz`: waypoints (if their median interval is two seconds or more), or
@@ -45,7 +48,11 @@ from stario.sequences.readers.clocks import (
 )
 from stario.sequences.readers.columns import (
     IMU,
+    PRESSURE,
     QUANTITIES,
+    RARE,
+    RARE_UNITS,
+    SATELLITE_HEADER,
     SIGMA,
     TRUTH,
     Column,
@@ -64,16 +71,26 @@ from stario.sequences.readers.lines import (
     read_lines,
     unquoted,
 )
+from stario.sequences.readers.pressure import barometer
+from stario.sequences.readers.satellites import OPTIONAL, in_degrees, satellites
 from stario.sequences.readers.text import RowFormat, Table, is_missing, read_table, seconds
 from stario.sequences.sequence import (
+    Barometer,
     BoolArray,
     FloatArray,
     ImuSequence,
     PositionTrack,
+    Satellites,
     Trajectory,
 )
 from stario.sequences.time_order import increasing_mask
-from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS, TIME_UNITS
+from stario.sequences.units import (
+    ACCEL_UNITS,
+    GYRO_UNITS,
+    MAGNETIC_UNITS,
+    TIME_UNITS,
+    unit_named,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -120,6 +137,8 @@ def read_generic_csv(path: Path) -> ImuSequence:
         truth=truth,
         positions=positions,
         magnetometer=field,
+        barometer=_barometer(path, header, rows),
+        satellites=_satellites(path, header, rows),
         source=source_words("generic CSV", rows.assumed_unit),
         converted=frozenset(sensor for sensor, done in converted.items() if done.any()),
     )
@@ -166,8 +185,8 @@ def _read_rows(path: Path, lines: list[str], header: Header) -> _Rows:
     dated = with_seconds(cells[clock.index : clock.index + 1])
     row_format = RowFormat(header.lines, separator, decimal, dated != cells[clock.index :][:1])
     names = ["t", *(name for name in QUANTITIES if name in columns)]
-    used, titles = [columns[n].index for n in names], [columns[n].title for n in names]
-    table = read_table(path, used, row_format, titles, killed=ends_within_a_row(path, separator))
+    table = _table(path, header, names, row_format)
+    names = names[: table.values.shape[1]]
     refuse_several_devices(table, header.titles, columns["gx"].index)
     is_imu = _imu_rows(table, [names.index(name) for name in IMU])
     if not is_imu.any():
@@ -177,6 +196,21 @@ def _read_rows(path: Path, lines: list[str], header: Header) -> _Rows:
     time = table.seconds(clock.index, clock.title, unit_ns, int(np.argmax(is_imu)))
     values = dict(zip(names[1:], table.values[:, 1:].T, strict=True))
     return _Rows(values, time, is_imu, table.line_numbers, assumed)
+
+
+def _table(path: Path, header: Header, names: list[str], row_format: RowFormat) -> Table:
+    """Return columns; without the rare ones, the last, where these hold something else."""
+    places = [header.columns[name] for name in names]
+    used, titles = [place.index for place in places], [place.title for place in places]
+    killed = ends_within_a_row(path, header.separator)
+    try:
+        return read_table(path, used, row_format, titles, killed)
+    except ReadError as error:
+        if not set(RARE) & set(names):
+            raise
+        table = _table(path, header, [name for name in names if name not in RARE], row_format)
+        _log.warning("pressure and satellites skipped: %s", error)
+        return table
 
 
 def _first_cells(path: Path, lines: list[str], header: Header, decimal: str) -> list[str]:
@@ -264,6 +298,35 @@ def _vectors(
     factors = np.array([unit_factor(path, header.columns[name], known) for name in names])
     values = np.stack([rows.table[name] for name in names], axis=1)
     return values * factors, factors
+
+
+def _barometer(path: Path, header: Header, rows: _Rows) -> Barometer | None:
+    if PRESSURE not in rows.table:
+        return None
+    column = header.columns[PRESSURE]
+    unit = unit_named(column.unit)
+    try:
+        return barometer(path, column.title, rows.time, rows.table[PRESSURE], unit)
+    except ReadError as error:  # the barometer is optional
+        _log.warning("pressure skipped: %s", error)
+        return None
+
+
+def _satellites(path: Path, header: Header, rows: _Rows) -> Satellites | None:
+    known = {
+        name: RARE_UNITS[name][unit_named(header.columns[name].unit)] * rows.table[name]
+        for name in SATELLITE_HEADER
+        if name in rows.table
+    }
+    if not known:
+        return None
+    try:
+        latlon_deg = in_degrees(path, np.stack([known["lat"], known["lon"]], axis=1))
+    except ReadError as error:  # satellites are optional
+        _log.warning("satellites skipped: %s", error)
+        return None
+    rest = {attribute: known[name] for name, attribute in OPTIONAL.items() if name in known}
+    return satellites(rows.time, latlon_deg, rest)
 
 
 def kind_of_positions(time: FloatArray) -> Literal["positions", "waypoints"]:

@@ -30,8 +30,7 @@ from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.time_order import increasing_mask
 from stario.sequences.truth.accel_axes import accel_axes
-from stario.sequences.truth.alignment import BodyAlignment, align_tracked_body
-from stario.sequences.truth.clock_offset import clock_offset
+from stario.sequences.truth.alignment import BodyAlignment, align_tracked_body, clock_offset
 
 _log = logging.getLogger(__name__)
 

@@ -10,15 +10,9 @@ import numpy as np
 from stario.sequences.errors import ReadError
 from stario.sequences.sequence import Barometer, FloatArray
 from stario.sequences.time_order import increasing_mask
-from stario.sequences.units import PRESSURE_UNITS
+from stario.sequences.units import HIGHEST_HPA, LOWEST_HPA, PRESSURE_UNITS, pressure_unit_of
 
 _log = logging.getLogger(__name__)
-
-LOWEST_HPA, HIGHEST_HPA = 300.0, 1100.0
-"""Range of phones' barometers, from 9 km above the sea to 0.7 km below it."""
-
-_BY_SIZE = {"hPa": (300.0, 1100.0), "Pa": (3e4, 1.1e5), "kPa": (50.0, 110.0), "inHg": (15.0, 32.5)}
-"""Values of each unit that are told from those of the others by their size."""
 
 _LARGEST_STEP_HPA = 0.3
 """Median step between different neighbours of anything but pressure; of barometers it is below 0.1,
@@ -48,7 +42,7 @@ def barometer(
     pressure_hPa = values * _factor(path, title, float(np.median(values)), unit)
     steps = np.abs(np.diff(pressure_hPa))
     step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
-    if step > _LARGEST_STEP_HPA:
+    if not unit and step > _LARGEST_STEP_HPA:
         found = f"steps of {step:.2g} hPa, which is {8.4 * step:.0f} m of height"
         raise ReadError(path, title, found, *_expected())
     return Barometer(time, pressure_hPa)
@@ -60,8 +54,7 @@ def _factor(path: Path, title: str, value: float, unit: str) -> float:
         raise ReadError(path, title, f"{value:.6g} {unit}", *_expected())
     if unit and LOWEST_HPA <= PRESSURE_UNITS[unit] * value <= HIGHEST_HPA:
         return PRESSURE_UNITS[unit]
-    fitting = (u for u, (low, high) in _BY_SIZE.items() if low <= value <= high)
-    if (likely := next(fitting, None)) is None:
+    if not (likely := pressure_unit_of(value)):
         raise ReadError(path, title, f"{value:.6g} {unit}".rstrip(), *_expected())
     if unit:
         _log.warning(

@@ -22,15 +22,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from stario.sequences.sequence import FloatArray
 from stario.sequences.simulation.routes import band_noise, drift, smoothed
 
-_STRIKE_HARMONICS = 12
+_STRIKE_HARMONICS = 10
 
 _STRIKE_LEVER = 0.1
 """Distance [m] from the point about which a device turns as it rings: angular rates in the bands of
 the ringing are about 0.3 rad/s per m/s^2, wherever a phone is carried."""
+
+_STRIKE_LAG = 0.9
+"""Phase [rad] between the trunk's lowest point and the blow: the other leg has taken the weight."""
 
 _TRUNK_BOUNCE = 2.0
 """Typical root mean square of the trunk's vertical acceleration at effort 1 [m/s^2]."""
@@ -80,11 +84,15 @@ class Strike:
         strength: root mean square of its vertical acceleration at effort 1 and vigor 1 [m/s^2].
         resonance: undamped frequency [Hz].
         damping: damping ratio.
+        forward: acceleration forward and back per acceleration up and down.
+        sideways: acceleration to the sides per acceleration up and down.
     """
 
     strength: float
     resonance: float
     damping: float
+    forward: float
+    sideways: float
 
 
 _ARM = (5.0, 0.4)
@@ -98,7 +106,7 @@ def trunk(gait: Gait, bounce: float) -> FloatArray:
     `bounce` [m/s^2] is the root mean square of the vertical acceleration at effort 1.
     """
     rng, phi = gait.rng, gait.phase
-    size, sway, surge, limp = rng.uniform([0.85, 0.5, 0.4, 0.0], [1.15, 1.4, 1.2, 0.25])
+    size, sway, surge, limp = rng.uniform([0.85, 0.5, 0.3, 0.0], [1.15, 1.4, 0.9, 0.25])
     per_acceleration = np.sqrt(2.0) * gait.effort / (2.0 * np.pi * gait.step_rate) ** 2
     rise = size * bounce * per_acceleration
     shift = rng.uniform(-np.pi, np.pi, 4)
@@ -118,7 +126,9 @@ def heel_strikes(gait: Gait, strike: Strike) -> CarryMotion:
     """
     rng = gait.rng
     resonance = strike.resonance * rng.uniform(0.85, 1.15)
-    tilt = np.array([rng.normal(-0.4, 0.15), rng.normal(0.0, 0.2), 1.0])  # strikes brake
+    share = rng.uniform(0.7, 1.3, 3) * np.array([strike.forward, strike.sideways, 1.0])
+    # A blow that comes from below and in front swings the device in a circle rather than in a line.
+    ahead = np.array([np.pi / 2.0, rng.choice([-1.0, 1.0]) * np.pi / 2.0, 0.0])
     turn_axis = rng.standard_normal(3)
     turn_axis /= np.linalg.norm(turn_axis)
     typical = float(np.median(gait.step_rate))
@@ -130,11 +140,10 @@ def heel_strikes(gait: Gait, strike: Strike) -> CarryMotion:
     offset, turn = np.zeros((2, len(gait), 3))
     for k, gain in zip(n, response, strict=True):
         amplitude = np.abs(gain) / (2.0 * np.pi * k * gait.step_rate) ** 2
-        # The strike comes half a step after mid-stance.
-        angle = k * (gait.phase - np.pi) + np.angle(gain)
-        stray = rng.uniform(-0.4, 0.4, 4)
+        angle = k * (gait.phase - np.pi - _STRIKE_LAG) + np.angle(gain)
+        stray = rng.uniform(-0.4, 0.4, 4) + np.append(ahead, 0.0)
         ring = (gait.vigor * amplitude * gait.effort)[:, None] * np.cos(angle[:, None] + stray)
-        offset += ring[:, :3] * tilt
+        offset += ring[:, :3] * share
         turn += ring[:, 3:] * turn_axis / _STRIKE_LEVER
     return CarryMotion(offset, turn)
 
@@ -162,25 +171,25 @@ def _held(gait: Gait, bounce: float, strike: Strike, tremor: float, wobble: floa
 def _handheld(gait: Gait) -> CarryMotion:
     """Return the motion of a device held in front, not quite as lively as the trunk."""
     rng = gait.rng
-    strike, wobble = Strike(rng.uniform(0.3, 0.6), *_ARM), rng.uniform(0.02, 0.04)
-    motion = _held(gait, rng.uniform(1.2, 2.0), strike, rng.uniform(0.05, 0.15), wobble)
+    strike, wobble = Strike(rng.uniform(0.3, 0.6), *_ARM, 2.0, 1.0), rng.uniform(0.02, 0.04)
+    motion = _held(gait, rng.uniform(1.3, 1.8), strike, rng.uniform(0.05, 0.15), wobble)
     return _displaced(motion, rng.uniform(0.2, 0.45), rng.uniform(-0.2, 0.2), 0.7 * gait.height)
 
 
 def _in_front(gait: Gait) -> CarryMotion:
     """Return the motion of a device laid flat on a hand, which bounces more than the trunk."""
     rng = gait.rng
-    strike, wobble = Strike(rng.uniform(1.2, 2.4), *_ARM), rng.uniform(0.03, 0.07)
-    motion = _held(gait, rng.uniform(2.6, 4.2), strike, rng.uniform(0.05, 0.15), wobble)
+    strike, wobble = Strike(rng.uniform(1.3, 2.5), *_ARM, 0.8, 0.6), rng.uniform(0.03, 0.07)
+    motion = _held(gait, rng.uniform(2.9, 4.3), strike, rng.uniform(0.05, 0.15), wobble)
     return _displaced(motion, rng.uniform(0.2, 0.45), rng.uniform(-0.2, 0.2), 0.7 * gait.height)
 
 
 def _texting(gait: Gait) -> CarryMotion:
     """Return the motion of a device that is read: the arms keep it steadier than the trunk."""
     rng = gait.rng
-    strike = Strike(rng.uniform(0.5, 1.4), *_ARM)
-    wobble, tremor = rng.uniform(0.04, 0.08), rng.uniform(0.03, 0.1)
-    motion = _held(gait, rng.uniform(0.4, 0.9), strike, tremor, wobble)
+    strike = Strike(rng.uniform(0.9, 2.0), *_ARM, 0.7, 0.5)
+    wobble, tremor = rng.uniform(0.04, 0.09), rng.uniform(0.05, 0.15)
+    motion = _held(gait, rng.uniform(0.75, 1.25), strike, tremor, wobble)
     return _displaced(motion, rng.uniform(0.2, 0.4), rng.uniform(-0.1, 0.1), 0.72 * gait.height)
 
 
@@ -190,9 +199,9 @@ def _displaced(motion: CarryMotion, x: float, y: float, z: float) -> CarryMotion
 
 def _call(gait: Gait) -> CarryMotion:
     rng, n = gait.rng, len(gait)
-    strike = Strike(rng.uniform(0.6, 1.4), *_ARM)
-    wobble, tremor = rng.uniform(0.05, 0.1), rng.uniform(0.03, 0.1)
-    motion = _held(gait, rng.uniform(0.5, 1.0), strike, tremor, wobble)
+    strike = Strike(rng.uniform(0.8, 1.6), *_ARM, 0.7, 0.5)
+    wobble, tremor = rng.uniform(0.04, 0.08), rng.uniform(0.03, 0.1)
+    motion = _held(gait, rng.uniform(0.9, 1.4), strike, tremor, wobble)
     head = 0.35 * drift(rng, n, gait.rate, 1.0)
     arm = np.array([0.05, rng.choice([-1.0, 1.0]) * 0.1, 0.0])
     offset = motion.offset_H + np.array([0.0, 0.0, 0.93 * gait.height]) + _about(2, head, arm)
@@ -202,37 +211,40 @@ def _call(gait: Gait) -> CarryMotion:
 
 def _swinging(gait: Gait) -> CarryMotion:
     rng, n = gait.rng, len(gait)
-    amplitude = np.radians(rng.uniform(22.0, 40.0)) * np.sqrt(gait.vigor)
+    amplitude = np.radians(rng.uniform(24.0, 42.0)) * np.sqrt(gait.vigor)
     forward = np.radians(rng.uniform(8.0, 24.0))
-    angle = _pendulum(gait, amplitude, forward, harmonic=0.04)
+    angle = _pendulum(gait, amplitude, forward, harmonic=0.02)
     side = rng.choice([-1.0, 1.0])
     # Elbow and shoulder give: the hand swings about a point below the shoulder.
     arm = np.array([0.0, 0.0, -0.27 * gait.height])
     pivot = np.array([0.0, side * 0.13 * gait.height, 0.7 * gait.height])
-    ring = heel_strikes(gait, Strike(rng.uniform(0.9, 1.7), *_ARM))
-    offset = pivot + _about(1, -angle, arm) + trunk(gait, rng.uniform(1.4, 2.8))
+    ring = heel_strikes(gait, Strike(rng.uniform(0.9, 1.5), 5.5, 0.4, 0.9, 0.5))
+    # Forward the hand also comes inward: the plane of the swing is turned.
+    inward = Rotation.from_rotvec([0.0, 0.0, -side * rng.uniform(0.15, 0.4)])
+    offset = pivot + inward.apply(_about(1, -angle, arm)) + trunk(gait, rng.uniform(1.7, 2.8))
     offset += ring.offset_H + 0.008 * drift(rng, n, gait.rate, 0.5, 3)
     twist = rng.uniform(0.1, 0.5) * angle + 0.08 * drift(rng, n, gait.rate, 0.7)
     roll = 0.08 * drift(rng, n, gait.rate, 0.7)
-    return CarryMotion(offset, np.stack([roll, -angle, twist], axis=1) + ring.turn_H)
+    turn = inward.apply(np.stack([roll, -angle, twist], axis=1))
+    return CarryMotion(offset, turn + ring.turn_H)
 
 
 def _pocket(gait: Gait) -> CarryMotion:
     """Return the motion of a device in a front pocket: it swings and shakes with the thigh."""
     rng = gait.rng
-    amplitude = np.radians(rng.uniform(14.0, 24.0))
-    place = (0.08, -rng.uniform(0.08, 0.16) * gait.height)
-    strike = Strike(rng.uniform(1.6, 3.2), 8.0, 0.25)
-    return _on_thigh(gait, amplitude, place, rng.uniform(0.7, 1.5), strike)
+    amplitude = np.radians(rng.uniform(11.0, 18.0))
+    place = (0.08, -rng.uniform(0.05, 0.12) * gait.height)
+    strike = Strike(rng.uniform(2.2, 4.0), 8.5, 0.25, 0.7, 0.7)
+    return _on_thigh(gait, amplitude, place, rng.uniform(1.2, 2.0), strike)
 
 
 def _back_pocket(gait: Gait) -> CarryMotion:
     """Return the motion of a device in a back pocket: it turns with pelvis and thigh."""
     rng = gait.rng
-    amplitude = np.radians(rng.uniform(10.0, 18.0))
+    amplitude = np.radians(rng.uniform(9.0, 14.0))
     place = (-0.1, -rng.uniform(0.0, 0.04) * gait.height)
-    strike = Strike(rng.uniform(1.5, 2.9), 7.0, 0.3)
-    return _on_thigh(gait, amplitude, place, rng.uniform(1.0, 1.9), strike)
+    strike = Strike(rng.uniform(2.3, 4.1), 7.0, 0.3, 0.7, 0.7)
+    return _on_thigh(gait, amplitude, place, rng.uniform(1.0, 1.8), strike)
 
 
 def _on_thigh(
@@ -247,7 +259,7 @@ def _on_thigh(
     offset = hip + _about(1, -angle, np.array([place[0], 0.0, place[1]]))
     offset += trunk(gait, bounce) + ring.offset_H
     shift = rng.uniform(-0.7, 0.7, 2)
-    yaw = 0.1 * gait.effort * np.cos(gait.phase / 2.0 + shift[0])
+    yaw = 0.2 * gait.effort * np.cos(gait.phase / 2.0 + shift[0])
     roll = 0.06 * gait.effort * np.cos(gait.phase + shift[1]) + 0.03 * drift(rng, n, gait.rate, 1.0)
     return CarryMotion(offset, np.stack([roll, -angle, yaw], axis=1) + ring.turn_H)
 
@@ -263,7 +275,7 @@ def _bag(gait: Gait) -> CarryMotion:
     body = np.array([rng.choice([-0.15, 0.12]), rng.uniform(-0.15, 0.15), 0.75 * gait.height])
     strap = np.array([0.0, 0.0, -hang])
     # A bag knocks against the body: its ringing is damped most.
-    ring = heel_strikes(gait, Strike(rng.uniform(0.7, 1.6), 8.0, 0.6))
+    ring = heel_strikes(gait, Strike(rng.uniform(0.8, 1.7), 6.5, 0.5, 1.3, 1.6))
     offset = body + np.cross(turn, strap) + strap + trunk(gait, rng.uniform(1.5, 2.4))
     return CarryMotion(offset + ring.offset_H, turn + ring.turn_H)
 
@@ -290,7 +302,7 @@ def _trolley(gait: Gait) -> CarryMotion:
 def _rig(gait: Gait) -> CarryMotion:
     """Return a rig's motion: quick turns to random directions, arms waved by up to their length."""
     rng, n = gait.rng, len(gait)
-    strike = Strike(rng.uniform(0.2, 0.6), *_ARM)
+    strike = Strike(rng.uniform(0.2, 0.6), *_ARM, 2.0, 1.0)
     motion = _held(gait, _TRUNK_BOUNCE, strike, rng.uniform(0.03, 0.1), rng.uniform(0.01, 0.03))
     reach = np.array([0.2, 0.25, 0.2]) * rng.uniform(0.3, 1.1)
     waved = drift(rng, n, gait.rate, rng.uniform(0.25, 0.5), 3)
@@ -329,9 +341,14 @@ def _looks(gait: Gait, spread: FloatArray) -> FloatArray:
 def _pendulum(gait: Gait, amplitude: float, forward: float, harmonic: float) -> FloatArray:
     """Return a limb's angle (N,) [rad]: it swings with the stride about a resting `forward`."""
     rng, n = gait.rng, len(gait)
-    size = amplitude * np.minimum(gait.effort, 1.2) * (1.0 + 0.1 * drift(rng, n, gait.rate, 1.0))
+    size = (
+        amplitude
+        * gait.effort
+        / np.sqrt(gait.effort + 0.1)
+        * (1.0 + 0.1 * drift(rng, n, gait.rate, 1.0))
+    )
     stride = gait.phase / 2.0 + rng.uniform(-0.4, 0.4)
-    overtone = harmonic * np.cos(2.0 * stride + rng.uniform(-0.5, 0.5))
+    overtone = harmonic * np.cos(2.0 * stride + rng.uniform(0.8, 1.6))
     restless = 0.03 * drift(rng, n, gait.rate, 0.6)
     return np.asarray(forward + size * (np.sin(stride) + overtone) + restless)
 

@@ -97,7 +97,7 @@ def simulate_house(
     seed: int,
     duration: float = 180.0,
     rate: float = 200.0,
-    style: WalkStyle = HANDHELD,
+    style: WalkStyle | None = HANDHELD,
     errors: ImuErrors = PHONE_IMU,
     air: Air = USUAL_AIR,
     sky: Sky | None = None,
@@ -109,7 +109,7 @@ def simulate_house(
         seed: seed of every draw; the same seed gives the same walk.
         duration: duration [s], at least `SHORTEST`.
         rate: sampling rate of the IMU [Hz].
-        style: person and carrying mode.
+        style: person and carrying mode; None draws them.
         errors: errors of the IMU.
         air: pressure of the air and errors of the barometer.
         sky: place on the earth and errors of the receiver; None for the default in a direction that
@@ -117,12 +117,18 @@ def simulate_house(
         name: name of the recording.
 
     Raises:
-        InputError: the duration is too short or too long, or the seed is not an integer >= 0.
+        InputError: the duration is too short or too long, the device is on a trolley, or the seed
+            is not an integer >= 0.
     """
     if not duration >= SHORTEST:
         raise InputError("duration", f"{duration:g} s", f"at least {SHORTEST:g} s")
     check_amount(duration, max(rate, _RATE))
     rng = generator(seed, _STREAM)
+    drawn = style is None
+    while style is None or (drawn and style.carry == "trolley"):
+        style = WalkStyle.random(rng)
+    if style.carry == "trolley":
+        raise InputError("carry", "trolley", "a device that a person carries on stairs")
     sky = Sky(azimuth=float(rng.uniform(-np.pi, np.pi))) if sky is None else sky
     plan = _plan(rng, duration, style.preferred_speed)
     route = route_along(rng, plan.commands, round(duration * _RATE) + 1, _RATE, walls=True)

@@ -15,9 +15,11 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.arrays import generator
 from stario.sequences.attitude.rotations import GyroIntegral, about_z
 from stario.sequences.attitude.stacks import composed
+from stario.sequences.auxiliary import Timed
 from stario.sequences.clean_samples import clean_samples
 from stario.sequences.noise import PHONE_NOISE
 from stario.sequences.sequence import (
+    Barometer,
     FloatArray,
     ImuSequence,
     Magnetometer,
@@ -27,6 +29,7 @@ from stario.sequences.sequence import (
 from stario.sequences.simulation.imu import PHONE_IMU, ImuErrors, simulate_imu
 from stario.sequences.simulation.magnetometer import MagneticField
 from stario.sequences.simulation.moments import Moment, MomentMotion, ramp
+from stario.sequences.units import METRES_PER_HPA
 
 GYRO_ERROR = 0.015
 """Standard deviation of the gyroscope's errors of scale and alignment during a moment [1]."""
@@ -39,6 +42,9 @@ _HALT_SECONDS, _STILL_SECONDS = 2.0, 0.5
 
 _BIAS_STRIDE = 0.2
 """Time over which gyroscope and poses are compared for the bias [s]."""
+
+_PRESSURES = 16
+"""Number of samples of the pressure near a moment from which those within it are drawn."""
 
 _ERRORS = ImuErrors(
     noise=PHONE_NOISE, gyro_range=PHONE_IMU.gyro_range, accel_range=PHONE_IMU.accel_range
@@ -116,6 +122,12 @@ def insert_moment(
     if sequence.positions is not None:
         positions = _with_positions(sequence.positions, instant.time, later, moved)
         new = replace(new, positions=positions)
+    if sequence.barometer is not None:
+        pressure = _pressure(sequence.barometer, inside.truth, instant, later, rng)
+        new = replace(new, barometer=pressure)
+    if sequence.satellites is not None:
+        known = sequence.satellites
+        new = replace(new, satellites=replace(known, time=_later(known, instant.time, later)))
     if sequence.magnetometer is not None and instant.field_L is not None:
         field = _field(sequence.magnetometer, inside.truth, motion, grid, instant, rng)
         new = replace(new, magnetometer=field)
@@ -203,7 +215,29 @@ def _with_positions(
     up = after[:, None] * moved[2] * [0.0, 0.0, 1.0]
     columns = known.position_W.shape[1]
     return replace(
-        known, time=known.time + later * after, position_W=known.position_W + up[:, :columns]
+        known, time=_later(known, start, later), position_W=known.position_W + up[:, :columns]
+    )
+
+
+def _later(known: Timed, start: float, later: float) -> FloatArray:
+    """Return times (N,) [s], those after a moment's start later by its duration."""
+    return np.asarray(known.time + later * (known.time >= start))
+
+
+def _pressure(
+    before: Barometer, inside: Trajectory, instant: _Instant, later: float, rng: np.random.Generator
+) -> Barometer:
+    """Return the pressure with that of a moment: the last before it, its noise, the new heights."""
+    time, hPa = before.time, before.pressure_hPa
+    after = time >= instant.time
+    near = hPa[np.argsort(np.abs(time - instant.time))[:_PRESSURES]]
+    ticks = np.arange(0.0, later - 1e-6, 1.0 / before.rate) if before.rate else np.empty(0)
+    rise = np.interp(ticks, inside.time, inside.position_W[:, 2]) - instant.position_L[2]
+    own = rng.choice(near, len(ticks)) - rise / METRES_PER_HPA
+    lasting = (inside.position_W[-1, 2] - instant.position_L[2]) / METRES_PER_HPA
+    return Barometer(
+        np.concatenate([time[~after], instant.time + ticks, time[after] + later]),
+        np.concatenate([hPa[~after], own, hPa[after] - lasting]),
     )
 
 

@@ -39,6 +39,10 @@ _BRISK = 1.4
 _STEP_RATE_POWER = 0.3
 """Exponent of the speed in the step rate."""
 
+_EFFORT_POWER = 1.2
+"""Exponent of the speed in the accelerations: on stiff legs the trunk rises by the square of the
+step's length, hence v^2; knees that give leave 1.0 to 1.4 (tyrex, RIDI, KIPD)."""
+
 _CHANGE = 0.6
 """Standard deviation of the Gaussian that smooths the change of carrying mode [s]."""
 
@@ -179,15 +183,13 @@ def _gait(rng: np.random.Generator, rate: float, route: Route, style: WalkStyle)
     wanted = np.stack([step_rate(moving, style), stairs, np.full(n, _SLOWEST_STEP_RATE)])
     steps = uneven * np.sum(wanted**8, axis=0) ** 0.125  # the largest of the three, smoothly
     strength = 1.0 + 0.1 * drift(rng, n, rate, 0.5)
-    # Below 0.2 m/s a person shuffles: the gait fades out towards standing.
     pace = np.hypot(moving, 0.8 * stairs)
-    fade = np.square(pace) / (np.square(pace) + 0.1**2)
     return Gait(
         rng=rng,
         rate=rate,
         phase=rng.uniform(0.0, 2.0 * np.pi) + 2.0 * np.pi * integral(steps, rate),
         step_rate=steps,
-        effort=fade * (0.15 + 0.85 * pace / _BRISK) * strength,
+        effort=strength * (pace / _BRISK) ** _EFFORT_POWER,
         speed=route.speed,
         height=style.height,
         vigor=style.vigor,

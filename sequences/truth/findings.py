@@ -1,7 +1,7 @@
 """Findings about ground truth: against gyroscope and accelerometer, and by itself; lines, values.
 
-What is compared is in `fit` (attitude against gyroscope), `positions` (against accelerometer) and
-`yaw_drift`; here are the limits beyond which it is told, and the words.
+What is compared is in `fit` (attitude against gyroscope) and `positions` (against accelerometer);
+here are the limits beyond which it is told, and the words.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ from stario.sequences.conventions import axes_matrix, axes_named, permuted
 from stario.sequences.findings import Finding
 from stario.sequences.legs import jumps
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.truth.fit import EDGE_S, MAX_OFFSET_S, TruthFit
+from stario.sequences.truth.fit import EDGE_S, MAX_OFFSET_S, TruthFit, YawDrift
 from stario.sequences.truth.positions import PositionFit
-from stario.sequences.truth.yaw_drift import YawDrift
 
 _LATE_S = 0.02
 _TURNED_RAD = math.radians(5.0)

@@ -22,9 +22,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import correlation, even_grid, integral, interpolated
+from stario.sequences.clean_samples import compared_samples
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 from stario.sequences.time_order import MAX_IMU_GAP
-from stario.sequences.truth.part import compared_samples
 
 _H_S = 0.3
 _MIN_ROWS = 50

@@ -1,21 +1,26 @@
-"""Recordings aligned for judging, and a predictor of a known share of their true displacements."""
+"""A predictor of a known share of a recording's true displacements, and its errors."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.benchmark.aligned import Aligned, aligned_recording
 from stario.fusion.evaluation.benchmark.displacement_error import (
     RecordingErrors,
     recording_errors,
 )
-from stario.fusion.evaluation.benchmark.network_alone import predictions
-from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
+from stario.fusion.evaluation.benchmark.pieces import (
+    judged_streams,
+)
+from stario.fusion.evaluation.pedestrian import Model, piece_of
+from stario.sequences.attitude.rotations import yaw_of
+from stario.sequences.levelled_stream import LevelledStream
 from stario.sequences.sequence import ImuSequence, PositionTrack
+
+streams_of = cache(judged_streams)
 
 
 def with_waypoints(walk: ImuSequence, every: float = 8.0) -> ImuSequence:
@@ -26,21 +31,24 @@ def with_waypoints(walk: ImuSequence, every: float = 8.0) -> ImuSequence:
     return replace(walk, truth=None, positions=PositionTrack(time, xy, "waypoints"))
 
 
-@cache
-def aligned_once(recording: ImuSequence) -> Aligned:
-    return aligned_recording(recording, Path("walk"))
+def yaw_WN(walk: ImuSequence, stream: LevelledStream) -> np.ndarray:
+    """Yaw (K,) that rotates N to the true world at each tick."""
+    assert walk.truth is not None
+    attitude_WB = walk.truth.at(stream.ticks).attitude_WB
+    return yaw_of(attitude_WB * Rotation.from_matrix(stream.R_NB).inv())
 
 
 class Stub:
     """Predictor of the true displacements of successive windows, scaled and rotated."""
 
     def __init__(self, walk: ImuSequence, scale: float = 1.0, yaw: float = 0.0) -> None:
-        [piece] = aligned_once(walk).pieces
-        known = piece.position_W
-        steps = np.exp(-1j * piece.yaw_WN[:-2]) * (known[2:] - known[:-2])
-        steps = scale * np.exp(1j * yaw) * steps[: piece.stream.window_count]
-        steps = np.pad(steps, (0, piece.stream.window_count - len(steps)), "edge")
-        steps = np.exp(-1j * piece.stream.headings) * steps  # in the windows' frames
+        [stream] = streams_of(walk)
+        assert walk.truth is not None
+        known = walk.truth.at(stream.ticks).position_W[:, :2] @ [1.0, 1j]
+        steps = np.exp(-1j * yaw_WN(walk, stream)[:-2]) * (known[2:] - known[:-2])
+        steps = scale * np.exp(1j * yaw) * steps[: stream.window_count]
+        steps = np.pad(steps, (0, stream.window_count - len(steps)), "edge")
+        steps = np.exp(-1j * stream.headings) * steps  # in the windows' frames
         self.displacement_H = np.stack([steps.real, steps.imag, 0.0 * steps.real], axis=1)
         self.served = 0
 
@@ -50,9 +58,8 @@ class Stub:
         return self.displacement_H[first : self.served], covariance
 
 
-def errors_of(recording: ImuSequence, stub: Stub | PedestrianDeadReckoning) -> RecordingErrors:
-    aligned = aligned_once(recording)
-    return recording_errors(aligned, predictions(stub, aligned))
+def errors_of(recording: ImuSequence, model: Model) -> RecordingErrors:
+    return recording_errors(recording, [piece_of(model, s) for s in streams_of(recording)])
 
 
 def horizontal_path(walk: ImuSequence) -> float:

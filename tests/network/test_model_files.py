@@ -1,4 +1,6 @@
-"""Files of weights and their cards: intact ones load, corrupt ones are refused by name."""
+"""Files of weights, and the network that they hold."""
+
+from __future__ import annotations
 
 import hashlib
 import json
@@ -12,6 +14,7 @@ import torch
 import stario.network
 from stario.network.card import MAX_SIGMA, Calibration, card_path
 from stario.network.model import load_model
+from stario.network.stario import moments, rms_normalised
 from stario.sequences.errors import InputError, StarioError, WeightsError
 
 DEFAULT = Path(stario.network.__file__).with_name("weights") / "default.safetensors"
@@ -160,3 +163,24 @@ def test_windows_with_a_value_that_is_not_finite_are_refused(value: float) -> No
 def test_windows_that_are_none_are_refused(windows: object) -> None:
     with pytest.raises(InputError, match=r"windows: .*\(B, 6, 200\)"):
         load_model().predict(windows)
+
+
+def test_gradient_of_the_deviation_of_a_constant_is_finite() -> None:
+    x = torch.full((2, 3, 5), 7.0, requires_grad=True)
+    moments(x, dim=2)[1].sum().backward()
+    assert x.grad is not None
+    assert torch.isfinite(x.grad).all()
+
+
+def test_moments_are_mean_and_deviation() -> None:
+    x = torch.randn(4, 8, 50, generator=torch.Generator().manual_seed(0)) * 3.0 + 1.0
+    mean, deviation = moments(x, dim=2)
+    torch.testing.assert_close(mean, x.mean(2, keepdim=True))
+    expected = x.std(2, correction=0, keepdim=True)
+    torch.testing.assert_close(deviation, expected, rtol=1e-4, atol=0.0)
+
+
+def test_normalised_windows_have_unit_mean_square_at_any_scale() -> None:
+    x = torch.randn(3, 8, 50) * torch.tensor([0.1, 1.0, 1e4]).view(3, 1, 1)
+    square = rms_normalised(x).square().mean(dim=(1, 2))
+    torch.testing.assert_close(square, torch.ones(3), rtol=2e-3, atol=0.0)

@@ -18,12 +18,18 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.benchmark.aligned import Aligned, AlignedPiece, Complex
-from stario.fusion.evaluation.benchmark.network_alone import Predictions
-from stario.fusion.imu.direction import Direction, direction, weighted_force
-from stario.sequences.levelled_stream import TICK_SECONDS, TICKS_PER_SECOND
-from stario.sequences.sequence import BoolArray, FloatArray
+from stario.fusion.evaluation.benchmark.pieces import Piece
+from stario.fusion.imu.direction import Complex, Direction, direction, weighted_force
+from stario.sequences.attitude.rotations import yaw_of
+from stario.sequences.errors import InputError
+from stario.sequences.legs import gaps_and_jumps
+from stario.sequences.levelled_stream import (
+    TICK_SECONDS,
+    TICKS_PER_SECOND,
+)
+from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, PositionTrack, is_gap
 
 HORIZONS = (1, 10, 30)
 """Spans [s] over which displacements are compared."""
@@ -138,28 +144,48 @@ class _Sums:
             self.blocks.setdefault(measure, []).append(sums)
 
 
-def recording_errors(aligned: Aligned, found: Sequence[Predictions]) -> RecordingErrors:
-    """Compute the errors of a network's predictions on each piece of a recording."""
-    sums = _Sums()
-    add_errors = {"poses": _poses, "positions": _positions, "waypoints": _waypoints}[aligned.kind]
-    total_direction = Direction()
-    paths = []
-    for piece, predictions in zip(aligned.pieces, found, strict=True):
+def known_truth(sequence: ImuSequence) -> tuple[str, PositionTrack]:
+    """Return the kind of a recording's truth, and its valid positions.
+
+    Raises:
+        InputError: there is no truth of any kind, or only one pose or position of it is valid.
+    """
+    known = sequence.truth or sequence.positions
+    if known is None:
+        raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
+    if known.valid.sum() < 2:
+        raise InputError(f"{sequence.name}: truth", f"{known.valid.sum()} valid", "two or more")
+    kind = known.kind if isinstance(known, PositionTrack) else "poses"
+    time, position_W = known.time[known.valid], known.position_W[known.valid]
+    return kind, PositionTrack(time, position_W, "positions")
+
+
+def recording_errors(sequence: ImuSequence, pieces: Sequence[Piece]) -> RecordingErrors:
+    """Compute the errors of a network's displacements in each piece of a recording.
+
+    Raises:
+        InputError: as for `known_truth`.
+    """
+    kind, known = known_truth(sequence)
+    sums, paths, total_direction = _Sums(), [], Direction()
+    for piece in pieces:
         before = sums.path
-        add_errors(piece, predictions, sums)
+        if kind == "waypoints":
+            _waypoints(piece, known, sums)
+        else:
+            _positions(piece, known, sequence, sums)
         paths.append(sums.path - before)
         weighted = weighted_force(piece.stream.windows())
-        total_direction += direction(weighted, predictions.displacement_N, TICKS_PER_SECOND)
+        total_direction += direction(weighted, piece.displacement_N, TICKS_PER_SECOND)
     if sums.path < _MIN_PATH_M:
-        unknown = dict.fromkeys(FIGURES, float("nan"))
-        return RecordingErrors(0.0, unknown, {})
+        return RecordingErrors(0.0, dict.fromkeys(FIGURES, float("nan")), {})
     fitted = sums.rms("fit")
     usual_path = float(np.square(paths).sum()) / sums.path  # of a piece, weighted by their lengths
     figures = {
         "ate_fit_m": fitted,
         "ate_fit_percent": 100.0 * fitted / usual_path,
         "ate_first_m": sums.rms("first"),
-        "length_ratio": _ratio(sums.length, sums.path),
+        "length_ratio": sums.length / sums.path,
         **{f"rms_{h}s_m": sums.rms(str(h)) for h in HORIZONS},
         "stretch_percent": 100.0 * sums.rms("stretch"),
         "direction_deg": abs(np.degrees(total_direction.turn)),
@@ -170,50 +196,67 @@ def recording_errors(aligned: Aligned, found: Sequence[Predictions]) -> Recordin
     return RecordingErrors(sums.path, figures, blocks)
 
 
-def _poses(piece: AlignedPiece, predictions: Predictions, sums: _Sums) -> None:
-    at = _at_ticks(piece, predictions)
-    track, truth = at.track, at.truth
-    finite = np.isfinite(truth)
-    if finite.sum() < 2:
-        return
-    fitted = fit_yaw_and_position(track[finite], truth[finite])
-    sums.add("fit", np.abs(fitted - truth[finite]))
-    turn = np.exp(1j * piece.yaw_WN[: len(track)])
-    first = np.flatnonzero(finite)[0]
-    on_first = truth[first] + turn[first] * (track - track[first])
-    sums.add("first", np.abs(on_first - truth)[finite])
-    _along_the_path(at, predictions, dict.fromkeys(HORIZONS, turn), sums)
+def _positions(piece: Piece, known: PositionTrack, sequence: ImuSequence, sums: _Sums) -> None:
+    """Add the errors at known positions; poses also tell the yaw at each tick."""
+    track, poses = piece.track(), sequence.truth
+    ticks = piece.stream.ticks[: len(track)]
+    if poses is None:
+        bad = gaps_and_jumps(known.time, known.position_W)
+        at = _AtTicks(track, *_interpolated(ticks, known, bad))
+        turns = {h: at.turn_of_stretches(max(h, STRETCH_SECONDS)) for h in HORIZONS}
+    else:
+        at = _AtTicks(track, *_interpolated(ticks, known, is_gap(np.diff(known.time))))
+        finite = np.isfinite(at.truth)
+        if finite.sum() < 2:
+            return
+        levelled = Rotation.from_matrix(piece.stream.R_NB[: len(track)])
+        yaw_WN = yaw_of(poses.at(ticks).attitude_WB * levelled.inv())
+        turn = np.where(finite, np.exp(1j * yaw_WN), np.nan)
+        turns = dict.fromkeys(HORIZONS, turn)
+        _whole_track(track[finite], at.truth[finite], turn[finite][0], sums)
+    _along_the_path(at, piece, turns, sums)
 
 
-def _positions(piece: AlignedPiece, predictions: Predictions, sums: _Sums) -> None:
-    at = _at_ticks(piece, predictions)
-    turns = {h: at.turn_of_stretches(max(h, STRETCH_SECONDS)) for h in HORIZONS}
-    _along_the_path(at, predictions, turns, sums)
+def _whole_track(track: Complex, truth: Complex, turn: complex, sums: _Sums) -> None:
+    """Add the position errors after a fit in yaw and position, and after that of the first pose."""
+    sums.add("fit", np.abs(fit_yaw_and_position(track, truth) - truth))
+    sums.add("first", np.abs(truth[0] + turn * (track - track[0]) - truth))
 
 
-def _along_the_path(
-    at: _AtTicks, predictions: Predictions, turns: Mapping[int, Complex], sums: _Sums
-) -> None:
+def _interpolated(
+    ticks: FloatArray, known: PositionTrack, bad: BoolArray
+) -> tuple[Complex, np.ndarray]:
+    """Return positions at the ticks (K,), NaN across bad steps, and how many are before each."""
+    time, position_W = known.time, known.position_W
+    before = np.searchsorted(time, ticks, side="right") - 1
+    inside = (before >= 0) & (before < len(bad))
+    inside[inside] = ~bad[before[inside]]
+    xy = np.interp(ticks, time, position_W[:, 0]) + 1j * np.interp(ticks, time, position_W[:, 1])
+    breaks = np.searchsorted(time[1:][bad], ticks, side="right")
+    return np.where(inside, xy, complex(np.nan, np.nan)), breaks
+
+
+def _along_the_path(at: _AtTicks, piece: Piece, turns: Mapping[int, Complex], sums: _Sums) -> None:
     """Add the errors over all horizons, given exp(i yaw) from N to W at each tick for each."""
     _lengths(at, sums)
     for horizon in HORIZONS:
         estimated, true, start = at.displacements(horizon)
         turn = turns[horizon][start]
         if horizon == 1:  # the windows themselves
-            estimated = _windows_xy(predictions)[start]
+            estimated = piece.windows[start]
             known = np.isfinite(turn)
-            _nis(predictions, start[known], np.conj(turn[known]) * true[known], sums)
+            _nis(piece, start[known], np.conj(turn[known]) * true[known], sums)
         errors = np.full(len(at.track), np.nan)
         errors[start] = np.abs(turn * estimated - true)
         sums.add_blocks(str(horizon), errors)
     _stretches(at, sums)
 
 
-def _waypoints(piece: AlignedPiece, predictions: Predictions, sums: _Sums) -> None:
-    track = predictions.track()[: len(piece.position_W)]
+def _waypoints(piece: Piece, known: PositionTrack, sums: _Sums) -> None:
+    track = piece.track()
     ticks = piece.stream.ticks[: len(track)]
-    inside = piece.waypoint_time <= ticks[-1]
-    time, truth = piece.waypoint_time[inside], piece.waypoint_W[inside]
+    inside = (known.time >= ticks[0]) & (known.time <= ticks[-1])
+    time, truth = known.time[inside], known.position_W[inside, 0] + 1j * known.position_W[inside, 1]
     if len(time) < 3:
         return
     estimated = np.interp(time, ticks, track.real) + 1j * np.interp(time, ticks, track.imag)
@@ -229,13 +272,6 @@ def block_sums(seconds: FloatArray, squares: FloatArray) -> FloatArray:
     block = np.floor(seconds / BLOCK_SECONDS).astype(int)
     rows = np.stack([np.bincount(block, squares), np.bincount(block)], axis=1)
     return np.asarray(rows[rows[:, 1] > 0])
-
-
-def _at_ticks(piece: AlignedPiece, predictions: Predictions) -> _AtTicks:
-    """Return track, truth and its breaks at the ticks common to all."""
-    track = predictions.track()
-    count = min(len(track), len(piece.position_W))
-    return _AtTicks(track[:count], piece.position_W[:count], piece.breaks[:count])
 
 
 def fit_yaw_and_position(track: Complex, truth: Complex) -> Complex:
@@ -266,18 +302,10 @@ def _stretches(at: _AtTicks, sums: _Sums) -> None:
         sums.add("stretch", errors / path)
 
 
-def _nis(predictions: Predictions, start: np.ndarray, true_N: Complex, sums: _Sums) -> None:
+def _nis(piece: Piece, start: np.ndarray, true_N: Complex, sums: _Sums) -> None:
     """Add the NIS of the horizontal error, scaled from two axes to three."""
-    error = _windows_xy(predictions)[start] - true_N
+    error = piece.windows[start] - true_N
     vector = np.stack([error.real, error.imag], axis=1)
-    covariance = predictions.covariance_N[start, :2, :2]
+    covariance = piece.covariance_N[start, :2, :2]
     nis = np.einsum("ni,ni->n", vector, np.linalg.solve(covariance, vector[..., None])[..., 0])
     sums.add("nis", np.sqrt(1.5 * nis))
-
-
-def _windows_xy(predictions: Predictions) -> Complex:
-    return np.asarray(predictions.displacement_N[:, 0] + 1j * predictions.displacement_N[:, 1])
-
-
-def _ratio(value: float, by: float) -> float:
-    return value / by if by > 0 else float("nan")

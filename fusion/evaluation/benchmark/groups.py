@@ -1,28 +1,30 @@
 """Benchmark of networks alone by groups of recordings: sets, people, devices, places.
 
-Each recording is aligned with its truth once and run through every network. `displacement_error`
-defines the errors, `stario.fusion.evaluation.bootstrap` the confidence intervals.
+`displacement_error` defines the errors, `stario.fusion.evaluation.bootstrap` the confidence
+intervals.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 import pandas as pd
 
-from stario.fusion.evaluation.benchmark.aligned import Aligned
 from stario.fusion.evaluation.benchmark.displacement_error import (
     FIGURES,
     HORIZONS,
-    RecordingErrors,
+    known_truth,
     recording_errors,
 )
-from stario.fusion.evaluation.benchmark.network_alone import RecordingPredictor, predictions
+from stario.fusion.evaluation.benchmark.pieces import (
+    judged_streams,
+)
 from stario.fusion.evaluation.bootstrap import (
     CONFIDENCE,
     REPLICATES,
@@ -30,12 +32,15 @@ from stario.fusion.evaluation.bootstrap import (
     block_rows,
     paired_ratio,
 )
-from stario.fusion.evaluation.scores import joined, parts, records, scored, wide
-from stario.fusion.imu.stateful import Predictor
+from stario.fusion.evaluation.pedestrian import Model, PedestrianDeadReckoning, piece_of
+from stario.fusion.evaluation.scores import joined, parts, records, scored, values, wide
 from stario.fusion.navigator import Navigator
-from stario.sequences.datasets.batch import Skipped, without_skipped
+from stario.fusion.recording import Progress, silent
+from stario.sequences.datasets.batch import Skipped, each
+from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.readers.archive import split_name
 from stario.sequences.sequence import ImuSequence
+from stario.sequences.truth.problems import warn_of_truth
 
 log = logging.getLogger(__name__)
 
@@ -120,62 +125,78 @@ class Benchmark:
 
 
 def benchmark(
-    recordings: Iterable[Aligned | Skipped],
-    models: Mapping[str, Callable[[str], Predictor | RecordingPredictor]],
-    groups: Mapping[Path, str],
-    read: Callable[[Path], ImuSequence] | None = None,
+    recordings: Mapping[Path, str],
+    models: Mapping[str, Callable[[str], Model]],
+    read: Callable[[Path], ImuSequence],
+    jobs: int | None = 1,
+    ekf: bool = False,
+    progress: Progress = silent,
 ) -> tuple[Benchmark | None, list[Skipped]]:
-    """Run every recording through every network; return None if there is no recording.
+    """Run every recording through every network; return None if none can be used.
 
     Args:
-        recordings: aligned recordings, and those skipped.
+        recordings: group of each recording, by path; empty for the name of the set.
         models: by name of the weights, a function that returns the network for a group: networks
             differ between groups if each group was held out of training in turn.
-        groups: group of each recording, by path; the name of the set where missing.
-        read: function that reads a path; if given, the EKF is run for its mean NIS, which is slow.
+        read: function that reads a path; like the models picklable.
+        jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
+        ekf: whether the EKF is run for its mean NIS, which is slow.
+        progress: called with the share of the work done.
     """
     skipped: list[Skipped] = []
     scores: list[pd.DataFrame] = []
     blocks = [block_rows([], **dict.fromkeys(("set", "group", "recording", "network", "metric")))]
-    still: list[Path] = []
-    for aligned in without_skipped(recordings, skipped):
-        named = labels(aligned.path, aligned.attributes, groups.get(aligned.path, ""))
-        unit = {"set": named["set"], "group": named["group"], "recording": str(aligned.path)}
-        errors = {n: _errors(model(named["group"]), aligned, read) for n, model in models.items()}
-        figures = {n: {"path_m": found.path_m, **found.figures} for n, found in errors.items()}
-        others = {key: name for key, name in named.items() if key != "group"}
-        scores.append(
-            scored(str(aligned.path), figures, named["group"], **others, truth=aligned.kind)
-        )
-        for name, found in errors.items():
-            for horizon, sums in found.blocks.items():
-                metric = f"rms_{horizon}s_m"
-                blocks.append(block_rows(sums, **unit, network=name, seed=0, metric=metric))
-        if not any(found.path_m > 0.0 for found in errors.values()):
-            still.append(aligned.path)
-    _warn_of_not_compared(still, len(scores))
+    work = partial(_scores, groups=recordings, models=models, read=read, ekf=ekf)
+    for done, outcome in enumerate(each(work, recordings, jobs), 1):
+        progress(done / len(recordings))
+        if isinstance(outcome, Skipped):
+            skipped.append(outcome)
+        else:
+            scores.append(outcome[0])
+            blocks += outcome[1]
+    _warn_of_not_compared(scores)
     return Benchmark(joined(scores), joined(blocks)) if scores else None, skipped
 
 
-def _warn_of_not_compared(paths: Sequence[Path], count: int) -> None:
+def _scores(
+    path: Path,
+    groups: Mapping[Path, str],
+    models: Mapping[str, Callable[[str], Model]],
+    read: Callable[[Path], ImuSequence],
+    ekf: bool,
+) -> tuple[pd.DataFrame, list[pd.DataFrame]]:
+    """Return a recording's rows of `Benchmark.scores` and of its blocks."""
+    sequence = read(path)
+    streams, (kind, _) = judged_streams(sequence), known_truth(sequence)
+    warn_of_truth(sequence)
+    named = labels(path, sequence.attributes, groups[path])
+    errors = {}
+    for name, make in models.items():
+        model = make(named["group"])
+        pieces = [piece_of(model, stream) for stream in streams]
+        errors[name] = recording_errors(sequence, pieces)
+        if ekf and not isinstance(model, PedestrianDeadReckoning):
+            nis = Navigator(model, backend="ekf").run(sequence).nis
+            errors[name].figures["nis_ekf"] = nis or np.nan
+    figures = {n: {"path_m": found.path_m, **found.figures} for n, found in errors.items()}
+    others = {key: name for key, name in named.items() if key != "group"}
+    unit = {"set": named["set"], "group": named["group"], "recording": str(path)}
+    blocks = [
+        block_rows(sums, **unit, network=name, seed=0, metric=f"rms_{horizon}s_m")
+        for name, found in errors.items()
+        for horizon, sums in found.blocks.items()
+    ]
+    return scored(str(path), figures, named["group"], **others, truth=kind), blocks
+
+
+def _warn_of_not_compared(scores: Sequence[pd.DataFrame]) -> None:
     """Log one warning about all recordings in which nothing could be compared."""
-    if len(paths) > 1:
+    still = [part["recording"].iloc[0] for part in scores if not values(part, "path_m").any()]
+    if len(still) > 1:
         message = "%d of %d recordings, the first %s: %s"
-        log.warning(message, len(paths), count, paths[0], _NOT_COMPARED)
-    elif paths:
-        log.warning("%s: %s", paths[0], _NOT_COMPARED)
-
-
-def _errors(
-    model: Predictor | RecordingPredictor,
-    aligned: Aligned,
-    read: Callable[[Path], ImuSequence] | None,
-) -> RecordingErrors:
-    found = recording_errors(aligned, predictions(model, aligned))
-    if read is not None and not isinstance(model, RecordingPredictor):
-        navigator = Navigator(model, backend="ekf")
-        found.figures["nis_ekf"] = navigator.run(read(aligned.path)).nis or np.nan
-    return found
+        log.warning(message, len(still), len(scores), still[0], _NOT_COMPARED)
+    elif still:
+        log.warning("%s: %s", still[0], _NOT_COMPARED)
 
 
 def labels(path: Path, attributes: Mapping[str, object], group: str = "") -> dict[str, str]:
@@ -228,3 +249,40 @@ def benchmark_dict(
         "recordings": records(found.scores.rename(columns={"track": "weights"})),
         "words": WORDS,
     }
+
+
+_TITLES = {
+    "ate_fit_m": ("fit [m]", ".2f"),
+    "ate_fit_percent": ("fit [%]", ".2f"),
+    "ate_first_m": ("first [m]", ".2f"),
+    "stretch_percent": ("20 s [%]", ".2f"),
+    "length_ratio": ("length", ".3f"),
+    "rms_1s_m": ("1 s [m]", ".3f"),
+    "rms_10s_m": ("10 s [m]", ".2f"),
+    "rms_30s_m": ("30 s [m]", ".2f"),
+    "direction_deg": ("direction [deg]", ".0f"),
+    "nis": ("NIS", ".2f"),
+    "nis_ekf": ("EKF NIS", ".2f"),
+}
+"""Titles and formats of the figures of a benchmark."""
+
+
+def benchmark_text(rows: pd.DataFrame, ours: str, theirs: str | None) -> str:
+    """Return for every group rows "theirs" and "ours", then the ratios, the verdict, the words."""
+    cells = [["", "", "n", "km", *(title for title, _ in _TITLES.values())]]
+    for row in rows.to_dict("records"):
+        known = [row["group"], row["role"], str(row["recordings"])]
+        found = [figure(row[key], form) for key, (_, form) in _TITLES.items()]
+        cells.append([*known, f"{row['path_km']:.2f}", *found])
+    head, *body = aligned(cells)
+    lines = [head]
+    for line, row in zip(body, rows.to_dict("records"), strict=True):
+        lines.append(line)
+        for key, metric in RATIOS.items():
+            if isinstance(row[key], Interval):
+                title = _TITLES[metric][0].split(" [")[0]
+                lines.append(f"{row['group']}: ratio over {title}: {row[key]:.3f}")
+    if conclusion := verdict(rows):
+        lines.append(conclusion)
+    lines += [f"ours: {ours}", *([f"theirs: {theirs}"] if theirs else [])]
+    return "\n".join([*lines, *(f"{key}: {words}." for key, words in WORDS.items())])

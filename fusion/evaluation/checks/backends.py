@@ -16,8 +16,7 @@ from stario.fusion.evaluation.checks.faults import (
     matched_config,
     with_true_displacements,
 )
-from stario.fusion.evaluation.scores import Column, parts, scored, wide
-from stario.fusion.evaluation.text import table
+from stario.fusion.evaluation.scores import Column, parts, scored, table, wide
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.filter.record import innovations_of
 from stario.fusion.graph import fixed_lag
@@ -119,13 +118,12 @@ def score_table(scores: pd.DataFrame) -> str:
     to_ekf, mean, error = (
         found[name] for name in ("median_ate_to_ekf", "mean_ratio_to_ekf", "mean_ratio_error")
     )
+    others = [name for name in ESTIMATORS if name != "ekf"]
+    ratios = [f"{ESTIMATORS[name]} {to_ekf[name]:.2f}" for name in others]
+    means = [f"{ESTIMATORS[name]} {mean[name]:.2f} +- {error[name]:.2f}" for name in others]
     notes = (
-        f"median ATE relative to the EKF's: graph {to_ekf['graph']:.2f}, fixed-lag "
-        f"{to_ekf['fixed_lag']:.2f}; geometric mean over recordings: "
-        + ", ".join(
-            f"{ESTIMATORS[name]} {mean[name]:.2f} +- {error[name]:.2f}"
-            for name in ("graph", "fixed_lag")
-        ),
+        f"median ATE relative to the EKF's: {', '.join(ratios)}; "
+        f"geometric mean over recordings: {', '.join(means)}",
         f"fixed-lag {60.0 / found['s_per_min']['fixed_lag']:.0f} times real time, slowest update "
         f"{found['slowest_update_ms']:.1f} ms",
     )
@@ -165,9 +163,8 @@ def _streamed(
     """Return the newest states of the fixed-lag graph, and the processor time of each step [s]."""
     state = fixed_lag.begin(config, preprocessed.start)
     states, times = [state.nav_state()], []
-    for interval, measurement in zip(
-        preprocessed.intervals, preprocessed.measurements, strict=True
-    ):
+    pairs = zip(preprocessed.intervals, preprocessed.measurements, strict=True)
+    for interval, measurement in pairs:
         began = process_time()
         state, _ = fixed_lag.step(state, interval, measurement, (), config)
         states.append(state.nav_state())

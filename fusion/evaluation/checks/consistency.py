@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.scores import Column, joined, scored
+from stario.fusion.evaluation.scores import joined, scored, wide
 from stario.fusion.filter import estimator
 from stario.fusion.filter.correlated_errors import ACCEL_SHARE, displacement_errors
 from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
@@ -55,29 +55,17 @@ _STYLE = WalkStyle(carry="rig")
 """Carried smoothly: strapdown integration of 200 Hz has errors far below those that are drawn."""
 
 
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
-_SUMMARY = (
-    Column("", "nees", over=np.mean),
-    Column("", "nees_end", over=np.mean),
-    Column("", "yaw", over=np.mean),
-    Column("", "nis", over=np.mean),
-    Column("", "yaw_sigma", over=_rms),
-    Column("", "yaw_error", over=_rms),
-)
-
-
 def summary(scores: pd.DataFrame, seconds: float) -> dict[str, Any]:
     """Return averages over the runs, each of so many seconds.
 
     `nees_bounds` are met by `nees_end` of a consistent filter in 95 of 100 trials, and nearly so by
     `nees`, since times are correlated.
     """
-    runs = scores["recording"].nunique()
-    averages = {column.metric: column.value(scores) for column in _SUMMARY}
-    return {"runs": runs, "seconds": seconds, **averages, "nees_bounds": nees_bounds(CORE, runs)}
+    runs = wide(scores)
+    means = runs[["nees", "nees_end", "yaw", "nis"]].mean().to_dict()
+    sizes = np.sqrt((runs[["yaw_sigma", "yaw_error"]] ** 2).mean()).to_dict()
+    bounds = nees_bounds(CORE, len(runs))
+    return {"runs": len(runs), "seconds": seconds, **means, **sizes, "nees_bounds": bounds}
 
 
 def consistency_text(scores: pd.DataFrame, seconds: float) -> str:
@@ -200,13 +188,7 @@ def _drawn_start(
 
 
 class _DrawnNetwork:
-    """Displacements with the errors that the filter's covariance contains.
-
-    Args:
-        walk: the walk.
-        config: configuration of the filter.
-        rng: source of the errors.
-    """
+    """Displacements with the errors that the filter's covariance contains, drawn from `rng`."""
 
     def __init__(self, walk: Trajectory, config: NavigatorConfig, rng: np.random.Generator) -> None:
         self._walk, self._config, self._rng = walk, config, rng

@@ -8,8 +8,9 @@ unless a network is given.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import get_args
 
 import numpy as np
@@ -19,9 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.fusion.evaluation.checks.corruption import Fault, ModifyPredictions, faults
-from stario.fusion.evaluation.scores import Column, joined, scored
-from stario.fusion.evaluation.text import rows_of
+from stario.fusion.evaluation.scores import Column, joined, rows_of, scored
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.health import Health
 from stario.fusion.imu.stateful import Predictor, WindowDisplacement
@@ -29,6 +28,7 @@ from stario.fusion.navigator import Navigator
 from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.state import Track
 from stario.sequences.accuracy.metrics import align, evaluate_track
+from stario.sequences.arrays import even_grid, interpolated
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.drawing.text_table import aligned
 from stario.sequences.errors import InputError
@@ -41,13 +41,121 @@ from stario.sequences.windows import WINDOW_SECONDS
 WHITE_NOISE = 0.05
 """White noise of the true displacements used without a network, per axis [m]."""
 
+Rng = np.random.Generator
+ModifySamples = Callable[[ImuSequence, Rng], ImuSequence]
+ModifyPredictions = Callable[[FloatArray, FloatArray, Rng], None]
+"""Function that modifies displacements (M, 3) and covariances (M, 3, 3) in place."""
 
-_COLUMNS = (
-    Column("ATE without [m]", "error_without", ".3f"),
-    Column("with [m]", "error_with", ".3f"),
-    Column("end [m]", "end_error", ".3f"),
-    Column("sigma [m]", "end_sigma", ".3f"),
-)
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault of the samples or of the network's predictions.
+
+    Attributes:
+        name: name in the table.
+        modify_samples: function that returns the recording with the fault; None for no change.
+        modify_predictions: function that modifies the predictions; None for no change.
+    """
+
+    name: str
+    modify_samples: ModifySamples | None = None
+    modify_predictions: ModifyPredictions | None = None
+
+
+def faults(duration: float) -> list[Fault]:
+    """Return every fault of the table, for a recording of this duration [s]."""
+    half, block = 0.5 * duration, 5.0 / duration
+    return [
+        Fault("none"),
+        Fault("network off by 1 m for 5 s", modify_predictions=partial(_offset_block, share=block)),
+        Fault("5 % of windows off by 2 m", modify_predictions=_outliers),
+        Fault("covariance 100 times too small", modify_predictions=_overconfident),
+        *(Fault(f"gap of {length:g} s", gap(half, length)) for length in (0.1, 1.0, 3.0)),
+        *(Fault(f"{share:.0%} of samples dropped", drops(share)) for share in (0.05, 0.2)),
+        *(Fault(f"{rate:g} Hz", partial(_resampled, rate=rate)) for rate in (190.0, 500.0)),
+        Fault("accelerometer clipped", _clipped),
+        *(
+            Fault(f"one NaN in {field}", partial(_one_nan, field=field))
+            for field in ("time", "gyro", "accel")
+        ),
+        Fault("one NaN from the network", modify_predictions=partial(_nan_prediction, which=0)),
+        Fault("one NaN in the covariance", modify_predictions=partial(_nan_prediction, which=1)),
+        Fault("1 % duplicated, 1 % swapped", _reordered),
+        Fault("three wild timestamps", _wild_times),
+        Fault("ten spikes", _spikes),
+    ]
+
+
+def _offset_block(mean: FloatArray, covariance: FloatArray, rng: Rng, share: float) -> None:
+    fraction = (np.arange(len(mean)) + 1.0) / len(mean)
+    mean[(fraction > 0.5) & (fraction <= 0.5 + share), 0] += 1.0
+
+
+def _outliers(mean: FloatArray, covariance: FloatArray, rng: Rng) -> None:
+    selected = rng.random(len(mean)) < 0.05
+    mean[selected] += rng.choice([-2.0, 2.0], (int(selected.sum()), 3)) / np.sqrt(3.0)
+
+
+def _overconfident(mean: FloatArray, covariance: FloatArray, rng: Rng) -> None:
+    covariance *= 0.01
+
+
+def _nan_prediction(mean: FloatArray, covariance: FloatArray, rng: Rng, which: int) -> None:
+    (mean, covariance)[which][len(mean) // 2] = np.nan
+
+
+def gap(start: float, seconds: float) -> ModifySamples:
+    """Remove `seconds` of samples, from `start` seconds after the first sample on."""
+
+    def modify_samples(sequence: ImuSequence, rng: Rng) -> ImuSequence:
+        since = sequence.time - sequence.time[0] - start
+        return sequence.select((since <= 0.0) | (since >= seconds))
+
+    return modify_samples
+
+
+def drops(share: float) -> ModifySamples:
+    """Remove a share of the samples at random."""
+    return lambda sequence, rng: sequence.select(rng.random(len(sequence)) >= share)
+
+
+def _resampled(sequence: ImuSequence, rng: Rng, rate: float) -> ImuSequence:
+    time = even_grid(sequence.time[0], sequence.time[-1], 1.0 / rate)
+    gyro, accel = (
+        interpolated(time, sequence.time, values) for values in (sequence.gyro, sequence.accel)
+    )
+    return replace(sequence, time=time, gyro=gyro, accel=accel)
+
+
+def _clipped(sequence: ImuSequence, rng: Rng) -> ImuSequence:
+    limit = float(np.quantile(np.abs(sequence.accel).max(axis=1), 0.98))
+    return replace(sequence, accel=np.clip(sequence.accel, -limit, limit))
+
+
+def _one_nan(sequence: ImuSequence, rng: Rng, field: str) -> ImuSequence:
+    values = getattr(sequence, field).copy()
+    values[len(values) // 2] = np.nan
+    return replace(sequence, **{field: values})
+
+
+def _reordered(sequence: ImuSequence, rng: Rng) -> ImuSequence:
+    order = np.arange(len(sequence))
+    for k in np.flatnonzero(rng.random(len(order) - 1) < 0.01):
+        order[[k, k + 1]] = order[[k + 1, k]]
+    return sequence.select(np.repeat(order, 1 + (rng.random(len(order)) < 0.01)))
+
+
+def _wild_times(sequence: ImuSequence, rng: Rng) -> ImuSequence:
+    time = sequence.time.copy()
+    time[rng.integers(0, len(time), 3)] += 1e6
+    return replace(sequence, time=time)
+
+
+def _spikes(sequence: ImuSequence, rng: Rng) -> ImuSequence:
+    gyro, accel = sequence.gyro.copy(), sequence.accel.copy()
+    gyro[rng.integers(0, len(gyro), 5), 1] += 200.0
+    accel[rng.integers(0, len(accel), 5), 2] += 500.0
+    return replace(sequence, gyro=gyro, accel=accel)
 
 
 def matched_walk(seconds: float = 120.0, seed: int = 0) -> tuple[ImuSequence, NavigatorConfig]:
@@ -98,20 +206,30 @@ def run_faults(
     Raises:
         InputError: the recording has no true poses, or is too short.
     """
-    truth = true_poses(sequence)
+    truth, predictor = true_poses(sequence), model or DummyPredictor()
+
+    def observed(recording: ImuSequence) -> PreprocessedRecording:
+        preprocessed = Navigator(predictor, config).observe(recording)
+        if model is None:
+            return with_true_displacements(preprocessed, truth, config, seed)
+        return preprocessed
+
     found: list[pd.DataFrame] = []
-    whole = _observed(sequence, config, model, seed)
+    whole = observed(sequence)
     for backend in backends:
-        navigator = Navigator(model or DummyPredictor(), config, backend=backend)
+        navigator = Navigator(predictor, config, backend=backend)
         without = evaluate_track(navigator.track(whole).trajectory, truth).ate_m
         for fault in faults(sequence.duration) if only is None else only:
+            rng, preprocessed = np.random.default_rng(seed), whole
             try:
-                track = navigator.track(_with_fault(fault, sequence, whole, config, model, seed))
+                if fault.modify_samples is not None:
+                    preprocessed = observed(fault.modify_samples(sequence, rng))
+                if fault.modify_predictions is not None:
+                    preprocessed = _corrupted(preprocessed, fault.modify_predictions, rng)
+                track = navigator.track(preprocessed)
             except InputError as refusal:
-                figures, words = (
-                    dict.fromkeys(_FIGURES, math.nan) | {"finite": 1.0},
-                    f"refused: {refusal}",
-                )
+                unknown = dict.fromkeys(("error_with", "end_error", "end_sigma"), math.nan)
+                figures, words = {**unknown, "finite": 1.0}, f"refused: {refusal}"
             else:
                 assert track.health is not None
                 figures, words = _figures(track, truth), reported(track.health)
@@ -122,8 +240,14 @@ def run_faults(
 
 def fault_table(scores: pd.DataFrame) -> str:
     """Return the results as text."""
+    columns = (
+        Column("ATE without [m]", "error_without", ".3f"),
+        Column("with [m]", "error_with", ".3f"),
+        Column("end [m]", "end_error", ".3f"),
+        Column("sigma [m]", "end_sigma", ".3f"),
+    )
     rows = list(scores.groupby(["group", "track"], sort=False))
-    lines = aligned(rows_of(rows, _COLUMNS, "fault", "back end"))
+    lines = aligned(rows_of(rows, columns, "fault", "back end"))
     finite = Column("", "finite", over=np.min)
     reports = [
         ("" if finite.value(part) else "NOT FINITE, ") + part["reported"].iloc[0]
@@ -142,33 +266,6 @@ def reported(health: Health) -> str:
     words += [f"gap {length:.1f} s" for _, length in health.gaps]
     words += [f"gated {health.gated} of {health.updates}", *health.notes]
     return ", ".join(words)
-
-
-def _observed(
-    sequence: ImuSequence, config: NavigatorConfig, model: Predictor | None, seed: int
-) -> PreprocessedRecording:
-    preprocessed = Navigator(model or DummyPredictor(), config).observe(sequence)
-    if model is None and sequence.truth is not None:
-        return with_true_displacements(preprocessed, sequence.truth, config, seed)
-    return preprocessed
-
-
-def _with_fault(
-    fault: Fault,
-    sequence: ImuSequence,
-    whole: PreprocessedRecording,
-    config: NavigatorConfig,
-    model: Predictor | None,
-    seed: int,
-) -> PreprocessedRecording:
-    """Preprocess a recording with a fault; without one in the samples, `whole` has been already."""
-    rng, preprocessed = np.random.default_rng(seed), whole
-    if fault.modify_samples is not None:
-        faulty = fault.modify_samples(sequence, rng)
-        preprocessed = _observed(faulty, config, model, seed)
-    if fault.modify_predictions is not None:
-        preprocessed = _corrupted(preprocessed, fault.modify_predictions, rng)
-    return preprocessed
 
 
 class DummyPredictor:
@@ -221,9 +318,6 @@ def _corrupted(
     for (k, each), d_N, C in zip(measured.items(), mean, covariance, strict=True):
         measurements[k] = each._replace(d_N=d_N, covariance_N=C)
     return replace(preprocessed, measurements=measurements)
-
-
-_FIGURES = ("error_with", "end_error", "end_sigma")
 
 
 def _figures(track: Track, truth: Trajectory) -> dict[str, float]:

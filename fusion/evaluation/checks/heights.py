@@ -10,8 +10,7 @@ import pandas as pd
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.known_positions import position_error
-from stario.fusion.evaluation.scores import Column, parts, scored
-from stario.fusion.evaluation.text import table
+from stario.fusion.evaluation.scores import Column, parts, scored, table
 from stario.fusion.floors import floor_at
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
@@ -112,7 +111,7 @@ _COLUMNS = (
 )
 
 
-def score_house(model: Predictor, seed: int, config: NavigatorConfig) -> pd.DataFrame:
+def score_house(model: Predictor, seed: int, *, config: NavigatorConfig) -> pd.DataFrame:
     """Score a simulated walk through a house with stairs and a lift."""
     walk = simulate_house(seed, name=f"house-{seed}")
     return score_heights(model, walk.sequence, config, "simulated")

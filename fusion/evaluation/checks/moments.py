@@ -16,12 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.benchmark.aligned import Complex
-from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position
+from stario.fusion.evaluation.benchmark.displacement_error import (
+    fit_yaw_and_position,
+)
 from stario.fusion.evaluation.checks.simulation import simulated_walk
-from stario.fusion.evaluation.scores import Column, geometric_mean, joined, parts, scored
-from stario.fusion.evaluation.text import table
+from stario.fusion.evaluation.scores import Column, geometric_mean, joined, parts, scored, table
 from stario.fusion.evaluation.tracks import network_track
+from stario.fusion.imu.direction import Complex
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.state import Track
@@ -56,10 +57,6 @@ _CARRIES = ("handheld", "pocket", "swinging", "bag")
 """How the device is carried in the simulated walks, one each."""
 
 
-def _small_share(ratio: FloatArray) -> float:
-    return float((ratio < MAX_RATIO).mean())
-
-
 _COLUMNS = (
     Column("n", "step", ".0f", len),
     Column("without [m]", "error_without"),
@@ -67,7 +64,7 @@ _COLUMNS = (
     Column("worst", "ratio", over=np.max),
     Column("joined: mean", "joined_ratio", over=geometric_mean),
     Column("worst", "joined_ratio", over=np.max),
-    Column(f"ratio < {MAX_RATIO:g}", "ratio", ".0%", _small_share),
+    Column(f"ratio < {MAX_RATIO:g}", "ratio", ".0%", lambda ratio: (ratio < MAX_RATIO).mean()),
     Column("step [m]", "step", ".1f", np.max),
     Column("turn [deg]", "turn", ".1f", np.max),
     Column("both small", "small", ".0%", np.mean),

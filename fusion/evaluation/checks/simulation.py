@@ -6,7 +6,6 @@ real walks. Recordings are those of archives whose attribute `carry` is in `CARR
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -14,10 +13,10 @@ import pandas as pd
 from scipy.signal import butter, sosfiltfilt, welch
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.checks.fusion_gain import fitted_error
+from stario.fusion.evaluation.checks.fusion import fitted_error
 from stario.fusion.evaluation.compare import Metrics, measure
-from stario.fusion.evaluation.scores import Column, scored
-from stario.fusion.evaluation.text import table
+from stario.fusion.evaluation.known_positions import true_path
+from stario.fusion.evaluation.scores import Column, scored, table
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
@@ -101,7 +100,7 @@ def motion_scores(
     Raises:
         InputError: it has no ground truth, or cannot be run.
     """
-    length = _path_length(sequence)
+    length = true_path(sequence)
     navigator = Navigator(model, config, backend="graph")
     observed = navigator.observe(sequence)
     figures: Metrics = dict(motion(sequence))
@@ -137,16 +136,6 @@ def _step_rates(force: FloatArray) -> FloatArray:
     return np.asarray(f[possible][np.argmax(power[:, possible], axis=1)])
 
 
-def _path_length(sequence: ImuSequence) -> float:
-    """Return the length of the true path [m]: with waypoints, of the straight lines between."""
-    if sequence.truth is not None:
-        return sequence.truth.path_length()
-    if sequence.positions is None:
-        raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
-    steps = np.diff(sequence.positions.position_W[sequence.positions.valid], axis=0)
-    return float(np.linalg.norm(steps, axis=1).sum())
-
-
 def motion_table(scores: pd.DataFrame) -> str:
     """Return for each way of carrying a row of simulated walks and one of recordings."""
     columns = [
@@ -165,9 +154,7 @@ def motion_table(scores: pd.DataFrame) -> str:
     ]
     if RECORDED not in set(scores["track"]):
         notes.append("recordings to compare with: none given (PATH: archives with attribute carry)")
-    return table(list(_rows(scores)), columns, ("carried",), notes)
-
-
-def _rows(scores: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
-    for (carry, kind), part in scores.groupby(["group", "track"]):
-        yield f"{carry}, {kind}", part
+    rows = (
+        (f"{carry}, {kind}", part) for (carry, kind), part in scores.groupby(["group", "track"])
+    )
+    return table(rows, columns, ("carried",), notes)

@@ -116,13 +116,15 @@ def tables_alongside(
         for head in table_heads(file, least):
             if len(head.rows) < 2 or not (places := places_in(head, own)):
                 continue
-            if clock := clock_of(head.titles, head.rows) or _first_column(head):
+            if clock := clock_of(head.titles, head.rows) or _first_column(head, places):
                 yield Columns(head, head.clock(clock), places, held=own)
                 break
 
 
-def _first_column(head: TableHead) -> Column | None:
+def _first_column(head: TableHead, places: dict[str, Column]) -> Column | None:
     """Return the first column of a table whose titles name no clock, if it grows."""
+    if any(place.index == 0 for place in places.values()):
+        return None
     return clock_of(["time"], head.rows[:, :1])
 
 

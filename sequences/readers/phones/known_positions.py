@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 
@@ -19,10 +18,15 @@ from stario.sequences.readers.columns import Column
 from stario.sequences.readers.geodesy import east_north
 from stario.sequences.readers.phones.alongside import Columns, Recording, tables_alongside
 from stario.sequences.readers.phones.sensor_words import sensor_of, unit_of, words_of
-from stario.sequences.readers.satellites import known_places, satellites
+from stario.sequences.readers.satellites import (
+    RADIUS_PER_SIGMA,
+    in_degrees,
+    known_places,
+    satellites,
+)
 from stario.sequences.readers.table_head import TableHead, table_heads
 from stario.sequences.readers.text import seconds
-from stario.sequences.sequence import FloatArray, PositionTrack, Satellites
+from stario.sequences.sequence import PositionTrack, Satellites
 from stario.sequences.time_order import increasing_mask
 from stario.sequences.units import SPEED_UNITS
 
@@ -66,9 +70,6 @@ _UNITS: dict[str, dict[str, float]] = {
 _ADVIO = "platform-locations.csv"
 _OF_ADVIO = ["time", "latitude", "longitude", "accuracy", "altitude", "vertical accuracy"]
 """Columns of a file of ADVIO, which names none."""
-
-_RADIUS_PER_SIGMA = 1.51
-"""Radius that holds 68 % of a Gaussian in the plane, in standard deviations per axis."""
 
 _USUAL_RADIUS = 10.0
 """Radius [m] where a file states none."""
@@ -115,7 +116,7 @@ def as_known_positions(reported: Satellites) -> PositionTrack | None:
         east_north(degrees)[1:],
         "positions",
         valid,
-        radius / _RADIUS_PER_SIGMA,
+        radius / RADIUS_PER_SIGMA,
         latlon_deg=reported.latlon_deg,
     )
 
@@ -150,15 +151,17 @@ def _place_of(words: set[str]) -> str:
 
 
 def _read(columns: Columns, recording: Recording) -> Satellites | None:
-    table = columns.read()
-    names, values = list(columns.places), table.values[:, 1:]
-    latlon_deg = values[:, :2]
-    _check_degrees(table.path, latlon_deg, [place.title for place in columns.places.values()][:2])
+    table, places = columns.read(), columns.places
+    for title in (places["latitude"].title, places["longitude"].title):
+        if unit_of(title).startswith("rad"):
+            raise ReadError(table.path, "latitude, longitude", title, "degrees")
+    values = table.values[:, 1:]
+    latlon_deg = in_degrees(table.path, values[:, :2])
     rows, time = columns.within(table, known_places(latlon_deg), recording)
     rest = {
         name: factor * values[rows, k]
-        for k, name in enumerate(names)
-        if (factor := _factor(name, columns.places[name].unit))
+        for k, name in enumerate(places)
+        if (factor := _factor(name, places[name].unit))
     }
     return satellites(time, latlon_deg[rows], rest)
 
@@ -167,20 +170,6 @@ def _factor(name: str, unit: str) -> float:
     """Return the factor to m, m/s or degrees; 0 for an unknown unit, and for the place itself."""
     known = _UNITS.get(name, {})
     return known.get(unit, 0.0) if unit else next(iter(known.values()), 0.0)
-
-
-def _check_degrees(path: Path, latlon_deg: FloatArray, titles: list[str]) -> None:
-    """Check that latitude and longitude are in degrees; a few cells may hold anything else.
-
-    Raises:
-        ReadError: their titles name another unit, or no row can be in degrees.
-    """
-    present = latlon_deg[np.isfinite(latlon_deg).all(axis=1) & latlon_deg.any(axis=1)]
-    found = next((title for title in titles if unit_of(title).startswith("rad")), "")
-    if not found and len(present) > 1 and not known_places(present).any():
-        found = f"{present[0, 0]:.10g} and {present[0, 1]:.10g}"
-    if found:
-        raise ReadError(path, "latitude, longitude", found, "degrees, as in 48.137 and 11.575")
 
 
 def reference_points(recording: Recording) -> PositionTrack | None:

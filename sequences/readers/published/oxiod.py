@@ -32,8 +32,7 @@ from stario.sequences.readers.clocks import resample_to_gyro, time_unit
 from stario.sequences.readers.lines import first_lines, first_numbers, numbers_in
 from stario.sequences.readers.text import IntArray, Table, read_table, seconds
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
-from stario.sequences.truth.alignment import align_tracked_body
-from stario.sequences.truth.clock_offset import clock_offset
+from stario.sequences.truth.alignment import align_tracked_body, clock_offset
 
 RATE = 100.0
 _log = logging.getLogger(__name__)

@@ -77,15 +77,19 @@ def stario(
 @pytest.fixture
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Skip figures, which take most of the time, in tests that do not check them."""
-    monkeypatch.setattr("stario.fusion.evaluation.results._figures", lambda *arguments: [])
+    monkeypatch.setattr("stario.fusion.evaluation.results._figures", lambda found: {})
 
 
 @pytest.fixture(scope="session")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A walk of twelve seconds, which no test modifies."""
+    """A walk of twelve seconds on the level, which no test modifies."""
     path = tmp_path_factory.mktemp("recordings") / "walk.csv"
     result = CliRunner().invoke(
-        app, ["simulate", str(path), "--seconds", "12", "--carry", "handheld", "--rate", "100"]
+        app,
+        [
+            *["simulate", "--seconds", "12", "--carry", "handheld", "--rate", "100", "--seed", "5"],
+            str(path),
+        ],
     )
     assert result.exit_code == 0, result.output
     return path

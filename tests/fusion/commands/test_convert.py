@@ -80,12 +80,6 @@ def test_overwrite_replaces_an_euroc_folder_and_nothing_else(
     assert imu.read_text() == written
 
 
-def test_a_folder_with_one_recording_is_converted(stario, recording: Path) -> None:
-    assert stario("convert", recording.parent, "out.csv").code == 0
-    there, here = read_generic_csv(Path("out.csv")), read_generic_csv(recording)
-    np.testing.assert_array_equal(there.gyro, here.gyro)
-
-
 @pytest.mark.usefixtures("no_figures")
 def test_every_track_is_compared_with_positions_half_a_second_apart(stario, tmp_path: Path) -> None:
     walk = simulate_imu(generate_walk(3, 8.0), 100.0, seed=1, name="taps")

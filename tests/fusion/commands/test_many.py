@@ -12,11 +12,16 @@ import numpy as np
 import pytest
 from training_runs import narrow
 
+from stario.fusion.commands import evaluate
 from stario.fusion.commands.options import ReadingOptions
 from stario.fusion.commands.train import _recipe
+from stario.fusion.commands.training_data import packaged_lists
 from stario.fusion.evaluation.compare import TRACKS
 from stario.network import load_model
+from stario.network.training import splits
 from stario.network.training.config import FINE_TUNING, training_config
+from stario.network.training.splits import read_packaged_list
+from stario.sequences.readers.archive import split_name
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
 from stario.sequences.simulation.moments import MOMENTS
@@ -82,7 +87,7 @@ def test_check_fusion_compares_the_fusion_with_its_network(
 def test_check_gaps_reports_how_far_missing_samples_move_the_end(
     stario, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stario.fusion.evaluation.checks.sample_loss.INSTANTS", 1)
+    monkeypatch.setattr("stario.fusion.evaluation.checks.fusion.INSTANTS", 1)
     done = stario("check", "gaps", recording, "--json")
     assert done.code == 0
     found = json.loads(done.out)
@@ -132,16 +137,6 @@ def test_truth_that_covers_only_a_part_is_reported(stario, recording: Path, tmp_
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_compare_accepts_folders_of_recordings(stario, recording: Path, tmp_path: Path) -> None:
-    for folder in ("a", "b"):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "walk.csv").write_bytes(recording.read_bytes())
-    done = stario("compare", "a", "b", "--out", "out", "--json")
-    assert set(json.loads(done.out)["recordings"]) == {"walk", "walk-2"}
-    assert {p.name for p in (tmp_path / "out").iterdir() if p.is_dir()} == {"walk", "walk-2"}
-
-
-@pytest.mark.usefixtures("no_figures")
 @pytest.mark.parametrize("command", ["run", "compare"])
 def test_figures_of_several_recordings_are_explained_once(
     stario, recording: Path, tmp_path: Path, command: str
@@ -150,24 +145,6 @@ def test_figures_of_several_recordings_are_explained_once(
     done = stario(command, recording, "again.csv", "--out", "out", "--explain")
     assert done.out.count("\nfitted [m]: ATE after") == 1
     assert done.out.count("m rms from the truth") == 2
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_a_bad_recording_in_the_list_is_named_and_the_rest_compared(
-    stario, recording: Path, tmp_path: Path
-) -> None:
-    sequence = read_generic_csv(recording)
-    write_csv(tmp_path / "short.csv", sequence.slice(0.0, 1.0))
-    (tmp_path / "broken.csv").write_text("t,gx,gy,gz,ax,ay,az\n0,0,0,0,x,0,0\n")
-    for bad in ("short.csv", "broken.csv"):
-        done = stario("compare", bad, recording, "--out", "out", "--json")
-        assert done.code == 1
-        assert set(json.loads(done.out)["recordings"]) == {"walk"}
-        (line,) = done.err.splitlines()
-        assert line.startswith("stario: skipped: ")
-        assert bad.removesuffix(".csv") in line
-        stario("compare", bad, "--out", "none").assert_one_line_error(bad.removesuffix(".csv"))
-        assert not (tmp_path / "none").exists()
 
 
 def test_many_recordings_skipped_for_one_reason_take_one_line(
@@ -408,14 +385,6 @@ def test_backends_compares_filter_and_graph(stario) -> None:
     assert content["scores"][0]["recording"] == "walk 0"
 
 
-def test_backends_continues_after_failures(stario, recording: Path, tmp_path: Path) -> None:
-    write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
-    done = stario("check", "backends", "blind.csv", recording, "--json")
-    assert done.code == 1
-    assert "skipped: blind.csv" in done.err
-    assert {score["recording"] for score in json.loads(done.out)["scores"]} == {"walk"}
-
-
 def test_recordings_too_short_to_hold_out_a_part_require_validation_recordings(
     stario, recording: Path, tmp_path: Path
 ) -> None:
@@ -423,3 +392,39 @@ def test_recordings_too_short_to_hold_out_a_part_require_validation_recordings(
     stario("train", "short.csv", "--generated", 1).assert_one_line_error(
         "two legs between known positions", "--validation"
     )
+
+
+def test_what_is_left_out_is_neither_learned_from_nor_selected_on(tmp_path: Path) -> None:
+    for line in _names():
+        file = split_name(tmp_path / line)[0]
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
+    entries = read_packaged_list("all", tmp_path)
+    groups = {entry.path: entry.group for entry in entries}
+
+    learned, selected = packaged_lists(tmp_path, ["tyrex", "ridi dan"], "all")
+
+    used = {groups[path] for path in learned + selected}
+    assert not {g for g in used if g.startswith("tyrex")} | ({"ridi dan"} & used)
+    holdout = {entry.path for entry in read_packaged_list("holdout", tmp_path)}
+    assert set(selected) <= holdout
+    assert not set(learned) & holdout
+    left_out = sum(g.startswith("tyrex") or g == "ridi dan" for g in groups.values())
+    assert len(learned) + len(selected) == len(entries) - left_out
+
+
+def _names() -> list[str]:
+    lists = Path(splits.__file__).parent / "all.txt"
+    lines = lists.read_text().splitlines()
+    return [line.partition(",")[0] for line in lines if line and not line.startswith("#")]
+
+
+def test_set_in_the_name_of_weights_is_the_first_word_of_a_group(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    loaded: list[str] = []
+    monkeypatch.setattr(evaluate, "_loaded", loaded.append)
+
+    evaluate._for_group("runs/{set}/{group}.safetensors", "ridi dan")
+
+    assert loaded == ["runs/ridi/ridi_dan.safetensors"]

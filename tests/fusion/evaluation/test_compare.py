@@ -1,7 +1,6 @@
 """Comparison of tracks, and the files it writes."""
 
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -21,13 +20,11 @@ from stario.fusion.evaluation.compare import (
     distinct_name,
     measure,
 )
-from stario.fusion.evaluation.folders import results_folder
 from stario.fusion.evaluation.results import write_comparison, write_run
 from stario.fusion.evaluation.summary import scores_of, summary, summary_table
 from stario.fusion.fixes import position_fix
 from stario.sequences.accuracy.metrics import evaluate_track
 from stario.sequences.accuracy.nees import position_nees
-from stario.sequences.errors import StarioError
 from stario.sequences.readers.tum import read_tum
 from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
 
@@ -209,7 +206,7 @@ def test_the_written_configuration_can_be_read_back(folder: Path) -> None:
 @pytest.fixture
 def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw figures, but leave their files empty: most of the time goes into rendering."""
-    saved = "stario.fusion.evaluation.results.save_figure"
+    saved = "stario.fusion.evaluation.folders.save_figure"
     monkeypatch.setattr(saved, lambda figure, path: path.touch())
 
 
@@ -247,23 +244,6 @@ def test_files_of_an_earlier_run_do_not_pass_for_those_of_a_later_one(
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_a_report_that_cannot_be_written_leaves_the_earlier_run_whole(
-    tmp_path: Path, compared: Comparison, walk: ImuSequence
-) -> None:
-    alone = Comparison(walk, {"track": compared.tracks["track"]}, {"track": {}})
-
-    def full_disk(path: Path, run: Comparison) -> None:
-        path.write_text("half")
-        raise OSError(28, "No space left on device")
-
-    write_run(tmp_path, alone, CONFIG, {"first": 1}, {"r.html": lambda path, _: path.touch()})
-    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
-    with pytest.raises(StarioError, match="No space left"):
-        write_run(tmp_path, alone, CONFIG, {"second": 2}, {"r.html": full_disk})
-    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
-
-
-@pytest.mark.usefixtures("blank_figures")
 def test_a_comparison_leaves_nothing_of_an_earlier_one_but_other_recordings(
     tmp_path: Path, compared: Comparison, blind: Comparison
 ) -> None:
@@ -273,35 +253,6 @@ def test_a_comparison_leaves_nothing_of_an_earlier_one_but_other_recordings(
     sequence = compared.sequence.without_truth()
     files = write_comparison(tmp_path, [replace(compared, sequence=sequence)], CONFIG, ORIGIN)
     assert {*files, *kept} == {path for path in tmp_path.rglob("*") if path.is_file()}
-
-
-def test_every_file_of_a_comparison_can_be_removed(folder: Path, tmp_path: Path) -> None:
-    written = shutil.copytree(folder, tmp_path / "copy")
-    for inner in (written, *(path for path in written.iterdir() if path.is_dir())):
-        with results_folder(inner):
-            pass  # a run without files
-    assert not [path for path in written.rglob("*") if path.is_file()]
-
-
-def test_a_removal_that_fails_can_be_repeated(folder: Path, tmp_path: Path) -> None:
-    written = shutil.copytree(folder, tmp_path / "copy")
-    inner, *_ = (path for path in written.iterdir() if path.is_dir())
-    (inner / "network.npz").unlink()
-    (inner / "network.npz").mkdir()
-    with pytest.raises(StarioError, match=r"network\.npz"), results_folder(inner):
-        pass
-    (inner / "network.npz").rmdir()
-    with results_folder(inner):
-        pass
-    assert not list(inner.iterdir())
-
-
-def test_a_folder_that_cannot_be_created_raises_a_stario_error(
-    tmp_path: Path, compared: Comparison
-) -> None:
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(StarioError, match="file"):
-        write_comparison(tmp_path / "file" / "out", [compared], CONFIG, ORIGIN)
 
 
 def test_truth_that_ends_early_is_compared_up_to_its_end(

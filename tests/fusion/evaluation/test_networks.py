@@ -17,10 +17,10 @@ from stario.fusion.evaluation.networks import (
     PROTOCOLS,
     NetworkTable,
     compare_networks,
+    networks_text,
     table_dict,
 )
 from stario.fusion.evaluation.scores import scored, values
-from stario.fusion.evaluation.text import networks_text
 from stario.network.model import weights_named
 from stario.sequences.errors import WeightsError
 

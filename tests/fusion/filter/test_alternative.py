@@ -13,8 +13,7 @@ from support import stream
 
 from stario.fusion import Navigator
 from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.fusion.evaluation.checks.corruption import faults
-from stario.fusion.evaluation.checks.faults import matched_walk, run_faults
+from stario.fusion.evaluation.checks.faults import faults, matched_walk, run_faults
 from stario.fusion.evaluation.scores import wide
 from stario.fusion.filter.alternative import AlternativeHypothesis, Hypotheses
 from stario.fusion.filter.displacements import update_with

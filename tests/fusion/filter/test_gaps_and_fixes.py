@@ -13,7 +13,7 @@ from support import GRAPH as CONFIG
 from support import stream, swivelled
 
 from stario.fusion import Navigator, PriorPose, Track
-from stario.fusion.evaluation.checks.with_fixes import true_fixes
+from stario.fusion.evaluation.checks.fusion import true_fixes
 from stario.fusion.filter.frame_transform import FrameTransform
 from stario.fusion.fixes import position_fix, yaw_fix
 from stario.fusion.state import NavState

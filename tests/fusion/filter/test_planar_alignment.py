@@ -10,7 +10,7 @@ import pytest
 from support import GRAPH as CONFIG
 
 from stario.fusion import Navigator
-from stario.fusion.evaluation.checks.with_fixes import true_fixes
+from stario.fusion.evaluation.checks.fusion import true_fixes
 from stario.fusion.filter.planar_alignment import PlanarAlignment
 from stario.sequences.accuracy.metrics import pose_errors
 

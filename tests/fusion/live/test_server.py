@@ -90,12 +90,6 @@ def test_a_compressed_body_is_refused_with_the_remedy(client, pushes, caplog):
     assert answer.json()["error"] in caplog.text
 
 
-def test_a_clock_that_jumps_back_begins_a_new_track(client, hub, pushes):
-    for offset in (2 * 10**18, 10**18):
-        send(client, pushes(session="", offset_ns=offset, seconds=3.0))
-    assert hub.sessions["phone"].track.samples == 300
-
-
 def test_stop_ignores_samples_and_start_begins_a_new_track(client, hub, pushes):
     bodies = pushes(seconds=6.0)
     send(client, bodies[:15])

@@ -1,18 +1,32 @@
-"""Split of recordings into training, validation and test."""
+"""Splits of recordings, what a training passes on, and rows from known errors."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from recorded import DATA
 
-from stario.fusion.paper_table import sets
-from stario.fusion.paper_table.sets import ALL, FIRST, development_sets
+from stario.fusion.paper_table import sets, training
+from stario.fusion.paper_table.scores import COLUMNS, set_table
+from stario.fusion.paper_table.sets import ALL, FIRST, DataSet, development_sets, published
+from stario.fusion.paper_table.table import work_of
+from stario.fusion.paper_table.text import table_text
+from stario.fusion.paper_table.training import ReaderConfig, run_recipe, train_run
+from stario.network.runtime.survey import ModelRow
 from stario.network.training import splits
+from stario.network.training.config import TrainingConfig
+from stario.network.training.history import EpochReport
 from stario.network.training.splits import learned_from
 from stario.sequences.datasets.splits import ListEntry
 from stario.sequences.errors import InputError
+from stario.sequences.files import write_json
+from stario.sequences.readers import read_recording
+from stario.sequences.readers.csv_writer import write_csv
 
 needs_data = pytest.mark.skipif(not (DATA / "archives").exists(), reason=f"no data in {DATA}")
 
@@ -83,3 +97,108 @@ def test_the_combined_set_is_tested_on_held_out_people_and_places() -> None:
     known = learned_from(DATA)
     assert not known["first-stage"] & {one.path for one in together.test}
     assert known["default"] >= {one.path for one in together.test}
+
+
+TESTED = tuple(ListEntry(Path(f"ridi.h5:{name}"), "ridi") for name in "ab")
+DATASET = DataSet("own", (Path("ridi.h5:c"),), (Path("ridi.h5:d"),), TESTED, "")
+
+
+def content(ate_m: float, seconds: float = 0.0) -> Mapping[str, Any]:
+    """Results on both recordings, the second without a drift."""
+    tracks = [
+        {"network_true_attitude": {"ate_m": ate_m, "rte_m": 2.0, "pde": pde}}
+        for pde in (0.03, None)
+    ]
+    recordings = [
+        {"recording": entry.path.name, "path": str(entry.path), "group": "ridi", "kind": "poses"}
+        | {"path_m": 50.0, "figures": {}}
+        | {"tracks": found, "blocks": {"ate": [[ate_m**2, 1.0]]}}
+        for entry, found in zip(TESTED, tracks, strict=True)
+    ]
+    return {"recordings": recordings, "skipped": [], "seconds": seconds}
+
+
+def trained(ate_m: float) -> Mapping[str, Any]:
+    work = {"windows_per_s": 200.0, "seconds": 7200.0, "skipped": []}
+    errors = {"training_error_m2": 0.1, "validation_error_m2": 0.2}
+    return {**content(ate_m, seconds=1800.0), "trained": work | errors}
+
+
+def test_errors_are_means_over_recordings_in_their_units() -> None:
+    rows = set_table(DATASET, {"pdr": {0: content(1.5)}}, {}).rows
+    assert rows["ate"].item() == 1.5
+    assert rows["pde"].item() == pytest.approx(3.0)  # in %, where it is known
+    known = [key for key in COLUMNS if rows[key].notna().any()]
+    assert known == ["ate", "rte", "pde"]
+
+
+def test_recordings_that_weights_have_learned_are_counted_among_the_tested_ones() -> None:
+    learned = {"default": frozenset({TESTED[0].path, *DATASET.training, *DATASET.validation})}
+    table = set_table(DATASET, {"default": {0: content(1.0)}, "open": {0: content(1.0)}}, learned)
+    rows = table.rows.to_dict("records")
+    assert [(row["network"], row["learned"]) for row in rows] == [("default", 1), ("open", 0)]
+
+
+def test_work_is_told_in_core_hours_and_windows_per_second() -> None:
+    completed = {"StarIO": {0: trained(1.0), 1: trained(1.2)}}
+    work = work_of([completed])
+    assert work.loc["StarIO"].tolist() == [14400.0, 3600.0, 200.0]
+    times = {"torch": {"1": 1.0, "64": 0.5}}
+    costs = [ModelRow("StarIO", 2_761_650, 25_124_210, 2_761_682, times, 11.2)]
+    text = table_text([set_table(DATASET, completed, {})], costs, work, TrainingConfig())
+    assert "| StarIO | 2.762 (2.762) | 25.124 (25.122) | 11.2 | 1.00 | 0.50 | 5.00 | 200 |" in text
+    assert "Total: 5.00 core hours, 4.00 for training and 1.00 for evaluation" in text
+
+
+def test_published_figures_are_found_by_set_and_network() -> None:
+    assert published("ridi", "StarIO") == (2.033, 2.274)
+    assert published("oxiod", "R-ResNet") == (4.336, 1.595)
+    assert published("ridi", "pdr") is None
+    assert published("tyrex", "StarIO") is None
+
+
+@pytest.fixture
+def dataset(make_walk: Any, tmp_path: Path) -> DataSet:
+    files = [tmp_path / f"{name}.csv" for name in "abc"]
+    for seed, path in enumerate(files):
+        write_csv(path, make_walk(seed=seed, seconds=8.0))
+    return DataSet("own", tuple(files[:2]), (files[2],), (), "")
+
+
+@pytest.fixture
+def weights(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
+    """Replace training by a log with three epochs; holds the weight of each stream."""
+    found: dict[str, float] = {}
+
+    def trained(
+        recipe: Any, streams: Any, weights: Any, held_out: Any, folder: Path, **rest: Any
+    ) -> None:
+        found.update((s.name, w * len(s)) for s, w in zip(streams, weights, strict=True))
+        errors = (0.5, 0.1), (0.4, float("nan")), (0.3, 0.2)
+        write_json(
+            folder / "log.json",
+            [asdict(EpochReport(k, *pair, {})) for k, pair in enumerate(errors, 1)],
+        )
+
+    monkeypatch.setattr(training, "train", trained)
+    return found
+
+
+def trained_cell(dataset: DataSet, folder: Path, **values: object) -> dict[str, object]:
+    recipe = run_recipe({"likelihood_from": 0.0, "epochs": 3, **values}, "StarIO", 0, None)
+    return train_run(dataset, recipe, folder, ReaderConfig(read_recording, {}, folder / "cache"))
+
+
+def test_the_validation_error_is_that_of_the_epoch_whose_weights_are_kept(
+    dataset: DataSet, weights: dict[str, float], tmp_path: Path
+) -> None:
+    done = trained_cell(dataset, tmp_path)
+    assert (done["training_error_m2"], done["validation_error_m2"]) == (0.3, 0.1)
+
+
+def test_the_shares_of_the_recipe_are_used(
+    dataset: DataSet, weights: dict[str, float], tmp_path: Path
+) -> None:
+    trained_cell(dataset, tmp_path, shares={"a.csv": 0.9}, augmentation={"speeds": [1.0, 1.0]})
+    shares = np.array([weights["a"], weights["b"]]) / sum(weights.values())
+    assert shares == pytest.approx([0.9, 0.1], abs=0.01)

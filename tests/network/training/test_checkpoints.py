@@ -1,5 +1,10 @@
-"""Training runs that are killed, resumed, or already finished."""
+"""Checkpoints: resumed exactly, by one process at a time."""
 
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,9 +16,10 @@ import torch
 from training_runs import STREAMS, TINY, VALIDATION, run, swaying
 
 from stario.network.model import load_model
+from stario.network.training.checkpoint import exclusive
 from stario.network.training.history import EpochReport
 from stario.network.training.train import train
-from stario.sequences.errors import ConfigError, ReadError
+from stario.sequences.errors import ConfigError, InputError, ReadError
 
 
 def test_a_killed_and_resumed_run_gives_the_same_weights(
@@ -127,3 +133,46 @@ def test_a_lost_log_is_written_again(
     (tmp_path / name).write_bytes((folder / name).read_bytes())
     run(tmp_path)
     assert (tmp_path / "log.json").read_text() == (folder / "log.json").read_text()
+
+
+HOLDING = """
+import sys, time
+from pathlib import Path
+from stario.network.training.checkpoint import exclusive
+with exclusive(Path(sys.argv[1])):
+    print("locked", flush=True)
+    time.sleep(60.0)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no flock")
+def test_a_folder_is_refused_while_another_run_trains_there_and_free_once_it_is_killed(
+    tmp_path: Path,
+) -> None:
+    command = [sys.executable, "-c", HOLDING, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "locked\n"
+        with pytest.raises(ConfigError, match="another run is training") as caught:
+            run(tmp_path)
+        assert str(tmp_path) in str(caught.value)
+        assert not list(tmp_path.glob("*.safetensors"))
+        other.kill()
+    with exclusive(tmp_path):
+        pass
+
+
+def test_only_old_temporary_files_are_removed(tmp_path: Path) -> None:
+    young, old = (tmp_path / f".checkpoint.safetensors.{name}.tmp" for name in ("young", "old"))
+    for path in (young, old):
+        path.touch()
+    os.utime(old, (0.0, 0.0))
+    with exclusive(tmp_path):
+        assert young.exists()
+        assert not old.exists()
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"file/run.*--out"), exclusive(tmp_path / "file/run"):
+        pass

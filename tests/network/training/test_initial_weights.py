@@ -1,16 +1,30 @@
-"""Training from initial weights: fine-tuning and a last stage."""
+"""What a training begins with: recipe and initial weights."""
 
+from __future__ import annotations
+
+import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from recorded import DATA
 from training_runs import STREAMS, TINY, VALIDATION, run
 
 from stario.network.card import Calibration
 from stario.network.model import load_model
+from stario.network.training.config import (
+    TrainingConfig,
+    learning_rate,
+    loss_with_sigma,
+    training_config,
+)
+from stario.network.training.splits import read_packaged_list, warn_of_learned
 from stario.network.training.train import train
 from stario.network.training.validation import ValidationSet
+from stario.sequences.errors import ConfigError
 
 
 def test_training_that_spoils_its_initial_weights_gives_a_warning(
@@ -94,3 +108,91 @@ def test_averaged_weights_of_a_short_run_are_not_the_initial_ones(
         learned = torch.nn.utils.parameters_to_vector(load_model(path).training_form.parameters())
         moved.append(float((learned - initial).detach().norm()))
     assert moved[1] > 0.5 * moved[0]
+
+
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="needs the development recordings")
+
+
+@needs_data
+def test_weights_judged_by_what_they_learned_are_named(caplog: pytest.LogCaptureFixture) -> None:
+    held_out = [entry.path for entry in read_packaged_list("holdout", DATA)]
+    warn_of_learned(["default", "first-stage", "open", "other.safetensors"], held_out, DATA)
+    [record] = caplog.records
+    count = len(held_out)
+    assert record.getMessage().startswith(f"default: trained on {count} of the {count} recordings")
+    caplog.clear()
+    test = [entry.path for entry in read_packaged_list("test", DATA)]
+    warn_of_learned(["default", "walks-36min"], test, DATA)
+    assert not caplog.records
+
+
+def test_nothing_is_said_of_a_folder_without_the_listed_recordings(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    warn_of_learned(["default"], [tmp_path / "walk.csv"], tmp_path)
+    assert not caplog.records
+
+
+def test_the_learning_rate_warms_up_and_decays() -> None:
+    config = TrainingConfig(epochs=100, epoch_windows=128, batch=16, warm_up=0.1, rate=1.0)
+    rates = [learning_rate(config, step) for step in range(config.steps)]
+    peak = int(np.argmax(rates))
+    assert peak == pytest.approx(0.1 * config.steps, abs=1.0)
+    assert max(rates) == pytest.approx(1.0)
+    assert (np.diff(rates[: peak + 1]) >= 0.0).all()
+    assert (np.diff(rates[peak:]) <= 0.0).all()
+    assert 0.0 < rates[-1] < 0.02
+    assert rates[0] > 0.0  # the first step learns, too
+
+
+def test_the_loss_is_minimal_at_the_true_sigma() -> None:
+    squared = torch.full((1, 3), 0.09)
+    log_sigma = torch.full((1, 3), math.log(0.3), requires_grad=True)
+    loss_with_sigma(squared, log_sigma).backward()
+    torch.testing.assert_close(log_sigma.grad, torch.zeros(1, 3), atol=1e-6, rtol=0.0)
+
+
+def test_sigma_does_not_affect_the_gradient_of_the_mean() -> None:
+    """The mean's gradient is that of the squared error, whatever sigma is."""
+    for sigma in (0.01, 1.0):
+        squared = torch.full((1, 3), 0.04, requires_grad=True)
+        loss_with_sigma(squared, torch.full((1, 3), math.log(sigma))).backward()
+        assert squared.grad is not None
+        torch.testing.assert_close(squared.grad, torch.ones(1, 3))
+
+
+@pytest.mark.parametrize(
+    ("values", "field"),
+    [
+        ({"epoch": 3}, "epoch"),
+        ({"batch": 10, "successive": 3}, "batch"),
+        ({"augmentation": {"tild": 0.1}}, "augmentation.tild"),
+        ({"augmentation": 3}, "augmentation"),
+        ({"epochs": 0}, "epochs"),
+        ({"precision": "half"}, "precision"),
+        ({"device": "tpu"}, "device"),
+        ({"attitude": "guessed"}, "attitude"),
+        ({"architecture": "Star"}, "architecture"),
+        ({"seed": -1}, "seed"),
+        ({"dropout": "no"}, "dropout"),
+        ({"augmentation": {"speeds": 3}}, "augmentation.speeds"),
+        *(
+            ({"augmentation": {share: 1.1}}, f"augmentation.{share}")
+            for share in ("replayed", "swung", "mirrored", "any_yaw")
+        ),
+        ({"shares": {"simulated": True}}, "shares, simulated"),
+        ({"augmentation": {"speeds": [1]}}, "augmentation.speeds"),
+        ({"augmentation": {"speeds": ["slow", "fast"]}}, "augmentation.speeds"),
+    ],
+)
+def test_an_invalid_recipe_is_refused(values: dict[str, object], field: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        training_config(values)
+    assert caught.value.field == field
+
+
+def test_a_recipe_survives_a_round_trip_through_json() -> None:
+    values = json.loads(json.dumps({"batch": 8, "augmentation": {"speeds": [0.7, 1.5]}}))
+    config = training_config(values)
+    assert config.batch == 8
+    assert config.augmentation.speeds == (0.7, 1.5)

@@ -267,12 +267,6 @@ def test_invalid_positions_and_those_of_another_clock_make_no_legs() -> None:
     assert abs(len(stream.start) - len(usual.start)) <= 1
 
 
-def test_a_share_outside_0_to_1_is_refused() -> None:
-    for share in (-0.1, 1.5, "half"):
-        with pytest.raises(ConfigError, match="shares, simulated"):
-            TrainingConfig(shares={"simulated": share})  # type: ignore[dict-item]
-
-
 def test_legs_of_short_walks_can_select_the_weights_alone() -> None:
     [legs] = leg_streams(with_positions("positions", 0.1))
     part = replace(legs, imu_N=legs.imu_N[: 8 * 200], facing_N=legs.facing_N[: 8 * 200])

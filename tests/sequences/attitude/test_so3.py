@@ -1,8 +1,13 @@
+"""Rotations: exponential and logarithm, products of stacks."""
+
+from __future__ import annotations
+
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from stario.sequences.attitude import so3
+from stario.sequences.attitude.stacks import composed, slerp
 
 ANGLES = [0.0, 1e-9, 1e-4, 0.0316, 0.0317, 0.2, 1.0, 2.5, np.pi - 1e-6]
 
@@ -53,3 +58,23 @@ def test_exp_of_a_stack_of_mixed_angles_equals_one_at_a_time() -> None:
     theta = np.concatenate([rotation_vectors(angle) for angle in ANGLES])
     singly = np.stack([so3.exp_so3(row) for row in theta])
     np.testing.assert_allclose(so3.exp_so3(theta), singly, atol=1e-10)
+
+
+def same(found: Rotation, expected: Rotation) -> None:
+    np.testing.assert_allclose(found.as_quat(), expected.as_quat(), rtol=0.0, atol=1e-10)
+
+
+@pytest.mark.parametrize("counts", [(50, 50), (50, None), (None, 50), (None, None), (0, 0)])
+def test_products_are_scipys(counts: tuple[int | None, int | None]) -> None:
+    p, q = (Rotation.random(count, rng=seed) for seed, count in enumerate(counts))
+    same(composed(p, q), p * q)
+
+
+@pytest.mark.parametrize("count", [0, 7, 1000])
+def test_interpolated_rotations_are_scipys(count: int) -> None:
+    """At fewer times than are known and at more, in any order, at the ends and at known times."""
+    rng = np.random.default_rng(0)
+    known = np.cumsum(rng.uniform(0.01, 0.1, 40))
+    rotations = Rotation.random(40, rng=1)
+    time = np.concatenate([rng.uniform(known[0], known[-1], count), known[[3, 0, -1]]])
+    same(slerp(known, rotations, time), Slerp(known, rotations)(time))

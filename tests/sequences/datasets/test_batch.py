@@ -1,13 +1,24 @@
+"""Batches of recordings, and their split into parts."""
+
 from __future__ import annotations
 
+import importlib.resources
 import os
 import time
+from pathlib import Path
 
 import pytest
 from joblib import parallel_config
 
+from stario.network.training.splits import NAMES, read_packaged_list
 from stario.sequences.datasets.batch import Skipped, each, without_skipped
-from stario.sequences.errors import InputError
+from stario.sequences.datasets.splits import (
+    hold_out_group,
+    random_split,
+    read_list,
+)
+from stario.sequences.errors import InputError, ReadError, StarioError
+from stario.sequences.readers import find_recordings
 
 
 @pytest.mark.parametrize("jobs", [None, 1, 2])
@@ -65,3 +76,114 @@ def test_several_jobs_run_in_separate_processes() -> None:
     found = set(each(process, [0.2] * 4, 2))
     assert os.getpid() not in found
     assert set(each(process, [0.0], 1)) == {os.getpid()}
+
+
+ROW = "t,gx,gy,gz,ax,ay,az\n0.0,0.1,0.2,0.3,1.0,2.0,9.0\n"
+PHONE = ",".join(["1.5e11", *["0.1"] * 6, "0,0,-1", *["0.1"] * 6]) + "\n"
+
+
+def ronin(root: Path, *names: str) -> None:
+    for name in names:
+        (root / name).mkdir(parents=True)
+        (root / name / "data.hdf5").touch()
+
+
+def phone(path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(PHONE)
+    return path
+
+
+def test_the_papers_split_is_by_recording_and_reproducible_by_seed() -> None:
+    paths = [Path(f"{k:02d}.csv") for k in range(40)]
+    split = random_split(paths, seed=7)
+    assert [len(split.training), len(split.validation), len(split.test)] == [32, 4, 4]
+    assert sorted([*split.training, *split.validation, *split.test]) == paths
+    assert random_split(reversed(paths), seed=7) == split
+    assert random_split(paths, seed=8) != split
+    few = random_split(paths[:3], seed=0)
+    assert [len(few.training), len(few.validation), len(few.test)] == [1, 1, 1]
+    with pytest.raises(InputError, match="at least 3"):
+        random_split(paths[:2], seed=0)
+
+
+def test_a_list_may_mix_formats_folders_and_duplicates(tmp_path: Path) -> None:
+    ronin(tmp_path, "a000_1")
+    (tmp_path / "own.csv").write_text(ROW)
+    imu = phone(tmp_path / "handheld/data1/syn/imu1.csv")
+    (tmp_path / "mine.txt").write_text("a000_1\nown.csv\nhandheld\nown.csv\n")
+    found = find_recordings(tmp_path / "mine.txt")
+    assert found == [tmp_path / "a000_1", tmp_path / "own.csv", imu]
+
+
+def test_wrong_entries_are_named_and_the_others_kept(tmp_path: Path) -> None:
+    (tmp_path / "own.csv").write_text(ROW)
+    (tmp_path / "empty").mkdir()
+    path = tmp_path / "list.txt"
+    path.write_text("own.csv\n\n,handheld\ngone.csv\nempty\nlist.txt\n# end\n")
+    with pytest.raises(ReadError, match=r"list\.txt: line 3: found an empty entry"):
+        find_recordings(path)
+    errors: list[StarioError] = []
+    assert find_recordings(path, errors.append) == [tmp_path / "own.csv"]
+    messages = [str(error).removeprefix(str(tmp_path)) for error in errors]
+    assert [text.split(", expected")[0] for text in messages] == [
+        "/list.txt: line 3: found an empty entry",
+        "/list.txt: line 4: found 'gone.csv', which does not exist",
+        "/empty: content: found a folder with nothing",
+        "/list.txt: list: found another list, list.txt",
+    ]
+    path.write_text("# nothing\n\n")
+    with pytest.raises(ReadError, match="no entry"):
+        find_recordings(path)
+
+
+def test_a_text_of_something_else_is_one_error(tmp_path: Path) -> None:
+    """A log of a serial port, or a list of a hundred recordings next to another data folder."""
+    path = tmp_path / "serial.txt"
+    path.write_text("".join(f"t: {k} ax: 0.1 ay: 0.2 az: 9.8\n" for k in range(100)))
+    errors: list[StarioError] = []
+    with pytest.raises(ReadError, match="found 100 lines without an existing name, such as t: 0 "):
+        find_recordings(path, errors.append)
+    assert errors == []
+
+
+def test_lists_name_recordings_below_a_folder_and_their_groups(tmp_path: Path) -> None:
+    for name in ("a.csv", "walks.h5"):
+        (tmp_path / name).touch()
+    file = tmp_path / "list.txt"
+    file.write_text("# who, where\na.csv, home anna\nwalks.h5:one, home bo\nwalks.h5:two\n\n")
+    found = read_list(file, tmp_path)
+    assert [one.path for one in found] == [
+        tmp_path / name for name in ("a.csv", "walks.h5:one", "walks.h5:two")
+    ]
+    assert [one.group for one in found] == ["home anna", "home bo", ""]
+    assert found[0].within("home")
+    assert not found[0].within("home an")
+    outside, inside = hold_out_group(found, "home")
+    assert [one.path.name for one in outside] == ["walks.h5:two"]
+    assert len(inside) == 2
+    assert read_packaged_list(str(file), tmp_path) == found
+    with pytest.raises(InputError, match="home anna"):
+        hold_out_group(found, "office")
+    (tmp_path / "a.csv").unlink()
+    with pytest.raises(InputError, match="--data"):
+        read_list(file, tmp_path)
+
+
+def test_the_packaged_lists_keep_groups_apart() -> None:
+    folder = importlib.resources.files("stario.network.training.splits")
+    names = {}
+    for name in NAMES:
+        lines = folder.joinpath(f"{name}.txt").read_text().splitlines()
+        names[name] = dict(line.split(", ") for line in lines if not line.startswith("#"))
+    assert len(names["test"]) == len(names["validation"]) == 4
+    assert not set(names["test"]) & set(names["all"])
+    held_out = set(names["holdout"])
+    assert held_out < set(names["all"])
+    assert not held_out & set(names["training"])
+    assert set(names["open"]) < set(names["all"])
+    assert not any(word in name for name in names["open"] for word in ("ridi", "kipd", "rocip"))
+    kept = {group for name, group in names["all"].items() if name not in held_out}
+    for group in ("tyrex Thibaud", "ridi dan", "ridi huayi", "kipd yk", "ilc site2 F1"):
+        assert group in names["holdout"].values()
+        assert group not in kept

@@ -1,4 +1,4 @@
-"""Figures fit the good tracks, break at gaps, label what they cut and change no global state."""
+"""Figures and tables as they are shown."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.plan import plan_view
 from stario.sequences.drawing.plots import (
     error_over_time,
     imu_overview,
     innovations,
 )
+from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
 
@@ -223,14 +223,6 @@ def test_imu_overview_tolerates_the_bad_samples_that_readers_keep(truth):
     assert len(imu_overview(ImuSequence("walk", time[:50], gyro[:50], accel[:50])).axes) == 2
 
 
-def test_figures_are_saved_whole_as_png(truth, tracks, tmp_path):
-    path = tmp_path / "plan.png"
-    save_figure(plan_view(tracks, truth, "a walk"), path)
-    assert path.read_bytes().startswith(b"\x89PNG")
-    assert path.stat().st_size > 10_000
-    assert [item.name for item in tmp_path.iterdir()] == ["plan.png"]
-
-
 def test_what_cannot_be_drawn_is_refused(truth):
     nowhere = replace(truth, valid=np.zeros(len(truth), dtype=bool))
     with pytest.raises(InputError, match="no valid pose"):
@@ -322,3 +314,17 @@ def test_lost_samples_are_marked_at_the_edge_and_only_gaps_are_shaded(truth):
         marks = line(axes, "lost")
         assert len(marks.get_xdata()) == len(lost)
         assert set(marks.get_ydata()) == {1.0}
+
+
+def test_columns_are_as_wide_as_their_widest_cell_with_space_between_them() -> None:
+    lines = aligned([["", "ATE [m]", "n"], ["a walk", "1.5", "12"], ["b", "-", "3"]])
+    assert lines == ["         ATE [m]    n", "a walk       1.5   12", "b              -    3"]
+
+
+def test_unknown_values_are_shown_as_a_dash() -> None:
+    assert [figure(None), figure(float("nan")), figure(0.0), figure(1.25, ".1f")] == [
+        "-",
+        "-",
+        "0.000",
+        "1.2",
+    ]

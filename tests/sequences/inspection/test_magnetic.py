@@ -24,7 +24,7 @@ from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.clean_samples import clean_samples
 from stario.sequences.inspection.magnetic import assess_magnetometer
 from stario.sequences.inspection.magnetic_findings import magnetic_findings
-from stario.sequences.inspection.samples import magnetometer_time
+from stario.sequences.inspection.samples import clock_findings
 from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
@@ -166,7 +166,7 @@ def test_a_magnetometer_at_other_times_than_the_samples_is_reported(
     sequence = walk(MagneticField())
     field = sequence.magnetometer
     assert field is not None
-    assert magnetometer_time(sequence) == []
+    assert clock_findings(sequence) == []
     elsewhere = replace(sequence, magnetometer=replace(field, time=factor * field.time + offset))
     problems = [p for p in told(elsewhere) if "found times from" in p]
     assert len(problems) == 1

@@ -16,8 +16,7 @@ from stario.sequences.errors import InputError, ReadError
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.readers import find_recordings
 from stario.sequences.sequence import ImuSequence, PositionTrack
-from stario.sequences.truth.alignment import align_tracked_body
-from stario.sequences.truth.clock_offset import clock_offset
+from stario.sequences.truth.alignment import align_tracked_body, clock_offset
 
 
 @pytest.fixture(scope="module")

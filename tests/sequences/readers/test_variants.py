@@ -127,6 +127,24 @@ def test_each_type_of_pose_message_is_read_as_truth(tmp_path, version, kind) -> 
     assert np.abs(read.truth.time - walk.time).max() < 2e-9
 
 
+@pytest.mark.parametrize("version", ["ros1", "sqlite3", "mcap"])
+def test_pressure_and_satellites_of_a_bag_are_read(tmp_path, version) -> None:
+    walk = formats.walk_of(100.0, 3.0)
+    topics = (("/air", "sensor_msgs/msg/FluidPressure"), ("/fix", "sensor_msgs/msg/NavSatFix"))
+    read = read_recording(formats.bag(tmp_path / "b", walk, version, other_topics=topics))
+    rows = np.arange(len(walk))
+    assert read.truth is not None
+    assert read.barometer is not None
+    np.testing.assert_allclose(read.barometer.pressure_hPa, 1013.25 - 0.01 * rows)
+    np.testing.assert_allclose(read.barometer.time, walk.time, atol=2e-9)
+    found = read.satellites
+    assert found is not None
+    place = np.stack([np.full(len(rows), 48.0), 11.0 + 1e-5 * rows], axis=1)
+    np.testing.assert_allclose(found.latlon_deg, place)
+    np.testing.assert_array_equal(found.altitude_m, 500.0)
+    np.testing.assert_allclose(found.radius_m, 1.51 * 3.0)
+
+
 def test_several_topics_are_named_with_the_option_that_selects_one(tmp_path) -> None:
     walk = formats.walk_of(100.0, 3.0)
     kind = "geometry_msgs/msg/PoseStamped"

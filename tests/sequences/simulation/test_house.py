@@ -14,6 +14,7 @@ from stario.sequences.sequence import BoolArray, FloatArray, Trajectory
 from stario.sequences.simulation.barometer import Air, simulate_barometer, standard_pressure
 from stario.sequences.simulation.house import HouseWalk, simulate_house
 from stario.sequences.simulation.receiver import Sky, simulate_satellites
+from stario.sequences.simulation.walks import WalkStyle
 
 METRES_PER_HPA = 8.43
 STILL_AIR = Air(weather=0.0, door=0.0, noise=0.0)
@@ -143,3 +144,8 @@ def test_other_air_changes_no_other_sensor(walk: HouseWalk) -> None:
 def test_a_walk_too_short_for_a_house_is_refused() -> None:
     with pytest.raises(InputError, match="duration: found 30 s, expected at least 60 s"):
         simulate_house(0, 30.0)
+
+
+def test_a_trolley_takes_no_stairs() -> None:
+    with pytest.raises(InputError, match="trolley"):
+        simulate_house(0, style=WalkStyle(carry="trolley"))

@@ -11,11 +11,14 @@ from stario.sequences import ImuSequence, PositionTrack
 from stario.sequences.attitude.rotations import GyroIntegral
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulation import insertion
+from stario.sequences.simulation.barometer import Air, simulate_barometer
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
 from stario.sequences.simulation.insertion import Inserted, insert_moment
 from stario.sequences.simulation.magnetometer import MagneticField
 from stario.sequences.simulation.moments import MOMENTS, Moment
+from stario.sequences.simulation.receiver import simulate_satellites
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
+from stario.sequences.units import METRES_PER_HPA
 
 BY_NAME = {moment.name: moment for moment in MOMENTS}
 
@@ -154,6 +157,29 @@ def test_known_positions_after_the_moment_come_later(walk: ImuSequence) -> None:
     assert found.positions is not None
     np.testing.assert_allclose(found.positions.time, [2.0, 8.0, 35.0])
     np.testing.assert_allclose(found.positions.position_W, known.position_W)
+
+
+def test_pressure_goes_on_in_a_moment_and_satellites_after_it(walk: ImuSequence) -> None:
+    assert walk.truth is not None
+    full = replace(
+        walk,
+        barometer=simulate_barometer(walk.truth, Air(weather=0.0, door=0.0, noise=0.02)),
+        satellites=simulate_satellites(walk.truth),
+    )
+    found = insert_moment(full, walk.truth, BY_NAME["table"], 0.5, seed=1)
+    pressure, reported = found.sequence.barometer, found.sequence.satellites
+    assert pressure is not None
+    assert np.diff(pressure.time).max() < 0.3
+    assert found.sequence.truth is not None
+    true = found.sequence.truth.at(pressure.time).position_W[:, 2]
+    height = METRES_PER_HPA * (pressure.pressure_hPa[0] - pressure.pressure_hPa)
+    np.testing.assert_allclose(height - height.mean(), true - true.mean(), atol=0.2)
+    assert full.satellites is not None
+    assert reported is not None
+    late = full.satellites.time >= found.start
+    moved = np.where(late, found.stop - found.start, 0.0)
+    np.testing.assert_allclose(reported.time, full.satellites.time + moved)
+    np.testing.assert_array_equal(reported.latlon_deg, full.satellites.latlon_deg)
 
 
 def test_a_seed_gives_the_same_moment_and_another_one_another(walk: ImuSequence) -> None:

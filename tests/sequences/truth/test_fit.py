@@ -1,19 +1,24 @@
+"""The truth fitted to the gyroscope: clock, axes, tilt, scale and bias."""
+
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from told import told
 
+from stario.sequences import inspect_recording
+from stario.sequences.clean_samples import middle_part
 from stario.sequences.conventions import SAME_AXES, with_axes
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, Trajectory
-from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
+from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.truth.findings import fit_findings
-from stario.sequences.truth.fit import fit_truth
-from stario.sequences.truth.part import middle_part
+from stario.sequences.truth.fit import fit_truth, yaw_drift
 
 
 def recorded_in(sequence: ImuSequence, axes: str) -> ImuSequence:
@@ -212,3 +217,66 @@ def test_a_gap_of_the_truth_is_no_jump(walk: ImuSequence) -> None:
     turned = Rotation.from_euler("z", np.where(truth.time > 20.0, 2.0, 0.0)[:, None])
     reset = replace(gappy.truth, attitude_WB=turned * truth.attitude_WB)
     assert fit_truth(replace(walk, truth=reset)).jumps == 1
+
+
+@pytest.fixture(scope="module")
+def turning() -> ImuSequence:
+    style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.5, 0.4))
+    return simulate_imu(generate_walk(5, 90.0, style=style), 100.0, PERFECT_IMU, 1)
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.023, -0.015])
+@pytest.mark.parametrize("bias", [0.0, 0.004])
+def test_scale_and_bias_are_recovered(turning: ImuSequence, scale: float, bias: float) -> None:
+    truth = turning.truth
+    up_B = truth.at(turning.time).attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)
+    turned = replace(turning, gyro=(1.0 + scale) * turning.gyro + bias * up_B)
+    found = yaw_drift(turned, fit_truth(turned))
+    assert found.scale == pytest.approx(scale, abs=2e-3)
+    assert found.bias == pytest.approx(bias, abs=5e-4)
+    assert found.residual_rms < np.radians(1.0)
+
+
+@pytest.mark.parametrize("carry", ["pocket", "swinging", "rig"])
+def test_scale_is_recovered_from_a_device_that_tilts_with_a_bias(carry: str) -> None:
+    """Neither its tilting nor a bias about its own axes is taken for a scale error."""
+    track = generate_walk(5, 120.0, style=WalkStyle(carry=carry))
+    tilting = simulate_imu(track, 100.0, PERFECT_IMU)
+    off = replace(tilting, gyro=1.03 * tilting.gyro + [0.03, -0.02, 0.04])
+    found = yaw_drift(off, fit_truth(off))
+    assert found.scale == pytest.approx(0.03, abs=2e-3)
+    assert found.residual_rms < np.radians(0.3)
+
+
+def test_the_report_states_the_scale_error(turning: ImuSequence) -> None:
+    too_high, too_low = (
+        "\n".join(inspect_recording(replace(turning, gyro=scale * turning.gyro)).lines())
+        for scale in (1.03, 0.97)
+    )
+    assert re.search(r"the gyroscope reads (2\.9|3\.[01]) % too high", too_high)
+    assert re.search(r"the gyroscope reads (2\.9|3\.[01]) % too low", too_low)
+
+
+def test_without_rotation_no_yaw_drift_is_estimated(turning: ImuSequence) -> None:
+    truth = turning.truth
+    until = turning.time < turning.time[0] + 12.0
+    short = ImuSequence(
+        turning.name,
+        turning.time[until],
+        1e-3 * turning.gyro[until],
+        turning.accel[until],
+        truth,
+    )
+    still = replace(truth, attitude_WB=truth.attitude_WB[np.zeros(len(truth.time), dtype=int)])
+    unturned = replace(short, truth=still)
+    assert yaw_drift(unturned, fit_truth(unturned)) is None
+
+
+@pytest.mark.parametrize(
+    ("scale", "words"),
+    [(1.3, r"(29|30)\.\d % too high"), (1 / 57.3, r"98\.\d % too low"), (1.04, "")],
+)
+def test_an_implausible_scale_is_a_problem(turning: ImuSequence, scale: float, words: str) -> None:
+    reported = "\n".join(told(replace(turning, gyro=scale * turning.gyro)))
+    assert ("gyroscope: reads" in reported) is bool(words)
+    assert re.search(words, reported)

@@ -14,8 +14,12 @@ from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence,
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk
 from stario.sequences.truth.positions import fit_positions
-from stario.sequences.truth.problems import check_truth, examine_truth, truth_findings
-from stario.sequences.truth.tracking import tracking_faults
+from stario.sequences.truth.problems import (
+    check_truth,
+    examine_truth,
+    tracking_faults,
+    truth_findings,
+)
 
 LATE_S = 20.0
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,58 +13,70 @@ import numpy as np
 import pytest
 from judged import Stub, horizontal_path, with_waypoints
 
-from stario.fusion.evaluation.benchmark.aligned import aligned_recording
 from stario.fusion.evaluation.benchmark.groups import (
     POOLED,
     RATIOS,
     Benchmark,
     benchmark,
+    benchmark_text,
     labels,
     verdict,
 )
 from stario.fusion.evaluation.figures import groups_figure, write_benchmark
 from stario.fusion.evaluation.scores import values
-from stario.fusion.evaluation.text import benchmark_text
-from stario.sequences.datasets.batch import Skipped
 from stario.sequences.sequence import ImuSequence
 
+Makers = dict[str, Callable[[str], Any]]
 
-def judged(*arguments: Any) -> Benchmark:
-    found, _ = benchmark(*arguments)
+
+def judged(
+    recordings: Mapping[str, ImuSequence], models: Makers, groups: Mapping[str, str] | None = None
+) -> Benchmark:
+    paths = {Path(name): (groups or {}).get(name, "") for name in recordings}
+    found, skipped = benchmark(paths, models, lambda path: recordings[str(path)])
     assert found is not None
+    assert skipped == []
     return found
+
+
+def of_person(recording: ImuSequence, person: str) -> ImuSequence:
+    return replace(recording, attributes={"person": person})
 
 
 @pytest.fixture(scope="module")
 def pair(walk: ImuSequence) -> Benchmark:
-    aligned = [
-        replace(aligned_recording(recording, Path(name)), attributes={"person": person})
-        for name, person, recording in (("one", "a", walk), ("two", "b", with_waypoints(walk)))
-    ]
-    groups = {Path("one"): "walks a", Path("two"): "walks b"}
+    recordings = {"one": of_person(walk, "a"), "two": of_person(with_waypoints(walk), "b")}
     scales = {"walks a": 0.95, "walks b": 0.9}
     models = {
         "ours": lambda group: Stub(walk, scales[group]),
         "theirs": lambda group: Stub(walk, 0.8),
     }
-    found, skipped = benchmark([*aligned, Skipped("three", "why")], models, groups)
-    assert [one.item for one in skipped] == ["three"]
-    assert found is not None
-    return found
+    return judged(recordings, models, {"one": "walks a", "two": "walks b"})
+
+
+def test_a_recording_that_cannot_be_used_is_skipped_and_a_wrong_truth_warned_of(
+    stepping: ImuSequence, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert stepping.truth is not None
+    mirrored = stepping.truth.position_W * [-1.0, 1.0, 1.0]
+    wrong = replace(stepping, truth=replace(stepping.truth, position_W=mirrored))
+    recordings = {Path("wrong"): wrong, Path("blind"): stepping.without_truth()}
+    models: Makers = {"ours": lambda group: Stub(stepping)}
+    _, skipped = benchmark(dict.fromkeys(recordings, ""), models, recordings.__getitem__)
+    assert [one.item for one in skipped] == ["blind"]
+    assert "steps: truth: positions mirrored" in caplog.text
 
 
 def test_a_recording_with_two_waypoints_is_named_as_not_compared(
     walk: ImuSequence, caplog: pytest.LogCaptureFixture
 ) -> None:
-    aligned = [
-        aligned_recording(with_waypoints(walk, every), Path(f"{every:g}")) for every in (50.0, 8.0)
-    ]
-    found = judged(aligned, {"ours": lambda group: Stub(walk)}, {})
+    few, enough = with_waypoints(walk, 50.0), with_waypoints(walk)
+    models: Makers = {"ours": lambda group: Stub(walk)}
+    found = judged({"50": few, "8": enough}, models)
     assert [record.getMessage()[:17] for record in caplog.records] == ["50: not compared,"]
     assert (values(found.scores, "path_m") > 0.0).tolist() == [False, True]
     caplog.clear()
-    third = replace(aligned[0], path=Path("third"))
-    judged([aligned[0], third, aligned[1]], {"ours": lambda group: Stub(walk)}, {})
+    judged({"50": few, "third": few, "8": enough}, models)
     [record] = caplog.records
     assert record.getMessage().startswith("2 of 3 recordings, the first 50: not compared,")
 
@@ -72,11 +85,11 @@ def test_a_device_at_rest_counts_in_no_median_or_ratio(
     walk: ImuSequence, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Its errors relative to its path, the noise of its truth, would be a thousand percent."""
+    assert walk.truth is not None
     still = 1e-4 * np.random.default_rng(0).normal(size=walk.truth.position_W.shape)
     resting = replace(walk, name="rest", truth=replace(walk.truth, position_W=still))
-    aligned = [aligned_recording(each, Path(each.name)) for each in (walk, resting)]
-    models = {"ours": lambda group: Stub(walk), "theirs": lambda group: Stub(walk, 0.8)}
-    found, walking = judged(aligned, models, {}), judged(aligned[:1], models, {})
+    models: Makers = {"ours": lambda group: Stub(walk), "theirs": lambda group: Stub(walk, 0.8)}
+    found, walking = judged({"walk": walk, "rest": resting}, models), judged({"walk": walk}, models)
     assert "rest: not compared, because the ground truth moves by less" in caplog.text
     both, alone = (part.rows("set", "ours", "theirs").iloc[-1] for part in (found, walking))
     assert str(both) == str(alone)  # some are NaN
@@ -100,16 +113,13 @@ def test_without_a_list_intervals_are_drawn_over_the_persons_of_an_archive(
 ) -> None:
     """Over recordings alone, those of one person would pass for those of many."""
     scales = {"r.h5:1": ("a", 0.95), "r.h5:2": ("b", 0.9), "r.h5:3": ("b", 0.9)}
-    aligned = [
-        replace(aligned_recording(walk, Path(name)), attributes={"person": person})
-        for name, (person, _) in scales.items()
-    ]
+    recordings = {name: of_person(walk, person) for name, (person, _) in scales.items()}
     by_group = {f"r {person}": scale for person, scale in scales.values()}
     models = {
         "ours": lambda group: Stub(walk, by_group[group]),
         "theirs": lambda group: Stub(walk, 0.8),
     }
-    pooled = judged(aligned, models, {}).rows("person", "ours", "theirs").iloc[-1]
+    pooled = judged(recordings, models).rows("person", "ours", "theirs").iloc[-1]
     # Persons have equal weights.
     assert pooled["ratio_1s"].ratio == pytest.approx(np.sqrt(0.25 * 0.5), rel=0.01)
 

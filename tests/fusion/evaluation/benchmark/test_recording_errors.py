@@ -7,22 +7,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from judged import Stub, aligned_once, errors_of, horizontal_path, with_waypoints
+from judged import Stub, errors_of, horizontal_path, streams_of, with_waypoints, yaw_WN
 from recorded import DATA
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.benchmark.aligned import aligned_recording
 from stario.fusion.evaluation.benchmark.displacement_error import (
     _AtTicks,
+    _interpolated,
     _stretches,
     _Sums,
-    recording_errors,
+    known_truth,
 )
-from stario.fusion.evaluation.benchmark.network_alone import Predictions, predictions
+from stario.fusion.evaluation.benchmark.pieces import (
+    Piece,
+)
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
 from stario.sequences.attitude.rotations import about_z
+from stario.sequences.errors import InputError
+from stario.sequences.levelled_stream import LevelledStream
 from stario.sequences.readers import read_recording
-from stario.sequences.sequence import ImuSequence, PositionTrack
+from stario.sequences.sequence import ImuSequence, PositionTrack, is_gap
 
 ARCHIVES = DATA / "archives"
 
@@ -49,12 +53,22 @@ def test_with_poses_displacements_of_nine_tenths_give_that_length_ratio(walk: Im
 
 
 def test_the_yaw_from_the_levelled_frame_to_the_world_is_the_truths(walk: ImuSequence) -> None:
-    [piece] = aligned_once(walk).pieces
-    known = np.isfinite(piece.yaw_WN)
-    attitude_WB = about_z(piece.yaw_WN[known]) * Rotation.from_matrix(piece.stream.R_NB[known])
+    [stream] = streams_of(walk)
     assert walk.truth is not None
-    true_WB = walk.truth.at(piece.stream.ticks[known]).attitude_WB
-    assert (attitude_WB * true_WB.inv()).magnitude().max() < 0.1  # what levelling is off by
+    true_WB = walk.truth.at(stream.ticks)
+    levelled = about_z(yaw_WN(walk, stream)) * Rotation.from_matrix(stream.R_NB)
+    off = (levelled * true_WB.attitude_WB.inv())[true_WB.valid]
+    assert off.magnitude().max() < 0.1  # what levelling is off by
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_recording_without_usable_truth_is_refused(walk: ImuSequence, count: int) -> None:
+    with pytest.raises(InputError, match="truth: found none"):
+        known_truth(walk.without_truth())
+    assert walk.truth is not None
+    valid = np.arange(len(walk.truth.time)) < count
+    with pytest.raises(InputError, match=f"truth: found {count} valid"):
+        known_truth(replace(walk, truth=replace(walk.truth, valid=valid)))
 
 
 def test_with_poses_a_rotation_raises_displacement_errors_but_not_the_fitted_ate(
@@ -115,20 +129,21 @@ def test_positions_are_unknown_in_their_gaps_and_beyond_their_ends(walk: ImuSequ
     whole = with_positions(walk).positions
     assert whole is not None
     time = whole.time
-    valid = ((time > 5.0) & (time < 20.0)) | ((time > 30.0) & (time < 70.0))
-    with_gap = replace(walk, truth=None, positions=replace(whole, valid=valid))
-    [piece] = aligned_recording(with_gap, Path("walk")).pieces
-    ticks, known = piece.stream.ticks, np.isfinite(piece.position_W)
+    known = ((time > 5.0) & (time < 20.0)) | ((time > 30.0) & (time < 70.0))
+    ticks = np.arange(0.0, 75.0, 0.5)
+    track = PositionTrack(time[known], whole.position_W[known], "positions")
+    position, breaks = _interpolated(ticks, track, is_gap(np.diff(track.time)))
     inside = ((ticks > 5.1) & (ticks < 19.9)) | ((ticks > 30.1) & (ticks < 69.9))
     outside = (ticks < 4.9) | ((ticks > 20.1) & (ticks < 29.9)) | (ticks > 70.1)
-    assert known[inside].all()
-    assert not known[outside].any()
-    assert len(set(piece.breaks[(ticks > 5.1) & (ticks < 69.9)])) == 2  # before and after the gap
+    assert np.isfinite(position[inside]).all()
+    assert np.isnan(position[outside]).all()
+    assert len(set(breaks[(ticks > 5.1) & (ticks < 69.9)])) == 2  # before and after the gap
 
 
 def test_equal_displacements_give_a_straight_track_at_constant_speed() -> None:
     displacement = np.tile([1.2, -0.4, 0.0], (9, 1))
-    track = Predictions(displacement, np.tile(np.eye(3), (9, 1, 1))).track()
+    stream = LevelledStream(0.0, np.empty((0, 6)), np.empty((0, 2)), np.empty((11, 3, 3)))
+    track = Piece(stream, displacement, np.tile(np.eye(3), (9, 1, 1))).track()
     np.testing.assert_allclose(track, (0.6 - 0.2j) * np.arange(11))
 
 
@@ -144,17 +159,17 @@ def test_equal_displacements_give_a_straight_track_at_constant_speed() -> None:
 def test_pedestrian_dead_reckoning_is_near_the_truth_on_real_recordings(
     name: str, kind: str, path_m: float, error: str
 ) -> None:
-    path = Path(f"{ARCHIVES}/{name}")
-    aligned = aligned_recording(read_recording(path), path)
-    found = recording_errors(aligned, predictions(PedestrianDeadReckoning(), aligned))
-    assert aligned.kind == kind
+    recording = read_recording(Path(f"{ARCHIVES}/{name}"))
+    found = errors_of(recording, PedestrianDeadReckoning())
+    assert known_truth(recording)[0] == kind
     assert found.path_m == pytest.approx(path_m, rel=0.05)
     assert found.figures["length_ratio"] == pytest.approx(1.0, abs=0.3)
     assert found.figures[error] < 15.0
 
 
 def test_pedestrian_dead_reckoning_is_judged_like_a_network(stepping: ImuSequence) -> None:
-    [predicted] = PedestrianDeadReckoning().predictions(aligned_once(stepping))
+    [stream] = streams_of(stepping)
+    predicted = PedestrianDeadReckoning().piece(stream)
     np.testing.assert_allclose(predicted.covariance_N[0], 0.3**2 * np.eye(3))  # its usual error
     found = errors_of(stepping, PedestrianDeadReckoning())
     assert 0.5 < found.figures["length_ratio"] < 1.6

@@ -123,6 +123,12 @@ def test_each_recording_of_a_folder_has_its_own_positions(
         np.testing.assert_allclose(found.position_W, speed * (METRES - METRES[0]), atol=0.02)
 
 
+def test_a_latitude_that_grows_is_no_clock(walk: ImuSequence, tmp_path: Path) -> None:
+    phyphox(tmp_path / "p", walk)
+    save(tmp_path / "p/gps.csv", "lat,lon,alt", np.stack([TIME, TIME, TIME], axis=1))
+    assert read_recording(tmp_path / "p").satellites is None
+
+
 def test_lateral_forces_are_no_positions(walk: ImuSequence, tmp_path: Path) -> None:
     phyphox(tmp_path / "p", walk)
     header = "time (s),acc_lat,acc_long,gps speed"
@@ -163,8 +169,8 @@ def test_positions_known_no_better_than_a_room_are_skipped_with_a_warning(
     ("titles", "factor", "found"),
     [
         ("lat,lon", 1e7, "found 449999955 and 70000152.19"),
-        ("lat,lon", 100.0, "found 4499.99"),  # degrees and minutes of NMEA
-        ("lat (rad),lon (rad)", math.radians(1.0), "found lat (rad)"),
+        ("lat,lon", 123.0, "found 5534.99"),
+        ("lat (rad),lon (rad)", math.radians(1.0), "found lat (rad), expected degrees"),
     ],
 )
 def test_positions_in_another_unit_than_degrees_are_skipped_with_a_warning(
@@ -179,7 +185,32 @@ def test_positions_in_another_unit_than_degrees_are_skipped_with_a_warning(
     save(tmp_path / "p/gps.csv", f"time,{titles}", TIME, factor * degrees(METRES))
     assert read_recording(tmp_path / "p").positions is None
     assert found in caplog.text
-    assert "expected degrees, as in 48.137 and 11.575" in caplog.text
+    assert "expected degrees" in caplog.text
+
+
+def test_degrees_and_minutes_are_named_in_one_line(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """NMEA's 4807.038 is 48 degrees 7.038 minutes; its hemisphere is in a column of its own."""
+    phyphox(tmp_path / "p", walk)
+    place = np.stack([4807.038 + 0.001 * TIME, 1131.0 - 0.001 * TIME], axis=1)
+    save(tmp_path / "p/gps.csv", "time,lat,lon", TIME, place)
+    assert read_recording(tmp_path / "p").satellites is None
+    [line] = [record.getMessage() for record in caplog.records]
+    assert "found 4807.039 and 1130.999, expected degrees" in line
+    assert line.endswith("NMEA's degrees and minutes? That latitude is 48.117317")
+
+
+def test_latitude_and_longitude_that_can_only_be_exchanged_are(
+    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    phyphox(tmp_path / "p", walk)
+    place = degrees(METRES) + np.array([0.0, 120.0])
+    save(tmp_path / "p/gps.csv", "time,lat,lon", TIME, place[:, ::-1])
+    found = read_recording(tmp_path / "p").satellites
+    assert found is not None
+    np.testing.assert_array_equal(found.latlon_deg, place)
+    assert "latitude and longitude are exchanged: read the other way round" in caplog.text
 
 
 @pytest.mark.parametrize(

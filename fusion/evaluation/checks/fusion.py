@@ -1,0 +1,269 @@
+"""The fusion on recordings, by group: beside its network, with fixes, and with samples missing.
+
+- Benefit: errors of filter and graph relative to the network's, whose displacements are chained
+  along the attitude levelled from the IMU. They are horizontal, root mean square after a fit of yaw
+  and position: over all poses, or at the waypoints.
+- Fixes: true positions at equal intervals with white errors; is the error as large as reported?
+  Only the second half of each track counts: by then several fixes have determined the direction.
+- Missing samples: a short gap at each of several instants, and samples dropped at random. Results
+  must not depend on a few samples. All tracks begin in the same pose, so ends need no alignment.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import get_args
+
+import numpy as np
+import pandas as pd
+
+from stario.fusion.backends import BackendName
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.checks.faults import drops, gap
+from stario.fusion.evaluation.compare import Metrics, measure
+from stario.fusion.evaluation.known_positions import MIN_POSITIONS, true_path
+from stario.fusion.evaluation.scores import (
+    Column,
+    geometric_mean,
+    median_degrees,
+    parts,
+    quantile,
+    scored,
+    table,
+)
+from stario.fusion.evaluation.tracks import network_track, true_poses
+from stario.fusion.fixes import Fix, position_fix
+from stario.fusion.imu.stateful import Predictor
+from stario.fusion.lie import yaw_twist
+from stario.fusion.navigator import Navigator
+from stario.fusion.state import Track
+from stario.sequences.accuracy.metrics import pose_errors
+from stario.sequences.accuracy.nees import nees
+from stario.sequences.arrays import even_grid
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+
+SIGMA_BOUND = 3.0
+"""Maximum yaw error of a consistent track, in standard deviations."""
+
+GOOD_YAW = math.radians(10.0)
+"""Maximum acceptable yaw error at the end [rad]."""
+
+GAP_SECONDS, DROPPED, INSTANTS = 0.1, 0.05, 6
+"""Length of a gap [s], share of samples that is dropped, and number of instants of a gap."""
+
+MAX_SHIFT, MAX_TURN = 0.01, 3.0
+"""Maximum acceptable shift of the end: in metres per metre of the path, and in yaw [deg]."""
+
+_MIN_FIXES, _MIN_PATH = 4, 1.0
+"""Minimum number of fixes, and path [m], of a track that is evaluated."""
+
+
+def fusion_gain(
+    model: Predictor,
+    sequence: ImuSequence,
+    config: NavigatorConfig,
+    group: str,
+    backends: Sequence[BackendName] = get_args(BackendName),
+) -> pd.DataFrame:
+    """Score the network alone and the back ends: `error_m`, its `ratio` to the network's, NIS.
+
+    The error is also given in percent of the true path (of the legs between waypoints; not where
+    positions are known whose noise adds up).
+
+    With true poses also the NEES of position, and at the end of the truth the yaw error relative to
+    its start [rad], the yaw's reported standard deviation [rad], and whether the error is good and
+    within the bound.
+
+    Raises:
+        InputError: it has no ground truth or too few known positions, or cannot be run.
+    """
+    truth, path = sequence.truth, true_path(sequence)
+    if sequence.positions is not None and truth is None and sequence.positions.kind != "waypoints":
+        path = 0.0
+    preprocessed = Navigator(model, config).observe(sequence)
+    alone = fitted_error(measure(network_track(preprocessed), sequence))
+    if math.isnan(alone):
+        found = f"fewer than {MIN_POSITIONS} within the track"
+        raise InputError(f"{sequence.name}: positions", found, f"{MIN_POSITIONS} or more")
+    figures: dict[str, Metrics] = {"network": {"error_m": alone}}
+    for name in backends:
+        track = Navigator(model, config, backend=name).track(preprocessed)
+        measured = measure(track, sequence)
+        error = fitted_error(measured)
+        figures[name] = {"error_m": error, "percent": 100.0 * error / path if path else None}
+        figures[name] |= {"ratio": error / alone, "nis": measured["nis_mean"]}
+        if truth is not None:
+            figures[name] |= {"nees": measured["nees_median"], **_yaw_at_the_end(track, truth)}
+    return scored(sequence.name, figures, group)
+
+
+def fitted_error(figures: Metrics) -> float:
+    """Return the horizontal error after a fit of yaw and position [m]; NaN if unknown."""
+    fitted = figures["ate_fit_m"]
+    found = figures["known_positions_m"] if fitted is None else fitted
+    return math.nan if found is None else found
+
+
+def _yaw_at_the_end(track: Track, truth: Trajectory) -> dict[str, float]:
+    assert track.covariance is not None  # both back ends give it
+    errors = pose_errors(track.trajectory, truth)
+    yaw = np.unwrap(errors.yaw)
+    # The truth may end before the track, whose sigma grows further.
+    last = np.searchsorted(track.time, errors.estimate.time[-1])
+    error, sigma = float(yaw[-1] - yaw[0]), math.sqrt(track.covariance[last, 2, 2])
+    return {
+        "yaw_error": error,
+        "yaw_sigma": sigma,
+        "yaw_good": float(abs(error) < GOOD_YAW),
+        "yaw_covered": float(abs(error) < SIGMA_BOUND * sigma),
+    }
+
+
+def _percentile_95(ratios: FloatArray) -> float:
+    return float(np.exp(np.quantile(np.log(ratios), 0.95)))
+
+
+def fusion_gain_table(scores: pd.DataFrame) -> str:
+    """Return a row for each group: ratios to the network, NIS, and yaw error at the end."""
+    backends = [name for name in scores["track"].unique() if name != "network"]
+    network, first = {"track": "network"}, {"track": backends[0]}
+    columns = [
+        Column("n", "error_m", ".0f", len, network),
+        Column("network", "error_m", where=network),
+    ]
+    for name in backends:
+        where = {"track": name}
+        columns += [
+            Column(f"{name} mean", "ratio", ".2f", geometric_mean, where),
+            Column("p95", "ratio", ".2f", _percentile_95, where),
+            Column("worst", "ratio", ".2f", np.max, where),
+            Column("% of path", "percent", ".1f", np.median, where),
+        ]
+    columns += [
+        Column("NIS", "nis", ".1f", np.mean, first),
+        Column("NEES", "nees", ".1f", np.median, first),
+        Column("yaw deg", "yaw_error", ".1f", median_degrees, first),
+        Column("< 10 deg", "yaw_good", ".0%", np.mean, first),
+        Column("< 3 sigma", "yaw_covered", ".0%", np.mean, first),
+    ]
+    notes = (
+        "network: median error [m]; ratios to it: geometric mean, 95th percentile, worst",
+        "% of path: error over the length of the true path, median",
+        "NIS: mean, 3 expected; NEES of position: median, 2.4 expected; yaw: error at the end "
+        "relative to the start",
+    )
+    return table(parts(scores), columns, notes=notes)
+
+
+def track_with_fixes(
+    model: Predictor,
+    sequence: ImuSequence,
+    config: NavigatorConfig,
+    group: str,
+    every: float = 5.0,
+    sigma: float = 0.3,
+    backend: BackendName = "ekf",
+) -> pd.DataFrame:
+    """Score the second half of a recording's track with fixes.
+
+    Figures: share of the fixes that were `applied`; horizontal `position_rms` [m] and median
+    `position_nees`; `yaw_rms` [rad], mean `yaw_nees`, and the share of poses whose yaw error is
+    within three standard deviations (`yaw_covered`).
+
+    Raises:
+        InputError: it has no true poses, is too short for enough fixes, or cannot be run.
+    """
+    truth = true_poses(sequence)
+    known = true_fixes(truth, every, sigma, seed=0)
+    fixes = [fix for fix in known if fix.time >= sequence.time[0]]  # truth may begin earlier
+    if len(fixes) < _MIN_FIXES:
+        raise InputError(f"{sequence.name}: fixes", str(len(fixes)), f"{_MIN_FIXES} or more")
+    track = Navigator(model, config, backend=backend).run(sequence, fixes=fixes)
+    assert track.covariance is not None  # both back ends give it
+    assert track.health is not None
+    errors = pose_errors(track.trajectory, truth)
+    second_half = errors.estimate.time > 0.5 * (truth.time[0] + truth.time[-1])
+    rows = np.searchsorted(track.time, errors.estimate.time[second_half])
+    P, error, yaw = track.covariance[rows], errors.position_W[second_half], errors.yaw[second_half]
+    figures = {
+        "applied": track.health.fixes.get("applied", 0) / len(fixes),
+        "position_rms": math.sqrt((error[:, :2] ** 2).sum(axis=1).mean()),
+        "position_nees": float(np.median(nees(error, P[:, 6:9, 6:9]))),
+        "yaw_rms": math.sqrt((yaw**2).mean()),
+        "yaw_nees": float((yaw**2 / P[:, 2, 2]).mean()),
+        "yaw_covered": float((np.abs(yaw) < SIGMA_BOUND * np.sqrt(P[:, 2, 2])).mean()),
+    }
+    return scored(sequence.name, {backend: figures}, group)
+
+
+def true_fixes(truth: Trajectory, every: float, sigma: float, seed: int) -> list[Fix]:
+    """Return a true position every `every` seconds, with errors of `sigma` [m] per axis."""
+    at = truth.at(even_grid(truth.time[0], truth.time[-1], every))
+    positions = at.position_W + np.random.default_rng(seed).normal(0.0, sigma, (len(at), 3))
+    return [
+        position_fix(float(time), position, sigma**2 * np.eye(3))
+        for time, position in zip(at.time[at.valid], positions[at.valid], strict=True)
+    ]
+
+
+def fixes_table(scores: pd.DataFrame) -> str:
+    """Return a row for each group: medians over recordings, and share of yaw errors in 3 sigma."""
+    columns = (
+        Column("n", "applied", ".0f", len),
+        Column("fixes applied", "applied", ".0%", np.mean),
+        Column("position m", "position_rms"),
+        Column("NEES", "position_nees", ".1f"),
+        Column("yaw deg", "yaw_rms", ".1f", median_degrees),
+        Column("yaw NEES", "yaw_nees", ".1f"),
+        Column("< 3 sigma", "yaw_covered", ".1%", np.mean),
+    )
+    note = "second half of each track; expected: NEES of position 2.4 (median), of yaw 1 (mean)"
+    return table(parts(scores), columns, notes=[note])
+
+
+def end_shifts(
+    model: Predictor, sequence: ImuSequence, config: NavigatorConfig, group: str
+) -> pd.DataFrame:
+    """Score a track without a few samples, in several ways: the shift of its end.
+
+    `metres` is the horizontal distance between the ends over the length of the track, `degrees`
+    the absolute difference of their yaws.
+
+    Raises:
+        InputError: the recording cannot be run, or its track is shorter than a metre.
+    """
+    navigator = Navigator(model, config, backend="ekf")
+    whole = navigator.run(sequence).trajectory
+    path = float(np.linalg.norm(np.diff(whole.position_W[:, :2], axis=0), axis=1).sum())
+    if path < _MIN_PATH:
+        raise InputError(f"{sequence.name}: track", f"{path:.2f} m", "at least a metre")
+    instants = (np.arange(INSTANTS) + 0.5) / INSTANTS * sequence.duration
+    faults = {f"gap at {instant:.0f} s": gap(float(instant), GAP_SECONDS) for instant in instants}
+    faults[f"{DROPPED:.0%} dropped"] = drops(DROPPED)
+    figures = {}
+    for name, modify_samples in faults.items():
+        faulty = modify_samples(sequence, np.random.default_rng(0))
+        other = navigator.run(faulty).trajectory
+        shift = float(np.linalg.norm(whole.position_W[-1, :2] - other.position_W[-1, :2])) / path
+        turn = (other.attitude_WB[-1] * whole.attitude_WB[-1].inv()).as_matrix()
+        degrees = abs(math.degrees(yaw_twist(turn)))
+        within = float(shift <= MAX_SHIFT and degrees <= MAX_TURN)
+        figures[name] = {"metres": shift, "degrees": degrees, "within": within}
+    return scored(sequence.name, figures, group)
+
+
+def end_shift_table(scores: pd.DataFrame) -> str:
+    """Return a row for each group: share of the ends within limits, and how far ends move."""
+    columns = (
+        Column("ends", "metres", ".0f", len),
+        Column(f"within {MAX_SHIFT:.0%} and {MAX_TURN:g} deg", "within", ".0%", np.mean),
+        Column("of the path: median", "metres", ".2%"),
+        Column("p95", "metres", ".2%", quantile(0.95)),
+        Column("worst", "metres", ".2%", np.max),
+        Column("deg: median", "degrees"),
+        Column("p95", "degrees", over=quantile(0.95)),
+        Column("worst", "degrees", over=np.max),
+    )
+    return table(parts(scores), columns)

@@ -1,0 +1,192 @@
+"""Findings about satellite positions: accuracy, repeated positions, jumps, agreement with Doppler.
+
+A receiver measures its velocity from Doppler shifts, apart from its position. So the positions must
+move with it: if they do only with latitude and longitude exchanged, these are; if they move 1.67
+times as far, minutes stand where decimals of a degree belong.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from stario.sequences.arrays import runs
+from stario.sequences.findings import Finding
+from stario.sequences.readers.geodesy import east_north
+from stario.sequences.sequence import FloatArray, Satellites
+
+_STALE_S, _STALE_ROWS = 8.0, 4
+"""Time [s] and reports from which an equal position is repeated rather than measured."""
+
+_FAST_M_S, _RADII = 6.0, 2.0
+"""Speed of a step, and its length relative to the sum of the radii at both ends, that no pedestrian
+takes."""
+
+_WALKING_M_S, _LONGEST_STEP_S, _FEWEST = 0.7, 3.0, 15
+"""Doppler speed and step between reports that are compared, and how many are needed."""
+
+_AGREES, _CONTRADICTS = 0.6, 0.2
+_SCALED, _SURE = 1.35, 4.0
+"""Correlations of positions' and Doppler velocities, and the factor between them and its standard
+deviations from one, that are told."""
+
+_COARSE_M = 30.0
+
+
+@dataclass(frozen=True)
+class Doppler:
+    """Comparison of the positions' velocity with the one measured from Doppler shifts.
+
+    Attributes:
+        correlation: correlation of both.
+        exchanged_correlation: the same with latitude and longitude exchanged.
+        scale: size of the positions' velocity relative to Doppler's.
+        scale_sigma: its standard deviation.
+    """
+
+    correlation: float
+    exchanged_correlation: float
+    scale: float
+    scale_sigma: float
+
+    def findings(self) -> list[Finding]:
+        """Return what stands out."""
+        if self.correlation < _CONTRADICTS and self.exchanged_correlation > _AGREES:
+            text = "satellites: positions move as their speed says only the other way round"
+            fix = "exchange latitude and longitude in the file"
+            return [Finding("satellites_exchanged", text, fix, values=vars(self))]
+        sure = abs(self.scale - 1.0) > _SURE * self.scale_sigma and self.correlation > _AGREES
+        if sure and not 1.0 / _SCALED < self.scale < _SCALED:
+            text = f"satellites: positions move {self.scale:.2f} times as far as their speed says"
+            fix = "are minutes written as decimals of a degree, or the speed in another unit?"
+            return [Finding("satellites_scale", text, fix, values=vars(self))]
+        return []
+
+
+@dataclass(frozen=True)
+class SatelliteFindings:
+    """Findings about a receiver's positions, named as in `as_dict`.
+
+    Attributes:
+        positions: number of reports.
+        rate_hz: median rate [Hz].
+        radius_median_m: median of the stated radius [m]; None if there is none.
+        stale: start and length [s] of each stretch in which the same position is repeated.
+        jumps_m: lengths [m] of steps that no pedestrian takes.
+        doppler: comparison with the Doppler velocity; None unless the person walks with both known.
+    """
+
+    positions: int
+    rate_hz: float
+    radius_median_m: float | None
+    stale: tuple[tuple[float, float], ...]
+    jumps_m: tuple[float, ...]
+    doppler: Doppler | None
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the findings as plain values, with units in their names."""
+        stale = [{"start_s": start, "length_s": length} for start, length in self.stale]
+        return vars(self) | {"stale": stale, "doppler": self.doppler and asdict(self.doppler)}
+
+    def lines(self) -> list[str]:
+        """Return the findings as lines to print."""
+        parts = [f"satellites: {self.positions} positions, {self.rate_hz:.1f} Hz"]
+        if self.radius_median_m is not None:
+            parts.append(f"radius {self.radius_median_m:.1f} m")
+        if self.stale:
+            parts.append(f"repeated for {sum(length for _, length in self.stale):.0f} s")
+        if self.doppler is not None:
+            parts.append(
+                f"move {self.doppler.scale:.2f} +- {self.doppler.scale_sigma:.2f} times as far as "
+                f"their speed says (correlation {self.doppler.correlation:.2f})"
+            )
+        return [", ".join(parts)]
+
+    def findings(self) -> list[Finding]:
+        """Return what stands out."""
+        found = self.doppler.findings() if self.doppler else []
+        if self.stale:
+            start, length = max(self.stale, key=lambda part: part[1])
+            text = f"satellites: one position for {length:.0f} s from {start:.0f} s, as indoors"
+            values = {"stale_s": sum(seconds for _, seconds in self.stale)}
+            found.append(Finding("satellites_stale", text, level="note", values=values))
+        if self.jumps_m:
+            longest = max(self.jumps_m)
+            text = f"satellites: {len(self.jumps_m)} jumps of up to {longest:.0f} m"
+            values = {"count": len(self.jumps_m), "longest_m": longest}
+            found.append(Finding("satellites_jump", text, level="note", values=values))
+        if self.radius_median_m is not None and self.radius_median_m > _COARSE_M:
+            text = f"satellites: a radius of {self.radius_median_m:.0f} m, as of Wi-Fi or cells"
+            values = {"radius_m": self.radius_median_m}
+            found.append(Finding("satellites_coarse", text, level="note", values=values))
+        return found
+
+
+def assess_satellites(reported: Satellites | None) -> SatelliteFindings | None:
+    """Return the findings about a receiver's positions; None without at least two."""
+    if reported is None or len(reported) < 2:
+        return None
+    radius = reported.radius_m
+    known = radius is not None and np.isfinite(radius).any()
+    return SatelliteFindings(
+        positions=len(reported),
+        rate_hz=reported.rate,
+        radius_median_m=float(np.nanmedian(radius)) if radius is not None and known else None,
+        stale=stale_stretches(reported),
+        jumps_m=_jumps(reported),
+        doppler=_against_doppler(reported),
+    )
+
+
+def stale_stretches(reported: Satellites) -> tuple[tuple[float, float], ...]:
+    """Return start and length [s] of the stretches in which the same position is repeated."""
+    same = (np.diff(reported.latlon_deg, axis=0) == 0.0).all(axis=1)
+    time = reported.time
+    parts = ((float(time[a]), float(time[b] - time[a]), b - a) for a, b in runs(same))
+    return tuple(
+        (start, length)
+        for start, length, rows in parts
+        if length >= _STALE_S and rows >= _STALE_ROWS
+    )
+
+
+def _jumps(reported: Satellites) -> tuple[float, ...]:
+    length = np.linalg.norm(np.diff(east_north(reported.latlon_deg), axis=0), axis=1)
+    radius = np.zeros(len(reported)) if reported.radius_m is None else reported.radius_m
+    reach = _RADII * (np.nan_to_num(radius[1:]) + np.nan_to_num(radius[:-1]))
+    far = (length > _FAST_M_S * np.diff(reported.time)) & (length > reach)
+    return tuple(length[far].tolist())
+
+
+def _against_doppler(reported: Satellites) -> Doppler | None:
+    if reported.speed_m_s is None or reported.bearing_deg is None:
+        return None
+    bearing = np.radians(reported.bearing_deg)
+    doppler = reported.speed_m_s[:, None] * np.stack([np.sin(bearing), np.cos(bearing)], axis=1)
+    doppler = 0.5 * (doppler[1:] + doppler[:-1])
+    step = np.diff(reported.time)
+    moved = np.diff(reported.latlon_deg, axis=0).any(axis=1)
+    walking = np.nan_to_num(np.linalg.norm(doppler, axis=1)) > _WALKING_M_S
+    used = walking & moved & (step < _LONGEST_STEP_S)
+    if used.sum() < _FEWEST:
+        return None
+    doppler = doppler[used]
+    straight, crossed = (
+        np.diff(east_north(degrees), axis=0)[used] / step[used, None]
+        for degrees in (reported.latlon_deg, reported.latlon_deg[:, ::-1])
+    )
+    size = float(np.sum(doppler**2))
+    scale = float(np.sum(straight * doppler)) / size
+    error = float(np.sum((straight - scale * doppler) ** 2)) / (doppler.size - 1.0)
+    return Doppler(
+        correlation=_correlation(straight, doppler),
+        exchanged_correlation=_correlation(crossed, doppler),
+        scale=scale,
+        scale_sigma=float(np.sqrt(error / size)),
+    )
+
+
+def _correlation(velocity: FloatArray, doppler: FloatArray) -> float:
+    sizes = float(np.linalg.norm(velocity) * np.linalg.norm(doppler))
+    return float(np.sum(velocity * doppler)) / max(sizes, 1e-12)

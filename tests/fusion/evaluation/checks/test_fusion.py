@@ -1,0 +1,218 @@
+"""Checks of recordings by group: fusion and network, fixes, missing samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from support import CONFIG
+
+from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.checks.fusion import (
+    end_shift_table,
+    end_shifts,
+    fixes_table,
+    fusion_gain,
+    fusion_gain_table,
+    track_with_fixes,
+    true_fixes,
+)
+from stario.fusion.evaluation.scores import joined, scored, values, wide
+from stario.fusion.health import Health
+from stario.fusion.navigator import Navigator
+from stario.fusion.state import Track
+from stario.network.model import load_model
+from stario.sequences.attitude.rotations import about_z
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
+
+Make = Callable[..., Any]
+
+
+def of(scores: pd.DataFrame, metric: str, track: str = "ekf") -> float:
+    [found] = values(scores, metric, track=track)
+    return float(found)
+
+
+def row(name: str, group: str, ratio: float, network: float, **ekf: float) -> pd.DataFrame:
+    return scored(name, {"network": {"error_m": network}, "ekf": {"ratio": ratio, **ekf}}, group)
+
+
+def test_ratios_are_geometric_means_by_group() -> None:
+    rows = [
+        row("a", "x", 0.5, 1.0, nis=3.0, nees=1.0, yaw_error=0.01, yaw_good=1.0),
+        row("b", "x", 2.0, 1.0, nis=3.0, nees=5.0, yaw_error=-0.9, yaw_good=0.0),
+        row("c", "y", 0.5, 2.0, nis=1.0),
+    ]
+    _, x, y, pooled, *_ = fusion_gain_table(joined(rows)).splitlines()
+    assert x.split()[:4] == ["x", "2", "1.00", "1.00"]
+    assert x.split()[4:6] == ["1.87", "2.00"]  # 95th percentile on a logarithmic scale, and worst
+    assert x.split()[-5:-1] == ["3.0", "3.0", "26.1", "50%"]
+    assert y.split()[3] == "0.50"
+    assert pooled.split()[:2] == ["all", "3"]
+
+
+def test_the_error_of_the_fusion_at_waypoints_agrees_with_its_error_at_poses(
+    walk: ImuSequence, make_oracle: Make
+) -> None:
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
+    poses = fusion_gain(oracle, walk, CONFIG, "walks", ("ekf",))
+    every = slice(None, None, 500)
+    at = walk.truth.time[every], walk.truth.position_W[every, :2]
+    at_waypoints = replace(walk, truth=None, positions=PositionTrack(*at, "waypoints"))
+    waypoints = fusion_gain(oracle, at_waypoints, CONFIG, "walks", ("ekf",))
+    assert of(poses, "error_m") < 0.5
+    assert of(waypoints, "error_m") == pytest.approx(of(poses, "error_m"), abs=0.2)
+    path = walk.truth.path_length()
+    assert of(poses, "percent") == pytest.approx(100.0 * of(poses, "error_m") / path)
+    legs = np.linalg.norm(np.diff(at[1], axis=0), axis=1).sum()
+    assert of(waypoints, "percent") == pytest.approx(100.0 * of(waypoints, "error_m") / legs)
+
+
+def test_the_yaw_error_is_that_since_the_start_next_to_the_sigma_of_yaw(
+    walk: ImuSequence, make_oracle: Make
+) -> None:
+    """A world whose axes point elsewhere changes neither."""
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
+    turn, truth = about_z(2.0), walk.truth
+    other = replace(
+        truth, position_W=turn.apply(truth.position_W), attitude_WB=turn * truth.attitude_WB
+    )
+    found, rotated = (
+        fusion_gain(oracle, replace(walk, truth=each), CONFIG, "walks", ("ekf",))
+        for each in (truth, other)
+    )
+    assert of(rotated, "yaw_error") == pytest.approx(of(found, "yaw_error"), abs=1e-9)
+    assert abs(of(found, "yaw_error")) < 0.1
+    track = Navigator(oracle, CONFIG, backend="ekf").run(walk)
+    assert of(found, "yaw_sigma") == pytest.approx(np.sqrt(track.covariance[-1, 2, 2]))
+    half = truth.slice(truth.time[0], 0.5 * truth.time[-1])
+    shorter = fusion_gain(oracle, replace(walk, truth=half), CONFIG, "walks", ("ekf",))
+    at_its_end = np.flatnonzero(track.time <= half.time[-1])[-1]
+    assert of(shorter, "yaw_sigma") == pytest.approx(np.sqrt(track.covariance[at_its_end, 2, 2]))
+
+
+def test_too_little_truth_is_refused(walk: ImuSequence, still_model: Any) -> None:
+    with pytest.raises(InputError, match="truth"):
+        fusion_gain(still_model, replace(walk, truth=None), CONFIG, "walks")
+    # A group's mean would be NaN with a single waypoint within the track.
+    at_waypoints = PositionTrack(np.array([5.0, 500.0]), np.zeros((2, 2)), "waypoints")
+    with pytest.raises(InputError, match="fewer than 2 within the track"):
+        fusion_gain(still_model, replace(walk, truth=None, positions=at_waypoints), CONFIG, "walks")
+
+
+def test_true_fixes_keep_a_track_near_the_truth(walk: ImuSequence, make_oracle: Make) -> None:
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
+    scores = track_with_fixes(oracle, walk, CONFIG, "walks", every=2.0, sigma=0.05)
+    [found] = wide(scores).itertuples()
+    assert found.applied > 0.8
+    assert found.position_rms < 0.3
+    assert found.yaw_covered == 1.0
+    row = fixes_table(scores).splitlines()[1].split()
+    assert row[:2] == ["walks", "1"]
+    assert row[-1] == "100.0%"
+
+
+def test_errors_and_sigmas_are_those_of_the_second_half(
+    walk: ImuSequence, still_model: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A track that is lost at first, then off by (0.3, 0.4, 0) m and 0.02 rad."""
+    truth = walk.truth
+    off = np.where(truth.time > truth.time[-1] / 2.0, 1.0, 100.0)
+    trajectory = replace(
+        truth,
+        position_W=truth.position_W + np.outer(off, [0.3, 0.4, 0.0]),
+        attitude_WB=about_z(0.02) * truth.attitude_WB,
+    )
+    variances = [1.0, 1.0, 0.01**2, *[9.0] * 3, *[0.5**2] * 3, *[4.0] * 6]
+    track = Track(
+        trajectory,
+        covariance=np.tile(np.diag(variances), (len(truth), 1, 1)),
+        health=Health(fixes={"applied": 3}),
+    )
+    monkeypatch.setattr(Navigator, "run", lambda *arguments, **options: track)
+    scores = track_with_fixes(still_model, walk, CONFIG, "walks", every=5.0)
+    [found] = wide(scores).itertuples()
+    assert found.applied == pytest.approx(0.75)
+    assert found.position_rms == pytest.approx(0.5)
+    assert found.position_nees == pytest.approx(0.5**2 / 0.25)
+    assert found.yaw_rms == pytest.approx(0.02)
+    assert found.yaw_nees == pytest.approx((0.02 / 0.01) ** 2)
+    assert found.yaw_covered == 1.0
+    assert fixes_table(scores).splitlines()[1].split()[2:] == [
+        "75%", "0.50", "1.0", "1.1", "4.0", "100.0%",
+    ]  # fmt: skip
+
+
+def test_errors_of_fixes_match_their_stated_sigma(walk: ImuSequence) -> None:
+    fixes = true_fixes(walk.truth, 0.05, 0.2, seed=1)
+    at = walk.truth.at(np.array([fix.time for fix in fixes])).position_W
+    error = np.array([fix.value for fix in fixes]) - at
+    assert np.sqrt((error**2).mean()) == pytest.approx(0.2, rel=0.1)
+
+
+def test_missing_poses_and_too_few_fixes_are_refused(walk: ImuSequence, still_model: Any) -> None:
+    with pytest.raises(InputError, match="truth"):
+        track_with_fixes(still_model, replace(walk, truth=None), CONFIG, "walks")
+    with pytest.raises(InputError, match="fixes"):
+        track_with_fixes(still_model, walk, CONFIG, "walks", every=15.0)
+
+
+def test_truth_before_the_first_sample_gives_no_fixes(
+    walk: ImuSequence, make_oracle: Make, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert walk.truth is not None
+    time = walk.truth.time.copy()
+    time[0] = walk.time[0] - 1.0
+    earlier = replace(walk, truth=replace(walk.truth, time=time))
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
+    scores = track_with_fixes(oracle, earlier, CONFIG, "walks", every=2.0, sigma=0.05)
+    assert "before the start" not in caplog.text
+    assert values(scores, "applied") > 0.9
+
+
+def test_gaps_of_a_tenth_of_a_second_and_5_percent_loss_hardly_move_the_end(
+    walk: ImuSequence,
+) -> None:
+    found = wide(end_shifts(load_model("default"), walk, NavigatorConfig(), "walks"))
+    assert len(found) == 7
+    assert set(found["recording"]) == {walk.name}
+    *gaps, dropped = found.itertuples()
+    assert [one.track for one in gaps[::5]] == ["gap at 2 s", "gap at 18 s"]  # of twenty
+    # On the short path of a simulated walk of 20 s, a turn at a gap has a large effect.
+    assert max(one.metres for one in gaps) < 0.1
+    assert max(one.degrees for one in gaps) < 15.0
+    assert 0.0 < dropped.metres < 0.01
+    assert dropped.degrees < 0.5
+
+
+def test_a_stationary_recording_is_refused(walk: ImuSequence, still_model: Any) -> None:
+    force = np.tile([0.0, 0.0, 9.81], (len(walk), 1))
+    still = replace(walk, gyro=0.0 * walk.gyro, accel=force, truth=None)
+    with pytest.raises(InputError, match="metre"):
+        end_shifts(still_model, still, NavigatorConfig(), "table")
+
+
+def test_a_shift_is_a_share_of_the_path_and_a_turn_in_degrees(
+    still_model: Any, walk: ImuSequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three ends: the unmodified one, one 0.5 m and 20 degrees off, the others not at all."""
+    time, position = np.arange(3.0), np.outer(np.arange(3.0), [5.0, 0.0, 0.0])
+    turned = about_z(np.radians([0.0, 10.0, -20.0]))
+    straight, other = (
+        Track(Trajectory(time, position + shift, attitude))
+        for shift, attitude in (([0.0, 0.0, 0.0], about_z(np.zeros(3))), ([0.3, 0.4, 9.0], turned))
+    )
+    runs = iter([straight, other, *[straight] * 6])
+    monkeypatch.setattr(Navigator, "run", lambda *arguments: next(runs))
+    scores = end_shifts(still_model, walk, NavigatorConfig(), "set")
+    assert values(scores, "metres")[:2] == pytest.approx([0.05, 0.0])
+    assert values(scores, "degrees")[:2] == pytest.approx([20.0, 0.0])
+    row = end_shift_table(scores).splitlines()[1].split()
+    assert row[:3] == ["set", "7", "86%"]
+    assert row[5] == "5.00%"
+    assert row[-1] == "20.00"

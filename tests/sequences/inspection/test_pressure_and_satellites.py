@@ -1,0 +1,170 @@
+"""Inspection of barometer and satellite positions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from told import told
+
+from stario.sequences.findings import Finding
+from stario.sequences.inspection.pressure import PressureFindings, assess_barometer
+from stario.sequences.inspection.receiver import SatelliteFindings, assess_satellites
+from stario.sequences.inspection.report import inspect_recording
+from stario.sequences.sequence import (
+    Barometer,
+    FloatArray,
+    ImuSequence,
+    Satellites,
+    Trajectory,
+)
+from stario.sequences.simulation.barometer import Air, simulate_barometer
+from stario.sequences.simulation.house import simulate_house
+from stario.sequences.simulation.receiver import Sky, simulate_satellites
+
+CALM = Air(weather=0.0, door=0.0, noise=0.05)
+
+
+def climbing(height: FloatArray) -> Trajectory:
+    """Return a device that is carried about at 1.2 m/s, at these heights each tenth of a second."""
+    time = 0.1 * np.arange(len(height))
+    angle = 0.05 * time
+    place = np.stack([24.0 * np.sin(angle), 24.0 * np.cos(angle), height], axis=1)
+    return Trajectory(time, place, Rotation.identity(len(time)))
+
+
+LEVEL = climbing(np.zeros(600))
+
+
+def pressure(barometer: Barometer) -> PressureFindings:
+    found = assess_barometer(barometer)
+    assert found is not None
+    return found
+
+
+def receiver(reported: Satellites) -> SatelliteFindings:
+    found = assess_satellites(reported)
+    assert found is not None
+    return found
+
+
+def codes(findings: list[Finding]) -> list[str]:
+    return [finding.code for finding in findings]
+
+
+@pytest.fixture(scope="module")
+def house() -> ImuSequence:
+    return simulate_house(1, 90.0, rate=50.0).sequence
+
+
+def test_a_house_is_inspected_in_a_line_for_each_sensor(house: ImuSequence) -> None:
+    inspection = inspect_recording(house)
+    lines = inspection.lines()
+    assert sum(line.startswith("barometer: ") for line in lines) == 1
+    assert sum(line.startswith("satellites: ") for line in lines) == 1
+    told_as_data = inspection.as_dict()
+    assert isinstance(told_as_data["barometer"], dict)
+    assert told_as_data["barometer"]["rate_hz"] == pytest.approx(8.0)
+    assert isinstance(told_as_data["satellites"], dict)
+    assert told_as_data["satellites"]["stale"][0]["length_s"] > 40.0
+
+
+@pytest.mark.parametrize("noise", [0.05, 0.2])
+def test_noise_is_measured_on_stairs_as_well(noise: float) -> None:
+    stairs = climbing(np.cumsum(np.full(600, 0.035)))
+    found = pressure(simulate_barometer(stairs, replace(CALM, noise=noise, rate=5.0)))
+    assert found.noise_m == pytest.approx(noise, rel=0.2)
+    assert found.height_range_m == pytest.approx(21.0, rel=0.1)
+
+
+def test_a_door_is_a_step_and_stairs_or_a_lift_are_none() -> None:
+    doors = np.array([20.0])
+    stepped = pressure(simulate_barometer(LEVEL, replace(CALM, door=0.8), doors, seed=1))
+    [(time, rise)] = stepped.steps
+    assert time == pytest.approx(20.0, abs=1.0)
+    assert abs(rise) > 0.35
+    speed = np.zeros(600)
+    speed[100:240] = 0.35  # stairs
+    speed[400:480] = 1.0  # a lift
+    assert pressure(simulate_barometer(climbing(np.cumsum(0.1 * speed)), CALM)).steps == ()
+
+
+def test_a_jump_that_is_no_height_is_a_problem() -> None:
+    calm = simulate_barometer(LEVEL, CALM)
+    hPa = calm.pressure_hPa - 2.0 * (calm.time > 30.0)
+    found = pressure(replace(calm, pressure_hPa=hPa)).findings()
+    assert codes(found) == ["pressure_jump"]
+    assert found[0].values["rise_m"] == pytest.approx(16.9, abs=0.2)
+    assert found[0].values["time_s"] == pytest.approx(30.0, abs=1.0)
+
+
+def test_repeated_samples_and_wind_are_good_to_know() -> None:
+    calm = simulate_barometer(LEVEL, CALM)
+    held = replace(calm, pressure_hPa=np.repeat(calm.pressure_hPa[::4], 4)[: len(calm)])
+    found = pressure(held)
+    assert found.repeated_share == pytest.approx(0.75, abs=0.02)
+    assert [(f.code, f.level) for f in found.findings()] == [("pressure_held", "note")]
+    windy = pressure(simulate_barometer(LEVEL, replace(CALM, noise=0.6)))
+    assert [(f.code, f.level) for f in windy.findings()] == [("pressure_noise", "note")]
+
+
+@pytest.mark.parametrize(
+    ("factor", "offset", "words"),
+    [
+        (100.0, 0.0, "found 101325, expected 300 to 1100 hPa: it seems to be in Pa"),
+        (0.1, 0.0, "found 101.325, expected 300 to 1100 hPa: it seems to be in kPa"),
+        (1.0 / 33.8639, 0.0, "it seems to be in inHg"),
+        (0.0, 12.0, "found 12, expected 300 to 1100 hPa: is it an altitude?"),
+    ],
+)
+def test_pressure_in_another_unit_is_a_problem(
+    house: ImuSequence, factor: float, offset: float, words: str
+) -> None:
+    still = Barometer(house.time[::10], np.full(len(house.time[::10]), 1013.25 * factor + offset))
+    [line] = told(replace(house, barometer=still, satellites=None))
+    assert words in line
+
+
+def test_a_barometer_on_another_clock_is_a_problem(house: ImuSequence) -> None:
+    assert house.barometer is not None
+    late = replace(house.barometer, time=house.barometer.time + 5000.0)
+    [line] = told(replace(house, barometer=late, satellites=None))
+    assert "barometer: found times from 5000 to 5090 s, expected most during the samples" in line
+    assert line.endswith("use one clock for both")
+
+
+def test_exchanged_latitude_and_longitude_contradict_the_speed() -> None:
+    reported = simulate_satellites(LEVEL, Sky(azimuth=1.0, sigma=1.0))
+    right = receiver(reported)
+    assert right.findings() == []
+    assert right.doppler is not None
+    assert right.doppler.correlation > 0.9
+    assert right.doppler.scale == pytest.approx(1.0, abs=0.1)
+    wrong = receiver(replace(reported, latlon_deg=reported.latlon_deg[:, ::-1]))
+    assert codes(wrong.findings()) == ["satellites_exchanged"]
+
+
+def test_minutes_in_place_of_decimals_contradict_the_speed() -> None:
+    """48 degrees 7.038 minutes as 48.07038."""
+    reported = simulate_satellites(LEVEL, Sky(sigma=1.0, latitude=48.3, longitude=11.3))
+    whole, part = np.divmod(reported.latlon_deg, 1.0)
+    found = receiver(replace(reported, latlon_deg=whole + 0.6 * part)).findings()
+    assert codes(found) == ["satellites_scale"]
+    assert found[0].values["scale"] == pytest.approx(0.6, abs=0.05)
+
+
+def test_stale_positions_and_jumps_are_good_to_know() -> None:
+    reported = simulate_satellites(LEVEL, Sky(sigma=1.0))
+    place = reported.latlon_deg.copy()
+    place[20:40] = place[20]
+    place[50] += 0.01
+    found = receiver(replace(reported, latlon_deg=place))
+    assert [(f.code, f.level) for f in found.findings()] == [
+        ("satellites_stale", "note"),
+        ("satellites_jump", "note"),
+    ]
+    [(start, length)] = found.stale
+    assert (start, length) == (pytest.approx(20.0), pytest.approx(19.0))
+    assert max(found.jumps_m) > 1000.0

@@ -1,0 +1,121 @@
+"""Pressure and satellite positions in a generic CSV."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from csv_lines import ROW, write_lines
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from stario.sequences import Barometer, Satellites
+from stario.sequences.readers import read_recording, write_csv
+from stario.sequences.sequence import FloatArray, ImuSequence
+
+SECONDS = 2.0
+IMU = ImuSequence(
+    "walk",
+    np.arange(0.0, SECONDS, 0.02),
+    np.full((100, 3), 0.25),
+    np.tile([0.5, -0.25, 9.75], (100, 1)),
+)
+
+times = st.lists(
+    st.one_of(
+        st.sampled_from(IMU.time.tolist()),
+        st.floats(-1.0, SECONDS + 1.0).filter(lambda t: abs(t) > 1e-9),
+    ),
+    min_size=1,
+    max_size=12,
+    unique=True,
+).map(lambda found: np.array(sorted(found)))
+
+
+@st.composite
+def barometers(draw: st.DrawFn) -> Barometer:
+    time = draw(times)
+    hPa = draw(arrays(np.float64, len(time), elements=st.floats(300.0, 1100.0)))
+    return Barometer(time, hPa)
+
+
+@st.composite
+def receivers(draw: st.DrawFn) -> Satellites:
+    time = draw(times)
+
+    def values(low: float, high: float, unknown: bool) -> FloatArray:
+        found = st.floats(low, high)
+        each = st.one_of(st.just(np.nan), found) if unknown else found
+        return draw(arrays(np.float64, len(time), elements=each))
+
+    def perhaps(low: float, high: float) -> FloatArray | None:
+        column = values(low, high, unknown=True)
+        return column if np.isfinite(column).any() and draw(st.booleans()) else None
+
+    place = np.stack([values(0.001, 90.0, False), values(-180.0, 180.0, False)], axis=1)
+    altitude, radius = perhaps(-400.0, 9000.0), perhaps(0.1, 1e4)
+    return Satellites(time, place, altitude, radius, perhaps(0.0, 99.0), perhaps(0.0, 360.0))
+
+
+def assert_same(found: object, expected: object) -> None:
+    assert type(found) is type(expected)
+    for field in fields(expected) if expected is not None else ():  # type: ignore[arg-type]
+        one, other = (getattr(part, field.name) for part in (found, expected))
+        assert (one is None) == (other is None), field.name
+        if one is not None:
+            np.testing.assert_array_equal(one, other, err_msg=field.name)
+
+
+@settings(max_examples=60, deadline=None)
+@given(barometer=st.none() | barometers(), satellites=st.none() | receivers())
+def test_what_is_written_is_read_back(
+    tmp_path_factory: pytest.TempPathFactory,
+    barometer: Barometer | None,
+    satellites: Satellites | None,
+) -> None:
+    path = tmp_path_factory.mktemp("csv") / "walk.csv"
+    write_csv(path, replace(IMU, barometer=barometer, satellites=satellites))
+    found = read_recording(path)
+    np.testing.assert_array_equal(found.accel, IMU.accel)
+    assert_same(found.barometer, barometer)
+    assert_same(found.satellites, satellites)
+
+
+def file_of(folder: Path, titles: str, cells: str) -> Path:
+    """Write 20 samples with further columns."""
+    rows = [f"{0.01 * k:.2f},{ROW},{cells}" for k in range(20)]
+    return write_lines(folder / "walk.csv", f"t,gx,gy,gz,ax,ay,az{titles}", *rows)
+
+
+def test_columns_may_name_other_units(tmp_path: Path) -> None:
+    titles = ",pressure [kPa],latitude [deg],longitude [deg],altitude [ft],speed [km/h]"
+    found = read_recording(file_of(tmp_path, titles, "100.5,48.5,11.5,100,36"))
+    assert found.barometer is not None
+    np.testing.assert_allclose(found.barometer.pressure_hPa, 1005.0)
+    assert found.satellites is not None
+    np.testing.assert_array_equal(found.satellites.latlon_deg, [[48.5, 11.5]] * len(found))
+    assert found.satellites.altitude_m is not None
+    np.testing.assert_allclose(found.satellites.altitude_m, 30.48)
+    assert found.satellites.speed_m_s is not None
+    np.testing.assert_allclose(found.satellites.speed_m_s, 10.0)
+
+
+@pytest.mark.parametrize(
+    ("titles", "cells", "words"),
+    [
+        (",p [rad/s]", "0.25", "p is not read: found unit 'rad/s', expected hPa, Pa"),
+        (",p", "35.5", "pressure skipped: "),
+        (",lat,lon", "48.5N,11.5E", "pressure and satellites skipped: "),
+    ],
+)
+def test_columns_that_hold_something_else_cost_no_recording(
+    tmp_path: Path, titles: str, cells: str, words: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    found = read_recording(file_of(tmp_path, titles, cells))
+    assert len(found) == 20
+    assert found.barometer is None
+    assert found.satellites is None
+    assert words in caplog.text
