@@ -23,8 +23,12 @@ _RATE = 0.12
 _OVER = 4
 """Time over which the vertical speed is taken [s]."""
 
-_LANDING_SECONDS = 8.0
-"""A shorter stay between two changes of one direction is a landing [s]."""
+_LEAST = 0.8
+"""Least change of height [m]: a few steps."""
+
+_LANDING_SECONDS = 4.0
+"""A shorter stay between two changes of one direction is a landing [s]; longer ones are landings if
+their height fits no floor."""
 
 _LEVEL_SECONDS = 8
 """Time over which the height before and after a change is taken [s]."""
@@ -32,8 +36,11 @@ _LEVEL_SECONDS = 8
 _SPACINGS = np.arange(2.5, 5.01, 0.05)
 """Possible distances of floors [m]."""
 
-_USUAL_SPACING, _SPACING_SIGMA, _HEIGHT_SIGMA = 3.2, 0.5, 0.4
-"""Usual distance of floors, its sigma, and that of the height of a change [m]."""
+_USUAL_SPACING, _LOWER, _HIGHER = 3.0, 0.2, 0.5
+"""Usual distance of floors, and its sigmas downward (a room has 2.4 m at least) and upward [m]."""
+
+_HEIGHT_ERROR = 0.4
+"""Scale of errors of a change [m], with heavy tails: doors."""
 
 _OFF_FLOOR = 0.3
 """Share of the floors' distance by which a change may differ from a whole number of them."""
@@ -136,7 +143,7 @@ def _changes(h: FloatArray) -> list[_Change]:
         if runs and start - runs[-1].stop < _LANDING_SECONDS and runs[-1].climb * sign[start] > 0.0:
             start = runs.pop().start
         runs.append(_change(start, min(stop, len(h) - 1), h))
-    return [run for run in runs if abs(run.climb) > 0.5 * _SPACINGS[0]]
+    return [run for run in runs if abs(run.climb) > _LEAST]
 
 
 def _change(start: int, stop: int, h: FloatArray) -> _Change:
@@ -158,14 +165,16 @@ def _spacing(changes: Sequence[_Change]) -> float:
     """Return the distance of floors that fits the changes best [m]."""
     climbs = np.array([change.climb for change in changes])
     off = climbs[:, None] - np.round(climbs[:, None] / _SPACINGS) * _SPACINGS
-    cost = np.square(off / _HEIGHT_SIGMA).sum(axis=0)
-    cost += np.square((_SPACINGS - _USUAL_SPACING) / _SPACING_SIGMA)
+    cost = 2.0 * np.log1p(np.square(off / _HEIGHT_ERROR)).sum(axis=0)
+    unusual = _SPACINGS - _USUAL_SPACING
+    cost += np.square(unusual / np.where(unusual < 0.0, _LOWER, _HIGHER))
     return float(_SPACINGS[np.argmin(cost)])
 
 
 def _worst(changes: Sequence[_Change], spacing: float) -> int | None:
-    """Return which change fits the floors worst; None if all fit."""
-    off = [abs(c.climb / spacing - round(c.climb / spacing)) for c in changes]
+    """Return which part of a way from floor to floor fits worst; None if there is none."""
+    floors = np.array([change.climb for change in changes]) / spacing
+    off = np.where(np.abs(floors) < 1.0, np.abs(floors - np.round(floors)), 0.0)
     worst = int(np.argmax(off))
     return worst if off[worst] > _OFF_FLOOR else None
 
