@@ -85,9 +85,11 @@ def step(
     s, before = s.with_correction(before, "rest"), s.ekf
     # Zero velocity is more accurate than a network trained on walks, off by 1 cm/s at rest.
     offered = displacement if zero_velocity is None else None
-    if offered is not None and s.ekf.offset is not None:
-        offered = height.yielding(offered, s.climb_rate != 0.0)
-    s, outcome, revoked = _with_displacement(s, offered, config)
+    climb_rate = None if s.ekf.offset is None else s.climb_rate
+    used = offered
+    if offered is not None and climb_rate is not None:
+        used = height.yielding(offered, climb_rate)
+    s, outcome, revoked = _with_displacement(s, used, config)
     s, before = s.with_correction(before, "network"), s.ekf
     s, bearing = _with_bearing(s, interval)
     s = s.with_correction(before, "magnetic field")
@@ -112,6 +114,7 @@ def step(
         accepted + north,
         s.estimate(),
         s.released if s.released is not released else None,
+        climb_rate,
     )
     return s, record
 
@@ -237,9 +240,8 @@ def _with_rest(
     if not s.stillness.rested:
         return s, None
     measured = s.stillness.measurement()
-    if s.climb_rate:
-        measured = height.resting_in_lift(measured)
-    state, result = update_zero_velocity(s.ekf, measured, config.filter)
+    used = height.resting_in_lift(measured) if s.climb_rate else measured
+    state, result = update_zero_velocity(s.ekf, used, config.filter)
     s = changed(s, ekf=state).counted("zero_velocity", *result.outcomes)
     if not result.accepted:
         return s, None

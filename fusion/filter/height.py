@@ -13,6 +13,8 @@ about the vertical.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from stario.fusion.filter.ekf_state import EkfState, PressureOffset
@@ -24,6 +26,7 @@ from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
+from stario.sequences.windows import WINDOW_SECONDS
 
 WEATHER_WALK = 0.03
 """Random walk of the offset [m/sqrt(s)]: weather and ventilation (28 level walks of IPIN 2023: 0.3
@@ -35,6 +38,15 @@ CLIMB_SIGMA = 1.0
 LEVEL_SIGMA = 0.1
 """Sigma of the height of other displacements [m], beside the network's: a short stair or a ramp is
 taken from the pressure, too."""
+
+STAIRS_SLOPE = 0.6
+"""Slope of stairs: a rise of 17 cm on a tread of 28."""
+
+_PATH, _STAIRS = 0.08, 0.2
+"""Slopes by the network's speed up to which one is on a path, and from which on stairs."""
+
+WALKING = 0.4
+"""Speed by the network [m/s] above which one walks on stairs, below which one stands in a lift."""
 
 _GATE = 0.99
 """Probability of the height's chi-square test; outliers are inflated."""
@@ -51,11 +63,24 @@ def with_height(s: EkfState, sample: HeightSample) -> tuple[EkfState, UpdateResu
     return update(s, Linear(np.array([residual]), blocks, R), chi2_quantile(_GATE, 1))
 
 
-def yielding(displacement: WindowDisplacement, climbs: bool) -> WindowDisplacement:
-    """Return a displacement whose height yields to the pressure's."""
-    covariance_N = displacement.covariance_N.copy()
-    covariance_N[2, 2] += (CLIMB_SIGMA if climbs else LEVEL_SIGMA) ** 2
-    return displacement._replace(covariance_N=covariance_N)
+def yielding(displacement: WindowDisplacement, rate: float) -> WindowDisplacement:
+    """Return a displacement whose height yields to the pressure's, on stairs its length as well.
+
+    The networks take steps on stairs for those on a floor, which lead twice as far.
+
+    Args:
+        displacement: the network's.
+        rate: vertical speed by the pressure while one climbs [m/s]; 0 on a floor.
+    """
+    covariance_N, d_N = displacement.covariance_N.copy(), displacement.d_N
+    covariance_N[2, 2] += (CLIMB_SIGMA if rate else LEVEL_SIGMA) ** 2
+    speed = math.hypot(d_N[0], d_N[1]) / WINDOW_SECONDS
+    if speed > WALKING:
+        slope = abs(rate) / speed
+        on_stairs = min(max((slope - _PATH) / (_STAIRS - _PATH), 0.0), 1.0)
+        share = 1.0 - on_stairs + on_stairs * min(1.0, slope / STAIRS_SLOPE)
+        d_N = d_N * np.array([share, share, 1.0])
+    return displacement._replace(d_N=d_N, covariance_N=covariance_N)
 
 
 def resting_in_lift(measured: ZeroVelocity) -> ZeroVelocity:

@@ -12,6 +12,7 @@ import numpy as np
 from stario.fusion.filter.corrections import CORRECTIONS_LISTED, Correction
 from stario.fusion.filter.estimates import Estimate
 from stario.fusion.filter.gained import Gained
+from stario.fusion.filter.height import resting_in_lift, yielding
 from stario.fusion.filter.kalman import UpdateResult
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Accepted
@@ -46,6 +47,18 @@ class Record(NamedTuple):
     """The estimate at the end."""
     released: Estimate | None
     """The pose that has just left the window, corrected by all of it; None if none has."""
+    climb_rate: float | None = None
+    """Vertical speed by the pressure while one climbs [m/s], 0 on a floor; None without one."""
+
+    def at_rate(self, rate: float | None) -> Record:
+        """Return the record with measurements that yield to the pressure at a vertical speed."""
+        if rate is None:
+            return self
+        offered, rest = self.offered, self.zero_velocity
+        return self._replace(
+            offered=offered and yielding(offered, rate),
+            zero_velocity=rest and (resting_in_lift(rest) if rate else rest),
+        )
 
     @property
     def displacement(self) -> WindowDisplacement | None:

@@ -12,8 +12,9 @@ from stario.fusion import Navigator, NavigatorConfig, NavState, Track
 from stario.fusion.evaluation.checks.heights import heights_table, score_heights
 from stario.fusion.evaluation.scores import values
 from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.filter.height import with_height
+from stario.fusion.filter.height import with_height, yielding
 from stario.fusion.imu.barometer import HeightSample
+from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.report.panels import motion_panels
 from stario.fusion.report.series import trajectory_series
 from stario.sequences.attitude.so3 import exp_so3
@@ -263,3 +264,24 @@ def test_a_barometer_on_another_clock_is_said_to_be_unused(
     assert health is not None
     assert health.pressures_dropped == len(time)
     assert not health.pressures
+
+
+@pytest.mark.parametrize(
+    ("rate", "speed", "share"),
+    [
+        (0.0, 1.2, 1.0),  # a floor
+        (0.3, 1.2, 0.3 / 0.6 / 1.2),  # stairs, on which the network walks as on a floor
+        (-0.3, 1.2, 0.3 / 0.6 / 1.2),
+        (0.5, 0.7, 1.0),  # an escalator
+        (1.5, 0.1, 1.0),  # a lift
+        (0.09, 1.2, 1.0),  # a ramp
+    ],
+)
+def test_on_stairs_a_displacement_is_as_long_as_the_climb_allows(
+    rate: float, speed: float, share: float
+) -> None:
+    network = WindowDisplacement(np.array([0.6, 0.8, 0.0]) * speed, 0.01 * np.eye(3), np.eye(3))
+    found = yielding(network, rate)
+    np.testing.assert_allclose(found.d_N, share * network.d_N, atol=1e-12)
+    assert found.covariance_N[2, 2] > network.covariance_N[2, 2]
+    np.testing.assert_array_equal(found.covariance_N[:2, :2], network.covariance_N[:2, :2])
