@@ -22,8 +22,9 @@ from stario.fusion.filter.estimator_state import EstimatorState
 from stario.fusion.filter.frame_transform import frame_rotation, to_final_frame, with_undirected
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import ASSUMED, GYRO_BIAS
+from stario.fusion.filter.map_frame import YAW_UNKNOWN
 from stario.fusion.filter.record import Record, innovations_of
-from stario.fusion.fixes import Accepted, Fix, FixQueue
+from stario.fusion.fixes import Accepted, Fix, FixQueue, fix_list
 from stario.fusion.floors import FloorChange, floor_changes
 from stario.fusion.graph import fixed_lag
 from stario.fusion.graph.batch import smooth
@@ -32,6 +33,7 @@ from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.health import Health, SampleCounts
 from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.imu.stateful import WindowDisplacement
+from stario.fusion.place import known_fixes
 from stario.fusion.recording import PreprocessedRecording, Progress
 from stario.fusion.state import NavState, SmoothedPose, Track, track_from_states
 from stario.sequences.arrays import check_type
@@ -120,7 +122,7 @@ def _smoothed_states(
     first = replace(states[0], covariance=covariance)
     final = to_final_frame(states, frame.transforms)
     try:
-        solved = smooth(final, first, filtered.records, frame.transforms, config, bias)
+        solved = smooth(final, first, filtered.records, frame, config, bias)
     except IndeterminateError as error:
         return _filtered_states(filtered), f"graph fell back to the filter's track: {error}"
     turns = [
@@ -159,13 +161,19 @@ def track_recording(
             f"this navigator's {config.filter.update_rate}",
             "observe with the same update rate",
         )
+    if backend == "ekf" and config.place.closed:
+        remedy = "leave out the back end"
+        raise InputError("closed", "the EKF", "the graph, which knows the end", remedy)
     began = perf_counter()
+    fixes, origin = known_fixes(recording, config.place, fix_list(fixes))
     queue = FixQueue(fixes, most=math.inf)  # all fixes of a recording are known from the start
     run = _filtered(recording, config, prior, queue, progress)
     counts, innovations = recording.front_end.counts, innovations_of(run.records)
 
     def track(states: list[NavState], note: str = "", filtered: Track | None = None) -> Track:
         health = queue.health(run.last.health(counts, config.filter, states[-1]))
+        if filtered is not None and not note:
+            health = _with_later_fixes(health, run)
         if health.pressures:
             health.floors = _floors(states)
         return track_from_states(
@@ -173,6 +181,7 @@ def track_recording(
             innovations,
             replace(health, notes=[*health.notes, *([note] if note else [])]),
             filtered=filtered,
+            georeference=origin,
             seconds_network=recording.seconds_network,
             seconds_filter=recording.seconds_front_end + perf_counter() - began,
         )
@@ -182,6 +191,18 @@ def track_recording(
         found = track(*_smoothed_states(run, config), filtered=found)
     progress(1.0)
     return found
+
+
+def _with_later_fixes(health: Health, run: FilteredRecording) -> Health:
+    """Count positions as applied that the graph has used although the filter could not yet."""
+    frame = run.last.map_frame
+    used = sum(frame.holds(fix) for record in run.records for fix in record.undirected)
+    if not used:
+        return health
+    counts = dict(health.fixes)
+    counts["applied"] = counts.get("applied", 0) + used
+    counts[YAW_UNKNOWN] -= used
+    return replace(health, fixes={name: n for name, n in counts.items() if n})
 
 
 def _filtered(

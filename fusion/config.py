@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ConfigError
+from stario.sequences.geodesy import Georeference
 from stario.sequences.noise import GYRO_SCALE_ERROR, ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.settings import check_number, read_settings, with_settings
@@ -30,6 +31,12 @@ MIN_WALK = 1e-7
 
 MIN_OUTPUT_RATE = 10
 """States per second if there are fewer network updates [Hz]."""
+
+SATELLITES = ("use", "compare", "ignore")
+"""What may become of a recording's satellite positions."""
+
+_ORIGIN = (90.0, 360.0, 360.0)
+"""Largest latitude, longitude and yaw of an origin [deg]."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +146,53 @@ class GraphConfig:
 
 
 @dataclass(frozen=True)
+class PlaceConfig:
+    """What is known of a recording's place, beside its IMU; streams are given fixes instead.
+
+    Attributes:
+        satellites: whether satellite positions are used as fixes ("use"), compared with the track
+            as if they were true ("compare"), or neither ("ignore").
+        waypoints: whether other positions known without attitude are used or compared with.
+        closed: whether the track ends where it began, to a metre.
+        origin: latitude and longitude of the map's origin [deg], and perhaps the direction of its x
+            axis, counter-clockwise from east [deg]; without fixes the origin is the start. None has
+            the first position used, with x east.
+    """
+
+    satellites: str = "compare"
+    waypoints: str = "compare"
+    closed: bool = False
+    origin: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        for name, choices in (("satellites", SATELLITES), ("waypoints", SATELLITES[:2])):
+            value = getattr(self, name)
+            if value not in choices:
+                raise ConfigError(name, repr(value), f"one of {', '.join(choices)}")
+        if not isinstance(self.closed, bool | np.bool_):
+            raise ConfigError("closed", repr(self.closed), "True or False")
+        if self.origin is not None:
+            object.__setattr__(self, "origin", _checked_origin(self.origin))
+
+    @property
+    def georeference(self) -> Georeference | None:
+        """Where the map lies according to `origin`."""
+        if self.origin is None:
+            return None
+        latitude, longitude, *yaw = self.origin
+        return Georeference(latitude, longitude, math.radians(yaw[0]) if yaw else 0.0)
+
+
+def _checked_origin(origin: object) -> tuple[float, ...]:
+    values = tuple(origin) if isinstance(origin, tuple | list) else ()
+    numbers = len(values) in (2, 3) and all(isinstance(v, Real) for v in values)
+    if not (numbers and all(abs(v) <= most for v, most in zip(values, _ORIGIN, strict=False))):
+        expected = "latitude and longitude in degrees, as in 48.137,11.575, and perhaps a yaw"
+        raise ConfigError("origin", repr(origin), expected)
+    return tuple(float(v) for v in values)
+
+
+@dataclass(frozen=True)
 class NavigatorConfig:
     """Everything that a run depends on, except the recording and the weights.
 
@@ -150,6 +204,7 @@ class NavigatorConfig:
         filter: settings of the EKF.
         graph: settings of the factor graph.
         gravity: magnitude [m/s^2].
+        place: what is known of a recording's place.
     """
 
     noise: ImuNoise = field(
@@ -164,13 +219,17 @@ class NavigatorConfig:
     filter: FilterConfig = field(default_factory=FilterConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
     gravity: float = STANDARD_GRAVITY
+    place: PlaceConfig = field(default_factory=PlaceConfig)
 
     def __post_init__(self) -> None:
-        for name, kind in (("noise", ImuNoise), ("filter", FilterConfig), ("graph", GraphConfig)):
+        for name, kind in _GROUPS.items():
             value = getattr(self, name)
             if not isinstance(value, kind):
                 raise ConfigError(name, f"{value!r:.60}", f"a value of type {kind.__name__}")
         check_number(self, "gravity", 9.5, 10.1)
+
+
+_GROUPS = {"noise": ImuNoise, "filter": FilterConfig, "graph": GraphConfig, "place": PlaceConfig}
 
 
 def read_config(path: Path | str) -> NavigatorConfig:

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stario.fusion.fixes import KINDS, MAX_YAW, Fix, make_fix
+from stario.fusion.fixes import KINDS, MAX_YAW, UNKNOWN_HEIGHT, Fix, make_fix
 from stario.fusion.lie import UNKNOWN_YAW
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.lines import decimal_mark, read_lines
@@ -32,9 +32,6 @@ _REQUIRED = (*_COLUMNS[:3], "sx")
 
 _UNITS = {"t": ("s",), "kind": ()}
 """Units that a header may name for a column; for the others m, m/s and rad."""
-
-_UNKNOWN_HEIGHT = 1e3
-"""Standard deviation of a height that is not given [m]."""
 
 
 def read_fixes(path: Path | str) -> list[Fix]:
@@ -121,7 +118,7 @@ def _read_row(path: Path, where: str, header: Sequence[str], row: Sequence[str])
         raise ReadError(path, f"{where}, kind", repr(cells["kind"]), expected)
     axes = "xyz"[: KINDS[kind]]
     if kind == "position" and not cells["z"] and not cells["sz"]:
-        cells |= {"z": "0", "sz": str(_UNKNOWN_HEIGHT)}
+        cells |= {"z": "0", "sz": str(UNKNOWN_HEIGHT)}
     cells |= {f"s{a}": cells[f"s{a}"] or cells["sx"] for a in axes}
     value, sigma = (_numbers(path, where, cells, [p + a for a in axes]) for p in ("", "s"))
     if sigma.min() <= 0.0:

@@ -43,6 +43,9 @@ squares that an update needs are not finite."""
 _HIGH_M, _HIGHEST_M = 150.0, 9e3
 """Heights of places on earth, but not within a map that is less than 180 m wide."""
 
+UNKNOWN_HEIGHT = 1e3
+"""Standard deviation of the height [m] of a position without one."""
+
 _MIN_SIGMA = 1e-4
 """Smallest standard deviation of a fix [m], [m/s], [rad]."""
 
@@ -66,6 +69,11 @@ class Fix:
     kind: FixKind
     value: FloatArray
     covariance: FloatArray
+
+    @property
+    def has_height(self) -> bool:
+        """Whether a position's height is known at all."""
+        return bool(self.covariance[2, 2] < UNKNOWN_HEIGHT**2)
 
     def shifted(self, by: FloatArray) -> Fix:
         """Express the fix in a frame whose origin lies at -`by` (3,) [m]."""

@@ -27,7 +27,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.findings import warn
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.inspection.constant_values import dead_axes
-from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Satellites
 from stario.sequences.time_order import MAX_IMU_GAP
 from stario.sequences.windows import WINDOW_SECONDS
 
@@ -52,6 +52,8 @@ class PreprocessedRecording:
         measurements: predicted displacement of the window ending with each interval, None if no
             window ends there.
         front_end: the front end, with the sample counts and the start.
+        satellites: its satellite positions, None if it has none.
+        positions: its positions known without attitude, None if it has none.
         seconds_front_end: computing time of the front end [s].
         seconds_network: computing time of the network [s].
     """
@@ -60,6 +62,8 @@ class PreprocessedRecording:
     update_rate: int
     measurements: list[WindowDisplacement | None]
     front_end: FrontEnd
+    satellites: Satellites | None
+    positions: PositionTrack | None
     seconds_front_end: float
     seconds_network: float
 
@@ -108,6 +112,8 @@ def preprocess(
         update_rate=config.filter.update_rate,
         measurements=measurements,
         front_end=front_end,
+        satellites=sequence.satellites,
+        positions=sequence.positions,
         seconds_front_end=seconds_front_end,
         seconds_network=seconds_network,
     )

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from stario.fusion.health import Health
 from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
+from stario.sequences.geodesy import Georeference
 from stario.sequences.sequence import BoolArray, FloatArray, Trajectory
 
 T = TypeVar("T")
@@ -214,6 +215,7 @@ class Track:
         health: report of the run, None without a filter.
         filtered: the filter's track, in which each state uses only the measurements until then, as
             a stream's does; None if this is it, or there is no filter.
+        georeference: place of the track's frame on the earth, None if unknown.
         seconds_network: computing time of the network [s].
         seconds_filter: computing time of everything else [s].
     """
@@ -225,6 +227,7 @@ class Track:
     innovations: Innovations | None = None
     health: Health | None = None
     filtered: Track | None = None
+    georeference: Georeference | None = None
     seconds_network: float = 0.0
     seconds_filter: float = 0.0
 
@@ -279,6 +282,7 @@ def track_from_states(
     innovations: Innovations | None = None,
     health: Health | None = None,
     filtered: Track | None = None,
+    georeference: Georeference | None = None,
     seconds_network: float = 0.0,
     seconds_filter: float = 0.0,
 ) -> Track:
@@ -300,6 +304,7 @@ def track_from_states(
         innovations=innovations,
         health=health,
         filtered=filtered,
+        georeference=georeference,
         seconds_network=seconds_network,
         seconds_filter=seconds_filter,
     )

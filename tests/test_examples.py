@@ -53,7 +53,7 @@ def test_run_recording_gives_a_finite_track_without_truth():
 def test_compare_tracks_ranks_the_filter_above_the_imu_alone():
     comparison = load("compare_tracks").main(seconds=30.0)
     ate = {name: metrics["ate_m"] for name, metrics in comparison.metrics.items()}
-    assert ate["track"] < 1.1 * ate["network"] < 5.0 < 100.0 < ate["dead_reckoning"]
+    assert ate["track"] < 1.25 * ate["network"] < 5.0 < 100.0 < ate["dead_reckoning"]
 
 
 def test_streaming_yields_states_ten_times_a_second():

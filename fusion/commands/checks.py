@@ -188,8 +188,8 @@ def fusion(
     """Compare the filter's error with the network's by group, with NIS and consistency of yaw."""
     from stario.fusion.evaluation.checks.fusion import fusion_gain, fusion_gain_table
 
-    judge = partial(fusion_gain, backends=_backends(graph))
-    _check_groups(reading, paths, estimating, by, judge, fusion_gain_table, as_json)
+    score = partial(fusion_gain, backends=_backends(graph))
+    _check_groups(reading, paths, estimating, by, score, fusion_gain_table, as_json)
 
 
 @expand_option_groups
@@ -209,8 +209,8 @@ def fixes(
     from stario.sequences.arrays import check_choice
 
     chosen: BackendName = check_choice("--backend", backend, get_args(BackendName))
-    judge = partial(track_with_fixes, every=every, sigma=sigma, backend=chosen)
-    _check_groups(reading, paths, estimating, by, judge, fixes_table, as_json)
+    score = partial(track_with_fixes, every=every, sigma=sigma, backend=chosen)
+    _check_groups(reading, paths, estimating, by, score, fixes_table, as_json)
 
 
 @expand_option_groups
@@ -270,13 +270,13 @@ def moments(
 
     skipped: list[Skipped] = []
     model, settings = estimating.network(), estimating.settings()
-    judge = partial(moment_costs, model, config=settings, backends=_backends(graph), seed=seed)
+    score = partial(moment_costs, model, config=settings, backends=_backends(graph), seed=seed)
     if paths:
-        found, skipped = map_recordings("moments", reading, paths, lambda path, each: judge(each))
+        found, skipped = map_recordings("moments", reading, paths, lambda path, each: score(each))
     else:
         refuse(context, "with simulated walks", "use with PATH", *READING)
         walks = simulated_walks()
-        found = [judge(walk) for walk in with_bar("moments", walks, len(walks))]
+        found = [score(walk) for walk in with_bar("moments", walks, len(walks))]
     _print_scores(found, skipped, moment_table, as_json)
 
 
@@ -306,15 +306,15 @@ def simulation(
 
     if not paths:
         refuse(context, "with simulated walks", "use with PATH", *READING)
-    judge = partial(motion_scores, estimating.network(), config=estimating.settings())
+    score = partial(motion_scores, estimating.network(), config=estimating.settings())
     wanted = [(carry, seed) for carry in SPEEDS for seed in range(walks)]
     found = [
-        judge(simulated_walk(carry, seed, seconds), carry=carry, kind=SIMULATED)
+        score(simulated_walk(carry, seed, seconds), carry=carry, kind=SIMULATED)
         for carry, seed in with_bar("simulation", wanted, len(wanted))
     ]
 
     def recorded(path: Path, sequence: ImuSequence) -> pd.DataFrame:
-        return judge(sequence, carry=carry_of(sequence), kind=RECORDED)
+        return score(sequence, carry=carry_of(sequence), kind=RECORDED)
 
     more, skipped = map_recordings("simulation", reading, paths or [], recorded)
     _print_scores(found + more, skipped, motion_table, as_json)
@@ -329,7 +329,7 @@ def _check_groups(
     paths: Sequence[Path],
     estimating: EstimatorOptions,
     by: str,
-    judge: Callable[[Predictor, ImuSequence, NavigatorConfig, str], pd.DataFrame],
+    score: Callable[[Predictor, ImuSequence, NavigatorConfig, str], pd.DataFrame],
     table: Callable[[pd.DataFrame], str],
     as_json: bool,
 ) -> None:
@@ -340,10 +340,10 @@ def _check_groups(
     grouping: By = check_choice("--by", by, get_args(By))
     model, settings = estimating.network(), estimating.settings()
 
-    def judged(path: Path, sequence: ImuSequence) -> pd.DataFrame:
-        return judge(model, sequence, settings, labels(path, sequence.attributes)[grouping])
+    def of_group(path: Path, sequence: ImuSequence) -> pd.DataFrame:
+        return score(model, sequence, settings, labels(path, sequence.attributes)[grouping])
 
-    _print_scores(*map_recordings("check", reading, paths, judged), table, as_json)
+    _print_scores(*map_recordings("check", reading, paths, of_group), table, as_json)
 
 
 def _print_scores(

@@ -29,6 +29,7 @@ from stario.fusion.commands.options import (
     JobsOption,
     JsonOption,
     OptionalPathsArgument,
+    PlaceOptions,
     ReadingOptions,
     ReportOption,
     expand_option_groups,
@@ -49,6 +50,7 @@ def compare(
     context: typer.Context,
     reading: ReadingOptions,
     estimating: EstimatorOptions,
+    placing: PlaceOptions,
     paths: OptionalPathsArgument = None,
     fixes: FixesOption = None,
     jobs: JobsOption = 1,
@@ -83,7 +85,7 @@ def compare(
     chosen = TRACKS if tracks == "all" else [*_SHOWN, *(names_in(tracks) if tracks else [])]
     for name in chosen:
         check_choice("--tracks", name, TRACKS)
-    settings, network = estimating.settings(), estimating.network()
+    settings, network = placing.settings(estimating.settings()), estimating.network()
     model = estimating.for_processes(network, jobs)
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
     files, skipped = reading.recordings(paths or [])
@@ -123,13 +125,13 @@ def compare(
 
 def _lines(found: Comparison, as_table: bool) -> list[str]:
     """Return how good the track is beside dead reckoning, and perhaps a table of all tracks."""
-    from stario.fusion.evaluation.text import error_words, track_table, track_words
+    from stario.fusion.evaluation.text import error_words, place_words, track_table, track_words
     from stario.sequences.drawing.figures import distance
 
     alone = found.metrics["dead_reckoning"]
     far = alone["ate_m"] or alone["known_positions_m"]
     far = far or found.tracks["dead_reckoning"].trajectory.path_length()
-    words = error_words(found) or track_words(found)
+    words = error_words(found) or place_words(found) or track_words(found)
     line = f"{found.sequence.name}: StarIO's track: {words}; dead reckoning: {distance(far)}"
     table = [track_table(found)] if as_table else []
     return [line, *table, *(finding.line() for finding in found.verdict)]

@@ -10,10 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import (
-    process_each,
-    training_command,
-)
+from stario.fusion.commands.common import process_each, training_command
 from stario.fusion.commands.options import (
     JsonOption,
     PathsArgument,

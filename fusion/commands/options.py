@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from stario.sequences.sequence import ImuSequence
 
 _reading = partial(typer.Option, rich_help_panel="Reading")
+_place = partial(typer.Option, rich_help_panel="Place")
 _estimation = partial(typer.Option, rich_help_panel="Estimation")
 flag = partial(typer.Option, metavar="")
 """Option without a value; the help would show `<bool>` after it."""
@@ -236,6 +237,57 @@ class EstimatorOptions:
         return network if jobs == 1 else self.model
 
 
+@dataclass(frozen=True)
+class PlaceOptions:
+    """What is known of a recording's place, and what becomes of it; as in `PlaceConfig`."""
+
+    satellites: Annotated[
+        str | None,
+        _place(
+            help="Satellite positions: use (as fixes), compare (with the track) or ignore. "
+            "Default: compare."
+        ),
+    ] = None
+    waypoints: Annotated[
+        str | None,
+        _place(help="Known positions of the file, such as waypoints: use or compare."),
+    ] = None
+    closed: Annotated[
+        bool, _place(metavar="", help="The track ends where it began, to a metre.")
+    ] = False
+    origin: Annotated[
+        str | None,
+        _place(
+            metavar="LAT,LON[,YAW]",
+            help="Latitude and longitude of the start, or of the fixes' zero, in degrees, and "
+            "perhaps the direction of the track's x axis, counter-clockwise from east.",
+        ),
+    ] = None
+
+    def settings(self, config: NavigatorConfig) -> NavigatorConfig:
+        """Return settings with these; without an option they keep their own.
+
+        Raises:
+            InputError: an option's value is none; it is named by the option.
+        """
+        given: dict[str, object] = {name: v for name, v in asdict(self).items() if v}
+        if self.origin is not None:
+            given["origin"] = _numbers_in("--origin", self.origin)
+        try:
+            return replace(config, place=replace(config.place, **given))  # type: ignore[arg-type]
+        except InputError as error:
+            raise InputError(f"--{error.field}", error.found, error.expected) from None
+
+
+def _numbers_in(option: str, text: str) -> tuple[float, ...]:
+    """Return the numbers of a comma-separated list."""
+    try:
+        return tuple(float(word) for word in text.split(","))
+    except ValueError:
+        expected = "numbers separated by commas, as in 48.137,11.575"
+        raise InputError(option, repr(text), expected) from None
+
+
 READING = tuple(field.name for field in fields(ReadingOptions))
 """Names of all options of reading, to refuse them where nothing is read."""
 
@@ -274,13 +326,14 @@ def refuse_unused_sources(
 def expand_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     """Expand a command's parameters of an option group into one typer option per field.
 
-    Groups are `ReadingOptions` and `EstimatorOptions`: each option is thus defined only once.
+    Groups are `ReadingOptions`, `EstimatorOptions` and `PlaceOptions`: each option is thus defined
+    only once.
     """
     options: list[inspect.Parameter] = []
     groups: dict[str, tuple[type, list[str]]] = {}
     for parameter in inspect.signature(command, eval_str=True).parameters.values():
         group = parameter.annotation
-        if group in (ReadingOptions, EstimatorOptions):
+        if group in (ReadingOptions, EstimatorOptions, PlaceOptions):
             members = inspect.signature(group, eval_str=True).parameters
             groups[parameter.name] = group, list(members)
             options += members.values()

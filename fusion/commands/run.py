@@ -21,6 +21,7 @@ from stario.fusion.commands.options import (
     FixesOption,
     JsonOption,
     PathsArgument,
+    PlaceOptions,
     ReadingOptions,
     ReportOption,
     RunOutOption,
@@ -40,6 +41,7 @@ def run(
     paths: PathsArgument,
     reading: ReadingOptions,
     estimating: EstimatorOptions,
+    placing: PlaceOptions,
     fixes: FixesOption = None,
     out: RunOutOption = None,
     filtered: Annotated[
@@ -62,7 +64,7 @@ def run(
     if view:
         optional_package("rerun", "view")
     network = estimating.network()
-    navigator = Navigator(network, estimating.settings())
+    navigator = Navigator(network, placing.settings(estimating.settings()))
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
     if explained:
         explain()
@@ -101,7 +103,7 @@ def _run(
     tracks = {"track": track}
     if filtered and track.filtered is not None:
         tracks["filtered"] = track.filtered
-    found = replace(measured(sequence, tracks, fixes), train=train)
+    found = replace(measured(sequence, tracks, navigator.config.place), train=train)
     also: dict[str, Callable[[Path, Comparison], object]] = {}
     if report:
         from stario.fusion.report.page import write_report
@@ -122,9 +124,10 @@ def _run(
 
 def _lines(found: Comparison) -> list[str]:
     """Return what was recorded, the track, its errors and the verdict, a fact per line."""
-    from stario.fusion.evaluation.text import error_words, track_words
+    from stario.fusion.evaluation.text import error_words, place_words, track_words
 
     lines = [found.sequence.summary(), f"track: {track_words(found)}"]
+    lines += [f"place: {words}"] if (words := place_words(found)) else []
     for name in found.tracks:
         if words := error_words(found, name):
             lines.append(f"{'error' if name == 'track' else f'{name}, error'}: {words}")

@@ -9,12 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stario.fusion.commands.common import exit_if_skipped, names_in
-from stario.fusion.commands.options import (
-    CacheOption,
-    ReadingOptions,
-    assignment,
-    refuse,
-)
+from stario.fusion.commands.options import CacheOption, ReadingOptions, assignment, refuse
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.known_positions import MIN_POSITIONS, position_error
+from stario.fusion.config import NavigatorConfig, PlaceConfig
+from stario.fusion.evaluation.known_positions import (
+    MIN_POSITIONS,
+    fitted_georeference,
+    position_error,
+)
 from stario.fusion.evaluation.pedestrian import pedestrian_track
 from stario.fusion.evaluation.tracks import (
     inertial_track,
@@ -23,7 +27,9 @@ from stario.fusion.fix_file import check_within
 from stario.fusion.fixes import Fix, fix_list
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
+from stario.fusion.place import compared_with, used_words
 from stario.fusion.recording import Progress, silent
+from stario.fusion.report.health import LOST_YAW_SIGMA
 from stario.fusion.state import Track
 from stario.sequences.accuracy.metrics import CONVENTIONS, Alignment, align, evaluate_track
 from stario.sequences.accuracy.nees import position_nees
@@ -32,6 +38,7 @@ from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.errors import InputError
 from stario.sequences.files import unused_name
 from stario.sequences.findings import Finding
+from stario.sequences.geodesy import Georeference
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
@@ -117,6 +124,7 @@ class Comparison:
         metrics: metrics by track name.
         alignment: how tracks are aligned with the truth, for metrics and figures.
         train: command that trains weights on the recording, for the verdict; empty for none.
+        used: what the tracks used of the recording's own positions, so that they are no truth.
     """
 
     sequence: ImuSequence
@@ -124,6 +132,7 @@ class Comparison:
     metrics: dict[str, Metrics]
     alignment: Alignment = "first"
     train: str = ""
+    used: tuple[str, ...] = ()
 
     @cached_property
     def verdict(self) -> list[Finding]:
@@ -134,6 +143,19 @@ class Comparison:
     def track(self) -> Track:
         """StarIO's track, which words and innovations are about."""
         return self.tracks["track"]
+
+    @cached_property
+    def georeference(self) -> Georeference | None:
+        """Where the frame of the tracks lies on the earth; None where that is unknown.
+
+        It is given, or that of the positions used as fixes, if these have determined the direction;
+        otherwise the track is fitted to known positions with coordinates.
+        """
+        sigma = self.track.health.final_sigma if self.track.health else {}
+        if self.track.georeference is not None and sigma.get("yaw_rad", 0.0) < LOST_YAW_SIGMA:
+            return self.track.georeference
+        known = self.sequence.positions
+        return None if known is None else fitted_georeference(self.track, known)
 
     @property
     def words(self) -> dict[str, str]:
@@ -212,26 +234,30 @@ def compare(
             tracks[name] = make()
         except InputError as error:
             log.warning("no track %s: %s", name, error)
-    return measured(sequence, tracks, fixes)
+    return measured(sequence, tracks, config.place)
 
 
 def measured(
-    sequence: ImuSequence, tracks: dict[str, Track], fixes: Sequence[Fix] = ()
+    sequence: ImuSequence, tracks: dict[str, Track], place: PlaceConfig | None = None
 ) -> Comparison:
-    """Return tracks of a recording, computed with these fixes, with their metrics.
+    """Return tracks of a recording, of whose place this was used, with their metrics.
 
     If the truth is known at no time of the tracks, they are those of a recording without any.
     """
+    place = place or PlaceConfig()
+    used = used_words(sequence, place)
+    sequence = replace(sequence, positions=compared_with(sequence, place))
+    health = tracks["track"].health
     # Where fixes define the frame, the first pose's yaw is the least certain one.
-    alignment: Alignment = "yaw" if fixes else "first"
+    alignment: Alignment = "yaw" if health and health.fixes else "first"
     try:
         metrics = {name: measure(track, sequence, alignment) for name, track in tracks.items()}
     except InputError as error:
         if sequence.truth is None:
             raise
         log.warning("%s: no errors are computed: %s", sequence.name, error)
-        return measured(replace(sequence, truth=None), tracks, fixes)
-    return Comparison(sequence, tracks, metrics, alignment)
+        return measured(replace(sequence, truth=None), tracks, place)
+    return Comparison(sequence, tracks, metrics, alignment, used=used)
 
 
 def measure(track: Track, sequence: ImuSequence, alignment: Alignment = "first") -> Metrics:

@@ -26,13 +26,7 @@ from stario.fusion.evaluation.networks import (
     table_dict,
 )
 from stario.fusion.evaluation.scores import records, values
-from stario.sequences.drawing.figures import (
-    BLUE,
-    INK,
-    apply_style,
-    new_figure,
-    split_at_gaps,
-)
+from stario.sequences.drawing.figures import BLUE, INK, apply_style, new_figure, split_at_gaps
 from stario.sequences.files import json_text, write_json, write_rows
 
 if TYPE_CHECKING:

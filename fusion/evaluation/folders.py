@@ -32,7 +32,7 @@ _TRACKS = tuple(f"{track}{suffix}" for track, suffix in product(TRACKS, (".tum",
 
 RESULTS = {
     "metrics.json": ("config.json", "run.json"),
-    "health.json": (*_FIGURES, *_TRACKS[:4], "track.rrd"),
+    "health.json": (*_FIGURES, *_TRACKS[:4], "track.rrd", "track.geojson", "track.gpx"),
     "dead_reckoning.npz": (*_FIGURES, *_TRACKS, "truth.tum"),
     "networks.json": (
         *("networks.csv", "ate_parameters.png", "distributions.png", "pde.png"),

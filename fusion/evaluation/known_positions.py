@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from stario.fusion.evaluation.benchmark.displacement_error import (
-    fit_yaw_and_position,
-)
+from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position, known_truth
 from stario.fusion.imu.direction import Complex
 from stario.fusion.state import Track
 from stario.sequences.arrays import even_grid, interpolated
-from stario.sequences.errors import InputError
 from stario.sequences.findings import Finding
+from stario.sequences.geodesy import Georeference
 from stario.sequences.legs import jumps
-from stario.sequences.sequence import MAX_TRUTH_GAP, FloatArray, ImuSequence, PositionTrack
+from stario.sequences.sequence import (
+    MAX_TRUTH_GAP,
+    BoolArray,
+    FloatArray,
+    ImuSequence,
+    PositionTrack,
+)
 
 MIN_POSITIONS = 2
 """Minimum number of positions: a shift alone fits one; with two, their distance is compared."""
@@ -32,6 +36,9 @@ _SCALED = 1.25
 _MIRRORED, _MIRRORED_M = 0.4, 2.0
 """Share of the error that a mirrored track must leave, and error [m] from which that is tested."""
 
+_APART_M = 3.0
+"""Distance from their centre [m] that positions must have to tell the direction of a track."""
+
 _SIGMAS = 3.0
 """Error in standard deviations, both over the whole track, that contradicts the track."""
 
@@ -39,15 +46,12 @@ _SIGMAS = 3.0
 def true_path(sequence: ImuSequence) -> float:
     """Return the length of the true path [m]: with known positions, of the lines between them.
 
-    Raises:
-        InputError: the recording has neither true poses nor known positions.
+    Raises what `known_truth` does.
     """
+    _, known = known_truth(sequence)
     if sequence.truth is not None:
         return sequence.truth.path_length()
-    if sequence.positions is None:
-        raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
-    steps = np.diff(sequence.positions.position_W[sequence.positions.valid], axis=0)
-    return float(np.linalg.norm(steps, axis=1).sum())
+    return float(np.linalg.norm(np.diff(known.position_W, axis=0), axis=1).sum())
 
 
 def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:
@@ -69,9 +73,7 @@ def placed(track: Track, known: PositionTrack) -> PositionTrack | None:
     They are rotated about the vertical and shifted to fit the track best, in its frame; a single
     one lies exactly on it. None if there is none within its time.
     """
-    # A track of steps has two poses per second: none of its intervals is a gap.
-    longest = max(MAX_TRUTH_GAP, 1.5 * float(np.median(np.diff(track.time))))
-    inside = known.valid & track.trajectory.covers(known.time, longest)
+    inside = known.valid & _within(track, known.time)
     time, truth = known.time[inside], known.position_W[inside]
     if not len(time):
         return None
@@ -80,6 +82,37 @@ def placed(track: Track, known: PositionTrack) -> PositionTrack | None:
         truth[:, 0] + 1j * truth[:, 1], estimated[:, 0] + 1j * estimated[:, 1]
     )
     return PositionTrack(time, np.column_stack([fitted.real, fitted.imag]), known.kind)
+
+
+def fitted_georeference(track: Track, known: PositionTrack) -> Georeference | None:
+    """Return where a track's frame lies on the earth by known positions with coordinates.
+
+    The track is rotated about the vertical and shifted to fit them best. None if fewer than
+    `MIN_POSITIONS` of them lie within it, or they are too close together to tell a direction.
+    """
+    if known.latlon_deg is None:
+        return None
+    with_coordinates = known.valid & np.isfinite(known.latlon_deg).all(axis=1)
+    inside = with_coordinates & _within(track, known.time)
+    if inside.sum() < MIN_POSITIONS:
+        return None
+    latlon = known.latlon_deg[inside]
+    first = Georeference(*latlon[0].tolist())
+    there, here = first.xy(latlon), _track_at(track, known.time[inside])
+    w, z = there[:, 0] + 1j * there[:, 1], here[:, 0] + 1j * here[:, 1]
+    turn = np.vdot(z - z.mean(), w - w.mean())
+    if min(np.abs(w - w.mean()).max(), np.abs(z - z.mean()).max()) < _APART_M:
+        return None
+    origin = w.mean() - turn / abs(turn) * z.mean()
+    latitude, longitude = first.latlon_deg(np.array([[origin.real, origin.imag]]))[0].tolist()
+    return Georeference(latitude, longitude, float(np.angle(turn)))
+
+
+def _within(track: Track, time: FloatArray) -> BoolArray:
+    """Return which times (N,) lie within a track and in none of its gaps."""
+    # A track of steps has two poses per second: none of its intervals is a gap.
+    longest = max(MAX_TRUTH_GAP, 1.5 * float(np.median(np.diff(track.time))))
+    return track.trajectory.covers(time, longest)
 
 
 def _track_at(track: Track, time: FloatArray) -> FloatArray:

@@ -12,6 +12,7 @@ from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import METRIC_WORDS, RECORDING_WORDS, Comparison
 from stario.fusion.evaluation.folders import Files, figure_files, write_results
 from stario.fusion.evaluation.known_positions import shown_positions
+from stario.fusion.evaluation.map_files import on_map, write_geojson, write_gpx
 from stario.sequences.drawing.plan import plan_view
 from stario.sequences.drawing.plots import error_over_time, innovations
 from stario.sequences.files import write_json, write_npz
@@ -32,8 +33,10 @@ def write_run(
 
     These are `track.tum` (9 decimals), `track.npz` (velocity, biases, covariance), `metrics.json`,
     `config.json`, `run.json` (`origin`: what produced them), `health.json` and the figures; with
-    the filter's track also `filtered.tum` and `filtered.npz`. Without truth, known positions in the
-    track's frame (`known_positions.placed`) are drawn. Raises what `write_results` does.
+    the filter's track also `filtered.tum` and `filtered.npz`; where it is known where on the earth
+    the track lies, also `track.geojson` and `track.gpx` (`map_files`). Without truth, known
+    positions in the track's frame (`known_positions.placed`) are drawn. Raises what `write_results`
+    does.
     """
     metrics = {"recording": run.sequence.name, **run.metrics, "conventions": run.words}
     health = run.track.health
@@ -42,6 +45,7 @@ def write_run(
         **_settings(metrics, config, origin),
         "health.json": partial(write_json, obj=asdict(health) if health else None),
         **_figures(run),
+        **_on_map(run),
         **_further(run, also),
     }
     return write_results(folder, files)
@@ -112,6 +116,17 @@ def _tracks(found: Comparison) -> Files:
         files[f"{name}.tum"] = partial(write_tum, trajectory=track.trajectory)
         files[f"{name}.npz"] = partial(write_npz, **track.arrays())
     return files
+
+
+def _on_map(run: Comparison) -> Files:
+    """Return the main track's files for maps, if it is known where on the earth it lies."""
+    if run.georeference is None:
+        return {}
+    found, name = on_map(run.track, run.georeference), run.sequence.name
+    return {
+        "track.geojson": partial(write_geojson, name=name, found=found),
+        "track.gpx": partial(write_gpx, name=name, found=found),
+    }
 
 
 def _figures(found: Comparison) -> Files:

@@ -66,6 +66,24 @@ def track_words(found: Comparison) -> str:
     return words
 
 
+def place_words(found: Comparison) -> str:
+    """Return in one line where on the earth the track lies and by what; empty if nothing is known.
+
+    Positions that were used are no truth to compare with, which it says, too.
+    """
+    place, positions = found.georeference, found.sequence.positions
+    used = " and ".join(found.used)
+    words = [f"{used} are used, and so not compared with"] if used else []
+    if place is None:
+        words += ["not on the map, since its direction there is unknown"] if used else []
+        return "; ".join(words)
+    start = place.latlon_deg(found.track.trajectory.position_W[:1])[0]
+    at = f"starts at {start[0]:.6f}, {start[1]:.6f}"
+    if place is not found.track.georeference and positions is not None:
+        at += f", fitted to {positions.kind}"
+    return "; ".join([at, *words])
+
+
 def error_words(found: Comparison, name: str = "track") -> str:
     """Return in one line how far a track is from the truth or the known positions.
 

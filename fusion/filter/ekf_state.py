@@ -314,12 +314,15 @@ class EkfState:
         common = N @ (C @ self.covariances @ C.T) @ N.T
         return changed(self, covariances=common + symmetric(rest @ self.covariances @ rest.T))
 
-    def with_position_inflated(self, sigma: float) -> EkfState:
-        """Return the state with its covariances inflated by a shift, `sigma` [m] per axis."""
-        N = np.zeros((self.covariances.shape[1], 3))
+    def with_position_inflated(self, sigma: float, axes: int = 3) -> EkfState:
+        """Return the state with its covariances inflated by a shift, `sigma` [m] per axis.
+
+        With two `axes` the shift is horizontal.
+        """
+        N = np.zeros((self.covariances.shape[1], axes))
         for _, rho in self._poses():
-            N[rho : rho + 3] = np.eye(3)
-        if self.offset is not None:
+            N[rho : rho + axes] = np.eye(axes)
+        if self.offset is not None and axes == 3:
             N[self.offset_row, 2] = -1.0
         return changed(self, covariances=self.covariances + sigma**2 * (N @ N.T))
 

@@ -78,7 +78,7 @@ def step(
     s = changed(with_step(s, interval, displacement, fixes), in_gap=interval.gap)
     if interval.gap or fixes:
         s = changed(s, alternative=None)
-    s, segment, accepted = _propagated(s, interval, accel_factor, fixes, config)
+    s, segment, accepted, undirected = _propagated(s, interval, accel_factor, fixes, config)
     s = _with_height(s, interval)
     before = s.ekf
     s, zero_velocity = _with_rest(s, interval, config)
@@ -112,6 +112,7 @@ def step(
         zero_velocity,
         bearing,
         accepted + north,
+        undirected,
         s.estimate(),
         s.released if s.released is not released else None,
         climb_rate,
@@ -151,10 +152,11 @@ def _propagated(
     accel_factor: float,
     fixes: Sequence[Fix],
     config: NavigatorConfig,
-) -> tuple[EstimatorState, Segment | None, list[Accepted]]:
+) -> tuple[EstimatorState, Segment | None, list[Accepted], list[Fix]]:
     """Propagate through the fixes and, after a gap, level the attitude.
 
-    Return the segment (None for a gap, and if fixes split it) and the fixes applied, too.
+    Return the segment (None for a gap, and if fixes split it), the fixes applied, and those refused
+    for want of a direction, too.
     """
     if interval.gap:
         for slot in s.ekf.clone_slots:  # no displacement spans a gap
@@ -165,9 +167,10 @@ def _propagated(
             fixes = ()
     if interval.lost:
         s = changed(s, ekf=state_after_loss(s.ekf, interval, config))
-        return _with_yaw_lost(s), None, []
+        return _with_yaw_lost(s), None, [], []
     segment: Segment | None = None
-    accepted = []
+    accepted: list[Accepted] = []
+    undirected: list[Fix] = []
     pieces = split_at_fixes(interval, fixes)
     for piece, due in pieces:
         if piece is not None and interval.gap:
@@ -176,13 +179,16 @@ def _propagated(
         elif piece is not None:
             s, segment = _integrated(s, piece, interval, accel_factor, config)
         for fix in due:
-            s, applied = _with_fix(s, fix, config)
-            accepted += applied
+            s, result = _with_fix(s, fix, config)
+            if result.accepted:
+                accepted.append(Accepted(fix, result.scale))
+            elif result.reason == map_frame.YAW_UNKNOWN:
+                undirected.append(fix)
     if interval.levelled is not None:
         sigma = tilt_sigma(interval.levelled, config)
         levelled, _ = ekf.update_tilt(s.ekf, interval.levelled.up_B, sigma)
         s = changed(s, ekf=levelled)
-    return s, (segment if len(pieces) == 1 else None), accepted
+    return s, (segment if len(pieces) == 1 else None), accepted, undirected
 
 
 def _with_yaw_lost(s: EstimatorState) -> EstimatorState:
@@ -212,10 +218,10 @@ def _integrated(
 
 def _with_fix(
     s: EstimatorState, fix: Fix, config: NavigatorConfig
-) -> tuple[EstimatorState, list[Accepted]]:
+) -> tuple[EstimatorState, UpdateResult]:
     (state, frame), result = map_frame.update_with(fix, Mapped(s.ekf, s.map_frame), config.filter)
     s = changed(s, ekf=state, map_frame=frame).counted("fixes", *result.outcomes)
-    return s, [Accepted(fix, result.scale)] if result.accepted else []
+    return s, result
 
 
 def _with_height(s: EstimatorState, interval: ImuInterval) -> EstimatorState:

@@ -17,6 +17,7 @@ import numpy as np
 
 from stario.fusion.filter.jacobians import CORE, POSITION
 from stario.fusion.filter.planar_alignment import PlanarAlignment, without_yaw
+from stario.fusion.fixes import Fix
 from stario.fusion.lie import UNKNOWN_YAW, e3_cross
 from stario.fusion.state import NavState, changed
 from stario.sequences.sequence import FloatArray
@@ -149,6 +150,19 @@ class MapFrameState:
         if not (self.arbitrary_yaw and (self.placed or self.transforms)):
             return self.unoriented
         return (*self.unoriented, unoriented_stretch(self.pivot, self.since, math.inf))
+
+    def holds(self, fix: Fix) -> bool:
+        """Return whether a fix holds for the track in its final frame.
+
+        Of a stretch whose yaw in the map has never become known, only the position that placed it
+        does: others would bend the track to lie in an arbitrary direction.
+        """
+        undirected = (
+            each
+            for each in (*self.undirected, *self.transforms)
+            if each.yaw_sigma >= UNKNOWN_YAW and each.since <= fix.time < each.until
+        )
+        return all(np.array_equal(fix.value, each.pivot) for each in undirected)
 
 
 def _turn_moments(variance: float) -> tuple[float, float, float]:

@@ -65,6 +65,9 @@ _INFLATION_RATIO, _MAX_SIGMA = 1e3, 1e5
 """Sigma of an unknown shift: this many times the sigma that remains after the measurement, but no
 more than this [m], beyond which the covariance keeps no digits for the fix."""
 
+YAW_UNKNOWN = "yaw not known"
+"""Why a position or velocity is refused before the track's direction in the map is known."""
+
 
 class Mapped(NamedTuple):
     """A filter's state and that of its map frame."""
@@ -100,13 +103,15 @@ def update_with(fix: Fix, m: Mapped, f: FilterConfig) -> tuple[Mapped, UpdateRes
     else:
         m, transform = _oriented(fix, m)
     if transform is None:
-        return m, UpdateResult("too coarse" if fix.kind == "yaw" else "yaw not known")
+        return m, UpdateResult("too coarse" if fix.kind == "yaw" else YAW_UNKNOWN)
     m, result = _updated(fix, m, f)
     if places:
         m = _with_alignment_begun(fix, m)
     now = m.ekf.nav_state()
     if places:
-        completed = changed(transform, position_covariance=now.position_covariance)
+        known = np.arange(3) < (3 if fix.has_height else 2)
+        covariance = now.position_covariance * np.outer(known, known)
+        completed = changed(transform, position_covariance=covariance)
     else:
         completed = changed(transform, yaw_sigma=math.sqrt(now.covariance[2, 2]))
     return m.with_frame(transforms=(*m.frame.transforms, completed)), result
@@ -158,19 +163,23 @@ def _needs_placing(fix: Fix, m: Mapped) -> tuple[bool, Mapped]:
 def _placed(fix: Fix, m: Mapped) -> tuple[Mapped, FrameTransform]:
     now = m.ekf.nav_state()
     P = now.covariance
+    # A position without a height leaves the track's own, above the start.
+    axes = 3 if fix.has_height else 2
+    known = np.arange(3) < axes
+    shift = np.where(known, fix.value - now.p_W, 0.0)
     transform = FrameTransform(
         np.eye(3),
-        fix.value - now.p_W,
-        fix.value,
+        shift,
+        now.p_W + shift,
         placed=True,
         since=m.frame.since,
         drift=float(P[2, 2]),
         by_yaw=P[POSITION, 2] / P[2, 2],
-        position_drift=without_yaw(P, POSITION),
+        position_drift=without_yaw(P, POSITION) * np.outer(known, known),
     )
-    variance = np.trace(fix.covariance) + np.trace(now.position_covariance)
+    variance = np.trace((fix.covariance + now.position_covariance)[:axes, :axes])
     sigma = min(_INFLATION_RATIO * math.sqrt(variance), _MAX_SIGMA)
-    shifted = m.ekf.transformed(np.eye(3), transform.shift).with_position_inflated(sigma)
+    shifted = m.ekf.transformed(np.eye(3), transform.shift).with_position_inflated(sigma, axes)
     return Mapped(shifted, changed(m.frame, placed=True)), transform
 
 

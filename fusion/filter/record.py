@@ -15,7 +15,7 @@ from stario.fusion.filter.gained import Gained
 from stario.fusion.filter.height import resting_in_lift, yielding
 from stario.fusion.filter.kalman import UpdateResult
 from stario.fusion.filter.zero_velocity import ZeroVelocity
-from stario.fusion.fixes import Accepted
+from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.health import Health, SampleCounts
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
@@ -43,6 +43,8 @@ class Record(NamedTuple):
     """What a magnetic bearing told about attitude and bias; None without one."""
     fixes: list[Accepted]
     """Fixes applied, in order."""
+    undirected: list[Fix]
+    """Fixes refused because the track's direction in the map was not known yet."""
     estimate: Estimate
     """The estimate at the end."""
     released: Estimate | None

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter.frame_transform import FrameTransform, frame_rotation
+from stario.fusion.filter.frame_transform import FrameTransform, MapFrameState, frame_rotation
 from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.filter.record import Record
 from stario.fusion.graph.builder import GraphBuilder
-from stario.fusion.graph.factors import GyroBias
+from stario.fusion.graph.factors import GyroBias, SamePlace
 from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.imu.barometer import CLIMB_DELAY
 from stario.fusion.imu.preintegration import Segment
@@ -32,6 +32,9 @@ _LEAST_CLIMB, _SLOW = 0.8, 1e-3
 """Height [m] below which a climb may be none, and its speed then [m/s]: its height yields to the
 pressure's, its length does not."""
 
+_CLOSURE_SIGMA = 1.0
+"""Standard deviation [m] per axis of a walk's end, relative to the start at which it ends."""
+
 _TRUSTED_ROUNDS = 2
 """Rounds before outliers are down-weighted. Headings off by 86 degrees beside accurate positions,
 which the filter follows, then turn the track by at most 6 degrees; with weights from the first
@@ -42,7 +45,7 @@ def smooth(
     filtered: Sequence[NavState],
     prior: NavState,
     records: Sequence[Record],
-    transforms: Sequence[FrameTransform],
+    frame: MapFrameState,
     config: NavigatorConfig,
     gyro_bias: tuple[FloatArray, FloatArray] | None = None,
 ) -> list[NavState]:
@@ -52,7 +55,7 @@ def smooth(
         filtered: the filter's states in one frame: the start and one for each interval.
         prior: first state before any frame transform.
         records: the filter's, interval by interval.
-        transforms: frame transforms since the start.
+        frame: the filter's map frame at the end.
         config: noise, filter and graph settings.
         gyro_bias: (3,) [rad/s] and covariance (3, 3) at the end, as estimated by the filter with
             the magnetic field, which the graph does not use; None without a field.
@@ -65,18 +68,23 @@ def smooth(
     """
     origin = filtered[0].p_W  # near the track; see `EkfState`
     local = [state.shifted(-origin) for state in filtered]
-    first = _inflated(local[0], prior, transforms)
+    first = _inflated(local[0], prior, frame.transforms)
     builder = GraphBuilder(config, first)
     records = _with_climbs(records)
     revoked = {time for record in records for time in record.revoked}
     for record, state in zip(records, local[1:], strict=True):
         # Neither is inflated as by the filter: the graph weights outliers by the whole track.
-        fixes = [accepted.fix.shifted(-origin) for accepted in record.fixes]
+        # By the end the direction may be known that the filter had to wait for.
+        fixes = [*(accepted.fix for accepted in record.fixes), *record.undirected]
+        placed = [fix.shifted(-origin) for fix in fixes if frame.holds(fix)]
         valid = record.displacement is not None and record.interval.stop not in revoked
-        builder.step(record, record.offered if valid else None, fixes, state)
+        builder.step(record, record.offered if valid else None, placed, state)
     builder.close(local[-1])
     if gyro_bias is not None:
         builder.graph.add(GyroBias(builder.graph.last, *gyro_bias), gated=False)
+    if config.place.closed:
+        ends = builder.graph.keyframes[0], builder.graph.last
+        builder.graph.add(SamePlace(*ends, _CLOSURE_SIGMA**2 * np.eye(3)), gated=False)
     builder.graph.solve(trusted_rounds=_TRUSTED_ROUNDS)
     solved = {state.time: state for state in all_states(builder.graph, builder.segments)}
     return [
@@ -135,8 +143,10 @@ def _inflated(first: NavState, prior: NavState, transforms: Sequence[FrameTransf
         return replace(first, covariance=prior.covariance)
     to_last = frame_rotation(first.R_WB @ prior.R_WB.T)
     covariance = to_last @ prior.covariance @ to_last.T
-    if any(transform.placed for transform in transforms):
-        covariance[POSITION, POSITION] += _UNKNOWN_POSITION**2 * np.eye(3)
+    for transform in transforms:
+        if transform.placed:
+            placed = np.diag(transform.position_covariance) > 0.0  # by a height, too, or without
+            covariance[POSITION, POSITION] += np.diag(_UNKNOWN_POSITION**2 * placed)
     if not all(transform.placed for transform in transforms):
         covariance[2, 2] += UNKNOWN_YAW**2
     return replace(first, covariance=covariance)

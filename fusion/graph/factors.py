@@ -155,6 +155,24 @@ class Displacement(Between):
 
 
 @dataclass(frozen=True, eq=False)
+class SamePlace(Between):
+    """The device is at keyframe j where it was at keyframe i.
+
+    Attributes:
+        covariance: (3, 3) [m^2].
+    """
+
+    covariance: FloatArray
+
+    def linearise(self, values: Any) -> Linearised:
+        """Linearise in W."""
+        (R_i, p_i), (R_j, p_j) = _pose(values, self.i), _pose(values, self.j)
+        H_i, H_j = np.zeros((3, 6)), np.zeros((3, 6))
+        H_i[:, 3:], H_j[:, 3:] = -R_i, R_j
+        return p_i - p_j, [(X(self.i), H_i), (X(self.j), H_j)]
+
+
+@dataclass(frozen=True, eq=False)
 class Position(AtKeyframe):
     """A position some time after a keyframe: p_k + dt v_k + dp_W.
 

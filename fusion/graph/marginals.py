@@ -51,8 +51,8 @@ def marginal_covariances(net: Any) -> dict[int, FloatArray]:
 
     Its tangent is gtsam's. Variable x of the system R x + S y = d + n, with unit white noise n and
     later variables y of covariance P, has the covariance R^-1 (I + S P S^T) R^-T, and -R^-1 S P
-    with y. So one pass back in time suffices, which keeps P for as long as earlier variables need
-    it.
+    with y. So one pass back in time suffices, which keeps the rows of P that earlier variables
+    need.
 
     Args:
         net: gtsam's Bayes net, with one conditional per variable, in order of time.
@@ -63,17 +63,22 @@ def marginal_covariances(net: Any) -> dict[int, FloatArray]:
     conditionals = [net.at(n) for n in range(net.size())]
     place = {c.keys()[0]: n for n, c in enumerate(conditionals)}
     parents = [[place[key] for key in c.keys()[1:]] for c in conditionals]
-    begin = np.cumsum([0, *(len(c.R()) for c in conditionals)])
-    # The last variable that this one or an earlier one needs.
-    last = np.maximum.accumulate([max([n + _KEYS, *p]) for n, p in enumerate(parents)])
+    widths = [len(c.R()) for c in conditionals]
+    begin = np.cumsum([0, *widths])
+    variable = np.repeat(np.arange(len(widths)), widths)  # by row
+    # The earliest variable that needs the covariance of each one.
+    first_use = np.arange(len(parents)) - _KEYS
+    for n, p in enumerate(parents):
+        first_use[p] = np.minimum(first_use[p], n)
     covariances = {}
+    held = np.zeros(0, dtype=np.intp)  # rows of the variables that P covers, in order of time
     P = np.zeros((0, 0))
     for n in reversed(range(len(conditionals))):
-        c, here = conditionals[n], begin[n + 1]
-        columns = [np.arange(begin[m], begin[m + 1]) - here for m in parents[n]]
-        S = np.zeros((here - begin[n], len(P)))
-        if columns:
-            S[:, np.concatenate(columns)] = c.S()
+        c, rows = conditionals[n], np.arange(begin[n], begin[n + 1])
+        S = np.zeros((len(rows), len(P)))
+        if parents[n]:
+            needed = np.concatenate([np.arange(begin[m], begin[m + 1]) for m in parents[n]])
+            S[:, np.searchsorted(held, needed)] = c.S()
         symbol = gtsam.Symbol(c.keys()[0])
         try:
             root = solve_triangular(c.R(), np.column_stack([np.eye(len(S)), S]))
@@ -82,11 +87,11 @@ def marginal_covariances(net: Any) -> dict[int, FloatArray]:
         by_noise, by_later = root[:, : len(S)], -root[:, len(S) :]
         cross = by_later @ P
         own = symmetric(by_noise @ by_noise.T + cross @ by_later.T)
-        P = np.block([[own, cross], [cross.T, P]])
+        P, held = np.block([[own, cross], [cross.T, P]]), np.concatenate([rows, held])
         if chr(symbol.chr()) == "x":
             size = begin[n + _KEYS] - begin[n]
             covariances[symbol.index()] = P[:size, :size]
-        if n:
-            kept = begin[min(last[n - 1] + 1, len(conditionals))] - begin[n]
-            P = P[:kept, :kept]
+        kept = first_use[variable[held]] < n
+        if not kept.all():
+            P, held = P[np.ix_(kept, kept)], held[kept]
     return covariances

@@ -16,15 +16,8 @@ from stario.fusion.evaluation.benchmark.displacement_error import (
     known_truth,
     recording_errors,
 )
-from stario.fusion.evaluation.benchmark.pieces import (
-    judged_streams,
-)
-from stario.fusion.evaluation.networks import (
-    MAX_DRAWN,
-    OWN_ATTITUDE,
-    metrics_of,
-    protocol_figures,
-)
+from stario.fusion.evaluation.benchmark.pieces import usable_streams
+from stario.fusion.evaluation.networks import MAX_DRAWN, OWN_ATTITUDE, metrics_of, protocol_figures
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning, pedestrian_track, piece_of
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.paper_table.training import ReaderConfig
@@ -71,7 +64,7 @@ def _recording(
     path: Path, model: Model, read: Callable[[Path], ImuSequence], groups: Mapping[Path, str]
 ) -> tuple[dict[str, object], dict[str, FloatArray]]:
     sequence = read(path)
-    streams, (kind, _) = judged_streams(sequence), known_truth(sequence)
+    streams, (kind, _) = usable_streams(sequence), known_truth(sequence)
     warn_of_truth(sequence)
     alone = recording_errors(sequence, [piece_of(model, stream) for stream in streams])
     blocks = {"10": alone.blocks["10"].tolist()} if "10" in alone.blocks else {}

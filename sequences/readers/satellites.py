@@ -25,6 +25,10 @@ OPTIONAL = {
 RADIUS_PER_SIGMA = 1.51
 """Radius that holds 68 % of a Gaussian in the plane, in standard deviations per axis."""
 
+USUAL_RADIUS, LARGEST_RADIUS = 10.0, 30.0
+"""Radius [m] where none is stated, and the largest: more is that of positions from the network's
+cells or of rooms without reception."""
+
 _LARGEST_DEGREES = 90.0, 180.0
 """Largest latitude and longitude."""
 

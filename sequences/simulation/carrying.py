@@ -86,6 +86,8 @@ class Strike:
         damping: damping ratio.
         forward: acceleration forward and back per acceleration up and down.
         sideways: acceleration to the sides per acceleration up and down.
+        one_sided: whether the device is at one leg, which pushes it to one side; in the middle the
+            sides alternate from step to step.
     """
 
     strength: float
@@ -93,6 +95,7 @@ class Strike:
     damping: float
     forward: float
     sideways: float
+    one_sided: bool = False
 
 
 _ARM = (5.0, 0.4)
@@ -140,9 +143,10 @@ def heel_strikes(gait: Gait, strike: Strike) -> CarryMotion:
     offset, turn = np.zeros((2, len(gait), 3))
     for k, gain in zip(n, response, strict=True):
         amplitude = np.abs(gain) / (2.0 * np.pi * k * gait.step_rate) ** 2
-        angle = k * (gait.phase - np.pi - _STRIKE_LAG) + np.angle(gain)
+        order = np.array([k, k if strike.one_sided else k - 0.5, k, k])
+        angle = order * (gait.phase - np.pi - _STRIKE_LAG)[:, None] + np.angle(gain)
         stray = rng.uniform(-0.4, 0.4, 4) + np.append(ahead, 0.0)
-        ring = (gait.vigor * amplitude * gait.effort)[:, None] * np.cos(angle[:, None] + stray)
+        ring = (gait.vigor * amplitude * gait.effort)[:, None] * np.cos(angle + stray)
         offset += ring[:, :3] * share
         turn += ring[:, 3:] * turn_axis / _STRIKE_LEVER
     return CarryMotion(offset, turn)
@@ -160,6 +164,7 @@ def _held(gait: Gait, bounce: float, strike: Strike, tremor: float, wobble: floa
     turn += 0.8 * tremor / (2.0 * np.pi * 3.0) * band_noise(rng, n, gait.rate, 1.5, 5.0, 3)
     turn += tremor / (2.0 * np.pi * 8.0) * band_noise(rng, n, gait.rate, 5.0, 11.0, 3)
     shift, size = rng.uniform(-0.7, 0.7, (2, 3)), rng.uniform(0.3, 1.0, (2, 3))
+    size[:, ::2] *= rng.choice([-1.0, 1.0], (2, 2))  # to the left as often as to the right
     for k, order in enumerate((0.5, 1.0)):
         swing = np.cos(order * gait.phase[:, None] + shift[k]) * size[k]
         turn += wobble * gait.effort[:, None] * swing
@@ -188,7 +193,7 @@ def _texting(gait: Gait) -> CarryMotion:
     """Return the motion of a device that is read: the arms keep it steadier than the trunk."""
     rng = gait.rng
     strike = Strike(rng.uniform(0.9, 2.0), *_ARM, 0.7, 0.5)
-    wobble, tremor = rng.uniform(0.04, 0.09), rng.uniform(0.05, 0.15)
+    wobble, tremor = rng.uniform(0.04, 0.09), rng.uniform(0.02, 0.07)
     motion = _held(gait, rng.uniform(0.75, 1.25), strike, tremor, wobble)
     return _displaced(motion, rng.uniform(0.2, 0.4), rng.uniform(-0.1, 0.1), 0.72 * gait.height)
 
@@ -234,7 +239,7 @@ def _pocket(gait: Gait) -> CarryMotion:
     rng = gait.rng
     amplitude = np.radians(rng.uniform(11.0, 18.0))
     place = (0.08, -rng.uniform(0.05, 0.12) * gait.height)
-    strike = Strike(rng.uniform(2.2, 4.0), 8.5, 0.25, 0.7, 0.7)
+    strike = Strike(rng.uniform(2.2, 4.0), 8.5, 0.25, 0.7, 0.7, True)
     return _on_thigh(gait, amplitude, place, rng.uniform(1.2, 2.0), strike)
 
 
@@ -243,7 +248,7 @@ def _back_pocket(gait: Gait) -> CarryMotion:
     rng = gait.rng
     amplitude = np.radians(rng.uniform(9.0, 14.0))
     place = (-0.1, -rng.uniform(0.0, 0.04) * gait.height)
-    strike = Strike(rng.uniform(2.3, 4.1), 7.0, 0.3, 0.7, 0.7)
+    strike = Strike(rng.uniform(2.3, 4.1), 7.0, 0.3, 0.7, 0.7, True)
     return _on_thigh(gait, amplitude, place, rng.uniform(1.0, 1.8), strike)
 
 
@@ -270,7 +275,8 @@ def _bag(gait: Gait) -> CarryMotion:
     shift = rng.uniform(-0.7, 0.7, 3)
     stride = np.cos(gait.phase[:, None] / 2.0 + shift)
     turn = sway * gait.effort[:, None] * stride * np.array([1.0, 0.5, 0.8])
-    turn += 0.03 * gait.effort[:, None] * np.cos(gait.phase[:, None] + shift[::-1])
+    step = 0.03 * rng.choice([-1.0, 1.0], 3)
+    turn += step * gait.effort[:, None] * np.cos(gait.phase[:, None] + shift[::-1])
     turn += 0.04 * drift(rng, n, gait.rate, 1.0, 3)
     body = np.array([rng.choice([-0.15, 0.12]), rng.uniform(-0.15, 0.15), 0.75 * gait.height])
     strap = np.array([0.0, 0.0, -hang])

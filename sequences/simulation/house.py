@@ -27,8 +27,8 @@ FLOOR_HEIGHT = 3.0
 LOWEST, HIGHEST = -2, 4
 """Floors of the house; the street is at 0."""
 
-SHORTEST = 60.0
-"""Shortest walk [s]."""
+SHORTEST = 120.0
+"""Shortest walk [s]: long enough for a change of floors."""
 
 _RISERS = 18
 """Number of stairs of a floor, in two flights."""

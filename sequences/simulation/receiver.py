@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from stario.sequences.arrays import generator, interpolated
 from stario.sequences.attitude.rotations import about_z
-from stario.sequences.readers.geodesy import latitude_longitude
+from stario.sequences.geodesy import Georeference
 from stario.sequences.sequence import BoolArray, FloatArray, Satellites, Trajectory
 from stario.sequences.settings import check_number
 
@@ -61,8 +61,8 @@ class Sky:
 
     def degrees(self, position_W: FloatArray) -> FloatArray:
         """Return latitude and longitude (N, 2) [deg] of positions (N, 3) in W [m]."""
-        origin = np.array([self.latitude, self.longitude])
-        return latitude_longitude(origin, self.east_north(position_W)[:, :2])
+        place = Georeference(self.latitude, self.longitude)
+        return place.latlon_deg(self.east_north(position_W))
 
     def east_north(self, vectors_W: FloatArray) -> FloatArray:
         """Return vectors (N, 3) in W as east, north and up."""

@@ -6,12 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from stario.fusion.config import (
-    UPDATE_RATES,
-    FilterConfig,
-    NavigatorConfig,
-    read_config,
-)
+from stario.fusion.config import UPDATE_RATES, FilterConfig, NavigatorConfig, read_config
 from stario.sequences.errors import ConfigError, StarioError
 from stario.sequences.files import write_json
 from stario.sequences.noise import ImuNoise

@@ -171,7 +171,7 @@ def test_a_snapshot_of_another_version_is_refused(walk: ImuSequence, still_model
         navigator.restore(data)
 
 
-LAYOUTS = {30: "71cff956", 31: "4602ccfd"}
+LAYOUTS = {32: "c183b965"}
 """CRC of the classes and attributes in a snapshot, by version."""
 
 

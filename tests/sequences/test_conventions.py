@@ -15,7 +15,13 @@ from stario.sequences.conventions import (
     with_gravity,
 )
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Magnetometer
+from stario.sequences.sequence import (
+    STANDARD_GRAVITY,
+    Barometer,
+    ImuSequence,
+    Magnetometer,
+    Satellites,
+)
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import generate_walk
 from stario.sequences.units import MAGNETIC_UNITS
@@ -43,6 +49,22 @@ def test_axes_name_the_file_axis_used_as_each_new_axis(walk: ImuSequence) -> Non
     assert seen is not None
     assert np.array_equal(seen.field, field.field[:, [1, 0, 2]] * [1, -1, 1])
     assert with_axes(walk, "x,y,z") is walk
+
+
+def test_conventions_and_parts_keep_pressure_and_satellites(walk: ImuSequence) -> None:
+    air = Barometer(np.array([1.0, 5.0, 9.0]), np.array([1000.0, 1000.5, 1001.0]))
+    reported = Satellites(np.array([2.0, 6.0]), np.array([[48.0, 11.0], [48.1, 11.0]]))
+    full = replace(walk, barometer=air, satellites=reported)
+    other = replace(full, gyro=np.degrees(walk.gyro), accel=without_gravity(walk).accel)
+    found = with_conventions(other, gyro_unit="deg/s", gravity="removed")
+    found = with_axes(found, "y,-x,z")
+    assert found.barometer is air
+    assert found.satellites is reported
+    part = found.slice(4.0, 8.0)
+    assert part.barometer is not None
+    assert part.satellites is not None
+    np.testing.assert_array_equal(part.barometer.pressure_hPa, [1000.5])
+    np.testing.assert_array_equal(part.satellites.latlon_deg, [[48.1, 11.0]])
 
 
 def test_axes_applied_one_after_the_other_are_named_by_those_of_the_file(walk: ImuSequence) -> None:

@@ -12,12 +12,7 @@ import numpy as np
 import pytest
 
 from stario.sequences.errors import InputError
-from stario.sequences.files import (
-    atomic_folder,
-    atomic_write,
-    write_json,
-    write_npz,
-)
+from stario.sequences.files import atomic_folder, atomic_write, write_json, write_npz
 
 
 def names(folder: Path) -> list[str]:

@@ -1,7 +1,13 @@
-"""The one verdict on findings."""
+"""Findings and errors, as they are told and passed on."""
 
 from __future__ import annotations
 
+import pickle
+from pathlib import Path
+
+import pytest
+
+from stario.sequences.errors import ConfigError, InputError, ReadError, StarioError, WeightsError
 from stario.sequences.findings import TOO_EARLY, Finding, verdict
 
 
@@ -31,3 +37,21 @@ def test_a_line_joins_observation_and_advice() -> None:
     assert AXES.line() == "! gyroscope: differs: turn it"
     assert NOTE.line() == "  1 gap."
     assert str(Finding("gaps", "1 gap.", "Log on.")) == "1 gap. Log on."
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        StarioError("text"),
+        InputError("field", "found", "expected", "fix"),
+        ConfigError("field", "found", "expected"),
+        ReadError(Path("a.csv"), "field", "found", "expected"),
+        WeightsError("a.safetensors", "field", "found", "expected", "fix"),
+    ],
+)
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_errors_survive_pickling_unchanged(error: StarioError, protocol: int) -> None:
+    again = pickle.loads(pickle.dumps(error, protocol))
+    assert type(again) is type(error)
+    assert str(again) == str(error)
+    assert vars(again) == vars(error)

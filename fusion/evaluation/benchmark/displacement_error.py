@@ -25,10 +25,7 @@ from stario.fusion.imu.direction import Complex, Direction, direction, weighted_
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.errors import InputError
 from stario.sequences.legs import gaps_and_jumps
-from stario.sequences.levelled_stream import (
-    TICK_SECONDS,
-    TICKS_PER_SECOND,
-)
+from stario.sequences.levelled_stream import TICK_SECONDS, TICKS_PER_SECOND
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, PositionTrack, is_gap
 
 HORIZONS = (1, 10, 30)

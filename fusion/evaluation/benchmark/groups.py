@@ -22,9 +22,7 @@ from stario.fusion.evaluation.benchmark.displacement_error import (
     known_truth,
     recording_errors,
 )
-from stario.fusion.evaluation.benchmark.pieces import (
-    judged_streams,
-)
+from stario.fusion.evaluation.benchmark.pieces import usable_streams
 from stario.fusion.evaluation.bootstrap import (
     CONFIDENCE,
     REPLICATES,
@@ -167,7 +165,7 @@ def _scores(
 ) -> tuple[pd.DataFrame, list[pd.DataFrame]]:
     """Return a recording's rows of `Benchmark.scores` and of its blocks."""
     sequence = read(path)
-    streams, (kind, _) = judged_streams(sequence), known_truth(sequence)
+    streams, (kind, _) = usable_streams(sequence), known_truth(sequence)
     warn_of_truth(sequence)
     named = labels(path, sequence.attributes, groups[path])
     errors = {}

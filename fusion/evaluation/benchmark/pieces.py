@@ -52,8 +52,8 @@ class Piece(NamedTuple):
         return track[: len(self.stream.R_NB)]
 
 
-def judged_streams(sequence: ImuSequence) -> list[LevelledStream]:
-    """Return the unbroken stretches of a recording whose network is to be judged.
+def usable_streams(sequence: ImuSequence) -> list[LevelledStream]:
+    """Return the unbroken stretches of a recording, levelled.
 
     Raises:
         InputError: there is no unbroken stretch of 2 s, or a unit is wrong.

@@ -20,6 +20,7 @@ import pandas as pd
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.evaluation.benchmark.displacement_error import known_truth
 from stario.fusion.evaluation.checks.faults import drops, gap
 from stario.fusion.evaluation.compare import Metrics, measure
 from stario.fusion.evaluation.known_positions import MIN_POSITIONS, true_path
@@ -79,9 +80,8 @@ def fusion_gain(
     Raises:
         InputError: it has no ground truth or too few known positions, or cannot be run.
     """
-    truth, path = sequence.truth, true_path(sequence)
-    if sequence.positions is not None and truth is None and sequence.positions.kind != "waypoints":
-        path = 0.0
+    truth, (kind, _) = sequence.truth, known_truth(sequence)
+    path = 0.0 if kind == "positions" else true_path(sequence)
     preprocessed = Navigator(model, config).observe(sequence)
     alone = fitted_error(measure(network_track(preprocessed), sequence))
     if math.isnan(alone):

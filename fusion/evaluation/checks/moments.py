@@ -16,9 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.benchmark.displacement_error import (
-    fit_yaw_and_position,
-)
+from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position, known_truth
 from stario.fusion.evaluation.checks.simulation import simulated_walk
 from stario.fusion.evaluation.scores import Column, geometric_mean, joined, parts, scored, table
 from stario.fusion.evaluation.tracks import network_track
@@ -30,7 +28,6 @@ from stario.sequences.arrays import interpolated
 from stario.sequences.attitude.rotations import GyroIntegral
 from stario.sequences.attitude.stacks import composed
 from stario.sequences.clean_samples import clean_samples
-from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence
 from stario.sequences.simulation.insertion import Inserted, insert_moment
 from stario.sequences.simulation.moments import MOMENTS
@@ -131,11 +128,9 @@ def moment_table(scores: pd.DataFrame) -> str:
 
 def _with_truth(sequence: ImuSequence) -> ImuSequence:
     """Return the recording from its first known position on, cut if it is long."""
-    known = sequence.truth or sequence.positions
-    if known is None:
-        raise InputError(f"{sequence.name}: truth", "none", "poses, positions or waypoints")
+    _, known = known_truth(sequence)
     earlier = 0.0 if sequence.truth is not None else _BEFORE_WAYPOINTS
-    start = max(float(sequence.time[0]), float(known.time[known.valid][0]) - earlier)
+    start = max(float(sequence.time[0]), float(known.time[0]) - earlier)
     return sequence.slice(start, start + MAX_SECONDS)
 
 

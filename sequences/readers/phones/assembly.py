@@ -23,13 +23,13 @@ from stario.sequences.readers.clocks import resample_to_gyro, source_words
 from stario.sequences.readers.lines import may_be_read
 from stario.sequences.readers.phones.alongside import Recording
 from stario.sequences.readers.phones.attitude import device_attitude, logged_attitude
+from stario.sequences.readers.phones.barometer_file import recorded_pressure
 from stario.sequences.readers.phones.files import NO_SAMPLES, PhoneFiles, app_of
 from stario.sequences.readers.phones.known_positions import (
     as_known_positions,
     reference_points,
     reported_positions,
 )
-from stario.sequences.readers.phones.pressure import recorded_pressure
 from stario.sequences.readers.phones.sensor_table import Samples, SensorTable, read_samples
 from stario.sequences.readers.phones.sensor_words import Sensor
 from stario.sequences.readers.phones.sign import accel_sign, is_in_g

@@ -13,13 +13,15 @@ from collections.abc import Iterator
 import numpy as np
 
 from stario.sequences.errors import ReadError
+from stario.sequences.geodesy import east_north
 from stario.sequences.readers.clocks import unit_within
 from stario.sequences.readers.columns import Column
-from stario.sequences.readers.geodesy import east_north
 from stario.sequences.readers.phones.alongside import Columns, Recording, tables_alongside
 from stario.sequences.readers.phones.sensor_words import sensor_of, unit_of, words_of
 from stario.sequences.readers.satellites import (
+    LARGEST_RADIUS,
     RADIUS_PER_SIGMA,
+    USUAL_RADIUS,
     in_degrees,
     known_places,
     satellites,
@@ -71,12 +73,6 @@ _ADVIO = "platform-locations.csv"
 _OF_ADVIO = ["time", "latitude", "longitude", "accuracy", "altitude", "vertical accuracy"]
 """Columns of a file of ADVIO, which names none."""
 
-_USUAL_RADIUS = 10.0
-"""Radius [m] where a file states none."""
-
-_LARGEST_RADIUS = 30.0
-"""Larger radii [m] are of positions from cells of the network or of rooms without reception."""
-
 
 def reported_positions(recording: Recording) -> Iterator[Satellites]:
     """Yield the positions next to a recording's sensors, those of the best file first."""
@@ -98,15 +94,15 @@ def as_known_positions(reported: Satellites) -> PositionTrack | None:
     """
     new = np.append(True, np.diff(reported.latlon_deg, axis=0).any(axis=1))
     reported = reported.select(new)
-    radius = np.full(len(reported), _USUAL_RADIUS)
+    radius = np.full(len(reported), USUAL_RADIUS)
     if reported.radius_m is not None:
-        radius = np.where(np.isfinite(reported.radius_m), reported.radius_m, _USUAL_RADIUS)
-    valid = radius <= _LARGEST_RADIUS
+        radius = np.where(np.isfinite(reported.radius_m), reported.radius_m, USUAL_RADIUS)
+    valid = radius <= LARGEST_RADIUS
     if valid.sum() < 2:
         if len(valid) > 1:
             _log.warning(
                 "satellite positions skipped: found %d of %d positions known to %g m, expected at "
-                "least two", valid.sum(), len(valid), _LARGEST_RADIUS,
+                "least two", valid.sum(), len(valid), LARGEST_RADIUS,
             )  # fmt: skip
         return None
     origin = int(np.argmax(valid))

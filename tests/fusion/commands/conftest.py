@@ -84,12 +84,7 @@ def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A walk of twelve seconds on the level, which no test modifies."""
     path = tmp_path_factory.mktemp("recordings") / "walk.csv"
-    result = CliRunner().invoke(
-        app,
-        [
-            *["simulate", "--seconds", "12", "--carry", "handheld", "--rate", "100", "--seed", "5"],
-            str(path),
-        ],
-    )
+    walk = ["--seconds", "12", "--carry", "handheld", "--rate", "100", "--seed", "5"]
+    result = CliRunner().invoke(app, ["simulate", str(path), *walk])
     assert result.exit_code == 0, result.output
     return path

@@ -130,7 +130,7 @@ def test_simulate_writes_a_recording_with_truth(stario, tmp_path: Path) -> None:
 
 
 def test_a_simulated_house_has_floors_pressure_and_satellites(stario, tmp_path: Path) -> None:
-    done = stario("simulate", "h.csv", "--floors", "--seconds", 90, "--rate", 50, "--json")
+    done = stario("simulate", "h.csv", "--floors", "--seconds", 120, "--rate", 50, "--json")
     assert done.code == 0
     stays = json.loads(done.out)["stays"]
     sequence = read_generic_csv(tmp_path / "h.csv")
@@ -375,3 +375,34 @@ def test_an_exported_graph_cannot_be_trained(stario) -> None:
     done = stario("train", "nowhere.csv", "--start-from", "exported.onnx")
     done.assert_one_line_error("an exported graph")
     assert "nowhere.csv" not in done.err  # nothing is read first
+
+
+# --- on the map ------------------------------------------------------------------------------
+
+
+def test_run_writes_files_for_a_map_where_the_place_is_known(
+    stario, recording: Path, no_figures
+) -> None:
+    done = stario("run", recording, "--origin=-33.86,151.21,90", "--out", "r")
+    assert done.code == 0, done.err
+    line = json.loads(Path("r/track.geojson").read_text())["features"][0]
+    assert line["geometry"]["coordinates"][0] == pytest.approx([151.21, -33.86], abs=1e-4)
+    assert Path("r/track.gpx").read_text().startswith("<?xml")
+    assert json.loads(Path("r/config.json").read_text())["place"]["origin"] == [-33.86, 151.21, 90]
+    assert stario("run", recording, "--out", "r").code == 0
+    assert not Path("r/track.gpx").exists()  # nothing places this run on the earth
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--origin", "11.5"), ("--origin", "here"), ("--satellites", "yes"), ("--waypoints", "no")],
+)
+def test_a_wrong_place_is_one_line(stario, recording: Path, option: str, value: str) -> None:
+    stario("run", recording, option, value).assert_one_line_error(option)
+
+
+def test_a_recording_without_satellites_says_so(
+    stario, recording: Path, no_figures, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert stario("run", recording, "--satellites", "use", "--out", "r").code == 0
+    assert "no satellite position is used" in caplog.text

@@ -15,6 +15,7 @@ from stario.fusion.graph.factors import (
     GyroBias,
     Position,
     Prior,
+    SamePlace,
     Term,
     Tilt,
     Velocity,
@@ -59,10 +60,11 @@ def terms(rng: np.random.Generator, values: Any) -> list[Term]:
         Bearing(0, state.R_WB, rng.normal(size=3), rng.normal(size=6), 0.7, np.eye(1)),
         Coasting(0, 1, 1.7, exp_so3(rng.normal(0.0, 0.3, 3)), np.eye(13)),
         Tilt(0, np.array([0.6, 0.0, 0.8]), EYE),
+        SamePlace(0, 1, EYE),
     ]
 
 
-@pytest.mark.parametrize("which", range(10))
+@pytest.mark.parametrize("which", range(11))
 def test_jacobians_agree_with_finite_differences(which: int) -> None:
     for seed in range(2):
         rng = np.random.default_rng(seed)

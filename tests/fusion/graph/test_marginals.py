@@ -13,8 +13,12 @@ from stario.fusion.graph.whitening import linear_factor
 WIDTHS = (6, 3, 6, 1)
 
 
-def system(keyframes: int, height_sigma: float) -> tuple[list[int], np.ndarray, object]:
+def system(
+    keyframes: int, height_sigma: float, closed: bool
+) -> tuple[list[int], np.ndarray, object]:
     """Return keys, dense Jacobian and factors of keyframes, each linked to the next two.
+
+    If closed, the last one is linked to the first.
 
     The last axis of each pose is that much less certain than the others.
     """
@@ -22,7 +26,8 @@ def system(keyframes: int, height_sigma: float) -> tuple[list[int], np.ndarray, 
     keys = [(X(k), V(k), B(k), T(k)) for k in range(keyframes)]
     graph, rows = gtsam.GaussianFactorGraph(), []
     for k in range(keyframes):
-        linked = range(k, min(k + 3, keyframes))
+        linked = list(range(k, min(k + 3, keyframes)))
+        linked += [0] if closed and k == keyframes - 1 else []
         blocks, row = [], np.zeros((20, 16 * keyframes))
         for j in linked:
             H = rng.normal(size=(20, 16))
@@ -34,16 +39,17 @@ def system(keyframes: int, height_sigma: float) -> tuple[list[int], np.ndarray, 
     return [key for group in keys for key in group], np.vstack(rows), graph
 
 
+@pytest.mark.parametrize("closed", [False, True])
 @pytest.mark.parametrize("height_sigma", [1.0, 1e6])
-def test_covariances_are_blocks_of_the_dense_inverse(height_sigma: float) -> None:
-    keys, J, graph = system(5, height_sigma)
+def test_covariances_are_blocks_of_the_dense_inverse(height_sigma: float, closed: bool) -> None:
+    keys, J, graph = system(7, height_sigma, closed)
     ordering = gtsam.Ordering()
     for key in keys:
         ordering.push_back(key)
     covariances = marginal_covariances(graph.eliminateSequential(ordering, gtsam.EliminateQR))
-    scale = np.tile([*[1.0] * 5, height_sigma, *[1.0] * 10], 5)
+    scale = np.tile([*[1.0] * 5, height_sigma, *[1.0] * 10], 7)
     dense = np.linalg.inv((J * scale).T @ (J * scale))
-    assert sorted(covariances) == [0, 1, 2, 3, 4]
+    assert sorted(covariances) == list(range(7))
     for k, covariance in covariances.items():
         rows = slice(16 * k, 16 * k + 15)
         found = covariance / np.outer(scale[rows], scale[rows])

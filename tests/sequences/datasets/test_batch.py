@@ -12,11 +12,7 @@ from joblib import parallel_config
 
 from stario.network.training.splits import NAMES, read_packaged_list
 from stario.sequences.datasets.batch import Skipped, each, without_skipped
-from stario.sequences.datasets.splits import (
-    hold_out_group,
-    random_split,
-    read_list,
-)
+from stario.sequences.datasets.splits import hold_out_group, random_split, read_list
 from stario.sequences.errors import InputError, ReadError, StarioError
 from stario.sequences.readers import find_recordings
 

@@ -11,11 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.drawing.plan import plan_view
-from stario.sequences.drawing.plots import (
-    error_over_time,
-    imu_overview,
-    innovations,
-)
+from stario.sequences.drawing.plots import error_over_time, imu_overview, innovations
 from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory

@@ -9,10 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError
-from stario.sequences.readers.geodesy import east_north, latitude_longitude
+from stario.sequences.geodesy import east_north
 from stario.sequences.sequence import BoolArray, FloatArray, Trajectory
 from stario.sequences.simulation.barometer import Air, simulate_barometer, standard_pressure
-from stario.sequences.simulation.house import HouseWalk, simulate_house
+from stario.sequences.simulation.house import SHORTEST, HouseWalk, simulate_house
 from stario.sequences.simulation.receiver import Sky, simulate_satellites
 from stario.sequences.simulation.walks import WalkStyle
 
@@ -43,6 +43,13 @@ def test_each_stay_is_on_the_level_of_its_floor(walk: HouseWalk) -> None:
         level = truth.slice(stay.start + 1.0, stay.stop - 1.0).position_W[:, 2]
         assert level.mean() - ground == pytest.approx(3.0 * stay.floor, abs=0.1)
         assert level.std() < 0.05
+
+
+def test_the_shortest_walk_changes_floors() -> None:
+    for seed in range(5):
+        stays = simulate_house(seed, SHORTEST, rate=20.0).stays
+        assert any(one.floor != stays[0].floor for one in stays)
+        assert stays[-1].stop == SHORTEST
 
 
 def test_waypoints_name_the_floor_at_both_ends_of_a_stay(walk: HouseWalk) -> None:
@@ -130,11 +137,6 @@ def test_doppler_velocity_and_positions_agree_on_where_north_is(walk: HouseWalk)
     np.testing.assert_allclose(place, sky.east_north(true - true[0])[:, :2], atol=0.02)
 
 
-def test_latitudes_and_longitudes_are_the_inverse_of_metres() -> None:
-    origin, metres = np.array([48.0, 11.0]), np.array([[0.0, 0.0], [300.0, -200.0]])
-    np.testing.assert_allclose(east_north(latitude_longitude(origin, metres)), metres, atol=1e-6)
-
-
 def test_other_air_changes_no_other_sensor(walk: HouseWalk) -> None:
     other = simulate_house(2, 120.0, rate=50.0, air=STILL_AIR)
     np.testing.assert_array_equal(other.sequence.accel, walk.sequence.accel)
@@ -142,7 +144,7 @@ def test_other_air_changes_no_other_sensor(walk: HouseWalk) -> None:
 
 
 def test_a_walk_too_short_for_a_house_is_refused() -> None:
-    with pytest.raises(InputError, match="duration: found 30 s, expected at least 60 s"):
+    with pytest.raises(InputError, match="duration: found 30 s, expected at least 120 s"):
         simulate_house(0, 30.0)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from judged import Stub, horizontal_path, with_waypoints
+from displacement_stub import Stub, horizontal_path, with_waypoints
 
 from stario.fusion.evaluation.benchmark.groups import (
     POOLED,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from judged import Stub, errors_of, horizontal_path, streams_of, with_waypoints, yaw_WN
+from displacement_stub import Stub, errors_of, horizontal_path, streams_of, with_waypoints, yaw_WN
 from recorded import DATA
 from scipy.spatial.transform import Rotation
 
@@ -18,9 +18,7 @@ from stario.fusion.evaluation.benchmark.displacement_error import (
     _Sums,
     known_truth,
 )
-from stario.fusion.evaluation.benchmark.pieces import (
-    Piece,
-)
+from stario.fusion.evaluation.benchmark.pieces import Piece
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError

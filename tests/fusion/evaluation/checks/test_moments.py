@@ -11,11 +11,7 @@ import pytest
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks import moments
-from stario.fusion.evaluation.checks.moments import (
-    largest_correction,
-    moment_costs,
-    moment_table,
-)
+from stario.fusion.evaluation.checks.moments import largest_correction, moment_costs, moment_table
 from stario.fusion.evaluation.checks.simulation import (
     BANDS,
     RECORDED,

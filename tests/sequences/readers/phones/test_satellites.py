@@ -11,7 +11,7 @@ from phone_files import START_NS, save
 from recorded import DATA
 
 from stario.sequences import ImuSequence, read_recording
-from stario.sequences.readers.geodesy import east_north
+from stario.sequences.geodesy import east_north
 from stario.sequences.sequence import FloatArray, PositionTrack
 
 PHYPHOX = '"Time (s)","Latitude (°)","Longitude (°)","Height (m)","Velocity (m/s)","Direction (°)"'

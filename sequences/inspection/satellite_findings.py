@@ -13,7 +13,7 @@ import numpy as np
 
 from stario.sequences.arrays import runs
 from stario.sequences.findings import Finding
-from stario.sequences.readers.geodesy import east_north
+from stario.sequences.geodesy import east_north
 from stario.sequences.sequence import FloatArray, Satellites
 
 _STALE_S, _STALE_ROWS = 8.0, 4
@@ -71,7 +71,8 @@ class SatelliteFindings:
     Attributes:
         positions: number of reports.
         rate_hz: median rate [Hz].
-        radius_median_m: median of the stated radius [m]; None if there is none.
+        radius_median_m: median of the radius [m] stated of positions that are not repeated; None
+            if there is none.
         stale: start and length [s] of each stretch in which the same position is repeated.
         jumps_m: lengths [m] of steps that no pedestrian takes.
         doppler: comparison with the Doppler velocity; None unless the person walks with both known.
@@ -127,12 +128,13 @@ def assess_satellites(reported: Satellites | None) -> SatelliteFindings | None:
     """Return the findings about a receiver's positions; None without at least two."""
     if reported is None or len(reported) < 2:
         return None
-    radius = reported.radius_m
-    known = radius is not None and np.isfinite(radius).any()
+    new = np.append(True, np.diff(reported.latlon_deg, axis=0).any(axis=1))
+    radius = np.empty(0) if reported.radius_m is None else reported.radius_m[new]
+    radius = radius[np.isfinite(radius)]
     return SatelliteFindings(
         positions=len(reported),
         rate_hz=reported.rate,
-        radius_median_m=float(np.nanmedian(radius)) if radius is not None and known else None,
+        radius_median_m=float(np.median(radius)) if len(radius) else None,
         stale=stale_stretches(reported),
         jumps_m=_jumps(reported),
         doppler=_against_doppler(reported),
@@ -172,10 +174,14 @@ def _against_doppler(reported: Satellites) -> Doppler | None:
     if used.sum() < _FEWEST:
         return None
     doppler = doppler[used]
-    straight, crossed = (
-        np.diff(east_north(degrees), axis=0)[used] / step[used, None]
-        for degrees in (reported.latlon_deg, reported.latlon_deg[:, ::-1])
-    )
+
+    def velocity(latlon_deg: FloatArray) -> FloatArray:
+        return np.asarray(np.diff(east_north(latlon_deg), axis=0)[used] / step[used, None])
+
+    exchanged = reported.latlon_deg[:, ::-1]
+    straight, crossed = velocity(reported.latlon_deg), np.zeros_like(doppler)
+    if (np.abs(exchanged[:, 0]) <= 90.0).all():  # else they are no latitudes
+        crossed = velocity(exchanged)
     size = float(np.sum(doppler**2))
     scale = float(np.sum(straight * doppler)) / size
     error = float(np.sum((straight - scale * doppler) ** 2)) / (doppler.size - 1.0)

@@ -8,19 +8,14 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.benchmark.displacement_error import (
-    RecordingErrors,
-    recording_errors,
-)
-from stario.fusion.evaluation.benchmark.pieces import (
-    judged_streams,
-)
+from stario.fusion.evaluation.benchmark.displacement_error import RecordingErrors, recording_errors
+from stario.fusion.evaluation.benchmark.pieces import usable_streams
 from stario.fusion.evaluation.pedestrian import Model, piece_of
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.levelled_stream import LevelledStream
 from stario.sequences.sequence import ImuSequence, PositionTrack
 
-streams_of = cache(judged_streams)
+streams_of = cache(usable_streams)
 
 
 def with_waypoints(walk: ImuSequence, every: float = 8.0) -> ImuSequence:

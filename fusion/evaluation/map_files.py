@@ -1,0 +1,152 @@
+"""A track as files for maps: GeoJSON (RFC 7946) and GPX 1.1, in latitude and longitude."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from stario.fusion.state import Track
+from stario.sequences.drawing.figures import split_at_gaps, split_at_nan
+from stario.sequences.files import atomic_write
+from stario.sequences.geodesy import Georeference
+from stario.sequences.sequence import FloatArray, whole_seconds
+
+_UNIX_TIME = (3e8, 4e9)
+"""Times [s] that are taken for seconds since 1970: from 1979 to 2096."""
+
+_NAMESPACE = "https://github.com/stario-nav/stario"
+
+
+@dataclass(frozen=True, eq=False)
+class MapTrack:
+    """A track on the map, about a point per second.
+
+    Attributes:
+        rows: (N, 6) time [s], latitude and longitude [deg], height above the map's zero and
+            standard deviations of position (in the direction of the largest) and height [m], zero
+            where unknown; a row of NaN in each gap.
+        altitude_m: altitude of the map's zero, NaN where unknown.
+    """
+
+    rows: FloatArray
+    altitude_m: float
+
+    @property
+    def parts(self) -> list[FloatArray]:
+        """The stretches (n, 6) between gaps."""
+        return split_at_nan(self.rows)
+
+
+def on_map(track: Track, georeference: Georeference) -> MapTrack:
+    """Place a track on the map.
+
+    Args:
+        track: the track; its positions are in the frame that lies at `georeference`.
+        georeference: where that frame lies on the earth.
+    """
+    trajectory = track.trajectory
+    latlon = georeference.latlon_deg(trajectory.position_W)
+    sigma = np.zeros((len(trajectory), 2))
+    if trajectory.position_covariance_W is not None:
+        P = trajectory.position_covariance_W
+        horizontal = np.linalg.eigvalsh(P[:, :2, :2])[:, 1]
+        sigma = np.sqrt(np.maximum(np.column_stack([horizontal, P[:, 2, 2]]), 0.0))
+    columns = np.column_stack([trajectory.time, latlon, trajectory.position_W[:, 2], sigma])
+    ticks = np.append(whole_seconds(trajectory.time), trajectory.time[-1])
+    rows = np.unique(np.searchsorted(trajectory.time, ticks))
+    rows = rows[trajectory.valid[rows]]
+    _, split = split_at_gaps(trajectory.time[rows], columns[rows], max_gap=2.0)
+    return MapTrack(split, georeference.altitude_m)
+
+
+def write_geojson(path: Path, name: str, found: MapTrack) -> Path:
+    """Write a track as GeoJSON: the line, its start and its end.
+
+    The line's properties hold lists, one value per point: seconds of the recording's clock, height
+    above the map's zero and standard deviations [m].
+
+    Args:
+        path: the file; its folder must exist.
+        name: name of the track.
+        found: the track.
+    """
+    parts = found.parts
+    lines = [_coordinates(part, found.altitude_m) for part in parts]
+    columns = np.vstack(parts).T
+    properties: dict[str, object] = {"name": name}
+    names = {"time_s": 0, "height_m": 3, "sigma_m": 4, "height_sigma_m": 5}
+    properties |= {key: columns[k].round(3).tolist() for key, k in names.items()}
+    line: dict[str, Any] = {"type": "MultiLineString", "coordinates": lines}
+    if len(lines) == 1:
+        line = {"type": "LineString", "coordinates": lines[0]}
+    ends = {"start": lines[0][0], "end": lines[-1][-1]}
+    features = [
+        _feature(line, properties),
+        *(_feature({"type": "Point", "coordinates": c}, {"name": k}) for k, c in ends.items()),
+    ]
+    with atomic_write(path) as file:
+        json.dump({"type": "FeatureCollection", "features": features}, file, separators=(",", ":"))
+    return path
+
+
+def _feature(geometry: dict[str, Any], properties: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "Feature", "geometry": geometry, "properties": properties}
+
+
+def _coordinates(part: FloatArray, altitude_m: float) -> list[list[float]]:
+    """Return longitude, latitude and, if known, altitude; a line has two points at least."""
+    digits = np.column_stack([part[:, [2, 1]].round(8), (part[:, 3] + altitude_m).round(2)])
+    if np.isnan(altitude_m):
+        digits = digits[:, :2]
+    listed: list[list[float]] = digits.tolist()
+    return listed if len(listed) > 1 else 2 * listed
+
+
+def write_gpx(path: Path, name: str, found: MapTrack) -> Path:
+    """Write a track as GPX, with a segment for each stretch between gaps.
+
+    Points have times if the recording's clock counts seconds since 1970. Their elevation is above
+    the map's zero if its altitude is unknown; standard deviations [m] are in `extensions`.
+
+    Args:
+        path: the file; its folder must exist.
+        name: name of the track.
+        found: the track.
+    """
+    from gpxpy.gpx import GPX, GPXTrack, GPXTrackSegment
+
+    above = "above the start" if np.isnan(found.altitude_m) else "as the receiver counts altitudes"
+    gpx, track = GPX(), GPXTrack(name, f"Estimated by StarIO; elevation {above}.")
+    gpx.creator = "StarIO"
+    gpx.nsmap["stario"] = _NAMESPACE
+    track.segments = [GPXTrackSegment(list(_points(p, found.altitude_m))) for p in found.parts]
+    gpx.tracks.append(track)
+    with atomic_write(path) as file:
+        file.write(gpx.to_xml(version="1.1"))
+    return path
+
+
+def _points(part: FloatArray, altitude_m: float) -> Iterator[Any]:
+    from gpxpy.gpx import GPXTrackPoint
+
+    zero = 0.0 if np.isnan(altitude_m) else altitude_m
+    for time, latitude, longitude, height, *sigmas in part.tolist():
+        known = _UNIX_TIME[0] < time < _UNIX_TIME[1]
+        point = GPXTrackPoint(
+            round(latitude, 8),
+            round(longitude, 8),
+            round(zero + height, 2),
+            datetime.fromtimestamp(time, UTC) if known else None,
+        )
+        for tag, sigma in zip(("sigma", "height_sigma"), sigmas, strict=True):
+            element = ElementTree.Element(f"{{{_NAMESPACE}}}{tag}")
+            element.text = f"{sigma:.2f}"
+            point.extensions.append(element)
+        yield point
