@@ -25,6 +25,7 @@ from stario.fusion.filter.jacobians import ASSUMED, GYRO_BIAS
 from stario.fusion.filter.map_frame import YAW_UNKNOWN
 from stario.fusion.filter.record import Record, innovations_of
 from stario.fusion.fixes import Accepted, Fix, FixQueue, fix_list
+from stario.fusion.floors import FloorChange, floor_changes
 from stario.fusion.graph import fixed_lag
 from stario.fusion.graph.batch import smooth
 from stario.fusion.graph.covariances import with_actual_covariances
@@ -132,6 +133,13 @@ def _smoothed_states(
     return with_undirected(solved, frame.undirected), ""
 
 
+def _floors(states: Sequence[NavState]) -> list[FloorChange]:
+    time, height, speed = np.array(
+        [(s.time, s.p_W[2], math.hypot(s.v_W[0], s.v_W[1])) for s in states]
+    ).T
+    return floor_changes(time, height, speed)[0]
+
+
 def track_recording(
     backend: BackendName,
     recording: PreprocessedRecording,
@@ -166,6 +174,8 @@ def track_recording(
         health = queue.health(run.last.health(counts, config.filter, states[-1]))
         if filtered is not None and not note:
             health = _with_later_fixes(health, run)
+        if health.pressures:
+            health.floors = _floors(states)
         return track_from_states(
             states,
             innovations,

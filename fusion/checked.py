@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from stario.fusion.imu.barometer import PRESSURE_RANGE
 from stario.sequences.arrays import numbers, shown
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 
 Vector = Sequence[float] | FloatArray
 """Three numbers."""
+
+_UNITS_HPA = {"Pa": 0.01, "kPa": 10.0, "inHg": 33.8639}
+"""Other units of pressure [hPa] that can be told from hPa."""
 
 _ROTATION_ERROR, _ROUNDING_ERROR = 1e-4, 1e-9
 """Limits on |R R^T - I|: above the first a matrix is not a rotation; above the second its numbers
@@ -44,6 +49,22 @@ def seconds(time: float) -> float:
         return float(time)
     except (TypeError, ValueError, OverflowError):
         raise InputError("time", shown(time), "a number of seconds") from None
+
+
+def hectopascals(pressure: float) -> float:
+    """Return a pressure [hPa] as a float; `InputError` if it is not one of the air in hPa."""
+    try:
+        if isinstance(pressure, str):
+            raise ValueError
+        value = float(pressure)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError("pressure", shown(pressure), "a number of hPa") from None
+    low, high = PRESSURE_RANGE
+    if math.isfinite(value) and not low <= value <= high:
+        names = [name for name, hPa in _UNITS_HPA.items() if low <= value * hPa <= high]
+        remedy = f"convert from {' or '.join(names)} to hPa" if names else "give it in hPa"
+        raise InputError("pressure", f"{value:g}", f"{low:g} to {high:g} hPa", remedy)
+    return value
 
 
 def three(name: str, value: Vector) -> tuple[float, float, float]:

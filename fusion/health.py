@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+from stario.fusion.floors import FloorChange
+
 Stopped = Literal["both", "gyroscope", "accelerometer"]
 """What has stopped: both sensors, or one alone."""
 
@@ -33,6 +35,10 @@ class Health:
             by fixes, that moved a filter's track by more than 1 m or 10 degrees at once.
         fields_dropped: number of magnetometer samples dropped: their value or time is wrong, or
             repeats an earlier one.
+        pressures: numbers of heights by the pressure applied (of these gated), of steps of the
+            air's pressure, and of refused ones by reason.
+        floors: changes of floor found in the heights of a recording with a barometer.
+        pressures_dropped: number of pressures dropped: their value or time is wrong.
         accel_noise_factor: final factor on the accelerometer's configured noise density, estimated
             from the innovations.
         network_error_level: final variance of the network's errors that change within seconds, as a
@@ -63,6 +69,9 @@ class Health:
     bearings: dict[str, int] = field(default_factory=dict)
     corrections: list[tuple[float, float, float, str]] = field(default_factory=list)
     fields_dropped: int = 0
+    pressures: dict[str, int] = field(default_factory=dict)
+    floors: list[FloorChange] = field(default_factory=list)
+    pressures_dropped: int = 0
     accel_noise_factor: float = 1.0
     network_error_level: float = 1.0
     final_sigma: dict[str, float] = field(default_factory=dict)
@@ -100,6 +109,11 @@ class Health:
             text.append(f"bearings of the magnetic field {_counted(self.bearings)}")
         if self.fields_dropped:
             text.append(f"magnetometer samples dropped: {self.fields_dropped}")
+        if self.pressures:
+            text.append(f"heights by the pressure {_counted(self.pressures)}")
+        text += [str(change) for change in self.floors]
+        if self.pressures_dropped:
+            text.append(f"pressures dropped: {self.pressures_dropped}")
         if self.accel_noise_factor > 1.0:
             text.append(
                 f"accelerometer noise {self.accel_noise_factor:.1f} times the configured one"
@@ -149,6 +163,7 @@ class SampleCounts:
         spike: used, but replaced because they differ too much from their neighbours.
         saturated: used, but at the sensor's limit.
         field_dropped: magnetic fields dropped: a value or a time is wrong, or the sensor stopped.
+        pressure_dropped: pressures dropped: a value or a time is wrong.
         gap_count: stretches without samples longer than `MAX_IMU_GAP`.
         longest_gap: length of the longest [s].
         gaps: (start, length) [s] of the newest `GAPS_LISTED`.
@@ -169,6 +184,7 @@ class SampleCounts:
     spike: int = 0
     saturated: int = 0
     field_dropped: int = 0
+    pressure_dropped: int = 0
     gap_count: int = 0
     longest_gap: float = 0.0
     gaps: list[tuple[float, float]] = field(default_factory=list)
@@ -198,6 +214,7 @@ class SampleCounts:
             longest_gap=self.longest_gap,
             gaps=list(self.gaps),
             fields_dropped=self.field_dropped,
+            pressures_dropped=self.pressure_dropped,
             set_back=self.set_back,
             longest_late=self.longest_late,
             stopped={

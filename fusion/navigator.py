@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stario.fusion.backends import BACKENDS, BackendName, track_recording
-from stario.fusion.checked import Vector, seconds, three
+from stario.fusion.checked import Vector, hectopascals, seconds, three
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import Fix, FixOutcome, position_fix, velocity_fix, yaw_fix
@@ -110,6 +110,22 @@ class Navigator:
             InputError: time is not a number, or field does not hold three numbers.
         """
         self._stream.front_end.push_field(seconds(time), np.array(three("field", field)))
+
+    def push_pressure(self, time: float, hPa: float) -> None:
+        """Process one pressure of a stream's barometer, before the IMU samples that follow it.
+
+        It tells changes of the height, on stairs and in lifts as well (`filter.height`). Pressures
+        that are not finite, repeat an earlier time, or are late by more than a tenth of a second
+        are dropped and counted. The barometer is optional.
+
+        Args:
+            time: [s], on the IMU's clock.
+            hPa: pressure of the air [hPa], about 1013 at sea level.
+
+        Raises:
+            InputError: time or pressure is not a number, or the pressure is one in another unit.
+        """
+        self._stream.front_end.push_pressure(seconds(time), hectopascals(hPa))
 
     def update_position(self, time: float, p_W: ArrayLike, covariance: ArrayLike) -> FixOutcome:
         """Apply a position fix to the stream.

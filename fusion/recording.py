@@ -131,10 +131,17 @@ def cut_recording(
     magnetometer, fields = sequence.magnetometer, deque[tuple[float, FloatArray]]()
     if magnetometer is not None:
         fields.extend(zip(magnetometer.time.tolist(), magnetometer.field, strict=True))
+    barometer, pressures = sequence.barometer, deque[tuple[float, float]]()
+    if barometer is not None:
+        table = barometer.time.tolist(), barometer.pressure_hPa.tolist()
+        pressures.extend(zip(*table, strict=True))
     for sample in np.column_stack([sequence.time, sequence.gyro, sequence.accel]).tolist():
         # A wild timestamp must not release all later fields at once.
-        while fields and fields[0][0] <= min(sample[0], front_end.newest + MAX_IMU_GAP):
+        until = min(sample[0], front_end.newest + MAX_IMU_GAP)
+        while fields and fields[0][0] <= until:
             front_end.push_field(*fields.popleft())
+        while pressures and pressures[0][0] <= until:
+            front_end.push_pressure(*pressures.popleft())
         try:
             intervals += front_end.push(tuple(sample))
         except ClockSetBackError as error:
@@ -144,6 +151,8 @@ def cut_recording(
     unused = config.filter.magnetometer and all(e.field_B is None for e in intervals)
     if magnetometer is not None and unused:  # it has another clock
         front_end.counts.field_dropped = len(magnetometer.time)
+    if barometer is not None and all(e.height is None for e in intervals):
+        front_end.counts.pressure_dropped = len(barometer.time)
     return intervals, front_end
 
 

@@ -214,6 +214,31 @@ def fixes(
 
 
 @expand_option_groups
+def heights(
+    context: typer.Context,
+    reading: ReadingOptions,
+    estimating: EstimatorOptions,
+    paths: OptionalPathsArgument = None,
+    walks: Annotated[int, typer.Option(min=1, help="Number of simulated walks.")] = 40,
+    by: ByOption = "set",
+    as_json: JsonOption = False,
+) -> None:
+    """Compare heights and floors with known ones, by the barometer and without it.
+
+    Without PATH, use simulated walks through a house with stairs and a lift.
+    """
+    from stario.fusion.evaluation.checks.heights import heights_table, score_heights, score_house
+
+    if paths:
+        _check_groups(reading, paths, estimating, by, score_heights, heights_table, as_json)
+        return
+    refuse(context, "with simulated walks", "use with PATH", *READING)
+    judge = partial(score_house, estimating.network(), config=estimating.settings())
+    found = [judge(seed) for seed in with_bar("heights", range(walks), walks)]
+    _print_scores(found, [], heights_table, as_json)
+
+
+@expand_option_groups
 def gaps(
     paths: PathsArgument,
     reading: ReadingOptions,

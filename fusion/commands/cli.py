@@ -58,9 +58,10 @@ for command in (run, live, compare, evaluate, inspect, convert, train, simulate,
 check = typer.Typer(no_args_is_help=True, help="Check estimators and networks on this machine.")
 for command in (checks.models, table, checks.fusion, checks.backends, checks.faults, checks.gaps):
     check.command()(command)
-for command in (checks.moments, checks.simulation, checks.fixes, checks.consistency):
+for command in (checks.moments, checks.heights, checks.simulation, checks.fixes):
     check.command()(command)
-check.command()(checks.benchmark)
+for command in (checks.consistency, checks.benchmark):
+    check.command()(command)
 app.add_typer(check, name="check")
 
 

@@ -58,6 +58,19 @@ class FieldState:
 
 
 @dataclass(frozen=True, eq=False)
+class PressureOffset:
+    """Estimate of the height by the pressure less that of the track (`height`).
+
+    Attributes:
+        metres: the offset [m].
+        time: time up to which its random walk is propagated [s].
+    """
+
+    metres: float
+    time: float
+
+
+@dataclass(frozen=True, eq=False)
 class EkfState:
     """The current pose and biases, the cloned poses, and their covariance.
 
@@ -76,6 +89,7 @@ class EkfState:
         clone_times: times of the clones [s]; None for an empty slot.
         considered_time: time up to which the considered errors are propagated [s].
         field: the magnetic field; None before its first measurement.
+        offset: that of the barometer; None before its first height.
     """
 
     time: float
@@ -87,6 +101,7 @@ class EkfState:
     clone_times: tuple[float | None, ...]
     considered_time: float
     field: FieldState | None = None
+    offset: PressureOffset | None = None
 
     @classmethod
     def initial(cls, state: NavState, slots: int) -> EkfState:
@@ -146,9 +161,14 @@ class EkfState:
         return slice(first, first + len(CONSIDERED_SECONDS))
 
     @property
+    def offset_row(self) -> int:
+        """Row of the error of the barometer's offset, if there is one."""
+        return CORE + CLONE * len(self.clone_times) + len(CONSIDERED_SECONDS)
+
+    @property
     def field_row(self) -> int:
         """First row of the magnetic field's error: azimuth, wander, hard iron (3)."""
-        return CORE + CLONE * len(self.clone_times) + len(CONSIDERED_SECONDS)
+        return self.offset_row + (self.offset is not None)
 
     @property
     def clone_slots(self) -> list[int]:
@@ -211,12 +231,16 @@ class EkfState:
             azimuth, wander, *_ = error[self.field_row :].tolist()
             hard_iron_B = field.hard_iron_B + error[self.field_row + 2 :]
             field = FieldState(field.azimuth + azimuth, field.wander + wander, hard_iron_B)
+        offset = self.offset
+        if offset is not None:
+            offset = changed(offset, metres=offset.metres + float(error[self.offset_row]))
         return changed(
             self,
             X=exp_times(xi[:, 0], xi[:, 1:].transpose(0, 2, 1), self.X),
             b_g=self.b_g + error[9:12],
             b_a=self.b_a + error[12:15],
             field=field,
+            offset=offset,
         )
 
     def transformed(self, R: FloatArray, shift: FloatArray) -> EkfState:
@@ -229,7 +253,7 @@ class EkfState:
             R: (3, 3) rotation about the vertical.
             shift: (3,) [m].
         """
-        new_origin = R @ self.origin_W + shift
+        new_origin, raised = R @ self.origin_W + shift, float(shift[2])
         origin_W = new_origin if np.linalg.norm(new_origin) > _MAX_ORIGIN_DISTANCE else np.zeros(3)
         shift = new_origin - origin_W  # the part that remains for the poses
         X = R @ self.X
@@ -244,7 +268,10 @@ class EkfState:
         field = self.field
         if field is not None:
             field = changed(field, azimuth=field.azimuth + math.atan2(R[1, 0], R[0, 0]))
-        return changed(self, X=X, origin_W=origin_W, covariances=P, field=field)
+        offset = self.offset
+        if offset is not None:
+            offset = changed(offset, metres=offset.metres - raised)
+        return changed(self, X=X, origin_W=origin_W, covariances=P, field=field, offset=offset)
 
     def with_yaw_inflated(self, about_W: FloatArray, sigma: float) -> EkfState:
         """Return the state with its covariances inflated by a turn of the frame about a vertical.
@@ -279,6 +306,8 @@ class EkfState:
         for first, rho in self._poses():
             N[first + 2, 0] = 1.0
             N[rho : rho + 3, 1:] = np.eye(3)
+        if self.offset is not None:
+            N[self.offset_row, 3] = -1.0
         if self.field is not None:
             N[self.field_row, 0] = 1.0
         rest = np.eye(n) - N @ C
@@ -293,6 +322,8 @@ class EkfState:
         N = np.zeros((self.covariances.shape[1], axes))
         for _, rho in self._poses():
             N[rho : rho + axes] = np.eye(axes)
+        if self.offset is not None and axes == 3:
+            N[self.offset_row, 2] = -1.0
         return changed(self, covariances=self.covariances + sigma**2 * (N @ N.T))
 
     def _poses(self) -> list[tuple[int, int]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.filter import displacements, ekf, magnetic, map_frame
+from stario.fusion.filter import displacements, ekf, height, magnetic, map_frame
 from stario.fusion.filter.correlated_errors import ACCEL_SHARE
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.estimator_state import EstimatorState, rewound, with_step
@@ -79,12 +79,17 @@ def step(
     if interval.gap or fixes:
         s = changed(s, alternative=None)
     s, segment, accepted, undirected = _propagated(s, interval, accel_factor, fixes, config)
+    s = _with_height(s, interval)
     before = s.ekf
     s, zero_velocity = _with_rest(s, interval, config)
     s, before = s.with_correction(before, "rest"), s.ekf
     # Zero velocity is more accurate than a network trained on walks, off by 1 cm/s at rest.
     offered = displacement if zero_velocity is None else None
-    s, outcome, revoked = _with_displacement(s, offered, config)
+    climb_rate = None if s.ekf.offset is None else s.climb_rate
+    used = offered
+    if offered is not None and climb_rate is not None:
+        used = height.yielding(offered, climb_rate)
+    s, outcome, revoked = _with_displacement(s, used, config)
     s, before = s.with_correction(before, "network"), s.ekf
     s, bearing = _with_bearing(s, interval)
     s = s.with_correction(before, "magnetic field")
@@ -110,6 +115,7 @@ def step(
         undirected,
         s.estimate(),
         s.released if s.released is not released else None,
+        climb_rate,
     )
     return s, record
 
@@ -218,6 +224,20 @@ def _with_fix(
     return s, result
 
 
+def _with_height(s: EstimatorState, interval: ImuInterval) -> EstimatorState:
+    """Update with the height by the pressure, and note whether it climbs."""
+    sample = interval.height
+    if sample is None:
+        return s
+    after, result = height.with_height(s.ekf, sample)
+    if s.alternative is not None:
+        other, _ = height.with_height(s.alternative.ekf, sample)
+        s = changed(s, alternative=changed(s.alternative, ekf=other))
+    s = changed(s, ekf=after, climb_rate=sample.rate)
+    steps = ["steps"] if sample.stepped else []
+    return s.counted("pressures", *result.outcomes, *steps)
+
+
 def _with_rest(
     s: EstimatorState, interval: ImuInterval, config: NavigatorConfig
 ) -> tuple[EstimatorState, ZeroVelocity | None]:
@@ -226,7 +246,8 @@ def _with_rest(
     if not s.stillness.rested:
         return s, None
     measured = s.stillness.measurement()
-    state, result = update_zero_velocity(s.ekf, measured, config.filter)
+    used = height.resting_in_lift(measured) if s.climb_rate else measured
+    state, result = update_zero_velocity(s.ekf, used, config.filter)
     s = changed(s, ekf=state).counted("zero_velocity", *result.outcomes)
     if not result.accepted:
         return s, None

@@ -59,6 +59,7 @@ class EstimatorState:
         statistics: what the innovations of displacements tell.
         alternative: the alternative hypothesis; None while all displacements fit.
         counts: updates by outcome.
+        climb_rate: vertical speed by the pressure while it climbs [m/s]; 0 on a floor.
         in_gap: whether the last interval had no samples.
         released: newest pose that left the window, corrected by the whole window; None at first.
     """
@@ -73,6 +74,7 @@ class EstimatorState:
     statistics: InnovationStatistics = field(default_factory=InnovationStatistics)
     alternative: AlternativeHypothesis | None = None
     counts: UpdateCounts = field(default_factory=UpdateCounts)
+    climb_rate: float = 0.0
     in_gap: bool = False
     released: Estimate | None = None
 

@@ -12,6 +12,7 @@ import numpy as np
 from stario.fusion.filter.corrections import CORRECTIONS_LISTED, Correction
 from stario.fusion.filter.estimates import Estimate
 from stario.fusion.filter.gained import Gained
+from stario.fusion.filter.height import resting_in_lift, yielding
 from stario.fusion.filter.kalman import UpdateResult
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Accepted, Fix
@@ -48,6 +49,18 @@ class Record(NamedTuple):
     """The estimate at the end."""
     released: Estimate | None
     """The pose that has just left the window, corrected by all of it; None if none has."""
+    climb_rate: float | None = None
+    """Vertical speed by the pressure while one climbs [m/s], 0 on a floor; None without one."""
+
+    def at_rate(self, rate: float | None) -> Record:
+        """Return the record with measurements that yield to the pressure at a vertical speed."""
+        if rate is None:
+            return self
+        offered, rest = self.offered, self.zero_velocity
+        return self._replace(
+            offered=offered and yielding(offered, rate),
+            zero_velocity=rest and (resting_in_lift(rest) if rate else rest),
+        )
 
     @property
     def displacement(self) -> WindowDisplacement | None:
@@ -69,6 +82,7 @@ class UpdateCounts:
         fixes: numbers of fixes applied (of these gated), and refused by reason.
         zero_velocity: numbers of measurements at rest applied, and refused by reason.
         bearings: numbers of magnetic bearings, likewise; 1 under "north" if they determined it.
+        pressures: numbers of heights by the pressure, likewise; "steps" counts the air's steps.
         nis_sum: sum of the NIS of all valid network measurements.
         nis_count: number of valid network measurements.
         corrections: the latest large corrections.
@@ -80,6 +94,7 @@ class UpdateCounts:
     fixes: Mapping[str, int] = field(default_factory=dict)
     zero_velocity: Mapping[str, int] = field(default_factory=dict)
     bearings: Mapping[str, int] = field(default_factory=dict)
+    pressures: Mapping[str, int] = field(default_factory=dict)
     nis_sum: float = 0.0
     nis_count: int = 0
     corrections: tuple[Correction, ...] = ()
@@ -139,6 +154,7 @@ class UpdateCounts:
             fixes=dict(self.fixes),
             zero_velocity=dict(self.zero_velocity),
             bearings=dict(self.bearings),
+            pressures=dict(self.pressures),
             corrections=list(self.corrections),
             final_sigma={name: math.sqrt(max(value, 0.0)) for name, value in variance.items()},
         )

@@ -14,14 +14,23 @@ from stario.fusion.filter.record import Record
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias, SamePlace
 from stario.fusion.graph.keyframes import KeyframeGraph
+from stario.fusion.imu.barometer import CLIMB_DELAY
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.lie import UNKNOWN_YAW
 from stario.fusion.state import NavState
 from stario.sequences.attitude.so3 import exp_so3, log_so3
 from stario.sequences.sequence import FloatArray
+from stario.sequences.windows import WINDOW_SECONDS
 
 _UNKNOWN_POSITION = 1e4
 """Standard deviation of a position determined by fixes alone [m]."""
+
+_RATE_SECONDS, _LEAST_HEIGHTS = 1.5, 3
+"""Time before and after the middle of a window [s], and number of heights, for their slope."""
+
+_LEAST_CLIMB, _SLOW = 0.8, 1e-3
+"""Height [m] below which a climb may be none, and its speed then [m/s]: its height yields to the
+pressure's, its length does not."""
 
 _CLOSURE_SIGMA = 1.0
 """Standard deviation [m] per axis of a walk's end, relative to the start at which it ends."""
@@ -61,6 +70,7 @@ def smooth(
     local = [state.shifted(-origin) for state in filtered]
     first = _inflated(local[0], prior, frame.transforms)
     builder = GraphBuilder(config, first)
+    records = _with_climbs(records)
     revoked = {time for record in records for time in record.revoked}
     for record, state in zip(records, local[1:], strict=True):
         # Neither is inflated as by the filter: the graph weights outliers by the whole track.
@@ -81,6 +91,46 @@ def smooth(
         replace(solved[f.time], in_gap=f.in_gap, map_frame=f.map_frame).shifted(origin)
         for f in filtered
     ]
+
+
+def _with_climbs(records: Sequence[Record]) -> list[Record]:
+    """Return the records with measurements that yield to the pressure's vertical speed.
+
+    A climb is known from where it began, which the pressure shows later, and by its height; its
+    speed is that about the middle of each window.
+    """
+    samples = [r.interval.height for r in records if r.interval.height is not None]
+    if not samples:
+        return list(records)
+    time, height = np.array([(s.time, s.height) for s in samples]).T
+    stop = np.array([r.interval.stop for r in records])
+    climbs = np.array([bool(r.climb_rate) for r in records])
+    for sample in samples:
+        if sample.risen:
+            climbs |= (stop > sample.time - CLIMB_DELAY) & (stop <= sample.time)
+    ends = np.flatnonzero(np.diff(climbs, prepend=False, append=False))
+    stairs = climbs.copy()
+    for first, last in zip(ends[::2], ends[1::2] - 1, strict=True):
+        before, after = np.interp(stop[[first, last]], time, height)
+        stairs[first : last + 1] = abs(after - before) > _LEAST_CLIMB
+    middle = stop - 0.5 * WINDOW_SECONDS
+    found = []
+    for record, climbing, known, at in zip(records, climbs, stairs, middle, strict=True):
+        rate = record.climb_rate
+        if rate is not None and climbing:
+            rate = _rate(time, height, at) if known else _SLOW
+        found.append(record.at_rate(rate))
+    return found
+
+
+def _rate(time: FloatArray, height: FloatArray, at: float) -> float:
+    """Return the slope of heights (N,) about a time [m/s]; 0 where there are too few."""
+    rows = slice(*np.searchsorted(time, (at - _RATE_SECONDS, at + _RATE_SECONDS)))
+    t, h = time[rows] - at, height[rows]
+    if len(t) < _LEAST_HEIGHTS:
+        return 0.0
+    t = t - t.mean()
+    return float(t @ h / (t @ t))
 
 
 def _inflated(first: NavState, prior: NavState, transforms: Sequence[FrameTransform]) -> NavState:

@@ -8,13 +8,24 @@ from collections.abc import Sequence
 import numpy as np
 
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.filter.height import WEATHER_WALK
 from stario.fusion.filter.initial import tilt_sigma
 from stario.fusion.filter.record import Record
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.fixes import Fix
-from stario.fusion.graph.factors import Displacement, GyroBias, Position, Term, Tilt, Velocity, Yaw
+from stario.fusion.graph.factors import (
+    Displacement,
+    GyroBias,
+    Height,
+    Position,
+    Term,
+    Tilt,
+    Velocity,
+    Yaw,
+)
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.keyframes import KeyframeGraph, shallow_copy
+from stario.fusion.imu.barometer import HeightSample
 from stario.fusion.imu.gap import gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval, split_at
 from stario.fusion.imu.preintegration import Segment, segment_of
@@ -74,6 +85,7 @@ class GraphBuilder:
         # Keyframes where windows begin and end, by the count of intervals; cleared at a gap.
         self._window_keyframes: dict[int, int] = {count: 0} if count % self._spacing == 0 else {}
         self._gaps: dict[int, ImuInterval] = {}  # by the keyframe before them
+        self._last_height: tuple[int, float] | None = None  # keyframe and time
 
     def copied(self) -> GraphBuilder:
         """Return a copy that may be changed; what both hold is never modified."""
@@ -124,6 +136,8 @@ class GraphBuilder:
             self._window_keyframes[self.count] = self.graph.last
             if record.zero_velocity is not None:
                 self._add_zero_velocity(record.zero_velocity)
+        if interval.height is not None:
+            self._add_height(interval.height)
         for fix in fixes:
             self.fix(fix)
         return self.graph.last > before
@@ -173,7 +187,7 @@ class GraphBuilder:
 
     def dead_reckoned(self, k: int, time: float = math.inf) -> Pose:
         """Dead-reckon from a keyframe to a time [s], or to the end of its data if earlier."""
-        R, v, p, b_g, b_a = self.graph.keyframe(k)
+        R, v, p, b_g, b_a, _ = self.graph.keyframe(k)
         if k in self._gaps:
             gap = self._gaps[k]
             until = min(time, gap.stop)
@@ -217,6 +231,20 @@ class GraphBuilder:
         covariance = zero_velocity.covariance / self._spacing
         self.graph.add(Velocity(k, zero, covariance[:3, :3], zero))
         self.graph.add(GyroBias(k, zero_velocity.b_g, covariance[3:, 3:]))
+
+    def _add_height(self, sample: HeightSample) -> None:
+        graph, k, before = self.graph, self.graph.last, self._last_height
+        i, variances = None, [sample.sigma**2]
+        # In a stream the one before may have left the graph.
+        if before is not None and before[0] != k and before[0] in graph.keyframes:
+            i = before[0]
+            walked = WEATHER_WALK**2 * (sample.time - before[1]) + sample.stepped**2
+            variances.append(walked)
+        if before is None or before[0] != k:
+            graph.add_offset(k, sample.height - float(graph.keyframe(k).p_W[2]))
+            self._last_height = k, sample.time
+        dt = sample.time - graph.time(k)
+        graph.add(Height(i, k, sample.height, dt, np.diag(variances)), gated=False)
 
     def _fix_term(self, fix: Fix, k: int) -> Term:
         graph = self.graph

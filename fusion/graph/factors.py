@@ -7,7 +7,7 @@ only: none models a displacement that turns with the yaw of a pose and not with 
 "Graph factors").
 
 Tangent of a keyframe, as in gtsam: pose R exp(w), p + R dp in the order w, dp; velocity additive;
-biases additive, accelerometer first. Keys: x pose, v velocity, b biases.
+biases additive, accelerometer first. Keys: x pose, v velocity, b biases, o barometer's offset.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
+from gtsam.symbol_shorthand import B, O, V, X
 
 from stario.fusion.filter.jacobians import plain_covariance, yaw_jacobian
 from stario.fusion.graph.covariances import root_information
@@ -115,7 +115,7 @@ class Prior:
         """Linearise in the rows of the root."""
         residual, blocks, rest = self.offset, [], self.root
         for k, reference in zip(self.keyframes, self.reference, strict=True):
-            state = KeyframeState.of(values, k)
+            state = KeyframeState.of(values, k).like(reference)
             error = state.error_from(reference)
             root, rest = rest[:, : len(error)], rest[:, len(error) :]
             residual = residual - root @ error
@@ -195,6 +195,44 @@ class Position(AtKeyframe):
         H = np.zeros((3, 6))
         H[:, 3:] = R
         return self.p_W - predicted, [(X(self.k), H), (V(self.k), self.dt * _EYE)]
+
+
+@dataclass(frozen=True, eq=False)
+class Height:
+    """The height by the air's pressure near a keyframe, and its offset's walk since another one.
+
+    Attributes:
+        i: the keyframe of the height before; None for the first one, whose offset is free.
+        k: number of the keyframe.
+        height: [m].
+        dt: time since the keyframe [s].
+        covariance: of the height and, unless it is the first one, of the walk [m^2].
+    """
+
+    i: int | None
+    k: int
+    height: float
+    dt: float
+    covariance: FloatArray
+
+    @property
+    def keyframes(self) -> tuple[int, ...]:
+        """Both keyframes, or the only one."""
+        return (self.k,) if self.i is None else (self.i, self.k)
+
+    def linearise(self, values: Any) -> Linearised:
+        """Linearise along the vertical."""
+        (R, p), v = _pose(values, self.k), values.atVector(V(self.k))
+        offset = float(values.atVector(O(self.k))[0])
+        rows = len(self.covariance)
+        H_x, H_v, H_o = np.zeros((rows, 6)), np.zeros((rows, 3)), np.ones((rows, 1))
+        H_x[0, 3:], H_v[0, 2] = R[2], self.dt
+        blocks = [(X(self.k), H_x), (V(self.k), H_v), (O(self.k), H_o)]
+        residual = [self.height - p[2] - self.dt * v[2] - offset]
+        if self.i is not None:
+            residual.append(float(values.atVector(O(self.i))[0]) - offset)
+            blocks.insert(0, (O(self.i), np.array([[0.0], [-1.0]])))
+        return np.array(residual), blocks
 
 
 @dataclass(frozen=True, eq=False)

@@ -132,8 +132,9 @@ def step(
     s = _with_prior_narrowed(changed(s, filter=after, builder=builder))
     if s.is_stale or interval.gap or record.revoked:
         return _restarted(s, 0 if interval.gap else builder.count + 1, config), record
+    yielded = record.at_rate(record.climb_rate)
     local_fixes = [_in_graph_frame(accepted, s) for accepted in record.fixes]
-    new_keyframe = builder.step(record, record.displacement, local_fixes)
+    new_keyframe = builder.step(yielded, yielded.displacement, local_fixes)
     if record.bearing is not None:
         _add_bearing(builder, record.bearing)
     if new_keyframe:

@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, V, X
+from gtsam.symbol_shorthand import B, O, V, X
+from scipy.linalg import block_diag
 
 from stario.fusion.filter.jacobians import invariant_from_local
 from stario.fusion.lie import log_se23
@@ -27,6 +28,8 @@ class KeyframeState(NamedTuple):
     """Gyroscope bias (3,) [rad/s]."""
     b_a: FloatArray
     """Accelerometer bias (3,) [m/s^2]."""
+    offset: float | None = None
+    """Height by the pressure less that of the track [m]; None without a barometer."""
 
     @classmethod
     def from_nav(cls, state: NavState) -> KeyframeState:
@@ -43,6 +46,7 @@ class KeyframeState(NamedTuple):
             pose.translation(),
             bias.gyroscope(),
             bias.accelerometer(),
+            float(values.atVector(O(k))[0]) if values.exists(O(k)) else None,
         )
 
     def insert_into(self, values: Any, k: int) -> None:
@@ -50,23 +54,36 @@ class KeyframeState(NamedTuple):
         values.insert(X(k), gtsam.Pose3(gtsam.Rot3(self.R_WB), self.p_W))
         values.insert(V(k), self.v_W)
         values.insert(B(k), gtsam.imuBias.ConstantBias(self.b_a, self.b_g))
+        if self.offset is not None:
+            values.insert(O(k), np.array([self.offset]))
 
     def keys(self, k: int) -> list[int]:
         """Return gtsam's keys of this state as keyframe k."""
-        return [X(k), V(k), B(k)]
+        return [X(k), V(k), B(k), *([] if self.offset is None else [O(k)])]
 
     def blocks(self, k: int, H: FloatArray) -> list[tuple[int, FloatArray]]:
         """Split a Jacobian (m, n) with respect to this state, keyframe k, by gtsam's keys."""
-        return list(zip(self.keys(k), np.split(H, [6, 9], axis=1), strict=True))
+        keys = self.keys(k)
+        return list(zip(keys, np.split(H, [6, 9, 15][: len(keys) - 1], axis=1), strict=True))
+
+    def like(self, other: KeyframeState) -> KeyframeState:
+        """Return the state without an offset if another has none."""
+        return self if other.offset is not None else self._replace(offset=None)
 
     def error_from(self, other: KeyframeState) -> FloatArray:
-        """Return the right-invariant error (15,) from another: theta, rho_v, rho_p, b_g, b_a."""
+        """Return the right-invariant error from another: theta, rho_v, rho_p, b_g, b_a, offset.
+
+        It is (15,), or (16,) if the other has an offset.
+        """
         R = self.R_WB @ other.R_WB.T
         pose = log_se23(R, self.v_W - R @ other.v_W, self.p_W - R @ other.p_W)
-        return np.concatenate([pose, self.b_g - other.b_g, self.b_a - other.b_a])
+        rest = [self.b_g - other.b_g, self.b_a - other.b_a]
+        if self.offset is not None and other.offset is not None:
+            rest.append(np.array([self.offset - other.offset]))
+        return np.concatenate([pose, *rest])
 
     def invariant_from_local(self) -> FloatArray:
-        """Return the map (15, 15) from gtsam's w, dp, dv, b_a, b_g to the invariant error."""
+        """Return the map from gtsam's w, dp, dv, b_a, b_g, offset to the invariant error."""
         matrix = invariant_from_local(self.R_WB, self.v_W, self.p_W)
         matrix[3:6, 6:9] = np.eye(3)  # a graph's velocities are in W
-        return matrix
+        return matrix if self.offset is None else block_diag(matrix, 1.0)

@@ -115,6 +115,10 @@ class KeyframeGraph:
         self.add(prior, gated=False)
         return self.last
 
+    def add_offset(self, k: int, offset: float) -> None:
+        """Give a keyframe the state of a barometer's offset [m]."""
+        self._states[k], self._solution = self._states[k]._replace(offset=offset), None
+
     def add(self, term: Term, gated: bool = True) -> None:
         """Add a measurement with positive definite covariance, if `gated` as a possible outlier."""
         limit = chi2_quantile(self._gate, len(term.covariance)) if gated else math.inf
@@ -151,7 +155,7 @@ class KeyframeGraph:
 
     def state(self, k: int) -> NavState:
         """Return a keyframe with its marginal covariance; call after `solve`."""
-        R, v, p, b_g, b_a = self.keyframe(k)
+        R, v, p, b_g, b_a, _ = self.keyframe(k)
         assert self._solution is not None  # solved
         joint = self._solution.covariances[k]
         to_world = KeyframeState(R, np.zeros(3), np.zeros(3), b_g, b_a).invariant_from_local()
@@ -206,7 +210,7 @@ class KeyframeGraph:
         to_local = [np.linalg.inv(state.invariant_from_local()) for state in reference]
         for k, state in zip(keyframes, reference, strict=True):
             # A window may reach only a pose: add the other columns, without information.
-            nothing = state.blocks(k, np.zeros((1, 15)))
+            nothing = state.blocks(k, np.zeros((1, 15 + (state.offset is not None))))
             remaining.push_back(linear_factor(nothing, np.zeros(1)))
         A, b = remaining.jacobian(self._ordering(keyframes))
         table = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))[: A.shape[1]]

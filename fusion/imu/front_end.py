@@ -22,6 +22,8 @@ import numpy as np
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.health import SampleCounts
+from stario.fusion.imu.barometer import HEIGHT_SECONDS, HeightBuffer
+from stario.fusion.imu.buffers import FieldBuffer
 from stario.fusion.imu.faults import (
     ClockSetBackDetector,
     FrozenSensorDetector,
@@ -29,7 +31,6 @@ from stario.fusion.imu.faults import (
 )
 from stario.fusion.imu.gap import gap_rotation
 from stario.fusion.imu.intervals import (
-    FieldBuffer,
     Flags,
     ImuInterval,
     Sample,
@@ -83,7 +84,7 @@ class FrontEnd:
         self._hole = (-math.inf, -math.inf)  # ends of the last hole [s]
         self._unconfirmed: list[Sample] = []  # jumped ahead in time, not confirmed yet
         self._before_gap: Sample | None = None  # after which gravity has not been averaged yet
-        self._fields = FieldBuffer()
+        self._fields, self._pressures = FieldBuffer(), HeightBuffer()
         self._clock = ClockSetBackDetector()
         self._frozen = FrozenSensorDetector(config.gravity)
         self._outliers = OutlierDetector()
@@ -127,6 +128,11 @@ class FrontEnd:
         """Add a magnetic field (3,) [uT] in B, before any later sample is pushed."""
         if self._config.filter.magnetometer and not self._fields.add(time, field_B, self.newest):
             self.counts.field_dropped += 1
+
+    def push_pressure(self, time: float, pressure_hPa: float) -> None:
+        """Add a pressure [hPa], before any later sample is pushed."""
+        if not self._pressures.add(time, pressure_hPa, self.newest):
+            self.counts.pressure_dropped += 1
 
     def finish(self) -> None:
         """End the stream: drop the samples that still wait for others to confirm their times."""
@@ -265,9 +271,13 @@ class FrontEnd:
     def _with_window(self, table: FloatArray, flags: Flags) -> ImuInterval:
         assert self._attitude is not None  # no interval is cut before the first attitude
         # _cut() has already counted this interval.
-        update = (self._index - 1) % self._config.filter.intervals_per_update == 0
+        f, count = self._config.filter, self._index - 1
+        update = count % f.intervals_per_update == 0
+        due = count % round(f.output_rate * HEIGHT_SECONDS) == 0
+        height = self._pressures.at(table[-1, 0]) if due else None
         field_B = self._fields.at(table[-1, 0])
         attitudes = self._attitude.advance(table[:, 0], table[:, 1:4], table[:, 4:])
         self._windows.add(table, attitudes, flags)
         window = self._windows.window() if update else None
-        return ImuInterval(table, False, self._attitude.R_NB, update, window, field_B, flags=flags)
+        R_NB = self._attitude.R_NB
+        return ImuInterval(table, False, R_NB, update, window, field_B, height, flags=flags)

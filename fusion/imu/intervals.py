@@ -1,9 +1,7 @@
-"""Output of the front end: the start, IMU intervals, and the magnetic field at their ends."""
+"""Output of the front end: the start, and IMU intervals with what else was measured in them."""
 
 from __future__ import annotations
 
-import math
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -12,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stario.fusion.fixes import Fix
+from stario.fusion.imu.barometer import HeightSample
 from stario.fusion.state import changed
 from stario.sequences.attitude.levelling import GravityStart
-from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
+from stario.sequences.sequence import FloatArray
 
 Sample = tuple[float, float, float, float, float, float, float]
 """Time [s], gyroscope xyz [rad/s], specific force xyz [m/s^2]."""
@@ -87,6 +86,7 @@ class ImuInterval:
         update: whether windows begin and end at this interval's end.
         window: the window that ends here; None if there is none.
         field_B: (3,) magnetic field at its end [uT]; None if none was measured.
+        height: height by the pressure of the last half second; None if there is none.
         levelled: attitude from gravity after a gap, estimated as at the first sample; None
             elsewhere.
         flags: whether samples of either sensor are saturated, missing, or were spikes.
@@ -98,6 +98,7 @@ class ImuInterval:
     update: bool = False
     window: Window | None = None
     field_B: FloatArray | None = None
+    height: HeightSample | None = None
     levelled: Start | None = None
     flags: Flags = NO_FLAGS
 
@@ -188,74 +189,3 @@ def interpolated_sample(before: FloatArray, after: FloatArray, time: float) -> F
     sample = before + (time - before[0]) / (after[0] - before[0]) * (after - before)
     sample[0] = time
     return np.asarray(sample)
-
-
-_MAX_FIELDS = 1000
-"""Maximum number of fields that wait for their samples: ten seconds of a fast sensor."""
-
-_MAX_AHEAD = 1.0
-"""A field further than this ahead of the newest sample [s] is dropped once an earlier one comes."""
-
-_MAX_FIELD_AGE = 0.11
-"""Maximum age of the field used at an interval's end [s]; slow sensors measure ten per second."""
-
-_MAX_DELAY = 0.1
-"""A field older than the end of the last interval by more than this [s] is dropped as late."""
-
-
-_MAX_REPEATED = 0.5
-"""Maximum time for which a field may repeat itself [s]: slow sensors are logged several times, but
-one that repeats its value for longer has stopped."""
-
-
-class FieldBuffer:
-    """The newest magnetic fields of a stream."""
-
-    def __init__(self) -> None:
-        self._value: tuple[float, ...] = ()
-        self._since = math.inf
-        self._fields: deque[tuple[float, FloatArray]] = deque(maxlen=_MAX_FIELDS)
-        self._last_query = -math.inf
-
-    def add(self, time: float, field_B: FloatArray, now: float) -> bool:
-        """Add a field; return False if its value or time cannot be right, or the sensor stopped.
-
-        It also returns False if too many fields wait, so that the first of them is dropped.
-
-        Args:
-            time: time of the field [s].
-            field_B: (3,) magnetic field in B [uT].
-            now: time of the newest sample [s]. A field far ahead of it is kept only until an
-                earlier one comes, so that one wild timestamp does not make later fields look late.
-        """
-        while (
-            self._fields
-            and time <= (last := self._fields[-1][0])
-            and -math.inf < now < last - _MAX_AHEAD
-        ):
-            self._fields.pop()
-        newest = self._fields[-1][0] if self._fields else -math.inf
-        newest = max(newest, self._last_query - _MAX_DELAY)
-        value = tuple(field_B.tolist())
-        size = sum(map(abs, value))
-        if not (math.isfinite(time) and time > newest and size < MAX_SENSOR_VALUE):
-            return False
-        if value != self._value:
-            self._value, self._since = value, time
-        if time - self._since > _MAX_REPEATED:
-            return False
-        room = len(self._fields) < _MAX_FIELDS
-        self._fields.append((time, field_B))
-        return room
-
-    @property
-    def waiting(self) -> FloatArray:
-        """The fields (N, 3) that are held."""
-        return np.reshape([field for _, field in self._fields], (-1, 3))
-
-    def at(self, time: float) -> FloatArray | None:
-        """Return the newest field (3,) up to a time [s], None if it is too old; later ones wait."""
-        self._last_query = time
-        while self._fields and self._fields[0][0] < time - _MAX_FIELD_AGE:
-            self._fields.popleft()
-        return next((m_B for t, m_B in reversed(self._fields) if t <= time), None)

@@ -65,7 +65,8 @@ def health_findings(health: Health) -> list[Finding]:
     elif health.zero_velocity.get("applied", 0) < _RESTING:
         text = "Too early to judge the motion: it takes ten seconds of it."
         found += [*_flagged(health), Finding(TOO_EARLY, text, level="note")]
-    found += [*_corrections(health), *_field(health), *_fixes(health), *_direction(health)]
+    found += [*_floors(health), *_corrections(health), *_field(health)]
+    found += [*_fixes(health), *_direction(health)]
     notes = (f"{note[:1].upper()}{note[1:]}." for note in health.notes)
     return found + [Finding(f"note_{k}", note) for k, note in enumerate(notes)]
 
@@ -212,6 +213,14 @@ def _corrections(health: Health) -> Iterator[Finding]:
     advice = "Until then a stream's track was wrong by as much; a recording's is smoothed."
     values = {"count": count, "largest_m": metres, "turn_deg": math.degrees(turn), "at_s": time}
     yield Finding("corrections", text, advice, values=values)
+
+
+def _floors(health: Health) -> Iterator[Finding]:
+    if not health.floors:
+        return
+    ways = "; ".join(str(change) for change in health.floors)
+    values = {"floors": [change._asdict() for change in health.floors]}
+    yield Finding("floors", f"{ways[0].upper()}{ways[1:]}.", level="note", values=values)
 
 
 def _field(health: Health) -> Iterator[Finding]:

@@ -74,7 +74,13 @@ def write_report(path: Path, found: Comparison, tiles: str = "") -> Path:
     main = "track"
     # Dead reckoning is kilometres off within a minute: no axis fits it and the others.
     drawn = {name: s for name, s in series.items() if name != "dead_reckoning"}
-    panels = motion_panels(drawn, true_series, main) + bias_panels(main, series[main])
+    health = tracks[main].health
+    floors = [
+        change._replace(start=change.start - start, stop=change.stop - start)
+        for change in (health.floors if health else [])
+    ]
+    panels = motion_panels(drawn, true_series, main, floors)
+    panels += bias_panels(main, series[main])
     innovations = tracks[main].innovations
     if innovations is not None and len(innovations.time):
         panels += innovation_panels(innovations, start)
@@ -82,7 +88,6 @@ def write_report(path: Path, found: Comparison, tiles: str = "") -> Path:
     known = shown_positions(sequence, tracks[main])
     if known is not None:
         known = replace(known, position_W=turned(known.position_W, yaw))
-    health = tracks[main].health
     corrections = [
         (time - start, metres, turn, cause)
         for time, metres, turn, cause in (health.corrections if health else [])

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import plotly.graph_objects as go
 
+from stario.fusion.floors import FloorChange
 from stario.fusion.report.series import Series
 from stario.fusion.state import Innovations
 from stario.sequences.arrays import evenly_spaced, interpolated
@@ -45,10 +46,21 @@ def style(name: str) -> tuple[str, str, str]:
     return label, colour, _DASHES.get(name, "solid")
 
 
-def motion_panels(tracks: Mapping[str, Series], truth: Series | None, main: str) -> list[Panel]:
+def motion_panels(
+    tracks: Mapping[str, Series],
+    truth: Series | None,
+    main: str,
+    floors: Sequence[FloorChange] = (),
+) -> list[Panel]:
     """Return panels of height, speed and yaw, and of position error if there is ground truth.
 
     The main track has bands; more of them on one another would show none.
+
+    Args:
+        tracks: by name.
+        truth: ground truth.
+        main: name of the main track.
+        floors: its changes of floor, in the time of the series.
     """
     shown = dict(tracks) if truth is None else {TRUTH: truth, **tracks}
     first = next(iter(shown.values()))
@@ -58,6 +70,7 @@ def motion_panels(tracks: Mapping[str, Series], truth: Series | None, main: str)
         height += _curve(name, s.time, s.position[:, 2], "m", sigmas[0])
         speed += _curve(name, s.time, s.speed, "m/s", sigmas[1], lowest=0.0)
         yaw += _curve(name, s.time, s.yaw + _whole_turns(s, first), "deg", sigmas[2])
+    height += _floor_lines(tracks[main], floors)
     return [
         *([] if truth is None else [_error_panel(tracks, truth)]),
         _fitted("Height [m], band: 3 sigma", height),
@@ -137,6 +150,32 @@ def _curve(
     )
     low = np.maximum(value - 3.0 * sigma[rows], lowest)
     return [_band(name, time, low, value + 3.0 * sigma[rows], colour), line]
+
+
+def _floor_lines(series: Series, floors: Sequence[FloorChange]) -> list[go.Scatter]:
+    """Return a dotted line along each stay on a floor, with the floor's number."""
+    if not floors:
+        return []
+    starts = [float(series.time[0]), *(change.stop for change in floors)]
+    stops = [*(change.start for change in floors), float(series.time[-1])]
+    lines = []
+    for start, stop, floor in zip(starts, stops, [0, *(c.after for c in floors)], strict=True):
+        inside = (series.time >= start) & (series.time <= stop)
+        if not inside.any():
+            continue
+        level = float(np.nanmedian(series.position[inside, 2]))
+        lines.append(
+            go.Scatter(
+                x=[start, stop],
+                y=[level, level],
+                mode="lines+text",
+                text=[f"floor {floor}"],
+                textposition="top right",
+                line={"color": FAINT, "dash": "dot", "width": 1},
+                hoverinfo="skip",
+            )
+        )
+    return lines
 
 
 def _error_panel(tracks: Mapping[str, Series], truth: Series) -> Panel:

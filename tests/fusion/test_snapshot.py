@@ -171,7 +171,7 @@ def test_a_snapshot_of_another_version_is_refused(walk: ImuSequence, still_model
         navigator.restore(data)
 
 
-LAYOUTS = {31: "c6f2bf2b"}
+LAYOUTS = {32: "c183b965"}
 """CRC of the classes and attributes in a snapshot, by version."""
 
 
@@ -201,6 +201,7 @@ def test_a_snapshot_with_other_classes_or_attributes_has_another_version(
             navigator.update_yaw(time, 0.3, 0.5)
         for row in zip(*(part[:400] for part in (walk.time, walk.gyro, walk.accel)), strict=True):
             navigator.push_magnetometer(row[0], np.array([20.0 + row[0], 5.0, -40.0]))
+            navigator.push_pressure(row[0], 1000.0)
             navigator.push(*row)
         visit(plain(unpack(navigator.snapshot()), {}))
     rare = [
@@ -210,6 +211,7 @@ def test_a_snapshot_with_other_classes_or_attributes_has_another_version(
     visit(plain(rare, {}))
     names = {line.partition(":")[0] for line in found}
     assert names >= {"FieldState", "FrameTransform", "Fix", "Bearing", "Position", "Yaw"}
+    assert names >= {"PressureOffset", "Height", "HeightSample"}
     layout = format(zlib.crc32("\n".join(sorted(found)).encode()), "08x")
     assert LAYOUTS.get(VERSION) == layout, f"raise VERSION, and note its layout {layout} here"
 

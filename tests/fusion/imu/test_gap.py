@@ -14,8 +14,9 @@ from support import GRAPH, swivelled
 
 from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig
+from stario.fusion.imu.buffers import FieldBuffer
 from stario.fusion.imu.gap import INTERPOLATED, gap_rotation, yaw_variance
-from stario.fusion.imu.intervals import FieldBuffer, ImuInterval, Start
+from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.recording import cut_recording
 from stario.sequences import PHONE_IMU, generate_walk, simulate_imu
 from stario.sequences.attitude.rotations import yaw_of
@@ -169,7 +170,7 @@ def test_a_block_of_fields_may_come_before_its_samples_and_what_does_not_fit_is_
     assert kept == [True] * 1000 + [False] * 200
     assert buffer.at(1.0) is None
     assert all(buffer.at(0.1 * k + 0.001) is not None for k in range(21, 119))
-    assert len(buffer._fields) < 50
+    assert len(buffer._waiting) < 50
 
 
 def test_a_field_too_late_for_any_interval_is_refused() -> None:

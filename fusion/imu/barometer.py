@@ -1,0 +1,213 @@
+"""Heights from the air's pressure, averaged twice a second, and what their last seconds look like.
+
+README.md, "Barometer". Whether one climbs shows in a line through the last seconds: stairs and
+lifts change the height over seconds, a door at once. What has just changed by much is held back
+until it is known which of both it was.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from stario.fusion.imu.buffers import TimedBuffer
+from stario.sequences.sequence import FloatArray
+
+PRESSURE_RANGE = (300.0, 1100.0)
+"""Pressures at which people walk [hPa]: 9 km above the sea, and the Dead Sea's shore."""
+
+HEIGHT_SECONDS = 0.5
+"""Time over which heights are averaged [s]."""
+
+MIN_CLIMB_RATE = 0.15
+"""Vertical speed from which a line through the last seconds means stairs or a lift [m/s]: stairs
+have 0.2 to 0.4, and a phone's pressure on a level floor exceeds it in 1 % of the time (28 walks of
+IPIN 2023)."""
+
+CLIMB_DELAY = 4.0
+"""Length of that line [s], and so the longest time before a climb is known to be one."""
+
+_MIN_POINTS = 4
+"""Number of heights that a line needs."""
+
+_CLIMB_SIGMAS = 3.0
+"""Sigmas of the line's slope from which it means a climb."""
+
+_STILL_CLIMBING = 0.1
+"""Vertical speed below which a climb has ended [m/s]."""
+
+_SUDDEN = 0.45
+"""Change [m] against the last seconds' median that is not used before it is known what it was."""
+
+_LONGEST_DOUBT = 3.0
+"""Time [s] after which it must be known."""
+
+_NO_DOOR, _STILL_MOVING = 1.2, 0.2
+"""Change [m] that is a lift's and no door's, if the last half second has still moved by so much
+[m]."""
+
+_CLEAR_STEP = 0.4
+"""Squared residuals about a step, relative to those about the line, below which the air has
+stepped: a door, a ventilator. Whoever climbs slowly must not be mistaken for one."""
+
+_FIRST_SCATTER, _MIN_SCATTER = 0.1, 0.02
+"""Scatter of averaged heights about their line [m]: assumed at first, and the least."""
+
+_SCATTER_COUNT = 60
+"""Number of heights over which the scatter is averaged: those of half a minute."""
+
+_CORRELATION = 4.0
+"""Variance of a height's noise relative to its scatter about the line: that of phones is correlated
+over a second."""
+
+
+class HeightSample(NamedTuple):
+    """An averaged height above the first one, by the pressure.
+
+    Attributes:
+        time: mean time of the averaged samples [s].
+        height: [m].
+        sigma: standard deviation of its noise [m].
+        rate: vertical speed while it climbs or descends [m/s]; 0 on a floor.
+        risen: change [m] that was not known to be a climb before; 0 otherwise.
+        stepped: step of the air's pressure since the last height [m]; 0 without one.
+    """
+
+    time: float
+    height: float
+    sigma: float
+    rate: float = 0.0
+    risen: float = 0.0
+    stepped: float = 0.0
+
+
+def pressure_altitude(pressure_hPa: FloatArray) -> FloatArray:
+    """Return altitudes (N,) in the standard atmosphere [m], 8.4 m/hPa at the sea's level.
+
+    Differences are as much too small as the air is warmer than 15 degrees less 6.5 per kilometre:
+    2 % in a room. ISO 2533.
+    """
+    return np.asarray(44330.77 * (1.0 - (pressure_hPa / 1013.25) ** 0.1902632))
+
+
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """A line through the last heights.
+
+    Attributes:
+        slope: [m/s].
+        scatter: standard deviation about it [m].
+        step_ratio: squared residuals about the best step, relative to those about the line.
+    """
+
+    slope: float
+    scatter: float
+    step_ratio: float
+
+
+class HeightBuffer(TimedBuffer[float]):
+    """Pressures of a stream, as averaged heights."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._first = math.nan
+        self._past: deque[tuple[float, float]] = deque()
+        self._variance, self._count = _FIRST_SCATTER**2, 0
+        self._doubt: tuple[float, float] | None = None  # time and height before a sudden change
+        self._climbing = False
+
+    def add(self, time: float, pressure_hPa: float, now: float) -> bool:
+        """Add a pressure [hPa]; return False if its value or time cannot be right.
+
+        Args:
+            time: its time [s].
+            pressure_hPa: [hPa].
+            now: as for `fits`.
+        """
+        low, high = PRESSURE_RANGE
+        right = low <= pressure_hPa <= high and self.fits(time, now)
+        return right and self.keep(time, pressure_hPa)
+
+    def at(self, stop: float) -> HeightSample | None:
+        """Return the height of the half second before a time [s]; None if there is none to be used.
+
+        Later pressures wait.
+        """
+        self._last_query, taken = stop, []
+        while self._waiting and self._waiting[0][0] <= stop:
+            taken.append(self._waiting.popleft())
+        taken = [each for each in taken if each[0] > stop - HEIGHT_SECONDS]
+        if not taken:
+            return None
+        times, pressures = np.array(taken).T
+        altitude, time = float(pressure_altitude(pressures).mean()), float(times.mean())
+        if math.isnan(self._first):
+            self._first = altitude
+        return self._judged(time, altitude - self._first)
+
+    def _judged(self, time: float, height: float) -> HeightSample | None:
+        usual = float(np.median([h for _, h in self._past])) if self._past else height
+        self._past.append((time, height))
+        while self._past[0][0] < time - CLIMB_DELAY - 0.5 * HEIGHT_SECONDS:
+            self._past.popleft()
+        line = _line(np.array(self._past))
+        climbed, doubt, began = self._climbing, self._doubt, self._past[0]
+        self._climbing = line is not None and (
+            self._is_climb(line, climbed) or self._is_lift(height - usual)
+        )
+        self._doubt = None
+        sample = HeightSample(time, height, self._sigma)
+        if line is not None and self._climbing:
+            risen = 0.0 if climbed else height - (doubt or began)[1]
+            return sample._replace(rate=line.slope, risen=risen)
+        if doubt is None and abs(height - usual) > _SUDDEN and not climbed:
+            doubt = time, usual
+        if doubt is not None and time - doubt[0] < _LONGEST_DOUBT:
+            self._doubt = doubt
+            return None
+        if doubt is not None:
+            by_air = line is not None and line.step_ratio < _CLEAR_STEP
+            return sample._replace(**{"stepped" if by_air else "risen": height - doubt[1]})
+        if line is not None:
+            self._learn(line.scatter)
+        return sample
+
+    @property
+    def _sigma(self) -> float:
+        return math.sqrt(_CORRELATION * self._variance)
+
+    def _is_climb(self, line: _Line, climbed: bool) -> bool:
+        if climbed:
+            return abs(line.slope) > _STILL_CLIMBING
+        # Over n heights at equal steps the slope's sigma is the mean's times sqrt(12) / span.
+        sigma = math.sqrt(12.0 * _CORRELATION * self._variance / len(self._past)) / CLIMB_DELAY
+        least = max(MIN_CLIMB_RATE, _CLIMB_SIGMAS * sigma)
+        return abs(line.slope) > least and line.step_ratio > 1.0
+
+    def _is_lift(self, change: float) -> bool:
+        (_, before), (_, now) = self._past[-2], self._past[-1]
+        return abs(change) > _NO_DOOR and (now - before) * change > _STILL_MOVING * abs(change)
+
+    def _learn(self, scatter: float) -> None:
+        self._count = min(self._count + 1, _SCATTER_COUNT)
+        change = min(scatter * scatter, 9.0 * self._variance) - self._variance
+        self._variance = max(self._variance + change / self._count, _MIN_SCATTER**2)
+
+
+def _line(past: FloatArray) -> _Line | None:
+    """Fit a line and a step to heights (n, 2) of time and height; None if they are too few."""
+    n = len(past)
+    if n < _MIN_POINTS:
+        return None
+    x, y = (past - past.mean(axis=0)).T
+    slope = float(x @ y / (x @ x))
+    about_line = float(np.square(y - slope * x).sum())
+    # Between mean m1 of the first k and m2 of the others: k m1^2 + (n - k) m2^2 is explained.
+    k, total = np.arange(1, n), np.cumsum(y)[:-1]
+    explained = float((total**2 / k + total**2 / (n - k)).max())
+    ratio = (float(y @ y) - explained) / max(about_line, 1e-9)
+    return _Line(slope, math.sqrt(about_line / (n - 2)), ratio)

@@ -1,0 +1,95 @@
+"""Measurements of a stream beside its samples, which wait for them in order of time."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
+
+_MAX_WAITING = 1000
+"""Maximum number that wait for their samples: ten seconds of a fast sensor."""
+
+_MAX_AHEAD = 1.0
+"""One further than this ahead of the newest sample [s] is dropped once an earlier one comes."""
+
+_MAX_DELAY = 0.1
+"""One older than the end of the last interval by more than this [s] is dropped as late."""
+
+_MAX_FIELD_AGE = 0.11
+"""Maximum age of the field used at an interval's end [s]; slow sensors measure ten per second."""
+
+_MAX_REPEATED = 0.5
+"""Maximum time for which a field may repeat itself [s]: slow sensors are logged several times, but
+one that repeats its value for longer has stopped."""
+
+Value = TypeVar("Value")
+
+
+class TimedBuffer(Generic[Value]):
+    """The newest measurements of one sensor, with their times."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[tuple[float, Value]] = deque(maxlen=_MAX_WAITING)
+        self._last_query = -math.inf
+
+    def fits(self, time: float, now: float) -> bool:
+        """Return whether a measurement of a time [s] may follow those that wait.
+
+        Args:
+            time: its time [s].
+            now: time of the newest sample [s]. A measurement far ahead of it is kept only until an
+                earlier one comes, so that one wild timestamp does not make later ones look late.
+        """
+        waiting = self._waiting
+        while waiting and time <= (last := waiting[-1][0]) and -math.inf < now < last - _MAX_AHEAD:
+            waiting.pop()
+        newest = waiting[-1][0] if waiting else -math.inf
+        return math.isfinite(time) and time > max(newest, self._last_query - _MAX_DELAY)
+
+    def keep(self, time: float, value: Value) -> bool:
+        """Keep a measurement; return False if too many wait, so that the first is dropped."""
+        room = len(self._waiting) < _MAX_WAITING
+        self._waiting.append((time, value))
+        return room
+
+
+class FieldBuffer(TimedBuffer[FloatArray]):
+    """The newest magnetic fields of a stream."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._value: tuple[float, ...] = ()
+        self._since = math.inf
+
+    def add(self, time: float, field_B: FloatArray, now: float) -> bool:
+        """Add a field; return False if its value or time cannot be right, or the sensor stopped.
+
+        It also returns False if too many fields wait, so that the first of them is dropped.
+
+        Args:
+            time: time of the field [s].
+            field_B: (3,) magnetic field in B [uT].
+            now: as for `fits`.
+        """
+        value = tuple(field_B.tolist())
+        if not (self.fits(time, now) and sum(map(abs, value)) < MAX_SENSOR_VALUE):
+            return False
+        if value != self._value:
+            self._value, self._since = value, time
+        return time - self._since <= _MAX_REPEATED and self.keep(time, field_B)
+
+    @property
+    def waiting(self) -> FloatArray:
+        """The fields (N, 3) that are held."""
+        return np.reshape([field for _, field in self._waiting], (-1, 3))
+
+    def at(self, time: float) -> FloatArray | None:
+        """Return the newest field (3,) up to a time [s], None if it is too old; later ones wait."""
+        self._last_query = time
+        while self._waiting and self._waiting[0][0] < time - _MAX_FIELD_AGE:
+            self._waiting.popleft()
+        return next((m_B for t, m_B in reversed(self._waiting) if t <= time), None)

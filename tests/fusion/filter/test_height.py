@@ -1,0 +1,287 @@
+"""The barometer in both estimators: what it observes, and what it must not."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from initial_ekf import Driven
+
+from stario.fusion import Navigator, NavigatorConfig, NavState, Track
+from stario.fusion.evaluation.checks.heights import heights_table, score_heights
+from stario.fusion.evaluation.scores import values
+from stario.fusion.filter.ekf_state import EkfState
+from stario.fusion.filter.height import with_height, yielding
+from stario.fusion.imu.barometer import HeightSample
+from stario.fusion.imu.stateful import WindowDisplacement
+from stario.fusion.report.panels import motion_panels
+from stario.fusion.report.series import trajectory_series
+from stario.sequences.attitude.so3 import exp_so3
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import Barometer, ImuSequence
+from stario.sequences.simulation.barometer import Air, simulate_barometer, standard_pressure
+from stario.sequences.simulation.house import HouseWalk, simulate_house
+
+Make = Callable[..., Any]
+CONFIG = NavigatorConfig()
+
+
+def state(position: tuple[float, float, float] = (30.0, -20.0, 5.0)) -> EkfState:
+    """A state with two clones and correlated errors."""
+    ekf = Driven(2)
+    root = np.random.default_rng(3).normal(size=(15, 15)) * 0.1
+    zero, v = np.zeros(3), np.array([0.4, 1.0, 0.3])
+    R_WB = exp_so3(np.array([0.3, -0.5, 1.2]))
+    ekf.initialise(NavState(10.0, R_WB, v, np.array(position), zero, zero, root @ root.T))
+    ekf.clone()
+    return ekf.state
+
+
+def sample(height: float = 7.0, time: float = 9.8, **rest: float) -> HeightSample:
+    return HeightSample(time, height, 0.1, **rest)
+
+
+def height_variance(s: EkfState) -> float:
+    return float(s.nav_state().covariance[8, 8])
+
+
+def test_the_first_height_determines_the_offset_alone() -> None:
+    before = state()
+    after, result = with_height(before, sample())
+    assert result.accepted
+    assert after.offset is not None
+    # A fifth of a second ago it was lower by a fifth of 0.3 m/s.
+    assert after.offset.metres == pytest.approx(7.0 - (5.0 - 0.06))
+    n = before.covariances.shape[1]
+    np.testing.assert_array_equal(after.covariances[:, :n, :n], before.covariances)
+    # The same height again: nothing new, wherever the track is by its own uncertainty.
+    again, result = with_height(after, sample())
+    assert result.residual == pytest.approx(0.0, abs=1e-12)
+    assert height_variance(again) == pytest.approx(height_variance(before), rel=1e-6)
+
+
+def test_jacobian_agrees_with_finite_differences() -> None:
+    s, _ = with_height(state(), sample())
+    n, step = s.covariances.shape[1], 1e-6
+    root = np.random.default_rng(1).normal(size=(n, n))
+    s = replace(s, covariances=np.stack([root @ root.T] * 2))
+    errors = [step * np.eye(n)[k] for k in range(n)]
+    moved = [with_height(s.plus(e), sample())[1].residual for e in errors]
+    at_rest = with_height(s, sample())[1]
+    H = -(np.array(moved)[:, 0] - at_rest.residual[0]) / step
+    H[s.considered_rows] = 0.0
+    expected = np.sqrt(H @ s.P_actual @ H + 0.1**2)
+    assert at_rest.sigma[0] == pytest.approx(expected, rel=1e-5)
+
+
+def test_pressure_tells_a_change_of_height() -> None:
+    s, _ = with_height(state(), sample())
+    climbed, _ = with_height(s, sample(height=10.0, time=9.9, rate=1.0, risen=3.0))
+    assert climbed.p_W[2] - s.p_W[2] == pytest.approx(3.0, abs=0.2)
+    stepped, _ = with_height(s, sample(height=10.0, time=9.9, stepped=3.0))
+    assert stepped.offset is not None
+    assert s.offset is not None
+    assert stepped.offset.metres - s.offset.metres > 2.0
+    # Neither tells where the track was before: the first pressure is any height's.
+    for after in (climbed, stepped):
+        assert height_variance(after) > 0.9 * height_variance(s)
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        lambda s: s.transformed(exp_so3(np.array([0.0, 0.0, 0.7])), np.array([5.0, 6.0, 2e4])),
+        lambda s: s.with_position_inflated(100.0),
+        lambda s: s.with_yaw_inflated(np.array([1.0, 2.0, 3.0]), 2.0),
+        lambda s: s.with_yaw_inflated(np.zeros(3), 2.0).with_lost_yaw_forgotten(),
+    ],
+)
+def test_moving_the_map_changes_nothing_that_pressure_tells(
+    transform: Callable[[EkfState], EkfState],
+) -> None:
+    s, _ = with_height(state(), sample())
+    now = sample(height=7.4, time=9.9)
+    before, after = with_height(s, now)[1], with_height(transform(s), now)[1]
+    np.testing.assert_allclose(after.residual, before.residual, atol=1e-7)
+    np.testing.assert_allclose(after.sigma, before.sigma, rtol=1e-5)
+
+
+# --- a house, with a network that knows only level floors ----------------------------------------
+
+
+@pytest.fixture(scope="module")
+def house() -> HouseWalk:
+    """Two minutes: stairs to the first floor, and a lift to the fourth."""
+    walk = simulate_house(9, 120.0, rate=100.0, air=Air(weather=0.01, door=0.3))
+    return replace(walk, sequence=replace(walk.sequence, magnetometer=None))
+
+
+@pytest.fixture(scope="module")
+def level_oracle(house: HouseWalk, make_oracle: Make) -> Any:
+    """The true horizontal displacements; the vertical ones are those of a level floor."""
+    oracle = make_oracle(house.sequence, house.sequence.truth, CONFIG, noise=0.03, sigma=0.05)
+    oracle._displacements = {k: v * [1.0, 1.0, 0.0] for k, v in oracle._displacements.items()}
+    return oracle
+
+
+def climb_error(track: Track, sequence: ImuSequence) -> float:
+    """Return the largest error of the height [m], relative to the start."""
+    z = track.trajectory.position_W[:, 2]
+    true = sequence.truth.at(track.time).position_W[:, 2]
+    return float(np.abs(z - z[0] - true + true[0]).max())
+
+
+@pytest.fixture(scope="module")
+def house_track(house: HouseWalk, level_oracle: Any) -> Track:
+    return Navigator(level_oracle, CONFIG).run(house.sequence)
+
+
+def test_heights_follow_stairs_and_a_lift(house: HouseWalk, house_track: Track) -> None:
+    true = house.sequence.truth.position_W[:, 2]
+    assert np.ptp(true) > 11.0
+    assert climb_error(house_track, house.sequence) < 1.0
+    assert house_track.filtered is not None
+    assert climb_error(house_track.filtered, house.sequence) < 2.5  # a lift shows after a second
+    error = house_track.trajectory.position_W[:, 2] - true[0]
+    error -= house.sequence.truth.at(house_track.time).position_W[:, 2] - true[0]
+    assert house_track.covariance is not None
+    variance = house_track.covariance[:, 8, 8]
+    assert 0.05 < np.mean((error - error[0]) ** 2 / variance) < 3.0
+
+
+def test_floors_are_those_of_the_house(house: HouseWalk, house_track: Track) -> None:
+    assert house_track.health is not None
+    found = [(change.after, change.how) for change in house_track.health.floors]
+    assert found == [(stay.floor, stay.way) for stay in house.stays[2:]]
+    for change, before, after in zip(
+        house_track.health.floors, house.stays[1:-1], house.stays[2:], strict=True
+    ):
+        assert change.start == pytest.approx(before.stop, abs=7.0)  # one waits for the lift
+        assert change.stop == pytest.approx(after.start, abs=4.0)
+    assert any(str(change) in str(house_track.health) for change in house_track.health.floors)
+
+
+def test_the_check_of_heights_tells_with_from_without(house: HouseWalk, level_oracle: Any) -> None:
+    scores = score_heights(level_oracle, house.sequence, CONFIG, "house")
+    assert values(scores, "height_rms", track="pressure")[0] < 0.6
+    assert values(scores, "height_rms", track="none")[0] > 2.0
+    assert values(scores, "floors", track="pressure")[0] == 1.0
+    assert "pressure" in heights_table(scores)
+    with pytest.raises(InputError, match="a recording with one"):
+        score_heights(level_oracle, replace(house.sequence, barometer=None), CONFIG, "house")
+
+
+def test_the_report_draws_floors_along_the_height(house_track: Track) -> None:
+    assert house_track.health is not None
+    series = trajectory_series(house_track.trajectory, 0.0)
+    panels = motion_panels({"track": series}, None, "track", house_track.health.floors)
+    labels = [trace.text[0] for trace in panels[0].traces if trace.text]
+    assert labels == ["floor 0", "floor 1", "floor 4"]
+
+
+def test_without_a_barometer_they_go_unnoticed(house: HouseWalk, level_oracle: Any) -> None:
+    blind = replace(house.sequence, barometer=None)
+    assert climb_error(Navigator(level_oracle, CONFIG).run(blind), blind) > 10.0
+
+
+@pytest.mark.parametrize("backend", ["ekf", "graph"])
+def test_a_stream_has_the_heights_of_the_recording(
+    house: HouseWalk, level_oracle: Any, house_track: Track, backend: Any
+) -> None:
+    sequence = house.sequence.slice(0.0, 60.0)
+    assert sequence.barometer is not None
+    pressures = dict(zip(sequence.barometer.time, sequence.barometer.pressure_hPa, strict=True))
+    times = list(pressures)
+    stream = Navigator(level_oracle, CONFIG, backend=backend)
+    rows = np.column_stack([sequence.time, sequence.gyro, sequence.accel]).tolist()
+    states = []
+    for k, row in enumerate(rows):
+        while times and times[0] <= row[0]:
+            time = times.pop(0)
+            stream.push_pressure(time, pressures[time])
+        if k == len(rows) // 2:
+            restored = Navigator(level_oracle, CONFIG, backend=backend)
+            restored.restore(stream.snapshot())
+            stream = restored
+        if (state := stream.push(row[0], row[1:4], row[4:7])) is not None:
+            states.append(state)
+    heights = np.array([state.p_W[2] for state in states])
+    expected = house_track.filtered
+    assert expected is not None
+    same = np.interp([s.time for s in states], expected.time, expected.trajectory.position_W[:, 2])
+    tolerance = 1e-6 if backend == "ekf" else 0.6
+    np.testing.assert_allclose(heights, same, atol=tolerance)
+    assert stream.health.pressures["applied"] > 100
+
+
+def test_weather_and_doors_on_a_level_floor_are_worth_their_sigma(make_walk: Make) -> None:
+    walk = make_walk(seed=4, seconds=60.0)
+    doors = np.array([20.0, 40.0])
+    air = Air(weather=0.03, door=0.5)
+    with_air = replace(walk, barometer=simulate_barometer(walk.truth, air, doors, seed=1))
+    track = Navigator(Level(), CONFIG).run(with_air)
+    assert climb_error(track, with_air) < 1.0
+
+
+class Level:
+    """Predicts that every window is level, and nothing about where it leads."""
+
+    def predict(self, windows: Any) -> tuple[np.ndarray, np.ndarray]:
+        n = len(windows)
+        return np.zeros((n, 3)), np.tile(np.diag([4.0, 4.0, 1e-3]), (n, 1, 1))
+
+
+@pytest.mark.parametrize(
+    ("pressure", "remedy"), [(101_325.0, "Pa"), (101.325, "kPa"), (29.92, "inHg")]
+)
+def test_pressures_in_other_units_are_refused(
+    pressure: float, remedy: str, still_model: Any
+) -> None:
+    with pytest.raises(InputError, match=f"from {remedy} to hPa"):
+        Navigator(still_model).push_pressure(0.0, pressure)
+
+
+def test_late_and_broken_pressures_are_counted(make_walk: Make, still_model: Any) -> None:
+    walk = make_walk()
+    stream = Navigator(still_model)
+    for row in np.column_stack([walk.time, walk.gyro, walk.accel])[:400].tolist():
+        stream.push(row[0], row[1:4], row[4:7])
+    for time, pressure in ((float("nan"), 1000.0), (3.95, float("nan")), (1.0, 1000.0)):
+        stream.push_pressure(time, pressure)
+    assert stream.health.pressures_dropped == 3
+    with pytest.raises(InputError, match="a number of hPa"):
+        stream.push_pressure(4.0, "1000")
+
+
+def test_a_barometer_on_another_clock_is_said_to_be_unused(
+    make_walk: Make, still_model: Any
+) -> None:
+    walk = make_walk()
+    time = walk.time[::20] + 1.7e9
+    other = Barometer(time, standard_pressure(np.zeros(len(time))))
+    health = Navigator(still_model).run(replace(walk, barometer=other)).health
+    assert health is not None
+    assert health.pressures_dropped == len(time)
+    assert not health.pressures
+
+
+@pytest.mark.parametrize(
+    ("rate", "speed", "share"),
+    [
+        (0.0, 1.2, 1.0),  # a floor
+        (0.3, 1.2, 0.3 / 0.6 / 1.2),  # stairs, on which the network walks as on a floor
+        (-0.3, 1.2, 0.3 / 0.6 / 1.2),
+        (0.5, 0.7, 1.0),  # an escalator
+        (1.5, 0.1, 1.0),  # a lift
+        (0.09, 1.2, 1.0),  # a ramp
+    ],
+)
+def test_on_stairs_a_displacement_is_as_long_as_the_climb_allows(
+    rate: float, speed: float, share: float
+) -> None:
+    network = WindowDisplacement(np.array([0.6, 0.8, 0.0]) * speed, 0.01 * np.eye(3), np.eye(3))
+    found = yielding(network, rate)
+    np.testing.assert_allclose(found.d_N, share * network.d_N, atol=1e-12)
+    assert found.covariance_N[2, 2] > network.covariance_N[2, 2]
+    np.testing.assert_array_equal(found.covariance_N[:2, :2], network.covariance_N[:2, :2])

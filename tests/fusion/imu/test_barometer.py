@@ -1,0 +1,101 @@
+"""Averaged heights by the pressure: what is a climb, a step of the air, or nothing."""
+
+import numpy as np
+import pytest
+
+from stario.fusion.imu.barometer import HeightBuffer, HeightSample, pressure_altitude
+from stario.sequences.simulation.barometer import standard_pressure
+
+RATE = 8.0
+
+
+def judged(heights: np.ndarray, noise: float = 0.05, seed: int = 0) -> list[HeightSample | None]:
+    """Return the averages of pressures at these heights, `RATE` per second."""
+    rng, buffer = np.random.default_rng(seed), HeightBuffer()
+    pressures = standard_pressure(300.0 + heights + noise * rng.standard_normal(len(heights)))
+    found = []
+    for k, pressure in enumerate(pressures):
+        assert buffer.add(k / RATE, float(pressure), k / RATE)
+        if k % 4 == 3:
+            found.append(buffer.at(k / RATE))
+    return found
+
+
+def ramp(rate: float, begin: float = 10.0, end: float = 22.0, until: float = 32.0) -> np.ndarray:
+    time = np.arange(0.0, until, 1.0 / RATE)
+    return rate * np.clip(time - begin, 0.0, end - begin)
+
+
+def test_a_hectopascal_is_eight_and_a_half_metres_near_the_sea() -> None:
+    altitude = pressure_altitude(np.array([1000.0, 1001.0]))
+    assert 8.3 < altitude[0] - altitude[1] < 8.5
+    np.testing.assert_allclose(pressure_altitude(standard_pressure(altitude)), altitude, atol=1e-3)
+
+
+def test_heights_count_from_the_first_and_their_sigma_is_that_of_the_data() -> None:
+    for noise in (0.03, 0.3):
+        found = [each for each in judged(np.zeros(400), noise) if each is not None]
+        assert abs(found[0].height) < 2.0 * noise
+        # Four samples make an average, whose noise is taken for correlated: twice the sigma.
+        assert found[-1].sigma == pytest.approx(noise, rel=0.35)
+
+
+@pytest.mark.parametrize("rate", [0.25, -0.3, 1.5])
+def test_stairs_and_lifts_are_climbs_while_they_last(rate: float) -> None:
+    found = judged(ramp(rate))
+    climbing = {each.time: each.rate for each in found if each is not None and each.rate}
+    times = np.array(list(climbing))
+    assert times[0] < 13.0
+    assert 20.0 < times[-1] < 26.0
+    assert np.sign(list(climbing.values())) == pytest.approx(np.sign(rate))
+    # What was not known to be a climb before it was one is said once.
+    risen = [each.risen for each in found if each is not None and each.risen]
+    assert len(risen) == 1
+    assert risen[0] * rate > 0.0
+
+
+def test_a_level_floor_is_no_climb() -> None:
+    for seed in range(5):
+        found = judged(np.zeros(800), noise=0.2, seed=seed)
+        assert all(each is not None and each.rate == each.stepped == 0.0 for each in found)
+
+
+@pytest.mark.parametrize("step", [0.6, -0.9])
+def test_a_door_is_held_back_and_then_a_step_of_the_air(step: float) -> None:
+    heights = np.where(np.arange(240) < 100, 0.0, step)
+    found = judged(heights)
+    assert [each for each in found if each is not None and each.rate] == []
+    assert any(each is None for each in found)
+    steps = [each.stepped for each in found if each is not None and each.stepped]
+    assert steps == pytest.approx([step], abs=0.15)
+
+
+def test_a_puff_of_air_is_held_back_and_nothing_else() -> None:
+    heights = np.zeros(240)
+    heights[100:108] = 0.8
+    found = judged(heights)
+    known = [each for each in found if each is not None]
+    assert len(known) < len(found)
+    assert all(each.rate == each.stepped == 0.0 for each in known)
+
+
+def test_late_repeated_and_impossible_pressures_are_refused() -> None:
+    buffer = HeightBuffer()
+    assert buffer.add(1.0, 1000.0, 1.0)
+    assert not buffer.add(1.0, 1000.0, 1.0)
+    assert not buffer.add(0.5, 1000.0, 1.0)
+    for pressure in (0.0, float("nan"), 100_000.0, 101.3):
+        assert not buffer.add(2.0, pressure, 1.0)
+    assert not buffer.add(float("nan"), 1000.0, 1.0)
+    assert buffer.at(1.2) is not None
+    assert not buffer.add(1.05, 1000.0, 1.2)
+
+
+def test_one_pressure_a_second_is_enough_and_none_is_none() -> None:
+    buffer, found = HeightBuffer(), []
+    for k in range(30):
+        buffer.add(float(k), float(standard_pressure(np.array(0.3 * max(0, k - 15)))), float(k))
+        found += [buffer.at(k + 0.1), buffer.at(k + 0.6)]
+    assert found[::2].count(None) < 4
+    assert all(each is None for each in found[1::2])
+    assert [each.rate for each in found if each is not None][-1] == pytest.approx(0.3, abs=0.02)
