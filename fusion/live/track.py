@@ -29,6 +29,9 @@ _MAX_UNWRITTEN = 6000
 
 _HEALTH_SECONDS = 1.0
 
+_FLOOR_SECONDS = 4.0
+"""Time for which the height must have changed no more for a climb to be over [s]."""
+
 _MANY_ALONE = 100
 """Number of readings of the gyroscope without acceleration that is a problem, if it is most."""
 
@@ -247,7 +250,7 @@ class LiveTrack:
         health = replace(health, samples=health.samples | {"late": late})
         if health.pressures:
             health.floors = self.drawn.floor_changes()
-            self.floor = _floor_words(floor_at(health.floors, time))
+            self.floor = _floor_words(floor_at(health.floors, time - _FLOOR_SECONDS))
         self.words = [asdict(finding) for finding in verdict(health_findings(health))]
 
     def _count(self, first_ns: int, last_ns: int, count: int) -> None:
