@@ -116,7 +116,6 @@ class Merger:
         self.upward = 0.0
         self._aside: list[Reading] = []
         self._newest = dict.fromkeys((*SENSORS, ORIENTATION), -1)
-        self._newest_place = -1
         self._aside_late = 0
         self._waiting: list[Reading] = []
         self._gyro = ""
@@ -166,11 +165,8 @@ class Merger:
         return self._join.ready()
 
     def add_places(self, places: Iterable[Reading]) -> None:
-        """Add places by the satellite receiver; repeated ones are skipped."""
-        for place in places:
-            if place.time_ns > self._newest_place:
-                self._newest_place = place.time_ns
-                self._aside.append(place)
+        """Add places by the satellite receiver; whoever reads the recording skips repeated ones."""
+        self._aside += places
 
     def aside(self) -> list[Reading]:
         """Return magnetic fields, pressures and places since the last call, in time order."""
