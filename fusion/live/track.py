@@ -248,9 +248,11 @@ class LiveTrack:
         health, late = self._navigator.health, self.dropped().get("late", 0)
         # The navigator never sees them; if the clock was set back a little, it sees no gap either.
         health = replace(health, samples=health.samples | {"late": late})
+        floor = ""  # as well when the stream began again and has no pressure yet
         if health.pressures:
             health.floors = self.drawn.floor_changes()
-            self.floor = _floor_words(floor_at(health.floors, time - _FLOOR_SECONDS))
+            floor = _floor_words(floor_at(health.floors, time - _FLOOR_SECONDS))
+        self.floor = floor
         self.words = [asdict(finding) for finding in verdict(health_findings(health))]
 
     def _count(self, first_ns: int, last_ns: int, count: int) -> None:
