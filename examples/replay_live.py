@@ -33,23 +33,29 @@ def replay(
     first_ns, began, accepted = time.time_ns(), time.monotonic(), 0
     stop = min(recording.duration, seconds)
     sensors = [
-        ("gyroscope", recording.time, recording.gyro),
-        ("totalacceleration", recording.time, recording.accel),
+        ("gyroscope", "xyz", recording.time, recording.gyro),
+        ("totalacceleration", "xyz", recording.time, recording.accel),
     ]
     if recording.magnetometer is not None:
         field = recording.magnetometer
-        sensors.append(("magnetometer", field.time, field.field))
+        sensors.append(("magnetometer", "xyz", field.time, field.field))
+    if recording.barometer is not None:
+        air = recording.barometer
+        sensors.append(("barometer", ["pressure"], air.time, air.pressure_hPa[:, None]))
+    if recording.satellites is not None:
+        place = recording.satellites
+        sensors.append(("location", ["latitude", "longitude"], place.time, place.latlon_deg))
     for number in range(int(stop / PERIOD) + 1):
         begin, end = number * PERIOD, min(stop, (number + 1) * PERIOD)
         payload = []
-        for name, times, values in sensors:
+        for name, titles, times, values in sensors:
             elapsed = times - recording.time[0]
             rows = (elapsed >= begin) & (elapsed < end)
             payload += [
                 {
                     "name": name,
                     "time": first_ns + round(t * 1e9),
-                    "values": dict(zip("xyz", value, strict=True)),
+                    "values": dict(zip(titles, value, strict=True)),
                 }
                 for t, value in zip(elapsed[rows].tolist(), values[rows].tolist(), strict=True)
             ]

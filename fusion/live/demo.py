@@ -8,7 +8,7 @@ import time
 import numpy as np
 
 from stario.fusion.live.hub import Hub
-from stario.fusion.live.payload import GYRO, MAG, TOTAL, Batch, Reading
+from stario.fusion.live.payload import BAROMETER, GYRO, MAG, TOTAL, Batch, Reading
 from stario.sequences.sequence import ImuSequence
 
 PERIOD = 0.2
@@ -35,10 +35,12 @@ def _readings(recording: ImuSequence) -> list[Reading]:
     streams = [(GYRO, recording.time, recording.gyro), (TOTAL, recording.time, recording.accel)]
     if (field := recording.magnetometer) is not None:
         streams.append((MAG, field.time, field.field))
+    if (pressure := recording.barometer) is not None:
+        streams.append((BAROMETER, pressure.time, pressure.pressure_hPa[:, None]))
     readings = [
-        Reading(sensor, round(1e9 * (t - recording.time[0])), (x, y, z))
+        Reading(sensor, round(1e9 * (t - recording.time[0])), tuple(value))
         for sensor, times, values in streams
-        for t, (x, y, z) in zip(times.tolist(), values.tolist(), strict=True)
+        for t, value in zip(times.tolist(), values.tolist(), strict=True)
         if t >= recording.time[0]
     ]
     return sorted(readings, key=lambda reading: reading.time_ns)

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.filter.map_frame import MAX_PRIOR_YAW_SIGMA
+from stario.fusion.floors import FloorChange, floor_changes
 from stario.fusion.state import NavState
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.sequence import FloatArray
@@ -19,6 +20,9 @@ standard deviation of yaw [deg], and x, y [m] of the line: the position without 
 
 MAX_POINTS = 20_000
 """Maximum number of points of a track; beyond it every second one is dropped to bound memory."""
+
+_FLOOR_STRIDE = 5
+"""One point in so many tells of floors, about two per second."""
 
 _GAP_SECONDS = 0.5
 """Interval between states [s] above which samples were missing; normally it is 0.1 s."""
@@ -50,6 +54,15 @@ class DisplayedTrack:
         self.points.append(point_of(state, p_W))
         if len(self.points) > MAX_POINTS:
             self.points, self.since = self.points[::2], self.since // 2
+
+    def floor_changes(self) -> list[FloorChange]:
+        """Return the changes of floor so far."""
+        points = self.points[::_FLOOR_STRIDE]
+        if len(points) < 2:
+            return []
+        time, height, x, y = np.array([[p[0], p[3], p[10], p[11]] for p in points]).T
+        speed = np.hypot(np.gradient(x, time), np.gradient(y, time))
+        return floor_changes(time, height, speed)[0]
 
     def move(self, before: NavState, after: NavState) -> None:
         """Transform earlier points by the map-frame change that turned `before` into `after`."""

@@ -202,7 +202,7 @@
       [`${sigmaOf(p).toFixed(2)} m`, "position sigma"],
       [`${p[4].toFixed(2)} m/s`, "speed"],
       [`${p[5].toFixed(0)} ± ${p[9].toFixed(0)}°`, "yaw, 1 sigma"],
-      [`${(Math.round(10 * (p[3] - device.origin[2])) / 10 || 0).toFixed(1)} m`, "height"],
+      [`${(Math.round(10 * (p[3] - device.origin[2])) / 10 || 0).toFixed(1)} m`, ["height", device.floor].filter(Boolean).join(", ")],
       [`${Math.floor(p[0] / 60)}:${String(Math.floor(p[0] % 60)).padStart(2, "0")}`, "time (min:s)"]] : [];
     device.card.querySelector(".figures").replaceChildren(...figures.map(([value, what]) => {
       const box = document.createElement("div");

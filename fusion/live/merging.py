@@ -14,6 +14,7 @@ import numpy as np
 
 from stario.fusion.live.payload import (
     ACCEL_RAW,
+    BAROMETER,
     GRAVITY,
     GYRO,
     GYRO_RAW,
@@ -31,9 +32,6 @@ from stario.sequences.time_order import MAX_IMU_GAP
 Sample = tuple[int, Vector, Vector]
 """Time [ns], angular rate [rad/s], specific force [m/s^2]."""
 
-Field = tuple[int, Vector]
-"""Time [ns], magnetic flux density [uT]."""
-
 CHOOSING = 5 * 10**8
 """Time [ns] allowed for every sensor of a device to appear before choosing among them."""
 
@@ -43,6 +41,8 @@ MAX_WAIT = 5 * 10**9
 _MAX_GAP = round(MAX_IMU_GAP * 1e9)
 _GYROS = (GYRO, GYRO_RAW)
 _ACCELS = ((TOTAL,), (LINEAR, GRAVITY), (ACCEL_RAW,))
+_ASIDE = (MAG, BAROMETER)
+"""Sensors whose readings keep their own times."""
 
 
 class Join:
@@ -114,9 +114,9 @@ class Merger:
 
     def __init__(self) -> None:
         self.upward = 0.0
-        self._fields: list[Field] = []
+        self._aside: list[Reading] = []
         self._newest = dict.fromkeys((*SENSORS, ORIENTATION), -1)
-        self._field_late = 0
+        self._aside_late = 0
         self._waiting: list[Reading] = []
         self._gyro = ""
         self._accel: tuple[str, ...] = ()
@@ -126,7 +126,7 @@ class Merger:
     def dropped(self) -> dict[str, int]:
         """Number of readings dropped so far by reason, without zeros."""
         counts = {
-            "late": self._join.late + self._gravity.late + self._field_late,
+            "late": self._join.late + self._gravity.late + self._aside_late,
             "without acceleration": self._join.alone,
         }
         return {reason: count for reason, count in counts.items() if count}
@@ -164,18 +164,22 @@ class Merger:
                 self._join.add(1, time, (x, y, z))
         return self._join.ready()
 
-    def fields(self) -> list[Field]:
-        """Return the magnetic fields since the last call, in time order."""
-        fields, self._fields = self._fields, []
-        return fields
+    def add_places(self, places: Iterable[Reading]) -> None:
+        """Add places by the satellite receiver; whoever reads the recording skips repeated ones."""
+        self._aside += places
+
+    def aside(self) -> list[Reading]:
+        """Return magnetic fields, pressures and places since the last call, in time order."""
+        aside, self._aside = self._aside, []
+        return sorted(aside, key=lambda reading: reading.time_ns)
 
     def _take(self, reading: Reading) -> None:
         sensor, time, value = reading.sensor, reading.time_ns, reading.value
-        if sensor == MAG:
-            if time > self._newest[MAG]:
-                self._fields.append((time, value))
+        if sensor in _ASIDE:
+            if time > self._newest[sensor]:
+                self._aside.append(reading)
             else:
-                self._field_late += 1
+                self._aside_late += 1
         if sensor == self._gyro:
             self._join.add(0, time, value)
         elif len(self._accel) == 2 and sensor in self._accel:

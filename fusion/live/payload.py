@@ -7,7 +7,8 @@ A push of the app Sensor Logger is a JSON object with a batch of samples of all 
 
 `time` is in nanoseconds, rates in rad/s, accelerations in m/s^2. "accelerometer" excludes gravity,
 which is a separate sensor, "gravity"; "totalacceleration" (Android) includes both; "magnetometer"
-is in uT. Other sensors are skipped.
+is in uT, the "pressure" of "barometer" in hPa (mbar), and "location" in degrees and metres. Other
+sensors are skipped.
 
 A line of any other device is one sample; gyro [rad/s], accel [m/s^2] and, optionally, mag [uT] may
 share a line or have lines of their own:
@@ -21,13 +22,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from stario.sequences.errors import InputError
 
-Vector = tuple[float, float, float]
+Vector = tuple[float, ...]
+"""Numbers of one sample: x, y and z of most sensors."""
 
 MAX_ENTRIES = 50_000
 """Maximum number of samples in one push; the fastest phone takes a minute to record them."""
@@ -50,9 +52,17 @@ GYRO, GYRO_RAW = "gyroscope", "gyroscopeuncalibrated"
 TOTAL, LINEAR, GRAVITY = "totalacceleration", "accelerometer", "gravity"
 ACCEL_RAW = "accelerometeruncalibrated"
 MAG = "magnetometer"
-SENSORS = frozenset({GYRO, GYRO_RAW, TOTAL, LINEAR, GRAVITY, ACCEL_RAW, MAG})
+BAROMETER = "barometer"
+_AXES = frozenset({GYRO, GYRO_RAW, TOTAL, LINEAR, GRAVITY, ACCEL_RAW, MAG})
+SENSORS = _AXES | {BAROMETER}
 ORIENTATION = "orientation"
 """The phone's own attitude, of which only the vertical is used."""
+
+LOCATION = "location"
+"""Places by the phone's satellite receiver."""
+
+_LOCATION_REST = ("altitude", "horizontalAccuracy", "speed", "bearing")
+"""Values of a place that may be unknown."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +70,11 @@ class Reading:
     """One sample of one sensor.
 
     Attributes:
-        sensor: one of `SENSORS`, or `ORIENTATION`.
+        sensor: one of `SENSORS`, `ORIENTATION` or `LOCATION`.
         time_ns: time on the device's clock [ns].
-        value: reading in rad/s, m/s^2 or uT; for an attitude, the upward unit vector in B.
+        value: reading in rad/s, m/s^2 or uT; for an attitude, the upward unit vector in B; for the
+            barometer, one number in hPa; for a place, latitude and longitude [deg], altitude [m],
+            radius [m], speed [m/s] and bearing [deg], NaN where unknown.
     """
 
     sensor: str
@@ -79,12 +91,14 @@ class Batch:
         recording: the device's name for the recording; empty if it gives none.
         readings: readings in order of arrival.
         number: place of a push among those of its recording; -1 if it gives none.
+        places: places by the satellite receiver; their times, perhaps minutes old, decide nothing.
     """
 
     device: str
     recording: str
     readings: list[Reading]
     number: int = -1
+    places: list[Reading] = field(default_factory=list)
 
 
 def parse_push(body: bytes) -> Batch:
@@ -104,11 +118,13 @@ def parse_push(body: bytes) -> Batch:
         raise InputError("payload", found, f"at most {MAX_ENTRIES}", "choose a shorter period")
     device = _name("deviceId", message.get("deviceId"))
     recording = _name("sessionId", message.get("sessionId", ""), needed=False)
-    readings = [
+    known = [
         reading
         for k, entry in enumerate(payload)
         if (reading := _pushed(f"payload[{k}]", _object(f"payload[{k}]", entry))) is not None
     ]
+    readings = [reading for reading in known if reading.sensor != LOCATION]
+    places = [reading for reading in known if reading.sensor == LOCATION]
     times = [reading.time_ns for reading in readings]
     if times and max(times) - min(times) > MAX_SPAN:
         found = f"times {(max(times) - min(times)) / 1e9:.3g} s apart"
@@ -117,7 +133,7 @@ def parse_push(body: bytes) -> Batch:
     number = message.get("messageId")
     if not recording or type(number) is not int:
         number = -1
-    return Batch(device, recording, readings, number)
+    return Batch(device, recording, readings, number, places)
 
 
 def _check_unit(readings: list[Reading]) -> None:
@@ -172,6 +188,7 @@ def joined(batches: Iterable[Batch]) -> list[Batch]:
         key = (batch.device, batch.recording, -1)
         if merged and (merged[-1].device, merged[-1].recording, batch.number) == key:
             merged[-1].readings.extend(batch.readings)
+            merged[-1].places.extend(batch.places)
         else:
             merged.append(batch)
     return merged
@@ -199,9 +216,9 @@ def _pushed(where: str, entry: Mapping[str, Any]) -> Reading | None:
         raise InputError(f"{where}.name", _describe(name), "a sensor name")
     sensor = name.lower()
     values = entry.get("values", entry)
-    if sensor == ORIENTATION:
-        return _vertical(entry.get("time"), values)
-    if sensor not in SENSORS:
+    if sensor in _OPTIONAL:
+        return _optional(sensor, entry.get("time"), values)
+    if sensor not in _AXES:
         return None
     time_ns = _nanoseconds(f"{where}.time", entry.get("time"))
     axes = _object(f"{where}.values", values)
@@ -212,17 +229,37 @@ def _pushed(where: str, entry: Mapping[str, Any]) -> Reading | None:
     )
 
 
-def _vertical(time: Any, values: Any) -> Reading | None:
-    """Return the vertical from the phone's attitude; None if invalid, since no track needs it."""
+def _optional(sensor: str, time: Any, values: Any) -> Reading | None:
+    """Parse a sensor that no track needs; None if its values are invalid."""
     try:
-        x, y, z, w = (number_from("q", values.get(f"q{axis}")) for axis in "xyzw")
-        time_ns = _nanoseconds("time", time)
-    except (InputError, AttributeError):
+        value = _OPTIONAL[sensor](_object("values", values))
+        return Reading(sensor, _nanoseconds("time", time), value)
+    except InputError:
         return None
-    if abs(x * x + y * y + z * z + w * w - 1.0) > _NORM_TOLERANCE:
-        return None
-    up_B = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
-    return Reading(ORIENTATION, time_ns, up_B)
+
+
+def _vertical(values: Mapping[str, Any]) -> Vector:
+    """Return the vertical in B from the phone's attitude."""
+    x, y, z, w = (number_from("q", values.get(f"q{axis}")) for axis in "xyzw")
+    if abs((norm := x * x + y * y + z * z + w * w) - 1.0) > _NORM_TOLERANCE:
+        raise InputError("q", f"norm {norm:.3g}", "a unit quaternion")
+    return 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+
+
+def _pressure(values: Mapping[str, Any]) -> Vector:
+    return (number_from("pressure", values.get("pressure")),)
+
+
+def _place(values: Mapping[str, Any]) -> Vector:
+    latlon_deg = (number_from(name, values.get(name)) for name in ("latitude", "longitude"))
+    return *latlon_deg, *(_number_or_nan(values.get(name)) for name in _LOCATION_REST)
+
+
+_OPTIONAL: dict[str, Callable[[Mapping[str, Any]], Vector]] = {
+    ORIENTATION: _vertical,
+    BAROMETER: _pressure,
+    LOCATION: _place,
+}
 
 
 def _object(where: str, value: Any) -> Mapping[str, Any]:
@@ -287,6 +324,13 @@ def number_from(where: str, value: Any) -> float:
     if not math.isfinite(number):
         raise InputError(where, "no finite number", "a finite number")
     return number
+
+
+def _number_or_nan(value: Any) -> float:
+    try:
+        return number_from("value", value)
+    except InputError:
+        return math.nan
 
 
 def _describe(value: Any) -> str:

@@ -16,6 +16,7 @@ from urllib.parse import quote, urlsplit
 
 from stario.fusion.live.hub import Hub
 from stario.fusion.live.payload import (
+    BAROMETER,
     GRAVITY,
     GYRO,
     LINEAR,
@@ -32,12 +33,15 @@ PERIOD = 0.2
 """Interval between two requests [s]."""
 
 _SENSORS = {
-    "gyroscope": GYRO,
-    "accelerometer": TOTAL,
-    "magnetic_field": MAG,
-    "linear_acceleration": LINEAR,
-    "gravity": GRAVITY,
+    "gyroscope": (GYRO, "xyz"),
+    "accelerometer": (TOTAL, "xyz"),
+    "magnetic_field": (MAG, "xyz"),
+    "linear_acceleration": (LINEAR, "xyz"),
+    "gravity": (GRAVITY, "xyz"),
+    "pressure": (BAROMETER, "x"),
 }
+"""Sensors and their outputs beside the time, by phyphox's names."""
+
 _TIMEOUT = 3.0
 _RETRY_SECONDS = 2.0
 _LARGEST = 1e9
@@ -64,7 +68,7 @@ class Phyphox:
             raise InputError("phyphox", repr(address), "an address such as 192.168.0.7:8080")
         self.device = f"phyphox {url.netloc}"
         self._root = f"http://{url.netloc}"
-        self._buffers: dict[str, tuple[str, str, str, str]] = {}
+        self._buffers: dict[str, tuple[str, ...]] = {}
         self._newest: dict[str, float] = {}
         self._session = ""
         self._restarts, self._measuring = 0, True
@@ -137,8 +141,7 @@ class Phyphox:
             if t <= self._newest.get(sensor, -1.0) or max(map(abs, value)) > MAX_READING:
                 continue
             self._newest[sensor] = t
-            x, y, z = value
-            readings.append(Reading(sensor, round(1e9 * t), (x, y, z)))
+            readings.append(Reading(sensor, round(1e9 * t), tuple(value)))
         return readings
 
     def _get(self, path: str) -> Mapping[str, Any]:
@@ -146,22 +149,23 @@ class Phyphox:
             return object_from("phyphox", response.read(_MAX_RESPONSE_BYTES))
 
 
-def buffers_of(config: Mapping[str, Any]) -> dict[str, tuple[str, str, str, str]]:
-    """Return the names of the time, x, y and z buffers by sensor from phyphox's `/config`.
+def buffers_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
+    """Return the names of the buffers of time and values by sensor from phyphox's `/config`.
 
     Raises:
         InputError: the experiment lacks the gyroscope or the acceleration with g.
     """
-    found = {}
+    found: dict[str, tuple[str, ...]] = {}
     inputs = config.get("inputs")
     for source in inputs if isinstance(inputs, list) else []:
-        sensor = _SENSORS.get(str(source.get("source"))) if isinstance(source, dict) else None
-        if sensor is None:
+        known = _SENSORS.get(str(source.get("source"))) if isinstance(source, dict) else None
+        if known is None:
             continue
+        sensor, axes = known
         outputs = {k: v for output in source.get("outputs", []) for k, v in output.items()}
-        if all(isinstance(outputs.get(key), str) for key in "txyz"):
-            t, x, y, z = (outputs[key] for key in "txyz")
-            found[sensor] = (t, x, y, z)
+        names = [outputs.get(key) for key in f"t{axes}"]
+        if all(isinstance(name, str) for name in names):
+            found[sensor] = tuple(map(str, names))
     if GYRO not in found or not (TOTAL in found or {LINEAR, GRAVITY} <= set(found)):
         present = ", ".join(found) or "neither"
         raise InputError(

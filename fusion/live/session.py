@@ -141,6 +141,7 @@ class Session:
             "file": None if track.path is None else track.path.name,
             "problem": track.problem(),
             "health": track.words,
+            "floor": track.floor,
         }
 
     def _is_new(self, batch: Batch) -> bool:

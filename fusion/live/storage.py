@@ -8,6 +8,7 @@ receipt, does not come from the device: a truncated line lacks it and can thus b
 from __future__ import annotations
 
 import errno
+import math
 import os
 import re
 from collections.abc import Sequence
@@ -16,14 +17,26 @@ from pathlib import Path
 from typing import BinaryIO
 
 from stario.fusion.fixes import Fix
-from stario.fusion.live.merging import Field, Sample
+from stario.fusion.live.merging import Sample
+from stario.fusion.live.payload import BAROMETER, LOCATION, MAG, Reading
 from stario.sequences.errors import InputError
+from stario.sequences.readers.columns import MAGNETIC_HEADER, PRESSURE_HEADER, SATELLITE_HEADER
+
+_ASIDE = {
+    MAG: MAGNETIC_HEADER.split(","),
+    BAROMETER: [PRESSURE_HEADER],
+    LOCATION: [*SATELLITE_HEADER.values()],
+}
+"""Columns of sensors that may start later; their readings have rows of their own."""
 
 HEADER = (
     "t [ns],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2],"
-    "mx [uT],my [uT],mz [uT],received [unix s]\n"
+    f"{','.join(title for titles in _ASIDE.values() for title in titles)},received [unix s]\n"
 )
-"""Header; a magnetometer, which may start later, has rows of its own."""
+"""Header of a recording."""
+
+_NO_IMU = "," * 6
+_NO_ASIDE = "," * (sum(map(len, _ASIDE.values())) - 1)
 
 FIXES_HEADER = "t,kind,x,y,z,sx,sy,sz\n"
 
@@ -53,17 +66,17 @@ class LiveFile:
         self.fixes_path = self.path.with_name(f"{self.path.stem}-fixes.csv")
 
     def append(
-        self, samples: Sequence[Sample], received: float, fields: Sequence[Field] = ()
+        self, samples: Sequence[Sample], received: float, aside: Sequence[Reading] = ()
     ) -> None:
-        """Append samples and magnetic fields received at a time [s since 1970].
+        """Append samples, and readings of other sensors, received at a time [s since 1970].
 
         Raises:
             OSError: they could not all be written; the file is then unchanged.
         """
         end = f"{received:.3f}\n"
-        rows = [f"{time},,,,,,,{m[0]!r},{m[1]!r},{m[2]!r},{end}" for time, m in fields]
+        rows = [f"{reading.time_ns}{_NO_IMU},{_cells(reading)},{end}" for reading in aside]
         rows += [
-            f"{time},{g[0]!r},{g[1]!r},{g[2]!r},{a[0]!r},{a[1]!r},{a[2]!r},,,,{end}"
+            f"{time},{g[0]!r},{g[1]!r},{g[2]!r},{a[0]!r},{a[1]!r},{a[2]!r},{_NO_ASIDE},{end}"
             for time, g, a in samples
         ]
         _write_whole(self._file, "".join(rows).encode())
@@ -80,6 +93,15 @@ class LiveFile:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+def _cells(reading: Reading) -> str:
+    """Return a reading in the columns of `_ASIDE`, blank where it is unknown."""
+    cells: list[str] = []
+    for sensor, titles in _ASIDE.items():
+        values = reading.value if sensor == reading.sensor else [math.nan] * len(titles)
+        cells += ["" if math.isnan(value) else repr(value) for value in values]
+    return ",".join(cells)
 
 
 def _write_whole(file: BinaryIO, data: bytes) -> None:

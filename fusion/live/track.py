@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 
 from stario.fusion.fixes import position_fix
+from stario.fusion.floors import floor_at
 from stario.fusion.live.drawn import DisplayedTrack
-from stario.fusion.live.merging import MAX_WAIT, Field, Merger, Sample
-from stario.fusion.live.payload import Batch, Vector
+from stario.fusion.live.merging import MAX_WAIT, Merger, Sample
+from stario.fusion.live.payload import BAROMETER, MAG, Batch, Reading, Vector
 from stario.fusion.live.storage import LiveFile
 from stario.fusion.live.times import with_credible_time
 from stario.fusion.navigator import Navigator
@@ -27,6 +28,9 @@ _MAX_UNWRITTEN = 6000
 """Maximum number of samples kept for the next attempt to write: a minute of a phone's."""
 
 _HEALTH_SECONDS = 1.0
+
+_FLOOR_SECONDS = 4.0
+"""Time for which the height must have changed no more for a climb to be over [s]."""
 
 _MANY_ALONE = 100
 """Number of readings of the gyroscope without acceleration that is a problem, if it is most."""
@@ -53,6 +57,7 @@ class LiveTrack:
     Attributes:
         drawn: displayed track.
         words: what stands out in the navigator's health, in words.
+        floor: the floor above that of the start, in words; empty without a barometer.
         samples: number of samples processed.
         rate: their rate [Hz], smoothed over some batches.
         fixes: number of fixes applied.
@@ -63,13 +68,14 @@ class LiveTrack:
         self._device, self._folder, self._navigator = device, folder, navigator
         self._merger, self._factor = Merger(), 1.0
         self._file: LiveFile | None = None
-        self._unwritten: tuple[list[Sample], list[Field]] = [], []
+        self._unwritten: tuple[list[Sample], list[Reading]] = [], []
         self._first_ns = self._newest_ns = -1
         self._push_error = self._write_error = ""
         self._health_time = self._error_time = -math.inf
         self._stray = self._lost = 0
         self.drawn = DisplayedTrack()
         self.words: list[dict[str, str]] = []
+        self.floor = ""
         self.samples = self.fixes = self.delayed = 0
         self.rate = 0.0
 
@@ -95,17 +101,18 @@ class LiveTrack:
         readings = with_credible_time(batch)
         self._stray += len(batch.readings) - len(readings)
         self._factor = accel_factor
-        samples = [
+        samples: list[Sample] = [
             (time, gyro, (accel_factor * a[0], accel_factor * a[1], accel_factor * a[2]))
             for time, gyro, a in self._merger.add(readings)
         ]
         # Samples wait until they are on disk: when a failed push is repeated, they count as late.
         samples = [*self._unwritten[0], *samples]
+        self._merger.add_places(batch.places)
         if not samples:
             return 0
-        fields = [*self._unwritten[1], *self._merger.fields()]
-        self._write(samples, received, fields)
-        self._navigate(samples, fields)
+        aside = [*self._unwritten[1], *self._merger.aside()]
+        self._write(samples, received, aside)
+        self._navigate(samples, aside)
         self._count(samples[0][0], samples[-1][0], len(samples))
         return len(samples)
 
@@ -178,34 +185,41 @@ class LiveTrack:
         counts = dropped | {"late": late, "wrong time": self._stray, "not written": self._lost}
         return {reason: count for reason, count in counts.items() if count}
 
-    def _write(self, samples: list[Sample], received: float, fields: list[Field]) -> None:
+    def _write(self, samples: list[Sample], received: float, aside: list[Reading]) -> None:
         """Write to disk, or keep for the next attempt as much as memory allows."""
         try:
             if self._file is None:
                 self._file = LiveFile(self._folder, self._device)
-            self._file.append(samples, received, fields)
+            self._file.append(samples, received, aside)
         except (OSError, InputError) as error:
             self._write_error = f"the recording cannot be written: {error}"
             self._lost += max(0, len(samples) - _MAX_UNWRITTEN)
-            self._unwritten = samples[-_MAX_UNWRITTEN:], fields[-_MAX_UNWRITTEN:]
+            self._unwritten = samples[-_MAX_UNWRITTEN:], aside[-_MAX_UNWRITTEN:]
             raise
         self._write_error, self._unwritten = "", ([], [])
 
-    def _navigate(self, samples: list[Sample], fields: Iterable[Field]) -> None:
-        """Pass samples and fields to the navigator in the order of their times."""
+    def _navigate(self, samples: list[Sample], aside: Sequence[Reading]) -> None:
+        """Pass samples, fields and pressures to the navigator in the order of their times."""
         if self._first_ns < 0:
             self._first_ns = samples[0][0]
-        pending = deque(fields)
+        pending = deque(aside)
         for time_ns, gyro, accel in samples:
-            while pending and pending[0][0] <= time_ns:
-                self._push_field(*pending.popleft())
+            while pending and pending[0].time_ns <= time_ns:
+                self._push_aside(pending.popleft())
             self._push(time_ns, gyro, accel)
-        for time_ns, field in pending:  # ahead of the samples, which wait for the accelerometer
-            self._push_field(time_ns, field)
+        for reading in pending:  # ahead of the samples, which wait for the accelerometer
+            self._push_aside(reading)
         self._update_health(self._seconds(samples[-1][0]))  # with or without a position
 
-    def _push_field(self, time_ns: int, field: Vector) -> None:
-        self._navigator.push_magnetometer(self._seconds(time_ns), field)
+    def _push_aside(self, reading: Reading) -> None:
+        time = self._seconds(reading.time_ns)
+        if reading.sensor == MAG:
+            self._navigator.push_magnetometer(time, reading.value)
+        if reading.sensor == BAROMETER:
+            try:
+                self._navigator.push_pressure(time, *reading.value)
+            except InputError as error:  # in another unit
+                self._push_error, self._error_time = str(error), time
 
     def _push(self, time_ns: int, gyro: Vector, accel: Vector) -> None:
         try:
@@ -234,6 +248,11 @@ class LiveTrack:
         health, late = self._navigator.health, self.dropped().get("late", 0)
         # The navigator never sees them; if the clock was set back a little, it sees no gap either.
         health = replace(health, samples=health.samples | {"late": late})
+        floor = ""  # as well when the stream began again and has no pressure yet
+        if health.pressures:
+            health.floors = self.drawn.floor_changes()
+            floor = _floor_words(floor_at(health.floors, time - _FLOOR_SECONDS))
+        self.floor = floor
         self.words = [asdict(finding) for finding in verdict(health_findings(health))]
 
     def _count(self, first_ns: int, last_ns: int, count: int) -> None:
@@ -251,3 +270,9 @@ class LiveTrack:
         if state is None:
             raise InputError(self._device, "no position yet", "a second of samples first")
         return state
+
+
+def _floor_words(floor: int | None) -> str:
+    if floor is None:
+        return "between floors"
+    return f"floor {floor:+d}" if floor else "floor 0"

@@ -2,6 +2,7 @@
 
 import importlib.util
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ import pytest
 from stario.fusion import Navigator, demonstration
 from stario.fusion.live.run import LiveServer
 from stario.network import load_model
-from stario.sequences import read_recording
+from stario.sequences import Barometer, read_recording
+from stario.sequences.units import METRES_PER_HPA
 
 from .conftest import DESKTOP, PHONE
 
@@ -65,6 +67,20 @@ def test_page_draws_two_phones_and_ends_where_a_run_on_their_files_does(show, se
     assert not shown.page.is_visible("#local")
     assert shown.page.locator("#map a[href=x]").count() == 0
     assert not shown.overflows()
+    assert shown.problems == []
+
+
+def test_height_and_floor_of_a_phone_with_a_barometer_are_shown(show, server, replay):
+    walk = demonstration()
+    height = np.interp(walk.time - walk.time[0], [5.0, 15.0], [0.0, 3.0])
+    air = Barometer(walk.time[::10], 1000.0 - height[::10] / METRES_PER_HPA)
+    url = f"http://127.0.0.1:{server.port}"
+    replay(replace(walk, barometer=air), f"{url}/data", 10.0, 22.0, "emil")
+    shown = show(url)
+    box = shown.page.locator("[data-device=emil] .figures div", has_text="height")
+    box.get_by_text("height, floor +1").wait_for()
+    metres = float(box.locator("b").inner_text().removesuffix(" m"))
+    assert metres == pytest.approx(3.0, abs=0.5)
     assert shown.problems == []
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from stario.fusion.live.phyphox import Phyphox, buffers_of
+from stario.fusion.live.session import Session
 from stario.sequences import InputError, read_recording
 
 CONFIG = {
@@ -20,12 +21,15 @@ CONFIG = {
     ]
 }  # fmt: skip
 
+PRESSURE = {"source": "pressure", "outputs": [{"x": "p"}, {"t": "p t"}]}
+
 
 class FakePhone:
     """An experiment whose buffers are requested as from phyphox: whole, last values or ends."""
 
     def __init__(self, walk):
         self.walk, self.count, self.measuring, self.cleared = walk, 0, True, False
+        self.config = CONFIG
 
     def clear(self):
         """Empty the buffers; the next answer is whole, so that this is noticed."""
@@ -35,7 +39,7 @@ class FakePhone:
         """Answer a request."""
         url = urlsplit(path)
         if url.path == "/config":
-            return CONFIG
+            return self.config
         columns, buffers = self._columns(), {}
         for name, asked in parse_qsl(url.query, keep_blank_values=True):
             since, _, by = asked.partition("|")
@@ -56,6 +60,8 @@ class FakePhone:
         for k, axis in enumerate("xyz"):
             columns[f"g{axis.upper()}"] = self.walk.gyro[known, k]
             columns[f"acc {axis}"] = self.walk.accel[known, k]
+        columns["p t"] = self.walk.time[known][::10]
+        columns["p"] = 1000.0 - 0.01 * columns["p t"]
         return columns
 
 
@@ -95,6 +101,20 @@ def test_a_phone_is_polled_until_all_samples_are_recorded(serve, fake):
         recording = read_recording(sessions[device].track.path)
         np.testing.assert_array_equal(recording.accel, fake.walk.accel[: len(recording)])
         listener.shutdown()
+
+
+def test_the_pressure_of_an_experiment_that_has_it_is_recorded(
+    phone, fake, tmp_path, new_navigator
+):
+    fake.config = {"inputs": [*CONFIG["inputs"], PRESSURE]}
+    session = Session(phone.device, tmp_path, new_navigator)
+    for fake.count in range(50, 501, 50):
+        session.take(phone.fetch(), 1.7e9)
+    session.close()
+    known = read_recording(session.track.path).barometer
+    np.testing.assert_allclose(known.time, 0.1 * np.arange(50), atol=1e-6)
+    np.testing.assert_allclose(known.pressure_hPa, 1000.0 - 0.001 * np.arange(50))
+    assert session.status()["floor"] == "floor 0"
 
 
 def test_an_experiment_without_both_sensors_is_refused():

@@ -1,0 +1,122 @@
+"""Pressures and places that phones push: heights, floors, and what the recording keeps of them."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from stario.sequences import read_recording
+from stario.sequences.units import METRES_PER_HPA
+
+LATLON = 48.137, 11.575
+
+
+def climb(time: float) -> float:
+    """Height [m] of stairs of ten seconds, one floor up."""
+    return float(np.interp(time, [4.0, 14.0], [0.0, 3.0]))
+
+
+def added(bodies, name, values):
+    """Pushes with one more entry in each, whose values depend on the time since the first [s]."""
+    for number, body in enumerate(bodies):
+        message = json.loads(body)
+        entry = {
+            "name": name,
+            "time": message["payload"][0]["time"],
+            "values": values(0.2 * number),
+        }
+        message["payload"].append(entry)
+        yield json.dumps(message).encode()
+
+
+def pressure(time: float) -> dict[str, float]:
+    return {"pressure": 950.0 - climb(time) / METRES_PER_HPA, "relativeAltitude": 99.0}
+
+
+def place(time: float) -> dict[str, float | None]:
+    latitude, longitude = LATLON
+    rest = {"horizontalAccuracy": 5.0, "altitude": 520.0, "speed": None, "bearing": -1}
+    return {"latitude": latitude + 1e-6 * time, "longitude": longitude} | rest
+
+
+def send(client, bodies):
+    return [client.post("/data", content=body).status_code for body in bodies]
+
+
+def test_pushed_pressures_change_height_and_floor(client, hub, pushes):
+    send(client, added(pushes("stairs"), "barometer", pressure))
+    send(client, pushes("level"))
+    heights, floors = {}, {}
+    for name in ("stairs", "level"):
+        session = hub.sessions[name]
+        heights[name] = session.track.drawn.points[-1][3]
+        floors[name] = session.status()["floor"]
+    assert heights["stairs"] - heights["level"] == pytest.approx(3.0, abs=0.5)
+    assert floors == {"stairs": "floor +1", "level": ""}
+    words = [word["text"] for word in hub.sessions["stairs"].status()["health"]]
+    assert any(text.startswith("Floor 0 to 1 by stairs") for text in words)
+
+
+def test_while_one_climbs_no_floor_is_claimed(client, hub, pushes):
+    shown = []
+    for body in added(pushes(), "barometer", pressure):
+        send(client, [body])
+        shown.append(hub.sessions["phone"].status()["floor"])
+    assert list(dict.fromkeys(shown)) == ["", "floor 0", "between floors", "floor +1"]
+
+
+def test_pressures_and_places_are_kept_and_read_back(client, hub, pushes, new_navigator):
+    bodies = added(added(pushes(), "barometer", pressure), "location", place)
+    send(client, bodies)
+    session = hub.sessions["phone"]
+    recording = read_recording(session.track.path)
+    times = 0.2 * np.arange(len(recording.barometer.time))
+    assert len(times) == 101
+    np.testing.assert_allclose(recording.barometer.time, times, atol=1e-6)
+    expected = [pressure(time)["pressure"] for time in times]
+    np.testing.assert_array_equal(recording.barometer.pressure_hPa, expected)
+    satellites = recording.satellites
+    np.testing.assert_allclose(satellites.latlon_deg, [[48.137 + 1e-6 * t, 11.575] for t in times])
+    np.testing.assert_array_equal(satellites.radius_m, 5.0)
+    np.testing.assert_array_equal(satellites.altitude_m, 520.0)
+    assert satellites.speed_m_s is None
+    assert satellites.bearing_deg is None
+    track = new_navigator().run(recording).filtered
+    np.testing.assert_allclose(
+        session.track.drawn.points[-1][1:4], track.trajectory.position_W[-1], atol=1e-5
+    )
+
+
+def test_an_old_or_repeated_place_neither_refuses_nor_divides_a_recording(client, hub, pushes):
+    """A phone's first place may be one of an hour ago, repeated until there is another."""
+    old = []
+    for body in added(pushes(seconds=4.0), "location", place):
+        message = json.loads(body)
+        message["payload"][-1]["time"] = 10**18 - 3600 * 10**9
+        old.append(json.dumps(message).encode())
+    assert set(send(client, old)) == {200}
+    session = hub.sessions["phone"]
+    assert session.track.samples == 400
+    assert session.status()["dropped"] == {}
+    recording = read_recording(session.track.path)
+    assert (len(recording), recording.duration) == (400, pytest.approx(3.99))
+    assert len(recording.satellites.time) == 1
+
+
+def test_pressure_in_another_unit_is_told_and_the_track_goes_on(client, hub, pushes):
+    bodies = added(
+        pushes(seconds=4.0), "barometer", lambda t: {"pressure": 100 * pressure(t)["pressure"]}
+    )
+    send(client, bodies)
+    session = hub.sessions["phone"]
+    assert "convert from Pa to hPa" in session.status()["problem"]
+    assert session.track.drawn.points[-1][0] > 3.5
+
+
+@pytest.mark.parametrize("values", [{}, {"pressure": None}, {"pressure": "x"}, [1013.0]])
+def test_a_barometer_without_pressure_refuses_no_push(client, hub, pushes, values):
+    bodies = added(pushes(seconds=1.0), "barometer", lambda _: values)
+    assert set(send(client, bodies)) == {200}
+    assert read_recording(hub.sessions["phone"].track.path).barometer is None
