@@ -153,7 +153,7 @@ def _curve(
 
 
 def _floor_lines(series: Series, floors: Sequence[FloorChange]) -> list[go.Scatter]:
-    """Return a dotted line along each stay on a floor, with the floor's number."""
+    """Return a dotted line along each stay on a floor, with its number; the first says of what."""
     if not floors:
         return []
     starts = [float(series.time[0]), *(change.stop for change in floors)]
@@ -169,7 +169,7 @@ def _floor_lines(series: Series, floors: Sequence[FloorChange]) -> list[go.Scatt
                 x=[start, stop],
                 y=[level, level],
                 mode="lines+text",
-                text=[f"floor {floor}"],
+                text=[str(floor) if lines else f"floor {floor}"],
                 textposition="top right",
                 line={"color": FAINT, "dash": "dot", "width": 1},
                 hoverinfo="skip",
