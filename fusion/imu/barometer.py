@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stario.fusion.imu.buffers import TimedBuffer
+from stario.sequences.atmosphere import pressure_altitude
 from stario.sequences.sequence import FloatArray
 
 PRESSURE_RANGE = (300.0, 1100.0)
@@ -83,15 +84,6 @@ class HeightSample(NamedTuple):
     rate: float = 0.0
     risen: float = 0.0
     stepped: float = 0.0
-
-
-def pressure_altitude(pressure_hPa: FloatArray) -> FloatArray:
-    """Return altitudes (N,) in the standard atmosphere [m], 8.4 m/hPa at the sea's level.
-
-    Differences are as much too small as the air is warmer than 15 degrees less 6.5 per kilometre:
-    2 % in a room. ISO 2533.
-    """
-    return np.asarray(44330.77 * (1.0 - (pressure_hPa / 1013.25) ** 0.1902632))
 
 
 @dataclass(frozen=True, eq=False)

@@ -158,7 +158,7 @@ def _floor_lines(series: Series, floors: Sequence[FloorChange]) -> list[go.Scatt
         return []
     starts = [float(series.time[0]), *(change.stop for change in floors)]
     stops = [*(change.start for change in floors), float(series.time[-1])]
-    lines = []
+    lines: list[go.Scatter] = []
     for start, stop, floor in zip(starts, stops, [0, *(c.after for c in floors)], strict=True):
         inside = (series.time >= start) & (series.time <= stop)
         if not inside.any():

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.sequences.arrays import generator
+from stario.sequences.atmosphere import standard_pressure
 from stario.sequences.sequence import Barometer, FloatArray, Trajectory
 from stario.sequences.settings import check_number
 from stario.sequences.simulation.routes import smoothed
@@ -48,11 +49,6 @@ class Air:
 
 USUAL_AIR = Air()
 """A phone's barometer in changing weather and a house with ventilation."""
-
-
-def standard_pressure(altitude: FloatArray) -> FloatArray:
-    """Return the pressure [hPa] of the international standard atmosphere at altitudes [m]."""
-    return np.asarray(1013.25 * (1.0 - altitude / 44_330.77) ** 5.25588)
 
 
 def simulate_barometer(

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from stario.fusion.imu.barometer import HeightBuffer, HeightSample, pressure_altitude
-from stario.sequences.simulation.barometer import standard_pressure
+from stario.fusion.imu.barometer import HeightBuffer, HeightSample
+from stario.sequences.atmosphere import pressure_altitude, standard_pressure
 
 RATE = 8.0
 

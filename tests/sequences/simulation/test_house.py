@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.atmosphere import standard_pressure
 from stario.sequences.errors import InputError
 from stario.sequences.geodesy import east_north
 from stario.sequences.sequence import BoolArray, FloatArray, Trajectory
-from stario.sequences.simulation.barometer import Air, simulate_barometer, standard_pressure
+from stario.sequences.simulation.barometer import Air, simulate_barometer
 from stario.sequences.simulation.house import SHORTEST, HouseWalk, simulate_house
 from stario.sequences.simulation.receiver import Sky, simulate_satellites
 from stario.sequences.simulation.walks import WalkStyle
