@@ -41,7 +41,7 @@ def main(folder: Path, seconds: float = 20.0) -> tuple[list[Scores], list[Skippe
     for seed, path in enumerate(paths):
         write_csv(path, simulate_imu(generate_walk(seed, seconds), 100.0, seed=seed))
     paths[2].write_text("t,gx,gy,gz,ax,ay,az\n0,0,0,0,0,0\n")
-    workers = LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+    workers = LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0")
     with workers as cluster, Client(cluster) as client:
         client.get_task_stream()  # from here on the scheduler records which worker computes what
         scores, skipped = evaluate(paths, client)
