@@ -41,7 +41,7 @@ _STEP_RATE_POWER = 0.3
 
 _EFFORT_POWER = 1.2
 """Exponent of the speed in the accelerations: on stiff legs the trunk rises by the square of the
-step's length, hence v^2; knees that give leave 1.0 to 1.4 (tyrex, RIDI, KIPD)."""
+step's length, hence v^2; knees that give leave 0.8 to 1.4 of most ways (tyrex, RIDI, KIPD)."""
 
 _CHANGE = 0.6
 """Standard deviation of the Gaussian that smooths the change of carrying mode [s]."""
