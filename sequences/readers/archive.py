@@ -173,6 +173,8 @@ def read_archive(path: Path) -> ImuSequence:
 
 def _sequence(path: Path, name: str, group: Any) -> ImuSequence:
     truth, positions = _truth(path, group)
+    field = _samples(path, group, "mag", "field", 3)
+    pressure = _samples(path, group, "pressure", "hPa")
     time = _column(path, group, "imu/t", finite=False)
     return ImuSequence(
         name=name,
@@ -181,40 +183,32 @@ def _sequence(path: Path, name: str, group: Any) -> ImuSequence:
         accel=_column(path, group, "imu/accel", (len(time), 3), finite=False),
         truth=truth,
         converted=frozenset({"gyro", "accel", "sign"}),
-        magnetometer=_magnetometer(path, group),
+        magnetometer=None if field is None else Magnetometer(*field),
         positions=positions,
         device_attitude=_device_attitude(path, group),
-        barometer=_barometer(path, group),
+        barometer=None if pressure is None else Barometer(*pressure),
         satellites=_satellites(path, group),
         attributes=_attributes(group),
     )
 
 
-def _magnetometer(path: Path, group: Any) -> Magnetometer | None:
-    if "mag" not in group:
+def _samples(
+    path: Path, group: Any, stem: str, name: str, *columns: int
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return times (N,) that increase and values (N, *columns) of a sensor; None without it."""
+    if stem not in group:
         return None
-    time = _column(path, group, "mag/t")
-    field = _column(path, group, "mag/field", (len(time), 3))
+    time = _column(path, group, f"{stem}/t")
+    values = _column(path, group, f"{stem}/{name}", (len(time), *columns))
     keep = increasing_mask(time)
-    return Magnetometer(time[keep], field[keep])
+    return time[keep], values[keep]
 
 
 def _device_attitude(path: Path, group: Any) -> DeviceAttitude | None:
-    if "attitude" not in group:
+    found = _samples(path, group, "attitude", "quat_xyzw", 4)
+    if found is None:
         return None
-    time = _column(path, group, "attitude/t")
-    quat = _column(path, group, "attitude/quat_xyzw", (len(time), 4))
-    keep = increasing_mask(time)
-    return DeviceAttitude(time[keep], rotations(path, "attitude/quat_xyzw", quat[keep], "xyzw"))
-
-
-def _barometer(path: Path, group: Any) -> Barometer | None:
-    if "pressure" not in group:
-        return None
-    time = _column(path, group, "pressure/t")
-    pressure_hPa = _column(path, group, "pressure/hPa", (len(time),))
-    keep = increasing_mask(time)
-    return Barometer(time[keep], pressure_hPa[keep])
+    return DeviceAttitude(found[0], rotations(path, "attitude/quat_xyzw", found[1], "xyzw"))
 
 
 def _satellites(path: Path, group: Any) -> Satellites | None:
