@@ -58,8 +58,8 @@ def used_positions(
     positions: PositionTrack | None, satellites: bool, place: PlaceConfig
 ) -> PositionTrack | None:
     """Return the known positions that are used as fixes, but not those of `satellites`."""
-    of_satellites = satellites and positions is not None and positions.kind == "positions"
-    return positions if place.waypoints == "use" and not of_satellites else None
+    used = place.waypoints == "use" and not _of_satellites(positions, satellites)
+    return positions if used else None
 
 
 def compared_with(sequence: ImuSequence, place: PlaceConfig) -> PositionTrack | None:
@@ -67,8 +67,13 @@ def compared_with(sequence: ImuSequence, place: PlaceConfig) -> PositionTrack | 
     positions, satellites = sequence.positions, sequence.satellites is not None
     if used_positions(positions, satellites, place) is not None:
         return None
-    of_satellites = satellites and positions is not None and positions.kind == "positions"
+    of_satellites = _of_satellites(positions, satellites)
     return None if of_satellites and place.satellites != "compare" else positions
+
+
+def _of_satellites(positions: PositionTrack | None, satellites: bool) -> bool:
+    """Return whether known positions are those of the recording's `satellites`, if it has any."""
+    return satellites and positions is not None and positions.kind == "positions"
 
 
 def used_words(sequence: ImuSequence, place: PlaceConfig) -> tuple[str, ...]:
