@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from told import health_lines, told
 
-from stario.fusion import Navigator, PriorPose
+from stario.fusion import Navigator, NavigatorConfig, PriorPose
 from stario.fusion.imu.faults import ClockSetBackDetector, ClockSetBackError, OutlierDetector
+from stario.fusion.recording import cut_recording
 from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.sequence import ImuSequence
 
@@ -50,6 +51,29 @@ def test_a_spike_is_replaced_by_its_neighbours_mean_and_the_last_sample_by_the_o
     rows[[3, 6], 1] = 500.0, -500.0
     assert OutlierDetector().detect(rows).spikes == 2
     np.testing.assert_array_equal(rows[:, 1], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 5.0])
+
+
+@pytest.mark.parametrize("at", [0, 60, 73, 200])
+def test_a_spike_at_the_start_or_after_a_gap_tilts_nothing(make_walk: Make, at: int) -> None:
+    walk = make_walk(3, 4.0).without_truth()
+    kept = np.delete(np.arange(len(walk)), np.arange(120, 200))
+    gyro = walk.gyro.copy()
+    gyro[[at, at + 2]] = [[9e3, -7e3, 8e3], [-6e3, 5e3, 9e3]]
+
+    def attitudes(rates: np.ndarray) -> np.ndarray:
+        used = replace(walk, time=walk.time[kept], gyro=rates[kept], accel=walk.accel[kept])
+        intervals, _ = cut_recording(used, NavigatorConfig())
+        return np.array([interval.R_NB[2] for interval in intervals])
+
+    np.testing.assert_allclose(attitudes(gyro), attitudes(walk.gyro), atol=0.05)
+
+
+def test_zeros_of_an_accelerometer_are_no_free_fall(make_walk: Make, still_model: Any) -> None:
+    walk = make_walk(3, 4.0).without_truth()
+    accel = walk.accel.copy()
+    accel[250:260] = 0.0
+    health = Navigator(still_model).run(replace(walk, accel=accel)).health
+    assert health.samples["frozen"] == 10
 
 
 # --- a clock that is set back ----------------------------------------------------------------
