@@ -4,8 +4,6 @@ Each imitates an app's file names, headers, units and conventions; the walk is s
 values, signs and axes are known.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Writers of every published format for simulated walks: names, orders, units and quirks."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What inspection and health say, in words, for tests of what a user reads."""
 
-from __future__ import annotations
-
 from stario.fusion.health import Health
 from stario.fusion.report.health import health_findings
 from stario.sequences.findings import Finding, verdict

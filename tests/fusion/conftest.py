@@ -1,7 +1,5 @@
 """Simulated walks and a predictor that returns the ground truth, for tests of the navigator."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 from functools import lru_cache

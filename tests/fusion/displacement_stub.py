@@ -1,7 +1,5 @@
 """A predictor of a known share of a recording's true displacements, and its errors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Settings, error metrics and a faulty network, shared by tests of the navigator."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from stario.fusion import Navigator
-from stario.fusion.backends import BackendName
 from stario.sequences.sequence import ImuSequence
 
 Make = Callable[..., Any]
@@ -36,7 +35,7 @@ def memory_growth(navigator: Navigator, walk: ImuSequence, warm_up: float, secon
         tracemalloc.stop()
 
 
-def test_the_memory_of_a_stream_does_not_grow(make_walk: Make, still_model: Any) -> None:
+def test_the_memory_of_a_stream_does_not_grow(make_walk, still_model):
     growth = memory_growth(Navigator(still_model), make_walk(1, 30.0, RATE), 20.0, 30.0)
     # One number per sample.
     assert growth < BYTES_PER_NUMBER * RATE * 30.0
@@ -44,9 +43,7 @@ def test_the_memory_of_a_stream_does_not_grow(make_walk: Make, still_model: Any)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_the_memory_of_an_hours_stream_does_not_grow(
-    make_walk: Make, still_model: Any, backend: BackendName
-) -> None:
+def test_the_memory_of_an_hours_stream_does_not_grow(make_walk, still_model, backend):
     navigator = Navigator(still_model, backend=backend)
     growth = memory_growth(navigator, make_walk(1, 30.0, RATE), 120.0, 3600.0)
     # Half of one number per network update.

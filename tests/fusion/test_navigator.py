@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,7 @@ def track(walk: ImuSequence, make_oracle: Make) -> Track:
     return Navigator(make_oracle(walk, walk.truth, CONFIG), backend="ekf").run(walk)
 
 
-def test_results_print_without_their_arrays(track: Track, walk: ImuSequence, still_model) -> None:
+def test_results_print_without_their_arrays(track, walk, still_model):
     nis = f"mean NIS {track.nis:.2f}"
     assert repr(track) == f"Track(Trajectory(201 rows, 0.00 to 20.00 s at 10.0 Hz), {nis})"
     assert str(track.health).splitlines() == track.health.lines()
@@ -42,9 +41,7 @@ def test_results_print_without_their_arrays(track: Track, walk: ImuSequence, sti
         assert len(repr(pose)) < 80
 
 
-def test_the_states_of_a_stream_become_a_track_that_can_be_written(
-    walk: ImuSequence, still_model: Any, tmp_path: Path
-) -> None:
+def test_the_states_of_a_stream_become_a_track_that_can_be_written(walk, still_model, tmp_path):
     states = stream(Navigator(still_model), walk.slice(0.0, 4.0))
     written = Track.from_states(states).trajectory
     write_tum(tmp_path / "walk.tum", written)
@@ -67,9 +64,7 @@ def test_the_states_of_a_stream_become_a_track_that_can_be_written(
 
 
 @pytest.mark.parametrize("carry", ["handheld", "pocket"])
-def test_the_error_stays_far_below_that_of_dead_reckoning(
-    make_walk: Make, make_oracle: Make, carry: str
-) -> None:
+def test_the_error_stays_far_below_that_of_dead_reckoning(make_walk, make_oracle, carry):
     walk = make_walk(3, 30.0, carry=carry)
     navigator = Navigator(make_oracle(walk, walk.truth, CONFIG), CONFIG)
     preprocessed = navigator.observe(walk)
@@ -79,9 +74,7 @@ def test_the_error_stays_far_below_that_of_dead_reckoning(
     assert ate(track, walk) < 0.03 * alone
 
 
-def test_only_the_state_at_the_end_of_a_gap_is_invalid(
-    walk: ImuSequence, without: Make, still_model: Any
-) -> None:
+def test_only_the_state_at_the_end_of_a_gap_is_invalid(walk, without, still_model):
     """Where the device moved meanwhile is unknown until measurements follow."""
     gappy = without(walk, (walk.time > 8.0) & (walk.time < 9.5))
     for backend in ("ekf", "graph"):
@@ -89,7 +82,7 @@ def test_only_the_state_at_the_end_of_a_gap_is_invalid(
         assert track.time[~track.trajectory.valid] == pytest.approx([9.5], abs=0.01)
 
 
-def test_the_blocks_of_the_covariance_have_names() -> None:
+def test_the_blocks_of_the_covariance_have_names():
     covariance, zero = np.arange(225.0).reshape(15, 15), np.zeros(3)
     state = NavState(0.0, np.eye(3), zero, zero, zero, zero, covariance)
     names = ("attitude", "velocity", "position", "gyro_bias", "accel_bias")
@@ -100,7 +93,7 @@ def test_the_blocks_of_the_covariance_have_names() -> None:
         )
 
 
-def test_attitude_and_speed_are_estimated_too(walk: ImuSequence, track: Track) -> None:
+def test_attitude_and_speed_are_estimated_too(walk, track):
     aligned = align(track.trajectory, walk.truth, "first")
     errors = pose_errors(aligned, walk.truth)
     late = errors.estimate.time > 5.0
@@ -111,9 +104,7 @@ def test_attitude_and_speed_are_estimated_too(walk: ImuSequence, track: Track) -
 
 
 @pytest.mark.parametrize("rate", [50.0, 200.0, 500.0, 1000.0])
-def test_the_track_is_accurate_at_any_imu_rate(
-    make_walk: Make, make_oracle: Make, rate: float
-) -> None:
+def test_the_track_is_accurate_at_any_imu_rate(make_walk, make_oracle, rate):
     walk = make_walk(4, 12.0, rate)
     assert (
         ate(Navigator(make_oracle(walk, walk.truth, CONFIG), backend="ekf").run(walk), walk) < 0.2
@@ -121,16 +112,14 @@ def test_the_track_is_accurate_at_any_imu_rate(
 
 
 @pytest.mark.parametrize("update_rate", [1, 5, 20])
-def test_the_track_is_accurate_at_every_update_rate(
-    walk: ImuSequence, make_oracle: Make, update_rate: int
-) -> None:
+def test_the_track_is_accurate_at_every_update_rate(walk, make_oracle, update_rate):
     config = NavigatorConfig(filter=FilterConfig(update_rate=update_rate))
     track = Navigator(make_oracle(walk, walk.truth, config), config, backend="ekf").run(walk)
     assert ate(track, walk) < 0.3
     np.testing.assert_allclose(np.diff(track.time), 1.0 / config.filter.output_rate, atol=1e-9)
 
 
-def test_a_track_starts_at_the_prior_pose(walk: ImuSequence, make_oracle: Make) -> None:
+def test_a_track_starts_at_the_prior_pose(walk, make_oracle):
     """The prior sets yaw, position and velocity, none of which gravity determines."""
     truth = walk.truth
     shift = np.array([100.0, -50.0, 3.0])
@@ -145,9 +134,7 @@ def test_a_track_starts_at_the_prior_pose(walk: ImuSequence, make_oracle: Make) 
     assert stream_deviation(stream(navigator, walk), track.filtered) < 1e-9
 
 
-def test_position_nees_is_consistent_if_the_noise_model_is(
-    make_walk: Make, make_oracle: Make
-) -> None:
+def test_position_nees_is_consistent_if_the_noise_model_is(make_walk, make_oracle):
     """IMU and oracle have white errors of the stated size; windows do not overlap."""
     noise = ImuNoise(gyro_noise=1e-3, accel_noise=0.02, gyro_walk=3e-5, accel_walk=1e-3)
     errors = ImuErrors(noise=noise, gyro_turn_on=3e-3, accel_turn_on=0.05)
@@ -166,7 +153,7 @@ def test_position_nees_is_consistent_if_the_noise_model_is(
 # --- one estimator for stream and batch ---------------------------------------------------------
 
 
-def test_stream_equals_batch(walk: ImuSequence, make_oracle: Make) -> None:
+def test_stream_equals_batch(walk, make_oracle):
     oracle = make_oracle(walk, walk.truth, CONFIG)
     track = Navigator(oracle, CONFIG, backend="ekf").run(walk)
     navigator = Navigator(oracle, CONFIG)
@@ -179,9 +166,7 @@ def test_stream_equals_batch(walk: ImuSequence, make_oracle: Make) -> None:
     np.testing.assert_allclose(navigator.state.covariance, track.covariance[-1], rtol=1e-9)
 
 
-def test_stream_equals_batch_through_gaps_and_bad_samples(
-    walk: ImuSequence, make_oracle: Make, without: Make
-) -> None:
+def test_stream_equals_batch_through_gaps_and_bad_samples(walk, make_oracle, without):
     rng = np.random.default_rng(0)
     gone = (rng.random(len(walk)) < 0.1) | ((walk.time > 7.0) & (walk.time < 8.3))
     holed = without(walk, gone)
@@ -192,7 +177,7 @@ def test_stream_equals_batch_through_gaps_and_bad_samples(
     assert navigator.health.gaps == track.health.gaps
 
 
-def test_stream_equals_batch_with_the_default_network(walk: ImuSequence) -> None:
+def test_stream_equals_batch_with_the_default_network(walk):
     from stario.network import load_model
 
     model = load_model("default")
@@ -200,9 +185,7 @@ def test_stream_equals_batch_with_the_default_network(walk: ImuSequence) -> None
     assert stream_deviation(stream(Navigator(model), walk), track) < 1e-3
 
 
-def test_run_does_not_disturb_a_stream_in_progress(
-    walk: ImuSequence, make_oracle: Make, track: Track
-) -> None:
+def test_run_does_not_disturb_a_stream_in_progress(walk, make_oracle, track):
     navigator = Navigator(make_oracle(walk, walk.truth, CONFIG))
     half = len(walk) // 2
     rows = list(zip(walk.time, walk.gyro, walk.accel, strict=True))
@@ -214,7 +197,7 @@ def test_run_does_not_disturb_a_stream_in_progress(
     np.testing.assert_array_equal(filtered.position_W, track.trajectory.position_W)
 
 
-def test_ground_truth_is_never_used(walk: ImuSequence, make_oracle: Make, track: Track) -> None:
+def test_ground_truth_is_never_used(walk, make_oracle, track):
     blind = Navigator(make_oracle(walk, walk.truth, CONFIG), backend="ekf").run(
         walk.without_truth()
     )
@@ -222,9 +205,7 @@ def test_ground_truth_is_never_used(walk: ImuSequence, make_oracle: Make, track:
         np.testing.assert_array_equal(blind.arrays()[name], values, err_msg=name)
 
 
-def test_times_since_1970_give_the_same_track(
-    walk: ImuSequence, make_oracle: Make, track: Track
-) -> None:
+def test_times_since_1970_give_the_same_track(walk, make_oracle, track):
     late = replace(walk, time=walk.time + 1.7e9)
     truth = replace(walk.truth, time=walk.truth.time + 1.7e9)
     ours = Navigator(make_oracle(late, truth, CONFIG), backend="ekf").run(late.without_truth())
@@ -235,9 +216,7 @@ def test_times_since_1970_give_the_same_track(
 
 
 @pytest.mark.parametrize("mount", [(0.0, 0.0, 2.0), (3.1, 0.0, 0.0), (1.5, 1.0, -0.5)])
-def test_another_mount_only_turns_the_track_about_the_vertical(
-    walk: ImuSequence, make_oracle: Make, mount: tuple[float, ...]
-) -> None:
+def test_another_mount_only_turns_the_track_about_the_vertical(walk, make_oracle, mount):
     R_BM = Rotation.from_rotvec(mount)
     turned = replace(
         walk,
@@ -255,9 +234,7 @@ def test_another_mount_only_turns_the_track_about_the_vertical(
     assert np.abs(back - theirs.position_W).max() < 1e-5
 
 
-def test_the_first_tilt_is_less_certain_the_faster_the_device_turns(
-    make_walk: Make, still_model: Any
-) -> None:
+def test_the_first_tilt_is_less_certain_the_faster_the_device_turns(make_walk, still_model):
     walk = make_walk(3, 3.0)
     slow, fast = (
         np.sqrt(Navigator(still_model, backend="ekf").run(each).covariance[0, 0, 0])

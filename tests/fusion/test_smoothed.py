@@ -55,9 +55,7 @@ def tracks(walks: list[tuple[ImuSequence, Any]]) -> list[tuple[ImuSequence, Trac
 # --- recordings ------------------------------------------------------------------------------
 
 
-def test_a_recordings_track_is_more_accurate_than_the_filters_and_consistent(
-    tracks: list[tuple[ImuSequence, Track]],
-) -> None:
+def test_a_recordings_track_is_more_accurate_than_the_filters_and_consistent(tracks):
     filtered, smoothed, nees = [], [], []
     for walk, track in tracks:
         error = errors_at(track.trajectory, walk)[5:]
@@ -71,9 +69,7 @@ def test_a_recordings_track_is_more_accurate_than_the_filters_and_consistent(
     assert 1.2 < np.median(np.concatenate(nees)) < 3.6  # median of chi-square with 3 DoF: 2.4
 
 
-def test_a_recordings_track_moves_by_its_velocity_where_the_filters_steps(
-    tracks: list[tuple[ImuSequence, Track]],
-) -> None:
+def test_a_recordings_track_moves_by_its_velocity_where_the_filters_steps(tracks):
     def steps(track: Track) -> np.ndarray:
         p, v, t = track.trajectory.position_W, track.trajectory.velocity_W, track.time
         moved = 0.5 * np.diff(t)[:, None] * (v[1:] + v[:-1])
@@ -84,9 +80,7 @@ def test_a_recordings_track_moves_by_its_velocity_where_the_filters_steps(
         assert steps(track.filtered).max() > 0.05
 
 
-def test_a_bias_known_at_the_end_mends_the_beginning(
-    tracks: list[tuple[ImuSequence, Track]],
-) -> None:
+def test_a_bias_known_at_the_end_mends_the_beginning(tracks):
     """The IMU's biases hardly change within half a minute."""
     for _, track in tracks:
         sigma, late = (t.covariance[:, 12, 12] for t in (track, track.filtered))
@@ -94,9 +88,7 @@ def test_a_bias_known_at_the_end_mends_the_beginning(
         assert sigma[0] < 1.5 * late[-1]
 
 
-def test_the_filters_track_stands_beside_and_is_the_streams(
-    walks: list[tuple[ImuSequence, Any]], tracks: list[tuple[ImuSequence, Track]]
-) -> None:
+def test_the_filters_track_stands_beside_and_is_the_streams(walks, tracks):
     (walk, model), (_, track) = walks[0], tracks[0]
     alone = Navigator(model, CONFIG, backend="ekf").run(walk)
     assert alone.filtered is None
@@ -125,9 +117,7 @@ def delayed(navigator: Navigator, walk: ImuSequence) -> list[SmoothedPose]:
     return poses
 
 
-def test_a_streams_smoothed_poses_are_one_window_late_and_better_than_its_states(
-    walks: list[tuple[ImuSequence, Any]], tracks: list[tuple[ImuSequence, Track]]
-) -> None:
+def test_a_streams_smoothed_poses_are_one_window_late_and_better_than_its_states(walks, tracks):
     errors, nees = [], []
     for (walk, model), (_, track) in zip(walks, tracks, strict=True):
         poses = delayed(Navigator(model, CONFIG), walk)
@@ -153,8 +143,8 @@ def test_a_streams_smoothed_poses_are_one_window_late_and_better_than_its_states
 
 
 def test_a_smoothed_pose_of_unknown_direction_is_as_uncertain_as_the_newest_state(
-    make_walk: Make, make_oracle: Make
-) -> None:
+    make_walk, make_oracle
+):
     """One position places the track and leaves its yaw in the map unknown."""
     walk = make_walk(1, 8.0, 100.0, ERRORS)
     fix = position_fix(3.0, walk.truth.at(np.array([3.0])).position_W[0], 1e-3 * np.eye(3))

@@ -5,7 +5,6 @@ import sys
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,9 +35,7 @@ def assert_same(ours: list[NavState], theirs: list[NavState]) -> None:
 
 
 @pytest.mark.parametrize("stop", [0.5, 1.0, 7.37, 12.2, 14.41])
-def test_a_restored_stream_continues_bit_for_bit(
-    walk: ImuSequence, make_oracle: Make, without: Make, stop: float
-) -> None:
+def test_a_restored_stream_continues_bit_for_bit(walk, make_oracle, without, stop):
     """Stopped in the first second, later, or next to a gap, with waiting and with late fixes."""
     holed = without(walk, (walk.time > 12.3) & (walk.time < 13.8))
     accel = holed.accel.copy()
@@ -68,7 +65,7 @@ def test_a_restored_stream_continues_bit_for_bit(
     assert second.health.fixes["value that is not finite"] == 1
 
 
-def test_a_snapshot_includes_the_prior(walk: ImuSequence, make_oracle: Make) -> None:
+def test_a_snapshot_includes_the_prior(walk, make_oracle):
     model = make_oracle(walk, walk.truth, CONFIG)
     prior = PriorPose(np.eye(3), np.ones(3), np.array([5.0, 6.0, 7.0]))
     whole, other = Navigator(model, CONFIG, prior), Navigator(model, CONFIG)
@@ -98,7 +95,7 @@ np.save(sys.argv[2], np.hstack([navigator.state.p_W, navigator.state.covariance.
 """
 
 
-def test_another_process_can_continue_a_stream(tmp_path: Path, still_model: Any) -> None:
+def test_another_process_can_continue_a_stream(tmp_path, still_model):
     from stario.sequences.simulation.imu import simulate_imu
     from stario.sequences.simulation.walks import generate_walk
 
@@ -124,7 +121,7 @@ class ModelWithCard:
         return np.zeros((len(windows), 3)), np.tile(np.eye(3), (len(windows), 1, 1))
 
 
-def test_a_snapshot_of_another_configuration_or_model_is_refused_by_name(walk: ImuSequence) -> None:
+def test_a_snapshot_of_another_configuration_or_model_is_refused_by_name(walk):
     navigator = Navigator(ModelWithCard("abc"), CONFIG)
     push(navigator, walk, 0.0, 2.0)
     data = navigator.snapshot()
@@ -139,7 +136,7 @@ def test_a_snapshot_of_another_configuration_or_model_is_refused_by_name(walk: I
     assert other.state is None
 
 
-def test_bytes_that_are_not_a_snapshot_are_refused(walk: ImuSequence, still_model: Any) -> None:
+def test_bytes_that_are_not_a_snapshot_are_refused(walk, still_model):
     navigator = Navigator(still_model, CONFIG)
     push(navigator, walk, 0.0, 3.0)
     data, before = navigator.snapshot(), navigator.state.p_W
@@ -152,7 +149,7 @@ def test_bytes_that_are_not_a_snapshot_are_refused(walk: ImuSequence, still_mode
         np.testing.assert_array_equal(navigator.state.p_W, before)
 
 
-def test_an_edited_snapshot_is_refused_with_the_remedy(walk: ImuSequence, still_model: Any) -> None:
+def test_an_edited_snapshot_is_refused_with_the_remedy(walk, still_model):
     """Its structure may be valid: it would be restored, and give other states later."""
     navigator = Navigator(still_model, CONFIG)
     push(navigator, walk, 0.0, 3.0)
@@ -164,7 +161,7 @@ def test_an_edited_snapshot_is_refused_with_the_remedy(walk: ImuSequence, still_
         np.testing.assert_array_equal(navigator.state.p_W, before)
 
 
-def test_a_snapshot_of_another_version_is_refused(walk: ImuSequence, still_model: Any) -> None:
+def test_a_snapshot_of_another_version_is_refused(walk, still_model):
     navigator = Navigator(still_model, CONFIG)
     data = navigator.snapshot().replace(f" {VERSION}\n".encode(), b" 1\n", 1)
     with pytest.raises(InputError, match=f"version: found 1, expected {VERSION}"):
@@ -175,9 +172,7 @@ LAYOUTS = {32: "c183b965"}
 """CRC of the classes and attributes in a snapshot, by version."""
 
 
-def test_a_snapshot_with_other_classes_or_attributes_has_another_version(
-    walk: ImuSequence, still_model: Any
-) -> None:
+def test_a_snapshot_with_other_classes_or_attributes_has_another_version(walk, still_model):
     """Otherwise an older one would be taken for damaged, or restored in part."""
     found: set[str] = set()
 
@@ -218,8 +213,8 @@ def test_a_snapshot_with_other_classes_or_attributes_has_another_version(
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
 def test_a_stream_is_silent_until_a_second_after_a_gap_and_a_snapshot_keeps_that_second(
-    walk: ImuSequence, still_model: Any, without: Any, backend: Any
-) -> None:
+    walk, still_model, without, backend
+):
     holed = without(walk, (walk.time > 5.0) & (walk.time < 5.6))
     expected, resumed = (Navigator(still_model, CONFIG, backend=backend) for _ in range(2))
     push(resumed, holed, 0.0, 6.0)

@@ -1,7 +1,5 @@
 """Files are written completely or not at all, and are read back as written."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

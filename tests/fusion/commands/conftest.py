@@ -1,7 +1,5 @@
 """Fixtures to call the `stario` command, and a recording for it."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The commands for many recordings: compare, evaluate, train, backends."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -29,7 +27,7 @@ from stario.sequences.simulation.moments import MOMENTS
 # --- compare and evaluate ----------------------------------------------------------------------
 
 
-def test_compare_prints_json_and_writes_the_same(stario, recording: Path, tmp_path: Path) -> None:
+def test_compare_prints_json_and_writes_the_same(stario, recording, tmp_path):
     done = stario("compare", recording, "--out", "out", "--json")
     assert done.code == 0
     assert json.loads(done.out) == json.loads((tmp_path / "out/metrics.json").read_text())
@@ -37,7 +35,7 @@ def test_compare_prints_json_and_writes_the_same(stario, recording: Path, tmp_pa
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_compare_sets_the_track_against_dead_reckoning(stario, recording: Path) -> None:
+def test_compare_sets_the_track_against_dead_reckoning(stario, recording):
     done = stario("compare", recording, "--out", "out")
     assert done.err == ""
     seen, *findings, files = done.out.splitlines()
@@ -55,9 +53,7 @@ def test_compare_sets_the_track_against_dead_reckoning(stario, recording: Path) 
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_compare_prints_a_table_of_further_tracks_and_explains_on_request(
-    stario, recording: Path
-) -> None:
+def test_compare_prints_a_table_of_further_tracks_and_explains_on_request(stario, recording):
     done = stario("compare", recording, "--tracks", "all", "--explain")
     rows = [line.split()[0] for line in done.out.splitlines()]
     assert [row for row in rows if row in TRACKS] == list(TRACKS)
@@ -70,9 +66,7 @@ def test_compare_prints_a_table_of_further_tracks_and_explains_on_request(
     stario("compare", recording, "--tracks", "ekf").assert_one_line_error("--tracks", "filtered")
 
 
-def test_check_fusion_compares_the_fusion_with_its_network(
-    stario, recording: Path, tmp_path: Path
-) -> None:
+def test_check_fusion_compares_the_fusion_with_its_network(stario, recording, tmp_path):
     (tmp_path / "walk.csv").write_bytes(recording.read_bytes())
     done = stario("check", "fusion", recording, "walk.csv", "--json")
     assert done.code == 0
@@ -84,9 +78,7 @@ def test_check_fusion_compares_the_fusion_with_its_network(
     assert "carry" in refused.err
 
 
-def test_check_gaps_reports_how_far_missing_samples_move_the_end(
-    stario, recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_check_gaps_reports_how_far_missing_samples_move_the_end(stario, recording, monkeypatch):
     monkeypatch.setattr("stario.fusion.evaluation.checks.fusion.INSTANTS", 1)
     done = stario("check", "gaps", recording, "--json")
     assert done.code == 0
@@ -98,9 +90,7 @@ def test_check_gaps_reports_how_far_missing_samples_move_the_end(
     assert "within 1% and 3 deg" in shown.out
 
 
-def test_check_moments_reports_what_a_bad_moment_costs(
-    stario, recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_check_moments_reports_what_a_bad_moment_costs(stario, recording, monkeypatch):
     checks = "stario.fusion.evaluation.checks.moments"
     monkeypatch.setattr(f"{checks}.MOMENTS", MOMENTS[-1:])
     monkeypatch.setattr(f"{checks}.PLACES", {"middle": 0.5})
@@ -117,7 +107,7 @@ def test_check_moments_reports_what_a_bad_moment_costs(
     stario("check", "moments", "--axes", "y,-x,z").assert_one_line_error("--axes", "simulated")
 
 
-def test_check_fixes_evaluates_tracks_with_fixes(stario, recording: Path) -> None:
+def test_check_fixes_evaluates_tracks_with_fixes(stario, recording):
     done = stario("check", "fixes", recording, "--every", "2", "--sigma", "0.1", "--json")
     assert done.code == 0
     (found,) = json.loads(done.out)
@@ -128,7 +118,7 @@ def test_check_fixes_evaluates_tracks_with_fixes(stario, recording: Path) -> Non
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_truth_that_covers_only_a_part_is_reported(stario, recording: Path, tmp_path: Path) -> None:
+def test_truth_that_covers_only_a_part_is_reported(stario, recording, tmp_path):
     walk = read_generic_csv(recording)
     assert walk.truth is not None
     write_csv(tmp_path / "part.csv", replace(walk, truth=walk.truth.slice(0.0, 6.0)))
@@ -138,18 +128,14 @@ def test_truth_that_covers_only_a_part_is_reported(stario, recording: Path, tmp_
 
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.parametrize("command", ["run", "compare"])
-def test_figures_of_several_recordings_are_explained_once(
-    stario, recording: Path, tmp_path: Path, command: str
-) -> None:
+def test_figures_of_several_recordings_are_explained_once(stario, recording, tmp_path, command):
     shutil.copy(recording, tmp_path / "again.csv")
     done = stario(command, recording, "again.csv", "--out", "out", "--explain")
     assert done.out.count("\nfitted [m]: ATE after") == 1
     assert done.out.count("m rms from the truth") == 2
 
 
-def test_many_recordings_skipped_for_one_reason_take_one_line(
-    stario, recording: Path, tmp_path: Path
-) -> None:
+def test_many_recordings_skipped_for_one_reason_take_one_line(stario, recording, tmp_path):
     blind = read_generic_csv(recording).without_truth()
     for k in range(5):
         write_csv(tmp_path / f"blind-{k}.csv", blind)
@@ -160,7 +146,7 @@ def test_many_recordings_skipped_for_one_reason_take_one_line(
     assert "blind-0.csv: truth: found none" in line
 
 
-def test_evaluate_prints_medians_and_needs_truth(stario, recording: Path, tmp_path: Path) -> None:
+def test_evaluate_prints_medians_and_needs_truth(stario, recording, tmp_path):
     done = stario("evaluate", recording)
     assert done.code == 0
     assert [line.split()[0] for line in done.out.splitlines()[1:4]] == ["walk", "median", "mean"]
@@ -172,9 +158,7 @@ def test_evaluate_prints_medians_and_needs_truth(stario, recording: Path, tmp_pa
 
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_a_batch_continues_after_failures_and_reports_them(
-    stario, recording: Path, tmp_path: Path, jobs: int
-) -> None:
+def test_a_batch_continues_after_failures_and_reports_them(stario, recording, tmp_path, jobs):
     walk = read_generic_csv(recording)
     write_csv(tmp_path / "deg.csv", replace(walk, gyro=np.degrees(walk.gyro)))
     write_csv(tmp_path / "blind.csv", walk.without_truth())
@@ -200,9 +184,7 @@ def test_a_batch_continues_after_failures_and_reports_them(
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_evaluate_compares_with_other_weights_by_groups(
-    stario, recording: Path, tmp_path: Path
-) -> None:
+def test_evaluate_compares_with_other_weights_by_groups(stario, recording, tmp_path):
     """Weights against themselves; twelve seconds are too few for an error over ten seconds."""
     (tmp_path / "walks").mkdir()
     stario("simulate", "walks/long.csv", "--seconds", 25, "--carry", "handheld", "--rate", 100)
@@ -223,7 +205,7 @@ def test_evaluate_compares_with_other_weights_by_groups(
     assert {(group["group"], group["role"]): group for group in written} == groups
 
 
-def test_every_option_that_changes_what_is_read_is_part_of_the_key_of_a_cache() -> None:
+def test_every_option_that_changes_what_is_read_is_part_of_the_key_of_a_cache():
     usual = ReadingOptions()
     for name in (field.name for field in fields(usual)):
         other = replace(usual, **{name: ["person=dan"] if name == "where" else "other"})
@@ -247,9 +229,7 @@ def narrow_network(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("no_figures", "narrow_network")
-def test_weights_that_train_writes_can_be_run(
-    stario, recording: Path, tmp_path: Path, tiny: Path
-) -> None:
+def test_weights_that_train_writes_can_be_run(stario, recording, tmp_path, tiny):
     done = stario(
         "train", recording, "--generated", 1, "--config", tiny, "--out", "trained",
         "--seed", 3,
@@ -270,8 +250,8 @@ def test_weights_that_train_writes_can_be_run(
 
 @pytest.mark.usefixtures("narrow_network")
 def test_training_continues_after_failures_and_caches_its_windows(
-    stario, recording: Path, tmp_path: Path, tiny: Path
-) -> None:
+    stario, recording, tmp_path, tiny
+):
     write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
     (tmp_path / "list.txt").write_text("blind.csv\nnosuch.csv\n")
     call = ("train", recording, "list.txt", "--generated", 1, "--config", tiny)
@@ -292,9 +272,7 @@ def test_training_continues_after_failures_and_caches_its_windows(
 
 
 @pytest.mark.usefixtures("narrow_network")
-def test_weights_to_start_from_set_the_network(
-    stario, recording: Path, tmp_path: Path, tiny: Path
-) -> None:
+def test_weights_to_start_from_set_the_network(stario, recording, tmp_path, tiny):
     call, other = ("train", recording, "--recorded-only", "--config", tiny), "StarIO without MSGCU"
     assert stario(*call, "--model", other, "--out", "first").code == 0
     first = ("--start-from", "first/model.safetensors")
@@ -306,8 +284,8 @@ def test_weights_to_start_from_set_the_network(
 
 @pytest.mark.usefixtures("narrow_network")
 def test_sigma_is_not_calibrated_on_a_few_seconds_where_initial_weights_have_a_calibration(
-    stario, recording: Path, tmp_path: Path, tiny: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    stario, recording, tmp_path, tiny, monkeypatch
+):
     def calibration(out: str, *options: str) -> object:
         call = ("train", recording, "--recorded-only", "--config", tiny, *options, "--out", out)
         assert stario(*call).code == 0
@@ -320,7 +298,7 @@ def test_sigma_is_not_calibrated_on_a_few_seconds_where_initial_weights_have_a_c
     assert calibration("calibrated", *tuned) != first
 
 
-def test_fine_tuning_changes_weights_a_little_unless_a_recipe_says_otherwise(tiny: Path) -> None:
+def test_fine_tuning_changes_weights_a_little_unless_a_recipe_says_otherwise(tiny):
     first = load_model("default")
     assert _recipe(None, None).learned == _recipe(tiny, first).learned == 1.0
     gentle = _recipe(None, first, epochs=5)
@@ -330,9 +308,7 @@ def test_fine_tuning_changes_weights_a_little_unless_a_recipe_says_otherwise(tin
 
 
 @pytest.mark.usefixtures("narrow_network")
-def test_training_can_use_recordings_alone(
-    stario, recording: Path, tmp_path: Path, tiny: Path
-) -> None:
+def test_training_can_use_recordings_alone(stario, recording, tmp_path, tiny):
     twice = recording, recording.parent  # counts once
     done = stario("train", *twice, "--recorded-only", "--config", tiny, "--out", "alone")
     assert done.code == 0, done.err
@@ -340,23 +316,21 @@ def test_training_can_use_recordings_alone(
     assert trained_on == ["recorded, others: 10 s"]  # nothing simulated, no licence known
 
 
-def test_a_recording_cannot_both_train_and_validate(
-    stario, recording: Path, tmp_path: Path
-) -> None:
+def test_a_recording_cannot_both_train_and_validate(stario, recording, tmp_path):
     (tmp_path / "list.txt").write_text(f"{recording}\n")
     done = stario("train", recording, "--validation", "list.txt", "--generated", 1)
     done.assert_one_line_error("--validation", f"{recording}, which is also trained on")
     assert not (tmp_path / "runs").exists()
 
 
-def test_nothing_is_trained_if_nothing_could_be_read(stario, tmp_path: Path) -> None:
+def test_nothing_is_trained_if_nothing_could_be_read(stario, tmp_path):
     stario("train", "missing.csv").assert_one_line_error("missing.csv", "no such file")
     assert not (tmp_path / "runs").exists()
 
 
 def test_run_writes_the_smoothed_track_and_on_request_the_filters(
-    stario, recording: Path, tmp_path: Path, no_figures
-) -> None:
+    stario, recording, tmp_path, no_figures
+):
     done = stario("run", recording, "--filtered", "--out", "out", "--json")
     assert done.code == 0
     assert json.loads(done.out)["filtered"]["ate_m"] > 0.0
@@ -377,7 +351,7 @@ def test_run_writes_the_smoothed_track_and_on_request_the_filters(
     assert not (tmp_path / "out/filtered.tum").exists()
 
 
-def test_backends_compares_filter_and_graph(stario) -> None:
+def test_backends_compares_filter_and_graph(stario):
     done = stario("check", "backends", "--walks", "1", "--seconds", "10", "--json")
     assert done.code == 0
     content = json.loads(done.out)
@@ -386,15 +360,15 @@ def test_backends_compares_filter_and_graph(stario) -> None:
 
 
 def test_recordings_too_short_to_hold_out_a_part_require_validation_recordings(
-    stario, recording: Path, tmp_path: Path
-) -> None:
+    stario, recording, tmp_path
+):
     write_csv(tmp_path / "short.csv", read_generic_csv(recording).slice(0.0, 9.0))
     stario("train", "short.csv", "--generated", 1).assert_one_line_error(
         "two legs between known positions", "--validation"
     )
 
 
-def test_what_is_left_out_is_neither_learned_from_nor_selected_on(tmp_path: Path) -> None:
+def test_what_is_left_out_is_neither_learned_from_nor_selected_on(tmp_path):
     for line in _names():
         file = split_name(tmp_path / line)[0]
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -419,9 +393,7 @@ def _names() -> list[str]:
     return [line.partition(",")[0] for line in lines if line and not line.startswith("#")]
 
 
-def test_set_in_the_name_of_weights_is_the_first_word_of_a_group(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_set_in_the_name_of_weights_is_the_first_word_of_a_group(monkeypatch):
     loaded: list[str] = []
     monkeypatch.setattr(evaluate, "_loaded", loaded.append)
 

@@ -1,9 +1,6 @@
 """Parameters, operations, time and memory of the networks."""
 
-from __future__ import annotations
-
 import warnings
-from pathlib import Path
 
 import pytest
 import torch
@@ -32,14 +29,14 @@ UNCOUNTED = {"I-IMUNet": 2 * 1200, "StarIO without MSGCU": 8 * 2 * 2, "StarIO": 
 
 
 @pytest.mark.parametrize("name", TABLE)
-def test_counts_match_the_table(name: str) -> None:
+def test_counts_match_the_table(name):
     assert table_cost(name) == Cost(*TABLE[name])
     network = build_network(name, architecture(name).table_outputs)
     assert sum(p.numel() for p in network.parameters()) == TABLE[name][0] + UNCOUNTED.get(name, 0)
 
 
 @pytest.mark.parametrize("name", TABLE)
-def test_counts_agree_with_the_paper(name: str) -> None:
+def test_counts_agree_with_the_paper(name):
     published = ARCHITECTURES[name]
     found = table_cost(name)
     # The paper does not specify StarIO's widths; without the MSGCU the closest is 0.4 % off.
@@ -50,7 +47,7 @@ def test_counts_agree_with_the_paper(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", TABLE)
-def test_counts_agree_with_thop(name: str) -> None:
+def test_counts_agree_with_thop(name):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         thop = pytest.importorskip("thop", exc_type=ImportError)
@@ -60,24 +57,24 @@ def test_counts_agree_with_thop(name: str) -> None:
     assert found == (ours.flops, ours.parameters)
 
 
-def test_a_module_that_runs_twice_counts_twice_and_its_parameters_once() -> None:
+def test_a_module_that_runs_twice_counts_twice_and_its_parameters_once():
     layer = nn.Linear(200, 200, bias=False)
     twice = nn.Sequential(layer, layer)
     assert cost(twice) == Cost(200 * 200, 2 * 6 * 200 * 200)
 
 
-def test_counting_does_not_change_the_network() -> None:
+def test_counting_does_not_change_the_network():
     network = build_network("DeepILS", 2)
     assert cost(network) == cost(network)
     assert not any(module._forward_hooks for module in network.modules())
 
 
-def test_an_unknown_name_is_refused_with_the_known_ones() -> None:
+def test_an_unknown_name_is_refused_with_the_known_ones():
     with pytest.raises(InputError, match=r"architecture: found 'ResNet99', expected one of .*RNIN"):
         table_cost("ResNet99")
 
 
-def test_peak_memory_is_the_most_that_is_allocated_at_once() -> None:
+def test_peak_memory_is_the_most_that_is_allocated_at_once():
     def work() -> torch.Tensor:
         a = torch.zeros(1000) + 1.0  # two at once
         b = a * 2.0
@@ -90,7 +87,7 @@ def test_peak_memory_is_the_most_that_is_allocated_at_once() -> None:
     assert peak_bytes(lambda: None) == 0
 
 
-def test_rows_hold_counts_times_and_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_hold_counts_times_and_memory(tmp_path, monkeypatch):
     monkeypatch.setattr("stario.network.runtime.survey._RUNS", {1: 2, 64: 1})
     # Exporting is slow and tested elsewhere.
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)

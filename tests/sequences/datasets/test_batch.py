@@ -1,7 +1,5 @@
 """Batches of recordings, and their split into parts."""
 
-from __future__ import annotations
-
 import importlib.resources
 import os
 import time
@@ -18,7 +16,7 @@ from stario.sequences.readers import find_recordings
 
 
 @pytest.mark.parametrize("jobs", [None, 1, 2])
-def test_a_failing_item_is_skipped_with_its_reason(jobs: int | None) -> None:
+def test_a_failing_item_is_skipped_with_its_reason(jobs):
     """The errors take arguments of their own, with which plain pickling between processes fails."""
 
     def halve(number: int) -> int:
@@ -34,7 +32,7 @@ def test_a_failing_item_is_skipped_with_its_reason(jobs: int | None) -> None:
     assert skipped == [odd]
 
 
-def test_results_are_yielded_one_by_one() -> None:
+def test_results_are_yielded_one_by_one():
     processed: list[int] = []
 
     def record(number: int) -> int:
@@ -51,20 +49,20 @@ def double(number: int) -> int:
     return 2 * number
 
 
-def test_a_backend_that_returns_nothing_before_the_end_works_too() -> None:
+def test_a_backend_that_returns_nothing_before_the_end_works_too():
     """Like Ray's; joblib's own backend of this kind runs processes without loky."""
     with parallel_config("multiprocessing"):
         assert list(each(double, [1, 2, 3], 2)) == [2, 4, 6]
 
 
-def test_an_unexpected_exception_costs_one_item_and_its_traceback_is_logged(caplog) -> None:
+def test_an_unexpected_exception_costs_one_item_and_its_traceback_is_logged(caplog):
     outcomes = list(each(lambda number: 1 // number, [1, 0, -1]))
     assert outcomes[::2] == [1, -1]
     assert outcomes[1].reason.startswith("ZeroDivisionError")
     assert "Traceback" in caplog.text
 
 
-def test_several_jobs_run_in_separate_processes() -> None:
+def test_several_jobs_run_in_separate_processes():
     def process(delay: float) -> int:
         time.sleep(delay)
         return os.getpid()
@@ -90,7 +88,7 @@ def phone(path: Path) -> Path:
     return path
 
 
-def test_the_papers_split_is_by_recording_and_reproducible_by_seed() -> None:
+def test_the_papers_split_is_by_recording_and_reproducible_by_seed():
     paths = [Path(f"{k:02d}.csv") for k in range(40)]
     split = random_split(paths, seed=7)
     assert [len(split.training), len(split.validation), len(split.test)] == [32, 4, 4]
@@ -103,7 +101,7 @@ def test_the_papers_split_is_by_recording_and_reproducible_by_seed() -> None:
         random_split(paths[:2], seed=0)
 
 
-def test_a_list_may_mix_formats_folders_and_duplicates(tmp_path: Path) -> None:
+def test_a_list_may_mix_formats_folders_and_duplicates(tmp_path):
     ronin(tmp_path, "a000_1")
     (tmp_path / "own.csv").write_text(ROW)
     imu = phone(tmp_path / "handheld/data1/syn/imu1.csv")
@@ -112,7 +110,7 @@ def test_a_list_may_mix_formats_folders_and_duplicates(tmp_path: Path) -> None:
     assert found == [tmp_path / "a000_1", tmp_path / "own.csv", imu]
 
 
-def test_wrong_entries_are_named_and_the_others_kept(tmp_path: Path) -> None:
+def test_wrong_entries_are_named_and_the_others_kept(tmp_path):
     (tmp_path / "own.csv").write_text(ROW)
     (tmp_path / "empty").mkdir()
     path = tmp_path / "list.txt"
@@ -133,7 +131,7 @@ def test_wrong_entries_are_named_and_the_others_kept(tmp_path: Path) -> None:
         find_recordings(path)
 
 
-def test_a_text_of_something_else_is_one_error(tmp_path: Path) -> None:
+def test_a_text_of_something_else_is_one_error(tmp_path):
     """A log of a serial port, or a list of a hundred recordings next to another data folder."""
     path = tmp_path / "serial.txt"
     path.write_text("".join(f"t: {k} ax: 0.1 ay: 0.2 az: 9.8\n" for k in range(100)))
@@ -143,7 +141,7 @@ def test_a_text_of_something_else_is_one_error(tmp_path: Path) -> None:
     assert errors == []
 
 
-def test_lists_name_recordings_below_a_folder_and_their_groups(tmp_path: Path) -> None:
+def test_lists_name_recordings_below_a_folder_and_their_groups(tmp_path):
     for name in ("a.csv", "walks.h5"):
         (tmp_path / name).touch()
     file = tmp_path / "list.txt"
@@ -166,7 +164,7 @@ def test_lists_name_recordings_below_a_folder_and_their_groups(tmp_path: Path) -
         read_list(file, tmp_path)
 
 
-def test_the_packaged_lists_keep_groups_apart() -> None:
+def test_the_packaged_lists_keep_groups_apart():
     folder = importlib.resources.files("stario.network.training.splits")
     names = {}
     for name in NAMES:

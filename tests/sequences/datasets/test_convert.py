@@ -1,7 +1,5 @@
 """Recordings converted to other layouts and archives."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 from pathlib import Path
@@ -58,7 +56,7 @@ def assert_same(found: ImuSequence, expected: ImuSequence) -> None:
 
 
 @pytest.mark.parametrize("layout", ["csv", "euroc"])
-def test_conversion_loses_nothing(walk: ImuSequence, tmp_path: Path, layout: str) -> None:
+def test_conversion_loses_nothing(walk, tmp_path, layout):
     gyro = walk.gyro.copy()
     gyro[17, 1] = np.nan
     given = replace(walk, gyro=gyro)
@@ -71,7 +69,7 @@ def test_conversion_loses_nothing(walk: ImuSequence, tmp_path: Path, layout: str
     assert_same(found, given)
 
 
-def test_converting_there_and_back_gives_the_same_bytes(walk: ImuSequence, tmp_path: Path) -> None:
+def test_converting_there_and_back_gives_the_same_bytes(walk, tmp_path):
     convert(walk, tmp_path / "a.csv")
     convert(read_recording(tmp_path / "a.csv"), tmp_path / "b")
     convert(read_recording(tmp_path / "b"), tmp_path / "c.csv")
@@ -89,7 +87,7 @@ def test_converting_there_and_back_gives_the_same_bytes(walk: ImuSequence, tmp_p
     assert first[imu] == second[imu]
 
 
-def test_the_euroc_layout_is_that_of_its_authors(walk: ImuSequence, tmp_path: Path) -> None:
+def test_the_euroc_layout_is_that_of_its_authors(walk, tmp_path):
     """Unsigned whole nanoseconds, quaternions with w first."""
     imu, truth = (file.read_text().splitlines() for file in convert(walk, tmp_path / "r"))
     for lines in (imu, truth):
@@ -102,8 +100,8 @@ def test_the_euroc_layout_is_that_of_its_authors(walk: ImuSequence, tmp_path: Pa
 
 
 def test_a_known_velocity_is_kept_in_euroc_and_dropped_with_a_warning_in_csv(
-    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+    walk, tmp_path, caplog
+):
     truth = walk.truth
     assert truth is not None
     velocity_W = np.gradient(truth.position_W, truth.time, axis=0)
@@ -128,8 +126,8 @@ def test_a_known_velocity_is_kept_in_euroc_and_dropped_with_a_warning_in_csv(
     ],
 )
 def test_positions_that_a_csv_would_change_give_a_warning(
-    walk: ImuSequence, tmp_path: Path, caplog, kind, interval: float, count: int, message: str
-) -> None:
+    walk, tmp_path, caplog, kind, interval, count, message
+):
     known = PositionTrack(interval * np.arange(count), np.ones((count, 2)), kind)
     with caplog.at_level(logging.WARNING):
         convert(replace(walk, truth=None, positions=known), tmp_path / "r.csv")
@@ -142,28 +140,24 @@ def test_positions_that_a_csv_would_change_give_a_warning(
     assert "attributes have no place" in caplog.text
 
 
-def test_a_recording_without_truth_is_converted_without_truth(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_a_recording_without_truth_is_converted_without_truth(walk, tmp_path):
     for path in (tmp_path / "a.csv", tmp_path / "a"):
         convert(walk.without_truth(), path)
         assert read_recording(path).truth is None
 
 
-def test_wrong_units_are_refused_and_nothing_is_written(walk: ImuSequence, tmp_path: Path) -> None:
+def test_wrong_units_are_refused_and_nothing_is_written(walk, tmp_path):
     with pytest.raises(InputError, match=r"give 9\.80665 \* accel"):
         convert(replace(walk, accel=walk.accel / STANDARD_GRAVITY), tmp_path / "a.csv")
     assert not list(tmp_path.iterdir())
 
 
-def test_a_recording_too_short_to_check_is_converted(walk: ImuSequence, tmp_path: Path) -> None:
+def test_a_recording_too_short_to_check_is_converted(walk, tmp_path):
     convert(walk.without_truth().slice(0.0, 0.5), tmp_path / "short")
     assert read_recording(tmp_path / "short").duration < 0.5
 
 
-def test_what_cannot_be_converted_is_refused_with_the_reason(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_what_cannot_be_converted_is_refused_with_the_reason(walk, tmp_path):
     time = walk.time.copy()
     time[3] = np.nan
     with pytest.raises(InputError, match=r"time of sample 3: found nan.*convert to csv"):
@@ -180,7 +174,7 @@ def test_what_cannot_be_converted_is_refused_with_the_reason(
     assert [p.name for p in (tmp_path / "full").iterdir()] == ["file"]
 
 
-def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_a_folder_appears_whole_or_not_at_all(tmp_path):
     def fail(folder: Path) -> None:
         (folder / "half").touch()
         assert not (tmp_path / "whole").exists()
@@ -191,7 +185,7 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_truth_that_starts_before_the_imu_keeps_its_offset(tmp_path: Path) -> None:
+def test_truth_that_starts_before_the_imu_keeps_its_offset(tmp_path):
     """Timestamps are unsigned, so both files are shifted together."""
     sequence = simulate_imu(generate_walk(5, 6.0), 100.0, name="w")
     truth = sequence.truth
@@ -263,7 +257,7 @@ def assert_equal(found: ImuSequence, given: ImuSequence) -> None:
         assert error.magnitude().max() < 1e-9
 
 
-def test_recordings_are_read_back_as_written(hall: ImuSequence, tmp_path: Path) -> None:
+def test_recordings_are_read_back_as_written(hall, tmp_path):
     path = tmp_path / "walks.h5"
     sigma = np.where(hall.time > 1.0, 2.0 + hall.time, np.nan)
     known = PositionTrack(
@@ -290,7 +284,7 @@ def test_recordings_are_read_back_as_written(hall: ImuSequence, tmp_path: Path) 
     assert found[1].positions.kind == "positions"
 
 
-def test_an_archive_is_written_whole_or_not_at_all(hall: ImuSequence, tmp_path: Path) -> None:
+def test_an_archive_is_written_whole_or_not_at_all(hall, tmp_path):
     path = tmp_path / "walks.h5"
     write_archive(path, [hall])
     before = path.read_bytes()

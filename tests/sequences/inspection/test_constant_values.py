@@ -29,7 +29,7 @@ def walk() -> ImuSequence:
 @pytest.mark.parametrize("sensor", ["gyro", "accel"])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("value", [0.0, 0.02])
-def test_a_dead_axis_is_named(walk: ImuSequence, sensor: str, axis: int, value: float) -> None:
+def test_a_dead_axis_is_named(walk, sensor, axis, value):
     values = getattr(walk, sensor).copy()
     values[:, axis] = value
     (problem,) = dead_axes(replace(walk, **{sensor: values}))
@@ -37,9 +37,7 @@ def test_a_dead_axis_is_named(walk: ImuSequence, sensor: str, axis: int, value: 
     assert f"{name}: its {'xyz'[axis]} axis never changes" in str(problem)
 
 
-def test_inspect_reports_it_and_the_log_warns_once(
-    walk: ImuSequence, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_inspect_reports_it_and_the_log_warns_once(walk, caplog):
     dead = replace(walk, gyro=walk.gyro * [1.0, 1.0, 0.0])
     assert any("its z axis" in problem for problem in told(dead))
     assert "axis" not in caplog.text
@@ -48,7 +46,7 @@ def test_inspect_reports_it_and_the_log_warns_once(
     assert caplog.text.count("its z axis") == 1
 
 
-def test_motion_in_a_plane_is_no_problem() -> None:
+def test_motion_in_a_plane_is_no_problem():
     """A robot on the floor and a pendulum, simulated without noise, and a device at rest."""
     t = np.arange(0.0, 20.0, 0.01)
     zero, up = np.zeros_like(t), np.full_like(t, STANDARD_GRAVITY)
@@ -62,14 +60,14 @@ def test_motion_in_a_plane_is_no_problem() -> None:
         assert dead_axes(planar) == []
 
 
-def test_two_equal_samples_are_not_stuck_for_the_seconds_of_a_wrong_unit(walk: ImuSequence) -> None:
+def test_two_equal_samples_are_not_stuck_for_the_seconds_of_a_wrong_unit(walk):
     gyro, accel = walk.gyro.copy(), walk.accel.copy()
     gyro[501] = gyro[500]
     accel[501, 0] += 9.0
     assert stuck_findings(1e3 * walk.time, gyro, accel) == []
 
 
-def test_few_or_coarsely_rounded_maxima_are_no_limit(walk: ImuSequence) -> None:
+def test_few_or_coarsely_rounded_maxima_are_no_limit(walk):
     short = walk.slice(0.0, 4.0)
     accel = short.accel.copy()
     accel[100:103, 0] = 40.0  # twice a repetition: a knock

@@ -1,9 +1,6 @@
 """Positions without attitude in a generic CSV: waypoints, tracks and their accuracy."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +10,6 @@ from stario.sequences.errors import ReadError
 from stario.sequences.readers import read_recording, write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
 from stario.sequences.sequence import (
-    ImuSequence,
     PositionTrack,
 )
 
@@ -21,9 +17,7 @@ from stario.sequences.sequence import (
 @pytest.mark.parametrize(
     ("every", "columns", "kind"), [(4.0, 2, "waypoints"), (0.5, 3, "positions")]
 )
-def test_positions_without_attitude_are_kept_as_such(
-    tmp_path: Path, walk: ImuSequence, every: float, columns: int, kind: str
-) -> None:
+def test_positions_without_attitude_are_kept_as_such(tmp_path, walk, every, columns, kind):
     time = np.arange(walk.time[0] + 0.3, walk.time[-1], every)
     assert walk.truth is not None
     position = walk.truth.at(time).position_W[:, :columns]
@@ -38,7 +32,7 @@ def test_positions_without_attitude_are_kept_as_such(
     np.testing.assert_array_equal(found.accel, walk.accel)
 
 
-def test_the_accuracy_of_positions_is_kept(tmp_path: Path, walk: ImuSequence) -> None:
+def test_the_accuracy_of_positions_is_kept(tmp_path, walk):
     time = np.arange(1.0, 6.0)
     place, sigma = np.stack([time, -time], axis=1), 0.5 * time
     known = PositionTrack(time, place, "positions", sigma=sigma)
@@ -58,9 +52,7 @@ def test_the_accuracy_of_positions_is_kept(tmp_path: Path, walk: ImuSequence) ->
         (("3.0", "0.0", "4.0"), [], "line 52, sp: found 0, expected a standard deviation above 0"),
     ],
 )
-def test_a_position_without_its_accuracy_is_none(
-    tmp_path: Path, cells: tuple[str, ...], times: list[float], error: str
-) -> None:
+def test_a_position_without_its_accuracy_is_none(tmp_path, cells, times, error):
     rows = [f"{0.01 * k:.2f},{ROW},,," for k in range(100)]
     for k, cell in zip((20, 50, 80), cells, strict=True):
         rows[k] = f"{0.01 * k:.2f},{ROW},{k},0,{cell}"
@@ -74,7 +66,7 @@ def test_a_position_without_its_accuracy_is_none(
         np.testing.assert_allclose(known.time, times)
 
 
-def test_an_accuracy_next_to_poses_is_ignored(tmp_path: Path, walk: ImuSequence) -> None:
+def test_an_accuracy_next_to_poses_is_ignored(tmp_path, walk):
     write_csv(tmp_path / "walk.csv", walk)
     header, *rows = (tmp_path / "walk.csv").read_text().splitlines()
     write_lines(tmp_path / "sp.csv", f"{header},sp", *(f"{row},3.0" for row in rows))
@@ -83,7 +75,7 @@ def test_an_accuracy_next_to_poses_is_ignored(tmp_path: Path, walk: ImuSequence)
     assert found.positions is None
 
 
-def test_waypoints_listed_below_the_samples_may_be_in_any_order(tmp_path: Path) -> None:
+def test_waypoints_listed_below_the_samples_may_be_in_any_order(tmp_path):
     samples = [f"{0.01 * k:.2f},{ROW},," for k in range(1000)]
     waypoints = [f"{time},,,,,,,{time + 1},0" for time in (8, 2, 5)]
     header = "t,gx,gy,gz,ax,ay,az,px,py"

@@ -1,7 +1,5 @@
 """Pressure and satellite positions in a generic CSV."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -71,11 +69,7 @@ def assert_same(found: object, expected: object) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(barometer=st.none() | barometers(), satellites=st.none() | receivers())
-def test_what_is_written_is_read_back(
-    tmp_path_factory: pytest.TempPathFactory,
-    barometer: Barometer | None,
-    satellites: Satellites | None,
-) -> None:
+def test_what_is_written_is_read_back(tmp_path_factory, barometer, satellites):
     path = tmp_path_factory.mktemp("csv") / "walk.csv"
     write_csv(path, replace(IMU, barometer=barometer, satellites=satellites))
     found = read_recording(path)
@@ -90,7 +84,7 @@ def file_of(folder: Path, titles: str, cells: str) -> Path:
     return write_lines(folder / "walk.csv", f"t,gx,gy,gz,ax,ay,az{titles}", *rows)
 
 
-def test_columns_may_name_other_units(tmp_path: Path) -> None:
+def test_columns_may_name_other_units(tmp_path):
     titles = ",pressure [kPa],latitude [deg],longitude [deg],altitude [ft],speed [km/h]"
     found = read_recording(file_of(tmp_path, titles, "100.5,48.5,11.5,100,36"))
     assert found.barometer is not None
@@ -111,9 +105,7 @@ def test_columns_may_name_other_units(tmp_path: Path) -> None:
         (",lat,lon", "48.5N,11.5E", "pressure and satellites skipped: "),
     ],
 )
-def test_columns_that_hold_something_else_cost_no_recording(
-    tmp_path: Path, titles: str, cells: str, words: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_columns_that_hold_something_else_cost_no_recording(tmp_path, titles, cells, words, caplog):
     found = read_recording(file_of(tmp_path, titles, cells))
     assert len(found) == 20
     assert found.barometer is None

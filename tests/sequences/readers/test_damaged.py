@@ -30,7 +30,7 @@ def archive(walk: ImuSequence, tmp_path: Path) -> Path:
     return tmp_path / "two.h5"
 
 
-def test_flipped_bytes_in_an_archive_raise_input_errors_only(archive: Path, tmp_path: Path) -> None:
+def test_flipped_bytes_in_an_archive_raise_input_errors_only(archive, tmp_path):
     data, rng = archive.read_bytes(), np.random.default_rng(0)
     damaged = tmp_path / "spoiled.h5"
     for _ in range(40):
@@ -44,7 +44,7 @@ def test_flipped_bytes_in_an_archive_raise_input_errors_only(archive: Path, tmp_
                     read_recording(path)
 
 
-def test_arrays_of_wrong_shapes_are_a_read_error(archive: Path) -> None:
+def test_arrays_of_wrong_shapes_are_a_read_error(archive):
     with h5py.File(archive, "r+") as file:
         del file["walk/truth/p"]
         file["walk/truth/p"] = np.zeros((3, 3))
@@ -57,13 +57,13 @@ def test_arrays_of_wrong_shapes_are_a_read_error(archive: Path) -> None:
             read_recording(f"{archive}:{name}")
 
 
-def test_an_archive_with_an_upper_case_suffix_is_read(archive: Path, tmp_path: Path) -> None:
+def test_an_archive_with_an_upper_case_suffix_is_read(archive, tmp_path):
     shutil.copy(archive, tmp_path / "TWO.H5")
     paths = find_recordings(tmp_path / "TWO.H5")
     assert [read_recording(path).name for path in paths] == ["other", "walk"]
 
 
-def test_a_damaged_zip_is_a_read_error(walk: ImuSequence, tmp_path: Path) -> None:
+def test_a_damaged_zip_is_a_read_error(walk, tmp_path):
     write_csv(tmp_path / "walk.csv", walk)
     with zipfile.ZipFile(tmp_path / "walk.zip", "w", zipfile.ZIP_DEFLATED) as file:
         file.write(tmp_path / "walk.csv", "walk.csv")
@@ -76,7 +76,7 @@ def test_a_damaged_zip_is_a_read_error(walk: ImuSequence, tmp_path: Path) -> Non
             read_recording(tmp_path / "walk.zip")
 
 
-def test_leftovers_of_a_killed_writer_are_not_recordings(walk: ImuSequence, tmp_path: Path) -> None:
+def test_leftovers_of_a_killed_writer_are_not_recordings(walk, tmp_path):
     from stario.sequences.datasets.convert import convert
 
     convert(walk, tmp_path / ".rec.abcd.tmp", "euroc")
@@ -84,13 +84,13 @@ def test_leftovers_of_a_killed_writer_are_not_recordings(walk: ImuSequence, tmp_
     assert find_recordings(tmp_path) == [tmp_path / "rec"]
 
 
-def test_a_truth_is_not_levelled_by_a_dead_accelerometer(walk: ImuSequence) -> None:
+def test_a_truth_is_not_levelled_by_a_dead_accelerometer(walk):
     truth, dead = walk.truth, np.zeros_like(walk.accel)
     with pytest.raises(InputError, match="gravity"):
         align_tracked_body(walk.time, walk.gyro, dead, truth.time, truth.attitude_WB, truth.valid)
 
 
-def test_a_pose_on_another_clock_does_not_exhaust_memory(walk: ImuSequence) -> None:
+def test_a_pose_on_another_clock_does_not_exhaust_memory(walk):
     truth = walk.truth
     time = truth.time + 1.7e9
     time[0] = 0.0
@@ -98,7 +98,7 @@ def test_a_pose_on_another_clock_does_not_exhaust_memory(walk: ImuSequence) -> N
         clock_offset(walk.time, walk.gyro, time, truth.attitude_WB, truth.valid)
 
 
-def test_a_slice_outside_the_truth_has_none(walk: ImuSequence) -> None:
+def test_a_slice_outside_the_truth_has_none(walk):
     short = replace(walk, truth=walk.truth.slice(0.0, 1.0))
     assert short.slice(5.0, 6.0).truth is None
 
@@ -113,7 +113,7 @@ def test_a_slice_outside_the_truth_has_none(walk: ImuSequence) -> None:
         "GYRO;12.345;12.340;0.01;-0.02;0.03;3",
     ],
 )
-def test_a_truncated_event_loses_only_itself(tmp_path: Path, cut: str) -> None:
+def test_a_truncated_event_loses_only_itself(tmp_path, cut):
     rows = []
     for k in range(200):
         t = 10.0 + 0.01 * k
@@ -124,9 +124,7 @@ def test_a_truncated_event_loses_only_itself(tmp_path: Path, cut: str) -> None:
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e3, 1e6, 1e9])
-def test_reference_points_take_the_time_unit_that_fits_the_recording(
-    tmp_path: Path, unit: float
-) -> None:
+def test_reference_points_take_the_time_unit_that_fits_the_recording(tmp_path, unit):
     from stario.sequences.readers.phones.alongside import Recording
     from stario.sequences.readers.phones.known_positions import reference_points
 
@@ -148,9 +146,7 @@ def test_reference_points_take_the_time_unit_that_fits_the_recording(
 
 
 @pytest.mark.parametrize(("delay", "sorts"), [(2, True), (60, False)])
-def test_slightly_disordered_rows_are_sorted(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, delay: int, sorts: bool
-) -> None:
+def test_slightly_disordered_rows_are_sorted(tmp_path, caplog, delay, sorts):
     """Every eighth row is late; a delay of 20 ms is sorted out, but 0.6 s has no clear cause."""
     walk = simulate_imu(generate_walk(2, 12.0), 100.0)
     row = np.arange(len(walk))

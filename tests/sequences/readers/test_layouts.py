@@ -136,7 +136,7 @@ def close(read: FloatArray, written: FloatArray) -> None:
 
 
 @pytest.mark.parametrize("names", NAMES)
-def test_a_table_is_read_back(names: str, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_a_table_is_read_back(names, tmp_path_factory):
     folder = tmp_path_factory.mktemp("tables")
 
     @settings(max_examples=80, deadline=None)

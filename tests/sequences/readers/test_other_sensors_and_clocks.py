@@ -22,7 +22,7 @@ OURS = "t,gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2]"
     seed=st.integers(0, 99),
 )
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25)
-def test_zeros_of_the_sensor_that_was_not_read_are_no_samples(tmp_path, rates, phase, seed) -> None:
+def test_zeros_of_the_sensor_that_was_not_read_are_no_samples(tmp_path, rates, phase, seed):
     rng = np.random.default_rng(seed)
     rows = []
     for sensor, rate in enumerate(rates):
@@ -47,7 +47,7 @@ def test_zeros_of_the_sensor_that_was_not_read_are_no_samples(tmp_path, rates, p
     rate=st.sampled_from([50, 100, 200, 1000]),
 )
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40)
-def test_integer_clocks_of_any_epoch_give_the_rate(tmp_path, unit, begin, rate) -> None:
+def test_integer_clocks_of_any_epoch_give_the_rate(tmp_path, unit, begin, rate):
     since = begin + (TO_1970 if unit == "100 ns" else 0)
     ticks = TICKS[unit]
     lines = []

@@ -28,7 +28,7 @@ def table(time_at: int) -> list[list[str]]:
     separator=st.sampled_from(",;\t"),
 )
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
-def test_a_row_that_lacks_cells_is_named(tmp_path, time_at, row, kept, separator) -> None:
+def test_a_row_that_lacks_cells_is_named(tmp_path, time_at, row, kept, separator):
     """The last one, cut short when the recorder was killed, is skipped."""
     lines = table(time_at)
     lines[row] = lines[row][:kept]
@@ -46,7 +46,7 @@ def test_a_row_that_lacks_cells_is_named(tmp_path, time_at, row, kept, separator
 
 
 @pytest.mark.parametrize("row", [1, ROWS // 2, ROWS])
-def test_a_ragged_row_of_a_sensor_is_refused_within_and_skipped_at_an_end(tmp_path, row) -> None:
+def test_a_ragged_row_of_a_sensor_is_refused_within_and_skipped_at_an_end(tmp_path, row):
     """An app writes its first rows before all sensors have begun, and its last as it is killed."""
     for name in ("accelerometer", "gyroscope"):
         lines = [f"{0.01 * k:.2f},5.66,5.66,5.66" for k in range(ROWS)]

@@ -1,5 +1,4 @@
 import logging
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -94,7 +93,7 @@ def write_oxiod(
 
 
 @pytest.mark.parametrize("velocity", [True, False], ids=["euroc", "tumvi"])
-def test_euroc_and_tumvi_are_read_back(tmp_path: Path, walk: ImuSequence, velocity: bool) -> None:
+def test_euroc_and_tumvi_are_read_back(tmp_path, walk, velocity):
     write_euroc(tmp_path / "room", walk, velocity)
     read = read_recording(tmp_path / "room")
     truth, given = true_track(read), true_track(walk)
@@ -111,7 +110,7 @@ def test_euroc_and_tumvi_are_read_back(tmp_path: Path, walk: ImuSequence, veloci
         assert np.abs(truth.velocity_W - given.velocity_W[400:-600:2]).max() < 1e-6
 
 
-def test_euroc_is_found_by_folder_mav0_and_file(tmp_path: Path, walk: ImuSequence) -> None:
+def test_euroc_is_found_by_folder_mav0_and_file(tmp_path, walk):
     write_euroc(tmp_path / "room", walk, velocity=False)
     for inner in ("", "mav0", "mav0/imu0/data.csv"):
         read = read_recording(tmp_path / "room" / inner)
@@ -119,7 +118,7 @@ def test_euroc_is_found_by_folder_mav0_and_file(tmp_path: Path, walk: ImuSequenc
         assert read.truth is not None
 
 
-def test_a_gap_in_the_truth_stays_a_gap(tmp_path: Path, walk: ImuSequence) -> None:
+def test_a_gap_in_the_truth_stays_a_gap(tmp_path, walk):
     keep = np.ones(len(walk.time[400:-600:2]), dtype=np.bool_)
     keep[1000:1500] = False
     write_euroc(tmp_path, walk, velocity=False, keep=keep)
@@ -131,15 +130,13 @@ def test_a_gap_in_the_truth_stays_a_gap(tmp_path: Path, walk: ImuSequence) -> No
     assert pose.valid[~lost & (walk.time > 2.001) & (walk.time < walk.time[-604])].all()
 
 
-def test_truth_that_is_not_the_imus_pose_is_ignored(tmp_path: Path, walk: ImuSequence) -> None:
+def test_truth_that_is_not_the_imus_pose_is_ignored(tmp_path, walk):
     write_euroc(tmp_path, walk, velocity=False)
     (tmp_path / "mav0/mocap0").rename(tmp_path / "mav0/vicon0")
     assert read_euroc(tmp_path).truth is None
 
 
-def test_a_sample_that_is_not_a_number_is_kept_for_the_health_report(
-    tmp_path: Path, walk: ImuSequence
-) -> None:
+def test_a_sample_that_is_not_a_number_is_kept_for_the_health_report(tmp_path, walk):
     write_euroc(tmp_path, walk, velocity=False)
     imu = tmp_path / "mav0/imu0/data.csv"
     lines = imu.read_text().splitlines()
@@ -152,9 +149,7 @@ def test_a_sample_that_is_not_a_number_is_kept_for_the_health_report(
     assert np.isfinite(read.gyro[11:]).all()
 
 
-def test_oxiod_returns_the_imus_pose_in_a_level_world(
-    tmp_path: Path, phone_walk: ImuSequence
-) -> None:
+def test_oxiod_returns_the_imus_pose_in_a_level_world(tmp_path, phone_walk):
     read = read_recording(write_oxiod(tmp_path / "handheld/data9", phone_walk))
     truth = true_track(read)
     assert read.name == "handheld-data9-imu1"
@@ -168,13 +163,13 @@ def test_oxiod_returns_the_imus_pose_in_a_level_world(
     assert truth.valid.mean() > 0.97
 
 
-def test_oxiod_flip_of_the_tracked_body_is_undone(tmp_path: Path, phone_walk: ImuSequence) -> None:
+def test_oxiod_flip_of_the_tracked_body_is_undone(tmp_path, phone_walk):
     truth = true_track(read_oxiod(write_oxiod(tmp_path, phone_walk, flip_row=3000)))
     assert truth.valid[3100:-20].mean() > 0.95
     assert_same_poses(truth, phone_walk, 2.0, 0.1)
 
 
-def test_oxiod_without_a_capture_file_has_no_truth(tmp_path: Path, phone_walk: ImuSequence) -> None:
+def test_oxiod_without_a_capture_file_has_no_truth(tmp_path, phone_walk):
     imu = write_oxiod(tmp_path, phone_walk)
     (tmp_path / "syn/vi1.csv").unlink()
     assert read_recording(imu).truth is None
@@ -182,9 +177,7 @@ def test_oxiod_without_a_capture_file_has_no_truth(tmp_path: Path, phone_walk: I
     assert read_recording(renamed).truth is None  # a file is not taken as its own truth
 
 
-def test_oxiod_gaps_in_the_imu_do_not_affect_the_truth(
-    tmp_path: Path, phone_walk: ImuSequence
-) -> None:
+def test_oxiod_gaps_in_the_imu_do_not_affect_the_truth(tmp_path, phone_walk):
     imu = write_oxiod(tmp_path, phone_walk)
     lines = imu.read_text().splitlines()
     lines[2000] = ",".join(["1.4955e+11", *["nan"] * 15])
@@ -194,7 +187,7 @@ def test_oxiod_gaps_in_the_imu_do_not_affect_the_truth(
     assert_same_poses(true_track(read), phone_walk, 2.0, 0.1)
 
 
-def test_oxiod_poses_next_to_missing_ones_are_used(tmp_path: Path, phone_walk: ImuSequence) -> None:
+def test_oxiod_poses_next_to_missing_ones_are_used(tmp_path, phone_walk):
     imu = write_oxiod(tmp_path, phone_walk)
     vicon = tmp_path / "syn/vi1.csv"
     rows = [line.split(",") for line in vicon.read_text().splitlines()]
@@ -207,9 +200,7 @@ def test_oxiod_poses_next_to_missing_ones_are_used(tmp_path: Path, phone_walk: I
 
 
 @pytest.mark.parametrize("rows", [1, 20, 500])
-def test_oxiod_too_short_to_determine_the_mount_has_no_truth(
-    tmp_path: Path, phone_walk: ImuSequence, rows: int, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_oxiod_too_short_to_determine_the_mount_has_no_truth(tmp_path, phone_walk, rows, caplog):
     imu = write_oxiod(tmp_path, phone_walk)
     for path in (imu, tmp_path / "syn/vi1.csv"):
         path.write_text("\n".join(path.read_text().splitlines()[:rows]))
@@ -220,9 +211,7 @@ def test_oxiod_too_short_to_determine_the_mount_has_no_truth(
     assert "to find the mount" in caplog.text
 
 
-def test_oxiod_requires_as_many_truth_rows_as_imu_rows(
-    tmp_path: Path, phone_walk: ImuSequence
-) -> None:
+def test_oxiod_requires_as_many_truth_rows_as_imu_rows(tmp_path, phone_walk):
     imu = write_oxiod(tmp_path, phone_walk)
     vicon = tmp_path / "syn/vi1.csv"
     vicon.write_text("\n".join(vicon.read_text().splitlines()[:-100]))
@@ -243,12 +232,7 @@ def test_oxiod_requires_as_many_truth_rows_as_imu_rows(
     ],
     ids=["truncated", "missing column", "not a number", "no time", "nan time", "header", "empty"],
 )
-def test_malformed_files_are_named_in_one_line(
-    tmp_path: Path,
-    walk: ImuSequence,
-    corrupt: Callable[[list[str]], list[str]],
-    message: str,
-) -> None:
+def test_malformed_files_are_named_in_one_line(tmp_path, walk, corrupt, message):
     write_euroc(tmp_path, walk, velocity=False)
     imu = tmp_path / "mav0/imu0/data.csv"
     imu.write_text("\n".join(corrupt(imu.read_text().splitlines())))
@@ -259,9 +243,7 @@ def test_malformed_files_are_named_in_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_formats_are_recognised_by_content(
-    tmp_path: Path, walk: ImuSequence, phone_walk: ImuSequence
-) -> None:
+def test_formats_are_recognised_by_content(tmp_path, walk, phone_walk):
     write_csv(tmp_path / "imu7.csv", walk.without_truth())  # named like OxIOD's
     assert np.array_equal(read_recording(tmp_path / "imu7.csv").gyro, walk.gyro)
     oxiod = write_oxiod(tmp_path, phone_walk).rename(tmp_path / "mine.csv")
@@ -270,7 +252,7 @@ def test_formats_are_recognised_by_content(
         read_recording(oxiod, format="csv")
 
 
-def test_unknown_content_is_shown_with_the_known_formats(tmp_path: Path) -> None:
+def test_unknown_content_is_shown_with_the_known_formats(tmp_path):
     path = tmp_path / "imu.csv"
     for text, seen in (
         ("0.0,1,2,3,4,5,6\n", "0.0,1,2,3,4,5,6"),
@@ -293,9 +275,7 @@ def test_unknown_content_is_shown_with_the_known_formats(tmp_path: Path) -> None
         read_recording(path, format="bags")
 
 
-def test_find_recordings_searches_folders_in_order(
-    tmp_path: Path, walk: ImuSequence, phone_walk: ImuSequence
-) -> None:
+def test_find_recordings_searches_folders_in_order(tmp_path, walk, phone_walk):
     imu = write_oxiod(tmp_path / "b/data1", phone_walk)
     raw = tmp_path / "b/data1/raw"
     raw.mkdir()
@@ -323,7 +303,7 @@ RECORDED = [
 
 @needs_data
 @pytest.mark.parametrize(("name", "least", "tilt_deg"), RECORDED)
-def test_recorded_truth_agrees_with_the_sensors(name: str, least: float, tilt_deg: float) -> None:
+def test_recorded_truth_agrees_with_the_sensors(name, least, tilt_deg):
     """The gyroscope is the derivative of the attitude; the mean force is gravity, pointing up."""
     sequence = read_recording(DATA / name)
     truth = true_track(sequence)

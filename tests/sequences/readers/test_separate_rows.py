@@ -1,9 +1,5 @@
 """One file whose gyroscope and accelerometer are in different rows, or in parts."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from csv_lines import write_lines
@@ -35,7 +31,7 @@ def expected(times: FloatArray, start: float) -> tuple[FloatArray, FloatArray]:
 
 
 @pytest.mark.parametrize("header", [HEADER, WIDE])
-def test_blank_cells_of_the_other_sensor_are_interpolated(tmp_path: Path, header: str) -> None:
+def test_blank_cells_of_the_other_sensor_are_interpolated(tmp_path, header):
     rows = [(t, f"{t:.3f},{text(rate(t))},,,") for t in GYRO_TIMES.tolist()]
     rows += [(t, f"{t:.3f},,,,{text(force(t))}") for t in ACCEL_TIMES.tolist()]
     path = write_lines(tmp_path / "own.csv", header, *(row for _, row in sorted(rows)))
@@ -47,7 +43,7 @@ def test_blank_cells_of_the_other_sensor_are_interpolated(tmp_path: Path, header
     np.testing.assert_allclose(read.accel, accel, atol=1e-9)
 
 
-def test_a_slower_accelerometer_is_interpolated(tmp_path: Path) -> None:
+def test_a_slower_accelerometer_is_interpolated(tmp_path):
     cells = [text(force(t)) if k % 3 == 0 else ",," for k, t in enumerate(GYRO_TIMES.tolist())]
     rows = [f"{t},{text(rate(t))},{cells[k]}" for k, t in enumerate(GYRO_TIMES.tolist())]
     path = write_lines(tmp_path / "own.csv", HEADER, *rows)
@@ -56,7 +52,7 @@ def test_a_slower_accelerometer_is_interpolated(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.accel, expected(read.time, 0.0)[1], atol=1e-9)
 
 
-def test_an_accelerometer_that_fails_halfway_leaves_its_rows_to_be_counted(tmp_path: Path) -> None:
+def test_an_accelerometer_that_fails_halfway_leaves_its_rows_to_be_counted(tmp_path):
     cells = [text(force(t)) if t < 1.0 else "nan,nan,nan" for t in GYRO_TIMES.tolist()]
     rows = [f"{t},{text(rate(t))},{cells[k]}" for k, t in enumerate(GYRO_TIMES.tolist())]
     path = write_lines(tmp_path / "own.csv", HEADER, *rows)
@@ -65,7 +61,7 @@ def test_an_accelerometer_that_fails_halfway_leaves_its_rows_to_be_counted(tmp_p
     assert np.isnan(read.accel).all(axis=1).sum() == 200
 
 
-def test_ground_truth_in_rows_of_its_own_stays_on_the_samples_clock(tmp_path: Path) -> None:
+def test_ground_truth_in_rows_of_its_own_stays_on_the_samples_clock(tmp_path):
     header = f"{HEADER},px,py,pz,qx,qy,qz,qw"
     rows = [(t, f"{t:.3f},{text(rate(t))},,,,,,,,,,") for t in GYRO_TIMES.tolist()]
     rows += [(t, f"{t:.3f},,,,{text(force(t))},,,,,,,") for t in ACCEL_TIMES.tolist()]
@@ -78,7 +74,7 @@ def test_ground_truth_in_rows_of_its_own_stays_on_the_samples_clock(tmp_path: Pa
 
 
 @pytest.mark.parametrize("accel", ["a", "lin_acc_"])
-def test_gravity_in_columns_of_its_own_is_added(tmp_path: Path, accel: str) -> None:
+def test_gravity_in_columns_of_its_own_is_added(tmp_path, accel):
     names = [f"{name}{axis}" for name in ("g", accel, "gravity_") for axis in "xyz"]
     rows = [f"{t},{text(rate(t))},{t},{-t},0.5,1,2,8.5" for t in GYRO_TIMES.tolist()]
     path = write_lines(tmp_path / "own.csv", ",".join(["t", *names]), *rows)

@@ -1,7 +1,5 @@
 """The head of a text file's table: separator, decimal mark, titles, dates."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +16,14 @@ def head_of(folder: Path, *lines: str) -> TableHead:
     return last
 
 
-def test_a_first_row_of_integers_has_the_decimal_mark_of_the_rows_below() -> None:
+def test_a_first_row_of_integers_has_the_decimal_mark_of_the_rows_below():
     rows = ["Zeit;x;y;z", "0;0;0;0", "0,01;0,5;-0,25;9,8", "0,02;0,5;-0,25;9,8"]
     assert first_row(rows) == RowFormat(1, ";", ",")
     points = [row.replace(",", ".") for row in rows]
     assert first_row(points) == RowFormat(1, ";", ".")
 
 
-def test_titles_are_those_above_a_row_of_their_units(tmp_path: Path) -> None:
+def test_titles_are_those_above_a_row_of_their_units(tmp_path):
     head = head_of(
         tmp_path, "# by a logger", "t;x;y;z", "s;rad/s;rad/s;rad/s", "0;1;2;3", "1;1;2;3"
     )
@@ -33,29 +31,29 @@ def test_titles_are_those_above_a_row_of_their_units(tmp_path: Path) -> None:
     assert (head.row_format.skip, head.row_format.delimiter) == (3, ";")
 
 
-def test_words_above_rows_with_blanks_are_no_titles(tmp_path: Path) -> None:
+def test_words_above_rows_with_blanks_are_no_titles(tmp_path):
     assert head_of(tmp_path, "made by a logger on a phone", "0 1 2 3", "1 1 2 3").titles == []
     assert head_of(tmp_path, "t x y z", "0 1 2 3", "1 1 2 3").titles == ["t", "x", "y", "z"]
 
 
-def test_titles_may_be_separated_in_another_way_than_the_rows(tmp_path: Path) -> None:
+def test_titles_may_be_separated_in_another_way_than_the_rows(tmp_path):
     """As NumPy's `savetxt` does: without its titles, columns z, y, x would be read as x, y, z."""
     assert head_of(tmp_path, "# time,z,y,x", "0 1 2 3", "1 1 2 3").titles == ["time", "z", "y", "x"]
 
 
-def test_quoted_numbers_have_decimal_commas_between_commas(tmp_path: Path) -> None:
+def test_quoted_numbers_have_decimal_commas_between_commas(tmp_path):
     head = head_of(tmp_path, "t,x,y,z", '0,"0,5","-0,25","9,8"', '1,"0,5","-0,25","9,8"')
     assert (head.row_format.delimiter, head.row_format.decimal) == (",", ",")
     np.testing.assert_array_equal(head.read(4).values[1], [1.0, 0.5, -0.25, 9.8])
 
 
-def test_a_last_line_that_may_be_cut_does_not_count(tmp_path: Path) -> None:
+def test_a_last_line_that_may_be_cut_does_not_count(tmp_path):
     head = head_of(tmp_path, "t,x,y,z", "10,1,2,3", "20,1,2,3", "3,1,2,3")
     np.testing.assert_array_equal(head.rows[:, 0], [10.0, 20.0])
 
 
 @pytest.mark.parametrize("form", ["2024-05-01T12:00:00.{:02d}Z", "12:00:00.{:02d}"])
-def test_columns_with_dates_become_seconds(tmp_path: Path, form: str) -> None:
+def test_columns_with_dates_become_seconds(tmp_path, form):
     rows = [f"{form.format(k)},{k},1,2,3" for k in range(5)]
     head = head_of(tmp_path, "date,count,x,y,z", *rows)
     assert head.dates == {0}
@@ -76,14 +74,12 @@ def test_columns_with_dates_become_seconds(tmp_path: Path, form: str) -> None:
         ("int64,float,float,float",),
     ],
 )
-def test_incomplete_rows_and_remarks_may_follow_the_titles(
-    tmp_path: Path, between: tuple[str, ...]
-) -> None:
+def test_incomplete_rows_and_remarks_may_follow_the_titles(tmp_path, between):
     """Without its titles, columns z, y, x would be read as x, y, z."""
     head = head_of(tmp_path, "by a logger", "time,z,y,x", *between, "2,1,2,3", "3,1,2,3")
     assert head.titles == ["time", "z", "y", "x"]
     assert head.row_format.skip == 2 + len(between)
 
 
-def test_incomplete_rows_without_titles_are_none(tmp_path: Path) -> None:
+def test_incomplete_rows_without_titles_are_none(tmp_path):
     assert head_of(tmp_path, "0,,,", "2,1,2,3", "3,1,2,3").titles == []

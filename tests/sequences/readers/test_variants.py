@@ -36,9 +36,7 @@ def relative_to_first(attitude: Rotation) -> Rotation:
         ({"grv_ori_error": 25.0, "ekf_ori_error": 30.0, "gyro_integration_error": 10.0}, "gyro"),
     ],
 )
-def test_ronin_uses_the_attitude_source_that_its_authors_use(
-    tmp_path, walks, errors, source
-) -> None:
+def test_ronin_uses_the_attitude_source_that_its_authors_use(tmp_path, walks, errors, source):
     walk = walks(200.0)
     recording = formats.ronin(tmp_path / "a000_1", walk, **errors)
     attitude = read_recording(recording.path).truth.attitude_WB
@@ -52,7 +50,7 @@ def test_ronin_uses_the_attitude_source_that_its_authors_use(
         assert max_angle(relative_to_first(attitude), relative_to_first(true[100:])) > 1e-9
 
 
-def test_ronin_without_an_ekf_uses_the_other_sources(tmp_path, walks) -> None:
+def test_ronin_without_an_ekf_uses_the_other_sources(tmp_path, walks):
     h5py = pytest.importorskip("h5py")
     recording = formats.ronin(tmp_path / "a", walks(200.0), grv_ori_error=30.0)
     with h5py.File(recording.path / "data.hdf5", "a") as data:
@@ -61,7 +59,7 @@ def test_ronin_without_an_ekf_uses_the_other_sources(tmp_path, walks) -> None:
     assert max_angle(read.truth.attitude_WB, recording.expected.truth.attitude_WB) < 2e-3
 
 
-def test_rnin_without_motion_capture_uses_the_odometry(tmp_path, walks) -> None:
+def test_rnin_without_motion_capture_uses_the_odometry(tmp_path, walks):
     recording = formats.rnin(tmp_path, walks(200.0), captured=False)
     truth, expected = read_recording(recording.path).truth, recording.expected.truth
     assert np.abs(truth.position_W - expected.position_W).max() < 1e-6
@@ -71,14 +69,14 @@ def test_rnin_without_motion_capture_uses_the_odometry(tmp_path, walks) -> None:
     assert np.array_equal(read_recording(csv).gyro, read_recording(recording.path).gyro)
 
 
-def test_tlio_quaternion_order_is_that_of_the_column_name(tmp_path, walks) -> None:
+def test_tlio_quaternion_order_is_that_of_the_column_name(tmp_path, walks):
     recording = formats.tlio(tmp_path / "7", walks(200.0), order="wxyz")
     read = read_recording(recording.path)
     assert max_angle(read.truth.attitude_WB, recording.expected.truth.attitude_WB) < 1e-6
     assert np.abs(read.accel - recording.expected.accel).max() < 1e-9
 
 
-def test_tlio_raw_poses_are_in_the_imus_axes(tmp_path, walks) -> None:
+def test_tlio_raw_poses_are_in_the_imus_axes(tmp_path, walks):
     """The calibration rotates a pose of the device, but not a pose of the IMU."""
     R_DI = Rotation.from_euler("zyx", [90.0, 10.0, -170.0], degrees=True)
     recording = formats.tlio_raw(tmp_path / "7", walks(1000.0), R_DI)
@@ -91,7 +89,7 @@ def test_tlio_raw_poses_are_in_the_imus_axes(tmp_path, walks) -> None:
     assert np.abs(alone.accel - recording.expected.accel).max() < 1e-9
 
 
-def test_raw_poses_in_a_world_with_z_up_are_kept(tmp_path, walks) -> None:
+def test_raw_poses_in_a_world_with_z_up_are_kept(tmp_path, walks):
     """RIDI's raw folders contain IMUNet's files, from a Tango."""
     recording = formats.imunet_raw(tmp_path / "seq", walks(200.0), world=Rotation.identity())
     truth, expected = read_recording(recording.path).truth, recording.expected.truth
@@ -99,7 +97,7 @@ def test_raw_poses_in_a_world_with_z_up_are_kept(tmp_path, walks) -> None:
     assert max_angle(truth.attitude_WB, expected.attitude_WB) < 1e-6
 
 
-def test_a_processed_recording_is_preferred_to_the_raw_files_next_to_it(tmp_path, walks) -> None:
+def test_a_processed_recording_is_preferred_to_the_raw_files_next_to_it(tmp_path, walks):
     walk = walks(200.0)
     formats.imunet_raw(tmp_path / "seq", walk)
     formats.ridi(tmp_path / "seq", walk)
@@ -118,7 +116,7 @@ def test_a_processed_recording_is_preferred_to_the_raw_files_next_to_it(tmp_path
         "nav_msgs/msg/Odometry",
     ],
 )
-def test_each_type_of_pose_message_is_read_as_truth(tmp_path, version, kind) -> None:
+def test_each_type_of_pose_message_is_read_as_truth(tmp_path, version, kind):
     walk = formats.walk_of(100.0, 3.0)
     path = formats.bag(tmp_path / "b", walk, version, pose_topics=(("/pose", kind),))
     read = read_recording(path)
@@ -128,7 +126,7 @@ def test_each_type_of_pose_message_is_read_as_truth(tmp_path, version, kind) -> 
 
 
 @pytest.mark.parametrize("version", ["ros1", "sqlite3", "mcap"])
-def test_pressure_and_satellites_of_a_bag_are_read(tmp_path, version) -> None:
+def test_pressure_and_satellites_of_a_bag_are_read(tmp_path, version):
     walk = formats.walk_of(100.0, 3.0)
     topics = (("/air", "sensor_msgs/msg/FluidPressure"), ("/fix", "sensor_msgs/msg/NavSatFix"))
     read = read_recording(formats.bag(tmp_path / "b", walk, version, other_topics=topics))
@@ -145,7 +143,7 @@ def test_pressure_and_satellites_of_a_bag_are_read(tmp_path, version) -> None:
     np.testing.assert_allclose(found.radius_m, 1.51 * 3.0)
 
 
-def test_several_topics_are_named_with_the_option_that_selects_one(tmp_path) -> None:
+def test_several_topics_are_named_with_the_option_that_selects_one(tmp_path):
     walk = formats.walk_of(100.0, 3.0)
     kind = "geometry_msgs/msg/PoseStamped"
     path = formats.bag(
@@ -167,7 +165,7 @@ def test_several_topics_are_named_with_the_option_that_selects_one(tmp_path) -> 
         read_recording(tmp_path / "a.csv", imu_topic="/imu")
 
 
-def test_a_bag_without_an_imu_is_refused_with_its_topics(tmp_path) -> None:
+def test_a_bag_without_an_imu_is_refused_with_its_topics(tmp_path):
     path = formats.bag(tmp_path / "b", formats.walk_of(100.0, 1.0), imu_topics=())
     with pytest.raises(
         ReadError, match=r"found /odom \(Odometry\), /mag .*, expected one topic with sens"
@@ -188,7 +186,7 @@ def rows(time, values, sep=",", last=False) -> str:
     )
 
 
-def test_loggers_with_different_conventions_are_read(tmp_path) -> None:
+def test_loggers_with_different_conventions_are_read(tmp_path):
     """Seconds with units in a header; milliseconds without any; the time after the values."""
     walk = formats.walk_of(200.0, 5.0)
     t, gyro, accel = walk.time, walk.gyro, walk.accel
@@ -231,13 +229,13 @@ def write_sensor_files(folder, *names: str) -> None:
         (("acc_1.csv", "acc_2.csv", "gyr_3.csv"), r"recordings \(acc_1\.csv, acc_2\.csv, gyr_3"),
     ],
 )
-def test_recordings_that_share_a_folder_are_not_mixed(tmp_path, names, message) -> None:
+def test_recordings_that_share_a_folder_are_not_mixed(tmp_path, names, message):
     write_sensor_files(tmp_path / "s", *names)
     with pytest.raises(ReadError, match=message):
         read_recording(tmp_path / "s")
 
 
-def test_files_with_two_prefixes_are_two_recordings(tmp_path) -> None:
+def test_files_with_two_prefixes_are_two_recordings(tmp_path):
     write_sensor_files(tmp_path / "s", "one_acc.csv", "one_gyr.csv", "Two_acc.csv", "Two_gyr.csv")
     (tmp_path / "s/Two_gyr.csv").write_text(rows(np.arange(99) / 100.0, np.ones((99, 3))))
     found = find_recordings(tmp_path)
@@ -248,14 +246,14 @@ def test_files_with_two_prefixes_are_two_recordings(tmp_path) -> None:
     assert np.array_equal(one.gyro, formats.walk_of(100.0, 3.0).gyro)
 
 
-def test_a_sensor_is_paired_with_the_one_of_its_own_device(tmp_path) -> None:
+def test_a_sensor_is_paired_with_the_one_of_its_own_device(tmp_path):
     write_sensor_files(tmp_path / "s", "watch_acc.csv", "watch_gyr.csv")
     expected = read_recording(tmp_path / "s")
     (tmp_path / "s/phone_acc.csv").write_text(rows(expected.time, 2.0 * expected.accel))
     assert np.array_equal(read_recording(tmp_path / "s").accel, expected.accel)
 
 
-def test_variants_of_a_recordings_files_are_not_other_recordings(tmp_path) -> None:
+def test_variants_of_a_recordings_files_are_not_other_recordings(tmp_path):
     """Files written alongside the raw sensors; names that differ by more than the sensor."""
     names = ("Accelerometer.csv", "Gyroscope.csv")
     variants = ("AccelerometerUncalibrated.csv", "GyroscopeUncalibrated.csv", "Gravity.csv")
@@ -268,7 +266,7 @@ def test_variants_of_a_recordings_files_are_not_other_recordings(tmp_path) -> No
 
 
 @pytest.mark.parametrize("above", ["", "\n", "Device: Pixel\n\n", "# a\n\n# b\n"])
-def test_any_text_above_a_loggers_header_is_skipped(tmp_path, above) -> None:
+def test_any_text_above_a_loggers_header_is_skipped(tmp_path, above):
     walk = formats.walk_of(100.0, 3.0)
     head = f"{above}time,x,y,z\n"
     write_phone_files(
@@ -279,14 +277,14 @@ def test_any_text_above_a_loggers_header_is_skipped(tmp_path, above) -> None:
 
 @pytest.mark.parametrize("rate", [50.0, 1000.0, 1125.0])
 @pytest.mark.parametrize("start", [0.0, 12345.678])
-def test_the_time_unit_is_determined_at_every_accepted_rate(tmp_path, rate, start) -> None:
+def test_the_time_unit_is_determined_at_every_accepted_rate(tmp_path, rate, start):
     walk = formats.walk_of(rate, 2.0)
     t = np.round(start + walk.time, 6)
     write_phone_files(tmp_path / "s", rows(t, walk.accel), rows(t, walk.gyro))
     assert read_recording(tmp_path / "s").rate == pytest.approx(rate, rel=1e-3)
 
 
-def test_units_named_by_a_logger_are_used_or_refused(tmp_path) -> None:
+def test_units_named_by_a_logger_are_used_or_refused(tmp_path):
     walk = formats.walk_of(100.0, 3.0)
 
     def read(time: str, gyro: str):
@@ -306,13 +304,13 @@ def test_units_named_by_a_logger_are_used_or_refused(tmp_path) -> None:
         read("ticks", "deg/s")
 
 
-def test_files_with_both_sensors_are_separate_recordings(tmp_path, walks) -> None:
+def test_files_with_both_sensors_are_separate_recordings(tmp_path, walks):
     write_csv(tmp_path / "accel_gyro_1.csv", walks(200.0))
     write_csv(tmp_path / "accel_gyro_2.csv", walks(200.0))
     assert len(find_recordings(tmp_path)) == 2
 
 
-def test_a_loggers_gravity_is_added_if_it_was_removed(tmp_path) -> None:
+def test_a_loggers_gravity_is_added_if_it_was_removed(tmp_path):
     walk = formats.walk_of(100.0, 5.0)
     gravity = walk.truth.attitude_WB.apply([0.0, 0.0, 9.80665], inverse=True)
     write_phone_files(
@@ -323,7 +321,7 @@ def test_a_loggers_gravity_is_added_if_it_was_removed(tmp_path) -> None:
     assert np.abs(read_recording(tmp_path / "s").accel - walk.accel).max() < 1e-9
 
 
-def test_clocks_of_different_phase_are_interpolated_but_not_across_a_gap(tmp_path) -> None:
+def test_clocks_of_different_phase_are_interpolated_but_not_across_a_gap(tmp_path):
     walk = formats.walk_of(200.0, 10.0)
     t = walk.time
     accel_time = np.delete(t[:-1] + 0.0017, np.arange(800, 1000))
@@ -349,7 +347,7 @@ def same_samples(a, b) -> bool:
     return all(np.array_equal(x, y, equal_nan=True) for x, y in zip(*arrays, strict=True))
 
 
-def test_a_bag_without_gravity_keeps_the_attitude_that_restores_it(tmp_path) -> None:
+def test_a_bag_without_gravity_keeps_the_attitude_that_restores_it(tmp_path):
     """As drivers of the BNO055 publish it: linear acceleration beside the sensor's own attitude."""
     walk = formats.walk_of(100.0, 20.0)
     up_B = walk.truth.at(walk.time).attitude_WB.apply([0.0, 0.0, STANDARD_GRAVITY], inverse=True)
@@ -367,7 +365,7 @@ def test_a_bag_without_gravity_keeps_the_attitude_that_restores_it(tmp_path) -> 
     )
 
 
-def test_large_files_are_read_as_small_ones_are(tmp_path, walks, monkeypatch) -> None:
+def test_large_files_are_read_as_small_ones_are(tmp_path, walks, monkeypatch):
     walk = walks(200.0)
     paths = [
         write(tmp_path / f"seq{k}", walk).path
@@ -385,7 +383,7 @@ def test_large_files_are_read_as_small_ones_are(tmp_path, walks, monkeypatch) ->
             assert same_samples(read_recording(path), careful), path
 
 
-def test_an_error_in_a_large_file_is_named_too(tmp_path, walks, monkeypatch) -> None:
+def test_an_error_in_a_large_file_is_named_too(tmp_path, walks, monkeypatch):
     monkeypatch.setattr("stario.sequences.readers.text._LARGE_BYTES", 0)
     path = formats.ridi(tmp_path / "seq", walks(200.0)).path
     csv = path / "processed/data.csv"
@@ -403,14 +401,14 @@ def test_an_error_in_a_large_file_is_named_too(tmp_path, walks, monkeypatch) -> 
         read_recording(tmp_path / "own.csv")
 
 
-def test_a_missing_package_is_named_with_what_installs_it(tmp_path, walks, monkeypatch) -> None:
+def test_a_missing_package_is_named_with_what_installs_it(tmp_path, walks, monkeypatch):
     recording = formats.ronin(tmp_path / "a", walks(200.0))
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(InputError, match=r"h5py: found not installed.*pip install 'h5py"):
         read_recording(recording.path)
 
 
-def test_calibration_is_applied_as_in_the_authors_filter(tmp_path, walks) -> None:
+def test_calibration_is_applied_as_in_the_authors_filter(tmp_path, walks):
     recording = formats.tlio_raw(tmp_path / "7", walks(1000.0))
     calibration = recording.path.with_name("calibration.json")
     fields = json.loads(calibration.read_text())

@@ -1,7 +1,5 @@
 """A moment is inserted into a recording so that its samples agree with the extended truth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +13,7 @@ from stario.sequences.simulation.barometer import Air, simulate_barometer
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
 from stario.sequences.simulation.insertion import Inserted, insert_moment
 from stario.sequences.simulation.magnetometer import MagneticField
-from stario.sequences.simulation.moments import MOMENTS, Moment
+from stario.sequences.simulation.moments import MOMENTS
 from stario.sequences.simulation.receiver import simulate_satellites
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.units import METRES_PER_HPA
@@ -51,9 +49,7 @@ def within(found: Inserted) -> ImuSequence:
 @pytest.mark.usefixtures("perfect")
 @pytest.mark.parametrize("moment", MOMENTS, ids=lambda moment: moment.name)
 @pytest.mark.parametrize("share", [0.0, 0.5])
-def test_samples_lead_from_each_true_pose_to_the_next(
-    walk: ImuSequence, moment: Moment, share: float
-) -> None:
+def test_samples_lead_from_each_true_pose_to_the_next(walk, moment, share):
     """Across the moment's ends, too; impacts are shorter than the samples' step."""
     assert walk.truth is not None
     whole = insert_moment(walk, walk.truth, moment, share, seed=1).sequence
@@ -74,9 +70,7 @@ def test_samples_lead_from_each_true_pose_to_the_next(
     assert np.sqrt(np.mean(np.square(off))) < 0.25
 
 
-def test_the_rest_of_a_recording_is_unchanged_but_for_its_time_and_a_lifts_height(
-    walk: ImuSequence,
-) -> None:
+def test_the_rest_of_a_recording_is_unchanged_but_for_its_time_and_a_lifts_height(walk):
     found = inserted(walk, "lift")
     whole, later = found.sequence, found.stop - found.start
     assert later == pytest.approx(24.0)
@@ -93,7 +87,7 @@ def test_the_rest_of_a_recording_is_unchanged_but_for_its_time_and_a_lifts_heigh
                                atol=0.1)  # fmt: skip
 
 
-def test_every_moment_is_what_its_name_says(walk: ImuSequence) -> None:
+def test_every_moment_is_what_its_name_says(walk):
     def sizes(name: str) -> tuple[np.ndarray, np.ndarray]:
         part = within(inserted(walk, name))
         return np.linalg.norm(part.gyro, axis=1), np.linalg.norm(part.accel, axis=1)
@@ -114,7 +108,7 @@ def test_every_moment_is_what_its_name_says(walk: ImuSequence) -> None:
     assert np.ptp(force[300:-300]) > 1.5
 
 
-def test_a_lift_turns_the_field_and_weakens_it_and_standing_does_not(walk: ImuSequence) -> None:
+def test_a_lift_turns_the_field_and_weakens_it_and_standing_does_not(walk):
     def field_W(name: str) -> np.ndarray:
         whole = inserted(walk, name)
         part = whole.sequence.slice(whole.start + 6.0, whole.stop - 6.0)
@@ -130,14 +124,14 @@ def test_a_lift_turns_the_field_and_weakens_it_and_standing_does_not(walk: ImuSe
     np.testing.assert_allclose(np.arctan2(standing[:, 1], standing[:, 0]), 0.0, atol=0.2)
 
 
-def test_the_gyroscope_keeps_its_bias(walk: ImuSequence) -> None:
+def test_the_gyroscope_keeps_its_bias(walk):
     bias = np.array([0.03, -0.02, 0.01])
     part = within(inserted(replace(walk, gyro=walk.gyro + bias), "table"))
     lying = (part.time > part.time[0] + 5.0) & (part.time < part.time[0] + 15.0)
     np.testing.assert_allclose(part.gyro[lying].mean(axis=0), bias, atol=2e-3)
 
 
-def test_errors_of_scale_and_alignment_grow_with_the_rotation() -> None:
+def test_errors_of_scale_and_alignment_grow_with_the_rotation():
     found = inserted(walk_of(PHONE_IMU), "shake 25 s")
     whole = found.sequence
     assert whole.truth is not None
@@ -148,7 +142,7 @@ def test_errors_of_scale_and_alignment_grow_with_the_rotation() -> None:
     assert np.degrees(wrong) > 5.0
 
 
-def test_known_positions_after_the_moment_come_later(walk: ImuSequence) -> None:
+def test_known_positions_after_the_moment_come_later(walk):
     assert walk.truth is not None
     time = np.array([2.0, 8.0, 15.0])
     known = PositionTrack(time, walk.truth.at(time).position_W[:, :2], "waypoints")
@@ -159,7 +153,7 @@ def test_known_positions_after_the_moment_come_later(walk: ImuSequence) -> None:
     np.testing.assert_allclose(found.positions.position_W, known.position_W)
 
 
-def test_pressure_goes_on_in_a_moment_and_satellites_after_it(walk: ImuSequence) -> None:
+def test_pressure_goes_on_in_a_moment_and_satellites_after_it(walk):
     assert walk.truth is not None
     full = replace(
         walk,
@@ -182,7 +176,7 @@ def test_pressure_goes_on_in_a_moment_and_satellites_after_it(walk: ImuSequence)
     np.testing.assert_array_equal(reported.latlon_deg, full.satellites.latlon_deg)
 
 
-def test_a_seed_gives_the_same_moment_and_another_one_another(walk: ImuSequence) -> None:
+def test_a_seed_gives_the_same_moment_and_another_one_another(walk):
     assert walk.truth is not None
     moment = BY_NAME["shake 10 s"]
     first, again, other = (

@@ -1,7 +1,5 @@
 """A walk with exact sensors, for judging."""
 
-from __future__ import annotations
-
 import pytest
 
 from stario.sequences.sequence import ImuSequence

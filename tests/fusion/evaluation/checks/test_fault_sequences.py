@@ -1,7 +1,5 @@
 """Any sequence of faults leaves finite states, valid covariances and increasing times."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -150,7 +148,7 @@ def assert_valid(state: NavState) -> None:
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
 @pytest.mark.parametrize("examples", [10, pytest.param(200, marks=pytest.mark.slow)])
-def test_no_sequence_of_faults_breaks_a_stream(backend: str, examples: int) -> None:
+def test_no_sequence_of_faults_breaks_a_stream(backend, examples):
     @settings(
         max_examples=examples,
         deadline=None,

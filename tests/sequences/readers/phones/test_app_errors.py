@@ -1,7 +1,5 @@
 """Files and zips that no reader of phone apps takes are refused in one line that names why."""
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -23,13 +21,13 @@ from stario.sequences.clean_samples import clean_samples
         (b"\x1f\x8b\x08\0\0\0", "compressed with gzip"),
     ],
 )
-def test_an_unsupported_container_is_named(start: bytes, message: str, tmp_path: Path) -> None:
+def test_an_unsupported_container_is_named(start, message, tmp_path):
     (tmp_path / "export.data").write_bytes(start)
     with pytest.raises(ReadError, match=rf"found [\w ,]*{message}.*; export as CSV"):
         read_recording(tmp_path / "export.data")
 
 
-def test_two_recordings_in_a_zip_are_named(walk: ImuSequence, tmp_path: Path) -> None:
+def test_two_recordings_in_a_zip_are_named(walk, tmp_path):
     zyx(tmp_path / "s", walk, TotalAcceleration=walk.accel, Gyroscope=walk.gyro)
     with zipfile.ZipFile(tmp_path / "two.zip", "w") as file:
         for one in (tmp_path / "s").iterdir():
@@ -41,7 +39,7 @@ def test_two_recordings_in_a_zip_are_named(walk: ImuSequence, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("first", [0, 1])
-def test_a_count_of_rows_is_no_time(first: int, walk: ImuSequence, tmp_path: Path) -> None:
+def test_a_count_of_rows_is_no_time(first, walk, tmp_path):
     count = first + np.arange(len(walk))
     wide = ",".join(f"{name} {axis}" for name in ("Gyroscope", "Accelerometer") for axis in "XYZ")
     save(tmp_path / "wide.csv", f"timestamp,{wide}", count, walk.gyro, walk.accel)
@@ -54,7 +52,7 @@ def test_a_count_of_rows_is_no_time(first: int, walk: ImuSequence, tmp_path: Pat
             read_recording(tmp_path / name)
 
 
-def test_sensors_without_a_time_are_refused_as_such(walk: ImuSequence, tmp_path: Path) -> None:
+def test_sensors_without_a_time_are_refused_as_such(walk, tmp_path):
     wide = ",".join(f"{name}_{axis}" for name in ("Gyr", "Acc") for axis in "XYZ")
     columns = np.arange(len(walk)), walk.gyro, walk.accel
     save(tmp_path / "MT.csv", f"// Update Rate: 100.0Hz\nPacketCounter,{wide}", *columns)
@@ -72,9 +70,7 @@ def test_sensors_without_a_time_are_refused_as_such(walk: ImuSequence, tmp_path:
         ('[{"sensor": "Gyroscope", "time": "1"}]', r"x\.json: .*found"),
     ],
 )
-def test_a_malformed_json_export_is_refused_in_one_line(
-    text: str, message: str, tmp_path: Path
-) -> None:
+def test_a_malformed_json_export_is_refused_in_one_line(text, message, tmp_path):
     (tmp_path / "x.json").write_text(text)
     with pytest.raises(ReadError, match=message) as error:
         read_recording(tmp_path / "x.json")
@@ -82,9 +78,7 @@ def test_a_malformed_json_export_is_refused_in_one_line(
     assert "stario-" not in str(error.value)
 
 
-def test_a_sensors_file_without_samples_is_named(
-    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_sensors_file_without_samples_is_named(walk, tmp_path, caplog):
     zyx(tmp_path, walk, Gyroscope=walk.gyro, GyroscopeUncalibrated=walk.gyro)
     (tmp_path / "TotalAcceleration.csv").write_text("time,seconds_elapsed,z,y,x\n")
     lacking = "no rows with a time that grows and three values"
@@ -97,9 +91,7 @@ def test_a_sensors_file_without_samples_is_named(
     assert "Gyroscope.csv: not read: it has no rows" in caplog.text
 
 
-def test_samples_without_an_accelerometer_are_counted(
-    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_samples_without_an_accelerometer_are_counted(walk, tmp_path, caplog):
     """It stopped halfway, say; that it starts a little late needs no mention."""
     for part, dropped in ((slice(10, None), False), (slice(0, 751), True)):
         zyx(tmp_path, walk, Gyroscope=walk.gyro)
@@ -110,9 +102,7 @@ def test_samples_without_an_accelerometer_are_counted(
         assert ("dropped" in caplog.text) == dropped
 
 
-def test_a_file_of_one_sensor_names_that_of_the_gyroscope(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_a_file_of_one_sensor_names_that_of_the_gyroscope(walk, tmp_path):
     zyx(tmp_path, walk, Gyroscope=walk.gyro, TotalAcceleration=walk.accel)
     message = r"found one sensor of a recording, .*; name its gyroscope: .*/Gyroscope\.csv$"
     with pytest.raises(ReadError, match=message):
@@ -120,9 +110,7 @@ def test_a_file_of_one_sensor_names_that_of_the_gyroscope(
     assert len(read_recording(tmp_path / "Gyroscope.csv")) == len(walk)
 
 
-def test_single_wild_samples_are_no_reason_to_refuse_a_file(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_single_wild_samples_are_no_reason_to_refuse_a_file(walk, tmp_path):
     """They would spoil the comparison with the phone's attitude, which tells Apple's sign."""
     gyro, accel = walk.gyro.copy(), -walk.accel
     gyro[500, 1], gyro[600, 0], accel[700, 2], accel[900, 0] = 1e30, 1e5, np.inf, -1e15
@@ -136,7 +124,7 @@ def test_single_wild_samples_are_no_reason_to_refuse_a_file(
     assert np.abs(force - np.delete(walk.accel, [500, 600], axis=0)).max() < 2.0
 
 
-def test_a_clock_in_another_unit_than_its_title_says(walk: ImuSequence, tmp_path: Path) -> None:
+def test_a_clock_in_another_unit_than_its_title_says(walk, tmp_path):
     for name, values in (("Gyroscope", walk.gyro), ("TotalAcceleration", walk.accel)):
         save(tmp_path / f"{name}.csv", "t [s],x,y,z", ns(walk), values)
     with pytest.raises(ReadError, match=r"time: found .*; is its unit the one that the header"):

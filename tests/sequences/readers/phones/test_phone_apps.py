@@ -1,9 +1,6 @@
 """Files as apps export them (`phone_exports`): each must be read as the walk written."""
 
-from __future__ import annotations
-
 import zipfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,7 +25,6 @@ from recorded import DATA
 from scipy.spatial.transform import Rotation
 
 from stario.sequences import (
-    ImuSequence,
     Magnetometer,
     ReadError,
     find_recordings,
@@ -42,7 +38,7 @@ RAW = DATA / "raw"
 
 
 @pytest.mark.parametrize("app", APPS)
-def test_an_apps_export_is_read_as_the_walk(app: str, walk: ImuSequence, tmp_path: Path) -> None:
+def test_an_apps_export_is_read_as_the_walk(app, walk, tmp_path):
     APPS[app](tmp_path / "s", walk)
     (found,) = find_recordings(tmp_path / "s")
     read = read_recording(found)
@@ -52,7 +48,7 @@ def test_an_apps_export_is_read_as_the_walk(app: str, walk: ImuSequence, tmp_pat
     np.testing.assert_allclose(read.magnetometer.time, walk.time, atol=1e-3)
 
 
-def test_old_unit_symbols_and_other_languages_are_read(walk: ImuSequence, tmp_path: Path) -> None:
+def test_old_unit_symbols_and_other_languages_are_read(walk, tmp_path):
     androsensor(tmp_path / "s", walk)
     (path,) = (tmp_path / "s").iterdir()
     path.write_bytes(path.read_text().replace("μ", "µ").encode("latin-1"))
@@ -65,9 +61,7 @@ def test_old_unit_symbols_and_other_languages_are_read(walk: ImuSequence, tmp_pa
     np.testing.assert_allclose(read_recording(tmp_path / "t").accel, walk.accel)
 
 
-def test_a_linear_acceleration_of_about_one_is_not_mistaken_for_gravity_in_g(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_a_linear_acceleration_of_about_one_is_not_mistaken_for_gravity_in_g(walk, tmp_path):
     """Its norm is about 1, as in g; the gravity file next to it shows what it is."""
     sensor_logger_ios(tmp_path / "s", walk)
     (tmp_path / "s/Metadata.csv").unlink()
@@ -79,9 +73,7 @@ def test_a_linear_acceleration_of_about_one_is_not_mistaken_for_gravity_in_g(
 
 
 @pytest.mark.parametrize("app", [sensor_logger_attitude, senslogs_ios])
-def test_the_phones_own_attitude_is_read_too(
-    app: Callable[[Path, ImuSequence], None], walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_the_phones_own_attitude_is_read_too(app, walk, tmp_path):
     """With quaternions in either order and direction, as determined by the gyroscope."""
     app(tmp_path / "s", walk)
     read = read_recording(tmp_path / "s")
@@ -99,9 +91,7 @@ def test_the_phones_own_attitude_is_read_too(
 
 @pytest.mark.parametrize("inner", ["", "walk/"])
 @pytest.mark.parametrize("app", ["sensor_logger", "phyphox"])
-def test_a_zip_is_read_like_the_folder_in_it(
-    app: str, inner: str, walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_a_zip_is_read_like_the_folder_in_it(app, inner, walk, tmp_path):
     folder = tmp_path / "s"
     APPS[app](folder, walk)
     (tmp_path / "zips").mkdir()
@@ -119,7 +109,7 @@ def test_a_zip_is_read_like_the_folder_in_it(
         read_recording(path)
 
 
-def test_an_error_in_a_zip_names_the_zip_and_the_file(walk: ImuSequence, tmp_path: Path) -> None:
+def test_an_error_in_a_zip_names_the_zip_and_the_file(walk, tmp_path):
     sensor_logger(tmp_path / "s", walk)
     path = tmp_path / "export.zip"
     with zipfile.ZipFile(path, "w") as file:
@@ -132,9 +122,7 @@ def test_an_error_in_a_zip_names_the_zip_and_the_file(walk: ImuSequence, tmp_pat
         read_recording(path)
 
 
-def test_messages_about_a_zip_name_the_zip_and_the_file(
-    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_messages_about_a_zip_name_the_zip_and_the_file(walk, tmp_path, caplog):
     for name, values in (("Gyroscope", walk.gyro), ("TotalAcceleration", walk.accel)):
         save(tmp_path / f"s/{name}.csv", "time,x,y,z", walk.time, values)
     path = tmp_path / "export.zip"
@@ -155,9 +143,7 @@ def test_messages_about_a_zip_name_the_zip_and_the_file(
 
 @pytest.mark.parametrize("order", ["xyzw", "wxyz"])
 @pytest.mark.parametrize("turn", ["x,y,z", "camera"])
-def test_poses_next_to_the_imu_are_read_as_truth_in_its_axes(
-    order: str, turn: str, walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_poses_next_to_the_imu_are_read_as_truth_in_its_axes(order, turn, walk, tmp_path):
     """30 Hz, y up, of the camera or the sensor, in either quaternion order despite the header."""
     truth, every = pose(walk), slice(None, None, 3)
     mount = Rotation.from_euler("z", 90.0 if turn == "camera" else 0.0, degrees=True)
@@ -179,9 +165,7 @@ def test_poses_next_to_the_imu_are_read_as_truth_in_its_axes(
 
 
 @pytest.mark.parametrize("columns", [7, 12])
-def test_a_pose_file_without_any_rotation_gives_a_warning(
-    columns: int, walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_pose_file_without_any_rotation_gives_a_warning(columns, walk, tmp_path, caplog):
     rows = np.ones((len(walk), columns))
     for name, values in (("acce", walk.accel), ("gyro", walk.gyro), ("ARKit_pose", rows)):
         save(tmp_path / f"s/{name}.txt", "# a", ns(walk), values, sep=" ")
@@ -189,7 +173,7 @@ def test_a_pose_file_without_any_rotation_gives_a_warning(
     assert "no row in ARKit_pose.txt holds a pose" in caplog.text
 
 
-def test_poses_without_an_imu_are_refused_as_such(walk: ImuSequence, tmp_path: Path) -> None:
+def test_poses_without_an_imu_are_refused_as_such(walk, tmp_path):
     rows = np.hstack([pose(walk).position_W, pose(walk).quat_xyzw])
     save(tmp_path / "s/ARCore_sensor_pose.txt", "# by a logger", ns(walk), rows, sep=" ")
     for read in (read_recording, find_recordings):
@@ -197,7 +181,7 @@ def test_poses_without_an_imu_are_refused_as_such(walk: ImuSequence, tmp_path: P
             read(tmp_path / "s")
 
 
-def test_a_missing_sensor_is_named(walk: ImuSequence, tmp_path: Path) -> None:
+def test_a_missing_sensor_is_named(walk, tmp_path):
     save(tmp_path / "s/Accelerometer.csv", "time,x,y,z", walk.time, walk.accel)
     save(tmp_path / "s/Magnetometer.csv", "time,x,y,z", walk.time, field(walk))
     message = "only accel and mag, expected a gyroscope and an accelerometer"
@@ -211,9 +195,7 @@ def test_a_missing_sensor_is_named(walk: ImuSequence, tmp_path: Path) -> None:
         read_recording(tmp_path / "a.csv")
 
 
-def test_an_accelerometer_in_other_axes_than_the_gyroscope_is_corrected(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_accelerometer_in_other_axes_than_the_gyroscope_is_corrected(tmp_path, caplog):
     style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.5, 0.4))
     walk = simulate_imu(generate_walk(3, 60.0, style=style), 50.0, PERFECT_IMU)
     poses = np.hstack(
@@ -227,9 +209,7 @@ def test_an_accelerometer_in_other_axes_than_the_gyroscope_is_corrected(
     np.testing.assert_allclose(read.accel, walk.accel, atol=1e-9)
 
 
-def test_timestamps_among_the_values_are_named_with_their_file_and_columns(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_timestamps_among_the_values_are_named_with_their_file_and_columns(walk, tmp_path):
     for name in ("accel", "gyro"):
         values = np.column_stack([ns(walk), walk.gyro[:, :2]])
         save(tmp_path / f"s/{name}.csv", "time,x,y,z", walk.time, values)
@@ -238,9 +218,7 @@ def test_timestamps_among_the_values_are_named_with_their_file_and_columns(
         read_recording(tmp_path / "s")
 
 
-def test_waypoints_and_reference_points_are_read_as_positions(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_waypoints_and_reference_points_are_read_as_positions(walk, tmp_path):
     trace(tmp_path / "t", walk)
     waypoints = read_recording(tmp_path / "t/5d07.txt").positions
     assert waypoints is not None
@@ -269,7 +247,7 @@ KINDS = {
 
 @pytest.mark.skipif(not RAW.is_dir(), reason="the apps' own files are not here")
 @pytest.mark.parametrize("name", KINDS)
-def test_the_apps_own_files_contain_gravity_and_the_expected_truth(name: str) -> None:
+def test_the_apps_own_files_contain_gravity_and_the_expected_truth(name):
     read = read_recording(RAW / name)
     assert 9.0 < np.median(np.linalg.norm(read.accel, axis=1)) < 12.0
     assert 0.1 < np.median(np.linalg.norm(read.gyro, axis=1)) < 3.0

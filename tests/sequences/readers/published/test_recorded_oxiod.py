@@ -52,12 +52,12 @@ def assert_consistent(path: Path) -> None:
 
 @needs_data
 @pytest.mark.parametrize("name", SELECTED)
-def test_selected_recordings_are_self_consistent(name: str) -> None:
+def test_selected_recordings_are_self_consistent(name):
     assert_consistent(OXIOD / name)
 
 
 @needs_data
 @pytest.mark.slow
 @pytest.mark.parametrize("path", ALL, ids=str)
-def test_every_recording_is_self_consistent(path: Path) -> None:
+def test_every_recording_is_self_consistent(path):
     assert_consistent(path)
