@@ -224,7 +224,6 @@ def tlio_raw(
     mount = Rotation.identity() if R_DI is None else R_DI
     lever = np.zeros(3) if R_DI is None else np.array([0.01, 0.03, -0.02])
     truth = pose_of(walk)
-    assert truth.velocity_W is not None
     R_WD = truth.attitude_WB * mount.inv()
     device = ImuSequence(
         "device", walk.time[::every], mount.apply(walk.gyro)[::every],

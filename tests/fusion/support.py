@@ -61,7 +61,6 @@ class Broken:
 
 def swivelled(walk: ImuSequence, rate: float) -> ImuSequence:
     """Return a walk whose device also turns about the vertical, at a rate [rad/s]."""
-    assert walk.truth is not None
     before = walk.truth.at(walk.time).attitude_WB
     after = about_z(rate * walk.time) * before
     gyro = walk.gyro + before.inv().apply([0.0, 0.0, rate])

@@ -39,7 +39,6 @@ def information(found: Any, axis: int = 0) -> float:
 
 def test_positions_are_metres_east_and_north_of_the_first():
     found = satellite_fixes(reported(straight(), altitude_m=np.full(60, 520.0)))
-    assert found is not None
     xy = np.array([fix.value[:2] for fix in found.fixes])
     np.testing.assert_allclose(xy, straight(), atol=1e-3)
     np.testing.assert_allclose(found.origin.latlon_deg(np.zeros((1, 2))), [[48.1, 11.5]])
@@ -62,7 +61,6 @@ def test_a_position_that_is_held_is_none():
     xy = straight()
     xy[20:50] = xy[20]
     found = satellite_fixes(reported(xy, radius_m=np.full(60, 4.0)))
-    assert found is not None
     times = {fix.time for fix in found.fixes}
     assert times == {*range(20), *range(50, 60)}
     assert satellite_fixes(reported(np.tile(xy[20], (60, 1)))) is None
@@ -72,7 +70,6 @@ def test_positions_without_a_radius_count_little_and_those_of_cells_not_at_all()
     radius = np.full(60, 4.0)
     radius[10:20], radius[20], radius[40] = 200.0, -1.0, 0.0
     found = satellite_fixes(reported(straight(), radius_m=radius))
-    assert found is not None
     times = [fix.time for fix in found.fixes]
     assert not {*range(10, 21)} & {*times}
     unknown, good = (found.fixes[times.index(t)].covariance[0, 0] for t in (40.0, 41.0))
@@ -122,7 +119,6 @@ def model(walk: ImuSequence, make_oracle: Make) -> Any:
 
 def error(track: Track, walk: ImuSequence) -> FloatArray:
     """Horizontal error (N,) [m] in the map, in which the walk's own origin is the place's."""
-    assert track.georeference is not None
     there = PLACE.xy(track.georeference.latlon_deg(track.trajectory.position_W))
     return np.linalg.norm(there - walk.truth.at(track.time).position_W[:, :2], axis=1)
 

@@ -32,7 +32,6 @@ def walk() -> ImuSequence:
 
 def without_gravity(sequence: ImuSequence) -> ImuSequence:
     """The recording with gravity removed by means of the true attitude."""
-    assert sequence.truth is not None
     up_B = sequence.truth.at(sequence.time).attitude_WB.apply([0, 0, STANDARD_GRAVITY], True)
     return replace(sequence, accel=sequence.accel - up_B)
 
@@ -44,7 +43,6 @@ def test_axes_name_the_file_axis_used_as_each_new_axis(walk):
     assert turned.truth is walk.truth
     field = Magnetometer(walk.time[:3], np.arange(9.0).reshape(3, 3))
     seen = with_axes(replace(walk, magnetometer=field), "y,-x,z").magnetometer
-    assert seen is not None
     assert np.array_equal(seen.field, field.field[:, [1, 0, 2]] * [1, -1, 1])
     assert with_axes(walk, "x,y,z") is walk
 
@@ -59,8 +57,6 @@ def test_conventions_and_parts_keep_pressure_and_satellites(walk):
     assert found.barometer is air
     assert found.satellites is reported
     part = found.slice(4.0, 8.0)
-    assert part.barometer is not None
-    assert part.satellites is not None
     np.testing.assert_array_equal(part.barometer.pressure_hPa, [1000.5])
     np.testing.assert_array_equal(part.satellites.latlon_deg, [[48.1, 11.0]])
 
@@ -138,7 +134,6 @@ def test_all_conventions_are_undone_at_once(walk):
 
 
 def test_samples_of_unknown_attitude_are_dropped_and_counted(walk, caplog):
-    assert walk.truth is not None
     time = walk.time.copy()
     time[7] = np.nan
     half = replace(without_gravity(walk), time=time, truth=walk.truth.slice(0.0, 10.0))
@@ -151,7 +146,6 @@ def test_samples_of_unknown_attitude_are_dropped_and_counted(walk, caplog):
 
 
 def test_without_an_attitude_gravity_is_not_guessed(walk):
-    assert walk.truth is not None
     for blind in (
         walk.without_truth(),
         replace(walk, truth=replace(walk.truth, valid=np.zeros(len(walk.truth), dtype=bool))),

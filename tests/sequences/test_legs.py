@@ -22,7 +22,6 @@ def recording() -> ImuSequence:
 def legs_of(
     recording: ImuSequence, time: FloatArray, kind: str, sigma: object, valid: object = ()
 ) -> LegStream:
-    assert recording.truth is not None
     position = recording.truth.at(time).position_W
     known = PositionTrack(time, position, kind, valid, sigma)  # type: ignore[arg-type]
     [legs] = leg_streams(replace(recording, truth=None, positions=known))
@@ -60,7 +59,6 @@ def test_the_time_of_a_tap_is_uncertain_wherever_the_waypoint_is(recording):
 
 def test_positions_seconds_apart_make_no_legs(recording):
     """Between them a pedestrian may have turned, however regular they are."""
-    assert recording.truth is not None
     time = TIME[::4]
     known = PositionTrack(time, recording.truth.at(time).position_W, "positions")
     assert leg_streams(replace(recording, truth=None, positions=known)) == []
@@ -68,7 +66,6 @@ def test_positions_seconds_apart_make_no_legs(recording):
 
 def test_a_single_leg_is_not_enough(recording):
     """With its yaw unknown, a leg by itself says no more than its length."""
-    assert recording.truth is not None
     time = np.array([5.0, 15.0])
     known = PositionTrack(time, recording.truth.at(time).position_W, "waypoints")
     assert leg_streams(replace(recording, truth=None, positions=known)) == []

@@ -120,7 +120,6 @@ def test_check_fixes_evaluates_tracks_with_fixes(stario, recording):
 @pytest.mark.usefixtures("no_figures")
 def test_truth_that_covers_only_a_part_is_reported(stario, recording, tmp_path):
     walk = read_generic_csv(recording)
-    assert walk.truth is not None
     write_csv(tmp_path / "part.csv", replace(walk, truth=walk.truth.slice(0.0, 6.0)))
     done = stario("run", "part.csv", "--out", "out")
     assert "; the truth covers 50% of it" in done.out

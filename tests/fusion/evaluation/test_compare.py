@@ -64,7 +64,6 @@ def compared(walk: ImuSequence, model: OracleWithFallback) -> Comparison:
 
 @pytest.fixture(scope="module")
 def blind(walk: ImuSequence, model: OracleWithFallback) -> Comparison:
-    assert walk.truth is not None
     time, position = walk.truth.time[::10], walk.truth.position_W[::10, :2]
     waypoints = PositionTrack(time, position + np.array([5.0, -3.0]), "waypoints")
     return compare(model, replace(walk.without_truth(), name="blind", positions=waypoints), CONFIG)
@@ -83,7 +82,6 @@ def folder(
 def test_path_length_is_horizontal_and_covers_only_the_compared_times(compared):
     """The truth rises as in a lift and continues after the IMU data: neither part counts."""
     truth = compared.sequence.truth
-    assert truth is not None
     lift = truth.position_W + np.outer(truth.time, [0.0, 0.0, 3.0])
     after = truth.time[-1] + 1.0 + truth.time
     longer = Trajectory(

@@ -161,7 +161,6 @@ def walk_and_track(make_walk: Callable[..., Any], make_oracle: Any) -> tuple[Imu
 )
 def test_positions_contradict_by_length_and_handedness_alone(walk_and_track, change, code):
     walk, track = walk_and_track
-    assert walk.truth is not None
     time = np.arange(0.0, 60.0, 0.5)
     path = change(walk.truth.at(time).position_W[:, :2])
     known = PositionTrack(time, path, "positions")

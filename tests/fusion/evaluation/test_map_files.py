@@ -77,7 +77,6 @@ def test_waypoints_with_coordinates_place_a_track_that_did_not_use_them():
     time = np.array([1.0, 10.0, 19.0])
     known = PositionTrack(time, xy + 7.0, "waypoints", latlon_deg=place.latlon_deg(xy))
     found = fitted_georeference(straight(), known)
-    assert found is not None
     assert found.yaw == pytest.approx(np.radians(90.0), abs=1e-4)
     np.testing.assert_allclose([found.latitude_deg, found.longitude_deg], [48.1, 11.5], atol=1e-7)
 

@@ -85,7 +85,6 @@ def test_without_recorded_poses_the_legs_alone_select_the_weights(
 
     def waypoints(path: Path) -> ImuSequence:
         walk = read_recording(path)
-        assert walk.truth is not None
         time = walk.truth.time[0] + np.arange(0.5, 16.0, 3.0)
         track = PositionTrack(time, walk.truth.at(time).position_W[:, :2], "waypoints")
         return replace(walk, truth=None, positions=track)

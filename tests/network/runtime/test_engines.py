@@ -35,8 +35,6 @@ def randomise_norms(network: nn.Module) -> None:
         if isinstance(module, nn.BatchNorm1d):
             nn.init.uniform_(module.weight, 0.5, 1.5)
             nn.init.normal_(module.bias, 0.0, 0.5)
-            assert module.running_mean is not None
-            assert module.running_var is not None
             module.running_mean.normal_(0.0, 0.5)
             module.running_var.uniform_(0.3, 2.0)
 

@@ -127,7 +127,6 @@ with exclusive(Path(sys.argv[1])):
 def test_a_folder_is_refused_while_another_run_trains_there_and_free_once_it_is_killed(tmp_path):
     command = [sys.executable, "-c", HOLDING, str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
-        assert other.stdout is not None
         assert other.stdout.readline() == "locked\n"
         with pytest.raises(ConfigError, match="another run is training") as caught:
             run(tmp_path)

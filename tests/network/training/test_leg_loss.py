@@ -111,8 +111,6 @@ def test_loss_and_gradients_follow_the_equations(drawn):
     loss, plain = leg_loss(mean, sigma, batch)
     loss = loss - direction_loss((batch.R_NH @ mean[..., None])[..., 0], batch)
     loss.backward()
-    assert mean.grad is not None
-    assert sigma.grad is not None
 
     count = sum(len(stretch.known) for stretch in stretches)
     assert int(batch.known.sum()) == count > 2 * STRETCHES

@@ -162,7 +162,6 @@ def test_a_waypoint_tapped_late_moves_two_legs_in_opposite_directions():
 
 def test_jumps_and_rides_of_a_track_make_no_legs():
     recording = with_positions("positions", 0.1)
-    assert recording.positions is not None
     time, position = recording.positions.time, recording.positions.position_W.copy()
     position[time > 30.0] += [5.0, 0.0, 0.0]
     jumped = replace(recording, positions=PositionTrack(time, position, "positions"))
@@ -181,7 +180,6 @@ def test_jumps_and_rides_of_a_track_make_no_legs():
 @pytest.mark.parametrize(("every", "legs"), [(0.1, 28), (0.5, 28), (1.0, 28), (2.5, 22)])
 def test_a_track_at_a_low_rate_has_legs_except_across_its_gaps(every, legs):
     recording = with_positions("positions", every)
-    assert recording.positions is not None
     [whole] = leg_streams(recording)
     assert len(whole.start) == pytest.approx(legs, abs=1)
     time = recording.positions.time
@@ -251,7 +249,6 @@ def test_a_recurrent_network_is_trained_on_stretches_in_rows(tmp_path, monkeypat
 
 def test_invalid_positions_and_those_of_another_clock_make_no_legs():
     recording = with_positions("positions", 0.1)
-    assert recording.positions is not None
     time, position = recording.positions.time, recording.positions.position_W
     nothing = PositionTrack(time, position, "positions", np.zeros(len(time), dtype=bool))
     assert leg_streams(replace(recording, positions=nothing)) == []

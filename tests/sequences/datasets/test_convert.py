@@ -36,7 +36,6 @@ def walk() -> ImuSequence:
 
 
 def nanoseconds(sequence: ImuSequence) -> tuple[np.ndarray, np.ndarray]:
-    assert sequence.truth is not None
     times = (sequence.time, sequence.truth.time[sequence.truth.valid])
     return tuple(np.round(t * 1e9).astype(np.int64) for t in times)
 
@@ -47,8 +46,6 @@ def assert_same(found: ImuSequence, expected: ImuSequence) -> None:
     for a, b in zip(nanoseconds(found), nanoseconds(expected), strict=True):
         np.testing.assert_array_equal(a, b)
     actual, original = found.truth, expected.truth
-    assert actual is not None
-    assert original is not None
     np.testing.assert_array_equal(actual.position_W, original.position_W[original.valid])
     np.testing.assert_allclose(
         actual.quat_xyzw, original.quat_xyzw[original.valid], rtol=0, atol=1e-10
@@ -93,7 +90,6 @@ def test_the_euroc_layout_is_that_of_its_authors(walk, tmp_path):
     for lines in (imu, truth):
         assert lines[0].startswith("#timestamp")
         assert all(line.split(",")[0].isdecimal() for line in lines[1:])
-    assert walk.truth is not None
     row = [float(cell) for cell in truth[1].split(",")]
     first = int(np.argmax(walk.truth.valid))
     np.testing.assert_allclose(row[4:8], walk.truth.quat_xyzw[first, [3, 0, 1, 2]], atol=1e-10)
@@ -103,12 +99,10 @@ def test_a_known_velocity_is_kept_in_euroc_and_dropped_with_a_warning_in_csv(
     walk, tmp_path, caplog
 ):
     truth = walk.truth
-    assert truth is not None
     velocity_W = np.gradient(truth.position_W, truth.time, axis=0)
     moving = replace(walk, truth=replace(truth, velocity_W=velocity_W))
     convert(moving, tmp_path / "r")
     found = read_recording(tmp_path / "r").truth
-    assert found is not None
     np.testing.assert_array_equal(found.velocity_W, velocity_W[truth.valid])
     with caplog.at_level(logging.WARNING):
         convert(moving, tmp_path / "r.csv")
@@ -189,7 +183,6 @@ def test_truth_that_starts_before_the_imu_keeps_its_offset(tmp_path):
     """Timestamps are unsigned, so both files are shifted together."""
     sequence = simulate_imu(generate_walk(5, 6.0), 100.0, name="w")
     truth = sequence.truth
-    assert truth is not None
     early = replace(sequence, truth=replace(truth, time=truth.time - 2.5))
     convert(early, tmp_path / "w")
     found = read_recording(tmp_path / "w").truth
@@ -252,7 +245,6 @@ def assert_equal(found: ImuSequence, given: ImuSequence) -> None:
             np.testing.assert_equal(getattr(read_back, name), getattr(original, name))
     assert dict(found.attributes) == dict(given.attributes)
     if given.device_attitude is not None:
-        assert found.device_attitude is not None
         error = found.device_attitude.attitude_WB.inv() * given.device_attitude.attitude_WB
         assert error.magnitude().max() < 1e-9
 
@@ -280,7 +272,6 @@ def test_recordings_are_read_back_as_written(hall, tmp_path):
     found = [read_recording(one) for one in find_recordings(path)]
     for read_back, original in zip(found, given, strict=True):
         assert_equal(read_back, original)
-    assert found[1].positions is not None
     assert found[1].positions.kind == "positions"
 
 

@@ -43,7 +43,6 @@ class Reader:
 def recording(tmp_path: Path) -> Path:
     """A walk whose ground truth has a gap, so that it gives two streams."""
     truth = WALK.truth
-    assert truth is not None
     gap = (truth.time > 4.0) & (truth.time < 4.5)
     path = tmp_path / "walk.csv"
     write_csv(path, replace(WALK, truth=replace(truth, valid=~gap)))
@@ -216,7 +215,6 @@ def test_processes_return_memory_mapped_files(recording, tmp_path):
 
 def test_recordings_unsuitable_for_training_are_skipped_with_the_reason(tmp_path):
     truth = WALK.truth
-    assert truth is not None
     unsuitable = {
         "blind": WALK.without_truth(),
         "degrees": replace(WALK, gyro=np.degrees(WALK.gyro)),
@@ -263,7 +261,6 @@ def test_a_recording_of_an_archive_is_cached_by_its_name(tmp_path):
 def test_a_truth_that_contradicts_the_imu_is_skipped_with_the_reason(tmp_path):
     walk = simulate_imu(generate_walk(6, 20.0), 100.0, seed=4, name="walk")
     truth = walk.truth
-    assert truth is not None
     path = tmp_path / "walk.csv"
     write_csv(path, replace(walk, truth=replace(truth, position_W=1e3 * truth.position_W)))
     (outcome,) = recorded([path], Reader(), {}, tmp_path / "cache")

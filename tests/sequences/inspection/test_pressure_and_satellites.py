@@ -124,7 +124,6 @@ def test_pressure_in_another_unit_is_a_problem(house, factor, offset, words):
 
 
 def test_a_barometer_on_another_clock_is_a_problem(house):
-    assert house.barometer is not None
     late = replace(house.barometer, time=house.barometer.time + 5000.0)
     [line] = told(replace(house, barometer=late, satellites=None))
     assert "barometer: found times from 5000 to 5120 s, expected most during the samples" in line
@@ -135,7 +134,6 @@ def test_exchanged_latitude_and_longitude_contradict_the_speed():
     reported = simulate_satellites(LEVEL, Sky(azimuth=1.0, sigma=1.0))
     right = receiver(reported)
     assert right.findings() == []
-    assert right.doppler is not None
     assert right.doppler.correlation > 0.9
     assert right.doppler.scale == pytest.approx(1.0, abs=0.1)
     wrong = receiver(replace(reported, latlon_deg=reported.latlon_deg[:, ::-1]))

@@ -38,10 +38,8 @@ def test_each_recording_has_its_kind_of_truth(tmp_path):
     assert pose.magnetometer is not None
     assert len(pose.magnetometer) == 10
     assert track.truth is None
-    assert track.positions is not None
     assert track.positions.kind == "positions"
     assert track.positions.position_W.shape == (50, 3)
-    assert waypoints.positions is not None
     assert waypoints.positions.kind == "waypoints"
     assert waypoints.positions.position_W.shape == (2, 2)
     assert waypoints.attributes["person"] == "ann"
@@ -167,7 +165,6 @@ def test_an_archive_that_another_program_writes_is_refused_with_the_remedy(tmp_p
 def test_mean_specific_force_points_up_in_the_true_frame_of_the_archives():
     for name in ("tyrex.h5:Thibaud_Nexus5_NoDist_Texting", "ridi.h5:dan_bag1", "kipd.h5:07CL"):
         recording = read_recording(ARCHIVES / name)
-        assert recording.truth is not None
         truth = recording.truth.at(recording.time)
         known = truth.valid
         up = truth.attitude_WB.apply(recording.accel)[known].mean(axis=0)

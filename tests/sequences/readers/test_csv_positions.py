@@ -19,13 +19,11 @@ from stario.sequences.sequence import (
 )
 def test_positions_without_attitude_are_kept_as_such(tmp_path, walk, every, columns, kind):
     time = np.arange(walk.time[0] + 0.3, walk.time[-1], every)
-    assert walk.truth is not None
     position = walk.truth.at(time).position_W[:, :columns]
     known = PositionTrack(time, position, kind)  # type: ignore[arg-type]
     write_csv(tmp_path / "walk.csv", replace(walk, truth=None, positions=known))
     found = read_recording(tmp_path / "walk.csv")
     assert found.truth is None
-    assert found.positions is not None
     assert found.positions.kind == kind
     np.testing.assert_allclose(found.positions.time, time - walk.time[0], atol=1e-9)
     np.testing.assert_array_equal(found.positions.position_W, position)
@@ -38,7 +36,6 @@ def test_the_accuracy_of_positions_is_kept(tmp_path, walk):
     known = PositionTrack(time, place, "positions", sigma=sigma)
     write_csv(tmp_path / "walk.csv", replace(walk, truth=None, positions=known))
     found = read_recording(tmp_path / "walk.csv").positions
-    assert found is not None
     assert found.sigma is not None
     np.testing.assert_array_equal(found.position_W, place)
     np.testing.assert_array_equal(found.sigma, sigma)
@@ -62,7 +59,6 @@ def test_a_position_without_its_accuracy_is_none(tmp_path, cells, times, error):
             read_generic_csv(path)
     else:
         known = read_generic_csv(path).positions
-        assert known is not None
         np.testing.assert_allclose(known.time, times)
 
 
@@ -82,6 +78,5 @@ def test_waypoints_listed_below_the_samples_may_be_in_any_order(tmp_path):
     known = read_generic_csv(
         write_lines(tmp_path / "a.csv", header, *samples, *waypoints)
     ).positions
-    assert known is not None
     assert known.time.tolist() == [2.0, 5.0, 8.0]
     assert known.position_W[:, 0].tolist() == [3.0, 6.0, 9.0]

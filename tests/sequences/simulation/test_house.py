@@ -35,7 +35,6 @@ def height(pressure_hPa: FloatArray) -> FloatArray:
 
 def test_each_stay_is_on_the_level_of_its_floor(walk):
     truth = walk.sequence.truth
-    assert truth is not None
     assert len({stay.floor for stay in walk.stays}) > 1
     ground = truth.slice(0.0, walk.stays[0].stop).position_W[:, 2].mean()
     for stay in walk.stays:
@@ -53,7 +52,6 @@ def test_the_shortest_walk_changes_floors():
 
 def test_waypoints_name_the_floor_at_both_ends_of_a_stay(walk):
     known = walk.sequence.positions
-    assert known is not None
     np.testing.assert_array_equal(known.floor, np.repeat([s.floor for s in walk.stays[1:]], 2))
     np.testing.assert_allclose(known.time, [t for s in walk.stays[1:] for t in (s.start, s.stop)])
 
@@ -63,7 +61,6 @@ def test_stairs_are_climbed_step_by_step_and_a_lift_stands(way):
     """On stairs the trunk bounces at every step; in a lift the accelerometer shows its start."""
     walk = next(w for k in range(9) if (w := simulate_house(k, 120.0, 50.0)).stays[2].way == way)
     sequence, ride = walk.sequence, slice(walk.stays[1].stop + 7.0, walk.stays[2].start - 4.0)
-    assert sequence.truth is not None
     inside = sequence.truth.slice(ride.start, ride.stop)
     climb = abs(np.polyfit(inside.time, inside.position_W[:, 2], 1)[0])
     force = np.linalg.norm(sequence.slice(ride.start, ride.stop).accel, axis=1)
@@ -73,7 +70,6 @@ def test_stairs_are_climbed_step_by_step_and_a_lift_stands(way):
 
 def test_pressure_falls_with_height_as_in_the_standard_atmosphere(walk):
     truth = walk.sequence.truth
-    assert truth is not None
     found = simulate_barometer(truth, replace(STILL_AIR, altitude=110.0), np.array([30.0]))
     true = truth.at(found.time).position_W[:, 2]
     np.testing.assert_allclose(height(found.pressure_hPa), true - true[0], atol=0.2)
@@ -109,22 +105,17 @@ def test_errors_of_satellites_last_and_are_larger_between_houses():
 
 def test_a_receiver_indoors_repeats_its_last_position(walk):
     found, entered = walk.sequence.satellites, walk.stays[0].stop
-    assert found is not None
     indoors: BoolArray = found.time > entered
     assert 30 < indoors.sum() < len(found) - 20
     assert (found.latlon_deg[indoors] == found.latlon_deg[~indoors][-1]).all()
-    assert found.radius_m is not None
     assert (found.radius_m[indoors] == 9.0).all()
     assert (np.diff(found.latlon_deg[~indoors], axis=0) != 0.0).all()
 
 
 def test_doppler_velocity_and_positions_agree_on_where_north_is(walk):
     truth, entered = walk.sequence.truth, walk.stays[0].stop
-    assert truth is not None
     sky = Sky(azimuth=2.0, sigma=0.0)
     found = simulate_satellites(truth, sky).slice(1.0, entered - 1.0)
-    assert found is not None
-    assert found.speed_m_s is not None
     assert found.bearing_deg is not None
     bearing = np.radians(found.bearing_deg)
     velocity = found.speed_m_s[:, None] * np.stack([np.sin(bearing), np.cos(bearing)], axis=1)

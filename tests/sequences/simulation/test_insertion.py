@@ -53,7 +53,6 @@ def test_samples_lead_from_each_true_pose_to_the_next(walk, moment, share):
     """Across the moment's ends, too; impacts are shorter than the samples' step."""
     assert walk.truth is not None
     whole = insert_moment(walk, walk.truth, moment, share, seed=1).sequence
-    assert whole.truth is not None
     assert (np.diff(whole.time) > 0.0).all()
     np.testing.assert_allclose(whole.truth.time, whole.time, atol=1e-6)
     attitude = GyroIntegral(whole.time, whole.gyro).attitude(whole.time)
@@ -79,8 +78,6 @@ def test_the_rest_of_a_recording_is_unchanged_but_for_its_time_and_a_lifts_heigh
     np.testing.assert_allclose(whole.time[rest], np.r_[walk.time[before], walk.time[after] + later])
     np.testing.assert_allclose(whole.gyro[rest], walk.gyro)
     np.testing.assert_allclose(whole.accel[rest], walk.accel)
-    assert whole.truth is not None
-    assert walk.truth is not None
     moved = whole.truth.position_W[rest] - walk.truth.position_W
     np.testing.assert_allclose(moved[before], 0.0, atol=1e-9)
     np.testing.assert_allclose(np.abs(moved[after]), np.tile([0.0, 0.0, 12.0], (after.sum(), 1)),
@@ -112,8 +109,6 @@ def test_a_lift_turns_the_field_and_weakens_it_and_standing_does_not(walk):
     def field_W(name: str) -> np.ndarray:
         whole = inserted(walk, name)
         part = whole.sequence.slice(whole.start + 6.0, whole.stop - 6.0)
-        assert part.magnetometer is not None
-        assert whole.sequence.truth is not None
         at = whole.sequence.truth.at(part.magnetometer.time)
         return at.attitude_WB.apply(part.magnetometer.field)
 
@@ -134,7 +129,6 @@ def test_the_gyroscope_keeps_its_bias(walk):
 def test_errors_of_scale_and_alignment_grow_with_the_rotation():
     found = inserted(walk_of(PHONE_IMU), "shake 25 s")
     whole = found.sequence
-    assert whole.truth is not None
     ends = np.array([found.start, found.stop])
     turn = GyroIntegral(whole.time, whole.gyro).attitude(ends)
     true = whole.truth.at(ends).attitude_WB
@@ -143,12 +137,10 @@ def test_errors_of_scale_and_alignment_grow_with_the_rotation():
 
 
 def test_known_positions_after_the_moment_come_later(walk):
-    assert walk.truth is not None
     time = np.array([2.0, 8.0, 15.0])
     known = PositionTrack(time, walk.truth.at(time).position_W[:, :2], "waypoints")
     without = replace(walk, truth=None, positions=known)
     found = insert_moment(without, walk.truth, BY_NAME["table"], 0.5, seed=1).sequence
-    assert found.positions is not None
     np.testing.assert_allclose(found.positions.time, [2.0, 8.0, 35.0])
     np.testing.assert_allclose(found.positions.position_W, known.position_W)
 
@@ -162,14 +154,10 @@ def test_pressure_goes_on_in_a_moment_and_satellites_after_it(walk):
     )
     found = insert_moment(full, walk.truth, BY_NAME["table"], 0.5, seed=1)
     pressure, reported = found.sequence.barometer, found.sequence.satellites
-    assert pressure is not None
     assert np.diff(pressure.time).max() < 0.3
-    assert found.sequence.truth is not None
     true = found.sequence.truth.at(pressure.time).position_W[:, 2]
     height = METRES_PER_HPA * (pressure.pressure_hPa[0] - pressure.pressure_hPa)
     np.testing.assert_allclose(height - height.mean(), true - true.mean(), atol=0.2)
-    assert full.satellites is not None
-    assert reported is not None
     late = full.satellites.time >= found.start
     moved = np.where(late, found.stop - found.start, 0.0)
     np.testing.assert_allclose(reported.time, full.satellites.time + moved)

@@ -157,7 +157,6 @@ def test_the_axes_remedy_refers_to_the_file_and_converges(walk, axes):
     assert fit_truth(with_axes(walk, axes)).axes_remedy() == "omit `--axes`"
     recorded = recorded_in(walk, "-x,-y,z")
     remedy = fit_truth(with_axes(recorded, axes)).axes_remedy()
-    assert remedy is not None
     right = remedy.removeprefix("pass `--axes=").removesuffix("`")
     assert fit_truth(with_axes(recorded, right)).axes_remedy() is None
 
@@ -178,7 +177,6 @@ def test_of_a_long_recording_the_middle_is_compared():
 def test_a_new_mounting_after_each_gap_of_the_truth_does_not_contradict_the_gyroscope(rate):
     """All pieces but the first are too short for the long fit; no mount lasts across a gap."""
     walk = simulate_imu(generate_walk(8, 120.0, style=WalkStyle()), 100.0, PHONE_IMU, 2)
-    assert walk.truth is not None
     time = np.arange(0.0, 120.0, 1.0 / rate)
     truth = walk.truth.at(time[(time < 11.0) | ((time + 1.0) % 12.0 > 2.1)])
     turned = Rotation.random(11, random_state=1)[(truth.time // 12.0).astype(int)]
@@ -201,7 +199,6 @@ def test_rotation_about_one_axis_leaves_clock_and_axes_open(walk):
 
 def test_a_gap_of_the_truth_is_no_jump(walk):
     truth = walk.truth
-    assert truth is not None
     gappy = replace(walk, truth=replace(truth, valid=np.abs(truth.time - 20.0) > 1.0))
     assert fit_truth(gappy).jumps == 0
     turned = Rotation.from_euler("z", np.where(truth.time > 20.0, 2.0, 0.0)[:, None])

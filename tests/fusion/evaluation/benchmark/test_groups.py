@@ -53,7 +53,6 @@ def pair(walk: ImuSequence) -> Benchmark:
 
 
 def test_a_recording_that_cannot_be_used_is_skipped_and_a_wrong_truth_warned_of(stepping, caplog):
-    assert stepping.truth is not None
     mirrored = stepping.truth.position_W * [-1.0, 1.0, 1.0]
     wrong = replace(stepping, truth=replace(stepping.truth, position_W=mirrored))
     recordings = {Path("wrong"): wrong, Path("blind"): stepping.without_truth()}
@@ -77,7 +76,6 @@ def test_a_recording_with_two_waypoints_is_named_as_not_compared(walk, caplog):
 
 def test_a_device_at_rest_counts_in_no_median_or_ratio(walk, caplog):
     """Its errors relative to its path, the noise of its truth, would be a thousand percent."""
-    assert walk.truth is not None
     still = 1e-4 * np.random.default_rng(0).normal(size=walk.truth.position_W.shape)
     resting = replace(walk, name="rest", truth=replace(walk.truth, position_W=still))
     models: Makers = {"ours": lambda group: Stub(walk), "theirs": lambda group: Stub(walk, 0.8)}

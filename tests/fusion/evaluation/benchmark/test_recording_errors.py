@@ -29,7 +29,6 @@ ARCHIVES = DATA / "archives"
 
 def with_positions(walk: ImuSequence, jump: float = 0.0) -> ImuSequence:
     truth = walk.truth
-    assert truth is not None
     position_W = truth.position_W + np.where(truth.time > 40.0, jump, 0.0)[:, None]
     return replace(walk, truth=None, positions=PositionTrack(truth.time, position_W, "positions"))
 
@@ -50,7 +49,6 @@ def test_with_poses_displacements_of_nine_tenths_give_that_length_ratio(walk):
 
 def test_the_yaw_from_the_levelled_frame_to_the_world_is_the_truths(walk):
     [stream] = streams_of(walk)
-    assert walk.truth is not None
     true_WB = walk.truth.at(stream.ticks)
     levelled = about_z(yaw_WN(walk, stream)) * Rotation.from_matrix(stream.R_NB)
     off = (levelled * true_WB.attitude_WB.inv())[true_WB.valid]
@@ -61,7 +59,6 @@ def test_the_yaw_from_the_levelled_frame_to_the_world_is_the_truths(walk):
 def test_a_recording_without_usable_truth_is_refused(walk, count):
     with pytest.raises(InputError, match="truth: found none"):
         known_truth(walk.without_truth())
-    assert walk.truth is not None
     valid = np.arange(len(walk.truth.time)) < count
     with pytest.raises(InputError, match=f"truth: found {count} valid"):
         known_truth(replace(walk, truth=replace(walk.truth, valid=valid)))
@@ -91,7 +88,6 @@ def test_with_positions_yaw_is_fitted_and_nothing_is_compared_across_a_jump(walk
 
 
 def test_positions_at_1_hz_give_the_same_errors(walk):
-    assert walk.truth is not None
     time = np.arange(1.0, 74.0)
     track = PositionTrack(time, walk.truth.at(time).position_W, "positions")
     slow = replace(walk, truth=None, positions=track)
@@ -109,7 +105,6 @@ def test_with_waypoints_yaw_and_position_are_fitted_first(walk):
     assert short.figures["length_ratio"] == pytest.approx(0.9, abs=0.02)
     # A track scaled about its centre has an error of a tenth of the waypoints' spread.
     time = np.arange(1.0, 70.0, 8.0)
-    assert walk.truth is not None
     xy = walk.truth.at(time).position_W[:, :2]
     spread = float(np.sqrt(np.mean(np.sum((xy - xy.mean(axis=0)) ** 2, axis=1))))
     assert short.figures["ate_fit_m"] == pytest.approx(0.1 * spread, rel=0.15)
@@ -119,7 +114,6 @@ def test_with_waypoints_yaw_and_position_are_fitted_first(walk):
 
 def test_positions_are_unknown_in_their_gaps_and_beyond_their_ends(walk):
     whole = with_positions(walk).positions
-    assert whole is not None
     time = whole.time
     known = ((time > 5.0) & (time < 20.0)) | ((time > 30.0) & (time < 70.0))
     ticks = np.arange(0.0, 75.0, 0.5)

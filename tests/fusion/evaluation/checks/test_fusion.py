@@ -155,7 +155,6 @@ def test_missing_poses_and_too_few_fixes_are_refused(walk, still_model):
 
 
 def test_truth_before_the_first_sample_gives_no_fixes(walk, make_oracle, caplog):
-    assert walk.truth is not None
     time = walk.truth.time.copy()
     time[0] = walk.time[0] - 1.0
     earlier = replace(walk, truth=replace(walk.truth, time=time))

@@ -95,7 +95,6 @@ def test_a_recording_without_known_positions_is_refused(walk):
 
 
 def test_a_recording_begins_at_its_first_known_position_and_is_cut(walk):
-    assert walk.truth is not None
     late = replace(walk, truth=walk.truth.slice(5.0, 20.0))
     assert moments._with_truth(late).time[0] == pytest.approx(5.0)
     assert isinstance(late.truth, Trajectory)

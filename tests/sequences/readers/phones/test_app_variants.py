@@ -38,7 +38,6 @@ ANDROSENSOR = [
 
 
 def quaternion(walk: ImuSequence) -> FloatArray:
-    assert walk.truth is not None
     return walk.truth.quat_xyzw
 
 
@@ -218,7 +217,6 @@ def ios_logger(folder: Path, walk: ImuSequence) -> None:
 
 
 def ios_logger_with_poses(folder: Path, walk: ImuSequence) -> None:
-    assert walk.truth is not None
     ios_logger(folder, walk)
     (folder / "Motion.txt").unlink()
     up = Rotation.from_euler("x", -90.0, degrees=True)
@@ -312,7 +310,6 @@ def test_an_undetermined_accelerometer_sign_is_reported(walk, tmp_path, caplog):
 @pytest.mark.parametrize("code", ["TYPE", "AHRS"])
 def test_the_rotation_vector_of_a_trace_is_the_devices_attitude(code, walk, tmp_path):
     """It contains x, y and z of a quaternion whose w is not negative."""
-    assert walk.truth is not None
     vector = quaternion(walk)[:, :3] * np.sign(quaternion(walk)[:, 3:])
     lines = []
     for k, t in enumerate(walk.time.tolist()):
@@ -328,7 +325,6 @@ def test_the_rotation_vector_of_a_trace_is_the_devices_attitude(code, walk, tmp_
             lines.append(";".join(["AHRS", *clock, "1", "2", "3", *map(str, vector[k]), "3"]))
     write_lines(tmp_path / "trace.txt", *lines)
     attitude = read_recording(tmp_path / "trace.txt").device_attitude
-    assert attitude is not None
     difference = attitude.attitude_WB * walk.truth.attitude_WB.inv()
     assert difference.magnitude().max() < 1e-6
     cut = (tmp_path / "trace.txt").read_text().replace(";1;2;3;", ";1;2;").replace("\t3\n", "\n")

@@ -121,13 +121,11 @@ def test_lines_of_pressure_satellites_and_floors_are_read(walk, tmp_path):
     assert read.barometer is not None
     assert_pressure(read.barometer, np.array([0.5, 1.5]), np.array([1013.055, 1013.065]))
     found = read.satellites
-    assert found is not None
     np.testing.assert_allclose(found.time, [0.75, 1.75], atol=1e-3)
     assert found.altitude_m is not None
     np.testing.assert_array_equal(found.altitude_m, [5.5, 6.5])
     stated = (found.bearing_deg, found.radius_m, found.speed_m_s)
     np.testing.assert_array_equal(stated, [[90.0] * 2, [4.5] * 2, [1.25] * 2])
-    assert read.positions is not None
     np.testing.assert_array_equal(read.positions.floor, [0.0, -1.0])
     np.testing.assert_array_equal(read.positions.latlon_deg, [[40.0, -3.0], [40.0001, -3.0]])
 

@@ -77,14 +77,12 @@ def test_the_phones_own_attitude_is_read_too(app, walk, tmp_path):
     """With quaternions in either order and direction, as determined by the gyroscope."""
     app(tmp_path / "s", walk)
     read = read_recording(tmp_path / "s")
-    assert read.device_attitude is not None
     np.testing.assert_allclose(read.device_attitude.time, walk.time, atol=1e-3)
     error = (read.device_attitude.attitude_WB * pose(walk).attitude_WB.inv()).magnitude()
     assert error.max() < 1e-6
     bare = replace(read, accel=read.accel - gravity(walk))
     np.testing.assert_allclose(with_gravity(bare).accel, walk.accel, atol=0.02)
     turned = with_axes(read, "y,-x,z").device_attitude
-    assert turned is not None
     up = turned.attitude_WB.apply(with_axes(read, "y,-x,z").accel)
     np.testing.assert_allclose(up, pose(walk).attitude_WB.apply(walk.accel), atol=1e-5)
 
@@ -156,7 +154,6 @@ def test_poses_next_to_the_imu_are_read_as_truth_in_its_axes(order, turn, walk, 
     save(Path(f"{stem}_IMU.txt"), "Timestamp,Ax,Ay,Az,Gx,Gy,Gz", ns(walk), walk.accel, walk.gyro)
     (found,) = find_recordings(tmp_path)
     read = read_recording(found)
-    assert read.truth is not None
     assert read.truth.valid.mean() > 0.9
     np.testing.assert_allclose(read.truth.time, truth.time[every], atol=0.01)
     error = (read.truth.attitude_WB * truth.attitude_WB[every].inv()).as_rotvec()
@@ -221,18 +218,15 @@ def test_timestamps_among_the_values_are_named_with_their_file_and_columns(walk,
 def test_waypoints_and_reference_points_are_read_as_positions(walk, tmp_path):
     trace(tmp_path / "t", walk)
     waypoints = read_recording(tmp_path / "t/5d07.txt").positions
-    assert waypoints is not None
     np.testing.assert_allclose(waypoints.time, [2.0, 7.0], atol=1e-3)
     np.testing.assert_allclose(waypoints.position_W, [[200.5, 7.25], [700.5, 7.25]])
     get_sensor_data(tmp_path / "g", walk)
     points = read_recording(tmp_path / "g/log.txt").positions
-    assert points is not None
     np.testing.assert_allclose(points.time, [2.0, 4.0], atol=1e-3)
     np.testing.assert_allclose(points.position_W, [[0.0, 0.0], [0.0, 11.10]], atol=0.01)
     prefixed(tmp_path / "p", walk)
     (tmp_path / "p/Eight_ref.csv").write_text("1606391910305 566578.7 5932830.4 19.6\n" * 2)
     references = read_recording(tmp_path / "p").positions
-    assert references is not None
     np.testing.assert_allclose(references.time, [2.0])
 
 

@@ -33,7 +33,6 @@ def degrees(metres: FloatArray) -> FloatArray:
 
 def positions_of(path: Path) -> PositionTrack:
     found = read_recording(path).positions
-    assert found is not None
     assert found.kind == "positions"
     return found
 
@@ -67,7 +66,6 @@ def test_positions_of_phyphox_are_read_with_their_accuracy(walk, tmp_path):
     found = positions_of(tmp_path / "p")
     np.testing.assert_allclose(found.time, TIME, atol=1e-9)
     np.testing.assert_allclose(found.position_W, METRES - METRES[0], atol=0.02)
-    assert found.sigma is not None
     np.testing.assert_allclose(found.sigma[found.valid], 3.0)
     np.testing.assert_array_equal(found.valid, TIME != 5.0)
     summary = read_recording(tmp_path / "p").truth_summary()
@@ -189,7 +187,6 @@ def test_latitude_and_longitude_that_can_only_be_exchanged_are(walk, tmp_path, c
     place = degrees(METRES) + np.array([0.0, 120.0])
     save(tmp_path / "p/gps.csv", "time,lat,lon", TIME, place[:, ::-1])
     found = read_recording(tmp_path / "p").satellites
-    assert found is not None
     np.testing.assert_array_equal(found.latlon_deg, place)
     assert "latitude and longitude are exchanged: read the other way round" in caplog.text
 
@@ -231,7 +228,6 @@ def test_what_a_receiver_reports_is_kept_as_measured(walk, tmp_path):
     save(tmp_path / "p/Location.csv", header, TIME, *columns)
     read = read_recording(tmp_path / "p")
     found = read.satellites
-    assert found is not None
     np.testing.assert_allclose(found.time, TIME, atol=1e-9)
     np.testing.assert_allclose(found.latlon_deg, place, atol=1e-12)
     expected = {
@@ -242,7 +238,6 @@ def test_what_a_receiver_reports_is_kept_as_measured(walk, tmp_path):
     }
     for name, values in expected.items():
         np.testing.assert_allclose(getattr(found, name), values, err_msg=name)
-    assert read.positions is not None
     np.testing.assert_allclose(read.positions.time, TIME[:7], atol=1e-9)
     np.testing.assert_allclose(read.positions.latlon_deg, place[:7], atol=1e-12)
 
@@ -252,9 +247,7 @@ def test_a_file_of_advio_without_titles_is_read():
     if not path.is_dir():
         pytest.skip("ADVIO is not here")
     found = read_recording(path).satellites
-    assert found is not None
     np.testing.assert_allclose(found.latlon_deg, [[60.187, 24.8215]] * len(found), atol=1e-3)
-    assert found.radius_m is not None
     assert found.altitude_m is not None
     assert found.radius_m.min() >= 5.0
     assert found.radius_m.max() <= 200.0

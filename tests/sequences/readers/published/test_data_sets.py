@@ -19,7 +19,6 @@ def test_a_recording_is_read_back_as_written(written):
     if expected.truth is None:
         assert read.truth is None
         return
-    assert read.truth is not None
     assert len(read.truth) == len(expected.truth)
     assert read.truth.valid.all()
     assert np.abs(read.truth.time - expected.truth.time).max() < 1e-8
