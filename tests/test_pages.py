@@ -106,7 +106,7 @@ def run_line(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_reader_can_follow_a_guide(page, monkeypatch, tmp_path, tmp_path_factory):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("STARIO_CACHE", str(tmp_path_factory.mktemp("cache")))
-    names: dict[str, object] = {"__name__": page.stem}
+    names = {"__name__": page.stem}
     for language, long, text in BLOCK.findall(page.read_text()):
         if language == "python":
             exec(compile(text, page_name(page), "exec"), names)

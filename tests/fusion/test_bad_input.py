@@ -1,8 +1,6 @@
 """The navigator's handling of bad input, on simulated walks."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +12,6 @@ from stario.fusion.config import NavigatorConfig
 from stario.sequences.accuracy.metrics import align
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
-
-Make = Callable[..., Any]
 
 both_backends = pytest.mark.parametrize("backend", ["ekf", "graph"])
 

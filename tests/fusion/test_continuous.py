@@ -1,16 +1,12 @@
 """The continuous position never steps, and converges to the corrected one."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from support import CONFIG
 
 from stario.fusion import Navigator, NavState
-from stario.fusion.state import MAX_STEP, ContinuousPose, advanced
-
-Make = Callable[..., Any]
+from stario.fusion.state import MAX_STEP, advanced
 
 
 def state_at(time: float, x: float, map_frame: int = 0) -> NavState:
@@ -39,7 +35,7 @@ def test_the_continuous_position_is_reset_where_fixes_move_the_frame():
 def test_corrections_cause_no_step_in_the_position(walk, make_oracle):
     """Noise of a quarter of a metre makes the corrected position step, not the continuous one."""
     navigator = Navigator(make_oracle(walk, walk.truth, CONFIG, noise=0.25, sigma=0.25), CONFIG)
-    poses: list[ContinuousPose] = []
+    poses = []
     for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
         if navigator.push(*row) is not None:
             assert navigator.continuous is not None

@@ -87,7 +87,7 @@ def variances(count: int) -> np.ndarray:
 )
 def test_predictions_of_other_shapes_are_refused(walk, predict, named):
     class Custom:
-        def predict(self, windows: Any) -> Any:
+        def predict(self, windows):
             return predict(len(windows))
 
     with pytest.raises(InputError, match=f"model.*{named}"):
@@ -96,7 +96,7 @@ def test_predictions_of_other_shapes_are_refused(walk, predict, named):
 
 def test_predictions_may_be_lists(walk):
     class Custom:
-        def predict(self, windows: Any) -> Any:
+        def predict(self, windows):
             return zeros(len(windows)).tolist(), variances(len(windows)).tolist()
 
     track = Navigator(Custom(), backend="ekf").run(walk)

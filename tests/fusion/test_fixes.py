@@ -1,8 +1,6 @@
 """Absolute fixes: on time, late or early, in stream and batch, and the map frame they define."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,16 +24,14 @@ CONFIG = NavigatorConfig(noise=NOISE, filter=replace(support.FILTER, update_rate
 EYE = np.eye(3)
 ROOT = np.array([[0.1, 0.1], [0.1, 0.3], [0.2, 0.7]])
 
-Make = Callable[..., Any]
-
 
 @pytest.fixture(scope="module")
-def walk(make_walk: Make) -> ImuSequence:
+def walk(make_walk):
     return make_walk(7, 30.0, 100.0, ERRORS)
 
 
 @pytest.fixture(scope="module")
-def model(walk: ImuSequence, make_oracle: Make) -> Any:
+def model(walk, make_oracle):
     return make_oracle(walk, walk.truth, CONFIG)
 
 
@@ -355,7 +351,7 @@ def test_a_wrong_shape_raises_an_error_that_names_the_argument(model):
     with pytest.raises(InputError, match="covariance"):
         navigator.update_velocity(0.0, np.zeros(3), np.ones(3))
     with pytest.raises(InputError, match="yaw"):
-        navigator.update_yaw(0.0, "north", 0.1)  # type: ignore[arg-type]
+        navigator.update_yaw(0.0, "north", 0.1)
 
 
 def test_the_covariance_of_an_exact_fix_has_a_floor(walk, model):

@@ -2,16 +2,13 @@
 
 import gc
 import tracemalloc
-from collections.abc import Callable
 from itertools import pairwise
-from typing import Any
 
 import pytest
 
 from stario.fusion import Navigator
 from stario.sequences.sequence import ImuSequence
 
-Make = Callable[..., Any]
 BYTES_PER_NUMBER = 16
 RATE = 50.0
 

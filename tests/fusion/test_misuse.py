@@ -1,10 +1,8 @@
 """Wrong arguments are refused at once, by name."""
 
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +26,6 @@ from stario.sequences import StarioError, read_recording
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 
-Make = Callable[..., Any]
 LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
 
 
@@ -159,12 +156,12 @@ def test_a_stream_that_is_too_slow_or_too_fast_is_refused(still_model, rate):
 def test_misplaced_arguments_are_named(still_model, make_walk):
     walk = make_walk(1, 3.0)
     with pytest.raises(InputError, match=r"progress.*fixes="):
-        Navigator(still_model, backend="ekf").run(walk, [yaw_fix(1.0, 0.0, 0.1)])  # type: ignore[arg-type]
+        Navigator(still_model, backend="ekf").run(walk, [yaw_fix(1.0, 0.0, 0.1)])
     for wrong in (None, 3):
         with pytest.raises(InputError, match="path"):
-            read_recording(wrong)  # type: ignore[arg-type]
+            read_recording(wrong)
         with pytest.raises(InputError, match="name_or_path"):
-            load_model(wrong)  # type: ignore[arg-type]
+            load_model(wrong)
 
 
 def test_a_prior_attitude_that_gravity_contradicts_is_refused(walk, still_model):

@@ -1,8 +1,6 @@
 """The navigator on simulated walks, with a predictor that returns the ground truth."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,14 +16,11 @@ from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.readers.tum import read_tum, write_tum
-from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.imu import ImuErrors
-
-Make = Callable[..., Any]
 
 
 @pytest.fixture(scope="module")
-def track(walk: ImuSequence, make_oracle: Make) -> Track:
+def track(walk, make_oracle):
     return Navigator(make_oracle(walk, walk.truth, CONFIG), backend="ekf").run(walk)
 
 

@@ -8,7 +8,7 @@ from support import stream
 from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import compare, measure
-from stario.network import DisplacementModel, load_model
+from stario.network import load_model
 from stario.sequences import ImuSequence, read_recording
 
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
@@ -19,7 +19,7 @@ EUROC = "euroc/V1_02_medium"
 
 
 @pytest.fixture(scope="module")
-def model() -> DisplacementModel:
+def model():
     return load_model("default")
 
 

@@ -1,6 +1,5 @@
 """A receiver's positions as fixes: what they tell, and what their errors do to a track."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +15,6 @@ from stario.sequences.geodesy import Georeference
 from stario.sequences.readers.satellites import RADIUS_PER_SIGMA
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Satellites
 
-Make = Callable[..., Any]
 TIME = np.arange(0.0, 60.0)
 PLACE = Georeference(48.1, 11.5)
 USED = replace(support.GRAPH, place=PlaceConfig(satellites="use"))
@@ -98,7 +96,7 @@ def test_a_velocity_without_a_direction_is_none(speed, bearing):
 
 
 @pytest.fixture(scope="module")
-def walk(make_walk: Make) -> ImuSequence:
+def walk(make_walk):
     """A walk whose receiver is wrong by the same 4 m, and gives velocities in its second half."""
     walk = make_walk(3, 60.0, 100.0)
     there = walk.truth.at(np.arange(1.0, 59.0))
@@ -113,7 +111,7 @@ def walk(make_walk: Make) -> ImuSequence:
 
 
 @pytest.fixture(scope="module")
-def model(walk: ImuSequence, make_oracle: Make) -> Any:
+def model(walk, make_oracle):
     return make_oracle(walk, walk.truth, USED)
 
 

@@ -1,14 +1,11 @@
 """A recording is smoothed as a whole, a stream by a window; both gain on the filter's states."""
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support import stream
 
-from stario.fusion import Navigator, NavigatorConfig, SmoothedPose, Track
+from stario.fusion import Navigator, NavigatorConfig, SmoothedPose
 from stario.fusion.config import FilterConfig
 from stario.fusion.fixes import position_fix
 from stario.sequences.accuracy.metrics import align, pose_errors
@@ -29,15 +26,13 @@ CONFIG = NavigatorConfig(
     ),
 )
 
-Make = Callable[..., Any]
-
 
 def errors_at(track: Trajectory, walk: ImuSequence) -> np.ndarray:
     return pose_errors(align(track, walk.truth, "first"), walk.truth).position_W
 
 
 @pytest.fixture(scope="module")
-def walks(make_walk: Make, make_oracle: Make) -> list[tuple[ImuSequence, Any]]:
+def walks(make_walk, make_oracle):
     """Walks, each with a model that measures its displacements with white noise."""
     made = [make_walk(seed, 25.0, 100.0, ERRORS) for seed in range(5)]
     noise = {"noise": 0.1, "sigma": 0.1}
@@ -48,7 +43,7 @@ def walks(make_walk: Make, make_oracle: Make) -> list[tuple[ImuSequence, Any]]:
 
 
 @pytest.fixture(scope="module")
-def tracks(walks: list[tuple[ImuSequence, Any]]) -> list[tuple[ImuSequence, Track]]:
+def tracks(walks):
     return [(walk, Navigator(model, CONFIG).run(walk)) for walk, model in walks]
 
 
@@ -70,7 +65,7 @@ def test_a_recordings_track_is_more_accurate_than_the_filters_and_consistent(tra
 
 
 def test_a_recordings_track_moves_by_its_velocity_where_the_filters_steps(tracks):
-    def steps(track: Track) -> np.ndarray:
+    def steps(track):
         p, v, t = track.trajectory.position_W, track.trajectory.velocity_W, track.time
         moved = 0.5 * np.diff(t)[:, None] * (v[1:] + v[:-1])
         return np.linalg.norm(np.diff(p, axis=0) - moved, axis=1)

@@ -3,9 +3,7 @@
 import subprocess
 import sys
 import zlib
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,8 +17,6 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 
 CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=5))
-
-Make = Callable[..., Any]
 
 
 def push(navigator: Navigator, walk: ImuSequence, start: float, stop: float) -> list[NavState]:
@@ -43,7 +39,7 @@ def test_a_restored_stream_continues_bit_for_bit(walk, make_oracle, without, sto
     holed = replace(holed, accel=accel)
     model = make_oracle(holed, walk.truth, CONFIG)
 
-    def late_fix(navigator: Navigator) -> None:
+    def late_fix(navigator):
         if navigator.state is not None:
             p = walk.truth.at(np.array([stop - 0.4])).position_W[0]
             navigator.update_position(stop - 0.4, p, 0.01 * np.eye(3))
@@ -174,9 +170,9 @@ LAYOUTS = {32: "c183b965"}
 
 def test_a_snapshot_with_other_classes_or_attributes_has_another_version(walk, still_model):
     """Otherwise an older one would be taken for damaged, or restored in part."""
-    found: set[str] = set()
+    found = set()
 
-    def visit(value: Any) -> None:
+    def visit(value):
         if isinstance(value, dict):
             if "is" in value:
                 names = sorted(name for name, _ in value["has"]["map"])

@@ -1,8 +1,6 @@
 """Recordings and streams in wrong units are refused by name, with what fixes them."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +10,6 @@ from stario.fusion import Navigator
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.walks import CARRYING_MODES
-
-Make = Callable[..., Any]
 
 
 @pytest.mark.parametrize(
@@ -135,7 +131,7 @@ def test_the_check_for_degrees_survives_a_snapshot(walk, still_model):
     wrong = after_a_still_start(walk)
     wrong = replace(wrong, gyro=np.degrees(wrong.gyro))
 
-    def refused_at(stop: float) -> float:
+    def refused_at(stop):
         """Time at which the stream is refused if another navigator continues it at `stop`."""
         navigator = Navigator(still_model)
         for time, gyro, accel in zip(wrong.time, wrong.gyro, wrong.accel, strict=True):

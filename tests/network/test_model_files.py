@@ -19,7 +19,7 @@ DEFAULT = Path(stario.network.__file__).with_name("weights") / "default.safetens
 
 
 @pytest.fixture
-def model(tmp_path: Path) -> Path:
+def model(tmp_path):
     """A copy of the default weights and their card, to be corrupted."""
     path = tmp_path / "model.safetensors"
     path.write_bytes(DEFAULT.read_bytes())

@@ -26,7 +26,7 @@ from stario.sequences.units import MAGNETIC_UNITS
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     return simulate_imu(generate_walk(3, 20.0), 100.0, seed=1)
 
 

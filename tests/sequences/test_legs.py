@@ -15,7 +15,7 @@ TIME = np.arange(1.0, 38.0)
 
 
 @pytest.fixture(scope="module")
-def recording() -> ImuSequence:
+def recording():
     return simulate_imu(generate_walk(3, 40.0), 100.0, PERFECT_IMU, 0, name="walk")
 
 
@@ -23,7 +23,7 @@ def legs_of(
     recording: ImuSequence, time: FloatArray, kind: str, sigma: object, valid: object = ()
 ) -> LegStream:
     position = recording.truth.at(time).position_W
-    known = PositionTrack(time, position, kind, valid, sigma)  # type: ignore[arg-type]
+    known = PositionTrack(time, position, kind, valid, sigma)
     [legs] = leg_streams(replace(recording, truth=None, positions=known))
     return legs
 

@@ -16,7 +16,6 @@ from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import (
     VELOCITY_WEIGHTS,
-    Attitude,
     facing,
     headings_at,
     imu_in_world,
@@ -28,12 +27,12 @@ from stario.sequences.windows import (
 
 
 @pytest.fixture(scope="module")
-def track() -> Trajectory:
+def track():
     return generate_walk(5, 20.0, rate=200.0, style=WalkStyle(carry="handheld"))
 
 
 @pytest.fixture(scope="module")
-def walk(track: Trajectory) -> ImuSequence:
+def walk(track):
     return simulate_imu(track, rate=200.0, errors=PERFECT_IMU)
 
 
@@ -164,7 +163,7 @@ def test_a_misaligned_truth_does_not_affect_levelled_windows():
     tilted = replace(walk, truth=replace(truth, attitude_WB=askew))
     settled = slice(20 * 200, None)
 
-    def off(attitude: Attitude) -> float:
+    def off(attitude):
         (right,) = world_streams(walk, attitude=attitude)
         (wrong,) = world_streams(tilted, attitude=attitude)
         np.testing.assert_array_equal(right.position_W, wrong.position_W)

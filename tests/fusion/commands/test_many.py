@@ -215,7 +215,7 @@ def test_every_option_that_changes_what_is_read_is_part_of_the_key_of_a_cache():
 
 
 @pytest.fixture
-def tiny(tmp_path: Path) -> Path:
+def tiny(tmp_path):
     """A recipe of one step."""
     path = tmp_path / "tiny.json"
     path.write_text(json.dumps({"epoch_windows": 32, "batch": 32, "epochs": 1}))
@@ -223,7 +223,7 @@ def tiny(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def narrow_network(monkeypatch: pytest.MonkeyPatch) -> None:
+def narrow_network(monkeypatch):
     narrow(monkeypatch)
 
 
@@ -285,7 +285,7 @@ def test_weights_to_start_from_set_the_network(stario, recording, tmp_path, tiny
 def test_sigma_is_not_calibrated_on_a_few_seconds_where_initial_weights_have_a_calibration(
     stario, recording, tmp_path, tiny, monkeypatch
 ):
-    def calibration(out: str, *options: str) -> object:
+    def calibration(out, *options):
         call = ("train", recording, "--recorded-only", "--config", tiny, *options, "--out", out)
         assert stario(*call).code == 0
         return json.loads((tmp_path / out / "model.json").read_text())["calibration"]
@@ -393,7 +393,7 @@ def _names() -> list[str]:
 
 
 def test_set_in_the_name_of_weights_is_the_first_word_of_a_group(monkeypatch):
-    loaded: list[str] = []
+    loaded = []
     monkeypatch.setattr(evaluate, "_loaded", loaded.append)
 
     evaluate._for_group("runs/{set}/{group}.safetensors", "ridi dan")

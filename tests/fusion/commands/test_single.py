@@ -95,14 +95,14 @@ def test_the_installed_command_has_the_same_exit_codes(tmp_path):
     if not command.exists():
         pytest.skip("stario is not installed next to this Python")
 
-    def code(*arguments: str) -> int:
+    def code(*arguments):
         return subprocess.run([command, *arguments], capture_output=True, cwd=tmp_path).returncode
 
     assert [code("--help"), code("convert", "one.csv"), code("nosuch")] == [0, 1, 2]
 
 
 def test_a_bug_is_not_reported_as_an_error_of_the_user(stario, monkeypatch, recording):
-    def broken(path: Path, format: str) -> None:
+    def broken(path, format):
         raise ZeroDivisionError
 
     monkeypatch.setattr("stario.sequences.readers.read_recording", broken)

@@ -40,7 +40,7 @@ def recordings(ratios: np.ndarray) -> list[Blocks]:
 
 
 def test_the_interval_of_a_ratio_widens_as_groups_differ():
-    def groups(ratios: list[float]) -> dict[str, list[Blocks]]:
+    def groups(ratios):
         return {f"g{k}": recordings(np.full(4, ratio)) for k, ratio in enumerate(ratios)}
 
     equal = interval_of(**groups([0.8] * 6))

@@ -1,9 +1,7 @@
 """Comparison of tracks, and the files it writes."""
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +24,7 @@ from stario.fusion.fixes import position_fix
 from stario.sequences.accuracy.metrics import evaluate_track
 from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.readers.tum import read_tum
-from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
+from stario.sequences.sequence import PositionTrack, Trajectory
 
 CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=10, covariance_scale=1.0))
 ORIGIN = {"stario": "0.1.0"}
@@ -34,8 +32,6 @@ KEYS = {
     *("ate_m", "ate_fit_m", "rte_m", "pde", "aye_rad", "coverage"),
     *("known_positions_m", "nees_median", "nis_mean", "seconds_network", "seconds_filter"),
 }
-
-Make = Callable[..., Any]
 
 
 class OracleWithFallback:
@@ -53,26 +49,24 @@ class OracleWithFallback:
 
 
 @pytest.fixture(scope="module")
-def model(walk: ImuSequence, make_oracle: Make) -> OracleWithFallback:
+def model(walk, make_oracle):
     return OracleWithFallback(make_oracle(walk, walk.truth, CONFIG))
 
 
 @pytest.fixture(scope="module")
-def compared(walk: ImuSequence, model: OracleWithFallback) -> Comparison:
+def compared(walk, model):
     return compare(model, walk, CONFIG)
 
 
 @pytest.fixture(scope="module")
-def blind(walk: ImuSequence, model: OracleWithFallback) -> Comparison:
+def blind(walk, model):
     time, position = walk.truth.time[::10], walk.truth.position_W[::10, :2]
     waypoints = PositionTrack(time, position + np.array([5.0, -3.0]), "waypoints")
     return compare(model, replace(walk.without_truth(), name="blind", positions=waypoints), CONFIG)
 
 
 @pytest.fixture(scope="module")
-def folder(
-    compared: Comparison, blind: Comparison, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
+def folder(compared, blind, tmp_path_factory):
     path = tmp_path_factory.mktemp("compare") / "deep" / "out"
     written = write_comparison(path, [compared, blind], CONFIG, ORIGIN)
     assert sorted(written) == sorted(p for p in path.rglob("*") if p.is_file())
@@ -202,7 +196,7 @@ def test_the_written_configuration_can_be_read_back(folder):
 
 
 @pytest.fixture
-def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+def blank_figures(monkeypatch):
     """Draw figures, but leave their files empty: most of the time goes into rendering."""
     saved = "stario.fusion.evaluation.folders.save_figure"
     monkeypatch.setattr(saved, lambda figure, path: path.touch())
@@ -311,7 +305,7 @@ def test_summary_has_median_and_mean_over_recordings(compared, walk):
 
 
 def test_recordings_with_the_same_name_get_distinct_folders():
-    taken: set[str] = set()
+    taken = set()
     for name in ("walk", "walk", "walk-2", "walk"):
         taken.add(distinct_name(name, taken))
     assert taken == {"walk", "walk-2", "walk-2-2", "walk-3"}

@@ -32,7 +32,7 @@ def test_a_run_that_fails_at_any_write_leaves_what_was_there(tmp_path, failing, 
         (out / "notes.txt").write_text("mine")
     before = contents(tmp_path)
 
-    def full(path: Path) -> None:
+    def full(path):
         path.write_text("partial")
         raise error
 

@@ -1,11 +1,9 @@
 """Known positions: the error at them, and what they contradict."""
 
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ from recorded import CASES
 from scipy.spatial.transform import Rotation
 from support import CONFIG
 
-from stario.fusion import Navigator, Track
+from stario.fusion import Navigator
 from stario.fusion.evaluation.known_positions import (
     placed,
     position_error,
@@ -24,7 +22,7 @@ from stario.fusion.evaluation.verdict import recording_verdict
 from stario.network import load_model
 from stario.sequences import Trajectory, read_recording
 from stario.sequences.findings import Finding
-from stario.sequences.sequence import ImuSequence, PositionTrack
+from stario.sequences.sequence import PositionTrack
 
 TIME = np.linspace(0.0, 20.0, 201)
 PATH = np.column_stack([TIME, np.sin(0.3 * TIME), 0.0 * TIME])
@@ -143,7 +141,7 @@ def test_a_rate_that_may_be_in_degrees_is_asked():
 
 
 @pytest.fixture(scope="module")
-def walk_and_track(make_walk: Callable[..., Any], make_oracle: Any) -> tuple[ImuSequence, Track]:
+def walk_and_track(make_walk, make_oracle):
     walk = make_walk(3, 60.0)
     return walk, Navigator(make_oracle(walk, walk.truth, CONFIG), CONFIG).run(walk)
 

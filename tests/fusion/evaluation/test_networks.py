@@ -43,7 +43,7 @@ MODELS = [
 
 @pytest.fixture(scope="module")
 def read(make_walk):
-    def read(path: Path):
+    def read(path):
         walk = make_walk(seed=int(path.stem), seconds=12.0)
         return walk.without_truth() if path.suffix == ".blind" else walk
 

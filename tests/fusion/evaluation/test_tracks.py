@@ -1,6 +1,5 @@
 """Tracks without a filter: the IMU alone, chained displacements, steps."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,8 +36,6 @@ from stario.sequences.windows import WINDOW_RATE, WINDOW_SECONDS, headings_at, i
 
 CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=10, covariance_scale=1.0))
 
-Make = Callable[..., Any]
-
 
 class TrueAttitudeOracle:
     """True displacements of the true-attitude track's windows, in order at ten per second."""
@@ -62,7 +59,7 @@ def horizontal_errors(trajectory, sequence: ImuSequence) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def from_rest() -> ImuSequence:
+def from_rest():
     """A perfect IMU on a walk that begins at rest, since time along it is slowed to a stop."""
     walk = generate_walk(2, 12.0, style=WalkStyle(carry="handheld", mount_rotvec=(0.4, -0.7, 1.1)))
     time = np.arange(0.0, 12.0, 0.005)
@@ -115,10 +112,10 @@ def test_gaps_in_the_truth_are_bridged_by_the_gyroscope(make_walk):
     walk = make_walk(5, 30.0, 200.0, PERFECT_IMU)
     valid = (walk.truth.time < 8.0) | (walk.truth.time > 14.0)
     with_gap = replace(walk, truth=replace(walk.truth, valid=valid))
-    recorded: list[Any] = []
+    recorded = []
 
     class Recorder:
-        def predict(self, windows: Any) -> Any:
+        def predict(self, windows):
             recorded.append(windows)
             return np.zeros((len(windows), 3)), np.tile(np.eye(3), (len(windows), 1, 1))
 

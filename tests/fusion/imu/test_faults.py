@@ -1,8 +1,6 @@
 """Faulty samples: values at a sensor's limit, a clock that is set back."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +10,6 @@ from stario.fusion import Navigator, PriorPose
 from stario.fusion.imu.faults import ClockSetBackDetector, ClockSetBackError, OutlierDetector
 from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.sequence import ImuSequence
-
-Make = Callable[..., Any]
-
 
 # --- saturation ------------------------------------------------------------------------------
 

@@ -1,8 +1,6 @@
 """Sensors that stop and repeat their last values, both together or one alone."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +11,6 @@ from stario.fusion import Navigator
 from stario.fusion.imu.faults import FrozenSensorDetector
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
-
-Make = Callable[..., Any]
 
 
 @pytest.mark.parametrize("held", ["last", "zeros"])

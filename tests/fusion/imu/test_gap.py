@@ -114,7 +114,7 @@ def noisy(k: int) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     sequence = simulate_imu(generate_walk(3, 20.0), 100.0, PHONE_IMU, 3)
     time = sequence.time[::4]
     field = np.array([noisy(k) for k in range(len(time))])

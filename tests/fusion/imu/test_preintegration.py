@@ -123,9 +123,7 @@ def test_coning_and_sculling_corrections_beat_the_midpoint_rule():
     corrected = corrected_increments(t, gyro, accel)
     midpoint = np.diff(t), 0.5 * (gyro[1:] + gyro[:-1]), 0.5 * (accel[1:] + accel[:-1])
 
-    def errors(
-        increments: tuple[np.ndarray, ...], R_ref: np.ndarray, v_ref: np.ndarray
-    ) -> np.ndarray:
+    def errors(increments, R_ref, v_ref):
         R, v = integrated(*increments)
         return np.array([np.linalg.norm(log_so3(R @ R_ref.T)), np.linalg.norm(v - v_ref)])
 
@@ -140,7 +138,7 @@ def test_transition_agrees_with_finite_differences():
     x = state()
     segment = preintegrate(*samples(200, 0.1), x[3], x[4], NOISE, GRAVITY)
 
-    def across(y: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+    def across(y):
         return (*segment.predict(*y), y[3], y[4])
 
     end, step = across(x), 1e-6
@@ -178,7 +176,7 @@ def test_noise_agrees_with_that_of_perturbed_samples():
     # Perturbed after the corrections for rotation, so that each sample acts on one interval.
     dt_k, rate, force = corrected_increments(t, gyro - b_g, accel - b_a)
 
-    def end(w: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, ...]:
+    def end(w, a):
         y_R, y_v, y_p = R, v, p
         for k in range(n):
             a_W = y_R @ a[k] - [0, 0, GRAVITY]

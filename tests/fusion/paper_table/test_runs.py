@@ -7,7 +7,6 @@ import pickle
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,13 +25,13 @@ from stario.sequences.datasets.batch import Skipped
 from stario.sequences.errors import ConfigError, InputError, WeightsError
 from stario.sequences.readers import read_recording
 from stario.sequences.readers.csv_writer import write_csv
-from stario.sequences.sequence import ImuSequence, PositionTrack
+from stario.sequences.sequence import PositionTrack
 
 RECIPE: dict[str, object] = {"batch": 6, "device": "cpu", "attitude": "true"}
 
 
 @pytest.fixture(scope="module")
-def dataset(make_walk: Any, tmp_path_factory: pytest.TempPathFactory) -> DataSet:
+def dataset(make_walk, tmp_path_factory):
     folder = tmp_path_factory.mktemp("walks")
     for seed in range(4):
         write_csv(folder / f"walk{seed}.csv", make_walk(seed=seed, seconds=8.0))
@@ -40,12 +39,12 @@ def dataset(make_walk: Any, tmp_path_factory: pytest.TempPathFactory) -> DataSet
 
 
 @pytest.fixture(scope="module")
-def reading(tmp_path_factory: pytest.TempPathFactory) -> ReaderConfig:
+def reading(tmp_path_factory):
     return ReaderConfig(read_recording, {}, tmp_path_factory.mktemp("cache"))
 
 
 @pytest.fixture
-def narrow_network(monkeypatch: pytest.MonkeyPatch) -> None:
+def narrow_network(monkeypatch):
     """Train a small StarIO, by default the network of the runs here."""
     narrow(monkeypatch)
 
@@ -77,13 +76,13 @@ def test_a_filled_run_writes_model_and_errors(dataset, reading, tmp_path):
 def test_without_recorded_poses_the_legs_alone_select_the_weights(
     dataset, make_walk, tmp_path, monkeypatch
 ):
-    chosen: list[bool] = []
+    chosen = []
 
-    def trained(*arguments: Any, chosen_by_legs: bool = False, **rest: Any) -> None:
+    def trained(*arguments, chosen_by_legs=False, **rest):
         chosen.append(chosen_by_legs)
         raise InputError("stop", "enough", "no training")
 
-    def waypoints(path: Path) -> ImuSequence:
+    def waypoints(path):
         walk = read_recording(path)
         time = walk.truth.time[0] + np.arange(0.5, 16.0, 3.0)
         track = PositionTrack(time, walk.truth.at(time).position_W[:, :2], "waypoints")
@@ -111,7 +110,7 @@ def test_a_killed_run_resumes_and_gives_the_same_model(dataset, reading, tmp_pat
     complete_run(whole, tmp_path / "whole", reading)
     with monkeypatch.context() as during:
 
-        def kill(path: Path, seconds: object) -> None:
+        def kill(path, seconds):
             raise KeyboardInterrupt
 
         during.setattr(training, "write_json", kill)
@@ -130,10 +129,10 @@ def test_a_killed_run_resumes_and_gives_the_same_model(dataset, reading, tmp_pat
 def test_filled_runs_are_kept_and_only_new_networks_and_seeds_are_trained(
     dataset, reading, tmp_path, monkeypatch
 ):
-    trained: list[str] = []
+    trained = []
     original = runs_module.train_run
 
-    def counted(dataset: DataSet, recipe: Any, *rest: Any) -> dict[str, object]:
+    def counted(dataset, recipe, *rest):
         trained.append(f"{recipe.architecture} {recipe.seed}")
         return original(dataset, recipe, *rest)
 

@@ -156,7 +156,7 @@ def test_published_figures_are_found_by_set_and_network():
 
 
 @pytest.fixture
-def dataset(make_walk: Any, tmp_path: Path) -> DataSet:
+def dataset(make_walk, tmp_path):
     files = [tmp_path / f"{name}.csv" for name in "abc"]
     for seed, path in enumerate(files):
         write_csv(path, make_walk(seed=seed, seconds=8.0))
@@ -164,13 +164,11 @@ def dataset(make_walk: Any, tmp_path: Path) -> DataSet:
 
 
 @pytest.fixture
-def weights(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
+def weights(monkeypatch):
     """Replace training by a log with three epochs; holds the weight of each stream."""
-    found: dict[str, float] = {}
+    found = {}
 
-    def trained(
-        recipe: Any, streams: Any, weights: Any, held_out: Any, folder: Path, **rest: Any
-    ) -> None:
+    def trained(recipe, streams, weights, held_out, folder, **rest):
         found.update((s.name, w * len(s)) for s, w in zip(streams, weights, strict=True))
         errors = (0.5, 0.1), (0.4, float("nan")), (0.3, 0.2)
         write_json(

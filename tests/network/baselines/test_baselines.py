@@ -50,7 +50,7 @@ def test_the_two_heads_are_trained_separately(name):
 
 
 @pytest.fixture(scope="module")
-def rnin() -> Rnin:
+def rnin():
     torch.manual_seed(0)
     return Rnin().eval()
 

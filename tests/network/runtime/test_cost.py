@@ -75,7 +75,7 @@ def test_an_unknown_name_is_refused_with_the_known_ones():
 
 
 def test_peak_memory_is_the_most_that_is_allocated_at_once():
-    def work() -> torch.Tensor:
+    def work():
         a = torch.zeros(1000) + 1.0  # two at once
         b = a * 2.0
         del a

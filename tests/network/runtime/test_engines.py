@@ -57,12 +57,12 @@ def engine_of(network: DisplacementNetwork) -> OnnxEngine:
 
 
 @pytest.fixture(scope="module")
-def network() -> DisplacementNetwork:
+def network():
     return randomised_network()
 
 
 @pytest.fixture(scope="module")
-def engine(network: DisplacementNetwork) -> OnnxEngine:
+def engine(network):
     return engine_of(network)
 
 
@@ -92,7 +92,7 @@ def test_engines_agree_at_rest_and_under_violent_motion(engine, network):
 
 def test_log_sigma_is_limited(network):
     network = randomised_network()
-    head = network.network.head[-1]  # type: ignore[index, union-attr]
+    head = network.network.head[-1]
     assert isinstance(head, nn.Linear)
     with torch.no_grad():
         head.bias[3:] = torch.tensor([-50.0, 0.0, 50.0])

@@ -51,7 +51,7 @@ def shallow_rnin() -> DisplacementModel:
 
 
 @pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def exported(tmp_path_factory):
     path = tmp_path_factory.mktemp("export") / "rnin.onnx"
     export_onnx(shallow_rnin(), path)
     return path

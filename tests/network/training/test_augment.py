@@ -196,7 +196,7 @@ def test_noise_is_white_and_within_its_deviation():
 
 
 def test_the_same_seed_draws_the_same_windows():
-    def batches(seed: int) -> list[torch.Tensor]:
+    def batches(seed):
         sampler = WindowSampler([STREAM], [1.0], Augmentation(), seed)
         return [*sampler.batch(8), *sampler.batch(8)]
 

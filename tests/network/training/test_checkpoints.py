@@ -14,20 +14,19 @@ from training_runs import STREAMS, TINY, VALIDATION, run, swaying
 
 from stario.network.model import load_model
 from stario.network.training.checkpoint import exclusive
-from stario.network.training.history import EpochReport
 from stario.network.training.train import train
 from stario.sequences.errors import ConfigError, InputError, ReadError
 
 
 def test_a_killed_and_resumed_run_gives_the_same_weights(finished, tmp_path):
-    def kill(step: int, loss: float) -> None:
+    def kill(step, loss):
         if step == 21:  # in the third epoch of eight steps
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, on_step=kill)
     assert not (tmp_path / "model.safetensors").exists()
-    reports: list[EpochReport] = []
+    reports = []
     resumed = safetensors.torch.load_file(run(tmp_path, on_epoch=reports.append))
     expected = safetensors.torch.load_file(finished[0])
     assert [r.epoch for r in reports] == [3, 4]
@@ -39,7 +38,7 @@ def test_a_killed_and_resumed_run_gives_the_same_weights(finished, tmp_path):
 def test_a_finished_run_is_not_trained_further(finished, tmp_path, caplog):
     checkpoint = tmp_path / "checkpoint.safetensors"
     checkpoint.write_bytes((finished[0].parent / checkpoint.name).read_bytes())
-    steps: list[int] = []
+    steps = []
     path = run(tmp_path, on_step=lambda step, loss: steps.append(step), trained_on=["swings"])
     assert steps == []
     assert path.read_bytes() == finished[0].read_bytes()

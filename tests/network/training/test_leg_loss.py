@@ -72,7 +72,7 @@ class Stretch:
 
 
 @pytest.fixture(scope="module")
-def drawn() -> tuple[LegBatch, list[Stretch]]:
+def drawn():
     """Stretches in double precision, as a batch and one by one."""
     rng = np.random.default_rng(0)
     imu_N = rng.normal(size=(3200, 6)).astype(np.float32)
@@ -196,7 +196,7 @@ def test_errors_are_those_of_a_network_that_always_predicts_the_same():
     still = np.tile(np.float32([0.0, 0.0, 0.0, 0.0, 0.0, 9.81]), (len(t), 1))
 
     class Constant(torch.nn.Module):
-        def forward(self, windows: torch.Tensor) -> torch.Tensor:
+        def forward(self, windows):
             return torch.tensor([[1.0, 0.0, 0.0, -1.0, -2.0, -3.0]]).expand(len(windows), 6)
 
     stream = WorldStream("north", still, position_W, facing_W)

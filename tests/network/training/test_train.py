@@ -41,7 +41,7 @@ def test_an_epoch_reports_its_speed(tmp_path, monkeypatch):
     """With a clock that advances by a second on every reading."""
     clock = count()
     monkeypatch.setattr("stario.network.training.run.perf_counter", lambda: float(next(clock)))
-    reports: list[EpochReport] = []
+    reports = []
     run(tmp_path, replace(TINY, epochs=1, epoch_windows=32), on_epoch=reports.append)
     assert reports[0].windows_per_second == TINY.batch / 2
     assert reports[0].drawing_share == 0.5
@@ -113,10 +113,10 @@ def test_training_stops_after_epochs_without_progress_that_train_sigma():
 
 
 def test_gradients_are_clipped(tmp_path, monkeypatch):
-    norms: list[float] = []
+    norms = []
     average = TrainingRun._average
 
-    def measured(self: TrainingRun) -> None:
+    def measured(self):
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
         norms.append(float(torch.nn.utils.get_total_norm(gradients)))
         average(self)
@@ -130,13 +130,13 @@ def test_weights_of_an_epoch_without_a_finite_error_are_not_kept(tmp_path, monke
     """Neither epoch that trains sigma has one: the weights of the better earlier one are kept."""
     original, errors_of = ValidationSet.errors, iter((1.0, 2.0, math.nan, math.nan))
 
-    def errors(self: ValidationSet, *arguments: Any) -> dict[str, float]:
+    def errors(self, *arguments):
         return original(self, *arguments) | {"c": next(errors_of, 0.0), "d": 0.0}
 
-    kept: list[dict[str, torch.Tensor]] = []
+    kept = []
     original_keep = TrainingRun._keep
 
-    def keep(self: TrainingRun, network: DisplacementNetwork) -> None:
+    def keep(self, network):
         original_keep(self, network)
         kept.append(self.best)
 
@@ -151,7 +151,7 @@ def test_a_short_run_keeps_the_epoch_that_trained_sigma(tmp_path, monkeypatch):
     """Training of sigma begins within the second of two epochs, which has the larger error here."""
     original, epoch = ValidationSet.errors, count(1)
 
-    def errors(self: ValidationSet, *arguments: Any) -> dict[str, float]:
+    def errors(self, *arguments):
         return original(self, *arguments) | {"c": float(next(epoch))}
 
     monkeypatch.setattr(ValidationSet, "errors", errors)
@@ -164,7 +164,7 @@ def test_a_short_run_keeps_the_epoch_that_trained_sigma(tmp_path, monkeypatch):
 def test_a_loss_that_is_not_finite_stops_before_it_corrupts_anything(tmp_path):
     corrupted = [replace(stream, imu_W=stream.imu_W.copy()) for stream in STREAMS]
 
-    def corrupt(report: EpochReport) -> None:
+    def corrupt(report):
         for stream in corrupted:
             stream.imu_W[:] = np.nan
 
@@ -174,7 +174,7 @@ def test_a_loss_that_is_not_finite_stops_before_it_corrupts_anything(tmp_path):
     state = safetensors.torch.load_file(tmp_path / "checkpoint.safetensors")
     assert all(value.isfinite().all() for value in state.values() if value.is_floating_point())
     assert not (tmp_path / "model.safetensors").exists()
-    reports: list[EpochReport] = []
+    reports = []
     run(tmp_path, short, on_epoch=reports.append)
     assert [r.epoch for r in reports] == [2]
 

@@ -40,7 +40,7 @@ def with_positions(kind: str, every: float, yaw: float = 0.0) -> ImuSequence:
     position = truth_of(WALK).at(time).position_W
     rotated = about_z(yaw).apply(position)
     columns = 2 if kind == "waypoints" else 3
-    track = PositionTrack(time, rotated[:, :columns], kind)  # type: ignore[arg-type]
+    track = PositionTrack(time, rotated[:, :columns], kind)
     return replace(WALK, truth=None, positions=track)
 
 
@@ -214,7 +214,7 @@ def test_training_with_legs_reduces_the_error_at_positions(tmp_path, monkeypatch
         epochs=4, epoch_windows=256, batch=16, rate=5e-3, seed=2, warm_up=0.0,
         likelihood_from=0.0, track_stretches=2, augmentation=PLAIN,
     )  # fmt: skip
-    reports: list[dict[str, float]] = []
+    reports = []
     train(
         config, streams, [1.0] * len(streams), streams, tmp_path,
         on_epoch=lambda report: reports.append(report.validation_by_recording),

@@ -190,7 +190,7 @@ def test_integration_of_coning_motion_matches_fine_steps():
     fine = np.linspace(0.0, time[-1], 100 * (len(time) - 1) + 1)
     between = np.stack([np.interp(fine, time, gyro[:, k]) for k in range(3)], axis=1)
 
-    def by_mean_rates(t: np.ndarray, rate: np.ndarray) -> Rotation:
+    def by_mean_rates(t, rate):
         turns = Rotation.from_rotvec(0.5 * (rate[1:] + rate[:-1]) * np.diff(t)[:, None])
         R = Rotation.identity()
         for turn in turns:

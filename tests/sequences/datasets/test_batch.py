@@ -11,7 +11,7 @@ from joblib import parallel_config
 from stario.network.training.splits import NAMES, read_packaged_list
 from stario.sequences.datasets.batch import Skipped, each, without_skipped
 from stario.sequences.datasets.splits import hold_out_group, random_split, read_list
-from stario.sequences.errors import InputError, ReadError, StarioError
+from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers import find_recordings
 
 
@@ -19,7 +19,7 @@ from stario.sequences.readers import find_recordings
 def test_a_failing_item_is_skipped_with_its_reason(jobs):
     """The errors take arguments of their own, with which plain pickling between processes fails."""
 
-    def halve(number: int) -> int:
+    def halve(number):
         if number % 2:
             raise InputError("number", str(number), "an even one")
         return number // 2
@@ -27,15 +27,15 @@ def test_a_failing_item_is_skipped_with_its_reason(jobs):
     odd = Skipped("3", "number: found 3, expected an even one")
     outcomes = list(each(halve, [2, 3, 8], jobs))
     assert outcomes == [1, odd, 4]
-    skipped: list[Skipped] = []
+    skipped = []
     assert list(without_skipped(outcomes, skipped)) == [1, 4]
     assert skipped == [odd]
 
 
 def test_results_are_yielded_one_by_one():
-    processed: list[int] = []
+    processed = []
 
-    def record(number: int) -> int:
+    def record(number):
         processed.append(number)
         return number
 
@@ -63,7 +63,7 @@ def test_an_unexpected_exception_costs_one_item_and_its_traceback_is_logged(capl
 
 
 def test_several_jobs_run_in_separate_processes():
-    def process(delay: float) -> int:
+    def process(delay):
         time.sleep(delay)
         return os.getpid()
 
@@ -117,7 +117,7 @@ def test_wrong_entries_are_named_and_the_others_kept(tmp_path):
     path.write_text("own.csv\n\n,handheld\ngone.csv\nempty\nlist.txt\n# end\n")
     with pytest.raises(ReadError, match=r"list\.txt: line 3: found an empty entry"):
         find_recordings(path)
-    errors: list[StarioError] = []
+    errors = []
     assert find_recordings(path, errors.append) == [tmp_path / "own.csv"]
     messages = [str(error).removeprefix(str(tmp_path)) for error in errors]
     assert [text.split(", expected")[0] for text in messages] == [
@@ -135,7 +135,7 @@ def test_a_text_of_something_else_is_one_error(tmp_path):
     """A log of a serial port, or a list of a hundred recordings next to another data folder."""
     path = tmp_path / "serial.txt"
     path.write_text("".join(f"t: {k} ax: 0.1 ay: 0.2 az: 9.8\n" for k in range(100)))
-    errors: list[StarioError] = []
+    errors = []
     with pytest.raises(ReadError, match="found 100 lines without an existing name, such as t: 0 "):
         find_recordings(path, errors.append)
     assert errors == []

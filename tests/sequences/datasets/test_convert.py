@@ -20,7 +20,7 @@ from stario.sequences.simulation.walks import generate_walk
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     """Uneven nanosecond timestamps; the ground truth has its own, starts earlier and has gaps."""
     rng = np.random.default_rng(4)
     sequence = simulate_imu(generate_walk(5, 12.0), 200.0, seed=3, name="walk").slice(2.0, 10.0)
@@ -169,7 +169,7 @@ def test_what_cannot_be_converted_is_refused_with_the_reason(walk, tmp_path):
 
 
 def test_a_folder_appears_whole_or_not_at_all(tmp_path):
-    def fail(folder: Path) -> None:
+    def fail(folder):
         (folder / "half").touch()
         assert not (tmp_path / "whole").exists()
         raise ZeroDivisionError
@@ -191,7 +191,7 @@ def test_truth_that_starts_before_the_imu_keeps_its_offset(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def hall() -> ImuSequence:
+def hall():
     """A recording with everything: lost samples, ground truth with gaps, velocity, magnetometer."""
     rng = np.random.default_rng(1)
     sequence = simulate_imu(generate_walk(5, 6.0), 100.0, seed=3, name="hall/walk")

@@ -40,7 +40,7 @@ class Reader:
 
 
 @pytest.fixture
-def recording(tmp_path: Path) -> Path:
+def recording(tmp_path):
     """A walk whose ground truth has a gap, so that it gives two streams."""
     truth = WALK.truth
     gap = (truth.time > 4.0) & (truth.time < 4.5)
@@ -232,9 +232,9 @@ def test_recordings_unsuitable_for_training_are_skipped_with_the_reason(tmp_path
 
 
 def test_built_streams_are_cached_by_key(tmp_path):
-    calls: list[int] = []
+    calls = []
 
-    def build() -> list[WorldStream]:
+    def build():
         calls.append(1)
         return world_streams(WALK)
 

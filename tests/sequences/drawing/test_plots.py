@@ -16,7 +16,7 @@ from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
 
 
 @pytest.fixture
-def truth() -> Trajectory:
+def truth():
     t = np.arange(0.0, 60.0, 0.05)
     position = np.stack([10 * np.sin(0.1 * t), 6 * np.cos(0.13 * t), 0 * t], axis=1)
     return Trajectory(t, position, Rotation.identity(len(t)))
@@ -28,7 +28,7 @@ def with_growing_error(track: Trajectory, growth: float, power: int = 1) -> Traj
 
 
 @pytest.fixture
-def tracks(truth: Trajectory) -> dict[str, Trajectory]:
+def tracks(truth):
     sigma = 0.02 * truth.time + 0.01
     covariance = np.einsum("n,ij->nij", sigma**2, np.eye(3))
     return {

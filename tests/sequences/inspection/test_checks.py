@@ -21,7 +21,7 @@ UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     return simulate_imu(generate_walk(4, 30.0, style=WalkStyle()), rate=200.0)
 
 

@@ -19,7 +19,7 @@ from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     style = WalkStyle(mount_rotvec=(0.4, -0.7, 1.1))
     return simulate_imu(
         generate_walk(8, 20.0, style=style), 100.0, seed=2, name="w"

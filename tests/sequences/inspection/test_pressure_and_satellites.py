@@ -14,7 +14,6 @@ from stario.sequences.inspection.satellite_findings import SatelliteFindings, as
 from stario.sequences.sequence import (
     Barometer,
     FloatArray,
-    ImuSequence,
     Satellites,
     Trajectory,
 )
@@ -53,7 +52,7 @@ def codes(findings: list[Finding]) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def house() -> ImuSequence:
+def house():
     return simulate_house(1, 120.0, rate=50.0).sequence
 
 

@@ -19,7 +19,7 @@ from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     return simulate_imu(generate_walk(8, 30.0, style=WalkStyle()), 100.0, seed=2, name="walk")
 
 

@@ -20,7 +20,7 @@ from stario.sequences.sequence import (
 def test_positions_without_attitude_are_kept_as_such(tmp_path, walk, every, columns, kind):
     time = np.arange(walk.time[0] + 0.3, walk.time[-1], every)
     position = walk.truth.at(time).position_W[:, :columns]
-    known = PositionTrack(time, position, kind)  # type: ignore[arg-type]
+    known = PositionTrack(time, position, kind)
     write_csv(tmp_path / "walk.csv", replace(walk, truth=None, positions=known))
     found = read_recording(tmp_path / "walk.csv")
     assert found.truth is None

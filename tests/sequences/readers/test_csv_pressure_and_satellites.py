@@ -60,7 +60,7 @@ def receivers(draw: st.DrawFn) -> Satellites:
 
 def assert_same(found: object, expected: object) -> None:
     assert type(found) is type(expected)
-    for field in fields(expected) if expected is not None else ():  # type: ignore[arg-type]
+    for field in fields(expected) if expected is not None else ():
         one, other = (getattr(part, field.name) for part in (found, expected))
         assert (one is None) == (other is None), field.name
         if one is not None:

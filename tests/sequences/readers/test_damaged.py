@@ -4,7 +4,6 @@ import shutil
 import zipfile
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -15,17 +14,17 @@ from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.readers import find_recordings
-from stario.sequences.sequence import ImuSequence, PositionTrack
+from stario.sequences.sequence import ImuSequence
 from stario.sequences.truth.alignment import align_tracked_body, clock_offset
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     return simulate_imu(generate_walk(3, 12.0), 100.0, seed=1, name="walk")
 
 
 @pytest.fixture
-def archive(walk: ImuSequence, tmp_path: Path) -> Path:
+def archive(walk, tmp_path):
     write_archive(tmp_path / "two.h5", [walk, replace(walk, name="other")])
     return tmp_path / "two.h5"
 
@@ -131,7 +130,7 @@ def test_reference_points_take_the_time_unit_that_fits_the_recording(tmp_path, u
     rows = [f"{round(t * unit)},{t},1.0" for t in (0.0, 2.0, 10.0, 28.0)]
     (tmp_path / "walk_ref.csv").write_text("\n".join(["t,x,y", *rows]) + "\n")
 
-    def read(start_ns: int) -> PositionTrack | None:
+    def read(start_ns):
         start, stop = np.int64(start_ns), np.int64(start_ns + 30 * 10**9)
         return reference_points(Recording(tmp_path / "gyr.csv", "", start, stop))
 

@@ -1,7 +1,6 @@
 """Recordings found below a path: what is one, what is a list of them, and what is passed over."""
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -26,7 +25,7 @@ def test_a_pipe_is_refused_before_it_is_read(read, tmp_path):
 def test_folders_without_permission_are_passed_over(tmp_path, monkeypatch):
     listed = Path.iterdir
 
-    def iterdir(folder: Path) -> Iterator[Path]:
+    def iterdir(folder):
         if folder.name == "private":
             raise PermissionError(13, "Permission denied")
         return listed(folder)

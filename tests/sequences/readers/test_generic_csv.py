@@ -122,7 +122,7 @@ def test_time_is_read_exactly_from_any_epoch(tmp_path, unit, per_second):
 
 @pytest.mark.parametrize("first", [0, 1])
 def test_a_count_of_rows_is_no_time_unless_it_has_a_unit(tmp_path, first, caplog):
-    def read(header: str, step: int) -> ImuSequence:
+    def read(header, step):
         rows = [f"{first + step * k},{ROW}" for k in range(20)]
         return read_generic_csv(write_lines(tmp_path / "own.csv", header, *rows))
 

@@ -9,11 +9,10 @@ from phone_files import save
 
 from stario.sequences import ReadError, find_recordings, read_recording
 from stario.sequences.datasets.convert import write_euroc
-from stario.sequences.sequence import ImuSequence
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     return formats.walk_of(100.0, 3.0)
 
 

@@ -141,7 +141,7 @@ def test_a_table_is_read_back(names, tmp_path_factory):
 
     @settings(max_examples=80, deadline=None)
     @given(texts(names))
-    def check(text: Text) -> None:
+    def check(text):
         path = text.write(folder / "own.csv")
         assert find_recordings(path) == [path]
         read = read_recording(path)

@@ -41,7 +41,7 @@ def change(path: Path, row: int, column: str, cell: str) -> None:
 
 
 @pytest.fixture
-def ronin(tmp_path, walks) -> Path:
+def ronin(tmp_path, walks):
     pytest.importorskip("h5py")
     return formats.ronin(tmp_path / "a000_1", walks(200.0)).path
 

@@ -37,13 +37,13 @@ def true_track(sequence: ImuSequence) -> Trajectory:
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     style = WalkStyle(carry="handheld", preferred_speed=1.0)
     return simulate_imu(generate_walk(4, 40.0, style=style), rate=200.0, errors=PHONE_IMU)
 
 
 @pytest.fixture(scope="module")
-def phone_walk() -> ImuSequence:
+def phone_walk():
     return simulate_imu(generate_walk(4, 60.0, style=WalkStyle("rig")), 100.0, PERFECT_IMU)
 
 

@@ -285,7 +285,7 @@ def test_the_time_unit_is_determined_at_every_accepted_rate(tmp_path, rate, star
 def test_units_named_by_a_logger_are_used_or_refused(tmp_path):
     walk = formats.walk_of(100.0, 3.0)
 
-    def read(time: str, gyro: str):
+    def read(time, gyro):
         texts = [
             f"time [{time}],x [{unit}],y,z\n" + rows(1e3 * walk.time, values)
             for unit, values in (("m/s^2", walk.accel), (gyro, np.degrees(walk.gyro)))

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
+from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulation.body import PLACES, carried_on, places_on, virtual_imu
 from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.simulation.motion_capture import BodyMotion, body_clips, read_body
@@ -57,8 +57,8 @@ def write_hdf5(path: Path, motion: BodyMotion) -> None:
 
 def strapdown_error(sequence: object) -> float:
     """Largest difference between truth and what integration of perfect samples gives [m]."""
-    truth, t = sequence.truth, sequence.time  # type: ignore[attr-defined]
-    force_W = truth.attitude_WB.apply(sequence.accel)  # type: ignore[attr-defined]
+    truth, t = sequence.truth, sequence.time
+    force_W = truth.attitude_WB.apply(sequence.accel)
     acceleration = force_W - [0.0, 0.0, STANDARD_GRAVITY]
     steps = np.diff(t)[:, None]
     velocity = truth.velocity_W[0] + np.cumsum(
@@ -102,9 +102,9 @@ def test_a_pocket_is_ahead_of_the_thigh_and_the_ear_beside_the_head():
 
 
 def test_landing_feet_shake_a_pocket_more_than_a_hand():
-    def high(place: str) -> float:
+    def high(place):
         device = virtual_imu(walker(), place, 100.0, PERFECT_IMU, seed=5)
-        force: FloatArray = np.linalg.norm(device.accel, axis=1)
+        force = np.linalg.norm(device.accel, axis=1)
         spectrum = np.abs(np.fft.rfft((force - force.mean()) * np.hanning(len(force)))) ** 2
         f = np.fft.rfftfreq(len(force), 0.01)
         return float(np.sqrt(8.0 / 3.0 * 2.0 * spectrum[(f > 9) & (f < 20)].sum()) / len(force))

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.atmosphere import standard_pressure
 from stario.sequences.errors import InputError
 from stario.sequences.geodesy import east_north
-from stario.sequences.sequence import BoolArray, FloatArray, Trajectory
+from stario.sequences.sequence import FloatArray, Trajectory
 from stario.sequences.simulation.barometer import Air, simulate_barometer
-from stario.sequences.simulation.house import SHORTEST, HouseWalk, simulate_house
+from stario.sequences.simulation.house import SHORTEST, simulate_house
 from stario.sequences.simulation.receiver import Sky, simulate_satellites
 from stario.sequences.simulation.walks import WalkStyle
 
@@ -20,7 +20,7 @@ STILL_AIR = Air(weather=0.0, door=0.0, noise=0.0)
 
 
 @pytest.fixture(scope="module")
-def walk() -> HouseWalk:
+def walk():
     return simulate_house(2, 120.0, rate=50.0)
 
 
@@ -105,7 +105,7 @@ def test_errors_of_satellites_last_and_are_larger_between_houses():
 
 def test_a_receiver_indoors_repeats_its_last_position(walk):
     found, entered = walk.sequence.satellites, walk.stays[0].stop
-    indoors: BoolArray = found.time > entered
+    indoors = found.time > entered
     assert 30 < indoors.sum() < len(found) - 20
     assert (found.latlon_deg[indoors] == found.latlon_deg[~indoors][-1]).all()
     assert (found.radius_m[indoors] == 9.0).all()

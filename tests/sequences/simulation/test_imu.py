@@ -213,7 +213,7 @@ QUIET = MagneticField(noise=0.0)
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     return simulate_imu(generate_walk(3, 30.0), 100.0, seed=1)
 
 

@@ -27,12 +27,12 @@ def walk_of(errors=PERFECT_IMU) -> ImuSequence:
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     return walk_of()
 
 
 @pytest.fixture
-def perfect(monkeypatch: pytest.MonkeyPatch) -> None:
+def perfect(monkeypatch):
     monkeypatch.setattr(insertion, "GYRO_ERROR", 0.0)
     monkeypatch.setattr(insertion, "_ERRORS", PERFECT_IMU)
 
@@ -85,7 +85,7 @@ def test_the_rest_of_a_recording_is_unchanged_but_for_its_time_and_a_lifts_heigh
 
 
 def test_every_moment_is_what_its_name_says(walk):
-    def sizes(name: str) -> tuple[np.ndarray, np.ndarray]:
+    def sizes(name):
         part = within(inserted(walk, name))
         return np.linalg.norm(part.gyro, axis=1), np.linalg.norm(part.accel, axis=1)
 
@@ -106,7 +106,7 @@ def test_every_moment_is_what_its_name_says(walk):
 
 
 def test_a_lift_turns_the_field_and_weakens_it_and_standing_does_not(walk):
-    def field_W(name: str) -> np.ndarray:
+    def field_W(name):
         whole = inserted(walk, name)
         part = whole.sequence.slice(whole.start + 6.0, whole.stop - 6.0)
         at = whole.sequence.truth.at(part.magnetometer.time)

@@ -169,7 +169,7 @@ def test_a_recording_hardly_too_short_is_not_said_to_be_long_enough():
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     style = WalkStyle(mount_rotvec=(0.3, -0.2, 0.9))
     return simulate_imu(generate_walk(2, 20.0, style=style), 100.0, PERFECT_IMU)
 

@@ -25,7 +25,7 @@ def recorded_in(sequence: ImuSequence, axes: str) -> ImuSequence:
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     return simulate_imu(generate_walk(8, 40.0, style=WalkStyle()), 200.0, seed=2)
 
 
@@ -207,7 +207,7 @@ def test_a_gap_of_the_truth_is_no_jump(walk):
 
 
 @pytest.fixture(scope="module")
-def turning() -> ImuSequence:
+def turning():
     style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.5, 0.4))
     return simulate_imu(generate_walk(5, 90.0, style=style), 100.0, PERFECT_IMU, 1)
 

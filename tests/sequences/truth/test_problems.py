@@ -23,7 +23,7 @@ LATE_S = 20.0
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     """A walk whose truth is noisy and slow, as a phone's visual odometry."""
     walk = simulate_imu(generate_walk(8, 40.0, style=WalkStyle()), 100.0, PHONE_IMU, 2, name="w")
     truth = walk.truth.at(np.arange(0.0, 40.0, 0.05))

@@ -42,7 +42,7 @@ def of_person(recording: ImuSequence, person: str) -> ImuSequence:
 
 
 @pytest.fixture(scope="module")
-def pair(walk: ImuSequence) -> Benchmark:
+def pair(walk):
     recordings = {"one": of_person(walk, "a"), "two": of_person(with_waypoints(walk), "b")}
     scales = {"walks a": 0.95, "walks b": 0.9}
     models = {
@@ -56,7 +56,7 @@ def test_a_recording_that_cannot_be_used_is_skipped_and_a_wrong_truth_warned_of(
     mirrored = stepping.truth.position_W * [-1.0, 1.0, 1.0]
     wrong = replace(stepping, truth=replace(stepping.truth, position_W=mirrored))
     recordings = {Path("wrong"): wrong, Path("blind"): stepping.without_truth()}
-    models: Makers = {"ours": lambda group: Stub(stepping)}
+    models = {"ours": lambda group: Stub(stepping)}
     _, skipped = benchmark(dict.fromkeys(recordings, ""), models, recordings.__getitem__)
     assert [one.item for one in skipped] == ["blind"]
     assert "steps: truth: positions mirrored" in caplog.text
@@ -64,7 +64,7 @@ def test_a_recording_that_cannot_be_used_is_skipped_and_a_wrong_truth_warned_of(
 
 def test_a_recording_with_two_waypoints_is_named_as_not_compared(walk, caplog):
     few, enough = with_waypoints(walk, 50.0), with_waypoints(walk)
-    models: Makers = {"ours": lambda group: Stub(walk)}
+    models = {"ours": lambda group: Stub(walk)}
     found = judged({"50": few, "8": enough}, models)
     assert [record.getMessage()[:17] for record in caplog.records] == ["50: not compared,"]
     assert (values(found.scores, "path_m") > 0.0).tolist() == [False, True]
@@ -78,7 +78,7 @@ def test_a_device_at_rest_counts_in_no_median_or_ratio(walk, caplog):
     """Its errors relative to its path, the noise of its truth, would be a thousand percent."""
     still = 1e-4 * np.random.default_rng(0).normal(size=walk.truth.position_W.shape)
     resting = replace(walk, name="rest", truth=replace(walk.truth, position_W=still))
-    models: Makers = {"ours": lambda group: Stub(walk), "theirs": lambda group: Stub(walk, 0.8)}
+    models = {"ours": lambda group: Stub(walk), "theirs": lambda group: Stub(walk, 0.8)}
     found, walking = judged({"walk": walk, "rest": resting}, models), judged({"walk": walk}, models)
     assert "rest: not compared, because the ground truth moves by less" in caplog.text
     both, alone = (part.rows("set", "ours", "theirs").iloc[-1] for part in (found, walking))

@@ -156,7 +156,7 @@ def test_no_sequence_of_faults_breaks_a_stream(backend, examples):
         suppress_health_check=list(HealthCheck),
     )
     @given(WALK)
-    def run(walk: list[tuple[str, int, float]]) -> None:
+    def run(walk):
         stream = Stream(backend)
         try:
             stream.samples(80, "fine", 0.0)

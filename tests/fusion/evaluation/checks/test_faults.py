@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from itertools import count
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -28,13 +27,13 @@ SAMPLES = ("time", "gyro", "accel")
 
 
 @pytest.fixture(scope="module")
-def scores() -> pd.DataFrame:
+def scores():
     sequence, config = matched_walk(SECONDS, seed=1)
     return run_faults(sequence, config, backends=("ekf",))
 
 
 @pytest.fixture(scope="module")
-def results(scores: pd.DataFrame) -> dict[str, Any]:
+def results(scores):
     return {row.group: row for row in wide(scores).itertuples()}
 
 

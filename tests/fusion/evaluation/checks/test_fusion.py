@@ -1,8 +1,6 @@
 """Checks of recordings by group: fusion and network, fixes, missing samples."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -27,8 +25,6 @@ from stario.network.model import load_model
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import PositionTrack, Trajectory
-
-Make = Callable[..., Any]
 
 
 def of(scores: pd.DataFrame, metric: str, track: str = "ekf") -> float:

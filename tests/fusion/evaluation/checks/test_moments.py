@@ -91,7 +91,7 @@ def test_a_phone_laid_down_and_taken_up_costs_the_rest_little(walk, monkeypatch)
 
 def test_a_recording_without_known_positions_is_refused(walk):
     with pytest.raises(InputError, match="truth"):
-        moment_costs(object(), walk.without_truth(), NavigatorConfig())  # type: ignore[arg-type]
+        moment_costs(object(), walk.without_truth(), NavigatorConfig())
 
 
 def test_a_recording_begins_at_its_first_known_position_and_is_cut(walk):

@@ -20,7 +20,7 @@ EPOCH_NS = 1_496_840_000_000_000_000
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     return simulate_imu(generate_walk(4, 60.0, style=WalkStyle("rig")), 100.0, PERFECT_IMU)
 
 
