@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from training_runs import narrow
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.recording import cut_recording
@@ -151,3 +152,9 @@ def without():
         lambda sequence, gone: sequence.select(~np.frombuffer(gone, dtype=np.bool_))
     )
     return lambda sequence, gone: kept(sequence, gone.tobytes())
+
+
+@pytest.fixture
+def narrow_network(monkeypatch):
+    """Train a small StarIO in place of the whole one."""
+    narrow(monkeypatch)

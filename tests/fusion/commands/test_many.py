@@ -8,23 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from training_runs import narrow
 
 from stario.fusion.commands import evaluate
 from stario.fusion.commands.options import ReadingOptions
-from stario.fusion.commands.train import _recipe
-from stario.fusion.commands.training_data import packaged_lists
 from stario.fusion.evaluation.compare import TRACKS
-from stario.network import load_model
-from stario.network.training import splits
-from stario.network.training.config import FINE_TUNING, training_config
-from stario.network.training.splits import read_packaged_list
-from stario.sequences.readers.archive import split_name
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
 from stario.sequences.simulation.moments import MOMENTS
-
-# --- compare and evaluate ----------------------------------------------------------------------
 
 
 def test_compare_prints_json_and_writes_the_same(stario, recording, tmp_path):
@@ -211,122 +201,6 @@ def test_every_option_that_changes_what_is_read_is_part_of_the_key_of_a_cache():
         assert (other.as_read() == usual.as_read()) == (name == "where")
 
 
-# --- train -------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def tiny(tmp_path):
-    """A recipe of one step."""
-    path = tmp_path / "tiny.json"
-    path.write_text(json.dumps({"epoch_windows": 32, "batch": 32, "epochs": 1}))
-    return path
-
-
-@pytest.fixture
-def narrow_network(monkeypatch):
-    narrow(monkeypatch)
-
-
-@pytest.mark.usefixtures("no_figures", "narrow_network")
-def test_weights_that_train_writes_can_be_run(stario, recording, tmp_path, tiny):
-    done = stario(
-        "train", recording, "--generated", 1, "--config", tiny, "--out", "trained",
-        "--seed", 3,
-    )  # fmt: skip
-    assert done.code == 0, done.err
-    weights = Path(done.out.strip())
-    assert weights == Path("trained/model.safetensors")
-    assert "epoch 1" in done.err
-    card = json.loads((tmp_path / "trained/model.json").read_text())
-    assert card["recipe"]["seed"] == 3
-    assert any("recorded" in words for words in card["trained_on"])
-    assert stario("run", recording, "--model", weights, "--out", "out").code == 0
-    content = bytearray(weights.read_bytes())
-    content[-1] ^= 1
-    weights.write_bytes(bytes(content))
-    stario("run", recording, "--model", weights).assert_one_line_error("model.safetensors")
-
-
-@pytest.mark.usefixtures("narrow_network")
-def test_training_continues_after_failures_and_caches_its_windows(
-    stario, recording, tmp_path, tiny
-):
-    write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
-    (tmp_path / "list.txt").write_text("blind.csv\nnosuch.csv\n")
-    call = ("train", recording, "list.txt", "--generated", 1, "--config", tiny)
-    done = stario(*call, "--out", "a", "--cache", "kept")
-    assert done.code == 1
-    assert Path(done.out.strip()) == Path("a/model.safetensors")
-    lines = [line for line in done.err.splitlines() if line.startswith("stario: skipped")]
-    assert len(lines) == 2
-    assert "nosuch.csv" in lines[0]
-    assert "blind.csv: truth" in lines[1]
-    assert done.err.index(lines[1]) < done.err.index("epoch 1:")
-    kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "kept").iterdir()}
-    assert len(kept) == 2  # the recording's and the generated walk's
-    assert stario(*call, "--out", "b", "--cache", "kept").code == 1
-    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "kept").iterdir()} == kept
-    first, second = ((tmp_path / out / "model.safetensors").read_bytes() for out in "ab")
-    assert first == second
-
-
-@pytest.mark.usefixtures("narrow_network")
-def test_weights_to_start_from_set_the_network(stario, recording, tmp_path, tiny):
-    call, other = ("train", recording, "--recorded-only", "--config", tiny), "StarIO without MSGCU"
-    assert stario(*call, "--model", other, "--out", "first").code == 0
-    first = ("--start-from", "first/model.safetensors")
-    assert stario(*call, *first, "--out", "second").code == 0
-    card = json.loads((tmp_path / "second/model.json").read_text())
-    assert card["architecture"] == other
-    stario(*call, *first, "--model", "StarIO").assert_one_line_error("--start-from", other)
-
-
-@pytest.mark.usefixtures("narrow_network")
-def test_sigma_is_not_calibrated_on_a_few_seconds_where_initial_weights_have_a_calibration(
-    stario, recording, tmp_path, tiny, monkeypatch
-):
-    def calibration(out, *options):
-        call = ("train", recording, "--recorded-only", "--config", tiny, *options, "--out", out)
-        assert stario(*call).code == 0
-        return json.loads((tmp_path / out / "model.json").read_text())["calibration"]
-
-    first = calibration("first")
-    tuned = ("--start-from", "first/model.safetensors")
-    assert calibration("tuned", *tuned) == first
-    monkeypatch.setattr("stario.fusion.commands.train._CALIBRATING_S", 1.0)
-    assert calibration("calibrated", *tuned) != first
-
-
-def test_fine_tuning_changes_weights_a_little_unless_a_recipe_says_otherwise(tiny):
-    first = load_model("default")
-    assert _recipe(None, None).learned == _recipe(tiny, first).learned == 1.0
-    gentle = _recipe(None, first, epochs=5)
-    assert gentle == replace(training_config(FINE_TUNING), epochs=5)
-    assert gentle.learned < 0.5
-    assert gentle.rate < _recipe(None, None).rate
-
-
-@pytest.mark.usefixtures("narrow_network")
-def test_training_can_use_recordings_alone(stario, recording, tmp_path, tiny):
-    twice = recording, recording.parent  # counts once
-    done = stario("train", *twice, "--recorded-only", "--config", tiny, "--out", "alone")
-    assert done.code == 0, done.err
-    trained_on = json.loads((tmp_path / "alone/model.json").read_text())["trained_on"]
-    assert trained_on == ["recorded, others: 10 s"]  # nothing simulated, no licence known
-
-
-def test_a_recording_cannot_both_train_and_validate(stario, recording, tmp_path):
-    (tmp_path / "list.txt").write_text(f"{recording}\n")
-    done = stario("train", recording, "--validation", "list.txt", "--generated", 1)
-    done.assert_one_line_error("--validation", f"{recording}, which is also trained on")
-    assert not (tmp_path / "runs").exists()
-
-
-def test_nothing_is_trained_if_nothing_could_be_read(stario, tmp_path):
-    stario("train", "missing.csv").assert_one_line_error("missing.csv", "no such file")
-    assert not (tmp_path / "runs").exists()
-
-
 def test_run_writes_the_smoothed_track_and_on_request_the_filters(
     stario, recording, tmp_path, no_figures
 ):
@@ -356,40 +230,6 @@ def test_backends_compares_filter_and_graph(stario):
     content = json.loads(done.out)
     assert set(content["summary"]["median_ate_m"]) == {"ekf", "graph", "fixed_lag"}
     assert content["scores"][0]["recording"] == "walk 0"
-
-
-def test_recordings_too_short_to_hold_out_a_part_require_validation_recordings(
-    stario, recording, tmp_path
-):
-    write_csv(tmp_path / "short.csv", read_generic_csv(recording).slice(0.0, 9.0))
-    stario("train", "short.csv", "--generated", 1).assert_one_line_error(
-        "two legs between known positions", "--validation"
-    )
-
-
-def test_what_is_left_out_is_neither_learned_from_nor_selected_on(tmp_path):
-    for line in _names():
-        file = split_name(tmp_path / line)[0]
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.touch()
-    entries = read_packaged_list("all", tmp_path)
-    groups = {entry.path: entry.group for entry in entries}
-
-    learned, selected = packaged_lists(tmp_path, ["tyrex", "ridi dan"], "all")
-
-    used = {groups[path] for path in learned + selected}
-    assert not {g for g in used if g.startswith("tyrex")} | ({"ridi dan"} & used)
-    holdout = {entry.path for entry in read_packaged_list("holdout", tmp_path)}
-    assert set(selected) <= holdout
-    assert not set(learned) & holdout
-    left_out = sum(g.startswith("tyrex") or g == "ridi dan" for g in groups.values())
-    assert len(learned) + len(selected) == len(entries) - left_out
-
-
-def _names() -> list[str]:
-    lists = Path(splits.__file__).parent / "all.txt"
-    lines = lists.read_text().splitlines()
-    return [line.partition(",")[0] for line in lines if line and not line.startswith("#")]
 
 
 def test_set_in_the_name_of_weights_is_the_first_word_of_a_group(monkeypatch):

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from training_runs import narrow
 from typer.testing import CliRunner
 
 from stario.fusion.commands.cli import app
@@ -41,12 +40,6 @@ def dataset(make_walk, tmp_path_factory):
 @pytest.fixture(scope="module")
 def reading(tmp_path_factory):
     return ReaderConfig(read_recording, {}, tmp_path_factory.mktemp("cache"))
-
-
-@pytest.fixture
-def narrow_network(monkeypatch):
-    """Train a small StarIO, by default the network of the runs here."""
-    narrow(monkeypatch)
 
 
 def run(dataset: DataSet, network: str = "StarIO", seed: int = 0, steps: int = 4) -> Run:
