@@ -1,7 +1,5 @@
 """A stream that is stopped and continued elsewhere gives the same states as without a stop."""
 
-import subprocess
-import sys
 import zlib
 from dataclasses import replace
 
@@ -68,42 +66,6 @@ def test_a_snapshot_includes_the_prior(walk, make_oracle):
     push(whole, walk, 0.0, 0.4)
     other.restore(whole.snapshot())
     assert_same(push(other, walk, 0.4, 5.0), push(whole, walk, 0.4, 5.0))
-
-
-SCRIPT = """
-import sys
-import numpy as np
-from stario.fusion import Navigator
-from stario.sequences.simulation.imu import simulate_imu
-from stario.sequences.simulation.walks import generate_walk
-
-class Still:
-    def predict(self, windows):
-        return np.zeros((len(windows), 3)), np.tile(np.eye(3), (len(windows), 1, 1))
-
-walk = simulate_imu(generate_walk(0, 6.0), 100.0)
-rows = list(zip(walk.time, walk.gyro, walk.accel))
-navigator = Navigator(Still())
-navigator.restore(open(sys.argv[1], "rb").read())
-for row in rows[350:]:
-    navigator.push(*row)
-np.save(sys.argv[2], np.hstack([navigator.state.p_W, navigator.state.covariance.ravel()]))
-"""
-
-
-def test_another_process_can_continue_a_stream(tmp_path, still_model):
-    from stario.sequences.simulation.imu import simulate_imu
-    from stario.sequences.simulation.walks import generate_walk
-
-    navigator = Navigator(still_model)
-    walk = simulate_imu(generate_walk(0, 6.0), 100.0)
-    stream(navigator, walk.select(np.arange(len(walk)) < 350))
-    data, result = tmp_path / "stream.bin", str(tmp_path / "result.npy")
-    data.write_bytes(navigator.snapshot())
-    subprocess.run([sys.executable, "-c", SCRIPT, str(data), result], check=True, timeout=60)
-    stream(navigator, walk.select(np.arange(len(walk)) >= 350))
-    expected = np.hstack([navigator.state.p_W, navigator.state.covariance.ravel()])
-    np.testing.assert_allclose(np.load(result), expected, atol=1e-9)
 
 
 # --- refused ---------------------------------------------------------------------------------

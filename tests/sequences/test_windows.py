@@ -242,16 +242,6 @@ def test_bad_samples_are_dropped(walk):
     assert np.abs(stream.position_W - true.position_W).max() < 1e-4
 
 
-def test_an_outlying_time_drops_only_its_own_sample(walk, caplog):
-    time = walk.time.copy()
-    time[100] += 1e6
-    outlying = replace(walk, time=time)
-    assert np.array_equal(clean_samples(outlying)[0], np.delete(walk.time, 100))
-    assert "samples ahead of their time dropped: 1" in caplog.text
-    (stream,), (whole,) = world_streams(outlying), world_streams(walk)
-    assert len(stream) == len(whole)
-
-
 @pytest.mark.parametrize("attitude", ["true", "levelled"])
 def test_a_zero_time_before_times_since_1970_does_not_exhaust_memory(walk, attitude):
     """A grid over the whole time between would not fit in memory."""

@@ -276,18 +276,6 @@ def test_rest_stops_the_drift(make_oracle: Make, still_model: Any, make_walk: Ma
     np.testing.assert_allclose(navigator.state.b_g, 2e-3, atol=2e-4)
 
 
-def test_states_stay_valid_under_bursts_of_nan(walk: ImuSequence, make_oracle: Make) -> None:
-    rng = np.random.default_rng(0)
-    gyro, accel = walk.gyro.copy(), walk.accel.copy()
-    for start in rng.integers(0, len(walk), 20):
-        (gyro if rng.random() < 0.5 else accel)[start : start + rng.integers(1, 60)] = np.nan
-    bad = replace(walk, gyro=gyro, accel=accel)
-    navigator = lagged(make_oracle(bad, walk.truth, CONFIG))
-    for state in stream(navigator, bad):
-        assert_valid(state)
-    assert len(navigator.health.gaps) > 3
-
-
 def test_if_the_graph_fails_the_stream_continues_from_the_filter(
     walk: ImuSequence, make_oracle: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -312,25 +300,6 @@ def test_if_the_graph_fails_the_stream_continues_from_the_filter(
         "fell back to the filter 1 times, last because velocity at 8.0 s is undetermined"
         in navigator.health.notes[0]
     )
-
-
-@pytest.mark.parametrize("stop", [pytest.param(3.0, marks=pytest.mark.slow), 11.37])
-def test_another_navigator_can_continue_a_stream(
-    walk: ImuSequence, make_oracle: Make, stop: float
-) -> None:
-    oracle = make_oracle(walk, walk.truth, CONFIG)
-    rows = list(zip(walk.time, walk.gyro, walk.accel, strict=True))
-    cut = int(np.searchsorted(walk.time, stop))
-    one = lagged(oracle)
-    for row in rows[:cut]:
-        one.push(*row)
-    other = lagged(oracle)
-    other.restore(one.snapshot())
-    for row in rows[cut:]:
-        one.push(*row)
-        other.push(*row)
-    assert np.abs(one.state.p_W - other.state.p_W).max() < 1e-9
-    np.testing.assert_allclose(other.state.covariance, one.state.covariance, rtol=1e-5, atol=1e-10)
 
 
 def test_a_step_leaves_the_state_before_it_as_it_was(walk: ImuSequence, make_oracle: Make) -> None:

@@ -223,16 +223,6 @@ def test_the_newest_gaps_are_listed_and_all_are_counted(walk):
     assert counts.health().lines()[1] == "gaps 249, longest 0.81 s"
 
 
-def test_times_since_1970_give_the_same_windows(walk):
-    late = replace(walk, time=walk.time + 1.7e9)
-    ours, theirs = (
-        [e.window.imu_N for e in cut_recording(s, CONFIG)[0] if e.window is not None]
-        for s in (late, walk)
-    )
-    assert len(ours) == len(theirs)
-    assert np.abs(np.stack(ours) - np.stack(theirs)).max() < 2e-3
-
-
 def test_filter_settings_do_not_affect_the_windows(walk):
     other = NavigatorConfig(
         filter=FilterConfig(update_rate=10, covariance_scale=9.0, gyro_bias_sigma=1.0)

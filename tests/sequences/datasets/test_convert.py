@@ -2,7 +2,6 @@
 
 import logging
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -64,24 +63,6 @@ def test_conversion_loses_nothing(walk, tmp_path, layout):
     found = read_recording(path, layout)
     assert found.name == "walk"
     assert_same(found, given)
-
-
-def test_converting_there_and_back_gives_the_same_bytes(walk, tmp_path):
-    convert(walk, tmp_path / "a.csv")
-    convert(read_recording(tmp_path / "a.csv"), tmp_path / "b")
-    convert(read_recording(tmp_path / "b"), tmp_path / "c.csv")
-    convert(read_recording(tmp_path / "c.csv"), tmp_path / "d")
-    first, second = (
-        {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*.csv")}
-        for folder in (tmp_path / "b", tmp_path / "d")
-    )
-    assert (
-        first.keys()
-        == second.keys()
-        == {str(Path("mav0", name, "data.csv")) for name in ("imu0", "state_groundtruth_estimate0")}
-    )
-    imu = str(Path("mav0/imu0/data.csv"))
-    assert first[imu] == second[imu]
 
 
 def test_the_euroc_layout_is_that_of_its_authors(walk, tmp_path):

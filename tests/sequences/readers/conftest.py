@@ -16,7 +16,7 @@ def walks():
 
     def walk(rate):
         if rate not in made:
-            made[rate] = walk_of(rate, 4000.0 / rate)
+            made[rate] = walk_of(rate, 2400.0 / rate)
         return made[rate]
 
     return walk

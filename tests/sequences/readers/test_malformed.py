@@ -62,7 +62,7 @@ def test_an_hdf5_with_a_missing_or_shorter_field_is_refused(ronin):
     assert_refused(ronin, "data.hdf5: synced/acce: found no such field")
     with h5py.File(ronin / "data.hdf5", "a") as data:
         data["synced/acce"] = np.zeros((50, 3))
-    assert_refused(ronin, "synced/acce: found shape (50, 3), expected (4001, 3)")
+    assert_refused(ronin, "synced/acce: found shape (50, 3), expected (2401, 3)")
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_an_hdf5_with_a_bad_row_is_refused(ronin, name, value, message):
         ("imu_acce_scale", None, "info.json: imu_acce_scale: found no such field"),
         ("imu_init_gyro_bias", [1, 2], "imu_init_gyro_bias: found [1, 2], expected 3 finite"),
         ("start_calibration", [0, 0, 0, 0], "start_calibration: found norm 0"),
-        ("start_frame", 9999, "start_frame: found 9999, expected a row from 0 to 4000"),
+        ("start_frame", 9999, "start_frame: found 9999, expected a row from 0 to 2400"),
         ("grv_ori_error", "large", "grv_ori_error: found 'large', expected a finite number"),
     ],
 )
@@ -155,7 +155,7 @@ def test_an_npy_that_does_not_fit_its_description_is_refused(tmp_path, walks):
     np.save(file, bad)
     assert_refused(path, "row 9, qxyzw_World_Device: found norm 0")
     np.save(file, table[:, :10])
-    assert_refused(path, "array: found shape (4001, 10), expected (N, 17)")
+    assert_refused(path, "array: found shape (2401, 10), expected (N, 17)")
     np.save(file, np.array(["a", "b"]))
     assert_refused(path, "array: found dtype <U1, expected numbers")
     np.save(file, table)

@@ -31,39 +31,10 @@ def phone_rows(cells: str = "0.1,0.2,9.5", count: int = 60) -> list[str]:
     return [f"{0.02 * k:.2f},{cells}" for k in range(count)]
 
 
-@pytest.mark.parametrize("encoding", ["utf-16", "utf-8-sig", "latin-1"])
-def test_any_encoding_of_a_phones_files_is_read(tmp_path, encoding):
-    folder = phone(tmp_path / "phone", phone_rows(), phone_rows(), encoding)
-    assert find_recordings(folder) == [folder]
-    assert np.allclose(read_recording(folder).accel, [0.1, 0.2, 9.5])
-
-
 def test_a_zip_is_recognised_by_its_content(tmp_path):
     with zipfile.ZipFile(tmp_path / "download", "w") as file:
         file.writestr("walk.csv", "\n".join([HEADER, *ROWS]))
     assert len(read_recording(tmp_path / "download")) == len(ROWS)
-
-
-@pytest.mark.parametrize("zone", ["", "Z", "+02:00", "-0330"])
-@pytest.mark.parametrize("joint", ["T", " "])
-def test_iso_dates_are_times(tmp_path, zone, joint):
-    days = [f"2024-02-2{8 + k // 30}" for k in range(60)]  # across midnight, in a leap year
-    clocks = [f"23:59:59.{10 * k + 700:03d}" for k in range(30)]
-    clocks += [f"00:00:00.{10 * k:03d}123456" for k in range(30)]
-    times = [f"{day}{joint}{clock}{zone}" for day, clock in zip(days, clocks, strict=True)]
-    expected = 0.01 * np.arange(60) + np.where(np.arange(60) < 30, 0.0, 123456e-9)
-    header = HEADER.replace("t [s]", "datetime [ISO 8601]")
-    own = write(tmp_path / "own.csv", header, *(f"{time},{ROW}" for time in times))
-    np.testing.assert_allclose(read_recording(own).time, expected, atol=1e-9)
-    rows = [f"{time},0.1,0.2,9.5" for time in times]
-    read = read_recording(phone(tmp_path / "phone", rows, rows))
-    np.testing.assert_allclose(read.time, expected, atol=1e-9)
-
-
-def test_a_date_that_is_none_is_refused_in_one_line(tmp_path):
-    rows = [f"2024-02-28T25:00:00.0{k},{ROW}" for k in range(6)]
-    with pytest.raises(ReadError, match=r"line 2, t: found '2024-02-28T25:00:00\.00'"):
-        read_recording(write(tmp_path / "own.csv", HEADER, *rows))
 
 
 @pytest.mark.parametrize("missing", ["", "NA", "n/a", "NULL"])

@@ -136,19 +136,6 @@ def test_truth_that_is_not_the_imus_pose_is_ignored(tmp_path, walk):
     assert read_euroc(tmp_path).truth is None
 
 
-def test_a_sample_that_is_not_a_number_is_kept_for_the_health_report(tmp_path, walk):
-    write_euroc(tmp_path, walk, velocity=False)
-    imu = tmp_path / "mav0/imu0/data.csv"
-    lines = imu.read_text().splitlines()
-    lines[11] = lines[11].split(",")[0] + ",nan,nan,nan,,,"
-    imu.write_text("\n".join(lines))
-    read = read_euroc(tmp_path)
-    assert len(read) == len(walk)
-    assert np.isnan(read.gyro[10]).all()
-    assert np.isnan(read.accel[10]).all()
-    assert np.isfinite(read.gyro[11:]).all()
-
-
 def test_oxiod_returns_the_imus_pose_in_a_level_world(tmp_path, phone_walk):
     read = read_recording(write_oxiod(tmp_path / "handheld/data9", phone_walk))
     truth = true_track(read)

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from stario.sequences.readers.table_head import TableHead, first_row, table_heads
@@ -23,14 +22,6 @@ def test_a_first_row_of_integers_has_the_decimal_mark_of_the_rows_below():
     assert first_row(points) == RowFormat(1, ";", ".")
 
 
-def test_titles_are_those_above_a_row_of_their_units(tmp_path):
-    head = head_of(
-        tmp_path, "# by a logger", "t;x;y;z", "s;rad/s;rad/s;rad/s", "0;1;2;3", "1;1;2;3"
-    )
-    assert head.titles == ["t [s]", "x [rad/s]", "y [rad/s]", "z [rad/s]"]
-    assert (head.row_format.skip, head.row_format.delimiter) == (3, ";")
-
-
 def test_words_above_rows_with_blanks_are_no_titles(tmp_path):
     assert head_of(tmp_path, "made by a logger on a phone", "0 1 2 3", "1 1 2 3").titles == []
     assert head_of(tmp_path, "t x y z", "0 1 2 3", "1 1 2 3").titles == ["t", "x", "y", "z"]
@@ -39,28 +30,6 @@ def test_words_above_rows_with_blanks_are_no_titles(tmp_path):
 def test_titles_may_be_separated_in_another_way_than_the_rows(tmp_path):
     """As NumPy's `savetxt` does: without its titles, columns z, y, x would be read as x, y, z."""
     assert head_of(tmp_path, "# time,z,y,x", "0 1 2 3", "1 1 2 3").titles == ["time", "z", "y", "x"]
-
-
-def test_quoted_numbers_have_decimal_commas_between_commas(tmp_path):
-    head = head_of(tmp_path, "t,x,y,z", '0,"0,5","-0,25","9,8"', '1,"0,5","-0,25","9,8"')
-    assert (head.row_format.delimiter, head.row_format.decimal) == (",", ",")
-    np.testing.assert_array_equal(head.read(4).values[1], [1.0, 0.5, -0.25, 9.8])
-
-
-def test_a_last_line_that_may_be_cut_does_not_count(tmp_path):
-    head = head_of(tmp_path, "t,x,y,z", "10,1,2,3", "20,1,2,3", "3,1,2,3")
-    np.testing.assert_array_equal(head.rows[:, 0], [10.0, 20.0])
-
-
-@pytest.mark.parametrize("form", ["2024-05-01T12:00:00.{:02d}Z", "12:00:00.{:02d}"])
-def test_columns_with_dates_become_seconds(tmp_path, form):
-    rows = [f"{form.format(k)},{k},1,2,3" for k in range(5)]
-    head = head_of(tmp_path, "date,count,x,y,z", *rows)
-    assert head.dates == {0}
-    read = head.read([0, 1])
-    np.testing.assert_allclose(
-        read.values[:, 0] - read.values[0, 0], 0.01 * np.arange(5), atol=1e-6
-    )
 
 
 @pytest.mark.parametrize(

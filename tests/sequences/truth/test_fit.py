@@ -74,16 +74,6 @@ def test_a_tilted_world_is_detected(walk):
     assert np.degrees(fit_truth(leaning).tilt) == pytest.approx(5.0, abs=1.0)
 
 
-def test_a_flip_of_the_truth_is_counted_as_a_jump(walk):
-    truth = walk.truth
-    quat_xyzw = truth.quat_xyzw
-    late = truth.time > 20.0
-    flip = Rotation.from_rotvec([0.0, 0.0, np.pi])
-    quat_xyzw[late] = (truth.attitude_WB[late] * flip).as_quat()
-    flipped = replace(walk, truth=replace(truth, attitude_WB=Rotation.from_quat(quat_xyzw)))
-    assert fit_truth(flipped).jumps == 1
-
-
 def test_a_gap_in_the_imu_is_not_a_jump_of_the_truth(walk):
     kept = (walk.time < 15.0) | (walk.time > 18.0)
     gappy = walk.select(kept)

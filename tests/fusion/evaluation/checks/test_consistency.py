@@ -42,7 +42,7 @@ def assert_consistent(result: SimpleNamespace) -> None:
 
 
 def test_nees_of_a_short_walk_is_within_its_bounds():
-    assert_consistent(averages(CONFIG, runs=10, seconds=30.0))
+    assert_consistent(averages(CONFIG, runs=10, seconds=12.0))
 
 
 @pytest.mark.slow
@@ -74,7 +74,7 @@ def test_runs_are_determined_by_the_seed():
 )
 def test_the_filter_is_consistent_at_either_update_rate(settings):
     config = replace(CONFIG, filter=replace(CONFIG.filter, **settings))
-    result = averages(config, runs=6, seconds=20.0)
+    result = averages(config, runs=6, seconds=10.0)
     # Chi-square with 90 degrees of freedom, divided by six runs: 99.9 % lies below 22.9.
     assert 9.0 < result.nees_end < 22.9
     assert 2.0 < result.nis < 3.6

@@ -147,7 +147,7 @@ def assert_valid(state: NavState) -> None:
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-@pytest.mark.parametrize("examples", [10, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("examples", [6, pytest.param(200, marks=pytest.mark.slow)])
 def test_no_sequence_of_faults_breaks_a_stream(backend, examples):
     @settings(
         max_examples=examples,

@@ -102,12 +102,6 @@ def test_small_faults_add_little_error(results, fault):
     assert results[fault].error_with < results[fault].error_without + 0.3
 
 
-def test_sigma_covers_the_error_after_a_gap(results):
-    after = results["gap of 3 s"]
-    assert after.end_error < 2.0 * after.end_sigma
-    assert after.end_sigma > results["none"].end_sigma
-
-
 def test_a_recording_without_truth_is_refused():
     sequence, config = matched_walk(3.0)
     with pytest.raises(InputError, match="truth"):
@@ -140,8 +134,8 @@ def test_true_displacements_have_the_noise_that_the_filter_takes_them_to_have():
 
 
 def test_five_seconds_of_false_displacements_cost_little_with_either_back_end():
-    sequence, config = matched_walk(60.0, seed=1)
-    block = [fault for fault in faults(60.0) if fault.name == "network off by 1 m for 5 s"]
+    sequence, config = matched_walk(24.0, seed=1)
+    block = [fault for fault in faults(24.0) if fault.name == "network off by 1 m for 5 s"]
     for result in wide(run_faults(sequence, config, only=block)).itertuples():
         assert result.error_with < result.error_without + 0.3
 

@@ -6,7 +6,6 @@ from alike import assert_same_samples
 from phone_files import ns, save
 
 from stario.sequences import read_recording
-from stario.sequences.readers.phones.sensor_words import axis_of, sensor_of, unit_of
 from stario.sequences.sequence import STANDARD_GRAVITY
 
 DEG = np.degrees(1.0)
@@ -42,13 +41,6 @@ def test_a_unit_within_the_name_is_converted(titles, accel, gyro, walk, tmp_path
     assert_same_samples(read_recording(tmp_path / "own.csv"), walk)
 
 
-def test_a_single_g_is_a_unit_only_next_to_a_sensor():
-    assert (axis_of("acc_x_g"), unit_of("acc_x_g")) == (("x", ("acc",)), "g")
-    assert (axis_of("imu_g_x"), unit_of("imu_g_x")) == (("x", ("imu", "g")), "")
-    assert sensor_of(("imu", "g")) == "gyro"
-    assert unit_of("gx") == unit_of("gyro_x_g") == ""
-
-
 def test_a_magnetic_field_in_gauss_is_converted(walk, tmp_path):
     titles = header("Time (s)", "Accelerometer # (g)", "Gyroscope # (deg/s)")
     titles += ",Magnetometer X (G),Magnetometer Y (G),Magnetometer Z (G)"
@@ -66,8 +58,6 @@ def test_numbered_elements_of_a_sensor_are_its_axes(walk, tmp_path):
     relative = np.zeros(len(walk), dtype=int)
     save(tmp_path / "log_0.csv", titles, micros, walk.gyro, walk.accel, relative)
     assert_same_samples(read_recording(tmp_path / "log_0.csv"), walk)
-    assert axis_of("delta_angle[0]") is None
-    assert unit_of("gyro_deg_s[0]") == "deg/s"
 
 
 def test_a_letter_in_a_devices_name_is_no_sensor(walk, tmp_path):
