@@ -24,9 +24,8 @@ from stario.sequences.sequence import PositionTrack
 )
 @pytest.mark.usefixtures("no_figures")
 def test_a_wrong_unit_or_sign_is_refused_with_the_option_that_helps(
-    stario, recording: Path, tmp_path: Path, field: str, factor: float, options: list[str],
-    truth: bool,
-) -> None:  # fmt: skip
+    stario, recording, tmp_path, field, factor, options, truth
+):
     sequence = read_generic_csv(recording)
     sequence = sequence if truth else sequence.without_truth()
     write_csv(tmp_path / "odd.csv", replace(sequence, **{field: factor * getattr(sequence, field)}))

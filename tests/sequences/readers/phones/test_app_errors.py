@@ -1,15 +1,13 @@
 """Files and zips that no reader of phone apps takes are refused in one line that names why."""
 
 import zipfile
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 from phone_exports import get_sensor_data, pose, trace
 from phone_files import ns, save, zyx
 
-from stario.sequences import ImuSequence, ReadError, read_recording
+from stario.sequences import ReadError, read_recording
 from stario.sequences.clean_samples import clean_samples
 
 
@@ -156,10 +154,7 @@ def test_a_clock_in_another_unit_than_its_title_says(walk, tmp_path):
         (get_sensor_data, "\nPOSI;7.000;1;", "\nPOSI\nPOSI;7;1;", "POSI, line 1 .*cut line"),
     ],
 )
-def test_a_damaged_event_line_is_named(
-    walk: ImuSequence, tmp_path: Path, write: Callable[[Path, ImuSequence], None], whole: str,
-    changed: str, error: str,
-) -> None:  # fmt: skip
+def test_a_damaged_event_line_is_named(walk, tmp_path, write, whole, changed, error):
     write(tmp_path / "walk", walk)
     (file,) = (tmp_path / "walk").iterdir()
     file.write_text(file.read_text().replace(whole, changed, 1))
@@ -170,10 +165,7 @@ def test_a_damaged_event_line_is_named(
 @pytest.mark.parametrize(
     ("write", "cell"), [(trace, "TYPE_GYROSCOPE\t"), (get_sensor_data, "\nACCE;5.010;0.0100;")]
 )
-def test_an_event_that_is_not_finite_is_dropped_with_a_warning(
-    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture,
-    write: Callable[[Path, ImuSequence], None], cell: str,
-) -> None:  # fmt: skip
+def test_an_event_that_is_not_finite_is_dropped_with_a_warning(walk, tmp_path, caplog, write, cell):
     write(tmp_path / "walk", walk)
     (file,) = (tmp_path / "walk").iterdir()
     before, _, after = file.read_text().rpartition(cell)
