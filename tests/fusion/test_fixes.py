@@ -1,26 +1,20 @@
 """Absolute fixes: on time, late or early, in stream and batch, and the map frame they define."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import support
+from support import WHITE as CONFIG
+from support import WHITE_ERRORS as ERRORS
 
 from stario.fusion import Navigator, NavState, PriorPose, Track
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_fix
 from stario.fusion.imu.intervals import split_at
 from stario.fusion.lie import UNKNOWN_YAW
 from stario.fusion.recording import cut_recording
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import InputError
-from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.simulation.imu import ImuErrors
 
-NOISE = ImuNoise(gyro_noise=1e-3, accel_noise=0.02, gyro_walk=3e-5, accel_walk=1e-3)
-ERRORS = ImuErrors(noise=NOISE, gyro_turn_on=3e-3, accel_turn_on=0.05)
-CONFIG = NavigatorConfig(noise=NOISE, filter=replace(support.FILTER, update_rate=1))
 EYE = np.eye(3)
 ROOT = np.array([[0.1, 0.1], [0.1, 0.3], [0.2, 0.7]])
 

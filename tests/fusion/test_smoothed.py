@@ -3,28 +3,14 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support import WHITE as CONFIG
+from support import WHITE_ERRORS as ERRORS
 from support import stream
 
-from stario.fusion import Navigator, NavigatorConfig, SmoothedPose
-from stario.fusion.config import FilterConfig
+from stario.fusion import Navigator, SmoothedPose
 from stario.fusion.fixes import position_fix
 from stario.sequences.accuracy.metrics import align, pose_errors
-from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence, Trajectory
-from stario.sequences.simulation.imu import ImuErrors
-
-NOISE = ImuNoise(gyro_noise=1e-3, accel_noise=0.02, gyro_walk=3e-5, accel_walk=1e-3)
-ERRORS = ImuErrors(noise=NOISE, gyro_turn_on=3e-3, accel_turn_on=0.05)
-CONFIG = NavigatorConfig(
-    NOISE,
-    FilterConfig(
-        update_rate=1,
-        covariance_scale=1.0,
-        gyro_bias_sigma=3e-3,
-        accel_bias_sigma=0.05,
-        correlated_errors=False,
-    ),
-)
 
 
 def errors_at(track: Trajectory, walk: ImuSequence) -> np.ndarray:

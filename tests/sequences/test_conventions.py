@@ -90,10 +90,6 @@ def test_axes_that_are_not_a_permutation_are_refused(walk, axes):
         with_axes(walk, axes)
 
 
-def test_gravity_is_restored_by_the_true_attitude(walk):
-    np.testing.assert_allclose(with_gravity(without_gravity(walk)).accel, walk.accel, atol=1e-9)
-
-
 def test_apples_sign_is_reversed_unless_the_reader_did_so(walk):
     apple = replace(walk, accel=-walk.accel / STANDARD_GRAVITY)
     back = with_conventions(apple, accel_unit="g", accel_sign="apple")

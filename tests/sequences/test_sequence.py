@@ -48,13 +48,6 @@ def test_interpolation_follows_a_screw_motion_exactly():
     assert np.allclose(read.position_covariance_W, np.einsum("n,ij->nij", 1 + time, np.eye(3)))
 
 
-def test_interpolation_at_its_own_samples_changes_nothing():
-    track = screw(GRID)
-    again = track.at(track.time)
-    assert np.array_equal(again.position_W, track.position_W)
-    assert again.valid.all()
-
-
 def test_nothing_is_valid_outside_a_track():
     read = screw(GRID).at(np.array([-0.01, 0.0, 2.0, 2.01]))
     assert read.valid.tolist() == [False, True, True, False]

@@ -31,6 +31,7 @@ def header(clock: str, accel: str, gyro: str, separator: str = ",") -> str:
         (header("t", "a#_g", "g#_dps"), G, DEG),
         (header("t", "a#_ms2", "w#_rad_s"), 1.0, 1.0),
         (header("time", "IMU(0):acc#", "IMU(0):gyro#"), 1.0, 1.0),
+        (header("time", "imu_a_#", "imu_g_#"), 1.0, 1.0),  # no unit of a sensor
         (header("time", "IMU(0):acc# (g)", "IMU(0):gyro# (deg/s)"), G, DEG),
         (header("Time, s", "Acc #, g", "Gyro #, deg/s", ";"), G, DEG),
     ],
