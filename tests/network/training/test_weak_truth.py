@@ -19,7 +19,7 @@ from stario.network.training.weak_truth import direction_loss, leg_loss, leg_res
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.legs import LegStream, leg_streams
-from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
+from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
 from stario.sequences.windows import world_streams
@@ -29,15 +29,10 @@ SECONDS = 12
 WALK = simulate_imu(generate_walk(3, 60.0), 100.0, PERFECT_IMU, 0, name="walk")
 
 
-def truth_of(walk: ImuSequence) -> Trajectory:
-    assert walk.truth is not None
-    return walk.truth
-
-
 def with_positions(kind: str, every: float, yaw: float = 0.0) -> ImuSequence:
     """The walk with positions in place of poses, on a map rotated by a yaw [rad]."""
     time = np.arange(1.0, 58.0, every)
-    position = truth_of(WALK).at(time).position_W
+    position = WALK.truth.at(time).position_W
     rotated = about_z(yaw).apply(position)
     columns = 2 if kind == "waypoints" else 3
     track = PositionTrack(time, rotated[:, :columns], kind)
@@ -57,7 +52,7 @@ def true_displacements(recording: ImuSequence, batch: LegBatch) -> torch.Tensor:
     found = []
     for windows in batch.windows:
         begin = begin_of(windows[0, 5].numpy(), stream)
-        position = truth_of(WALK).at(begin / 200.0 + np.arange(SECONDS + 1.0)).position_W
+        position = WALK.truth.at(begin / 200.0 + np.arange(SECONDS + 1.0)).position_W
         # The rotation from the world to the levelled frame, from the horizontal force.
         part = slice(begin, begin + 2000)
         a, b = (x[part, 3] + 1j * x[part, 4] for x in (world.imu_W, stream.imu_N))

@@ -108,7 +108,7 @@ def test_the_rows_before_the_start_frame_may_be_damaged(tmp_path, walks):
 def test_a_message_of_a_bag_that_is_not_finite_is_left_out(tmp_path, caplog, part):
     walk = formats.walk_of(100.0, 2.0)
     path = formats.bag(tmp_path / "b", walk)
-    truth = formats.pose_of(walk)
+    truth = walk.truth
     value = walk.gyro[20, 1] if part == "gyro" else truth.position_W[20, 0]
     nan = struct.pack("<d", np.nan)
     path.write_bytes(path.read_bytes().replace(struct.pack("<d", value), nan))

@@ -12,7 +12,7 @@ from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers import FORMATS, find_recordings, read_recording, write_csv
 from stario.sequences.readers.published.euroc import read_euroc
 from stario.sequences.readers.published.oxiod import read_oxiod
-from stario.sequences.sequence import BoolArray, ImuSequence, Trajectory
+from stario.sequences.sequence import BoolArray, ImuSequence
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
@@ -29,11 +29,6 @@ EUROC_TRUTH = (
 TUMVI_TRUTH = EUROC_TRUTH.split(", v_RS")[0]
 MOUNT_VB = Rotation.from_euler("zyx", [172.0, 3.0, -4.0], degrees=True)
 TILT_WW = Rotation.from_euler("xy", [0.5, -0.6], degrees=True)
-
-
-def true_track(sequence: ImuSequence) -> Trajectory:
-    assert sequence.truth is not None
-    return sequence.truth
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +48,7 @@ def write_euroc(
     """Write EuRoC (with velocity) or TUM-VI; truth at 100 Hz without the first 2 s and last 3 s."""
     rows = formats.text(formats.stamps_ns(imu.time), imu.gyro, imu.accel)
     formats.save(folder / "mav0/imu0/data.csv", EUROC_IMU, rows)
-    truth = true_track(imu)
+    truth = imu.truth
     part = slice(400, -600, 2)
     quat_wxyz = truth.quat_xyzw[:, [3, 0, 1, 2]]
     table = np.hstack([truth.position_W, quat_wxyz])
@@ -70,7 +65,7 @@ def write_oxiod(
     folder: Path, imu: ImuSequence, lag_rows: int = 3, flip_row: int | None = None
 ) -> Path:
     """Write OxIOD files: Apple's signs, a mounted and lagging tracked body, a tilted world."""
-    truth = true_track(imu)
+    truth = imu.truth
     force = imu.accel / -9.81
     gravity = truth.attitude_WB.apply([0.0, 0.0, -1.0], inverse=True)
     angles = np.zeros((len(imu), 3))
@@ -96,7 +91,7 @@ def write_oxiod(
 def test_euroc_and_tumvi_are_read_back(tmp_path, walk, velocity):
     write_euroc(tmp_path / "room", walk, velocity)
     read = read_recording(tmp_path / "room")
-    truth, given = true_track(read), true_track(walk)
+    truth, given = read.truth, walk.truth
     assert read.name == "room"
     assert np.abs(read.time - walk.time).max() < 2e-9
     assert np.abs(read.gyro - walk.gyro).max() < 1e-10
@@ -122,7 +117,7 @@ def test_a_gap_in_the_truth_stays_a_gap(tmp_path, walk):
     keep = np.ones(len(walk.time[400:-600:2]), dtype=np.bool_)
     keep[1000:1500] = False
     write_euroc(tmp_path, walk, velocity=False, keep=keep)
-    pose = true_track(read_euroc(tmp_path)).at(walk.time)
+    pose = read_euroc(tmp_path).truth.at(walk.time)
     lost = (walk.time > 11.991) & (walk.time < 16.999)
     outside = (walk.time < 1.999) | (walk.time > walk.time[-600] + 0.01)
     assert not pose.valid[lost].any()
@@ -138,7 +133,7 @@ def test_truth_that_is_not_the_imus_pose_is_ignored(tmp_path, walk):
 
 def test_oxiod_returns_the_imus_pose_in_a_level_world(tmp_path, phone_walk):
     read = read_recording(write_oxiod(tmp_path / "handheld/data9", phone_walk))
-    truth = true_track(read)
+    truth = read.truth
     assert read.name == "handheld-data9-imu1"
     assert np.abs(read.time - phone_walk.time).max() < 1e-9
     assert np.abs(read.gyro - phone_walk.gyro).max() < 1e-9
@@ -151,7 +146,7 @@ def test_oxiod_returns_the_imus_pose_in_a_level_world(tmp_path, phone_walk):
 
 
 def test_oxiod_flip_of_the_tracked_body_is_undone(tmp_path, phone_walk):
-    truth = true_track(read_oxiod(write_oxiod(tmp_path, phone_walk, flip_row=3000)))
+    truth = read_oxiod(write_oxiod(tmp_path, phone_walk, flip_row=3000)).truth
     assert truth.valid[3100:-20].mean() > 0.95
     assert_same_poses(truth, phone_walk, 2.0, 0.1)
 
@@ -171,7 +166,7 @@ def test_oxiod_gaps_in_the_imu_do_not_affect_the_truth(tmp_path, phone_walk):
     imu.write_text("\n".join(lines))
     read = read_oxiod(imu)
     assert np.isnan(read.gyro[2000]).all()
-    assert_same_poses(true_track(read), phone_walk, 2.0, 0.1)
+    assert_same_poses(read.truth, phone_walk, 2.0, 0.1)
 
 
 def test_oxiod_poses_next_to_missing_ones_are_used(tmp_path, phone_walk):
@@ -182,8 +177,8 @@ def test_oxiod_poses_next_to_missing_ones_are_used(tmp_path, phone_walk):
         row[-7:] = ["nan"] * 7
     vicon.write_text("\n".join(",".join(row) for row in rows))
     read = read_oxiod(imu)
-    assert true_track(read).covers(read.time[50:-50]).mean() > 0.97
-    assert_same_poses(true_track(read), phone_walk, 2.0, 0.1)
+    assert read.truth.covers(read.time[50:-50]).mean() > 0.97
+    assert_same_poses(read.truth, phone_walk, 2.0, 0.1)
 
 
 @pytest.mark.parametrize("rows", [1, 20, 500])
@@ -293,7 +288,7 @@ RECORDED = [
 def test_recorded_truth_agrees_with_the_sensors(name, least, tilt_deg):
     """The gyroscope is the derivative of the attitude; the mean force is gravity, pointing up."""
     sequence = read_recording(DATA / name)
-    truth = true_track(sequence)
+    truth = sequence.truth
     inside = (sequence.time >= truth.time[0]) & (sequence.time <= truth.time[-1])
     pose = truth.at(sequence.time[inside])
     stride = round(0.04 * sequence.rate)

@@ -4,7 +4,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from phone_exports import get_sensor_data, pose, trace
+from phone_exports import get_sensor_data, trace
 from phone_files import ns, save, zyx
 
 from stario.sequences import ReadError, read_recording
@@ -114,7 +114,7 @@ def test_single_wild_samples_are_no_reason_to_refuse_a_file(walk, tmp_path):
     gyro[500, 1], gyro[600, 0], accel[700, 2], accel[900, 0] = 1e30, 1e5, np.inf, -1e15
     zyx(tmp_path, walk, Gyroscope=gyro, TotalAcceleration=accel)
     header = "time,seconds_elapsed,qz,qy,qx,qw"
-    quat_xyzw = pose(walk).quat_xyzw[:, [2, 1, 0, 3]]
+    quat_xyzw = walk.truth.quat_xyzw[:, [2, 1, 0, 3]]
     save(tmp_path / "Orientation.csv", header, ns(walk), walk.time, quat_xyzw)
     time, rate, force = clean_samples(read_recording(tmp_path))
     assert len(time) == len(walk) - 2

@@ -22,7 +22,7 @@ from stario.sequences import (
     read_recording,
     with_conventions,
 )
-from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
+from stario.sequences.sequence import STANDARD_GRAVITY
 
 METADATA = (
     "version,device name,recording epoch time,recording time,recording timezone,platform,"
@@ -35,10 +35,6 @@ ANDROSENSOR = [
     for name, unit in (("ACCELEROMETER", "m/s²"), ("GYROSCOPE", "rad/s"), ("MAGNETIC FIELD", "μT"))
     for axis in "XYZ"
 ]
-
-
-def quaternion(walk: ImuSequence) -> FloatArray:
-    return walk.truth.quat_xyzw
 
 
 def android(folder: Path, walk: ImuSequence) -> None:
@@ -75,7 +71,7 @@ def watch(folder: Path, walk: ImuSequence) -> None:
         f"{name}{axis}" for name in ("rotationRate", "gravity", "acceleration") for axis in "XYZ"
     )
     linear = (walk.accel - gravity(walk)) / STANDARD_GRAVITY
-    columns = walk.gyro, -gravity(walk) / STANDARD_GRAVITY, -linear, quaternion(walk)
+    columns = walk.gyro, -gravity(walk) / STANDARD_GRAVITY, -linear, walk.truth.quat_xyzw
     header += ",quaternionX,quaternionY,quaternionZ,quaternionW"
     save(folder / "WristMotion.csv", header, ns(walk), walk.time, *columns)
 
@@ -212,7 +208,7 @@ def ios_logger(folder: Path, walk: ImuSequence) -> None:
     save(folder / "Gyro.txt", "", t, walk.gyro)
     save(folder / "Magnet.txt", "", t, field(walk) + 300.0)
     save(folder / "MotMagnFull.txt", "", t, field(walk), np.full(len(walk), 2))
-    save(folder / "Motion.txt", "", t, quaternion(walk)[:, [3, 0, 1, 2]])
+    save(folder / "Motion.txt", "", t, walk.truth.quat_xyzw[:, [3, 0, 1, 2]])
     save(folder / "Frames.txt", "", t[::3], np.ones((len(t[::3]), 5)))
 
 
@@ -310,7 +306,7 @@ def test_an_undetermined_accelerometer_sign_is_reported(walk, tmp_path, caplog):
 @pytest.mark.parametrize("code", ["TYPE", "AHRS"])
 def test_the_rotation_vector_of_a_trace_is_the_devices_attitude(code, walk, tmp_path):
     """It contains x, y and z of a quaternion whose w is not negative."""
-    vector = quaternion(walk)[:, :3] * np.sign(quaternion(walk)[:, 3:])
+    vector = walk.truth.quat_xyzw[:, :3] * np.sign(walk.truth.quat_xyzw[:, 3:])
     lines = []
     for k, t in enumerate(walk.time.tolist()):
         rows = (("GYROSCOPE", "GYRO", walk.gyro[k]), ("ACCELEROMETER", "ACCE", walk.accel[k]))

@@ -12,7 +12,6 @@ from phone_exports import (
     Y_UP,
     androsensor,
     get_sensor_data,
-    pose,
     prefixed,
     senslogs_ios,
     sensor_logger,
@@ -78,13 +77,13 @@ def test_the_phones_own_attitude_is_read_too(app, walk, tmp_path):
     app(tmp_path / "s", walk)
     read = read_recording(tmp_path / "s")
     np.testing.assert_allclose(read.device_attitude.time, walk.time, atol=1e-3)
-    error = (read.device_attitude.attitude_WB * pose(walk).attitude_WB.inv()).magnitude()
+    error = (read.device_attitude.attitude_WB * walk.truth.attitude_WB.inv()).magnitude()
     assert error.max() < 1e-6
     bare = replace(read, accel=read.accel - gravity(walk))
     np.testing.assert_allclose(with_gravity(bare).accel, walk.accel, atol=0.02)
     turned = with_axes(read, "y,-x,z").device_attitude
     up = turned.attitude_WB.apply(with_axes(read, "y,-x,z").accel)
-    np.testing.assert_allclose(up, pose(walk).attitude_WB.apply(walk.accel), atol=1e-5)
+    np.testing.assert_allclose(up, walk.truth.attitude_WB.apply(walk.accel), atol=1e-5)
 
 
 @pytest.mark.parametrize("inner", ["", "walk/"])
@@ -143,7 +142,7 @@ def test_messages_about_a_zip_name_the_zip_and_the_file(walk, tmp_path, caplog):
 @pytest.mark.parametrize("turn", ["x,y,z", "camera"])
 def test_poses_next_to_the_imu_are_read_as_truth_in_its_axes(order, turn, walk, tmp_path):
     """30 Hz, y up, of the camera or the sensor, in either quaternion order despite the header."""
-    truth, every = pose(walk), slice(None, None, 3)
+    truth, every = walk.truth, slice(None, None, 3)
     mount = Rotation.from_euler("z", 90.0 if turn == "camera" else 0.0, degrees=True)
     attitude = (Y_UP * truth.attitude_WB * mount.inv())[every].as_quat()
     quat = attitude if order == "xyzw" else attitude[:, [3, 0, 1, 2]]
@@ -171,7 +170,7 @@ def test_a_pose_file_without_any_rotation_gives_a_warning(columns, walk, tmp_pat
 
 
 def test_poses_without_an_imu_are_refused_as_such(walk, tmp_path):
-    rows = np.hstack([pose(walk).position_W, pose(walk).quat_xyzw])
+    rows = np.hstack([walk.truth.position_W, walk.truth.quat_xyzw])
     save(tmp_path / "s/ARCore_sensor_pose.txt", "# by a logger", ns(walk), rows, sep=" ")
     for read in (read_recording, find_recordings):
         with pytest.raises(ReadError, match=r"only poses, ARCore_sensor_pose\.txt, expected a gyr"):
@@ -196,7 +195,7 @@ def test_an_accelerometer_in_other_axes_than_the_gyroscope_is_corrected(tmp_path
     style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.5, 0.4))
     walk = simulate_imu(generate_walk(3, 60.0, style=style), 50.0, PERFECT_IMU)
     poses = np.hstack(
-        [Y_UP.apply(pose(walk).position_W), (Y_UP * pose(walk).attitude_WB).as_quat()]
+        [Y_UP.apply(walk.truth.position_W), (Y_UP * walk.truth.attitude_WB).as_quat()]
     )
     wrong = -walk.accel[:, [1, 0, 2]]
     for name, values in (("acce", wrong), ("gyro", walk.gyro), ("ARKit_pose", poses)):
