@@ -134,8 +134,8 @@ def test_true_displacements_have_the_noise_that_the_filter_takes_them_to_have():
 
 
 def test_five_seconds_of_false_displacements_cost_little_with_either_back_end():
-    sequence, config = matched_walk(24.0, seed=1)
-    block = [fault for fault in faults(24.0) if fault.name == "network off by 1 m for 5 s"]
+    sequence, config = matched_walk(45.0, seed=1)
+    block = [fault for fault in faults(45.0) if fault.name == "network off by 1 m for 5 s"]
     for result in wide(run_faults(sequence, config, only=block)).itertuples():
         assert result.error_with < result.error_without + 0.3
 
