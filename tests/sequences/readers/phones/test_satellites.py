@@ -11,7 +11,6 @@ from phone_files import START_NS, save
 from recorded import DATA
 
 from stario.sequences import read_recording
-from stario.sequences.geodesy import east_north
 from stario.sequences.sequence import FloatArray, PositionTrack
 
 PHYPHOX = '"Time (s)","Latitude (°)","Longitude (°)","Height (m)","Velocity (m/s)","Direction (°)"'
@@ -37,12 +36,6 @@ def positions_of(path: Path) -> PositionTrack:
     return found
 
 
-def test_a_degree_has_its_length_on_the_ellipsoid():
-    north, east = east_north(np.array([[45.0, 7.0], [45.001, 7.0], [45.0, 7.001]]))[1:]
-    np.testing.assert_allclose(north, [0.0, 1e-3 * NORTH], atol=0.02)
-    np.testing.assert_allclose(east, [1e-3 * EAST, 0.0], atol=0.02)
-
-
 @pytest.mark.parametrize("title", ["accuracy", "hAcc (m)", "h_acc", "HACC"])
 def test_the_radius_may_be_named_briefly(walk, tmp_path, title):
     phyphox(tmp_path / "p", walk)
@@ -51,11 +44,6 @@ def test_the_radius_may_be_named_briefly(walk, tmp_path, title):
     sigma = positions_of(tmp_path / "p").sigma
     assert sigma is not None
     np.testing.assert_allclose(sigma, 3.0)
-
-
-def test_the_antimeridian_is_no_jump():
-    _, there = east_north(np.array([[0.0, 179.999], [0.0, -179.999]]))
-    np.testing.assert_allclose(there, [222.64, 0.0], atol=0.01)
 
 
 def test_positions_of_phyphox_are_read_with_their_accuracy(walk, tmp_path):
