@@ -38,35 +38,6 @@ def standing(duration: float, rate: float = 1.0) -> Trajectory:
     return Trajectory(t, np.zeros((len(t), 3)), Rotation.identity(len(t)))
 
 
-def strapdown(imu: ImuSequence) -> tuple[FloatArray, Rotation]:
-    """Pose at every fourth sample from the first true pose and the samples, by Simpson's rule."""
-    truth = imu.truth
-    h = 2.0 / imu.rate
-    w0, w1, w2 = imu.gyro[:-2:2], imu.gyro[1:-1:2], imu.gyro[2::2]
-    # Magnus expansion of fourth order: Simpson's mean and the first coning term.
-    turns = Rotation.from_rotvec(h / 6.0 * (w0 + 4.0 * w1 + w2) + h**2 / 12.0 * np.cross(w0, w2))
-    attitudes = [truth.attitude_WB[0]]
-    for turn in turns:
-        attitudes.append(attitudes[-1] * turn)
-    R_WB = Rotation.concatenate(attitudes)
-    a = R_WB.apply(np.array(imu.accel[::2])) - UP
-    a0, a1, a2, h = a[:-2:2], a[1:-1:2], a[2::2], 2.0 * h
-    origin = np.zeros((1, 3))
-    gained = np.cumsum(h / 6.0 * (a0 + 4.0 * a1 + a2), axis=0)
-    velocity = truth.velocity_W[0] + np.concatenate([origin, gained])
-    # The double integral of the parabola through a0, a1, a2: their weights are 1/6, 1/3 and 0.
-    moved = np.cumsum(h * velocity[:-1] + h**2 / 6.0 * (a0 + 2.0 * a1), axis=0)
-    return truth.position_W[0] + np.concatenate([origin, moved]), R_WB[::2]
-
-
-def test_strapdown_of_a_perfect_imu_returns_the_trajectory():
-    imu = simulate_imu(waving(), rate=400.0, errors=PERFECT_IMU)
-    position, R_WB = strapdown(imu)
-    off = (R_WB.inv() * imu.truth.attitude_WB[::4]).magnitude()
-    assert off.max() < 1e-7
-    assert np.abs(position - imu.truth.position_W[::4]).max() < 1e-5
-
-
 def test_truth_passes_through_the_given_poses():
     given = waving()
     truth = simulate_imu(given, rate=200.0, errors=PERFECT_IMU).truth

@@ -32,14 +32,10 @@ def test_every_carrying_mode_is_plausible(carry):
         assert upward == pytest.approx(STANDARD_GRAVITY, abs=0.15)
 
 
-def test_a_hundred_walks_are_plausible_and_cover_the_styles():
+def test_a_hundred_walks_cover_the_styles():
     styles = [WalkStyle.random(np.random.default_rng(seed)) for seed in range(100)]
     assert {style.carry for style in styles} == set(CARRYING_MODES)
     assert 10 < sum(bool(style.next_carry) for style in styles) < 60
-    for seed in range(40):
-        imu = simulate_imu(generate_walk(seed, 20.0), errors=PERFECT_IMU)
-        assert np.linalg.norm(imu.accel, axis=1).max() < 6.0 * STANDARD_GRAVITY
-        assert np.linalg.norm(imu.gyro, axis=1).max() < 20.0
 
 
 def test_a_seed_reproduces_and_another_differs():

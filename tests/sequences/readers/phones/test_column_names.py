@@ -42,15 +42,6 @@ def test_a_unit_within_the_name_is_converted(titles, accel, gyro, walk, tmp_path
     assert_same_samples(read_recording(tmp_path / "own.csv"), walk)
 
 
-def test_a_magnetic_field_in_gauss_is_converted(walk, tmp_path):
-    titles = header("Time (s)", "Accelerometer # (g)", "Gyroscope # (deg/s)")
-    titles += ",Magnetometer X (G),Magnetometer Y (G),Magnetometer Z (G)"
-    field = 0.5 * walk.gyro
-    save(tmp_path / "own.csv", titles, walk.time, G * walk.accel, DEG * walk.gyro, field)
-    read = read_recording(tmp_path / "own.csv")
-    np.testing.assert_allclose(read.magnetometer.field, 100.0 * field, atol=1e-6)
-
-
 def test_numbered_elements_of_a_sensor_are_its_axes(walk, tmp_path):
     """As PX4's `sensor_combined` names them."""
     names = [f"{name}[{k}]" for name in ("gyro_rad", "accelerometer_m_s2") for k in range(3)]
