@@ -1,4 +1,4 @@
-"""The commands for many recordings: compare, evaluate, train, backends."""
+"""The commands for many recordings: compare, evaluate and the checks."""
 
 import json
 import re

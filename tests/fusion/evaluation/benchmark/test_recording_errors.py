@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from displacement_stub import Stub, errors_of, horizontal_path, streams_of, with_waypoints, yaw_WN
+from displacement_stub import Stub, errors_of, horizontal_path, streams_of, with_waypoints
 from recorded import DATA
-from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.benchmark.displacement_error import (
     _AtTicks,
@@ -16,11 +15,8 @@ from stario.fusion.evaluation.benchmark.displacement_error import (
     _Sums,
     known_truth,
 )
-from stario.fusion.evaluation.benchmark.pieces import Piece
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
-from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
-from stario.sequences.levelled_stream import LevelledStream
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import ImuSequence, PositionTrack, is_gap
 
@@ -45,14 +41,6 @@ def test_with_poses_displacements_of_nine_tenths_give_that_length_ratio(walk):
     assert len(found.blocks["1"]) == 3  # of 30 s each, the last one shorter
     total, count = found.blocks["1"].sum(axis=0)
     assert np.sqrt(total / count) == pytest.approx(found.figures["rms_1s_m"])
-
-
-def test_the_yaw_from_the_levelled_frame_to_the_world_is_the_truths(walk):
-    [stream] = streams_of(walk)
-    true_WB = walk.truth.at(stream.ticks)
-    levelled = about_z(yaw_WN(walk, stream)) * Rotation.from_matrix(stream.R_NB)
-    off = (levelled * true_WB.attitude_WB.inv())[true_WB.valid]
-    assert off.magnitude().max() < 0.1  # what levelling is off by
 
 
 @pytest.mark.parametrize("count", [0, 1])
@@ -124,13 +112,6 @@ def test_positions_are_unknown_in_their_gaps_and_beyond_their_ends(walk):
     assert np.isfinite(position[inside]).all()
     assert np.isnan(position[outside]).all()
     assert len(set(breaks[(ticks > 5.1) & (ticks < 69.9)])) == 2  # before and after the gap
-
-
-def test_equal_displacements_give_a_straight_track_at_constant_speed():
-    displacement = np.tile([1.2, -0.4, 0.0], (9, 1))
-    stream = LevelledStream(0.0, np.empty((0, 6)), np.empty((0, 2)), np.empty((11, 3, 3)))
-    track = Piece(stream, displacement, np.tile(np.eye(3), (9, 1, 1))).track()
-    np.testing.assert_allclose(track, (0.6 - 0.2j) * np.arange(11))
 
 
 @pytest.mark.skipif(not ARCHIVES.exists(), reason=f"no recordings at {ARCHIVES}")
