@@ -175,9 +175,12 @@
   const watchMap = () => {
     let pressed = null;
     map.addEventListener("pointerdown", (event) => { pressed = [event.clientX, event.clientY]; }, true);
-    map.addEventListener("pointerup", (event) => {
+    // Of a mouse, plotly's cover over the page gets it.
+    document.addEventListener("pointerup", (event) => {
       const moved = pressed && Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) > 6;
-      if (tapping === null || moved || !pressed) return;
+      const tapped = pressed && !moved;
+      pressed = null;
+      if (tapping === null || !tapped) return;
       const layout = map._fullLayout;
       const box = map.getBoundingClientRect();
       const x = layout.xaxis.p2d(event.clientX - box.left - layout.xaxis._offset);

@@ -124,14 +124,15 @@ def test_a_walk_with_satellites_lies_on_the_map(show, tile_server, replay, tmp_p
         assert shown.problems == []
 
 
-def test_buttons_for_zero_place_and_stop_reach_the_server(show, server, replay):
+@pytest.mark.parametrize(("size", "name"), [(DESKTOP, "carl"), (PHONE, "carla")])
+def test_buttons_for_zero_place_and_stop_reach_the_server(show, server, replay, size, name):
     url = f"http://127.0.0.1:{server.port}"
-    replay(demonstration(), f"{url}/data", 10.0, 4.0, "carla")
-    session = server.hub.sessions["carla"]
-    shown = show(url, PHONE)
-    card = shown.page.locator("[data-device=carla]")
+    replay(demonstration(), f"{url}/data", 10.0, 4.0, name)
+    session = server.hub.sessions[name]
+    shown = show(url, size)
+    card = shown.page.locator(f"[data-device={name}]")
     card.get_by_text("Zero here").click()
-    shown.page.wait_for_function("() => window.stario.devices.get('carla').origin[0] !== 0")
+    shown.page.wait_for_function(f"() => window.stario.devices.get('{name}').origin[0] !== 0")
     np.testing.assert_allclose(
         session.track.drawn.origin, session.track.drawn.points[-1][1:4], atol=1e-3
     )
@@ -140,12 +141,12 @@ def test_buttons_for_zero_place_and_stop_reach_the_server(show, server, replay):
     before = session.track.drawn.points[-1][1:3]
     box = shown.page.locator("#map .nsewdrag").first.bounding_box()
     shown.page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 0.25 * box["height"])
-    shown.page.wait_for_function("() => window.stario.devices.get('carla').fixes === 1")
+    shown.page.wait_for_function(f"() => window.stario.devices.get('{name}').fixes === 1")
     x, y = np.array(session.track.drawn.points[-1][1:3]) - before
     assert np.hypot(x, y) > 0.5  # where to depends on whether the map has followed the zero yet
     assert card.locator(".file").inner_text().endswith(", 1 fix")
     card.get_by_text("Stop").click()
-    shown.page.wait_for_function("() => !window.stario.devices.get('carla').running")
+    shown.page.wait_for_function(f"() => !window.stario.devices.get('{name}').running")
     assert not session.running
     assert not shown.overflows()
     assert shown.problems == []
