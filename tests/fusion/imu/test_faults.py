@@ -49,13 +49,13 @@ def test_a_spike_is_replaced_by_its_neighbours_mean_and_the_last_sample_by_the_o
 
 
 @pytest.mark.parametrize("at", [0, 60, 73, 200])
-def test_a_spike_at_the_start_or_after_a_gap_tilts_nothing(make_walk: Make, at: int) -> None:
+def test_a_spike_at_the_start_or_after_a_gap_tilts_nothing(make_walk, at):
     walk = make_walk(3, 4.0).without_truth()
     kept = np.delete(np.arange(len(walk)), np.arange(120, 200))
     gyro = walk.gyro.copy()
     gyro[[at, at + 2]] = [[9e3, -7e3, 8e3], [-6e3, 5e3, 9e3]]
 
-    def attitudes(rates: np.ndarray) -> np.ndarray:
+    def attitudes(rates):
         used = replace(walk, time=walk.time[kept], gyro=rates[kept], accel=walk.accel[kept])
         intervals, _ = cut_recording(used, NavigatorConfig())
         return np.array([interval.R_NB[2] for interval in intervals])
@@ -63,7 +63,7 @@ def test_a_spike_at_the_start_or_after_a_gap_tilts_nothing(make_walk: Make, at: 
     np.testing.assert_allclose(attitudes(gyro), attitudes(walk.gyro), atol=0.05)
 
 
-def test_zeros_of_an_accelerometer_are_no_free_fall(make_walk: Make, still_model: Any) -> None:
+def test_zeros_of_an_accelerometer_are_no_free_fall(make_walk, still_model):
     walk = make_walk(3, 4.0).without_truth()
     accel = walk.accel.copy()
     accel[250:260] = 0.0
