@@ -25,6 +25,9 @@ PRESSURE_RANGE = (300.0, 1100.0)
 HEIGHT_SECONDS = 0.5
 """Time over which heights are averaged [s]."""
 
+FASTEST_LIFT = 10.0
+"""Vertical speed [m/s] that only the lifts of towers exceed: what rises faster is no height."""
+
 MIN_CLIMB_RATE = 0.15
 """Vertical speed from which a line through the last seconds means stairs or a lift [m/s]: stairs
 have 0.2 to 0.4, and a phone's pressure on a level floor exceeds it in 1 % of the time (28 walks of
@@ -140,7 +143,12 @@ class HeightBuffer(TimedBuffer[float]):
         altitude, time = float(pressure_altitude(pressures).mean()), float(times.mean())
         if math.isnan(self._first):
             self._first = altitude
-        return self._judged(time, altitude - self._first)
+        height = altitude - self._first
+        if self._past:
+            before, from_height = self._past[-1]
+            if abs(height - from_height) > FASTEST_LIFT * (time - before):
+                return None
+        return self._judged(time, height)
 
     def _judged(self, time: float, height: float) -> HeightSample | None:
         usual = median(h for _, h in self._past) if self._past else height

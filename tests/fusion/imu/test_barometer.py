@@ -99,3 +99,15 @@ def test_one_pressure_a_second_is_enough_and_none_is_none():
     assert found[::2].count(None) < 4
     assert all(each is None for each in found[1::2])
     assert [each.rate for each in found if each is not None][-1] == pytest.approx(0.3, abs=0.02)
+
+
+def test_what_rises_faster_than_any_lift_is_no_height():
+    heights = np.zeros(400)
+    heights[160:] = 60.0  # the pressure of another place: from then on it is the height
+    heights[80:84] = -40.0
+    found = judged(heights)
+    assert found[20] is None
+    used = [abs(each.height) for each in found[:40] if each is not None]
+    assert len(used) > 30
+    assert max(used) < 1.0
+    assert found[-1].height == pytest.approx(60.0, abs=1.0)
