@@ -44,7 +44,7 @@ def test_compare_sets_the_track_against_dead_reckoning(stario, recording: Path) 
     assert all(line.startswith(("! ", "  ")) for line in findings)
     assert re.fullmatch(
         r"walk: StarIO's track: [\d.]+ m rms from the truth \([\d.]+ % of its [\d.]+ m\), "
-        r"[\d.]+ m after a yaw fit; its sigma says [\d.]+ m; "
+        r"[\d.]+ m \([\d.]+ %\) after the best shift and turn; its sigma says [\d.]+ m; "
         r"dead reckoning: [\d.]+ m",
         seen,
     )
