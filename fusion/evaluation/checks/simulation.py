@@ -106,7 +106,7 @@ def motion_scores(
     figures: Metrics = dict(motion(sequence))
     figures["speed"] = length / sequence.duration
     for name, track in (("network", network_track(observed)), ("track", navigator.track(observed))):
-        figures[name] = 100.0 * fitted_error(measure(track, sequence)) / length
+        figures[f"{name}_percent"] = 100.0 * fitted_error(measure(track, sequence)) / length
     return scored(sequence.name, {kind: figures}, carry)
 
 
@@ -144,8 +144,8 @@ def motion_table(scores: pd.DataFrame) -> str:
         Column("rate", "rate", ".2f"),
         Column("steps", "step_rate", ".2f"),
         Column("speed", "speed", ".2f"),
-        Column("network %", "network", ".1f"),
-        Column("track %", "track", ".1f"),
+        Column("network %", "network_percent", ".1f"),
+        Column("track %", "track_percent", ".1f"),
     ]
     notes = [
         "medians; force by band [m/s^2]: root mean square of its norm; rate: of the angular rate "

@@ -157,6 +157,7 @@ def test_the_table_has_a_row_of_each_kind_and_says_what_is_missing(still_model: 
     simulated = motion_scores(still_model, walk, NavigatorConfig(), "bag", SIMULATED)
     assert values(simulated, "network") > 20.0  # % of the path: the network says that it rests
     assert "none given" in motion_table(simulated)
+    assert wide(simulated)["track_percent"].notna().all()
     both = joined([simulated, simulated.assign(track=RECORDED)])
     text = motion_table(both)
     assert "bag, simulated" in text
