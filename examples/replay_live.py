@@ -18,6 +18,8 @@ import time
 import urllib.request
 from pathlib import Path
 
+import numpy as np
+
 from stario.fusion import LiveServer, Navigator, demonstration
 from stario.network import load_model
 from stario.sequences import ImuSequence, read_recording
@@ -44,7 +46,15 @@ def replay(
         sensors.append(("barometer", ["pressure"], air.time, air.pressure_hPa[:, None]))
     if recording.satellites is not None:
         place = recording.satellites
-        sensors.append(("location", ["latitude", "longitude"], place.time, place.latlon_deg))
+        columns = {
+            "latitude": place.latlon_deg[:, 0],
+            "longitude": place.latlon_deg[:, 1],
+            "horizontalAccuracy": place.radius_m,
+            "speed": place.speed_m_s,
+            "bearing": place.bearing_deg,
+        }
+        known = {title: column for title, column in columns.items() if column is not None}
+        sensors.append(("location", [*known], place.time, np.column_stack([*known.values()])))
     for number in range(int(stop / PERIOD) + 1):
         begin, end = number * PERIOD, min(stop, (number + 1) * PERIOD)
         payload = []

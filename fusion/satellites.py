@@ -24,11 +24,14 @@ buildings, and 1.7 to 2.2 times of it held 90 %."""
 _CORRELATION_S = 30.0
 """Time for which a position's error lasts [s]."""
 
+_PERIOD_S = 1.0
+"""Time between the positions of phones [s]."""
+
 _HELD_S = 3.0
 """Time over which the same position is held [s] from which on it is stale."""
 
 _VELOCITY_SIGMA, _VELOCITY_PERIOD_S = 0.3, 5.0
-"""Standard deviation per axis [m/s] of a velocity, and time between those used [s]."""
+"""Standard deviation per axis [m/s] of a velocity, and periods in each of which one is used [s]."""
 
 _SETTLED_S = 3.0
 """Time [s] after a pause of as much before velocities count: receivers smooth them."""
@@ -57,21 +60,31 @@ def satellite_fixes(
         origin: the map they are to be given in; None begins one at the first good position, with x
             east and y north.
     """
-    radius = _column(satellites.radius_m, satellites)
-    radius = np.where(np.isnan(radius) | (radius == 0.0), USUAL_RADIUS, radius)
-    good = (radius > 0.0) & (radius <= LARGEST_RADIUS) & ~_held(satellites)
+    good = reliable(satellites)
     if not good.any():
         return None
     used = satellites.select(good)
     if origin is None:
         latitude, longitude = used.latlon_deg[0].tolist()
         origin = Georeference(latitude, longitude, altitude_m=_altitude(used))
-    sigma = _RADIUS_FACTOR / RADIUS_PER_SIGMA * radius[good] * np.sqrt(_shared(used.time))
+    sigma = _RADIUS_FACTOR / RADIUS_PER_SIGMA * _radius(used) * np.sqrt(_shared(used.time))
     positions = [
         position_fix(time, [x, y, 0.0], np.diag(np.square([s, s, UNKNOWN_HEIGHT])))
         for time, (x, y), s in zip(used.time, origin.xy(used.latlon_deg), sigma, strict=True)
     ]
     return SatelliteFixes([*positions, *_velocities(used, origin)], origin)
+
+
+def reliable(satellites: Satellites) -> BoolArray:
+    """Return which positions (N,) a receiver has measured well: not those held, nor of cells."""
+    radius = _radius(satellites)
+    return np.asarray((radius > 0.0) & (radius <= LARGEST_RADIUS) & ~_held(satellites))
+
+
+def _radius(satellites: Satellites) -> FloatArray:
+    """Return the stated radius (N,) [m], or the usual one."""
+    radius = _column(satellites.radius_m, satellites)
+    return np.where(np.isnan(radius) | (radius == 0.0), USUAL_RADIUS, radius)
 
 
 def _column(values: FloatArray | None, satellites: Satellites) -> FloatArray:
@@ -96,7 +109,8 @@ def _held(satellites: Satellites) -> BoolArray:
 
 def _shared(time: FloatArray) -> FloatArray:
     """Return how many positions around each one (N,) tell as much as one: they share an error."""
-    step = np.diff(time, prepend=2.0 * time[0] - time[min(1, len(time) - 1)])
+    first = time[1] - time[0] if len(time) > 1 else _PERIOD_S
+    step = np.diff(time, prepend=time[0] - first)
     return np.asarray(_CORRELATION_S / np.clip(step, 1e-3, _CORRELATION_S))
 
 
@@ -108,10 +122,10 @@ def _velocities(used: Satellites, origin: Georeference) -> list[Fix]:
     paused = np.diff(used.time, prepend=-math.inf) > _SETTLED_S
     known &= used.time - np.maximum.accumulate(np.where(paused, used.time, -math.inf)) >= _SETTLED_S
     covariance = np.diag(np.square([_VELOCITY_SIGMA, _VELOCITY_SIGMA, _VERTICAL_SPEED]))
+    rows = np.flatnonzero(known)
+    _, first = np.unique(used.time[rows] // _VELOCITY_PERIOD_S, return_index=True)
     fixes: list[Fix] = []
-    for k in np.flatnonzero(known):
-        if fixes and used.time[k] - fixes[-1].time < _VELOCITY_PERIOD_S:
-            continue
+    for k in rows[first]:
         angle = 0.5 * math.pi - math.radians(bearing[k]) - origin.yaw
         v_W = speed[k] * np.array([math.cos(angle), math.sin(angle), 0.0])
         fixes.append(velocity_fix(used.time[k], v_W, covariance))

@@ -16,8 +16,9 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.arrays import even_grid
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.stacks import slerp
-from stario.sequences.clean_samples import clean_samples, unbroken
+from stario.sequences.clean_samples import unbroken
 from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.spikes import spike_free_samples
 from stario.sequences.windows import (
     WINDOW_RATE,
     WINDOW_SAMPLES,
@@ -89,7 +90,7 @@ def levelled_streams(sequence: ImuSequence, min_seconds: float = 2.0) -> list[Le
     Raises:
         InputError: too few samples, or their rate is not between 50 Hz and 1 kHz.
     """
-    time, gyro, accel = clean_samples(sequence)
+    time, gyro, accel = spike_free_samples(sequence)
     streams = []
     for begin, end in unbroken(time):
         if time[end - 1] - time[begin] < min_seconds:

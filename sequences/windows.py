@@ -35,9 +35,10 @@ from stario.sequences.arrays import (
 )
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import about_z, yaw_of
-from stario.sequences.clean_samples import clean_samples, unbroken
+from stario.sequences.clean_samples import unbroken
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
+from stario.sequences.spikes import spike_free_samples
 from stario.sequences.time_order import MAX_IMU_GAP
 
 WINDOW_RATE = 200.0
@@ -188,7 +189,7 @@ def imu_in_world(sequence: ImuSequence, truth: Trajectory, attitude: Attitude) -
     Raises:
         InputError: as for `clean_samples`.
     """
-    time, gyro, accel = clean_samples(sequence)
+    time, gyro, accel = spike_free_samples(sequence)
     pose = truth.at(time)
     attitude_WB = pose.attitude_WB
     if attitude == "levelled":

@@ -1,6 +1,7 @@
 """Comparison of a recording with the one that was written, and of its truth with its gyroscope."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from stario.sequences import ImuSequence, Trajectory
 from stario.sequences.arrays import interpolated
@@ -38,3 +39,8 @@ def turned_and_measured(
     angle = interpolated(truth.time, sequence.time, angle)
     turned = truth.attitude_WB[:-stride].inv() * truth.attitude_WB[stride:]
     return turned.as_rotvec(), angle[stride:] - angle[:-stride]
+
+
+def max_angle(a: Rotation, b: Rotation) -> float:
+    """Return the largest angle [rad] between two stacks of rotations."""
+    return float((a.inv() * b).magnitude().max())

@@ -4,8 +4,6 @@ Each imitates an app's file names, headers, units and conventions; the walk is s
 values, signs and axes are known.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,15 +11,10 @@ import numpy as np
 from phone_files import field, gravity, ns, save, zyx
 from scipy.spatial.transform import Rotation
 
-from stario.sequences import ImuSequence, Trajectory
+from stario.sequences import ImuSequence
 from stario.sequences.sequence import STANDARD_GRAVITY
 
 Y_UP = Rotation.from_euler("x", -90.0, degrees=True)
-
-
-def pose(walk: ImuSequence) -> Trajectory:
-    assert walk.truth is not None
-    return walk.truth
 
 
 def sensor_logger(folder: Path, walk: ImuSequence) -> None:
@@ -50,7 +43,7 @@ def sensor_logger_attitude(folder: Path, walk: ImuSequence) -> None:
     sensor_logger_ios(folder, walk)
     (folder / "Metadata.csv").unlink()
     header = "time,seconds_elapsed,qz,qy,qx,qw,roll,pitch,yaw"
-    columns = walk.time, pose(walk).quat_xyzw[:, [2, 1, 0, 3]], np.zeros((len(walk), 3))
+    columns = walk.time, walk.truth.quat_xyzw[:, [2, 1, 0, 3]], np.zeros((len(walk), 3))
     save(folder / "Orientation.csv", header, ns(walk), *columns)
 
 
@@ -74,7 +67,7 @@ def senslogs_ios(folder: Path, walk: ImuSequence) -> None:
     save(folder / "magnetometer.txt", "", t, field(walk) + 200.0, sep=" ")
     accuracy = np.full(len(walk), 2)
     save(folder / "magnetometer-calibrated.txt", "", t, field(walk), accuracy, sep=" ")
-    save(folder / "attitude.txt", "", t, pose(walk).quat_xyzw[:, [3, 0, 1, 2]], sep=" ")
+    save(folder / "attitude.txt", "", t, walk.truth.quat_xyzw[:, [3, 0, 1, 2]], sep=" ")
 
 
 def senslogs_android(folder: Path, walk: ImuSequence) -> None:
@@ -137,7 +130,7 @@ def sensor_log(folder: Path, walk: ImuSequence) -> None:
     save(
         folder / "my_iOS_device.csv", header, ["2020-01-01 10:00:00.123 +0100"] * n, np.arange(n),
         ["A-B"] * n, t, -walk.accel / STANDARD_GRAVITY, t, walk.gyro, field(walk), np.zeros(n),
-        linear, walk.gyro + 0.001, pose(walk).quat_xyzw, np.zeros(n, dtype=int),
+        linear, walk.gyro + 0.001, walk.truth.quat_xyzw, np.zeros(n, dtype=int),
     )  # fmt: skip
 
 
@@ -147,7 +140,7 @@ def raw_g_iphone(folder: Path, walk: ImuSequence) -> None:
                          ("magnetometer", field(walk))):  # fmt: skip
         save(folder / f"advio-01/iphone/{name}.csv", "", walk.time, values)
     poses = np.hstack(
-        [Y_UP.apply(pose(walk).position_W), (Y_UP * pose(walk).attitude_WB).as_quat()]
+        [Y_UP.apply(walk.truth.position_W), (Y_UP * walk.truth.attitude_WB).as_quat()]
     )
     save(folder / "advio-01/ground-truth/pose.csv", "", walk.time, poses[:, [0, 1, 2, 6, 3, 4, 5]])
 

@@ -13,7 +13,6 @@ ZYX = "time,seconds_elapsed,z,y,x"
 
 
 def in_body(walk: ImuSequence, vector_W: list[float]) -> FloatArray:
-    assert walk.truth is not None
     return np.asarray(walk.truth.attitude_WB.apply(vector_W, inverse=True))
 
 

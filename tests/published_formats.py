@@ -1,7 +1,5 @@
 """Writers of every published format for simulated walks: names, orders, units and quirks."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -45,14 +43,9 @@ def walk_of(rate: float, seconds: float, carry: str = "handheld") -> ImuSequence
     return simulate_imu(generate_walk(4, seconds, style=style), rate, PERFECT_IMU)
 
 
-def pose_of(walk: ImuSequence) -> Trajectory:
-    assert walk.truth is not None
-    return walk.truth
-
-
 def cut(walk: ImuSequence, rows: slice) -> ImuSequence:
     """Part of a walk as a reader returns it, with time starting at its first row."""
-    truth, time = pose_of(walk), walk.time[rows] - walk.time[rows][0]
+    truth, time = walk.truth, walk.time[rows] - walk.time[rows][0]
     return ImuSequence(
         name=walk.name,
         time=time,
@@ -65,7 +58,7 @@ def cut(walk: ImuSequence, rows: slice) -> ImuSequence:
 
 def field_of(walk: ImuSequence) -> FloatArray:
     """The magnetic field in B at each sample."""
-    return np.asarray(pose_of(walk).attitude_WB.apply(FIELD_W, inverse=True))
+    return np.asarray(walk.truth.attitude_WB.apply(FIELD_W, inverse=True))
 
 
 def wxyz(rotation: Rotation) -> FloatArray:
@@ -99,7 +92,7 @@ def names(stem: str, axes: str = "xyz") -> str:
 def ronin(folder: Path, walk: ImuSequence, **info: object) -> Written:
     h5py = pytest.importorskip("h5py")
     folder.mkdir(parents=True, exist_ok=True)
-    truth, start = pose_of(walk), 100
+    truth, start = walk.truth, 100
     R_TB = Rotation.from_euler("zyx", [170.0, 5.0, -3.0], degrees=True)
     scale = np.array([0.998, 0.997, 0.993])
     drift = Rotation.from_rotvec(np.outer(walk.time, [0.0, 0.0, 0.01]))
@@ -130,7 +123,7 @@ def ronin(folder: Path, walk: ImuSequence, **info: object) -> Written:
 
 def pandas_table(folder: Path, walk: ImuSequence, ori: Rotation, rv: Rotation) -> Path:
     """RIDI's columns as pandas writes them, with an unnamed index."""
-    truth = pose_of(walk)
+    truth = walk.truth
     header = ",time," + ",".join(map(names, ("gyro", "acce", "linacce", "grav", "magnet", "pos")))
     header += f",{names('ori', 'wxyz')},{names('rv', 'wxyz')}"
     other = np.hstack([np.zeros((len(walk), 6)), field_of(walk)])
@@ -143,21 +136,21 @@ def pandas_table(folder: Path, walk: ImuSequence, ori: Rotation, rv: Rotation) -
 
 
 def ridi(folder: Path, walk: ImuSequence) -> Written:
-    attitude_WB = pose_of(walk).attitude_WB
+    attitude_WB = walk.truth.attitude_WB
     pandas_table(folder, walk, attitude_WB, about_z(1.2) * attitude_WB)
     return Written(folder, replace(cut(walk, slice(None)), name=folder.name))
 
 
 def imunet(folder: Path, walk: ImuSequence) -> Written:
     """Positions are z-up as converted by its authors; attitudes remain in ARCore's world."""
-    attitude_WB = pose_of(walk).attitude_WB
+    attitude_WB = walk.truth.attitude_WB
     pandas_table(folder, walk, Y_UP * attitude_WB, about_z(1.2) * attitude_WB)
     return Written(folder, replace(cut(walk, slice(None)), name=folder.name))
 
 
 def imunet_raw(folder: Path, walk: ImuSequence, world: Rotation = Y_UP) -> Written:
     """Each sensor over its own time span; the pose at about 30 Hz in a world with y up."""
-    truth, poses = pose_of(walk), slice(21, -30, 7)
+    truth, poses = walk.truth, slice(21, -30, 7)
     quat = (about_z(1.2) * truth.attitude_WB).as_quat()
     pose = np.hstack([world.apply(truth.position_W), (world * truth.attitude_WB).as_quat()])
     for name, values, rows in (
@@ -179,7 +172,7 @@ def imunet_raw(folder: Path, walk: ImuSequence, world: Rotation = Y_UP) -> Writt
 
 
 def rnin(folder: Path, walk: ImuSequence, captured: bool = True) -> Written:
-    truth, count = pose_of(walk), len(walk)
+    truth, count = walk.truth, len(walk)
     away = about_z(2.0)
     bias = np.linspace(0.0, 1.0, count)[:, None]
     good = np.hstack([wxyz(truth.attitude_WB), truth.position_W])
@@ -199,7 +192,7 @@ def rnin(folder: Path, walk: ImuSequence, captured: bool = True) -> Written:
 
 
 def tlio(folder: Path, walk: ImuSequence, order: str = "xyzw") -> Written:
-    truth = pose_of(walk)
+    truth = walk.truth
     assert truth.velocity_W is not None
     quat = truth.quat_xyzw if order == "xyzw" else wxyz(truth.attitude_WB)
     R_WB = truth.attitude_WB
@@ -225,8 +218,7 @@ def tlio_raw(
     """Raw samples with a calibration; the resampled pose of a device with the IMU turned in it."""
     mount = Rotation.identity() if R_DI is None else R_DI
     lever = np.zeros(3) if R_DI is None else np.array([0.01, 0.03, -0.02])
-    truth = pose_of(walk)
-    assert truth.velocity_W is not None
+    truth = walk.truth
     R_WD = truth.attitude_WB * mount.inv()
     device = ImuSequence(
         "device", walk.time[::every], mount.apply(walk.gyro)[::every],
@@ -306,7 +298,7 @@ def bag(
     else:
         plugin = StoragePlugin.MCAP if version == "mcap" else StoragePlugin.SQLITE3
         writer = Writer2(path, version=9, storage_plugin=plugin)
-    truth, kinds, field = pose_of(walk), store.types, field_of(walk)
+    truth, kinds, field = walk.truth, store.types, field_of(walk)
     with writer:
         joined = {
             topic: (kind, writer.add_connection(topic, kind, typestore=store))

@@ -1,12 +1,19 @@
 """What inspection and health say, in words, for tests of what a user reads."""
 
-from __future__ import annotations
+from dataclasses import replace
+
+import numpy as np
+import pytest
 
 from stario.fusion.health import Health
 from stario.fusion.report.health import health_findings
+from stario.sequences.errors import InputError
 from stario.sequences.findings import Finding, verdict
+from stario.sequences.inspection.checks import check_units
 from stario.sequences.inspection.report import inspect_recording
-from stario.sequences.sequence import ImuSequence
+from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
+
+UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
 
 
 def told(sequence: ImuSequence) -> list[str]:
@@ -23,3 +30,13 @@ def health_verdict(health: Health | None) -> list[Finding]:
 def health_lines(health: Health | None) -> list[str]:
     """Return that verdict as the lines of a terminal."""
     return [finding.line() for finding in health_verdict(health)]
+
+
+def refusal(sequence: ImuSequence) -> str:
+    """Return the error of a recording that was read from a file."""
+    with pytest.raises(InputError) as caught:
+        check_units(replace(sequence, source="generic CSV"))
+    text = str(caught.value)
+    assert "\n" not in text
+    assert text.startswith(sequence.name)
+    return text

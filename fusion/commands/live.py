@@ -7,12 +7,19 @@ from typing import Annotated
 
 import typer
 
-from stario.fusion.commands.options import EstimatorOptions, expand_option_groups, flag
+from stario.fusion.commands.options import (
+    EstimatorOptions,
+    MapOptions,
+    TilesOption,
+    expand_option_groups,
+    flag,
+)
 
 
 @expand_option_groups
 def live(
     estimating: EstimatorOptions,
+    placing: MapOptions,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of page and pushes.")] = 8000,
     host: Annotated[
         str, typer.Option(help="Address to listen on; 0.0.0.0 admits phones, with a token.")
@@ -20,10 +27,12 @@ def live(
     phyphox: Annotated[
         list[str] | None, typer.Option(help="Address of a phone running phyphox; repeatable.")
     ] = None,
+    tiles: TilesOption = "",
     demo: Annotated[bool, flag("--demo", help="Let a simulated phone walk.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for the recordings.")] = Path("runs/live"),
 ) -> None:
     """Show live tracks on a web page, from Sensor Logger, phyphox or any device that posts JSON."""
+    from stario.sequences.errors import InputError
     from stario.sequences.lazy import optional_package
 
     for package in ("starlette", "uvicorn", "plotly", "segno"):
@@ -33,10 +42,17 @@ def live(
     from stario.fusion.live.run import LiveServer
     from stario.fusion.navigator import Navigator
 
-    model, settings = estimating.network(), estimating.settings()
+    model, settings = estimating.network(), placing.settings(estimating.settings())
+    if settings.place.origin is not None and len(settings.place.origin) > 2:
+        fix = "leave it out: satellites, or two places given on the page, turn the track"
+        raise InputError("--origin", "a yaw", "LAT,LON: the page has x east", fix)
+    if tiles:
+        from stario.fusion.report.background import check_tiles
+
+        check_tiles(tiles)
     check_folder(out)
     simulated = demonstration() if demo else None
     server = LiveServer(
-        lambda: Navigator(model, settings), out, host, port, phyphox or [], simulated
+        lambda: Navigator(model, settings), out, host, port, phyphox or [], simulated, tiles
     )
     server.run(started=lambda: typer.echo("\n".join(server.addresses()), err=True))

@@ -64,6 +64,14 @@ JobsOption = Annotated[
 ReportOption = Annotated[
     bool, flag("--report", help="Also write report.html: map, time slider, plots, health.")
 ]
+TilesOption = Annotated[
+    str,
+    typer.Option(
+        metavar="URL",
+        help="Map server for the map's background, such as "
+        "https://tile.openstreetmap.org/{z}/{x}/{y}.png; the browser asks it.",
+    ),
+]
 ExplainOption = Annotated[
     bool, flag("--explain", help="Say first what the printed words and figures mean.")
 ]
@@ -238,8 +246,8 @@ class EstimatorOptions:
 
 
 @dataclass(frozen=True)
-class PlaceOptions:
-    """What is known of a recording's place, and what becomes of it; as in `PlaceConfig`."""
+class MapOptions:
+    """What is known of a place on the earth; as in `PlaceConfig`."""
 
     satellites: Annotated[
         str | None,
@@ -248,13 +256,6 @@ class PlaceOptions:
             "Default: compare."
         ),
     ] = None
-    waypoints: Annotated[
-        str | None,
-        _place(help="Known positions of the file, such as waypoints: use or compare."),
-    ] = None
-    closed: Annotated[
-        bool, _place(metavar="", help="The track ends where it began, to a metre.")
-    ] = False
     origin: Annotated[
         str | None,
         _place(
@@ -277,6 +278,19 @@ class PlaceOptions:
             return replace(config, place=replace(config.place, **given))  # type: ignore[arg-type]
         except InputError as error:
             raise InputError(f"--{error.field}", error.found, error.expected) from None
+
+
+@dataclass(frozen=True)
+class PlaceOptions(MapOptions):
+    """What is known of a recording's place, and what becomes of it."""
+
+    waypoints: Annotated[
+        str | None,
+        _place(help="Known positions of the file, such as waypoints: use or compare."),
+    ] = None
+    closed: Annotated[
+        bool, _place(metavar="", help="The track ends where it began, to a metre.")
+    ] = False
 
 
 def _numbers_in(option: str, text: str) -> tuple[float, ...]:
@@ -326,14 +340,14 @@ def refuse_unused_sources(
 def expand_option_groups(command: Callable[..., None]) -> Callable[..., None]:
     """Expand a command's parameters of an option group into one typer option per field.
 
-    Groups are `ReadingOptions`, `EstimatorOptions` and `PlaceOptions`: each option is thus defined
-    only once.
+    Groups are `ReadingOptions`, `EstimatorOptions`, `MapOptions` and `PlaceOptions`: each option is
+    thus defined only once.
     """
     options: list[inspect.Parameter] = []
     groups: dict[str, tuple[type, list[str]]] = {}
     for parameter in inspect.signature(command, eval_str=True).parameters.values():
         group = parameter.annotation
-        if group in (ReadingOptions, EstimatorOptions, PlaceOptions):
+        if group in (ReadingOptions, EstimatorOptions, MapOptions, PlaceOptions):
             members = inspect.signature(group, eval_str=True).parameters
             groups[parameter.name] = group, list(members)
             options += members.values()

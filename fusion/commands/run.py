@@ -8,8 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from stario.fusion.commands.common import (
     explain,
     origin_of,
@@ -27,6 +25,7 @@ from stario.fusion.commands.options import (
     ReadingOptions,
     ReportOption,
     RunOutOption,
+    TilesOption,
     expand_option_groups,
     flag,
 )
@@ -51,14 +50,7 @@ def run(
         bool, flag("--filtered", help="Also write the filter's track, as a stream gives it.")
     ] = False,
     report: ReportOption = False,
-    tiles: Annotated[
-        str,
-        typer.Option(
-            metavar="URL",
-            help="Map server for the report's background, such as "
-            "https://tile.openstreetmap.org/{z}/{x}/{y}.png; the browser asks it.",
-        ),
-    ] = "",
+    tiles: TilesOption = "",
     view: Annotated[
         bool, flag("--view", help="Open the rerun 3-D viewer; its file is kept in --out.")
     ] = False,

@@ -96,10 +96,22 @@ def fitted_georeference(track: Track, known: PositionTrack) -> Georeference | No
     inside = with_coordinates & _within(track, known.time)
     if inside.sum() < MIN_POSITIONS:
         return None
-    latlon = known.latlon_deg[inside]
-    first = Georeference(*latlon[0].tolist())
-    there, here = first.xy(latlon), _track_at(track, known.time[inside])
-    w, z = there[:, 0] + 1j * there[:, 1], here[:, 0] + 1j * here[:, 1]
+    return georeference_of(known.latlon_deg[inside], _track_at(track, known.time[inside]))
+
+
+def georeference_of(latlon_deg: FloatArray, track: FloatArray) -> Georeference | None:
+    """Return where a frame lies on the earth in which a track fits places best.
+
+    Args:
+        latlon_deg: (N, 2) latitude and longitude of at least one place [deg].
+        track: (N, 2) the track at the same times, in its frame [m].
+
+    Returns:
+        The frame's place; None if the places or the track are too close together to tell it.
+    """
+    first = Georeference(*latlon_deg[0].tolist())
+    there = first.xy(latlon_deg)
+    w, z = there[:, 0] + 1j * there[:, 1], track[:, 0] + 1j * track[:, 1]
     turn = np.vdot(z - z.mean(), w - w.mean())
     if min(np.abs(w - w.mean()).max(), np.abs(z - z.mean()).max()) < _APART_M:
         return None

@@ -153,7 +153,7 @@ def corrected(
 
 
 def gauss_markov(
-    covariances: FloatArray, rows: slice, kept: FloatArray, sigma: float
+    covariances: FloatArray, rows: slice, kept: FloatArray, sigma: float | FloatArray
 ) -> FloatArray:
     """Return covariances (..., n, n) after errors have taken a Gauss-Markov step.
 
@@ -161,7 +161,7 @@ def gauss_markov(
         covariances: before the step.
         rows: the k rows of the errors, which vary about zero, independently of each other.
         kept: (k,) correlation of each error with its value before the step.
-        sigma: stationary standard deviation of the errors.
+        sigma: stationary standard deviation of the errors, or of each (k,).
     """
     P = covariances.copy()
     P[..., rows, :] *= kept[:, None]

@@ -5,12 +5,12 @@ README.md, "Magnetometer". The field's direction in the world is unknown, and in
     azimuth = c + wander,   c constant and unknown at first
                             wander Gauss-Markov over metres and seconds
 
-The bearing of R_WB (m_B - h), with the sensor's hard iron h, measures it. A field of unusual size
-or dip for the place has less weight, as does one that the device has extrapolated by its own
-gyroscope; one that contradicts the rest is an outlier like any other. If a declination is given,
-and only then, the field determines north once, as a fix of yaw. The field varies slowly and its
-errors are correlated over metres: two bearings a second suffice. How much size and dip vary along
-the path tells how much the azimuth does.
+The bearing of R_WB (m_B - h), with the sensor's hard iron h, measures it; h is Gauss-Markov, too. A
+field of unusual size or dip for the place has less weight, as does one that the device has
+extrapolated by its own gyroscope; one that contradicts the rest is an outlier like any other. If a
+declination is given, and only then, the field determines north once, as a fix of yaw. The field
+varies slowly and its errors are correlated over metres: two bearings a second suffice. How much
+size and dip vary along the path tells how much the azimuth does.
 """
 
 from __future__ import annotations
@@ -35,8 +35,10 @@ WANDER_METRES, WANDER_SECONDS = 5.0, 60.0
 """Distance [m] and time [s] over which the wander decorrelates: the reach of a beam or a
 radiator, and the duration of other changes."""
 
-HARD_IRON_SIGMA = 10.0
-"""Sigma of the hard iron that a phone's calibration leaves, per axis [uT]."""
+HARD_IRON_SIGMA, HARD_IRON_SECONDS = 10.0, 60.0
+"""Sigma of the hard iron that a phone's calibration leaves, per axis [uT], and the time over which
+it decorrelates [s]: phones calibrate their magnetometer anew as they are carried, by up to 30 uT at
+once (IPIN 2023, Trial01_1), so that what it was a minute ago tells little."""
 
 BEARING_SIGMA = 0.3
 """White noise of one bearing [rad]: steel within a step's length, late samples while it turns."""
@@ -70,6 +72,9 @@ WANDER_SIGMA = 0.4
 """Sigma of the wander, the azimuth about its mean [rad]: buildings turn it by 5 to 30 degrees. One
 that follows how size and dip vary along the path changed no error on OxIOD, RIDI, KIPD and tyrex by
 more than 1 %."""
+
+_SIGMAS = np.array([WANDER_SIGMA, *[HARD_IRON_SIGMA] * 3])
+"""Stationary sigmas of the wander [rad] and of the hard iron [uT]."""
 
 _SIZE_TOLERANCE, _DIP_TOLERANCE = 0.05, 0.05
 """Deviations from the place's usual size (fraction) and dip [rad] that double the variance."""
@@ -161,7 +166,7 @@ def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> 
 def with_field(s: EkfState, m_B: FloatArray) -> EkfState:
     """Return the state with an unknown azimuth, initialised by the first field (3,) [uT]."""
     x, y, _ = s.R_WB @ m_B
-    variances = [_FIRST_AZIMUTH_SIGMA**2, WANDER_SIGMA**2, *[HARD_IRON_SIGMA**2] * 3]
+    variances = [_FIRST_AZIMUTH_SIGMA**2, *_SIGMAS**2]
     n = s.field_row
     P = np.zeros((2, n + len(variances), n + len(variances)))
     P[:, :n, :n], P[:, n:, n:] = s.covariances, np.diag(variances)
@@ -169,13 +174,17 @@ def with_field(s: EkfState, m_B: FloatArray) -> EkfState:
 
 
 def propagated_field(s: EkfState, seconds: float) -> EkfState:
-    """Return the state with its azimuth propagated for a time [s] at the current speed."""
+    """Return the state with its azimuth and hard iron propagated for a time [s]."""
     assert s.field is not None  # set by `with_field`
     metres = seconds * math.hypot(s.v_W[0], s.v_W[1])
     row = s.field_row + 1
-    correlation = math.exp(-metres / WANDER_METRES - seconds / WANDER_SECONDS)
-    P = gauss_markov(s.covariances, slice(row, row + 1), np.array([correlation]), WANDER_SIGMA)
-    return changed(s, covariances=P, field=changed(s.field, wander=correlation * s.field.wander))
+    wander = math.exp(-metres / WANDER_METRES - seconds / WANDER_SECONDS)
+    iron = math.exp(-seconds / HARD_IRON_SECONDS)
+    kept = np.array([wander, iron, iron, iron])
+    P = gauss_markov(s.covariances, slice(row, row + 4), kept, _SIGMAS)
+    wander_iron = kept * np.array([s.field.wander, *s.field.hard_iron_B])
+    field = changed(s.field, wander=float(wander_iron[0]), hard_iron_B=wander_iron[1:])
+    return changed(s, covariances=P, field=field)
 
 
 def update_bearing(

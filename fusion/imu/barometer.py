@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
+from statistics import median
 from typing import NamedTuple
 
 import numpy as np
@@ -142,7 +143,7 @@ class HeightBuffer(TimedBuffer[float]):
         return self._judged(time, altitude - self._first)
 
     def _judged(self, time: float, height: float) -> HeightSample | None:
-        usual = float(np.median([h for _, h in self._past])) if self._past else height
+        usual = median(h for _, h in self._past) if self._past else height
         self._past.append((time, height))
         while self._past[0][0] < time - CLIMB_DELAY - 0.5 * HEIGHT_SECONDS:
             self._past.popleft()

@@ -10,13 +10,13 @@ device may be at rest. One sensor alone: loggers repeat samples of a slow one, a
 rest measures the same numbers for minutes. So its values must repeat for half a second in which the
 other one shows motion that they rule out, by the rules of `sequences.inspection.constant_values`.
 From then on it counts as stopped until its values change. Samples of a stopped sensor are dropped,
-so that they are treated as a gap. A sensor whose values have never changed is dead (`units`).
+so that they are treated as a gap. A sensor whose values have never changed is dead (`units`). Three
+zeros of an accelerometer are no measurement at all, not even of a free fall, which has noise.
 
-Outliers: a spike is one sample that differs from both its neighbours by more than a carried device
-can cause; it is replaced by their mean. Saturation shows as values of a moving axis that repeat
-exactly and more than once at the largest magnitude measured so far; two that are equal by chance,
-at a magnitude soon exceeded, do not count. What the sensor missed is unknown, so these are only
-flagged.
+Outliers: spikes are replaced (`sequences.spikes`). Saturation shows as values of a moving axis that
+repeat exactly and more than once at the largest magnitude measured so far; two that are equal by
+chance, at a magnitude soon exceeded, do not count. What the sensor missed is unknown, so these are
+only flagged.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from stario.sequences.clean_samples import MIN_RATE
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.constant_values import shaken, tilting
 from stario.sequences.sequence import BoolArray, FloatArray
+from stario.sequences.spikes import replace_spikes
 
 SET_BACK_SECONDS = 5.0
 """Late samples that advance for this long in a row [s] come from a clock that was set back; batches
@@ -120,6 +121,8 @@ class FrozenSensorDetector:
     def stopped(self, sample: Sample) -> Stopped | None:
         """Return what has stopped according to a sample (time, gyro, accel); None if nothing."""
         last, self._last = self._last, sample
+        if self._accel.varied and not any(sample[4:]):
+            return "accelerometer" if any(sample[1:4]) else "both"
         # Nearly all samples end here: comparing two numbers is the cheapest proof.
         if sample[1] != last[1] and sample[4] != last[4] and not self._unclear:
             self._since = sample[0]
@@ -190,10 +193,6 @@ class _Repetition:
             self.stopped = moves(table[:, 0], table[:, 1:4], table[:, 4:7])
 
 
-SPIKE = np.array([12.0, 12.0, 12.0, 60.0, 60.0, 60.0])
-"""A sample that differs from both neighbours by more than this is a spike [rad/s], [m/s^2]; heel
-strikes stay below half of it at 50 Hz."""
-
 _MOVING_RANGE = np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5])
 _LARGE_VALUE = np.array([3.0, 3.0, 3.0, 15.0, 15.0, 15.0])
 """An axis within this range and size [rad/s], [m/s^2] may repeat itself: coarse digits at rest."""
@@ -219,8 +218,7 @@ class OutlierDetector:
         """
         values = table[:, 1:]
         steps = values[1:] - values[:-1]
-        candidates = np.abs(steps).max(axis=0) > SPIKE
-        spikes = self._replace_spikes(values) if candidates.any() else _NO_AXES
+        spikes = replace_spikes(values, first=False).sum(axis=0)
         largest = np.maximum(self.largest, np.abs(values).max(axis=0))
         self._repeats = np.where(largest > self.largest, 0.0, self._repeats)
         self.largest = largest
@@ -233,22 +231,6 @@ class OutlierDetector:
         return Flags(
             bool(bad[:3].any()), bool(bad[3:].any()), int(spikes.max()), int(saturated.max())
         )
-
-    @staticmethod
-    def _replace_spikes(values: FloatArray) -> FloatArray:
-        """Replace spikes by the mean of their neighbours; return their number per axis (6,)."""
-        found = np.zeros(6)
-        n = len(values)
-        for k in range(1, n):
-            before = values[k - 1]
-            # The last sample has no successor yet: it is compared with the two before it.
-            after = values[k + 1] if k + 1 < n else values[max(k - 2, 0)]
-            off = np.minimum(np.abs(values[k] - before), np.abs(values[k] - after)) > SPIKE
-            if off.any():
-                mean = 0.5 * (before + after) if k + 1 < n else before
-                values[k, off] = mean[off]
-                found += off
-        return found
 
     def _count_saturated(self, values: FloatArray) -> FloatArray:
         """Return the number of samples per axis (6,) that repeat at the axis's limit."""

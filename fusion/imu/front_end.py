@@ -31,6 +31,7 @@ from stario.fusion.imu.faults import (
 )
 from stario.fusion.imu.gap import gap_rotation
 from stario.fusion.imu.intervals import (
+    NO_FLAGS,
     Flags,
     ImuInterval,
     Sample,
@@ -42,6 +43,7 @@ from stario.fusion.imu.units import SensorCheck, warn_of_field
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
+from stario.sequences.spikes import replace_spikes
 from stario.sequences.time_order import CONFIRMED, CONFIRMED_FAR, FAR_AHEAD, MAX_IMU_GAP
 
 BRIDGED = 0.2
@@ -185,6 +187,9 @@ class FrontEnd:
             self._next = first + START_SECONDS
             return []
         table = np.array(self._samples)
+        # Those after the first are replaced in the samples, and counted, when these are cut.
+        self.counts.spike += int(replace_spikes(table[:, 1:])[0].any())
+        self._samples[0] = tuple(table[0].tolist())
         gravity = start_from_gravity(table[:, 0], table[:, 1:4], table[:, 4:7])
         rate = 1.0 / float(np.median(np.diff(table[:, 0])))
         start = Start(**vars(gravity), time=first, rate=rate)
@@ -226,11 +231,11 @@ class FrontEnd:
         self._next = -math.inf
         if self._attitude is None or self._before_gap is not None:
             return []
-        self._before_gap = before[-1]
+        table = np.array(before)
+        flags = self._flag_outliers(table) if len(before) > 1 else NO_FLAGS
+        self._before_gap = tuple(table[-1].tolist())
         if len(before) == 1:
             return []
-        table = np.array(before)
-        flags = self._flag_outliers(table)
         self._attitude.advance(table[:, 0], table[:, 1:4], table[:, 4:])
         return [ImuInterval(table, False, self._attitude.R_NB, flags=flags)]
 

@@ -36,14 +36,12 @@ class DisplayedTrack:
         points: thinned beyond `MAX_POINTS`. A list that only grows: when earlier points change,
             another takes its place, as viewers read it while a thread adds points.
         origin: (3,) position displayed as zero [m].
-        map_frame: `NavState.map_frame` of the newest states.
         since: index of the first point that fixes still move; points before a gap in which the
             yaw was lost stay where they are.
     """
 
     points: list[Point] = field(default_factory=list)
     origin: FloatArray = field(default_factory=lambda: np.zeros(3))
-    map_frame: int = 0
     since: int = 0
 
     def add(self, state: NavState, p_W: FloatArray) -> None:
@@ -78,7 +76,6 @@ class DisplayedTrack:
         P = table[:, [6, 7, 7, 8]].reshape(-1, 2, 2)
         table[:, 6:9] = (R @ P @ R.T).reshape(-1, 4)[:, [0, 1, 3]]
         self.points = self.points[: self.since] + table.tolist()
-        self.map_frame = after.map_frame
 
 
 def point_of(state: NavState, p_W: FloatArray) -> Point:

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 from stario.fusion.live.drawn import Point
 from stario.fusion.live.payload import Batch
+from stario.fusion.live.places import Earth, Place
 from stario.fusion.live.session import Session
 from stario.fusion.navigator import Navigator
 from stario.sequences.errors import InputError
@@ -45,6 +46,7 @@ class Hub:
 
     Attributes:
         sessions: sessions by device.
+        earth: where on the earth the map lies that they share.
         refused: number of refused messages by transport.
         viewers: number of pages that watch.
         ending: whether the server is stopping and viewers must be disconnected.
@@ -53,6 +55,7 @@ class Hub:
     def __init__(self, folder: Path, new_navigator: Callable[[], Navigator]) -> None:
         self._folder, self._new_navigator = folder, new_navigator
         self.sessions: dict[str, Session] = {}
+        self.earth = Earth()
         self.refused: Counter[str] = Counter()
         self.viewers, self.ending = 0, False
         self._threads: dict[str, ThreadPoolExecutor] = {}
@@ -124,7 +127,8 @@ class Hub:
 
     def _session(self, device: str) -> Session:
         if device not in self.sessions:
-            self.sessions[device] = Session(device, self._folder, self._new_navigator)
+            session = Session(device, self._folder, self._new_navigator, self.earth)
+            self.sessions[device] = session
             self._threads[device] = ThreadPoolExecutor(1)
         return self.sessions[device]
 
@@ -182,11 +186,13 @@ class Viewer:
     def __init__(self, hub: Hub) -> None:
         self._hub = hub
         self._sent: dict[str, tuple[list[Point], int]] = {}
+        self._places: dict[str, list[Place]] = {}
 
     def message(self) -> dict[str, Any]:
         """Return every device's status and its points since the last message.
 
         If `fresh` is true, `points` replace all the viewer has; otherwise they are appended.
+        `places` are there if they have changed, all of them.
         """
         devices = []
         for device, session in list(self._hub.sessions.items()):
@@ -198,5 +204,9 @@ class Viewer:
             if len(new) > MAX_SENT:
                 new = [*new[: -1 : -(-len(new) // MAX_SENT)], new[-1]]
             self._sent[device] = (points, count)
-            devices.append(session.status() | {"fresh": fresh, "points": new})
+            news: dict[str, Any] = {"fresh": fresh, "points": new}
+            places = session.track.places.drawn
+            if places is not self._places.get(device):
+                self._places[device] = news["places"] = places
+            devices.append(session.status() | news)
         return {"time": time.time(), "devices": devices, "refused": dict(self._hub.refused)}

@@ -56,7 +56,8 @@
       const newest = d.points[d.points.length - 1];
       const last = [newest[1] - d.origin[0], newest[2] - d.origin[1]];
       const reach = Math.min(50, 3 * sigmaOf(newest));
-      return [...points, [last[0] - reach, last[1] - reach], [last[0] + reach, last[1] + reach]];
+      const places = d.places.map((p) => [p[1] - d.origin[0], p[2] - d.origin[1]]);
+      return [...points, ...places, [last[0] - reach, last[1] - reach], [last[0] + reach, last[1] + reach]];
     });
     const [xs, ys] = [0, 1].map((k) => known.map((p) => p[k]));
     const size = map.getBoundingClientRect();
@@ -76,6 +77,9 @@
       const words = (p) => `<b>${plain(d.label)}</b> at ${p[0].toFixed(1)} s<br>sigma ${sigmaOf(p).toFixed(2)} m<br>speed ${p[4].toFixed(2)} m/s`;
       const last = points[points.length - 1];
       const way = [...points.map((p) => [p[10] - d.origin[0], p[11] - d.origin[1]]), ...(last ? [place(last)] : [])];
+      mapTraces.push({ x: d.places.map((p) => p[1] - d.origin[0]), y: d.places.map((p) => p[2] - d.origin[1]), mode: "markers",
+        marker: { color: d.colour, size: 5, opacity: 0.45 }, hovertemplate: "%{text}<extra></extra>",
+        text: d.places.map((p) => `<b>${plain(d.label)}</b>, satellites at ${p[0].toFixed(0)} s${p[3] ? `<br>radius ${p[3].toFixed(0)} m` : ""}`) });
       mapTraces.push({ x: way.map((xy) => xy[0]), y: way.map((xy) => xy[1]), mode: "lines", line, text: points.map(words), hovertemplate: "%{text}<extra></extra>" });
       mapTraces.push({ x: last ? [place(last)[0]] : [], y: last ? [place(last)[1]] : [], mode: "markers+text", text: [plain(d.label)],
         textposition: d.beside, hoverinfo: "skip", marker: { color: d.colour, symbol: d.symbol, size: 13, line: { color: "white", width: 2 } } });
@@ -100,9 +104,34 @@
       mapLayout.uirevision += 1;
     }
     mapLayout.shapes = shapes;
+    const onEarth = [...devices.values()].some((d) => d.georeferenced);
+    mapLayout.xaxis.title.text = onEarth ? "east [m]" : "x [m]";
+    mapLayout.yaxis.title.text = onEarth ? "north [m]" : "y [m]";
+    element("dots").hidden = ![...devices.values()].some((d) => d.places.length);
     await Plotly.react(map, mapTraces, mapLayout, config);
+    if (onEarth && map.dataset.tiles) askBackground();
     time.parentElement.hidden = !shapes.length;  // no empty plots
     if (shapes.length) await Plotly.react(time, timeTraces, timeLayout, config);
+  };
+
+  // The tiles reach beyond the limits for which they were asked; others are asked where the map is moved or zoomed out of them.
+  let [background, asking] = [null, false];
+  const askBackground = async () => {
+    const [[left, right], [bottom, top]] = [map._fullLayout.xaxis.range, map._fullLayout.yaxis.range];
+    const span = Math.max(right - left, top - bottom);
+    const [x, y] = [(left + right) / 2, (bottom + top) / 2];
+    const seen = background && Math.hypot(x - background.x, y - background.y) < background.span / 4;
+    if (asking || (seen && span < 1.4 * background.span && span > 0.4 * background.span)) return;
+    asking = true;
+    try {
+      const answer = await fetch(`background?${new URLSearchParams({ left, right, bottom, top })}`);
+      mapLayout.images = await answer.json();
+      mapLayout.annotations = [{ text: `map: ${map.dataset.tiles}`, xref: "paper", yref: "paper", x: 1, y: 0, showarrow: false,
+        bgcolor: "rgba(255,255,255,0.8)", font: { size: 11 } }];
+      background = { x, y, span };
+      redraw();
+    } catch {}  // the next message asks again
+    asking = false;
   };
 
   // A slow browser draws less often: it spends at most half of its time drawing.
@@ -148,9 +177,12 @@
   const watchMap = () => {
     let pressed = null;
     map.addEventListener("pointerdown", (event) => { pressed = [event.clientX, event.clientY]; }, true);
-    map.addEventListener("pointerup", (event) => {
+    // Of a mouse, plotly's cover over the page gets it.
+    document.addEventListener("pointerup", (event) => {
       const moved = pressed && Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) > 6;
-      if (tapping === null || moved || !pressed) return;
+      const tapped = pressed && !moved;
+      pressed = null;
+      if (tapping === null || !tapped) return;
       const layout = map._fullLayout;
       const box = map.getBoundingClientRect();
       const x = layout.xaxis.p2d(event.clientX - box.left - layout.xaxis._offset);
@@ -159,7 +191,10 @@
       tap(null);
     }, true);
     map.on("plotly_relayout", (change) => {
-      if ("xaxis.range[0]" in change || "yaxis.range[0]" in change) following = false;
+      if ("xaxis.range[0]" in change || "yaxis.range[0]" in change) {
+        following = false;
+        redraw();  // perhaps with other tiles
+      }
     });
   };
 
@@ -179,7 +214,7 @@
       '<div class="figures"></div><ul class="words"></ul><div class="tools"></div><p class="error" hidden></p><p class="file"></p>';
     const device = { id, n, label: id.length > 24 ? `${id.slice(0, 22)}..` : id, colour: COLOURS[n % COLOURS.length],
       symbol: SYMBOLS[n % SYMBOLS.length], beside: BESIDE[n % BESIDE.length],
-      points: [], origin: [0, 0, 0], received: 0, running: true, card };
+      points: [], places: [], origin: [0, 0, 0], received: 0, running: true, card };
     const corners = { circle: "", square: "4,4 16,4 16,16 4,16", diamond: "10,2 18,10 10,18 2,10", "triangle-up": "10,3 18,17 2,17" }[device.symbol];
     card.querySelector("svg").innerHTML = (corners ? `<polygon points="${corners}"` : '<circle cx="10" cy="10" r="7"') + ` fill="${device.colour}"/>`;
     card.querySelector(".name").textContent = id;
@@ -224,9 +259,10 @@
     }
     device.toggle.textContent = device.running ? "Stop" : "Start a new track";
     device.zero.disabled = device.fix.disabled = !p || !device.running;
+    device.zero.hidden = device.georeferenced;
     const dropped = Object.entries(device.dropped).map(([reason, n]) => `${n} ${reason}`).join(", ");
     device.card.querySelector(".file").textContent = [`${device.file ? `${device.file}: ` : ""}${several(device.samples, "sample")}`,
-      dropped && `dropped: ${dropped}`, device.fixes && several(device.fixes, "fix")].filter(Boolean).join(", ");
+      dropped && `dropped: ${dropped}`, device.fixes && several(device.fixes, "fix"), device.satellites].filter(Boolean).join(", ");
   };
 
   const remove = (id) => {

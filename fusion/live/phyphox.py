@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 from urllib.parse import quote, urlsplit
 
@@ -20,6 +21,7 @@ from stario.fusion.live.payload import (
     GRAVITY,
     GYRO,
     LINEAR,
+    LOCATION,
     MAG,
     MAX_READING,
     TOTAL,
@@ -32,13 +34,14 @@ from stario.sequences.errors import InputError
 PERIOD = 0.2
 """Interval between two requests [s]."""
 
-_SENSORS = {
+_SENSORS: dict[str, tuple[str, Sequence[str]]] = {
     "gyroscope": (GYRO, "xyz"),
     "accelerometer": (TOTAL, "xyz"),
     "magnetic_field": (MAG, "xyz"),
     "linear_acceleration": (LINEAR, "xyz"),
     "gravity": (GRAVITY, "xyz"),
     "pressure": (BAROMETER, "x"),
+    "location": (LOCATION, ("lat", "lon", "z", "accuracy", "v", "dir")),
 }
 """Sensors and their outputs beside the time, by phyphox's names."""
 
@@ -94,14 +97,16 @@ class Phyphox:
                 return Batch(self.device, session, [])
         if self._is_forced(buffers):
             self._restart()
-        readings = [r for sensor in self._buffers for r in self._readings(sensor, buffers)]
+        known = [r for sensor in self._buffers for r in self._readings(sensor, buffers)]
+        readings = [r for r in known if r.sensor != LOCATION]
+        places = [r for r in known if r.sensor == LOCATION]
         measuring = status.get("measuring") is not False
         if measuring and not self._measuring:
             self._restarts += 1  # phyphox's time does not count a pause: the track cannot continue
         self._measuring = measuring
         if measuring and not readings and self._is_behind():
             self._restart()
-        return Batch(self.device, f"{session} {self._restarts}", readings)
+        return Batch(self.device, f"{session} {self._restarts}", readings, places=places)
 
     def _restart(self) -> None:
         """Follow a cleared experiment, whose time restarts at 0, from its beginning."""
@@ -135,7 +140,10 @@ class Phyphox:
         return parts
 
     def _readings(self, sensor: str, buffers: Mapping[str, Any]) -> list[Reading]:
-        columns = [_column(buffers, name) for name in self._buffers[sensor]]
+        columns = [
+            _column(buffers, name, unknown=k > 2 and sensor == LOCATION)
+            for k, name in enumerate(self._buffers[sensor])
+        ]
         readings = []
         for t, *value in zip(*columns, strict=False):  # one column may be a sample longer
             if t <= self._newest.get(sensor, -1.0) or max(map(abs, value)) > MAX_READING:
@@ -163,7 +171,7 @@ def buffers_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
             continue
         sensor, axes = known
         outputs = {k: v for output in source.get("outputs", []) for k, v in output.items()}
-        names = [outputs.get(key) for key in f"t{axes}"]
+        names = [outputs.get(key) for key in ("t", *axes)]
         if all(isinstance(name, str) for name in names):
             found[sensor] = tuple(map(str, names))
     if GYRO not in found or not (TOTAL in found or {LINEAR, GRAVITY} <= set(found)):
@@ -194,14 +202,17 @@ async def follow(hub: Hub, phone: Phyphox) -> None:
         await asyncio.sleep(PERIOD)
 
 
-def _column(buffers: Mapping[str, Any], name: str) -> list[float]:
-    """Return the numbers of a buffer, up to the first invalid value."""
+def _column(buffers: Mapping[str, Any], name: str, unknown: bool = False) -> list[float]:
+    """Return the numbers of a buffer, up to the first invalid value or with NaN where `unknown`."""
     buffer = buffers.get(name)
     values = buffer.get("buffer") if isinstance(buffer, dict) else None
     numbers: list[float] = []
     for value in values if isinstance(values, list) else []:
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if not number or not abs(value) < _LARGEST:  # or NaN
+            if unknown:
+                numbers.append(math.nan)
+                continue
             break
         numbers.append(float(value))
     return numbers

@@ -42,6 +42,8 @@ class LiveServer:
         port: port of the page; 0 for a free one.
         phones: addresses of phones running phyphox.
         demo: recording that a simulated phone sends, at its own speed; None for no such phone.
+        tiles: address of a map server's tiles, with {z}, {x} and {y}, as the page's background once
+            a track lies on the earth; the browser asks it. Empty for none.
 
     Attributes:
         hub: hub of the devices.
@@ -60,6 +62,7 @@ class LiveServer:
         port: int = 8000,
         phones: Iterable[str] = (),
         demo: ImuSequence | None = None,
+        tiles: str = "",
     ) -> None:
         self.token = "" if is_loopback(host) else secrets.token_urlsafe(12)
         self.hub = Hub(out, new_navigator)
@@ -70,7 +73,7 @@ class LiveServer:
         own = host if host not in ("0.0.0.0", "::") else _own_address()
         self._netloc = f"[{own}]:{self.port}" if ":" in own else f"{own}:{self.port}"
         config = uvicorn.Config(
-            live_app(self.hub, self.token, self._netloc if self.token else ""),
+            live_app(self.hub, self.token, self._netloc if self.token else "", tiles),
             http=Connection,
             log_config=None,
             log_level="warning",

@@ -2,6 +2,7 @@
 
     GET  /        the page
     GET  /events  updates for the page, as server-sent events
+    GET  /background?left=-9&right=9&bottom=-9&top=9  map tiles between limits [m], for plotly
     POST /data    a push of Sensor Logger, or lines of JSON (application/x-ndjson)
     POST /command {"device": name, "command": start, stop, zero, or fix with x, y, sigma [m]}
 
@@ -27,7 +28,9 @@ from collections.abc import AsyncIterator, Mapping
 from functools import cache
 from html import escape
 from typing import Any
+from urllib.parse import urlsplit
 
+import numpy as np
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
@@ -64,22 +67,27 @@ _MAX_PERIOD = 1.0
 _COOKIE = "stario_token"
 _MAX_COORDINATE, _SIGMA_RANGE = 1e6, (0.01, 1e3)
 _LINES = "application/x-ndjson"
+_SIDES = ("left", "right"), ("bottom", "top")
+"""Limits of the map's axes in a request."""
+
+_POLICY = "content-security-policy"
 _HEADERS = {
     "cache-control": "no-cache",
-    "content-security-policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; "
+    _POLICY: "default-src 'self'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
 }
 
 _log = logging.getLogger(__name__)
 
 
-def live_app(hub: Hub, token: str = "", host: str = "") -> Starlette:
+def live_app(hub: Hub, token: str = "", host: str = "", tiles: str = "") -> Starlette:
     """Return the web application.
 
     Args:
         hub: hub of the devices.
         token: token that every request must carry; empty for a server on loopback only.
         host: this computer's name or address and port in its network; empty on loopback.
+        tiles: address of a map server's tiles; empty for none.
     """
     guard = (
         Middleware(TokenMiddleware, token=token)
@@ -89,6 +97,7 @@ def live_app(hub: Hub, token: str = "", host: str = "") -> Starlette:
     app = Starlette(
         routes=[
             Route("/", _page),
+            Route("/background", _background),
             Route("/live.css", _asset("live.css", "text/css")),
             Route("/live.js", _asset("live.js", "text/javascript")),
             Route("/plotly.js", _plotly),
@@ -101,6 +110,7 @@ def live_app(hub: Hub, token: str = "", host: str = "") -> Starlette:
         exception_handlers={StarioError: _bad_request, OSError: _storage_error},
     )
     app.state.hub, app.state.token, app.state.host = hub, token, host
+    app.state.tiles = tiles
     return app
 
 
@@ -218,12 +228,16 @@ async def _command(request: Request) -> Response:
 def _fix_values(message: Mapping[str, Any]) -> dict[str, float]:
     values = {name: number_from(name, message.get(name)) for name in ("x", "y", "sigma")}
     for name in ("x", "y"):
-        if abs(values[name]) > _MAX_COORDINATE:
-            raise InputError(name, f"{values[name]:g}", f"up to {_MAX_COORDINATE:g} m")
+        _check_coordinate(name, values[name])
     low, high = _SIGMA_RANGE
     if not low <= values["sigma"] <= high:
         raise InputError("sigma", f"{values['sigma']:g}", f"{low:g} to {high:g} m")
     return values
+
+
+def _check_coordinate(name: str, value: float) -> None:
+    if abs(value) > _MAX_COORDINATE:
+        raise InputError(name, f"{value:g}", f"up to {_MAX_COORDINATE:g} m")
 
 
 async def _events(request: Request) -> Response:
@@ -248,10 +262,37 @@ async def _events(request: Request) -> Response:
 
 
 async def _page(request: Request) -> Response:
-    text = (
-        _content("live.html").decode().replace("PUSH_URL", escape(_url_for_phones(request, "data")))
-    )
-    return Response(text, media_type="text/html", headers=_HEADERS)
+    tiles = urlsplit(request.app.state.tiles)
+    text = _content("live.html").decode()
+    text = text.replace("PUSH_URL", escape(_url_for_phones(request, "data")))
+    text = text.replace("TILE_SERVER", escape(tiles.hostname or ""))
+    headers = dict(_HEADERS)
+    if tiles.hostname:
+        source = f"img-src {tiles.scheme}://{tiles.netloc} "
+        headers[_POLICY] = headers[_POLICY].replace("img-src ", source)
+    return Response(text, media_type="text/html", headers=headers)
+
+
+async def _background(request: Request) -> Response:
+    """Return the map's tiles between limits of its axes; none before a track is on the earth."""
+    from stario.fusion.report.background import tile_images
+
+    limits = np.array([[_metres(request, side) for side in axis] for axis in _SIDES])
+    if not (limits[:, 0] < limits[:, 1]).all():
+        raise InputError("left, bottom", "not below right, top", "limits of the map's axes")
+    place, tiles = request.app.state.hub.earth.georeference, request.app.state.tiles
+    return JSONResponse([*tile_images(place, limits, tiles)] if place and tiles else [])
+
+
+def _metres(request: Request, name: str) -> float:
+    """Return a limit of the map's axes in a request [m]."""
+    text = request.query_params.get(name, "")
+    try:
+        value = number_from(name, float(text))
+    except ValueError:
+        raise InputError(name, repr(text[:40]), "metres") from None
+    _check_coordinate(name, value)
+    return value
 
 
 async def _page_code(request: Request) -> Response:

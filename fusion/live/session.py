@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from stario.fusion.live.payload import Batch
+from stario.fusion.live.places import Earth
 from stario.fusion.live.times import BACKWARD, middle_time, with_credible_time
 from stario.fusion.live.track import LiveTrack
 from stario.fusion.navigator import Navigator
@@ -26,6 +27,7 @@ class Session:
         device: name of the device.
         folder: folder for recordings.
         new_navigator: returns a new navigator for each track.
+        earth: where the map lies that all devices share.
 
     Attributes:
         received: time of the last receipt [s since 1970].
@@ -33,8 +35,14 @@ class Session:
         track: current track.
     """
 
-    def __init__(self, device: str, folder: Path, new_navigator: Callable[[], Navigator]) -> None:
-        self.device = device
+    def __init__(
+        self,
+        device: str,
+        folder: Path,
+        new_navigator: Callable[[], Navigator],
+        earth: Earth | None = None,
+    ) -> None:
+        self.device, self._earth = device, earth or Earth()
         self._folder, self._new_navigator = folder, new_navigator
         self.received, self._factor = 0.0, 1.0
         self._order = PushOrder()
@@ -49,7 +57,7 @@ class Session:
 
     def _begin(self, recording: str = "") -> None:
         self._recording, self._number = recording, -1
-        self.track = LiveTrack(self.device, self._folder, self._new_navigator())
+        self.track = LiveTrack(self.device, self._folder, self._new_navigator(), self._earth)
         self.running = True
 
     def take(self, batch: Batch, received: float, accel_factor: float = 1.0) -> int:
@@ -142,6 +150,8 @@ class Session:
             "problem": track.problem(),
             "health": track.words,
             "floor": track.floor,
+            "satellites": track.places.words(),
+            "georeferenced": track.georeferenced,
         }
 
     def _is_new(self, batch: Batch) -> bool:

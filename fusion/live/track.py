@@ -10,11 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from stario.fusion.fixes import position_fix
+from stario.fusion.fixes import Fix, position_fix
 from stario.fusion.floors import floor_at
 from stario.fusion.live.drawn import DisplayedTrack
 from stario.fusion.live.merging import MAX_WAIT, Merger, Sample
-from stario.fusion.live.payload import BAROMETER, MAG, Batch, Reading, Vector
+from stario.fusion.live.payload import BAROMETER, LOCATION, MAG, Batch, Reading, Vector
+from stario.fusion.live.places import Earth, Places
 from stario.fusion.live.storage import LiveFile
 from stario.fusion.live.times import with_credible_time
 from stario.fusion.navigator import Navigator
@@ -53,9 +54,12 @@ class LiveTrack:
         device: name of the device.
         folder: folder for the recording, which is created with the first sample.
         navigator: a new navigator.
+        earth: where on the earth the map lies.
 
     Attributes:
         drawn: displayed track.
+        places: places by satellites.
+        georeferenced: whether the track lies on the earth: the origin or satellites placed it.
         words: what stands out in the navigator's health, in words.
         floor: the floor above that of the start, in words; empty without a barometer.
         samples: number of samples processed.
@@ -64,8 +68,9 @@ class LiveTrack:
         delayed: number of readings that came after a later recording had begun.
     """
 
-    def __init__(self, device: str, folder: Path, navigator: Navigator) -> None:
+    def __init__(self, device: str, folder: Path, navigator: Navigator, earth: Earth) -> None:
         self._device, self._folder, self._navigator = device, folder, navigator
+        self._earth = earth
         self._merger, self._factor = Merger(), 1.0
         self._file: LiveFile | None = None
         self._unwritten: tuple[list[Sample], list[Reading]] = [], []
@@ -74,6 +79,9 @@ class LiveTrack:
         self._health_time = self._error_time = -math.inf
         self._stray = self._lost = 0
         self.drawn = DisplayedTrack()
+        self.places = Places(navigator.config.place.satellites, self._earth)
+        self.georeferenced = navigator.config.place.origin is not None
+        self._earth.begin(navigator.config.place.georeference)
         self.words: list[dict[str, str]] = []
         self.floor = ""
         self.samples = self.fixes = self.delayed = 0
@@ -125,8 +133,10 @@ class LiveTrack:
         """Display the newest position as the origin, without changing estimate or recording.
 
         Raises:
-            InputError: there is no position yet.
+            InputError: there is no position yet, or the track lies on the earth.
         """
+        if self.georeferenced:
+            raise InputError("zero", "a track that lies on the earth", "one that does not")
         self.drawn.origin = self._state().p_W.copy()
 
     def fix(self, x: float, y: float, sigma: float) -> None:
@@ -142,12 +152,12 @@ class LiveTrack:
         covariance = np.diag([sigma**2, sigma**2, 1e6])  # a tap says nothing about the height
         assert self._file is not None  # there is a state
         # First to disk, as samples: a fix that is not written moves nothing.
-        self._file.append_fix(position_fix(before.time, p_W, covariance))
-        self._navigator.update_position(before.time, p_W, covariance)
+        fix = position_fix(before.time, p_W, covariance)
+        self._file.append_fix(fix)
+        if self._earth.georeference is None:
+            self.places.compare()
+        after = self._applied(fix)
         self.fixes += 1
-        after = self._state()
-        if after.map_frame != self.drawn.map_frame:
-            self.drawn.move(before, after)
         self._draw(after)
         self._health_time = -math.inf
         self._update_health(after.time)
@@ -215,6 +225,8 @@ class LiveTrack:
         time = self._seconds(reading.time_ns)
         if reading.sensor == MAG:
             self._navigator.push_magnetometer(time, reading.value)
+        if reading.sensor == LOCATION:
+            self.places.add(time, reading.value)
         if reading.sensor == BAROMETER:
             try:
                 self._navigator.push_pressure(time, *reading.value)
@@ -231,7 +243,22 @@ class LiveTrack:
             return
         if state.time - self._error_time > _ERROR_SECONDS:
             self._push_error = ""
+        for fix in self.places.due(state.time):
+            state = self._applied(fix)
         self._draw(state)
+
+    def _applied(self, fix: Fix) -> NavState:
+        """Apply a fix, which may move the track so far; return the state then."""
+        before = self._state()
+        navigator, arguments = self._navigator, (fix.time, fix.value, fix.covariance)
+        if fix.kind == "velocity":
+            navigator.update_velocity(*arguments)
+        elif navigator.update_position(*arguments) != "refused" and self._earth.georeference:
+            self.georeferenced, self.drawn.origin = True, np.zeros(3)
+        after = self._state()
+        if after.map_frame != before.map_frame:
+            self.drawn.move(before, after)
+        return after
 
     def _draw(self, state: NavState) -> None:
         pose = self._navigator.continuous
@@ -253,6 +280,7 @@ class LiveTrack:
             health.floors = self.drawn.floor_changes()
             floor = _floor_words(floor_at(health.floors, time - _FLOOR_SECONDS))
         self.floor = floor
+        self.places.draw(self.drawn.points)
         self.words = [asdict(finding) for finding in verdict(health_findings(health))]
 
     def _count(self, first_ns: int, last_ns: int, count: int) -> None:

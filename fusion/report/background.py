@@ -70,9 +70,7 @@ def add_tiles(figure: go.Figure, place: Georeference, url: str) -> None:
         url: address of a tile, with {z}, {x} and {y}.
     """
     limits = np.array([figure.layout.xaxis.range, figure.layout.yaxis.range], dtype=np.float64)
-    half = (0.5 + _MARGIN) * np.ptp(limits, axis=1).max()
-    middle = limits.mean(axis=1)
-    for image in _tiles(place, middle - half, middle + half, url):
+    for image in tile_images(place, limits, url):
         figure.add_layout_image(image)
     figure.add_annotation(
         text=f"map: {urlsplit(url).hostname}",
@@ -86,25 +84,32 @@ def add_tiles(figure: go.Figure, place: Georeference, url: str) -> None:
     )
 
 
-def _tiles(
-    place: Georeference, low: FloatArray, high: FloatArray, url: str
-) -> Iterator[dict[str, Any]]:
-    """Yield the tiles between two corners (2,) [m] as images in the map's axes."""
+def tile_images(place: Georeference, limits: FloatArray, url: str) -> Iterator[dict[str, Any]]:
+    """Yield a map's tiles as images of a plotly figure with x east and y north.
+
+    Args:
+        place: where the figure's origin lies.
+        limits: (2, 2) lower and upper limit of its x axis and of its y axis [m]; the tiles reach
+            beyond them by half of their width.
+        url: address of a tile, with {z}, {x} and {y}.
+    """
+    span = float(np.ptp(limits, axis=1).max())
+    middle, half = limits.mean(axis=1), (0.5 + _MARGIN) * span
+    corners = np.stack([middle - half, middle + half])
     width = _EQUATOR_M * math.cos(math.radians(place.latitude_deg))
-    across = float((high - low).max()) / (1.0 + 2.0 * _MARGIN)
-    zoom = min(_LARGEST_ZOOM, math.floor(math.log2(_TILES_ACROSS * width / across)))
-    (left, bottom), (right, top) = _tile_of(place.latlon_deg(np.stack([low, high])), zoom)
+    zoom = min(_LARGEST_ZOOM, math.floor(math.log2(_TILES_ACROSS * width / span)))
+    (left, bottom), (right, top) = _tile_of(place.latlon_deg(corners), zoom)
     for x, y in product(range(int(left), int(right) + 1), range(int(top), int(bottom) + 1)):
-        corners = place.xy(_latlon_of(np.array([[x, y], [x + 1, y + 1]]), zoom))
+        ends = place.xy(_latlon_of(np.array([[x, y], [x + 1, y + 1]]), zoom))
         address = url.replace("{z}", str(zoom)).replace("{x}", str(x)).replace("{y}", str(y))
         yield {
             "source": address,
             "xref": "x",
             "yref": "y",
-            "x": corners[0, 0],
-            "y": corners[0, 1],
-            "sizex": corners[1, 0] - corners[0, 0],
-            "sizey": corners[0, 1] - corners[1, 1],
+            "x": ends[0, 0],
+            "y": ends[0, 1],
+            "sizex": ends[1, 0] - ends[0, 0],
+            "sizey": ends[0, 1] - ends[1, 1],
             "sizing": "stretch",
             "layer": "below",
         }

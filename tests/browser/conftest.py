@@ -1,12 +1,16 @@
 """Pages in a real browser, headless Chromium; tests are skipped if it is not installed."""
 
+import io
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from threading import Thread
+from typing import Any, ClassVar
 
 import pytest
+from PIL import Image
 
 DESKTOP, PHONE = (1440, 900), (390, 844)
 
@@ -63,3 +67,34 @@ def show(browser, tmp_path: Path):
     yield show
     for context in opened:
         context.close()
+
+
+class Tiles(BaseHTTPRequestHandler):
+    """A map server that answers every tile with a grey square, and keeps what it was asked."""
+
+    asked: ClassVar[list[str]] = []
+
+    def do_GET(self) -> None:
+        self.asked.append(self.path)
+        data = io.BytesIO()
+        tone = 170 + 50 * (sum(map(int, self.path.removesuffix(".png").split("/")[1:])) % 2)
+        Image.new("RGB", (256, 256), (tone, tone + 20, tone)).save(data, "PNG")
+        self.send_response(200)
+        self.send_header("Content-Type", "image/png")
+        self.end_headers()
+        self.wfile.write(data.getvalue())
+
+    def log_message(self, *arguments: object) -> None:
+        """Keep the tests' output clean."""
+
+
+@pytest.fixture
+def tile_server():
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Tiles)
+    thread = Thread(target=server.serve_forever)
+    thread.start()
+    Tiles.asked.clear()
+    yield f"http://127.0.0.1:{server.server_port}/{{z}}/{{x}}/{{y}}.png"
+    server.shutdown()
+    thread.join()
+    server.server_close()

@@ -2,19 +2,22 @@
 
 import importlib.util
 import threading
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from stario.fusion import Navigator, demonstration
+from stario.fusion import Navigator, NavigatorConfig, PlaceConfig, demonstration
 from stario.fusion.live.run import LiveServer
 from stario.network import load_model
 from stario.sequences import Barometer, read_recording
+from stario.sequences.geodesy import Georeference
+from stario.sequences.sequence import Satellites
 from stario.sequences.units import METRES_PER_HPA
 
-from .conftest import DESKTOP, PHONE
+from .conftest import DESKTOP, PHONE, Tiles
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "replay_live.py"
 LAST = "id => { const p = window.stario.devices.get(id)?.points; return p && p[p.length - 1]; }"
@@ -32,14 +35,22 @@ def replay():
 def server(tmp_path_factory):
     model = load_model()
     folder = tmp_path_factory.mktemp("live")
-    server = LiveServer(lambda: Navigator(model), folder, port=0)
+    with running(LiveServer(lambda: Navigator(model), folder, port=0)) as server:
+        yield server
+
+
+@contextmanager
+def running(server):
+    """Run a server in a thread."""
     listening = threading.Event()
     thread = threading.Thread(target=server.run, args=(listening.set,))
     thread.start()
-    assert listening.wait(60.0)
-    yield server
-    server.stop()
-    thread.join()
+    try:
+        assert listening.wait(60.0)
+        yield server
+    finally:
+        server.stop()
+        thread.join()
 
 
 def test_page_draws_two_phones_and_ends_where_a_run_on_their_files_does(show, server, replay):
@@ -84,14 +95,44 @@ def test_height_and_floor_of_a_phone_with_a_barometer_are_shown(show, server, re
     assert shown.problems == []
 
 
-def test_buttons_for_zero_place_and_stop_reach_the_server(show, server, replay):
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_a_walk_with_satellites_lies_on_the_map(show, tile_server, replay, tmp_path, size):
+    walk = demonstration()
+    there = walk.truth.at(np.arange(walk.time[0] + 0.5, walk.time[0] + 12.0))
+    v = there.velocity_W
+    receiver = Satellites(
+        there.time,
+        Georeference(48.1, 11.5).latlon_deg(there.position_W),
+        radius_m=np.full(len(there.time), 4.0),
+        speed_m_s=np.hypot(v[:, 0], v[:, 1]),
+        bearing_deg=np.degrees(np.arctan2(v[:, 0], v[:, 1])),
+    )
+    model, config = load_model(), NavigatorConfig(place=PlaceConfig(satellites="use"))
+    server = LiveServer(lambda: Navigator(model, config), tmp_path, port=0, tiles=tile_server)
+    with running(server):
+        url = f"http://127.0.0.1:{server.port}"
+        replay(replace(walk, satellites=receiver), f"{url}/data", 10.0, 12.0, "fred")
+        shown = show(url, size)
+        shown.page.locator("#map image").first.wait_for(state="attached")
+        shown.page.get_by_text("east [m]").wait_for()
+        shown.page.get_by_text("map: 127.0.0.1").wait_for()
+        drawn = "window.stario.devices.get('fred').places.length"
+        assert shown.page.evaluate(drawn) == len(server.hub.sessions["fred"].track.places.drawn) > 8
+        assert not shown.page.get_by_text("Zero here").is_visible()
+        assert Tiles.asked
+        assert not shown.overflows()
+        assert shown.problems == []
+
+
+@pytest.mark.parametrize(("size", "name"), [(DESKTOP, "carl"), (PHONE, "carla")])
+def test_buttons_for_zero_place_and_stop_reach_the_server(show, server, replay, size, name):
     url = f"http://127.0.0.1:{server.port}"
-    replay(demonstration(), f"{url}/data", 10.0, 4.0, "carla")
-    session = server.hub.sessions["carla"]
-    shown = show(url, PHONE)
-    card = shown.page.locator("[data-device=carla]")
+    replay(demonstration(), f"{url}/data", 10.0, 4.0, name)
+    session = server.hub.sessions[name]
+    shown = show(url, size)
+    card = shown.page.locator(f"[data-device={name}]")
     card.get_by_text("Zero here").click()
-    shown.page.wait_for_function("() => window.stario.devices.get('carla').origin[0] !== 0")
+    shown.page.wait_for_function(f"() => window.stario.devices.get('{name}').origin[0] !== 0")
     np.testing.assert_allclose(
         session.track.drawn.origin, session.track.drawn.points[-1][1:4], atol=1e-3
     )
@@ -100,12 +141,12 @@ def test_buttons_for_zero_place_and_stop_reach_the_server(show, server, replay):
     before = session.track.drawn.points[-1][1:3]
     box = shown.page.locator("#map .nsewdrag").first.bounding_box()
     shown.page.mouse.click(box["x"] + 0.75 * box["width"], box["y"] + 0.25 * box["height"])
-    shown.page.wait_for_function("() => window.stario.devices.get('carla').fixes === 1")
+    shown.page.wait_for_function(f"() => window.stario.devices.get('{name}').fixes === 1")
     x, y = np.array(session.track.drawn.points[-1][1:3]) - before
     assert np.hypot(x, y) > 0.5  # where to depends on whether the map has followed the zero yet
     assert card.locator(".file").inner_text().endswith(", 1 fix")
     card.get_by_text("Stop").click()
-    shown.page.wait_for_function("() => !window.stario.devices.get('carla').running")
+    shown.page.wait_for_function(f"() => !window.stario.devices.get('{name}').running")
     assert not session.running
     assert not shown.overflows()
     assert shown.problems == []
@@ -138,11 +179,7 @@ def test_a_command_without_an_answer_is_shown_and_any_name_can_be_commanded(show
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
 def test_page_of_a_server_that_requires_a_token_loads_with_it(show, tmp_path, size):
     server = LiveServer(lambda: None, tmp_path, host="0.0.0.0", port=0)
-    listening = threading.Event()
-    thread = threading.Thread(target=server.run, args=(listening.set,))
-    thread.start()
-    assert listening.wait(60.0)
-    try:
+    with running(server):
         shown = show(f"http://127.0.0.1:{server.port}/?token={server.token}", size)
         address = shown.page.inner_text("#push-url")
         assert "127.0.0.1" not in address
@@ -150,6 +187,3 @@ def test_page_of_a_server_that_requires_a_token_loads_with_it(show, tmp_path, si
         shown.page.wait_for_function("document.getElementById('code').naturalWidth > 50")
         assert not shown.overflows()
         assert shown.problems == []
-    finally:
-        server.stop()
-        thread.join()

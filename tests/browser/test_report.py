@@ -1,15 +1,10 @@
 """The report loads without a network, names units, and its slider moves every cursor."""
 
-import io
 import re
 from dataclasses import replace
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from threading import Thread
-from typing import ClassVar
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig
@@ -22,7 +17,7 @@ from stario.sequences.attitude.rotations import about_z
 from stario.sequences.geodesy import Georeference
 from stario.sequences.sequence import ImuSequence, Trajectory
 
-from .conftest import DESKTOP, PHONE
+from .conftest import DESKTOP, PHONE, Tiles
 
 SECONDS = 20.0
 
@@ -170,37 +165,6 @@ def test_ellipse_is_where_the_mahalanobis_distance_is_three():
     weight = np.linalg.inv(covariance[:2, :2])
     distance = np.sqrt(np.einsum("ni,ij,nj->n", outline, weight, outline))
     np.testing.assert_allclose(distance, 3.0)
-
-
-class Tiles(BaseHTTPRequestHandler):
-    """A map server that answers every tile with a grey square, and keeps what it was asked."""
-
-    asked: ClassVar[list[str]] = []
-
-    def do_GET(self) -> None:
-        self.asked.append(self.path)
-        data = io.BytesIO()
-        tone = 170 + 50 * (sum(map(int, self.path.removesuffix(".png").split("/")[1:])) % 2)
-        Image.new("RGB", (256, 256), (tone, tone + 20, tone)).save(data, "PNG")
-        self.send_response(200)
-        self.send_header("Content-Type", "image/png")
-        self.end_headers()
-        self.wfile.write(data.getvalue())
-
-    def log_message(self, *arguments: object) -> None:
-        """Keep the tests' output clean."""
-
-
-@pytest.fixture
-def tile_server():
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Tiles)
-    thread = Thread(target=server.serve_forever)
-    thread.start()
-    Tiles.asked.clear()
-    yield f"http://127.0.0.1:{server.server_port}/{{z}}/{{x}}/{{y}}.png"
-    server.shutdown()
-    thread.join()
-    server.server_close()
 
 
 def test_a_map_server_is_asked_on_request_and_points_have_their_place(

@@ -1,8 +1,5 @@
 """Simulated walks and a predictor that returns the ground truth, for tests of the navigator."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator
 from copy import deepcopy
 from functools import lru_cache
 from typing import NamedTuple
@@ -10,10 +7,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from training_runs import narrow
 
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.imu.front_end import FrontEnd
-from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.recording import cut_recording
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence, Trajectory
@@ -43,15 +39,13 @@ cut_once = lru_cache(maxsize=8)(cut_recording)
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _cut_once() -> Iterator[None]:
+def _cut_once():
     """Cut each recording once per settings: for the oracle and for the tracks of every back end.
 
     The front end is copied, since its counts are changed later.
     """
 
-    def copied(
-        sequence: ImuSequence, config: NavigatorConfig
-    ) -> tuple[list[ImuInterval], FrontEnd]:
+    def copied(sequence, config):
         intervals, front_end = cut_once(sequence, config)
         return list(intervals), deepcopy(front_end)
 
@@ -130,31 +124,37 @@ def simulated_walk(
 
 
 @pytest.fixture(scope="session")
-def make_walk() -> Callable[..., ImuSequence]:
+def make_walk():
     return simulated_walk
 
 
 @pytest.fixture(scope="session")
-def make_oracle() -> type[Oracle]:
+def make_oracle():
     return Oracle
 
 
 @pytest.fixture(scope="session")
-def still_model() -> Still:
+def still_model():
     return Still()
 
 
 @pytest.fixture(scope="session")
-def walk() -> ImuSequence:
+def walk():
     """Twenty seconds hand-held at 100 Hz, by an IMU with noise and biases."""
     return simulated_walk()
 
 
 @pytest.fixture(scope="session")
-def without() -> Callable[[ImuSequence, np.ndarray], ImuSequence]:
+def without():
     """Function that removes the marked samples of a recording; its ground truth is kept whole."""
     # The same object for the same samples, so that the tests of both back ends share its windows.
     kept = lru_cache(maxsize=16)(
         lambda sequence, gone: sequence.select(~np.frombuffer(gone, dtype=np.bool_))
     )
     return lambda sequence, gone: kept(sequence, gone.tobytes())
+
+
+@pytest.fixture
+def narrow_network(monkeypatch):
+    """Train a small StarIO in place of the whole one."""
+    narrow(monkeypatch)

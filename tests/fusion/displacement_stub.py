@@ -1,7 +1,5 @@
 """A predictor of a known share of a recording's true displacements, and its errors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -20,7 +18,6 @@ streams_of = cache(usable_streams)
 
 def with_waypoints(walk: ImuSequence, every: float = 8.0) -> ImuSequence:
     truth = walk.truth
-    assert truth is not None
     time = np.arange(1.0, 70.0, every)
     xy = truth.at(time).position_W[:, :2]
     return replace(walk, truth=None, positions=PositionTrack(time, xy, "waypoints"))
@@ -28,7 +25,6 @@ def with_waypoints(walk: ImuSequence, every: float = 8.0) -> ImuSequence:
 
 def yaw_WN(walk: ImuSequence, stream: LevelledStream) -> np.ndarray:
     """Yaw (K,) that rotates N to the true world at each tick."""
-    assert walk.truth is not None
     attitude_WB = walk.truth.at(stream.ticks).attitude_WB
     return yaw_of(attitude_WB * Rotation.from_matrix(stream.R_NB).inv())
 
@@ -38,7 +34,6 @@ class Stub:
 
     def __init__(self, walk: ImuSequence, scale: float = 1.0, yaw: float = 0.0) -> None:
         [stream] = streams_of(walk)
-        assert walk.truth is not None
         known = walk.truth.at(stream.ticks).position_W[:, :2] @ [1.0, 1j]
         steps = np.exp(-1j * yaw_WN(walk, stream)[:-2]) * (known[2:] - known[:-2])
         steps = scale * np.exp(1j * yaw) * steps[: stream.window_count]
@@ -59,5 +54,4 @@ def errors_of(recording: ImuSequence, model: Model) -> RecordingErrors:
 
 def horizontal_path(walk: ImuSequence) -> float:
     truth = walk.truth
-    assert truth is not None
     return replace(truth, position_W=truth.position_W * [1.0, 1.0, 0.0]).path_length()

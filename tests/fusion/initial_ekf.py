@@ -1,7 +1,5 @@
 """A filter's state under test, which the functions of `filter.ekf` replace one after the other."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

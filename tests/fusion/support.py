@@ -1,7 +1,5 @@
 """Settings, error metrics and a faulty network, shared by tests of the navigator."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +11,7 @@ from stario.sequences.accuracy.metrics import Alignment, evaluate_track
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence
+from stario.sequences.simulation.imu import ImuErrors
 
 # Settings for the oracle and the simulated phone; the defaults are for networks and real phones.
 FILTER = FilterConfig(
@@ -25,6 +24,11 @@ FILTER = FilterConfig(
 NOISE = ImuNoise(gyro_noise=2e-3, accel_noise=0.1, gyro_walk=3e-5, accel_walk=1e-3)
 CONFIG = NavigatorConfig(NOISE, FILTER)
 GRAPH = NavigatorConfig(NOISE, replace(FILTER, update_rate=2))
+
+# An IMU of known white errors and a filter that takes them as they are, updated once a second.
+WHITE_NOISE = ImuNoise(gyro_noise=1e-3, accel_noise=0.02, gyro_walk=3e-5, accel_walk=1e-3)
+WHITE_ERRORS = ImuErrors(noise=WHITE_NOISE, gyro_turn_on=3e-3, accel_turn_on=0.05)
+WHITE = NavigatorConfig(WHITE_NOISE, replace(FILTER, update_rate=1))
 
 
 def stream(navigator: Navigator, sequence: ImuSequence) -> list[NavState]:
@@ -63,7 +67,6 @@ class Broken:
 
 def swivelled(walk: ImuSequence, rate: float) -> ImuSequence:
     """Return a walk whose device also turns about the vertical, at a rate [rad/s]."""
-    assert walk.truth is not None
     before = walk.truth.at(walk.time).attitude_WB
     after = about_z(rate * walk.time) * before
     gyro = walk.gyro + before.inv().apply([0.0, 0.0, rate])

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import pytest
 
@@ -22,7 +21,7 @@ gyro_noise = 1e-3
 """
 
 
-def test_toml_sets_the_named_fields_and_keeps_the_other_defaults(tmp_path: Path) -> None:
+def test_toml_sets_the_named_fields_and_keeps_the_other_defaults(tmp_path):
     path = tmp_path / "slow.toml"
     path.write_text(TOML)
     default, config = NavigatorConfig(), read_config(path)
@@ -34,7 +33,7 @@ def test_toml_sets_the_named_fields_and_keeps_the_other_defaults(tmp_path: Path)
     )
 
 
-def test_json_and_toml_give_the_same_configuration(tmp_path: Path) -> None:
+def test_json_and_toml_give_the_same_configuration(tmp_path):
     values = {"gravity": 9.8, "filter": {"gate": 0.99}}
     (tmp_path / "a.json").write_text(json.dumps(values))
     (tmp_path / "a.toml").write_text("gravity = 9.8\n[filter]\ngate = 0.99\n")
@@ -45,12 +44,12 @@ def test_json_and_toml_give_the_same_configuration(tmp_path: Path) -> None:
         assert read_config(marked) == read_config(tmp_path / name)
 
 
-def test_an_empty_file_gives_the_defaults(tmp_path: Path) -> None:
+def test_an_empty_file_gives_the_defaults(tmp_path):
     (tmp_path / "empty.toml").write_text("")
     assert read_config(tmp_path / "empty.toml") == NavigatorConfig()
 
 
-def test_a_saved_configuration_reads_back_equal(tmp_path: Path) -> None:
+def test_a_saved_configuration_reads_back_equal(tmp_path):
     config = NavigatorConfig(
         noise=ImuNoise(1e-3, 0.123456789012345, 3e-5, 2e-3),
         filter=FilterConfig(update_rate=20, gate=0.99),
@@ -82,7 +81,7 @@ def test_a_saved_configuration_reads_back_equal(tmp_path: Path) -> None:
         ({"gravity": float("nan")}, "gravity"),
     ],
 )
-def test_an_invalid_setting_is_refused_by_name_in_one_line(values: dict, named: str) -> None:
+def test_an_invalid_setting_is_refused_by_name_in_one_line(values, named):
     with pytest.raises(ConfigError) as caught:
         with_settings(NavigatorConfig(), values)
     assert caught.value.field == named
@@ -98,14 +97,14 @@ def test_an_invalid_setting_is_refused_by_name_in_one_line(values: dict, named: 
         ("binary.toml", b"\xff\xfe\x00"),
     ],
 )
-def test_a_malformed_file_is_named_in_one_line(tmp_path: Path, name: str, content: bytes) -> None:
+def test_a_malformed_file_is_named_in_one_line(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ConfigError, match=name) as caught:
         read_config(tmp_path / name)
     assert "\n" not in str(caught.value)
 
 
-def test_an_invalid_setting_in_a_file_is_named_with_the_file(tmp_path: Path) -> None:
+def test_an_invalid_setting_in_a_file_is_named_with_the_file(tmp_path):
     path = tmp_path / "device.toml"
     path.write_text("[noise]\ngyro = 1e-3\n")
     with pytest.raises(ConfigError, match="an unknown key") as caught:
@@ -113,14 +112,14 @@ def test_an_invalid_setting_in_a_file_is_named_with_the_file(tmp_path: Path) -> 
     assert caught.value.field == f"{path}: noise.gyro"
 
 
-def test_a_missing_file_or_a_folder_raises_a_stario_error(tmp_path: Path) -> None:
+def test_a_missing_file_or_a_folder_raises_a_stario_error(tmp_path):
     for path in (tmp_path / "none.toml", tmp_path):
         with pytest.raises(StarioError):
             read_config(path)
 
 
 @pytest.mark.parametrize("rate", UPDATE_RATES)
-def test_updates_coincide_with_states_and_overlap_inflates_the_covariance(rate: int) -> None:
+def test_updates_coincide_with_states_and_overlap_inflates_the_covariance(rate):
     config = FilterConfig(update_rate=rate, covariance_scale=1.0)
     assert config.intervals_per_update * rate == config.output_rate >= 10
     assert config.window_updates == rate

@@ -1,17 +1,12 @@
 """The continuous position never steps, and converges to the corrected one."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from support import CONFIG
 
 from stario.fusion import Navigator, NavState
-from stario.fusion.state import MAX_STEP, ContinuousPose, advanced
-from stario.sequences.sequence import ImuSequence
-
-Make = Callable[..., Any]
+from stario.fusion.state import MAX_STEP, advanced
 
 
 def state_at(time: float, x: float, map_frame: int = 0) -> NavState:
@@ -20,7 +15,7 @@ def state_at(time: float, x: float, map_frame: int = 0) -> NavState:
     return NavState(time, np.eye(3), v_W, p_W, zero, zero, np.eye(15), False, map_frame)
 
 
-def test_a_step_is_bled_in_a_centimetre_at_a_time() -> None:
+def test_a_step_is_bled_in_a_centimetre_at_a_time():
     pose = advanced(None, state_at(0.0, 0.0))
     remaining = []
     for k in range(1, 101):
@@ -32,15 +27,15 @@ def test_a_step_is_bled_in_a_centimetre_at_a_time() -> None:
     assert remaining[-1] < 0.01
 
 
-def test_the_continuous_position_is_reset_where_fixes_move_the_frame() -> None:
+def test_the_continuous_position_is_reset_where_fixes_move_the_frame():
     pose = advanced(advanced(None, state_at(0.0, 0.0)), state_at(0.1, 100.0, map_frame=1))
     np.testing.assert_array_equal(pose.correction_W, np.zeros(3))
 
 
-def test_corrections_cause_no_step_in_the_position(walk: ImuSequence, make_oracle: Make) -> None:
+def test_corrections_cause_no_step_in_the_position(walk, make_oracle):
     """Noise of a quarter of a metre makes the corrected position step, not the continuous one."""
     navigator = Navigator(make_oracle(walk, walk.truth, CONFIG, noise=0.25, sigma=0.25), CONFIG)
-    poses: list[ContinuousPose] = []
+    poses = []
     for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
         if navigator.push(*row) is not None:
             assert navigator.continuous is not None
@@ -54,20 +49,16 @@ def test_corrections_cause_no_step_in_the_position(walk: ImuSequence, make_oracl
     assert np.linalg.norm(poses[-1].correction_W) < 0.5
 
 
-def test_a_late_fix_that_moves_the_map_moves_the_continuous_position_at_once(
-    walk: ImuSequence, make_oracle: Make
-) -> None:
+def test_a_late_fix_that_moves_the_map_moves_the_continuous_position_at_once(walk, make_oracle):
     navigator = Navigator(make_oracle(walk, walk.truth, CONFIG), CONFIG)
     for row in zip(walk.time[:600], walk.gyro[:600], walk.accel[:600], strict=True):
         navigator.push(*row)
     navigator.update_position(walk.time[590], [1e5, 5e6, 0.0], np.eye(3))
-    assert navigator.continuous is not None
-    assert navigator.state is not None
     assert navigator.continuous.map_frame == navigator.state.map_frame == 1
     np.testing.assert_allclose(navigator.continuous.p_W, navigator.state.p_W)
 
 
-def test_returned_arrays_may_be_overwritten(walk: ImuSequence, make_oracle: Make) -> None:
+def test_returned_arrays_may_be_overwritten(walk, make_oracle):
     ends = []
     for overwrite in (False, True):
         navigator = Navigator(make_oracle(walk, walk.truth, CONFIG), CONFIG)
@@ -79,14 +70,12 @@ def test_returned_arrays_may_be_overwritten(walk: ImuSequence, make_oracle: Make
                     for value in vars(returned).values():
                         if isinstance(value, np.ndarray):
                             value *= 57.3
-        assert navigator.state is not None
-        assert navigator.continuous is not None
         ends.append((navigator.state.p_W, navigator.state.b_g, navigator.continuous.p_W))
     for clean, written in zip(*ends, strict=True):
         np.testing.assert_array_equal(clean, written)
 
 
-def test_the_continuous_position_is_reset_at_the_end_of_a_gap() -> None:
+def test_the_continuous_position_is_reset_at_the_end_of_a_gap():
     before = advanced(None, state_at(0.0, 0.0))
     after = replace(state_at(3.0, 5.0), in_gap=True)
     np.testing.assert_array_equal(advanced(before, after).p_W, after.p_W)

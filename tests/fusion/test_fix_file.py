@@ -1,7 +1,5 @@
 """Files of fixes: columns, units, and errors that name the line."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -13,7 +11,7 @@ from stario.sequences.sequence import ImuSequence
 HEADER = "t,kind,x,y,z,sx,sy,sz\n"
 
 
-def test_a_file_of_fixes_is_read(tmp_path: Path) -> None:
+def test_a_file_of_fixes_is_read(tmp_path):
     path = tmp_path / "fixes.csv"
     path.write_text(
         HEADER + "1.5,position,1,2,3,0.1,,0.3\n\n2,yaw,0.7,,,0.05,,\n3, velocity,1,0,0,0.2\n",
@@ -27,13 +25,13 @@ def test_a_file_of_fixes_is_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(yaw.covariance, [[0.0025]])
 
 
-def test_a_folder_is_no_file_of_fixes(tmp_path: Path) -> None:
+def test_a_folder_is_no_file_of_fixes(tmp_path):
     with pytest.raises(ReadError, match="file: found is a directory, expected a readable file"):
         read_fixes(tmp_path)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
-def test_a_spreadsheets_blank_cells_and_encoding_are_read(tmp_path: Path, encoding: str) -> None:
+def test_a_spreadsheets_blank_cells_and_encoding_are_read(tmp_path, encoding):
     path = tmp_path / "fixes.csv"
     table = "t,kind,x,y,sx,,\n1.5,position,1,2,0.1,,\n2,yaw,0.7,,0.05,,\n,,,,,\xa0,\n"
     path.write_bytes(table.replace(",", "\t").encode(encoding))
@@ -66,9 +64,7 @@ def test_a_spreadsheets_blank_cells_and_encoding_are_read(tmp_path: Path, encodi
         (HEADER + "\n", "a header only, expected at least one fix"),
     ],
 )
-def test_an_invalid_file_raises_an_error_that_names_line_and_field(
-    tmp_path: Path, text: str, match: str
-) -> None:
+def test_an_invalid_file_raises_an_error_that_names_line_and_field(tmp_path, text, match):
     path = tmp_path / "fixes.csv"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ReadError, match=match) as caught:
@@ -77,7 +73,7 @@ def test_an_invalid_file_raises_an_error_that_names_line_and_field(
     assert "\n" not in str(caught.value)
 
 
-def test_columns_may_be_in_any_order_in_degrees_and_without_height(tmp_path: Path) -> None:
+def test_columns_may_be_in_any_order_in_degrees_and_without_height(tmp_path):
     path = tmp_path / "fixes.csv"
     path.write_text("Kind;t [s];x;y;z;sx\nposition;1;2;3;;0.5\nyaw[deg];2;170;;;5\n")
     position, yaw = read_fixes(path)
@@ -89,7 +85,7 @@ def test_columns_may_be_in_any_order_in_degrees_and_without_height(tmp_path: Pat
 
 
 @pytest.mark.parametrize("separator", [";", "\t"])
-def test_decimal_commas_are_read(tmp_path: Path, separator: str) -> None:
+def test_decimal_commas_are_read(tmp_path, separator):
     lines = ["t;kind;x;y;sx", "5,0;position;0,5;-1;1,5", "20;position;3;4,25;1e0"]
     path = tmp_path / "fixes.csv"
     path.write_text("\n".join(lines).replace(";", separator))
@@ -100,13 +96,13 @@ def test_decimal_commas_are_read(tmp_path: Path, separator: str) -> None:
     assert first.covariance[0, 0] == pytest.approx(2.25)
 
 
-def test_a_missing_file_raises_an_error(tmp_path: Path) -> None:
+def test_a_missing_file_raises_an_error(tmp_path):
     with pytest.raises(ReadError, match="fixes"):
         read_fixes(tmp_path / "fixes.csv")
 
 
 @pytest.mark.parametrize("by", [-100.0, 100.0])
-def test_fixes_before_or_after_the_recording_are_on_another_clock(by: float) -> None:
+def test_fixes_before_or_after_the_recording_are_on_another_clock(by):
     time, zero = np.arange(101) / 10.0, np.zeros((101, 3))
     sequence = ImuSequence("walk", time, zero, zero)
     fixes = [position_fix(at + by, np.zeros(3), np.eye(3)) for at in (2.0, 4.0)]

@@ -1,41 +1,31 @@
 """Absolute fixes: on time, late or early, in stream and batch, and the map frame they define."""
 
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
-
 import numpy as np
 import pytest
 import support
+from support import WHITE as CONFIG
+from support import WHITE_ERRORS as ERRORS
 
 from stario.fusion import Navigator, NavState, PriorPose, Track
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_fix
 from stario.fusion.imu.intervals import split_at
 from stario.fusion.lie import UNKNOWN_YAW
 from stario.fusion.recording import cut_recording
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import InputError
-from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.simulation.imu import ImuErrors
 
-NOISE = ImuNoise(gyro_noise=1e-3, accel_noise=0.02, gyro_walk=3e-5, accel_walk=1e-3)
-ERRORS = ImuErrors(noise=NOISE, gyro_turn_on=3e-3, accel_turn_on=0.05)
-CONFIG = NavigatorConfig(noise=NOISE, filter=replace(support.FILTER, update_rate=1))
 EYE = np.eye(3)
 ROOT = np.array([[0.1, 0.1], [0.1, 0.3], [0.2, 0.7]])
 
-Make = Callable[..., Any]
-
 
 @pytest.fixture(scope="module")
-def walk(make_walk: Make) -> ImuSequence:
+def walk(make_walk):
     return make_walk(7, 30.0, 100.0, ERRORS)
 
 
 @pytest.fixture(scope="module")
-def model(walk: ImuSequence, make_oracle: Make) -> Any:
+def model(walk, make_oracle):
     return make_oracle(walk, walk.truth, CONFIG)
 
 
@@ -88,9 +78,7 @@ def assert_same(state: NavState, track: Track, atol: float = 1e-9) -> None:
 
 
 @pytest.mark.parametrize("late", [-3.0, 0.0, 0.3, 0.85])
-def test_a_fix_is_applied_at_its_own_time_however_late(
-    walk: ImuSequence, make_oracle: Make, late: float
-) -> None:
+def test_a_fix_is_applied_at_its_own_time_however_late(walk, make_oracle, late):
     model, fixes = make_oracle(walk, walk.truth, CONFIG), fixes_of(walk)
     track = Navigator(model, CONFIG, backend="ekf").run(walk, fixes=fixes)
     navigator = Navigator(model, CONFIG)
@@ -103,7 +91,7 @@ def test_a_fix_is_applied_at_its_own_time_however_late(
     assert navigator.health.zero_velocity == track.health.zero_velocity
 
 
-def test_fixes_that_are_too_old_are_refused_and_counted(walk: ImuSequence, model: Any) -> None:
+def test_fixes_that_are_too_old_are_refused_and_counted(walk, model):
     untouched, navigator = Navigator(model, CONFIG), Navigator(model, CONFIG)
     streamed(untouched, walk, [], 0.0)
     streamed(navigator, walk, fixes_of(walk), 1.6)
@@ -114,7 +102,7 @@ def test_fixes_that_are_too_old_are_refused_and_counted(walk: ImuSequence, model
     assert track.health.fixes == {"before the start": 1, "after the end": 1}
 
 
-def test_a_fix_one_window_late_is_not_too_late_by_rounding(walk: ImuSequence, model: Any) -> None:
+def test_a_fix_one_window_late_is_not_too_late_by_rounding(walk, model):
     navigator, given = Navigator(model, CONFIG), 0
     for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
         state = navigator.push(*row)
@@ -125,7 +113,7 @@ def test_a_fix_one_window_late_is_not_too_late_by_rounding(walk: ImuSequence, mo
     assert "too late" not in navigator.health.fixes
 
 
-def test_future_fixes_wait_for_their_time(walk: ImuSequence, model: Any) -> None:
+def test_future_fixes_wait_for_their_time(walk, model):
     navigator = Navigator(model, CONFIG)
     for fix in reversed(fixes_of(walk)):
         apply_fix(navigator, fix)
@@ -137,7 +125,7 @@ def test_future_fixes_wait_for_their_time(walk: ImuSequence, model: Any) -> None
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_a_fix_tells_what_became_of_it(walk: ImuSequence, model: Any, backend: Any) -> None:
+def test_a_fix_tells_what_became_of_it(walk, model, backend):
     navigator = Navigator(model, CONFIG, backend=backend)
     p = [truth_at(walk, t)[0] for t in (4.0, 12.0, 16.0)]
     assert navigator.update_position(4.0, p[0], 0.01 * EYE) == "waiting"
@@ -152,7 +140,7 @@ def test_a_fix_tells_what_became_of_it(walk: ImuSequence, model: Any, backend: A
     assert {key: navigator.health.fixes[key] for key in reasons} == reasons
 
 
-def test_an_interval_split_in_two_keeps_its_window_and_integrals(walk: ImuSequence) -> None:
+def test_an_interval_split_in_two_keeps_its_window_and_integrals(walk):
     interval = next(e for e in cut_recording(walk, CONFIG)[0] if e.window is not None)
     for time in (interval.start + 0.033, float(interval.time[4]), interval.stop - 1e-4):
         first, second = split_at(interval, time)
@@ -169,9 +157,7 @@ def test_an_interval_split_in_two_keeps_its_window_and_integrals(walk: ImuSequen
 
 
 @pytest.mark.parametrize("turn", [0.0, 1.0, np.pi, -2.5])
-def test_two_positions_determine_the_position_and_direction_of_a_track(
-    walk: ImuSequence, model: Any, turn: float
-) -> None:
+def test_two_positions_determine_the_position_and_direction_of_a_track(walk, model, turn):
     """The map frame is turned and shifted relative to the walk's by any amount."""
     R, shift = about_z(turn).as_matrix(), np.array([5e3, -2e4, 30.0])
     fixes = [
@@ -189,7 +175,7 @@ def test_two_positions_determine_the_position_and_direction_of_a_track(
     assert np.linalg.norm(np.diff(track.trajectory.position_W, axis=0), axis=1).max() < 0.4
 
 
-def test_the_covariance_in_the_map_frame_is_consistent(make_walk: Make, make_oracle: Make) -> None:
+def test_the_covariance_in_the_map_frame_is_consistent(make_walk, make_oracle):
     position, yaw = [], []
     for seed in range(12):
         walk = make_walk(seed, 30.0, 50.0, ERRORS)
@@ -215,9 +201,7 @@ def test_the_covariance_in_the_map_frame_is_consistent(make_walk: Make, make_ora
 
 
 @pytest.mark.parametrize("kind", ["yaw", "velocity"])
-def test_a_heading_or_a_velocity_determines_the_yaw_too(
-    walk: ImuSequence, model: Any, kind: str
-) -> None:
+def test_a_heading_or_a_velocity_determines_the_yaw_too(walk, model, kind):
     turn = about_z(2.0)
     fixes = []
     for t in (8.0, 20.0):
@@ -234,9 +218,7 @@ def test_a_heading_or_a_velocity_determines_the_yaw_too(
     assert np.linalg.norm(off, axis=1).max() < 1.0
 
 
-def test_a_track_with_a_known_start_is_corrected_without_a_frame_change(
-    walk: ImuSequence, model: Any
-) -> None:
+def test_a_track_with_a_known_start_is_corrected_without_a_frame_change(walk, model):
     first = walk.truth.at(walk.time[:1])
     prior = PriorPose(first.attitude_WB[0].as_matrix(), first.velocity_W[0], first.position_W[0])
     p = truth_at(walk, 25.0)[0]
@@ -252,18 +234,14 @@ def test_a_track_with_a_known_start_is_corrected_without_a_frame_change(
         assert np.linalg.norm(error) < 0.5 + 0.8 * off
 
 
-def test_positions_too_close_together_do_not_turn_the_map_frame(
-    walk: ImuSequence, model: Any
-) -> None:
+def test_positions_too_close_together_do_not_turn_the_map_frame(walk, model):
     fixes = [position_fix(t, truth_at(walk, t)[0], 9.0 * EYE) for t in (5.0, 6.0, 7.0)]
     track = Navigator(model, CONFIG, backend="ekf").run(walk, fixes=fixes)
     assert track.health.fixes == {"applied": 1, "yaw not known": 2}
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_one_position_leaves_the_direction_in_the_map_unknown(
-    walk: ImuSequence, model: Any, backend: Any
-) -> None:
+def test_one_position_leaves_the_direction_in_the_map_unknown(walk, model, backend):
     """However the walk lies in the map, the error is within the sigma; the pivot is sure."""
     fix = position_fix(5.0, truth_at(walk, 5.0)[0], 0.01 * EYE)
     track = Navigator(model, CONFIG, backend=backend).run(walk, fixes=[fix])
@@ -280,9 +258,7 @@ def test_one_position_leaves_the_direction_in_the_map_unknown(
     assert streamed.health.final_sigma["yaw_rad"] > 1.5
 
 
-def test_states_of_a_stream_carry_the_number_of_their_map_frame(
-    walk: ImuSequence, model: Any
-) -> None:
+def test_states_of_a_stream_carry_the_number_of_their_map_frame(walk, model):
     navigator, map_frames = Navigator(model, CONFIG), []
     for fix in fixes_of(walk):
         apply_fix(navigator, fix)
@@ -313,9 +289,7 @@ def test_states_of_a_stream_carry_the_number_of_their_map_frame(
         ([1e20, 0, 0], EYE, "value too large"),
     ],
 )
-def test_invalid_fixes_are_refused_and_counted(
-    walk: ImuSequence, model: Any, value: list[float], covariance: np.ndarray, reason: str
-) -> None:
+def test_invalid_fixes_are_refused_and_counted(walk, model, value, covariance, reason):
     bad = position_fix(5.0, value, covariance)
     assert Navigator(model, CONFIG, backend="ekf").run(walk, fixes=[bad]).health.fixes == {
         reason: 1
@@ -328,14 +302,12 @@ def test_invalid_fixes_are_refused_and_counted(
 
 
 @pytest.mark.parametrize("degrees", [90.0, -90.0])
-def test_a_yaw_in_degrees_is_refused_in_either_direction(degrees: float) -> None:
+def test_a_yaw_in_degrees_is_refused_in_either_direction(degrees):
     assert yaw_fix(1.0, degrees, 0.1).fault() == "yaw not in radians"
     assert yaw_fix(1.0, np.radians(degrees), 0.1).fault() == ""
 
 
-def test_fixes_with_a_time_or_value_that_is_not_finite_are_refused(
-    walk: ImuSequence, model: Any
-) -> None:
+def test_fixes_with_a_time_or_value_that_is_not_finite_are_refused(walk, model):
     navigator = Navigator(model, CONFIG)
     streamed(navigator, walk.slice(0.0, 3.0), [], 0.0)
     for time in (np.nan, np.inf):
@@ -355,9 +327,7 @@ def test_fixes_with_a_time_or_value_that_is_not_finite_are_refused(
         (-np.inf, "value that is not finite"),
     ],
 )
-def test_a_heading_with_an_invalid_sigma_is_refused_and_counted(
-    walk: ImuSequence, model: Any, sigma: float, reason: str
-) -> None:
+def test_a_heading_with_an_invalid_sigma_is_refused_and_counted(walk, model, sigma, reason):
     bad = yaw_fix(5.0, 0.0, sigma)
     assert Navigator(model, CONFIG, backend="ekf").run(walk, fixes=[bad]).health.fixes == {
         reason: 1
@@ -368,17 +338,17 @@ def test_a_heading_with_an_invalid_sigma_is_refused_and_counted(
     assert navigator.health.fixes == {reason: 1}
 
 
-def test_a_wrong_shape_raises_an_error_that_names_the_argument(model: Any) -> None:
+def test_a_wrong_shape_raises_an_error_that_names_the_argument(model):
     navigator = Navigator(model, CONFIG)
     with pytest.raises(InputError, match="position"):
         navigator.update_position(0.0, [1.0, 2.0], EYE)
     with pytest.raises(InputError, match="covariance"):
         navigator.update_velocity(0.0, np.zeros(3), np.ones(3))
     with pytest.raises(InputError, match="yaw"):
-        navigator.update_yaw(0.0, "north", 0.1)  # type: ignore[arg-type]
+        navigator.update_yaw(0.0, "north", 0.1)
 
 
-def test_the_covariance_of_an_exact_fix_has_a_floor(walk: ImuSequence, model: Any) -> None:
+def test_the_covariance_of_an_exact_fix_has_a_floor(walk, model):
     p = truth_at(walk, 10.0)[0]
     track = Navigator(model, CONFIG, backend="ekf").run(
         walk, fixes=[position_fix(10.0, p, 1e-30 * EYE)]
@@ -388,19 +358,19 @@ def test_the_covariance_of_an_exact_fix_has_a_floor(walk: ImuSequence, model: An
     assert np.linalg.eigvalsh(track.covariance).min() > -1e-9
 
 
-def test_beyond_the_most_that_wait_those_furthest_ahead_are_refused() -> None:
+def test_beyond_the_most_that_wait_those_furthest_ahead_are_refused():
     eye = np.eye(3)
     queue = FixQueue((position_fix(time, np.zeros(3), eye) for time in (3.0, 1.0, 2.0)), most=2)
     assert [fix.time for fix in queue.waiting] == [1.0, 2.0]
     assert queue.refused == {"too many waiting": 1}
 
 
-def test_variances_instead_of_a_covariance_are_refused_with_the_matrix_to_pass() -> None:
+def test_variances_instead_of_a_covariance_are_refused_with_the_matrix_to_pass():
     with pytest.raises(InputError, match=r"np\.diag"):
         position_fix(0.0, [1.0, 2.0, 3.0], [0.1, 0.1, 0.2])
 
 
-def test_a_position_in_degrees_is_refused_with_what_to_do(still_model: Any) -> None:
+def test_a_position_in_degrees_is_refused_with_what_to_do(still_model):
     navigator = Navigator(still_model)
     with pytest.raises(InputError, match=r"latitude, longitude and height.*metres east"):
         navigator.update_position(0.0, [48.1, 11.5, 500.0], EYE)

@@ -19,7 +19,7 @@ def found(*legs: tuple[float, float, float]) -> tuple[list[FloorChange], float]:
 
 
 @pytest.mark.parametrize("spacing", [2.7, 3.2, 4.0])
-def test_stairs_and_a_lift_between_floors_of_any_distance(spacing: float) -> None:
+def test_stairs_and_a_lift_between_floors_of_any_distance(spacing):
     changes, distance = found(
         (30, 0, 1.2), (12, spacing, 0.5), (20, 0, 1.2), (15, -3 * spacing, 0.0), (20, 0, 1.0)
     )
@@ -31,16 +31,16 @@ def test_stairs_and_a_lift_between_floors_of_any_distance(spacing: float) -> Non
     assert str(changes[1]).startswith("floor 1 to -2 by lift, 6")
 
 
-def test_landings_are_no_floors() -> None:
+def test_landings_are_no_floors():
     for rest in (3.0, 11.0):  # at once, and after a look out of the window
         changes, _ = found((30, 0, 1.2), (6, 1.5, 0.5), (rest, 0, 0.2), (6, 1.5, 0.5), (30, 0, 1.2))
         assert [(c.before, c.after) for c in changes] == [(0, 1)]
 
 
-def test_a_level_walk_a_ramp_and_a_doorstep_are_one_floor() -> None:
+def test_a_level_walk_a_ramp_and_a_doorstep_are_one_floor():
     for legs in ([(300, 0.0, 1.2)], [(60, 2.0, 1.2)], [(30, 0, 1.2), (3, 0.6, 1.0), (30, 0, 1.2)]):
         assert found(*legs) == ([], 0.0)
 
 
-def test_too_short_a_track_has_no_floors() -> None:
+def test_too_short_a_track_has_no_floors():
     assert found((2.0, 0.0, 1.0)) == ([], 0.0)

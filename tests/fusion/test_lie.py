@@ -29,7 +29,7 @@ def se23_hat(xi: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_extended_pose_exp_is_the_matrix_exponential(angle: float) -> None:
+def test_extended_pose_exp_is_the_matrix_exponential(angle):
     rng = np.random.default_rng(1)
     for theta in rotation_vectors(angle):
         xi = np.concatenate([theta, rng.normal(size=6)])
@@ -40,7 +40,7 @@ def test_extended_pose_exp_is_the_matrix_exponential(angle: float) -> None:
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_exp_times_is_the_product_with_the_exponential(angle: float) -> None:
+def test_exp_times_is_the_product_with_the_exponential(angle):
     rng = np.random.default_rng(2)
     theta = rotation_vectors(angle)
     rho, X = rng.normal(size=(5, 3, 2)), rng.normal(size=(5, 3, 5))
@@ -50,7 +50,7 @@ def test_exp_times_is_the_product_with_the_exponential(angle: float) -> None:
     np.testing.assert_allclose(lie.exp_times(theta, rho, X), expected, atol=1e-10)
 
 
-def test_yaw_twist_agrees_with_yaw_of_and_is_undefined_upside_down() -> None:
+def test_yaw_twist_agrees_with_yaw_of_and_is_undefined_upside_down():
     attitude = Rotation.random(50, rng=np.random.default_rng(0))
     ours = np.array([lie.yaw_twist(R) for R in attitude.as_matrix()])
     known = np.isfinite(ours)

@@ -2,17 +2,13 @@
 
 import gc
 import tracemalloc
-from collections.abc import Callable
 from itertools import pairwise
-from typing import Any
 
 import pytest
 
 from stario.fusion import Navigator
-from stario.fusion.backends import BackendName
 from stario.sequences.sequence import ImuSequence
 
-Make = Callable[..., Any]
 BYTES_PER_NUMBER = 16
 RATE = 50.0
 
@@ -36,7 +32,7 @@ def memory_growth(navigator: Navigator, walk: ImuSequence, warm_up: float, secon
         tracemalloc.stop()
 
 
-def test_the_memory_of_a_stream_does_not_grow(make_walk: Make, still_model: Any) -> None:
+def test_the_memory_of_a_stream_does_not_grow(make_walk, still_model):
     growth = memory_growth(Navigator(still_model), make_walk(1, 30.0, RATE), 20.0, 30.0)
     # One number per sample.
     assert growth < BYTES_PER_NUMBER * RATE * 30.0
@@ -44,9 +40,7 @@ def test_the_memory_of_a_stream_does_not_grow(make_walk: Make, still_model: Any)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_the_memory_of_an_hours_stream_does_not_grow(
-    make_walk: Make, still_model: Any, backend: BackendName
-) -> None:
+def test_the_memory_of_an_hours_stream_does_not_grow(make_walk, still_model, backend):
     navigator = Navigator(still_model, backend=backend)
     growth = memory_growth(navigator, make_walk(1, 30.0, RATE), 120.0, 3600.0)
     # Half of one number per network update.

@@ -1,10 +1,8 @@
 """Wrong arguments are refused at once, by name."""
 
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,9 +25,7 @@ from stario.network import load_model
 from stario.sequences import StarioError, read_recording
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
-from stario.sequences.sequence import ImuSequence
 
-Make = Callable[..., Any]
 LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
 
 
@@ -72,45 +68,39 @@ LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
         (lambda model: PriorPose(LEVEL[0], [0.0, 0.0], LEVEL[2]), "v_W"),
     ],
 )
-def test_a_wrong_argument_is_named(still_model: Any, make: Any, named: str) -> None:
+def test_a_wrong_argument_is_named(still_model, make, named):
     with pytest.raises(StarioError, match=named):
         make(still_model)
 
 
-def test_a_fix_of_the_wrong_type_is_refused_with_a_remedy(
-    walk: ImuSequence, still_model: Any
-) -> None:
+def test_a_fix_of_the_wrong_type_is_refused_with_a_remedy(walk, still_model):
     for wrong in ([(1.0, "position")], ["fix"]):
         for run in (Navigator(still_model).run, partial(compare, still_model)):
             with pytest.raises(InputError, match="position_fix"):
                 run(walk, fixes=wrong)
 
 
-def test_a_single_fix_in_place_of_a_list_is_named(walk: ImuSequence, still_model: Any) -> None:
+def test_a_single_fix_in_place_of_a_list_is_named(walk, still_model):
     fix = position_fix(1.0, np.zeros(3), np.eye(3))
     for run in (Navigator(still_model).run, partial(compare, still_model)):
         with pytest.raises(InputError, match="fixes"):
             run(walk, fixes=fix)
 
 
-def test_numpy_numbers_are_accepted() -> None:
+def test_numpy_numbers_are_accepted():
     config = FilterConfig(update_rate=np.float64(10.0), adaptive=np.True_)
     assert config.update_rate == 10
     assert isinstance(config.update_rate, int)
     assert PriorPose(*LEVEL, yaw_sigma=np.array(0.1)).yaw_sigma == 0.1
 
 
-def test_a_recording_preprocessed_for_another_update_rate_is_refused(
-    walk: ImuSequence, still_model: Any
-) -> None:
+def test_a_recording_preprocessed_for_another_update_rate_is_refused(walk, still_model):
     fast = Navigator(still_model, NavigatorConfig(filter=FilterConfig(update_rate=10)))
     with pytest.raises(InputError, match="update_rate"):
         Navigator(still_model).track(fast.observe(walk))
 
 
-def test_a_recording_may_have_more_fixes_than_may_wait_in_a_stream(
-    walk: ImuSequence, still_model: Any
-) -> None:
+def test_a_recording_may_have_more_fixes_than_may_wait_in_a_stream(walk, still_model):
     times = [*np.linspace(1.0, walk.duration - 0.01, 50), *np.linspace(1e3, 2e3, 10_001)]
     fixes = [position_fix(t, np.zeros(3), 1e4 * np.eye(3)) for t in times]
     counts = Navigator(still_model, backend="ekf").run(walk, fixes=fixes).health.fixes
@@ -118,7 +108,7 @@ def test_a_recording_may_have_more_fixes_than_may_wait_in_a_stream(
     assert "too many waiting" not in counts
 
 
-def test_fixes_of_a_clock_that_is_ahead_do_not_block_correct_ones(still_model: Any) -> None:
+def test_fixes_of_a_clock_that_is_ahead_do_not_block_correct_ones(still_model):
     navigator = Navigator(still_model)
     for k in range(10_001):
         navigator.update_position(1e6 + k, np.zeros(3), np.eye(3))
@@ -126,7 +116,7 @@ def test_fixes_of_a_clock_that_is_ahead_do_not_block_correct_ones(still_model: A
     assert navigator.health.fixes == {"too many waiting": 2, "waiting": 10_000}
 
 
-def test_the_graph_accepts_biases_without_random_walk(make_walk: Make, make_oracle: Make) -> None:
+def test_the_graph_accepts_biases_without_random_walk(make_walk, make_oracle):
     walk = make_walk(3, 15.0)
     oracle = make_oracle(walk, walk.truth, GRAPH, noise=0.03, sigma=0.03)
     steady = replace(GRAPH, noise=ImuNoise(2e-3, 0.1, 0.0, 0.0))
@@ -134,9 +124,7 @@ def test_the_graph_accepts_biases_without_random_walk(make_walk: Make, make_orac
     assert not any("fell back" in note for note in track.health.notes)
 
 
-def test_a_snapshot_with_any_byte_changed_is_refused_or_restored(
-    walk: ImuSequence, still_model: Any
-) -> None:
+def test_a_snapshot_with_any_byte_changed_is_refused_or_restored(walk, still_model):
     navigator = Navigator(still_model)
     for row in zip(walk.time[:150], walk.gyro[:150], walk.accel[:150], strict=True):
         navigator.push(*row)
@@ -150,7 +138,7 @@ def test_a_snapshot_with_any_byte_changed_is_refused_or_restored(
 
 
 @pytest.mark.parametrize("rate", [20.0, 2000.0])
-def test_a_stream_that_is_too_slow_or_too_fast_is_refused(still_model: Any, rate: float) -> None:
+def test_a_stream_that_is_too_slow_or_too_fast_is_refused(still_model, rate):
     navigator, refused_at = Navigator(still_model), None
     for k in range(round(1.2 * rate)):
         with suppress(InputError):
@@ -165,20 +153,18 @@ def test_a_stream_that_is_too_slow_or_too_fast_is_refused(still_model: Any, rate
     assert navigator.state is not None
 
 
-def test_misplaced_arguments_are_named(still_model: Any, make_walk: Make) -> None:
+def test_misplaced_arguments_are_named(still_model, make_walk):
     walk = make_walk(1, 3.0)
     with pytest.raises(InputError, match=r"progress.*fixes="):
-        Navigator(still_model, backend="ekf").run(walk, [yaw_fix(1.0, 0.0, 0.1)])  # type: ignore[arg-type]
+        Navigator(still_model, backend="ekf").run(walk, [yaw_fix(1.0, 0.0, 0.1)])
     for wrong in (None, 3):
         with pytest.raises(InputError, match="path"):
-            read_recording(wrong)  # type: ignore[arg-type]
+            read_recording(wrong)
         with pytest.raises(InputError, match="name_or_path"):
-            load_model(wrong)  # type: ignore[arg-type]
+            load_model(wrong)
 
 
-def test_a_prior_attitude_that_gravity_contradicts_is_refused(
-    walk: ImuSequence, still_model: Any
-) -> None:
+def test_a_prior_attitude_that_gravity_contradicts_is_refused(walk, still_model):
     """As the transposed attitude of a phone that is held upright."""
     on_its_side = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     first = walk.truth.at(walk.time[:1]).attitude_WB[0].as_matrix()

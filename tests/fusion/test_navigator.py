@@ -1,36 +1,27 @@
 """The navigator on simulated walks, with a predictor that returns the ground truth."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support import CONFIG, ate, stream, stream_deviation, swivelled
+from support import CONFIG, GRAPH, ate, stream, stream_deviation, swivelled
 
 from stario.fusion import Navigator, NavState, PriorPose, Track
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.tracks import inertial_track
 from stario.sequences.accuracy.metrics import align, pose_errors
-from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import InputError
-from stario.sequences.noise import ImuNoise
 from stario.sequences.readers.tum import read_tum, write_tum
-from stario.sequences.sequence import ImuSequence
-from stario.sequences.simulation.imu import ImuErrors
-
-Make = Callable[..., Any]
 
 
 @pytest.fixture(scope="module")
-def track(walk: ImuSequence, make_oracle: Make) -> Track:
+def track(walk, make_oracle):
     return Navigator(make_oracle(walk, walk.truth, CONFIG), backend="ekf").run(walk)
 
 
-def test_results_print_without_their_arrays(track: Track, walk: ImuSequence, still_model) -> None:
+def test_results_print_without_their_arrays(track, walk, still_model):
     nis = f"mean NIS {track.nis:.2f}"
     assert repr(track) == f"Track(Trajectory(201 rows, 0.00 to 20.00 s at 10.0 Hz), {nis})"
     assert str(track.health).splitlines() == track.health.lines()
@@ -42,9 +33,7 @@ def test_results_print_without_their_arrays(track: Track, walk: ImuSequence, sti
         assert len(repr(pose)) < 80
 
 
-def test_the_states_of_a_stream_become_a_track_that_can_be_written(
-    walk: ImuSequence, still_model: Any, tmp_path: Path
-) -> None:
+def test_the_states_of_a_stream_become_a_track_that_can_be_written(walk, still_model, tmp_path):
     states = stream(Navigator(still_model), walk.slice(0.0, 4.0))
     written = Track.from_states(states).trajectory
     write_tum(tmp_path / "walk.tum", written)
@@ -67,9 +56,7 @@ def test_the_states_of_a_stream_become_a_track_that_can_be_written(
 
 
 @pytest.mark.parametrize("carry", ["handheld", "pocket"])
-def test_the_error_stays_far_below_that_of_dead_reckoning(
-    make_walk: Make, make_oracle: Make, carry: str
-) -> None:
+def test_the_error_stays_far_below_that_of_dead_reckoning(make_walk, make_oracle, carry):
     walk = make_walk(3, 30.0, carry=carry)
     navigator = Navigator(make_oracle(walk, walk.truth, CONFIG), CONFIG)
     preprocessed = navigator.observe(walk)
@@ -79,9 +66,7 @@ def test_the_error_stays_far_below_that_of_dead_reckoning(
     assert ate(track, walk) < 0.03 * alone
 
 
-def test_only_the_state_at_the_end_of_a_gap_is_invalid(
-    walk: ImuSequence, without: Make, still_model: Any
-) -> None:
+def test_only_the_state_at_the_end_of_a_gap_is_invalid(walk, without, still_model):
     """Where the device moved meanwhile is unknown until measurements follow."""
     gappy = without(walk, (walk.time > 8.0) & (walk.time < 9.5))
     for backend in ("ekf", "graph"):
@@ -89,7 +74,7 @@ def test_only_the_state_at_the_end_of_a_gap_is_invalid(
         assert track.time[~track.trajectory.valid] == pytest.approx([9.5], abs=0.01)
 
 
-def test_the_blocks_of_the_covariance_have_names() -> None:
+def test_the_blocks_of_the_covariance_have_names():
     covariance, zero = np.arange(225.0).reshape(15, 15), np.zeros(3)
     state = NavState(0.0, np.eye(3), zero, zero, zero, zero, covariance)
     names = ("attitude", "velocity", "position", "gyro_bias", "accel_bias")
@@ -100,7 +85,7 @@ def test_the_blocks_of_the_covariance_have_names() -> None:
         )
 
 
-def test_attitude_and_speed_are_estimated_too(walk: ImuSequence, track: Track) -> None:
+def test_attitude_and_speed_are_estimated_too(walk, track):
     aligned = align(track.trajectory, walk.truth, "first")
     errors = pose_errors(aligned, walk.truth)
     late = errors.estimate.time > 5.0
@@ -111,9 +96,7 @@ def test_attitude_and_speed_are_estimated_too(walk: ImuSequence, track: Track) -
 
 
 @pytest.mark.parametrize("rate", [50.0, 200.0, 500.0, 1000.0])
-def test_the_track_is_accurate_at_any_imu_rate(
-    make_walk: Make, make_oracle: Make, rate: float
-) -> None:
+def test_the_track_is_accurate_at_any_imu_rate(make_walk, make_oracle, rate):
     walk = make_walk(4, 12.0, rate)
     assert (
         ate(Navigator(make_oracle(walk, walk.truth, CONFIG), backend="ekf").run(walk), walk) < 0.2
@@ -121,16 +104,14 @@ def test_the_track_is_accurate_at_any_imu_rate(
 
 
 @pytest.mark.parametrize("update_rate", [1, 5, 20])
-def test_the_track_is_accurate_at_every_update_rate(
-    walk: ImuSequence, make_oracle: Make, update_rate: int
-) -> None:
+def test_the_track_is_accurate_at_every_update_rate(walk, make_oracle, update_rate):
     config = NavigatorConfig(filter=FilterConfig(update_rate=update_rate))
     track = Navigator(make_oracle(walk, walk.truth, config), config, backend="ekf").run(walk)
     assert ate(track, walk) < 0.3
     np.testing.assert_allclose(np.diff(track.time), 1.0 / config.filter.output_rate, atol=1e-9)
 
 
-def test_a_track_starts_at_the_prior_pose(walk: ImuSequence, make_oracle: Make) -> None:
+def test_a_track_starts_at_the_prior_pose(walk, make_oracle):
     """The prior sets yaw, position and velocity, none of which gravity determines."""
     truth = walk.truth
     shift = np.array([100.0, -50.0, 3.0])
@@ -145,43 +126,10 @@ def test_a_track_starts_at_the_prior_pose(walk: ImuSequence, make_oracle: Make) 
     assert stream_deviation(stream(navigator, walk), track.filtered) < 1e-9
 
 
-def test_position_nees_is_consistent_if_the_noise_model_is(
-    make_walk: Make, make_oracle: Make
-) -> None:
-    """IMU and oracle have white errors of the stated size; windows do not overlap."""
-    noise = ImuNoise(gyro_noise=1e-3, accel_noise=0.02, gyro_walk=3e-5, accel_walk=1e-3)
-    errors = ImuErrors(noise=noise, gyro_turn_on=3e-3, accel_turn_on=0.05)
-    config = NavigatorConfig(noise=noise, filter=FilterConfig(update_rate=1))
-    means, nis = [], []
-    for seed in range(8):
-        walk = make_walk(seed, 20.0, 100.0, errors)
-        oracle = make_oracle(walk, walk.truth, config, noise=0.05, sigma=0.05, seed=seed)
-        track = Navigator(oracle, config, backend="ekf").run(walk)
-        means.append(position_nees(track.trajectory, walk.truth).mean)
-        nis.append(track.nis)
-    assert 1.0 < np.mean(means) < 9.0  # expected 3, and strongly correlated over a track
-    assert 1.0 < np.mean(nis) < 6.0
-
-
 # --- one estimator for stream and batch ---------------------------------------------------------
 
 
-def test_stream_equals_batch(walk: ImuSequence, make_oracle: Make) -> None:
-    oracle = make_oracle(walk, walk.truth, CONFIG)
-    track = Navigator(oracle, CONFIG, backend="ekf").run(walk)
-    navigator = Navigator(oracle, CONFIG)
-    states = stream(navigator, walk)
-    assert len(states) > 18 * CONFIG.filter.output_rate
-    assert stream_deviation(states, track) < 1e-9
-    assert navigator.health.samples == track.health.samples
-    assert navigator.health.updates == track.health.updates
-    assert navigator.health.mean_nis == pytest.approx(track.health.mean_nis)
-    np.testing.assert_allclose(navigator.state.covariance, track.covariance[-1], rtol=1e-9)
-
-
-def test_stream_equals_batch_through_gaps_and_bad_samples(
-    walk: ImuSequence, make_oracle: Make, without: Make
-) -> None:
+def test_stream_equals_batch_through_gaps_and_bad_samples(walk, make_oracle, without):
     rng = np.random.default_rng(0)
     gone = (rng.random(len(walk)) < 0.1) | ((walk.time > 7.0) & (walk.time < 8.3))
     holed = without(walk, gone)
@@ -189,10 +137,13 @@ def test_stream_equals_batch_through_gaps_and_bad_samples(
     oracle = make_oracle(holed, walk.truth, CONFIG)
     track, navigator = Navigator(oracle, backend="ekf").run(holed), Navigator(oracle)
     assert stream_deviation(stream(navigator, holed), track) < 1e-9
-    assert navigator.health.gaps == track.health.gaps
+    ours, theirs = navigator.health, track.health
+    assert (ours.gaps, ours.samples, ours.updates) == (theirs.gaps, theirs.samples, theirs.updates)
+    assert ours.mean_nis == pytest.approx(theirs.mean_nis)
+    np.testing.assert_allclose(navigator.state.covariance, track.covariance[-1], rtol=1e-9)
 
 
-def test_stream_equals_batch_with_the_default_network(walk: ImuSequence) -> None:
+def test_stream_equals_batch_with_the_default_network(walk):
     from stario.network import load_model
 
     model = load_model("default")
@@ -200,9 +151,7 @@ def test_stream_equals_batch_with_the_default_network(walk: ImuSequence) -> None
     assert stream_deviation(stream(Navigator(model), walk), track) < 1e-3
 
 
-def test_run_does_not_disturb_a_stream_in_progress(
-    walk: ImuSequence, make_oracle: Make, track: Track
-) -> None:
+def test_run_does_not_disturb_a_stream_in_progress(walk, make_oracle, track):
     navigator = Navigator(make_oracle(walk, walk.truth, CONFIG))
     half = len(walk) // 2
     rows = list(zip(walk.time, walk.gyro, walk.accel, strict=True))
@@ -214,17 +163,15 @@ def test_run_does_not_disturb_a_stream_in_progress(
     np.testing.assert_array_equal(filtered.position_W, track.trajectory.position_W)
 
 
-def test_ground_truth_is_never_used(walk: ImuSequence, make_oracle: Make, track: Track) -> None:
-    blind = Navigator(make_oracle(walk, walk.truth, CONFIG), backend="ekf").run(
-        walk.without_truth()
-    )
-    for name, values in track.arrays().items():
-        np.testing.assert_array_equal(blind.arrays()[name], values, err_msg=name)
+@pytest.mark.parametrize("backend", ["ekf", "graph"])
+def test_ground_truth_is_never_used(walk, make_oracle, backend):
+    navigator = Navigator(make_oracle(walk, walk.truth, GRAPH), GRAPH, backend=backend)
+    known, blind = (navigator.run(each).arrays() for each in (walk, walk.without_truth()))
+    for name, values in known.items():
+        np.testing.assert_array_equal(blind[name], values, err_msg=name)
 
 
-def test_times_since_1970_give_the_same_track(
-    walk: ImuSequence, make_oracle: Make, track: Track
-) -> None:
+def test_times_since_1970_give_the_same_track(walk, make_oracle, track):
     late = replace(walk, time=walk.time + 1.7e9)
     truth = replace(walk.truth, time=walk.truth.time + 1.7e9)
     ours = Navigator(make_oracle(late, truth, CONFIG), backend="ekf").run(late.without_truth())
@@ -234,11 +181,18 @@ def test_times_since_1970_give_the_same_track(
 # --- symmetries ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mount", [(0.0, 0.0, 2.0), (3.1, 0.0, 0.0), (1.5, 1.0, -0.5)])
+@pytest.mark.parametrize(
+    ("backend", "mount", "atol"),
+    [
+        ("ekf", (0.0, 0.0, 2.0), 1e-6),
+        ("ekf", (3.1, 0.0, 0.0), 1e-6),
+        ("graph", (1.5, 1.0, -0.5), 1e-4),
+    ],
+)
 def test_another_mount_only_turns_the_track_about_the_vertical(
-    walk: ImuSequence, make_oracle: Make, mount: tuple[float, ...]
-) -> None:
-    R_BM = Rotation.from_rotvec(mount)
+    walk, make_oracle, backend, mount, atol
+):
+    R_BM, config = Rotation.from_rotvec(mount), CONFIG if backend == "ekf" else GRAPH
     turned = replace(
         walk,
         gyro=R_BM.apply(walk.gyro, inverse=True),
@@ -246,18 +200,16 @@ def test_another_mount_only_turns_the_track_about_the_vertical(
         truth=replace(walk.truth, attitude_WB=walk.truth.attitude_WB * R_BM),
     )
     ours, theirs = (
-        Navigator(make_oracle(s, s.truth, CONFIG), CONFIG, backend="ekf").run(s).trajectory
+        Navigator(make_oracle(s, s.truth, config), config, backend=backend).run(s).trajectory
         for s in (turned, walk)
     )
     turn = ours.attitude_WB * (theirs.attitude_WB * R_BM).inv()
-    assert np.ptp(np.unwrap(yaw_of(turn))) < 1e-6
+    assert np.ptp(np.unwrap(yaw_of(turn))) < atol
     back = about_z(float(yaw_of(turn)[0])).apply(ours.position_W, inverse=True)
-    assert np.abs(back - theirs.position_W).max() < 1e-5
+    assert np.abs(back - theirs.position_W).max() < 10.0 * atol
 
 
-def test_the_first_tilt_is_less_certain_the_faster_the_device_turns(
-    make_walk: Make, still_model: Any
-) -> None:
+def test_the_first_tilt_is_less_certain_the_faster_the_device_turns(make_walk, still_model):
     walk = make_walk(3, 3.0)
     slow, fast = (
         np.sqrt(Navigator(still_model, backend="ekf").run(each).covariance[0, 0, 0])

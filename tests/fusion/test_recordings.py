@@ -1,7 +1,5 @@
 """The navigator on real recordings, where they are available."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from recorded import DATA
@@ -10,7 +8,7 @@ from support import stream
 from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import compare, measure
-from stario.network import DisplacementModel, load_model
+from stario.network import load_model
 from stario.sequences import ImuSequence, read_recording
 
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
@@ -21,7 +19,7 @@ EUROC = "euroc/V1_02_medium"
 
 
 @pytest.fixture(scope="module")
-def model() -> DisplacementModel:
+def model():
     return load_model("default")
 
 
@@ -37,9 +35,7 @@ def stretch(name: str, seconds: float) -> ImuSequence:
 # Measured 0.24, 0.82 and 20 m in 20 s. A network trained on walks does not suit a flying platform,
 # but the IMU alone is 300 m off there.
 @pytest.mark.parametrize(("name", "worst_m"), [(OXIOD, 0.5), (TUMVI, 1.5), (EUROC, 40.0)])
-def test_recordings_of_every_format_run_with_a_bounded_error(
-    model: DisplacementModel, name: str, worst_m: float
-) -> None:
+def test_recordings_of_every_format_run_with_a_bounded_error(model, name, worst_m):
     recording = stretch(name, 20.0)
     result = compare(model, recording, NavigatorConfig())
     track = result.tracks["track"]
@@ -54,7 +50,7 @@ def test_recordings_of_every_format_run_with_a_bounded_error(
     assert result.metrics["track"]["ate_m"] < worst_m
 
 
-def test_stream_equals_batch_within_a_millimetre(model: DisplacementModel) -> None:
+def test_stream_equals_batch_within_a_millimetre(model):
     recording = stretch(TUMVI, 40.0)
     track, navigator = Navigator(model, backend="ekf").run(recording), Navigator(model)
     states = stream(navigator, recording)
@@ -65,9 +61,7 @@ def test_stream_equals_batch_within_a_millimetre(model: DisplacementModel) -> No
     assert navigator.health.gated == track.health.gated
 
 
-def test_a_phone_in_a_runners_hand_is_tracked_although_both_sensors_saturate(
-    model: DisplacementModel,
-) -> None:
+def test_a_phone_in_a_runners_hand_is_tracked_although_both_sensors_saturate(model):
     archive = DATA / "archives/tyrex.h5"
     if not archive.exists():
         pytest.skip(f"no {archive}")

@@ -1,8 +1,5 @@
 """A receiver's positions as fixes: what they tell, and what their errors do to a track."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +15,6 @@ from stario.sequences.geodesy import Georeference
 from stario.sequences.readers.satellites import RADIUS_PER_SIGMA
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Satellites
 
-Make = Callable[..., Any]
 TIME = np.arange(0.0, 60.0)
 PLACE = Georeference(48.1, 11.5)
 USED = replace(support.GRAPH, place=PlaceConfig(satellites="use"))
@@ -39,16 +35,15 @@ def information(found: Any, axis: int = 0) -> float:
     return float(sum(1.0 / fix.covariance[axis, axis] for fix in positions))
 
 
-def test_positions_are_metres_east_and_north_of_the_first() -> None:
+def test_positions_are_metres_east_and_north_of_the_first():
     found = satellite_fixes(reported(straight(), altitude_m=np.full(60, 520.0)))
-    assert found is not None
     xy = np.array([fix.value[:2] for fix in found.fixes])
     np.testing.assert_allclose(xy, straight(), atol=1e-3)
     np.testing.assert_allclose(found.origin.latlon_deg(np.zeros((1, 2))), [[48.1, 11.5]])
     assert found.origin.altitude_m == 520.0
 
 
-def test_a_minute_of_positions_tells_as_much_at_any_rate() -> None:
+def test_a_minute_of_positions_tells_as_much_at_any_rate():
     """They share their error: ten a second are not ten times as much."""
     radius = 6.0
     once = satellite_fixes(reported(straight(), radius_m=np.full(60, radius)))
@@ -59,29 +54,27 @@ def test_a_minute_of_positions_tells_as_much_at_any_rate() -> None:
     assert information(once) < 3.0 / (radius / RADIUS_PER_SIGMA) ** 2
 
 
-def test_a_position_that_is_held_is_none() -> None:
+def test_a_position_that_is_held_is_none():
     """Indoors phones repeat the last one, with a small radius."""
     xy = straight()
     xy[20:50] = xy[20]
     found = satellite_fixes(reported(xy, radius_m=np.full(60, 4.0)))
-    assert found is not None
     times = {fix.time for fix in found.fixes}
     assert times == {*range(20), *range(50, 60)}
     assert satellite_fixes(reported(np.tile(xy[20], (60, 1)))) is None
 
 
-def test_positions_without_a_radius_count_little_and_those_of_cells_not_at_all() -> None:
+def test_positions_without_a_radius_count_little_and_those_of_cells_not_at_all():
     radius = np.full(60, 4.0)
     radius[10:20], radius[20], radius[40] = 200.0, -1.0, 0.0
     found = satellite_fixes(reported(straight(), radius_m=radius))
-    assert found is not None
     times = [fix.time for fix in found.fixes]
     assert not {*range(10, 21)} & {*times}
     unknown, good = (found.fixes[times.index(t)].covariance[0, 0] for t in (40.0, 41.0))
     assert unknown > 5.0 * good
 
 
-def test_doppler_velocities_turn_with_the_map() -> None:
+def test_doppler_velocities_turn_with_the_map():
     """North-east at 2 m/s; the map's x axis points north."""
     columns = {"speed_m_s": np.full(60, 2.0), "bearing_deg": np.full(60, 45.0)}
     found = satellite_fixes(reported(straight(), **columns), Georeference(48.1, 11.5, np.pi / 2))
@@ -93,7 +86,7 @@ def test_doppler_velocities_turn_with_the_map() -> None:
 
 
 @pytest.mark.parametrize(("speed", "bearing"), [(0.2, 45.0), (2.0, 0.0), (2.0, np.nan)])
-def test_a_velocity_without_a_direction_is_none(speed: float, bearing: float) -> None:
+def test_a_velocity_without_a_direction_is_none(speed, bearing):
     columns = {"speed_m_s": np.full(60, speed), "bearing_deg": np.full(60, bearing)}
     found = satellite_fixes(reported(straight(), **columns))
     assert {fix.kind for fix in found.fixes} == {"position"}
@@ -103,7 +96,7 @@ def test_a_velocity_without_a_direction_is_none(speed: float, bearing: float) ->
 
 
 @pytest.fixture(scope="module")
-def walk(make_walk: Make) -> ImuSequence:
+def walk(make_walk):
     """A walk whose receiver is wrong by the same 4 m, and gives velocities in its second half."""
     walk = make_walk(3, 60.0, 100.0)
     there = walk.truth.at(np.arange(1.0, 59.0))
@@ -118,20 +111,17 @@ def walk(make_walk: Make) -> ImuSequence:
 
 
 @pytest.fixture(scope="module")
-def model(walk: ImuSequence, make_oracle: Make) -> Any:
+def model(walk, make_oracle):
     return make_oracle(walk, walk.truth, USED)
 
 
 def error(track: Track, walk: ImuSequence) -> FloatArray:
     """Horizontal error (N,) [m] in the map, in which the walk's own origin is the place's."""
-    assert track.georeference is not None
     there = PLACE.xy(track.georeference.latlon_deg(track.trajectory.position_W))
     return np.linalg.norm(there - walk.truth.at(track.time).position_W[:, :2], axis=1)
 
 
-def test_a_track_with_satellites_lies_on_the_map_from_its_start(
-    walk: ImuSequence, model: Any
-) -> None:
+def test_a_track_with_satellites_lies_on_the_map_from_its_start(walk, model):
     track = Navigator(model, USED).run(walk)
     assert error(track, walk).max() < 6.0
     sigma = np.sqrt(np.trace(track.trajectory.position_covariance_W[:, :2, :2], axis1=1, axis2=2))
@@ -142,16 +132,14 @@ def test_a_track_with_satellites_lies_on_the_map_from_its_start(
     assert track.health.final_sigma["height_m"] < 5.0
 
 
-def test_satellites_that_are_not_used_change_nothing(walk: ImuSequence, model: Any) -> None:
+def test_satellites_that_are_not_used_change_nothing(walk, model):
     without = Navigator(model, support.GRAPH).run(replace(walk, satellites=None))
     track = Navigator(model, support.GRAPH).run(walk)
     np.testing.assert_array_equal(track.trajectory.position_W, without.trajectory.position_W)
     assert track.georeference is None
 
 
-def test_positions_that_never_tell_a_direction_do_not_bend_the_track(
-    walk: ImuSequence, model: Any
-) -> None:
+def test_positions_that_never_tell_a_direction_do_not_bend_the_track(walk, model):
     """A receiver in a basement, whose position creeps through the house above."""
     creeping = np.column_stack([0.05 * TIME, 0.1 * TIME])[1:58]
     satellites = reported(creeping, TIME[1:58], radius_m=np.full(57, 15.0))
@@ -160,7 +148,7 @@ def test_positions_that_never_tell_a_direction_do_not_bend_the_track(
     assert support.ate(track, walk, "yaw") < 1.02 * support.ate(plain, walk, "yaw") + 0.01
 
 
-def test_waypoints_are_fixes_where_they_are_used(walk: ImuSequence, model: Any) -> None:
+def test_waypoints_are_fixes_where_they_are_used(walk, model):
     there = walk.truth.at(np.array([5.0, 20.0, 40.0, 55.0]))
     xy = there.position_W[:, :2]
     waypoints = PositionTrack(there.time, xy, "waypoints", latlon_deg=PLACE.latlon_deg(xy))
@@ -169,7 +157,7 @@ def test_waypoints_are_fixes_where_they_are_used(walk: ImuSequence, model: Any) 
     assert error(track, walk).max() < 2.0
 
 
-def test_metres_beside_degrees_need_an_origin(walk: ImuSequence, model: Any) -> None:
+def test_metres_beside_degrees_need_an_origin(walk, model):
     fix = [position_fix(10.0, [1.0, 2.0, 0.0], np.eye(3))]
     with pytest.raises(InputError, match="origin"):
         Navigator(model, USED).run(walk, fixes=fix)
@@ -188,6 +176,6 @@ def test_metres_beside_degrees_need_an_origin(walk: ImuSequence, model: Any) -> 
         {"closed": "yes"},
     ],
 )
-def test_an_unknown_use_or_place_is_refused(wrong: dict[str, Any]) -> None:
+def test_an_unknown_use_or_place_is_refused(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         PlaceConfig(**wrong)

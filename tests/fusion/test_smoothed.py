@@ -1,35 +1,16 @@
 """A recording is smoothed as a whole, a stream by a window; both gain on the filter's states."""
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support import WHITE as CONFIG
+from support import WHITE_ERRORS as ERRORS
 from support import stream
 
-from stario.fusion import Navigator, NavigatorConfig, SmoothedPose, Track
-from stario.fusion.config import FilterConfig
+from stario.fusion import Navigator, SmoothedPose
 from stario.fusion.fixes import position_fix
 from stario.sequences.accuracy.metrics import align, pose_errors
-from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence, Trajectory
-from stario.sequences.simulation.imu import ImuErrors
-
-NOISE = ImuNoise(gyro_noise=1e-3, accel_noise=0.02, gyro_walk=3e-5, accel_walk=1e-3)
-ERRORS = ImuErrors(noise=NOISE, gyro_turn_on=3e-3, accel_turn_on=0.05)
-CONFIG = NavigatorConfig(
-    NOISE,
-    FilterConfig(
-        update_rate=1,
-        covariance_scale=1.0,
-        gyro_bias_sigma=3e-3,
-        accel_bias_sigma=0.05,
-        correlated_errors=False,
-    ),
-)
-
-Make = Callable[..., Any]
 
 
 def errors_at(track: Trajectory, walk: ImuSequence) -> np.ndarray:
@@ -37,7 +18,7 @@ def errors_at(track: Trajectory, walk: ImuSequence) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def walks(make_walk: Make, make_oracle: Make) -> list[tuple[ImuSequence, Any]]:
+def walks(make_walk, make_oracle):
     """Walks, each with a model that measures its displacements with white noise."""
     made = [make_walk(seed, 25.0, 100.0, ERRORS) for seed in range(5)]
     noise = {"noise": 0.1, "sigma": 0.1}
@@ -48,16 +29,14 @@ def walks(make_walk: Make, make_oracle: Make) -> list[tuple[ImuSequence, Any]]:
 
 
 @pytest.fixture(scope="module")
-def tracks(walks: list[tuple[ImuSequence, Any]]) -> list[tuple[ImuSequence, Track]]:
+def tracks(walks):
     return [(walk, Navigator(model, CONFIG).run(walk)) for walk, model in walks]
 
 
 # --- recordings ------------------------------------------------------------------------------
 
 
-def test_a_recordings_track_is_more_accurate_than_the_filters_and_consistent(
-    tracks: list[tuple[ImuSequence, Track]],
-) -> None:
+def test_a_recordings_track_is_more_accurate_than_the_filters_and_consistent(tracks):
     filtered, smoothed, nees = [], [], []
     for walk, track in tracks:
         error = errors_at(track.trajectory, walk)[5:]
@@ -71,10 +50,8 @@ def test_a_recordings_track_is_more_accurate_than_the_filters_and_consistent(
     assert 1.2 < np.median(np.concatenate(nees)) < 3.6  # median of chi-square with 3 DoF: 2.4
 
 
-def test_a_recordings_track_moves_by_its_velocity_where_the_filters_steps(
-    tracks: list[tuple[ImuSequence, Track]],
-) -> None:
-    def steps(track: Track) -> np.ndarray:
+def test_a_recordings_track_moves_by_its_velocity_where_the_filters_steps(tracks):
+    def steps(track):
         p, v, t = track.trajectory.position_W, track.trajectory.velocity_W, track.time
         moved = 0.5 * np.diff(t)[:, None] * (v[1:] + v[:-1])
         return np.linalg.norm(np.diff(p, axis=0) - moved, axis=1)
@@ -84,9 +61,7 @@ def test_a_recordings_track_moves_by_its_velocity_where_the_filters_steps(
         assert steps(track.filtered).max() > 0.05
 
 
-def test_a_bias_known_at_the_end_mends_the_beginning(
-    tracks: list[tuple[ImuSequence, Track]],
-) -> None:
+def test_a_bias_known_at_the_end_mends_the_beginning(tracks):
     """The IMU's biases hardly change within half a minute."""
     for _, track in tracks:
         sigma, late = (t.covariance[:, 12, 12] for t in (track, track.filtered))
@@ -94,9 +69,7 @@ def test_a_bias_known_at_the_end_mends_the_beginning(
         assert sigma[0] < 1.5 * late[-1]
 
 
-def test_the_filters_track_stands_beside_and_is_the_streams(
-    walks: list[tuple[ImuSequence, Any]], tracks: list[tuple[ImuSequence, Track]]
-) -> None:
+def test_the_filters_track_stands_beside_and_is_the_streams(walks, tracks):
     (walk, model), (_, track) = walks[0], tracks[0]
     alone = Navigator(model, CONFIG, backend="ekf").run(walk)
     assert alone.filtered is None
@@ -125,9 +98,7 @@ def delayed(navigator: Navigator, walk: ImuSequence) -> list[SmoothedPose]:
     return poses
 
 
-def test_a_streams_smoothed_poses_are_one_window_late_and_better_than_its_states(
-    walks: list[tuple[ImuSequence, Any]], tracks: list[tuple[ImuSequence, Track]]
-) -> None:
+def test_a_streams_smoothed_poses_are_one_window_late_and_better_than_its_states(walks, tracks):
     errors, nees = [], []
     for (walk, model), (_, track) in zip(walks, tracks, strict=True):
         poses = delayed(Navigator(model, CONFIG), walk)
@@ -153,8 +124,8 @@ def test_a_streams_smoothed_poses_are_one_window_late_and_better_than_its_states
 
 
 def test_a_smoothed_pose_of_unknown_direction_is_as_uncertain_as_the_newest_state(
-    make_walk: Make, make_oracle: Make
-) -> None:
+    make_walk, make_oracle
+):
     """One position places the track and leaves its yaw in the map unknown."""
     walk = make_walk(1, 8.0, 100.0, ERRORS)
     fix = position_fix(3.0, walk.truth.at(np.array([3.0])).position_W[0], 1e-3 * np.eye(3))

@@ -1,8 +1,6 @@
 """Recordings and streams in wrong units are refused by name, with what fixes them."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +9,6 @@ from support import CONFIG, stream, stream_deviation
 from stario.fusion import Navigator
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
-from stario.sequences.simulation.walks import CARRYING_MODES
-
-Make = Callable[..., Any]
 
 
 @pytest.mark.parametrize(
@@ -21,24 +16,22 @@ Make = Callable[..., Any]
     [(180 / np.pi, 1.0, r"np\.radians\(gyro\)"), (1.0, 1 / 9.80665, "9.80665 . accel")],
 )
 def test_wrong_units_are_refused_with_what_fixes_them(
-    walk: ImuSequence, still_model: Any, scale_gyro: float, scale_accel: float, remedy: str
-) -> None:
+    walk, still_model, scale_gyro, scale_accel, remedy
+):
     wrong = replace(walk, gyro=scale_gyro * walk.gyro, accel=scale_accel * walk.accel)
     with pytest.raises(InputError, match=remedy) as caught:
         Navigator(still_model).run(wrong.without_truth())
     assert "\n" not in str(caught.value)
 
 
-def test_missing_gravity_is_refused(walk: ImuSequence, still_model: Any) -> None:
+def test_missing_gravity_is_refused(walk, still_model):
     up_B = walk.truth.attitude_WB.apply([0.0, 0.0, 9.80665], inverse=True)
     with pytest.raises(InputError, match="accelerometer"):
         Navigator(still_model, backend="ekf").run(replace(walk, accel=walk.accel - up_B))
 
 
 @pytest.mark.parametrize("scale", [1 / 9.80665, 0.0])
-def test_a_stream_in_wrong_units_is_refused_after_its_first_second(
-    walk: ImuSequence, make_oracle: Make, scale: float
-) -> None:
+def test_a_stream_in_wrong_units_is_refused_after_its_first_second(walk, make_oracle, scale):
     navigator = Navigator(make_oracle(walk, walk.truth, CONFIG))
     with pytest.raises(InputError, match="accel: found an average"):
         stream(navigator, replace(walk, accel=scale * walk.accel))
@@ -58,18 +51,14 @@ def test_a_stream_in_wrong_units_is_refused_after_its_first_second(
         (lambda gyro, accel: (accel, gyro), "gyro and accel are swapped"),
     ],
 )
-def test_the_first_second_of_a_stream_blames_the_right_sensor(
-    walk: ImuSequence, still_model: Any, wrong: Callable[..., Any], words: str
-) -> None:
+def test_the_first_second_of_a_stream_blames_the_right_sensor(walk, still_model, wrong, words):
     """In deg/s the force averages to nothing, although each sample of it is right."""
     gyro, accel = wrong(walk.gyro, walk.accel)
     with pytest.raises(InputError, match=words):
         stream(Navigator(still_model), replace(walk, gyro=gyro, accel=accel))
 
 
-def test_an_inverted_accelerometer_and_a_field_in_gauss_are_said(
-    still_model: Any, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_inverted_accelerometer_and_a_field_in_gauss_are_said(still_model, caplog):
     navigator = Navigator(still_model)
     noise = 0.02 * np.random.default_rng(0).standard_normal((300, 6))
     for k, row in enumerate(noise):
@@ -94,10 +83,8 @@ def after_a_still_start(walk: ImuSequence) -> ImuSequence:
     )
 
 
-@pytest.mark.parametrize("carry", CARRYING_MODES)
-def test_a_stream_in_degrees_is_refused_once_the_device_turns(
-    make_walk: Make, still_model: Any, carry: str
-) -> None:
+@pytest.mark.parametrize("carry", ["handheld", "pocket", "swinging"])
+def test_a_stream_in_degrees_is_refused_once_the_device_turns(make_walk, still_model, carry):
     right = after_a_still_start(make_walk(3, 26.0, carry=carry))
     navigator = Navigator(still_model)
     for row in zip(right.time[:300], right.gyro[:300], right.accel[:300], strict=True):
@@ -110,9 +97,7 @@ def test_a_stream_in_degrees_is_refused_once_the_device_turns(
 
 
 @pytest.mark.parametrize("sensor", ["gyro", "accel"])
-def test_a_stream_with_a_sensor_dead_from_the_beginning_is_refused(
-    make_walk: Make, still_model: Any, sensor: str
-) -> None:
+def test_a_stream_with_a_sensor_dead_from_the_beginning_is_refused(make_walk, still_model, sensor):
     right = after_a_still_start(make_walk(3, 26.0))
     dead = replace(right, **{sensor: np.tile(getattr(right, sensor)[0], (len(right), 1))})
     navigator = Navigator(still_model)
@@ -122,9 +107,7 @@ def test_a_stream_with_a_sensor_dead_from_the_beginning_is_refused(
     assert stream(navigator, right)
 
 
-def test_a_briefly_tumbling_device_is_not_mistaken_for_a_stream_in_degrees(
-    make_walk: Make, still_model: Any
-) -> None:
+def test_a_briefly_tumbling_device_is_not_mistaken_for_a_stream_in_degrees(make_walk, still_model):
     walk = make_walk(3, 46.0)
     gyro = walk.gyro.copy()
     for k in (550, 1350, 2150, 2950):  # each within a piece or across its end, between calm ones
@@ -132,7 +115,7 @@ def test_a_briefly_tumbling_device_is_not_mistaken_for_a_stream_in_degrees(
     assert stream(Navigator(still_model), replace(walk, gyro=gyro))
 
 
-def test_a_turn_within_gaps_is_not_taken_for_wrong_units(still_model: Any) -> None:
+def test_a_turn_within_gaps_is_not_taken_for_wrong_units(still_model):
     """The device turns while it is measured and rests in every gap: nobody knows what it did."""
     time = 0.01 * np.arange(2400)
     measured = time % 4.0 < 2.5
@@ -143,11 +126,11 @@ def test_a_turn_within_gaps_is_not_taken_for_wrong_units(still_model: Any) -> No
     assert stream(Navigator(still_model), samples)[-1].time > 22.0
 
 
-def test_the_check_for_degrees_survives_a_snapshot(walk: ImuSequence, still_model: Any) -> None:
+def test_the_check_for_degrees_survives_a_snapshot(walk, still_model):
     wrong = after_a_still_start(walk)
     wrong = replace(wrong, gyro=np.degrees(wrong.gyro))
 
-    def refused_at(stop: float) -> float:
+    def refused_at(stop):
         """Time at which the stream is refused if another navigator continues it at `stop`."""
         navigator = Navigator(still_model)
         for time, gyro, accel in zip(wrong.time, wrong.gyro, wrong.accel, strict=True):

@@ -1,7 +1,5 @@
 """Files are written completely or not at all, and are read back as written."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os
@@ -23,7 +21,7 @@ def test_an_exception_leaves_only_the_old_file(tmp_path):
     path = tmp_path / "result.txt"
     path.write_text("old")
 
-    def write_and_fail() -> None:
+    def write_and_fail():
         with atomic_write(path) as file:
             file.write("new, half ")
             file.flush()
@@ -67,7 +65,7 @@ def test_an_operating_system_error_names_path_reason_and_fix(tmp_path, write):
     with pytest.raises(InputError, match=expected), write(long):
         pass
 
-    def fill() -> None:
+    def fill():
         with write(tmp_path / "full"):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

@@ -1,7 +1,5 @@
 """Findings and errors, as they are told and passed on."""
 
-from __future__ import annotations
-
 import pickle
 from pathlib import Path
 
@@ -19,21 +17,21 @@ NOTE = Finding("gaps", "1 gap.", level="note")
 AXES = Finding("gyro_axes", "gyroscope: differs", "turn it", values={"tilts": 7})
 
 
-def test_nothing_to_do_is_said_only_if_nothing_was_found_and_there_was_motion_to_judge() -> None:
+def test_nothing_to_do_is_said_only_if_nothing_was_found_and_there_was_motion_to_judge():
     assert codes() == ["nothing"]
     assert codes(NOTE) == ["nothing", "gaps"]
     assert codes(NOTE, AXES) == ["gyro_axes", "gaps"]
     assert codes(Finding(TOO_EARLY, "Too early.", level="note")) == [TOO_EARLY]
 
 
-def test_one_fault_is_told_once() -> None:
+def test_one_fault_is_told_once():
     again = Finding("gyro_axes", "another inspection of the same")
     follows = Finding("network_contradicts", "30% of the displacements contradict the IMU.")
     assert verdict([AXES, again, follows]) == [AXES]
     assert codes(follows) == ["network_contradicts"]
 
 
-def test_a_line_joins_observation_and_advice() -> None:
+def test_a_line_joins_observation_and_advice():
     assert AXES.line() == "! gyroscope: differs: turn it"
     assert NOTE.line() == "  1 gap."
     assert str(Finding("gaps", "1 gap.", "Log on.")) == "1 gap. Log on."
@@ -50,7 +48,7 @@ def test_a_line_joins_observation_and_advice() -> None:
     ],
 )
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
-def test_errors_survive_pickling_unchanged(error: StarioError, protocol: int) -> None:
+def test_errors_survive_pickling_unchanged(error, protocol):
     again = pickle.loads(pickle.dumps(error, protocol))
     assert type(again) is type(error)
     assert str(again) == str(error)

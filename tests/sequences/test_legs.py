@@ -15,21 +15,20 @@ TIME = np.arange(1.0, 38.0)
 
 
 @pytest.fixture(scope="module")
-def recording() -> ImuSequence:
+def recording():
     return simulate_imu(generate_walk(3, 40.0), 100.0, PERFECT_IMU, 0, name="walk")
 
 
 def legs_of(
     recording: ImuSequence, time: FloatArray, kind: str, sigma: object, valid: object = ()
 ) -> LegStream:
-    assert recording.truth is not None
     position = recording.truth.at(time).position_W
-    known = PositionTrack(time, position, kind, valid, sigma)  # type: ignore[arg-type]
+    known = PositionTrack(time, position, kind, valid, sigma)
     [legs] = leg_streams(replace(recording, truth=None, positions=known))
     return legs
 
 
-def test_the_ends_of_a_leg_are_as_certain_as_their_own_positions(recording: ImuSequence) -> None:
+def test_the_ends_of_a_leg_are_as_certain_as_their_own_positions(recording):
     """Those of satellites share most of their error, which a displacement does not contain."""
     known = TIME > 4.0
     stated = np.where(known, 3.0 + 0.1 * TIME, 99.0)
@@ -42,13 +41,13 @@ def test_the_ends_of_a_leg_are_as_certain_as_their_own_positions(recording: ImuS
     assert 0.1 < relative[0, 0] < 0.4
 
 
-def test_precise_positions_are_still_those_of_another_device(recording: ImuSequence) -> None:
+def test_precise_positions_are_still_those_of_another_device(recording):
     precise = legs_of(recording, TIME, "positions", np.full(len(TIME), 0.01))
     unstated = legs_of(recording, TIME, "positions", None)
     np.testing.assert_allclose(precise.sigma, unstated.sigma)
 
 
-def test_the_time_of_a_tap_is_uncertain_wherever_the_waypoint_is(recording: ImuSequence) -> None:
+def test_the_time_of_a_tap_is_uncertain_wherever_the_waypoint_is(recording):
     time = TIME[::6]
     surveyed = legs_of(recording, time, "waypoints", np.full(len(time), 0.01))
     by_eye = legs_of(recording, time, "waypoints", None)
@@ -58,23 +57,21 @@ def test_the_time_of_a_tap_is_uncertain_wherever_the_waypoint_is(recording: ImuS
     assert (by_eye.sigma > surveyed.sigma).all()
 
 
-def test_positions_seconds_apart_make_no_legs(recording: ImuSequence) -> None:
+def test_positions_seconds_apart_make_no_legs(recording):
     """Between them a pedestrian may have turned, however regular they are."""
-    assert recording.truth is not None
     time = TIME[::4]
     known = PositionTrack(time, recording.truth.at(time).position_W, "positions")
     assert leg_streams(replace(recording, truth=None, positions=known)) == []
 
 
-def test_a_single_leg_is_not_enough(recording: ImuSequence) -> None:
+def test_a_single_leg_is_not_enough(recording):
     """With its yaw unknown, a leg by itself says no more than its length."""
-    assert recording.truth is not None
     time = np.array([5.0, 15.0])
     known = PositionTrack(time, recording.truth.at(time).position_W, "waypoints")
     assert leg_streams(replace(recording, truth=None, positions=known)) == []
 
 
-def test_a_part_has_the_legs_that_lie_within_it(recording: ImuSequence) -> None:
+def test_a_part_has_the_legs_that_lie_within_it(recording):
     legs = legs_of(recording, TIME, "positions", None)
     part = legs.part(1000, 3000)
     inside = (legs.start >= 5.0) & (legs.stop <= 15.0)

@@ -1,11 +1,7 @@
 """Wrong arguments are refused at once, by name, with what was expected."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -85,7 +81,7 @@ DATES = np.datetime64("2026-01-01") + (1e9 * TIME).astype("timedelta64[ns]")
         (lambda: write_tum("track.tum", SEQUENCE), "trajectory", "track.trajectory"),
     ],
 )
-def test_a_wrong_argument_is_named(make: Callable[[], Any], field: str, text: str) -> None:
+def test_a_wrong_argument_is_named(make, field, text):
     with pytest.raises(InputError) as caught:
         make()
     assert caught.value.field == field
@@ -93,6 +89,6 @@ def test_a_wrong_argument_is_named(make: Callable[[], Any], field: str, text: st
     assert "\n" not in str(caught.value)
 
 
-def test_the_remedy_for_dates_gives_seconds() -> None:
+def test_the_remedy_for_dates_gives_seconds():
     seconds = (DATES - DATES[0]) / np.timedelta64(1, "s")
     np.testing.assert_allclose(replace(SEQUENCE, time=seconds).time, TIME)

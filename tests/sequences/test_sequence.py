@@ -38,7 +38,7 @@ def marked(track: Trajectory, lost: slice) -> Trajectory:
 GRID = np.arange(101) / 50.0
 
 
-def test_interpolation_follows_a_screw_motion_exactly() -> None:
+def test_interpolation_follows_a_screw_motion_exactly():
     time = np.sort(np.random.default_rng(0).uniform(0.0, 2.0, 300))
     read, true = screw(GRID).at(time), screw(time)
     assert read.valid.all()
@@ -48,20 +48,13 @@ def test_interpolation_follows_a_screw_motion_exactly() -> None:
     assert np.allclose(read.position_covariance_W, np.einsum("n,ij->nij", 1 + time, np.eye(3)))
 
 
-def test_interpolation_at_its_own_samples_changes_nothing() -> None:
-    track = screw(GRID)
-    again = track.at(track.time)
-    assert np.array_equal(again.position_W, track.position_W)
-    assert again.valid.all()
-
-
-def test_nothing_is_valid_outside_a_track() -> None:
+def test_nothing_is_valid_outside_a_track():
     read = screw(GRID).at(np.array([-0.01, 0.0, 2.0, 2.01]))
     assert read.valid.tolist() == [False, True, True, False]
 
 
 @pytest.mark.parametrize("missing", [False, True], ids=["marked", "missing"])
-def test_interpolation_never_crosses_a_gap(missing: bool) -> None:
+def test_interpolation_never_crosses_a_gap(missing):
     """Rows 40 to 54 are lost: 0.8 to 1.08 s; both neighbours (0.78 and 1.1 s) stay valid."""
     kept = np.delete(np.arange(len(GRID)), np.arange(40, 55))
     track = screw(GRID[kept]) if missing else marked(screw(GRID), slice(40, 55))
@@ -71,14 +64,14 @@ def test_interpolation_never_crosses_a_gap(missing: bool) -> None:
     assert np.isfinite(read.position_W).all()
 
 
-def test_short_gaps_are_bridged_by_their_valid_neighbours() -> None:
+def test_short_gaps_are_bridged_by_their_valid_neighbours():
     read = marked(screw(GRID), slice(40, 43)).at(GRID)
     assert read.valid.all()
     assert np.allclose(read.position_W, screw(GRID).position_W)
 
 
 @pytest.mark.parametrize("start", [0.0, 1.7e9])
-def test_truth_at_the_lowest_rate_has_no_gaps_despite_rounding(start: float) -> None:
+def test_truth_at_the_lowest_rate_has_no_gaps_despite_rounding(start):
     """0.3 - 0.2 > 0.1 in floating point."""
     track = screw(start + np.round(np.arange(201) * 0.1, 1))
     assert track.covers(start + np.linspace(0.05, 19.95, 400)).all()
@@ -86,7 +79,7 @@ def test_truth_at_the_lowest_rate_has_no_gaps_despite_rounding(start: float) -> 
     assert "at 5 Hz; at least 10 Hz are needed" in low_rate_message(screw(track.time[::2]))
 
 
-def test_gaps_are_not_bridged_at_times_since_1970() -> None:
+def test_gaps_are_not_bridged_at_times_since_1970():
     """A relative tolerance of 1e-9 is 1.7 s at such times."""
     kept = np.delete(1.7e9 + GRID, np.arange(40, 55))
     outside = 1.7e9 + np.array([-0.5, 0.9, 2.5])
@@ -94,19 +87,19 @@ def test_gaps_are_not_bridged_at_times_since_1970() -> None:
     assert screw(kept).covers(kept).all()
 
 
-def test_interpolation_needs_two_valid_samples() -> None:
+def test_interpolation_needs_two_valid_samples():
     with pytest.raises(InputError, match="0 valid samples"):
         marked(screw(GRID), slice(None)).at(GRID)
 
 
-def test_a_slice_keeps_both_ends() -> None:
+def test_a_slice_keeps_both_ends():
     part = screw(GRID).slice(0.5, 1.0)
     assert part.time[0] == 0.5
     assert part.time[-1] == 1.0
     assert len(part) == len(part.attitude_WB) == len(part.velocity_W) == 26
 
 
-def test_path_length_is_hardly_affected_by_noise() -> None:
+def test_path_length_is_hardly_affected_by_noise():
     time = np.arange(1001) / 100.0
     circle = np.stack([np.cos(0.5 * time), np.sin(0.5 * time), 0 * time], axis=1)
     rest = Rotation.identity(len(time))
@@ -116,7 +109,7 @@ def test_path_length_is_hardly_affected_by_noise() -> None:
     assert marked(Trajectory(time, circle, rest), slice(1, None)).path_length() == 0.0
 
 
-def test_a_clock_jump_of_decades_does_not_exhaust_memory() -> None:
+def test_a_clock_jump_of_decades_does_not_exhaust_memory():
     time = np.concatenate([[0.0], 1.7e9 + np.arange(1001) / 100.0])
     position = np.outer(np.append(0.0, np.arange(1001) / 100.0), [1.0, 0.0, 0.0])
     track = Trajectory(time, position, Rotation.identity(len(time)))
@@ -124,7 +117,7 @@ def test_a_clock_jump_of_decades_does_not_exhaust_memory() -> None:
     assert len(whole_seconds(time)) < 20
 
 
-def test_a_trajectory_is_validated_on_construction() -> None:
+def test_a_trajectory_is_validated_on_construction():
     track = screw(GRID)
     back, bad = GRID.copy(), track.position_W.copy()
     back[7] = back[6]
@@ -145,7 +138,7 @@ def test_a_trajectory_is_validated_on_construction() -> None:
         screw(np.empty(0))
 
 
-def test_an_imu_sequence_is_validated_for_shape_only() -> None:
+def test_an_imu_sequence_is_validated_for_shape_only():
     """Dropping and counting bad samples is left to the navigator."""
     time, zeros = np.array([0.0, 0.01, 0.01, np.nan]), np.zeros((4, 3))
     sequence = ImuSequence("odd", time, np.nan * zeros, zeros)
@@ -160,7 +153,7 @@ def test_an_imu_sequence_is_validated_for_shape_only() -> None:
         ImuSequence("odd", np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
 
 
-def test_recordings_and_trajectories_print_in_one_line() -> None:
+def test_recordings_and_trajectories_print_in_one_line():
     track = screw(GRID)
     assert repr(track) == "Trajectory(101 rows, 0.00 to 2.00 s at 50.0 Hz)"
     walk = ImuSequence("walk", GRID, np.zeros((101, 3)), np.zeros((101, 3)), track)
@@ -169,14 +162,14 @@ def test_recordings_and_trajectories_print_in_one_line() -> None:
     assert repr(track.slice(0.0, 0.0)) == "Trajectory(1 rows, 0.00 to 0.00 s)"
 
 
-def test_masked_samples_are_missing_ones() -> None:
+def test_masked_samples_are_missing_ones():
     gyro = np.ma.masked_equal(np.where(np.eye(3) > 0, -9999.0, 0.5), -9999.0)
     sequence = ImuSequence("masked", np.arange(3.0), gyro, np.zeros((3, 3)))
     np.testing.assert_array_equal(np.isnan(sequence.gyro), np.eye(3) > 0)
     assert np.nanmax(sequence.gyro) == 0.5
 
 
-def test_without_truth_neither_poses_nor_positions_are_left() -> None:
+def test_without_truth_neither_poses_nor_positions_are_left():
     zero = np.zeros((101, 3))
     known = PositionTrack(GRID, zero, "positions")
     sequence = ImuSequence("both", GRID, zero, zero, screw(GRID), positions=known)
@@ -184,7 +177,7 @@ def test_without_truth_neither_poses_nor_positions_are_left() -> None:
     assert bare.truth is bare.positions is None
 
 
-def test_a_wild_time_changes_neither_duration_nor_rate() -> None:
+def test_a_wild_time_changes_neither_duration_nor_rate():
     time, zero = np.arange(1001) / 100.0, np.zeros((1001, 3))
     time[500] += 1e9
     sequence = ImuSequence("wild", time, zero, zero)
@@ -192,7 +185,7 @@ def test_a_wild_time_changes_neither_duration_nor_rate() -> None:
     assert sequence.rate == pytest.approx(100.0)
 
 
-def test_slicing_a_sequence_also_slices_its_truth() -> None:
+def test_slicing_a_sequence_also_slices_its_truth():
     zeros = np.zeros((len(GRID), 3))
     sequence = ImuSequence("cut", GRID, zeros, zeros, screw(GRID))
     part = sequence.slice(0.5, 1.0)
@@ -200,13 +193,13 @@ def test_slicing_a_sequence_also_slices_its_truth() -> None:
     assert part.duration == 0.5
 
 
-def test_about_z_and_yaw_of_are_inverses() -> None:
+def test_about_z_and_yaw_of_are_inverses():
     yaw = np.linspace(-3.1, 3.1, 63)
     assert np.allclose(yaw_of(about_z(yaw)), yaw)
     assert np.allclose(about_z(0.5 * np.pi).apply([1.0, 0.0, 0.0]), [0.0, 1.0, 0.0])
 
 
-def test_rotating_the_world_adds_to_the_yaw_at_any_tilt() -> None:
+def test_rotating_the_world_adds_to_the_yaw_at_any_tilt():
     attitudes = Rotation.random(200, rng=np.random.default_rng(1))
     for yaw in (-2.0, 0.3, 3.0):
         turned = yaw_of(about_z(yaw) * attitudes)
@@ -214,7 +207,7 @@ def test_rotating_the_world_adds_to_the_yaw_at_any_tilt() -> None:
         assert (np.abs(turned) <= np.pi).all()
 
 
-def test_tilt_aligning_rotates_up_to_z_by_the_smallest_angle() -> None:
+def test_tilt_aligning_rotates_up_to_z_by_the_smallest_angle():
     rng = np.random.default_rng(2)
     for up in rng.standard_normal((100, 3)):
         R_WB = tilt_aligning(9.8 * up)
@@ -226,13 +219,13 @@ def test_tilt_aligning_rotates_up_to_z_by_the_smallest_angle() -> None:
         assert np.allclose(tilt_aligning(np.array(up)).apply(up)[2], np.linalg.norm(up))
 
 
-def test_latitude_and_longitude_given_the_other_way_round_are_refused() -> None:
+def test_latitude_and_longitude_given_the_other_way_round_are_refused():
     swapped, given = np.array([[144.9, -37.8]]), np.array([[-37.8, 144.9]])
     with pytest.raises(InputError, match="give latitude first"):
         Satellites(np.zeros(1), swapped)
     assert len(Satellites(np.zeros(1), given, radius_m=np.array([math.nan]))) == 1
 
 
-def test_a_pressure_that_is_not_finite_is_refused() -> None:
+def test_a_pressure_that_is_not_finite_is_refused():
     with pytest.raises(InputError, match="pressure_hPa"):
         Barometer(np.array([0.0, 1.0]), np.array([1013.2, math.nan]))

@@ -1,7 +1,5 @@
 """Times: order of samples, and even grids."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -30,13 +28,13 @@ def dropped_rows(time: FloatArray) -> list[int]:
     return np.flatnonzero(~kept).tolist()
 
 
-def test_increasing_times_are_all_kept_whatever_the_gaps() -> None:
+def test_increasing_times_are_all_kept_whatever_the_gaps():
     gaps = np.concatenate([TIME[:100], 5.0 + TIME[:1], 1e9 + TIME])
     assert dropped_rows(TIME) == dropped_rows(gaps) == []
     assert increasing_mask(np.empty(0)).tolist() == []
 
 
-def test_repeated_and_late_times_are_dropped() -> None:
+def test_repeated_and_late_times_are_dropped():
     time = TIME.copy()
     time[20], time[30] = time[19], time[11]
     assert dropped_rows(time) == [20, 30]
@@ -44,11 +42,11 @@ def test_repeated_and_late_times_are_dropped() -> None:
 
 @pytest.mark.parametrize("by", [0.3, 5.0, 100.0, 1e9])
 @pytest.mark.parametrize("row", [0, 1, 200, 398])
-def test_one_outlying_time_drops_only_its_own_sample(row: int, by: float) -> None:
+def test_one_outlying_time_drops_only_its_own_sample(row, by):
     assert dropped_rows(moved(slice(row, row + 1), by)) == [row]
 
 
-def test_several_times_from_the_far_future_are_dropped_too() -> None:
+def test_several_times_from_the_far_future_are_dropped_too():
     last = 100 + CONFIRMED_FAR - 1
     assert dropped_rows(moved(slice(100, last), 1e6)) == list(range(100, last))
     time = moved(slice(100, 102), 1e6)
@@ -57,12 +55,12 @@ def test_several_times_from_the_far_future_are_dropped_too() -> None:
     assert dropped_rows(time) == [100, 101, 200]
 
 
-def test_after_a_confirmed_jump_earlier_times_are_dropped() -> None:
+def test_after_a_confirmed_jump_earlier_times_are_dropped():
     assert dropped_rows(moved(slice(100, 102), 0.3)) == list(range(102, 132))
     assert dropped_rows(moved(slice(100, 100 + CONFIRMED_FAR), 1e6)) == list(range(120, 400))
 
 
-def test_late_times_do_not_refute_a_gap() -> None:
+def test_late_times_do_not_refute_a_gap():
     time = np.concatenate([TIME[:100], TIME[200:201], TIME[50:60], TIME[201:]])
     assert dropped_rows(time) == list(range(101, 111))
     repeated = np.concatenate([TIME[:100], TIME[200:201], TIME[50:60], TIME[200:]])
@@ -71,7 +69,7 @@ def test_late_times_do_not_refute_a_gap() -> None:
     assert dropped_rows(swapped) == [101, 103]
 
 
-def test_rows_far_out_of_order_are_neither_sorted_nor_thinned_out() -> None:
+def test_rows_far_out_of_order_are_neither_sorted_nor_thinned_out():
     """They are refused as they are, with how many there are."""
     time = np.random.default_rng(0).permutation(TIME)
     shuffled = ImuSequence("shuffled", time, np.zeros((400, 3)), np.ones((400, 3)))
@@ -83,7 +81,7 @@ STEPS = st.sampled_from([1.0 / 200.0, 0.05, 0.1, 0.15, 1.0 / 30.0])
 
 
 @given(start=st.floats(0.0, 1e4), steps=st.integers(0, 5000), step=STEPS)
-def test_no_time_is_at_or_beyond_the_end(start: float, steps: int, step: float) -> None:
+def test_no_time_is_at_or_beyond_the_end(start, steps, step):
     """Rounding decides whether a whole number of steps reaches the end."""
     stop = start + steps * step
     grid = even_grid(start, stop, step)
@@ -93,7 +91,7 @@ def test_no_time_is_at_or_beyond_the_end(start: float, steps: int, step: float) 
 
 
 @pytest.mark.parametrize("first", range(2, 14))
-def test_positions_are_compared_whenever_a_recording_begins(first: int) -> None:
+def test_positions_are_compared_whenever_a_recording_begins(first):
     """The last instant is compared with what is 0.3 s later: rounding may place that at the end."""
     time = (first + np.arange(1411)) / 50.0
     rest = np.zeros((len(time), 3))

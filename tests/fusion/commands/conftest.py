@@ -1,19 +1,15 @@
 """Fixtures to call the `stario` command, and a recording for it."""
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
 from stario.fusion.commands.cli import app, main
-from stario.network.model import DisplacementModel, load_model
+from stario.network.model import load_model
 
 
 @dataclass(frozen=True)
@@ -35,12 +31,12 @@ class CommandResult:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _prepared_once() -> Iterator[None]:
+def _prepared_once():
     """Load the packaged weights and build the command once, not at every call."""
 
     default = cache(load_model)
 
-    def loaded(name_or_path: str | Path = "default") -> DisplacementModel:
+    def loaded(name_or_path="default"):
         return default() if name_or_path == "default" else load_model(name_or_path)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -50,17 +46,12 @@ def _prepared_once() -> Iterator[None]:
 
 
 @pytest.fixture
-def stario(
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    tmp_path_factory: pytest.TempPathFactory,
-    capsys: pytest.CaptureFixture[str],
-):
+def stario(monkeypatch, tmp_path, tmp_path_factory, capsys):
     """Call `stario` with arguments, in this process and in an empty folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("STARIO_CACHE", str(tmp_path_factory.mktemp("cache")))
 
-    def call(*arguments: object) -> CommandResult:
+    def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["stario", *map(str, arguments)])
         capsys.readouterr()
         code = 0
@@ -75,13 +66,13 @@ def stario(
 
 
 @pytest.fixture
-def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_figures(monkeypatch):
     """Skip figures, which take most of the time, in tests that do not check them."""
     monkeypatch.setattr("stario.fusion.evaluation.results._figures", lambda found: {})
 
 
 @pytest.fixture(scope="session")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(tmp_path_factory):
     """A walk of twelve seconds on the level, which no test modifies."""
     path = tmp_path_factory.mktemp("recordings") / "walk.csv"
     walk = ["--seconds", "12", "--carry", "handheld", "--rate", "100", "--seed", "5"]

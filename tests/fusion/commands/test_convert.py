@@ -1,7 +1,5 @@
 """The command `convert`: layouts, archives, and waypoints that survive them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,9 +16,7 @@ from stario.sequences.simulation.walks import generate_walk
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_a_converted_recording_gives_the_same_track(
-    stario, recording: Path, tmp_path: Path
-) -> None:
+def test_a_converted_recording_gives_the_same_track(stario, recording, tmp_path):
     assert stario("convert", recording, "there").code == 0
     done = stario("convert", "there", "back.csv")
     assert done.code == 0
@@ -34,9 +30,7 @@ def test_a_converted_recording_gives_the_same_track(
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_recordings_are_archived_and_selected_from_the_archive(
-    stario, recording: Path, tmp_path: Path
-) -> None:
+def test_recordings_are_archived_and_selected_from_the_archive(stario, recording, tmp_path):
     (tmp_path / "again").mkdir()
     (tmp_path / "again/walk.csv").write_bytes(recording.read_bytes())
     done = stario("convert", recording, "again", "all.h5")
@@ -54,16 +48,14 @@ def test_recordings_are_archived_and_selected_from_the_archive(
     stario("convert", "all.h5", "out.csv").assert_one_line_error("2 recordings", "all.h5:walk")
 
 
-def test_an_archive_of_nothing_is_not_written_and_the_reason_is_told(stario, tmp_path) -> None:
+def test_an_archive_of_nothing_is_not_written_and_the_reason_is_told(stario, tmp_path):
     (tmp_path / "bad.csv").write_text("t,gx,gy,gz,ax,ay,az\n0,0,0,x,0,0,9.8\n")
     done = stario("convert", "bad.csv", "out.h5")
     done.assert_one_line_error("bad.csv: line 2, gz: found 'x'")
     assert not (tmp_path / "out.h5").exists()
 
 
-def test_overwrite_replaces_an_euroc_folder_and_nothing_else(
-    stario, recording: Path, tmp_path: Path
-) -> None:
+def test_overwrite_replaces_an_euroc_folder_and_nothing_else(stario, recording, tmp_path):
     assert stario("convert", recording, "there").code == 0
     imu = tmp_path / "there/mav0/imu0/data.csv"
     written = imu.read_text()
@@ -81,7 +73,7 @@ def test_overwrite_replaces_an_euroc_folder_and_nothing_else(
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_every_track_is_compared_with_positions_half_a_second_apart(stario, tmp_path: Path) -> None:
+def test_every_track_is_compared_with_positions_half_a_second_apart(stario, tmp_path):
     walk = simulate_imu(generate_walk(3, 8.0), 100.0, seed=1, name="taps")
     time = np.arange(1.0, 7.0, 0.5)
     known = PositionTrack(time, walk.truth.at(time).position_W, "positions")
@@ -94,7 +86,7 @@ def test_every_track_is_compared_with_positions_half_a_second_apart(stario, tmp_
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_waypoints_are_reported_and_do_not_count_as_poses(stario, tmp_path: Path) -> None:
+def test_waypoints_are_reported_and_do_not_count_as_poses(stario, tmp_path):
     walk = simulate_imu(generate_walk(3, 8.0), 100.0, seed=1, name="taps")
     taps = PositionTrack(np.array([1.0, 6.0]), np.zeros((2, 2)), "waypoints")
     write_archive(tmp_path / "taps.h5", [replace(walk, truth=None, positions=taps)])

@@ -1,6 +1,4 @@
-"""The commands for many recordings: compare, evaluate, train, backends."""
-
-from __future__ import annotations
+"""The commands for many recordings: compare, evaluate and the checks."""
 
 import json
 import re
@@ -10,26 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from training_runs import narrow
 
 from stario.fusion.commands import evaluate
 from stario.fusion.commands.options import ReadingOptions
-from stario.fusion.commands.train import _recipe
-from stario.fusion.commands.training_data import packaged_lists
 from stario.fusion.evaluation.compare import TRACKS
-from stario.network import load_model
-from stario.network.training import splits
-from stario.network.training.config import FINE_TUNING, training_config
-from stario.network.training.splits import read_packaged_list
-from stario.sequences.readers.archive import split_name
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
 from stario.sequences.simulation.moments import MOMENTS
 
-# --- compare and evaluate ----------------------------------------------------------------------
 
-
-def test_compare_prints_json_and_writes_the_same(stario, recording: Path, tmp_path: Path) -> None:
+def test_compare_prints_json_and_writes_the_same(stario, recording, tmp_path):
     done = stario("compare", recording, "--out", "out", "--json")
     assert done.code == 0
     assert json.loads(done.out) == json.loads((tmp_path / "out/metrics.json").read_text())
@@ -37,7 +25,7 @@ def test_compare_prints_json_and_writes_the_same(stario, recording: Path, tmp_pa
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_compare_sets_the_track_against_dead_reckoning(stario, recording: Path) -> None:
+def test_compare_sets_the_track_against_dead_reckoning(stario, recording):
     done = stario("compare", recording, "--out", "out")
     assert done.err == ""
     seen, *findings, files = done.out.splitlines()
@@ -55,9 +43,7 @@ def test_compare_sets_the_track_against_dead_reckoning(stario, recording: Path) 
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_compare_prints_a_table_of_further_tracks_and_explains_on_request(
-    stario, recording: Path
-) -> None:
+def test_compare_prints_a_table_of_further_tracks_and_explains_on_request(stario, recording):
     done = stario("compare", recording, "--tracks", "all", "--explain")
     rows = [line.split()[0] for line in done.out.splitlines()]
     assert [row for row in rows if row in TRACKS] == list(TRACKS)
@@ -70,9 +56,7 @@ def test_compare_prints_a_table_of_further_tracks_and_explains_on_request(
     stario("compare", recording, "--tracks", "ekf").assert_one_line_error("--tracks", "filtered")
 
 
-def test_check_fusion_compares_the_fusion_with_its_network(
-    stario, recording: Path, tmp_path: Path
-) -> None:
+def test_check_fusion_compares_the_fusion_with_its_network(stario, recording, tmp_path):
     (tmp_path / "walk.csv").write_bytes(recording.read_bytes())
     done = stario("check", "fusion", recording, "walk.csv", "--json")
     assert done.code == 0
@@ -86,9 +70,7 @@ def test_check_fusion_compares_the_fusion_with_its_network(
     assert "carry" in refused.err
 
 
-def test_check_gaps_reports_how_far_missing_samples_move_the_end(
-    stario, recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_check_gaps_reports_how_far_missing_samples_move_the_end(stario, recording, monkeypatch):
     monkeypatch.setattr("stario.fusion.evaluation.checks.fusion.INSTANTS", 1)
     done = stario("check", "gaps", recording, "--json")
     assert done.code == 0
@@ -100,9 +82,7 @@ def test_check_gaps_reports_how_far_missing_samples_move_the_end(
     assert "within 1% and 3 deg" in shown.out
 
 
-def test_check_moments_reports_what_a_bad_moment_costs(
-    stario, recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_check_moments_reports_what_a_bad_moment_costs(stario, recording, monkeypatch):
     checks = "stario.fusion.evaluation.checks.moments"
     monkeypatch.setattr(f"{checks}.MOMENTS", MOMENTS[-1:])
     monkeypatch.setattr(f"{checks}.PLACES", {"middle": 0.5})
@@ -119,7 +99,7 @@ def test_check_moments_reports_what_a_bad_moment_costs(
     stario("check", "moments", "--axes", "y,-x,z").assert_one_line_error("--axes", "simulated")
 
 
-def test_check_fixes_evaluates_tracks_with_fixes(stario, recording: Path) -> None:
+def test_check_fixes_evaluates_tracks_with_fixes(stario, recording):
     done = stario("check", "fixes", recording, "--every", "2", "--sigma", "0.1", "--json")
     assert done.code == 0
     (found,) = json.loads(done.out)
@@ -130,9 +110,8 @@ def test_check_fixes_evaluates_tracks_with_fixes(stario, recording: Path) -> Non
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_truth_that_covers_only_a_part_is_reported(stario, recording: Path, tmp_path: Path) -> None:
+def test_truth_that_covers_only_a_part_is_reported(stario, recording, tmp_path):
     walk = read_generic_csv(recording)
-    assert walk.truth is not None
     write_csv(tmp_path / "part.csv", replace(walk, truth=walk.truth.slice(0.0, 6.0)))
     done = stario("run", "part.csv", "--out", "out")
     assert "; the truth covers 50% of it" in done.out
@@ -140,18 +119,14 @@ def test_truth_that_covers_only_a_part_is_reported(stario, recording: Path, tmp_
 
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.parametrize("command", ["run", "compare"])
-def test_figures_of_several_recordings_are_explained_once(
-    stario, recording: Path, tmp_path: Path, command: str
-) -> None:
+def test_figures_of_several_recordings_are_explained_once(stario, recording, tmp_path, command):
     shutil.copy(recording, tmp_path / "again.csv")
     done = stario(command, recording, "again.csv", "--out", "out", "--explain")
     assert done.out.count("\nfitted [m]: ATE after") == 1
     assert done.out.count("m rms from the truth") == 2
 
 
-def test_many_recordings_skipped_for_one_reason_take_one_line(
-    stario, recording: Path, tmp_path: Path
-) -> None:
+def test_many_recordings_skipped_for_one_reason_take_one_line(stario, recording, tmp_path):
     blind = read_generic_csv(recording).without_truth()
     for k in range(5):
         write_csv(tmp_path / f"blind-{k}.csv", blind)
@@ -162,7 +137,7 @@ def test_many_recordings_skipped_for_one_reason_take_one_line(
     assert "blind-0.csv: truth: found none" in line
 
 
-def test_evaluate_prints_medians_and_needs_truth(stario, recording: Path, tmp_path: Path) -> None:
+def test_evaluate_prints_medians_and_needs_truth(stario, recording, tmp_path):
     done = stario("evaluate", recording)
     assert done.code == 0
     assert [line.split()[0] for line in done.out.splitlines()[1:4]] == ["walk", "median", "mean"]
@@ -174,9 +149,7 @@ def test_evaluate_prints_medians_and_needs_truth(stario, recording: Path, tmp_pa
 
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_a_batch_continues_after_failures_and_reports_them(
-    stario, recording: Path, tmp_path: Path, jobs: int
-) -> None:
+def test_a_batch_continues_after_failures_and_reports_them(stario, recording, tmp_path, jobs):
     walk = read_generic_csv(recording)
     write_csv(tmp_path / "deg.csv", replace(walk, gyro=np.degrees(walk.gyro)))
     write_csv(tmp_path / "blind.csv", walk.without_truth())
@@ -202,9 +175,7 @@ def test_a_batch_continues_after_failures_and_reports_them(
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_evaluate_compares_with_other_weights_by_groups(
-    stario, recording: Path, tmp_path: Path
-) -> None:
+def test_evaluate_compares_with_other_weights_by_groups(stario, recording, tmp_path):
     """Weights against themselves; twelve seconds are too few for an error over ten seconds."""
     (tmp_path / "walks").mkdir()
     stario("simulate", "walks/long.csv", "--seconds", 25, "--carry", "handheld", "--rate", 100)
@@ -225,140 +196,16 @@ def test_evaluate_compares_with_other_weights_by_groups(
     assert {(group["group"], group["role"]): group for group in written} == groups
 
 
-def test_every_option_that_changes_what_is_read_is_part_of_the_key_of_a_cache() -> None:
+def test_every_option_that_changes_what_is_read_is_part_of_the_key_of_a_cache():
     usual = ReadingOptions()
     for name in (field.name for field in fields(usual)):
         other = replace(usual, **{name: ["person=dan"] if name == "where" else "other"})
         assert (other.as_read() == usual.as_read()) == (name == "where")
 
 
-# --- train -------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def tiny(tmp_path: Path) -> Path:
-    """A recipe of one step."""
-    path = tmp_path / "tiny.json"
-    path.write_text(json.dumps({"epoch_windows": 32, "batch": 32, "epochs": 1}))
-    return path
-
-
-@pytest.fixture
-def narrow_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    narrow(monkeypatch)
-
-
-@pytest.mark.usefixtures("no_figures", "narrow_network")
-def test_weights_that_train_writes_can_be_run(
-    stario, recording: Path, tmp_path: Path, tiny: Path
-) -> None:
-    done = stario(
-        "train", recording, "--generated", 1, "--config", tiny, "--out", "trained",
-        "--seed", 3,
-    )  # fmt: skip
-    assert done.code == 0, done.err
-    weights = Path(done.out.strip())
-    assert weights == Path("trained/model.safetensors")
-    assert "epoch 1" in done.err
-    card = json.loads((tmp_path / "trained/model.json").read_text())
-    assert card["recipe"]["seed"] == 3
-    assert any("recorded" in words for words in card["trained_on"])
-    assert stario("run", recording, "--model", weights, "--out", "out").code == 0
-    content = bytearray(weights.read_bytes())
-    content[-1] ^= 1
-    weights.write_bytes(bytes(content))
-    stario("run", recording, "--model", weights).assert_one_line_error("model.safetensors")
-
-
-@pytest.mark.usefixtures("narrow_network")
-def test_training_continues_after_failures_and_caches_its_windows(
-    stario, recording: Path, tmp_path: Path, tiny: Path
-) -> None:
-    write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
-    (tmp_path / "list.txt").write_text("blind.csv\nnosuch.csv\n")
-    call = ("train", recording, "list.txt", "--generated", 1, "--config", tiny)
-    done = stario(*call, "--out", "a", "--cache", "kept")
-    assert done.code == 1
-    assert Path(done.out.strip()) == Path("a/model.safetensors")
-    lines = [line for line in done.err.splitlines() if line.startswith("stario: skipped")]
-    assert len(lines) == 2
-    assert "nosuch.csv" in lines[0]
-    assert "blind.csv: truth" in lines[1]
-    assert done.err.index(lines[1]) < done.err.index("epoch 1:")
-    kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "kept").iterdir()}
-    assert len(kept) == 2  # the recording's and the generated walk's
-    assert stario(*call, "--out", "b", "--cache", "kept").code == 1
-    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "kept").iterdir()} == kept
-    first, second = ((tmp_path / out / "model.safetensors").read_bytes() for out in "ab")
-    assert first == second
-
-
-@pytest.mark.usefixtures("narrow_network")
-def test_weights_to_start_from_set_the_network(
-    stario, recording: Path, tmp_path: Path, tiny: Path
-) -> None:
-    call, other = ("train", recording, "--recorded-only", "--config", tiny), "StarIO without MSGCU"
-    assert stario(*call, "--model", other, "--out", "first").code == 0
-    first = ("--start-from", "first/model.safetensors")
-    assert stario(*call, *first, "--out", "second").code == 0
-    card = json.loads((tmp_path / "second/model.json").read_text())
-    assert card["architecture"] == other
-    stario(*call, *first, "--model", "StarIO").assert_one_line_error("--start-from", other)
-
-
-@pytest.mark.usefixtures("narrow_network")
-def test_sigma_is_not_calibrated_on_a_few_seconds_where_initial_weights_have_a_calibration(
-    stario, recording: Path, tmp_path: Path, tiny: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def calibration(out: str, *options: str) -> object:
-        call = ("train", recording, "--recorded-only", "--config", tiny, *options, "--out", out)
-        assert stario(*call).code == 0
-        return json.loads((tmp_path / out / "model.json").read_text())["calibration"]
-
-    first = calibration("first")
-    tuned = ("--start-from", "first/model.safetensors")
-    assert calibration("tuned", *tuned) == first
-    monkeypatch.setattr("stario.fusion.commands.train._CALIBRATING_S", 1.0)
-    assert calibration("calibrated", *tuned) != first
-
-
-def test_fine_tuning_changes_weights_a_little_unless_a_recipe_says_otherwise(tiny: Path) -> None:
-    first = load_model("default")
-    assert _recipe(None, None).learned == _recipe(tiny, first).learned == 1.0
-    gentle = _recipe(None, first, epochs=5)
-    assert gentle == replace(training_config(FINE_TUNING), epochs=5)
-    assert gentle.learned < 0.5
-    assert gentle.rate < _recipe(None, None).rate
-
-
-@pytest.mark.usefixtures("narrow_network")
-def test_training_can_use_recordings_alone(
-    stario, recording: Path, tmp_path: Path, tiny: Path
-) -> None:
-    twice = recording, recording.parent  # counts once
-    done = stario("train", *twice, "--recorded-only", "--config", tiny, "--out", "alone")
-    assert done.code == 0, done.err
-    trained_on = json.loads((tmp_path / "alone/model.json").read_text())["trained_on"]
-    assert trained_on == ["recorded, others: 10 s"]  # nothing simulated, no licence known
-
-
-def test_a_recording_cannot_both_train_and_validate(
-    stario, recording: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "list.txt").write_text(f"{recording}\n")
-    done = stario("train", recording, "--validation", "list.txt", "--generated", 1)
-    done.assert_one_line_error("--validation", f"{recording}, which is also trained on")
-    assert not (tmp_path / "runs").exists()
-
-
-def test_nothing_is_trained_if_nothing_could_be_read(stario, tmp_path: Path) -> None:
-    stario("train", "missing.csv").assert_one_line_error("missing.csv", "no such file")
-    assert not (tmp_path / "runs").exists()
-
-
 def test_run_writes_the_smoothed_track_and_on_request_the_filters(
-    stario, recording: Path, tmp_path: Path, no_figures
-) -> None:
+    stario, recording, tmp_path, no_figures
+):
     done = stario("run", recording, "--filtered", "--out", "out", "--json")
     assert done.code == 0
     assert json.loads(done.out)["filtered"]["ate_m"] > 0.0
@@ -379,7 +226,7 @@ def test_run_writes_the_smoothed_track_and_on_request_the_filters(
     assert not (tmp_path / "out/filtered.tum").exists()
 
 
-def test_backends_compares_filter_and_graph(stario) -> None:
+def test_backends_compares_filter_and_graph(stario):
     done = stario("check", "backends", "--walks", "1", "--seconds", "10", "--json")
     assert done.code == 0
     content = json.loads(done.out)
@@ -387,44 +234,8 @@ def test_backends_compares_filter_and_graph(stario) -> None:
     assert content["scores"][0]["recording"] == "walk 0"
 
 
-def test_recordings_too_short_to_hold_out_a_part_require_validation_recordings(
-    stario, recording: Path, tmp_path: Path
-) -> None:
-    write_csv(tmp_path / "short.csv", read_generic_csv(recording).slice(0.0, 9.0))
-    stario("train", "short.csv", "--generated", 1).assert_one_line_error(
-        "two legs between known positions", "--validation"
-    )
-
-
-def test_what_is_left_out_is_neither_learned_from_nor_selected_on(tmp_path: Path) -> None:
-    for line in _names():
-        file = split_name(tmp_path / line)[0]
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.touch()
-    entries = read_packaged_list("all", tmp_path)
-    groups = {entry.path: entry.group for entry in entries}
-
-    learned, selected = packaged_lists(tmp_path, ["tyrex", "ridi dan"], "all")
-
-    used = {groups[path] for path in learned + selected}
-    assert not {g for g in used if g.startswith("tyrex")} | ({"ridi dan"} & used)
-    holdout = {entry.path for entry in read_packaged_list("holdout", tmp_path)}
-    assert set(selected) <= holdout
-    assert not set(learned) & holdout
-    left_out = sum(g.startswith("tyrex") or g == "ridi dan" for g in groups.values())
-    assert len(learned) + len(selected) == len(entries) - left_out
-
-
-def _names() -> list[str]:
-    lists = Path(splits.__file__).parent / "all.txt"
-    lines = lists.read_text().splitlines()
-    return [line.partition(",")[0] for line in lines if line and not line.startswith("#")]
-
-
-def test_set_in_the_name_of_weights_is_the_first_word_of_a_group(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    loaded: list[str] = []
+def test_set_in_the_name_of_weights_is_the_first_word_of_a_group(monkeypatch):
+    loaded = []
     monkeypatch.setattr(evaluate, "_loaded", loaded.append)
 
     evaluate._for_group("runs/{set}/{group}.safetensors", "ridi dan")

@@ -1,7 +1,5 @@
 """`run --report`, `run --view`, `compare --report` and `live` as users call them."""
 
-from __future__ import annotations
-
 import logging
 import socket
 import sys
@@ -95,9 +93,7 @@ def test_live_refuses_an_invalid_address_of_a_phone(stario):
     stario("live", "--port", 0, "--phyphox", "file:///etc/passwd").assert_one_line_error("phyphox")
 
 
-def test_training_without_a_terminal_tells_its_progress_and_the_time_left(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_training_without_a_terminal_tells_its_progress_and_the_time_left(monkeypatch, capsys):
     """Steps of four seconds: a line every third of them, none of seconds that had no step."""
     clock = count(0.0, 4.0)
     monkeypatch.setattr("stario.fusion.commands.common.monotonic", lambda: next(clock))

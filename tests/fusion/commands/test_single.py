@@ -1,7 +1,5 @@
 """The `stario` command as a user meets it: output, files, exit codes, one-line errors."""
 
-from __future__ import annotations
-
 import html
 import json
 import re
@@ -14,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -22,10 +19,7 @@ from stario.fusion.commands.cli import app
 from stario.fusion.commands.common import origin_of
 from stario.fusion.commands.options import EstimatorOptions, ReadingOptions
 from stario.fusion.config import read_config
-from stario.network.architectures import build_network
-from stario.network.card import Card
-from stario.network.displacement import DisplacementNetwork
-from stario.network.model import load_model, save_model
+from stario.network.model import load_model
 from stario.sequences.conventions import with_axes
 from stario.sequences.readers import FORMATS
 from stario.sequences.readers.csv_writer import write_csv
@@ -43,7 +37,7 @@ CHECKS = ("models", "backends", "faults", "consistency", "benchmark")
 # --- help and usage ----------------------------------------------------------------------------
 
 
-def test_help_names_every_command() -> None:
+def test_help_names_every_command():
     result = CliRunner().invoke(app, ["--help"])
     assert result.exit_code == 0
     shown = re.findall(r"^│ (\w+)", result.output, flags=re.MULTILINE)
@@ -51,14 +45,14 @@ def test_help_names_every_command() -> None:
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, *(f"check {name}" for name in CHECKS)])
-def test_every_command_prints_its_help(command: str) -> None:
+def test_every_command_prints_its_help(command):
     result = CliRunner().invoke(app, [*command.split(), "--help"], terminal_width=200)
     assert result.exit_code == 0
     assert f"stario {command}" in result.output.replace("root", "stario")
     assert " . " not in result.output  # left if the formatter drops a word in brackets
 
 
-def test_help_shows_a_commands_own_options_first_and_names_every_format() -> None:
+def test_help_shows_a_commands_own_options_first_and_names_every_format():
     result = CliRunner().invoke(app, ["run", "--help"], terminal_width=200)
     options, reading, estimation = re.split("─ (?:Reading|Estimation) ─", result.output)
     assert "--filtered" in options
@@ -81,32 +75,30 @@ def test_help_shows_a_commands_own_options_first_and_names_every_format() -> Non
         ["train", "--epochs", "0"],
     ],
 )
-def test_wrong_usage_exits_with_code_2(stario, arguments: list[str]) -> None:
+def test_wrong_usage_exits_with_code_2(stario, arguments):
     done = stario(*arguments)
     assert done.code == 2
     assert "Usage" in done.err
 
 
-def test_the_version_is_that_of_the_distribution(stario) -> None:
+def test_the_version_is_that_of_the_distribution(stario):
     done = stario("--version")
     assert (done.code, done.out, done.err) == (0, f"{version('stario-nav')}\n", "")
 
 
-def test_the_installed_command_has_the_same_exit_codes(tmp_path: Path) -> None:
+def test_the_installed_command_has_the_same_exit_codes(tmp_path):
     command = Path(sys.executable).with_name("stario")
     if not command.exists():
         pytest.skip("stario is not installed next to this Python")
 
-    def code(*arguments: str) -> int:
+    def code(*arguments):
         return subprocess.run([command, *arguments], capture_output=True, cwd=tmp_path).returncode
 
     assert [code("--help"), code("convert", "one.csv"), code("nosuch")] == [0, 1, 2]
 
 
-def test_a_bug_is_not_reported_as_an_error_of_the_user(
-    stario, monkeypatch: pytest.MonkeyPatch, recording: Path
-) -> None:
-    def broken(path: Path, format: str) -> None:
+def test_a_bug_is_not_reported_as_an_error_of_the_user(stario, monkeypatch, recording):
+    def broken(path, format):
         raise ZeroDivisionError
 
     monkeypatch.setattr("stario.sequences.readers.read_recording", broken)
@@ -114,47 +106,10 @@ def test_a_bug_is_not_reported_as_an_error_of_the_user(
         stario("run", recording)
 
 
-# --- simulate and run --------------------------------------------------------------------------
+# --- run -------------------------------------------------------------------------------------
 
 
-def test_simulate_writes_a_recording_with_truth(stario, tmp_path: Path) -> None:
-    done = stario("simulate", "w.csv", "--seconds", 5, "--rate", 50, "--seed", 7, "--json")
-    assert done.code == 0
-    figures = json.loads(done.out)
-    sequence = read_generic_csv(tmp_path / "w.csv")
-    assert figures["samples"] == len(sequence) == 251
-    assert figures["duration_s"] == pytest.approx(5.0)
-    assert sequence.truth is not None
-    stario("simulate", "again.csv", "--seconds", 5, "--rate", 50, "--seed", 7)
-    assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "w.csv").read_bytes()
-
-
-def test_a_simulated_house_has_floors_pressure_and_satellites(stario, tmp_path: Path) -> None:
-    done = stario("simulate", "h.csv", "--floors", "--seconds", 120, "--rate", 50, "--json")
-    assert done.code == 0
-    stays = json.loads(done.out)["stays"]
-    sequence = read_generic_csv(tmp_path / "h.csv")
-    assert sequence.truth is not None
-    assert sequence.barometer is not None
-    assert sequence.satellites is not None
-    height = sequence.truth.position_W[:, 2]
-    assert np.ptp(height) > 2.9 * max(abs(stay["floor"]) for stay in stays) > 0.0
-    pressure = 8.43 * np.ptp(sequence.barometer.pressure_hPa)
-    assert pressure == pytest.approx(np.ptp(height), abs=2.0)
-
-
-def test_simulate_replaces_a_recording_only_on_request(stario, tmp_path: Path) -> None:
-    own = tmp_path / "own.csv"
-    own.write_text("own")
-    refused = stario("simulate", "own.csv", "--seconds", 5)
-    assert refused.code == 1
-    assert "--overwrite" in refused.err
-    assert own.read_text() == "own"
-    assert stario("simulate", "own.csv", "--seconds", 5, "--overwrite").code == 0
-    assert len(read_generic_csv(own)) == 1001
-
-
-def test_run_writes_a_track_and_prints_a_summary(stario, recording: Path, tmp_path: Path) -> None:
+def test_run_writes_a_track_and_prints_a_summary(stario, recording, tmp_path):
     done = stario("run", recording, "--out", "out")
     assert done.code == 0
     assert done.err == ""
@@ -167,21 +122,15 @@ def test_run_writes_a_track_and_prints_a_summary(stario, recording: Path, tmp_pa
         assert words not in done.out
     track = read_tum(tmp_path / "out" / "track.tum")
     assert track.time[-1] - track.time[0] == pytest.approx(12.0, abs=0.11)
+    (printed,) = re.findall(r"track: ([\d.]+) m in", done.out)
+    assert float(printed) == pytest.approx(track.path_length(), abs=0.051)
+    steps = np.linalg.norm(np.diff(track.position_W, axis=0), axis=1)
+    assert float(printed) == pytest.approx(steps.sum(), rel=0.06)  # the phone sways, and no more
     assert len(list((tmp_path / "out").iterdir())) == 9
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_the_printed_length_is_that_of_the_file(stario, recording: Path, tmp_path: Path) -> None:
-    done = stario("run", recording, "--out", "out")
-    (printed,) = re.findall(r"track: ([\d.]+) m in", done.out)
-    track = read_tum(tmp_path / "out/track.tum")
-    assert float(printed) == pytest.approx(track.path_length(), abs=0.051)
-    steps = np.linalg.norm(np.diff(track.position_W, axis=0), axis=1)
-    assert float(printed) == pytest.approx(steps.sum(), rel=0.06)  # the phone sways, and no more
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_run_inspect_and_report_give_one_verdict(stario, recording: Path, tmp_path: Path) -> None:
+def test_run_inspect_and_report_give_one_verdict(stario, recording, tmp_path):
     """Here on positions that contradict accelerometer and track."""
     pytest.importorskip("plotly")
     walk = read_generic_csv(recording)
@@ -212,8 +161,8 @@ def write_fixes(path: Path, truth: Trajectory, yaw: float = 0.0, delay: float = 
 
 @pytest.mark.usefixtures("no_figures")
 def test_a_track_with_fixes_is_aligned_by_least_squares_and_not_by_its_first_yaw(
-    stario, recording: Path, tmp_path: Path
-) -> None:
+    stario, recording, tmp_path
+):
     truth = read_generic_csv(recording).truth
     assert truth is not None
     for yaw in (0.0, 1.0):
@@ -228,7 +177,7 @@ def test_a_track_with_fixes_is_aligned_by_least_squares_and_not_by_its_first_yaw
     assert compared["recordings"]["walk"]["tracks"]["track"]["ate_m"] < 0.3
 
 
-def test_fixes_on_another_clock_are_refused(stario, recording: Path, tmp_path: Path) -> None:
+def test_fixes_on_another_clock_are_refused(stario, recording, tmp_path):
     truth = read_generic_csv(recording).truth
     assert truth is not None
     fixes = write_fixes(tmp_path / "fixes.csv", truth, delay=1.7e9)
@@ -237,7 +186,7 @@ def test_fixes_on_another_clock_are_refused(stario, recording: Path, tmp_path: P
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_run_tells_how_much_of_a_recording_it_tracked(stario, recording: Path) -> None:
+def test_run_tells_how_much_of_a_recording_it_tracked(stario, recording):
     """The sensors stop after 7 s of 12 and repeat their values."""
     head, *lines = recording.read_text().splitlines()
     whole = stario("run", recording)
@@ -253,7 +202,7 @@ def test_run_tells_how_much_of_a_recording_it_tracked(stario, recording: Path) -
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_settings_are_read_from_a_file_and_saved(stario, recording: Path, tmp_path: Path) -> None:
+def test_settings_are_read_from_a_file_and_saved(stario, recording, tmp_path):
     (tmp_path / "slow.toml").write_text("[filter]\nupdate_rate = 2\n")
     assert stario("run", recording, "--config", "slow.toml", "--out", "a").code == 0
     assert read_config(tmp_path / "a/config.json") == read_config(tmp_path / "slow.toml")
@@ -261,9 +210,7 @@ def test_settings_are_read_from_a_file_and_saved(stario, recording: Path, tmp_pa
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_run_compare_and_evaluate_state_what_produced_their_results(
-    stario, recording: Path, tmp_path: Path
-) -> None:
+def test_run_compare_and_evaluate_state_what_produced_their_results(stario, recording, tmp_path):
     for command in ("run", "compare", "evaluate"):
         done = stario(command, recording, "--axes", "x,y,z", "--accel-sign", "up", "--out", command)
         assert done.code == 0, done.err
@@ -279,7 +226,7 @@ def test_run_compare_and_evaluate_state_what_produced_their_results(
         }
 
 
-def test_what_produced_a_run_names_fixes_and_changed_reading_options(tmp_path: Path) -> None:
+def test_what_produced_a_run_names_fixes_and_changed_reading_options(tmp_path):
     reading = ReadingOptions(gyro_unit="deg/s", where=["person=dan"])
     estimating, fixes = EstimatorOptions(), tmp_path / "fixes.csv"
     origin = origin_of([], reading, estimating, estimating.network(), fixes)
@@ -288,7 +235,7 @@ def test_what_produced_a_run_names_fixes_and_changed_reading_options(tmp_path: P
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_run_accepts_a_folder_or_a_list(stario, recording: Path, tmp_path: Path) -> None:
+def test_run_accepts_a_folder_or_a_list(stario, recording, tmp_path):
     (tmp_path / "all").mkdir()
     for name in ("a", "b"):
         (tmp_path / "all" / f"{name}.csv").write_bytes(recording.read_bytes())
@@ -309,9 +256,7 @@ def test_run_accepts_a_folder_or_a_list(stario, recording: Path, tmp_path: Path)
 
 @pytest.mark.usefixtures("no_figures")
 @pytest.mark.parametrize("command", ["run", "compare", "evaluate", "convert"])
-def test_every_command_accepts_units_axes_and_gravity(
-    stario, recording: Path, tmp_path: Path, command: str
-) -> None:
+def test_every_command_accepts_units_axes_and_gravity(stario, recording, tmp_path, command):
     """Rates in degrees, Apple's user acceleration in g, axes rotated relative to the truth's."""
     walk = with_axes(read_generic_csv(recording), "-y,x,z")
     upright = walk.truth.at(walk.time).attitude_WB * Rotation.from_euler("z", 90, degrees=True)
@@ -329,7 +274,7 @@ def test_every_command_accepts_units_axes_and_gravity(
 # --- inspect -----------------------------------------------------------------------------------
 
 
-def test_inspect_names_the_option_that_helps(stario, recording: Path, tmp_path: Path) -> None:
+def test_inspect_names_the_option_that_helps(stario, recording, tmp_path):
     walk = read_generic_csv(recording)
     write_csv(tmp_path / "g.csv", replace(walk, accel=walk.accel / 9.80665))
     done = stario("inspect", "g.csv", "--out", "out")
@@ -342,47 +287,10 @@ def test_inspect_names_the_option_that_helps(stario, recording: Path, tmp_path: 
     assert corrected["rate_hz"] == pytest.approx(100.0)
 
 
-# --- export ------------------------------------------------------------------------------------
-
-
-def test_export_accepts_the_name_of_a_network(
-    stario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of its run; without one, StarIO is the default and others require training first."""
-    pytest.importorskip("onnx")
-    exported = []  # tracing others than StarIO takes seconds
-    monkeypatch.setattr(
-        "stario.network.runtime.export.export_onnx", lambda *given: exported.append(given)
-    )
-    done = stario("export", "--model", "StarIO")
-    assert (done.code, done.out) == (0, "StarIO.onnx\n")
-    [(model, path)] = exported
-    assert (model.card, path) == (load_model("default").card, Path("StarIO.onnx"))
-    stario("export", "--model", "R-ResNet").assert_one_line_error(
-        "runs/R-ResNet/model.safetensors", "stario train --model 'R-ResNet'"
-    )
-    torch.manual_seed(0)
-    network = DisplacementNetwork(build_network("R-ResNet"))
-    save_model(tmp_path / "mine/R-ResNet/model.safetensors", network, Card(architecture="R-ResNet"))
-    done = stario("export", "--model", "R-ResNet", "--runs", "mine", "--out", "r.onnx")
-    assert done.code == 0, done.err
-    assert [(model.name, path) for model, path in exported[1:]] == [("R-ResNet", Path("r.onnx"))]
-
-
-def test_an_exported_graph_cannot_be_trained(stario) -> None:
-    pytest.importorskip("onnx")
-    assert stario("export", "--out", "exported.onnx").code == 0
-    done = stario("train", "nowhere.csv", "--start-from", "exported.onnx")
-    done.assert_one_line_error("an exported graph")
-    assert "nowhere.csv" not in done.err  # nothing is read first
-
-
 # --- on the map ------------------------------------------------------------------------------
 
 
-def test_run_writes_files_for_a_map_where_the_place_is_known(
-    stario, recording: Path, no_figures
-) -> None:
+def test_run_writes_files_for_a_map_where_the_place_is_known(stario, recording, no_figures):
     done = stario("run", recording, "--origin=-33.86,151.21,90", "--out", "r")
     assert done.code == 0, done.err
     line = json.loads(Path("r/track.geojson").read_text())["features"][0]
@@ -397,12 +305,10 @@ def test_run_writes_files_for_a_map_where_the_place_is_known(
     ("option", "value"),
     [("--origin", "11.5"), ("--origin", "here"), ("--satellites", "yes"), ("--waypoints", "no")],
 )
-def test_a_wrong_place_is_one_line(stario, recording: Path, option: str, value: str) -> None:
+def test_a_wrong_place_is_one_line(stario, recording, option, value):
     stario("run", recording, option, value).assert_one_line_error(option)
 
 
-def test_a_recording_without_satellites_says_so(
-    stario, recording: Path, no_figures, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_recording_without_satellites_says_so(stario, recording, no_figures, caplog):
     assert stario("run", recording, "--satellites", "use", "--out", "r").code == 0
     assert "no satellite position is used" in caplog.text

@@ -1,7 +1,5 @@
 """Wrong input to the commands: one line that names what is wrong and what fixes it."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -26,9 +24,8 @@ from stario.sequences.sequence import PositionTrack
 )
 @pytest.mark.usefixtures("no_figures")
 def test_a_wrong_unit_or_sign_is_refused_with_the_option_that_helps(
-    stario, recording: Path, tmp_path: Path, field: str, factor: float, options: list[str],
-    truth: bool,
-) -> None:  # fmt: skip
+    stario, recording, tmp_path, field, factor, options, truth
+):
     sequence = read_generic_csv(recording)
     sequence = sequence if truth else sequence.without_truth()
     write_csv(tmp_path / "odd.csv", replace(sequence, **{field: factor * getattr(sequence, field)}))
@@ -49,15 +46,13 @@ def test_a_wrong_unit_or_sign_is_refused_with_the_option_that_helps(
         (b"\x89PNG\r\n\x1a\n\x00\x00", ["broken.csv"]),
     ],
 )
-def test_a_broken_file_is_named_in_one_line(
-    stario, tmp_path: Path, content: bytes, words: list[str]
-) -> None:
+def test_a_broken_file_is_named_in_one_line(stario, tmp_path, content, words):
     (tmp_path / "broken.csv").write_bytes(content)
     stario("run", "broken.csv").assert_one_line_error(*words)
     assert list(tmp_path.iterdir()) == [tmp_path / "broken.csv"]
 
 
-def test_a_line_that_is_cut_short_is_named(stario, recording: Path, tmp_path: Path) -> None:
+def test_a_line_that_is_cut_short_is_named(stario, recording, tmp_path):
     content = recording.read_bytes()
     cut, end = content.index(b",", content.index(b"\n", 50_000)), content.index(b"\n", 60_000)
     (tmp_path / "cut.csv").write_bytes(content[:cut] + content[end:])
@@ -118,9 +113,7 @@ def test_a_line_that_is_cut_short_is_named(stario, recording: Path, tmp_path: Pa
         (["evaluate", "RECORDING", "--models", "default", "--convention", "tlio"], ["convention"]),
     ],
 )
-def test_invalid_arguments_give_a_one_line_error(
-    stario, recording: Path, arguments: list[str], words: list[str]
-) -> None:
+def test_invalid_arguments_give_a_one_line_error(stario, recording, arguments, words):
     done = stario(*(recording if word == "RECORDING" else word for word in arguments))
     done.assert_one_line_error(*words)
 
@@ -158,9 +151,7 @@ def test_invalid_arguments_give_a_one_line_error(
         ("train RECORDING --learn-from few", "--learn-from without --data"),
     ],
 )
-def test_an_option_that_would_do_nothing_is_refused(
-    stario, recording: Path, tmp_path: Path, arguments: str, words: str
-) -> None:
+def test_an_option_that_would_do_nothing_is_refused(stario, recording, tmp_path, arguments, words):
     given = (recording if word == "RECORDING" else word for word in arguments.split())
     stario(*given).assert_one_line_error(*words.split())
     assert not list(tmp_path.iterdir())
@@ -181,13 +172,13 @@ def test_an_option_that_would_do_nothing_is_refused(
     ],
 )
 def test_an_invalid_setting_is_named_in_one_line(
-    stario, recording: Path, tmp_path: Path, command: str, content: str, named: str
-) -> None:
+    stario, recording, tmp_path, command, content, named
+):
     (tmp_path / "settings.json").write_text(content)
     stario(command, recording, "--config", "settings.json").assert_one_line_error(named)
 
 
-def test_no_file_is_overwritten_without_the_option(stario, recording: Path, tmp_path: Path) -> None:
+def test_no_file_is_overwritten_without_the_option(stario, recording, tmp_path):
     before = recording.read_bytes()
     stario("convert", recording, recording).assert_one_line_error("also an input", "another file")
     stario("convert", recording, recording, "--overwrite").assert_one_line_error("also an input")
@@ -205,12 +196,12 @@ def test_no_file_is_overwritten_without_the_option(stario, recording: Path, tmp_
     assert Path("two.h5").read_bytes() == before
 
 
-def test_a_file_extension_without_a_layout_is_refused(stario, recording: Path) -> None:
+def test_a_file_extension_without_a_layout_is_refused(stario, recording):
     stario("convert", recording, "walk.txt").assert_one_line_error(".txt", ".csv, .h5", "--to")
     assert not Path("walk.txt").exists()
 
 
-def test_a_declination_without_a_source_of_north_is_reported(stario, recording: Path) -> None:
+def test_a_declination_without_a_source_of_north_is_reported(stario, recording):
     done = stario("run", recording, "--declination", "-6", "--out", "north")
     assert done.code == 0
     assert "north" in done.out
@@ -220,8 +211,8 @@ def test_a_declination_without_a_source_of_north_is_reported(stario, recording: 
 @pytest.mark.parametrize("command", ["train", "evaluate"])
 @pytest.mark.parametrize("where", ["all.h5", "list.txt"])
 def test_a_missing_package_ends_a_batch_instead_of_leaving_out_recordings(
-    stario, recording: Path, tmp_path: Path, monkeypatch, command: str, where: str
-) -> None:
+    stario, recording, tmp_path, monkeypatch, command, where
+):
     write_archive(tmp_path / "all.h5", [read_generic_csv(recording)])
     (tmp_path / "list.txt").write_text("all.h5:walk\n")
     monkeypatch.setitem(sys.modules, "h5py", None)
@@ -229,9 +220,7 @@ def test_a_missing_package_ends_a_batch_instead_of_leaving_out_recordings(
     done.assert_one_line_error("h5py", "not installed", "pip install 'h5py>=3")
 
 
-def test_waypoints_alone_cannot_be_all_recorded_data(
-    stario, recording: Path, tmp_path: Path
-) -> None:
+def test_waypoints_alone_cannot_be_all_recorded_data(stario, recording, tmp_path):
     sequence = read_generic_csv(recording)
     truth = sequence.truth
     legs = slice(None, None, len(truth) // 8)

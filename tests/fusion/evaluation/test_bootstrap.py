@@ -1,7 +1,5 @@
 """Intervals of error ratios and ranks: their width, what is drawn, and the verdict on them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -41,8 +39,8 @@ def recordings(ratios: np.ndarray) -> list[Blocks]:
     return [(ratio**2 * blocks, blocks) for ratio, blocks in zip(ratios, theirs, strict=True)]
 
 
-def test_the_interval_of_a_ratio_widens_as_groups_differ() -> None:
-    def groups(ratios: list[float]) -> dict[str, list[Blocks]]:
+def test_the_interval_of_a_ratio_widens_as_groups_differ():
+    def groups(ratios):
         return {f"g{k}": recordings(np.full(4, ratio)) for k, ratio in enumerate(ratios)}
 
     equal = interval_of(**groups([0.8] * 6))
@@ -53,7 +51,7 @@ def test_the_interval_of_a_ratio_widens_as_groups_differ() -> None:
     assert paired_ratio(table_of({"g": recordings(np.ones(1))}), "ours", "nobody") is None
 
 
-def test_the_interval_over_recordings_of_a_group_is_that_of_a_mean_with_95_percent() -> None:
+def test_the_interval_over_recordings_of_a_group_is_that_of_a_mean_with_95_percent():
     logs = RNG.normal(0.0, 0.5, 60)
     found = interval_of(g=recordings(np.exp(logs)))
     assert found.ratio == pytest.approx(np.exp(logs.mean()))
@@ -61,7 +59,7 @@ def test_the_interval_over_recordings_of_a_group_is_that_of_a_mean_with_95_perce
     assert np.log([found.low, found.high]) - logs.mean() == pytest.approx([-half, half], rel=0.15)
 
 
-def test_a_single_recording_has_an_interval_from_its_blocks() -> None:
+def test_a_single_recording_has_an_interval_from_its_blocks():
     theirs = np.ones(12)
     even = interval_of(g=[(0.25 * theirs, theirs)])
     assert (even.low, even.high) == pytest.approx((0.5, 0.5))
@@ -69,7 +67,7 @@ def test_a_single_recording_has_an_interval_from_its_blocks() -> None:
     assert uneven.low < 0.8 * uneven.ratio < 1.2 * uneven.ratio < uneven.high
 
 
-def test_a_few_blocks_have_no_interval() -> None:
+def test_a_few_blocks_have_no_interval():
     """A single block would have one without width: certainty from nothing."""
     theirs = np.ones(4)
     few = interval_of(g=[(0.25 * theirs, theirs)])
@@ -90,7 +88,7 @@ def rows_with(groups: list[Interval], pooled: Interval) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def test_two_groups_are_too_few_for_a_verdict() -> None:
+def test_two_groups_are_too_few_for_a_verdict():
     assert verdict(rows_with([BETTER] * 2, BETTER)).startswith("not decided")
     assert verdict(rows_with([BETTER] * 3, BETTER)).startswith("accepted")
 
@@ -103,9 +101,7 @@ def test_two_groups_are_too_few_for_a_verdict() -> None:
         (BETTER, Interval(0.9, 0.8, 1.01), False),
     ],
 )
-def test_a_pooled_gain_by_chance_or_a_group_much_worse_is_not_accepted(
-    worst: Interval, pooled: Interval, accepted: bool
-) -> None:
+def test_a_pooled_gain_by_chance_or_a_group_much_worse_is_not_accepted(worst, pooled, accepted):
     words = verdict(rows_with([BETTER, BETTER, worst], pooled))
     assert words.startswith("accepted" if accepted else "not accepted")
 
@@ -141,7 +137,7 @@ def part(errors: Errors, recordings: slice) -> Errors:
     return {key: errors[key] for key in list(errors)[recordings]}
 
 
-def test_twice_the_error_is_certain_however_much_recordings_differ_in_difficulty() -> None:
+def test_twice_the_error_is_certain_however_much_recordings_differ_in_difficulty():
     found = ranked({"StarIO": [errors(1.0)], "worse": [errors(2.0)]}, "StarIO")
     assert found["StarIO"]["ratio"] is None
     ratio = found["worse"]["ratio"]
@@ -150,7 +146,7 @@ def test_twice_the_error_is_certain_however_much_recordings_differ_in_difficulty
     assert bounds == [(1, 1, 1), (2, 2, 2)]
 
 
-def test_networks_that_differ_by_chance_alone_may_have_either_rank() -> None:
+def test_networks_that_differ_by_chance_alone_may_have_either_rank():
     runs = {name: [errors(1.0, 0.7, seed)] for seed, name in enumerate(["StarIO", "a", "b"])}
     found = ranked(runs, "StarIO")
     assert all(row["rank_low"] < row["rank_high"] for row in found.values())
@@ -158,7 +154,7 @@ def test_networks_that_differ_by_chance_alone_may_have_either_rank() -> None:
     assert ranked(runs, "StarIO") == found
 
 
-def test_seeds_are_averaged_over_common_recordings_only() -> None:
+def test_seeds_are_averaged_over_common_recordings_only():
     halves = [part(errors(scale), slice(6)) for scale in (1.0, 2.0)]
     found = ranked({"StarIO": [errors(1.0)], "two": halves}, "StarIO")
     assert found["two"]["ratio"].ratio == pytest.approx(np.sqrt(2.0))
@@ -166,14 +162,14 @@ def test_seeds_are_averaged_over_common_recordings_only() -> None:
     assert ranked(apart, "a") == {}
 
 
-def test_sets_have_equal_weights_however_many_recordings_they_have() -> None:
+def test_sets_have_equal_weights_however_many_recordings_they_have():
     """Eight times the error on the two recordings of one set, none on the six of the other."""
     other = part(errors(8.0), slice(0, 3, 2)) | part(errors(1.0), slice(1, None, 2))
     found = ranked({"StarIO": [errors(1.0)], "other": [other]}, "StarIO")["other"]["ratio"]
     assert found.ratio == pytest.approx(np.sqrt(8.0))
 
 
-def test_groups_are_drawn_before_their_recordings() -> None:
+def test_groups_are_drawn_before_their_recordings():
     """A network that is worse with one of two people may be worse or equal with the next ones."""
     keys = [
         ("set", person, f"{person} {k}") for person, n in (("a", 9), ("b", 3)) for k in range(n)

@@ -25,16 +25,14 @@ def files_of(value: int) -> Files:
 @pytest.mark.parametrize("failing", NAMES)
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left"), KeyboardInterrupt()])
 @pytest.mark.parametrize("earlier", [True, False])
-def test_a_run_that_fails_at_any_write_leaves_what_was_there(
-    tmp_path: Path, failing: str, error: BaseException, earlier: bool
-) -> None:
+def test_a_run_that_fails_at_any_write_leaves_what_was_there(tmp_path, failing, error, earlier):
     out = tmp_path / "out"
     if earlier:
         write_results(out, files_of(1))
         (out / "notes.txt").write_text("mine")
     before = contents(tmp_path)
 
-    def full(path: Path) -> None:
+    def full(path):
         path.write_text("partial")
         raise error
 
@@ -44,7 +42,7 @@ def test_a_run_that_fails_at_any_write_leaves_what_was_there(
     assert list(tmp_path.iterdir()) == ([out] if earlier else [])
 
 
-def test_a_later_set_replaces_results_and_removes_those_without_a_successor(tmp_path: Path) -> None:
+def test_a_later_set_replaces_results_and_removes_those_without_a_successor(tmp_path):
     write_results(tmp_path / "out", files_of(1))
     for name in ("walk/plan.png", "walk/filtered.tum", "walk/notes.txt", "other/health.json"):
         path = tmp_path / "out" / name
@@ -57,7 +55,7 @@ def test_a_later_set_replaces_results_and_removes_those_without_a_successor(tmp_
     assert contents(tmp_path) == {f"out/{name}": text for name, text in (kept | new).items()}
 
 
-def test_a_removal_that_fails_is_named_and_can_be_repeated(tmp_path: Path) -> None:
+def test_a_removal_that_fails_is_named_and_can_be_repeated(tmp_path):
     for mark, names in RESULTS.items():
         for name in (mark, *names):
             (tmp_path / name).touch()
@@ -70,7 +68,7 @@ def test_a_removal_that_fails_is_named_and_can_be_repeated(tmp_path: Path) -> No
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_in_the_way_is_named(tmp_path: Path) -> None:
+def test_a_file_in_the_way_is_named(tmp_path):
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(InputError, match="file"):
         write_results(tmp_path / "file" / "out", files_of(1))

@@ -1,13 +1,9 @@
 """Known positions: the error at them, and what they contradict."""
 
-from __future__ import annotations
-
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +11,7 @@ from recorded import CASES
 from scipy.spatial.transform import Rotation
 from support import CONFIG
 
-from stario.fusion import Navigator, Track
+from stario.fusion import Navigator
 from stario.fusion.evaluation.known_positions import (
     placed,
     position_error,
@@ -26,7 +22,7 @@ from stario.fusion.evaluation.verdict import recording_verdict
 from stario.network import load_model
 from stario.sequences import Trajectory, read_recording
 from stario.sequences.findings import Finding
-from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
+from stario.sequences.sequence import PositionTrack
 
 TIME = np.linspace(0.0, 20.0, 201)
 PATH = np.column_stack([TIME, np.sin(0.3 * TIME), 0.0 * TIME])
@@ -112,7 +108,7 @@ def case(name: str) -> dict[str, Finding]:
         return {found.code: found for found in recording_verdict(sequence, track, train="train")}
 
 
-def test_positions_that_say_the_way_is_longer_are_told_with_the_factor() -> None:
+def test_positions_that_say_the_way_is_longer_are_told_with_the_factor():
     """A real walk with an instrument in the hand; nothing but its positions can tell."""
     found = case("handheld_walk_too_short/walk.csv")
     assert found["track_scale"].values["scale"] == pytest.approx(2.4, abs=0.3)
@@ -120,32 +116,32 @@ def test_positions_that_say_the_way_is_longer_are_told_with_the_factor() -> None
     assert "train" not in found  # positions without attitude cannot teach the weights
 
 
-def test_positions_that_fit_the_mirror_image_name_the_accelerometers_sign() -> None:
+def test_positions_that_fit_the_mirror_image_name_the_accelerometers_sign():
     found = case("sign_flipped_with_positions/walk.csv")["mirror_image"]
     assert found.values["error_m"] == pytest.approx(8.3, abs=0.5)
     assert found.values["mirrored_m"] < 1.2
     assert "--accel-sign apple" in found.advice
 
 
-def test_a_run_says_what_an_inspection_says_of_the_axes() -> None:
+def test_a_run_says_what_an_inspection_says_of_the_axes():
     assert case("run_silent_on_axes/gyro_not_rotated.csv")["gyro_axes"].level == "warning"
 
 
-def test_a_robot_that_turns_about_one_axis_gets_no_remedy_that_harms() -> None:
+def test_a_robot_that_turns_about_one_axis_gets_no_remedy_that_harms():
     found = case("planar_robot/robot.csv")
     assert not {code for code in found if code.startswith("truth_")}
     assert "track_scale" in found
     assert found["train"].advice == "Run `train`."
 
 
-def test_a_rate_that_may_be_in_degrees_is_asked() -> None:
+def test_a_rate_that_may_be_in_degrees_is_asked():
     assert (
         "--gyro-unit deg/s" in case("gyro_degrees_planar_robot/robot.csv")["gyro_unit_open"].advice
     )
 
 
 @pytest.fixture(scope="module")
-def walk_and_track(make_walk: Callable[..., Any], make_oracle: Any) -> tuple[ImuSequence, Track]:
+def walk_and_track(make_walk, make_oracle):
     walk = make_walk(3, 60.0)
     return walk, Navigator(make_oracle(walk, walk.truth, CONFIG), CONFIG).run(walk)
 
@@ -161,13 +157,8 @@ def walk_and_track(make_walk: Callable[..., Any], make_oracle: Any) -> tuple[Imu
         (lambda xy: xy * [1.0, -1.0], "mirror_image"),
     ],
 )
-def test_positions_contradict_by_length_and_handedness_alone(
-    walk_and_track: tuple[ImuSequence, Track],
-    change: Callable[[FloatArray], FloatArray],
-    code: str,
-) -> None:
+def test_positions_contradict_by_length_and_handedness_alone(walk_and_track, change, code):
     walk, track = walk_and_track
-    assert walk.truth is not None
     time = np.arange(0.0, 60.0, 0.5)
     path = change(walk.truth.at(time).position_W[:, :2])
     known = PositionTrack(time, path, "positions")
@@ -179,7 +170,7 @@ def test_positions_contradict_by_length_and_handedness_alone(
     assert position_findings(track, few) == []
 
 
-def test_a_right_truth_contradicts_nothing(walk_and_track: tuple[ImuSequence, Track]) -> None:
+def test_a_right_truth_contradicts_nothing(walk_and_track):
     walk, track = walk_and_track
     assert position_findings(track, walk) == []
     assert position_findings(track, walk.without_truth()) == []

@@ -1,9 +1,6 @@
 """Tracks as GeoJSON and GPX, as other programs read them."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
-from pathlib import Path
 
 import geojson
 import gpxpy
@@ -31,7 +28,7 @@ def straight(start: float = 0.0, gap: bool = False) -> Track:
     return Track(Trajectory(start + time, position, attitude, position_covariance_W=covariance))
 
 
-def test_geojson_is_valid_and_holds_the_track(tmp_path: Path) -> None:
+def test_geojson_is_valid_and_holds_the_track(tmp_path):
     path = write_geojson(tmp_path / "t.geojson", "walk", on_map(straight(), PLACE))
     found = geojson.loads(path.read_text())
     assert found.is_valid, found.errors()
@@ -49,9 +46,7 @@ def test_geojson_is_valid_and_holds_the_track(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("start", [0.0, 1_700_000_000.0])
-def test_gpx_is_read_with_heights_and_with_times_where_they_are_known(
-    tmp_path: Path, start: float
-) -> None:
+def test_gpx_is_read_with_heights_and_with_times_where_they_are_known(tmp_path, start):
     path = write_gpx(tmp_path / "t.gpx", "walk & talk", on_map(straight(start), PLACE))
     gpx = gpxpy.parse(path.read_text())
     assert gpx.tracks[0].name == "walk & talk"
@@ -64,7 +59,7 @@ def test_gpx_is_read_with_heights_and_with_times_where_they_are_known(
     assert [element.text for element in last.extensions] == ["3.00", "1.00"]
 
 
-def test_a_gap_parts_the_line(tmp_path: Path) -> None:
+def test_a_gap_parts_the_line(tmp_path):
     found = on_map(straight(gap=True), Georeference(48.1, 11.5))
     gpx = gpxpy.parse(write_gpx(tmp_path / "t.gpx", "walk", found).read_text())
     assert [s.length_2d() < 20.0 for s in gpx.tracks[0].segments] == [True, True]
@@ -75,19 +70,18 @@ def test_a_gap_parts_the_line(tmp_path: Path) -> None:
     assert len(line.properties["time_s"]) == sum(map(len, line.geometry.coordinates))
 
 
-def test_waypoints_with_coordinates_place_a_track_that_did_not_use_them() -> None:
+def test_waypoints_with_coordinates_place_a_track_that_did_not_use_them():
     """The track's own frame is turned by 90 degrees and shifted."""
     place = Georeference(48.1, 11.5, np.radians(90.0))
     xy = np.array([[2.0, 0.0], [20.0, 0.0], [38.0, 0.0]])
     time = np.array([1.0, 10.0, 19.0])
     known = PositionTrack(time, xy + 7.0, "waypoints", latlon_deg=place.latlon_deg(xy))
     found = fitted_georeference(straight(), known)
-    assert found is not None
     assert found.yaw == pytest.approx(np.radians(90.0), abs=1e-4)
     np.testing.assert_allclose([found.latitude_deg, found.longitude_deg], [48.1, 11.5], atol=1e-7)
 
 
-def test_waypoints_at_one_place_do_not_tell_a_direction() -> None:
+def test_waypoints_at_one_place_do_not_tell_a_direction():
     xy = np.array([[0.0, 0.0], [1.0, 0.0]])
     known = PositionTrack(np.array([1.0, 19.0]), xy, "waypoints", latlon_deg=PLACE.latlon_deg(xy))
     assert fitted_georeference(straight(), known) is None

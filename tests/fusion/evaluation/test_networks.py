@@ -1,7 +1,5 @@
 """Comparison table of networks, for tracks with known errors."""
 
-from __future__ import annotations
-
 import csv
 import json
 from itertools import product
@@ -45,7 +43,7 @@ MODELS = [
 
 @pytest.fixture(scope="module")
 def read(make_walk):
-    def read(path: Path):
+    def read(path):
         walk = make_walk(seed=int(path.stem), seconds=12.0)
         return walk.without_truth() if path.suffix == ".blind" else walk
 
@@ -60,7 +58,7 @@ def table(read):
     return table
 
 
-def test_every_network_has_every_track_of_every_recording(table) -> None:
+def test_every_network_has_every_track_of_every_recording(table):
     assert list(table.parameters) == ["StarIO", "R-ResNet"]
     assert table.parameters["R-ResNet"] == 4_634_882
     for protocol, (weights, count) in product(PROTOCOLS, {"a": 2, "b": 2, "c": 2}.items()):
@@ -68,7 +66,7 @@ def test_every_network_has_every_track_of_every_recording(table) -> None:
         assert found.shape == (count,)
 
 
-def test_recordings_with_the_same_name_are_distinguished(read) -> None:
+def test_recordings_with_the_same_name_are_distinguished(read):
     twice, _ = compare_networks(
         [Path("1.walk"), Path("1.walk")], MODELS[:1], NavigatorConfig(), read, jobs=1
     )
@@ -76,7 +74,7 @@ def test_recordings_with_the_same_name_are_distinguished(read) -> None:
     assert [sample.recording for sample in twice.samples] == ["walk-1", "walk-1-2"]
 
 
-def test_mean_and_spread_are_taken_over_weights_of_recording_means(table) -> None:
+def test_mean_and_spread_are_taken_over_weights_of_recording_means(table):
     a, b = (
         values(table.scores, "ate_m", track="network", weights=weights).mean() for weights in "ab"
     )
@@ -91,7 +89,7 @@ def test_mean_and_spread_are_taken_over_weights_of_recording_means(table) -> Non
     )
 
 
-def test_a_recording_at_rest_has_no_share_of_its_path_and_no_warning() -> None:
+def test_a_recording_at_rest_has_no_share_of_its_path_and_no_warning():
     figures = {"ate_m": 0.1, "rte_m": 0.1, "pde": None}
     scores = scored("rest", dict.fromkeys(PROTOCOLS, figures), network="StarIO", weights="a")
     known = NetworkTable("rms", {"StarIO": 1}, scores, [])
@@ -99,7 +97,7 @@ def test_a_recording_at_rest_has_no_share_of_its_path_and_no_warning() -> None:
     assert {("rest", "0.100"), ("rest", "-"), ("mean", "-")} < rows
 
 
-def test_the_ronin_convention_is_smaller_by_the_square_root_of_two(table, read) -> None:
+def test_the_ronin_convention_is_smaller_by_the_square_root_of_two(table, read):
     ronin, _ = compare_networks(
         [Path("1.walk")], MODELS[2:], NavigatorConfig(), read, "ronin", jobs=1
     )
@@ -111,13 +109,13 @@ def test_the_ronin_convention_is_smaller_by_the_square_root_of_two(table, read) 
     assert "convention ronin" in networks_text(ronin)
 
 
-def test_text_names_networks_recordings_convention_and_units(table) -> None:
+def test_text_names_networks_recordings_convention_and_units(table):
     text = networks_text(table)
     for word in ("StarIO", "R-ResNet", "walk-1", "walk-2", "+-", "convention rms", "RTE [m]"):
         assert word in text
 
 
-def test_csv_and_json_hold_the_same_figures(table, tmp_path: Path) -> None:
+def test_csv_and_json_hold_the_same_figures(table, tmp_path):
     write_table(tmp_path, table)
     assert {path.name for path in tmp_path.iterdir()} == {
         "networks.csv",
@@ -139,13 +137,13 @@ def test_csv_and_json_hold_the_same_figures(table, tmp_path: Path) -> None:
         assert path.read_bytes().startswith(b"\x89PNG")
 
 
-def test_no_panel_of_the_drift_cuts_its_boxes(table) -> None:
+def test_no_panel_of_the_drift_cuts_its_boxes(table):
     for axes in figures(table)["pde.png"].axes:
         assert axes.get_ylim()[0] == 0.0
         assert axes.dataLim.y1 <= axes.get_ylim()[1]
 
 
-def test_weights_are_found_by_network_name_in_the_runs_folder(tmp_path: Path) -> None:
+def test_weights_are_found_by_network_name_in_the_runs_folder(tmp_path):
     assert weights_named("StarIO", tmp_path) == "default"
     assert weights_named("some/file.onnx", tmp_path) == "some/file.onnx"
     with pytest.raises(WeightsError, match=r"stario train --model 'RNIN'"):

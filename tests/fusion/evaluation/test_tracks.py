@@ -1,8 +1,5 @@
 """Tracks without a filter: the IMU alone, chained displacements, steps."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -39,8 +36,6 @@ from stario.sequences.windows import WINDOW_RATE, WINDOW_SECONDS, headings_at, i
 
 CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=10, covariance_scale=1.0))
 
-Make = Callable[..., Any]
-
 
 class TrueAttitudeOracle:
     """True displacements of the true-attitude track's windows, in order at ten per second."""
@@ -64,7 +59,7 @@ def horizontal_errors(trajectory, sequence: ImuSequence) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def from_rest() -> ImuSequence:
+def from_rest():
     """A perfect IMU on a walk that begins at rest, since time along it is slowed to a stop."""
     walk = generate_walk(2, 12.0, style=WalkStyle(carry="handheld", mount_rotvec=(0.4, -0.7, 1.1)))
     time = np.arange(0.0, 12.0, 0.005)
@@ -75,9 +70,7 @@ def from_rest() -> ImuSequence:
     return simulate_imu(Trajectory(time, position, warped.attitude_WB), 200.0, PERFECT_IMU)
 
 
-def test_the_inertial_track_is_strapdown_from_rest(
-    from_rest: ImuSequence, still_model: Any
-) -> None:
+def test_the_inertial_track_is_strapdown_from_rest(from_rest, still_model):
     track = inertial_track(Navigator(still_model).observe(from_rest), CONFIG)
     aligned = align(track.trajectory, from_rest.truth, "first")
     errors = pose_errors(aligned, from_rest.truth)
@@ -87,9 +80,7 @@ def test_the_inertial_track_is_strapdown_from_rest(
     assert turn.magnitude().max() < 1e-3
 
 
-def test_chained_displacements_follow_the_truth_within_40_centimetres(
-    make_walk: Make, make_oracle: Make
-) -> None:
+def test_chained_displacements_follow_the_truth_within_40_centimetres(make_walk, make_oracle):
     """The remaining error is due to the mean over a second, which cuts corners."""
     walk = make_walk(5, 30.0, 200.0, PERFECT_IMU)
     preprocessed = Navigator(make_oracle(walk, walk.truth, CONFIG)).observe(walk)
@@ -98,7 +89,7 @@ def test_chained_displacements_follow_the_truth_within_40_centimetres(
     assert errors.max() < 0.4
 
 
-def test_chained_displacements_with_true_attitude_follow_the_truth(make_walk: Make) -> None:
+def test_chained_displacements_with_true_attitude_follow_the_truth(make_walk):
     walk = make_walk(5, 30.0, 200.0, PERFECT_IMU)
     track = network_track_true_attitude(TrueAttitudeOracle(walk), walk, CONFIG)
     errors = horizontal_errors(track.trajectory, walk)
@@ -109,7 +100,7 @@ def test_chained_displacements_with_true_attitude_follow_the_truth(make_walk: Ma
     assert np.linalg.norm(steps - true, axis=1)[1:-1].mean() < 0.05
 
 
-def test_the_track_with_true_attitude_requires_truth(walk: ImuSequence, still_model: Any) -> None:
+def test_the_track_with_true_attitude_requires_truth(walk, still_model):
     with pytest.raises(InputError, match="truth"):
         network_track_true_attitude(still_model, walk.without_truth(), CONFIG)
     short_truth = replace(walk, truth=walk.truth.slice(3.0, 3.5))
@@ -117,14 +108,14 @@ def test_the_track_with_true_attitude_requires_truth(walk: ImuSequence, still_mo
         network_track_true_attitude(still_model, short_truth, CONFIG)
 
 
-def test_gaps_in_the_truth_are_bridged_by_the_gyroscope(make_walk: Make) -> None:
+def test_gaps_in_the_truth_are_bridged_by_the_gyroscope(make_walk):
     walk = make_walk(5, 30.0, 200.0, PERFECT_IMU)
     valid = (walk.truth.time < 8.0) | (walk.truth.time > 14.0)
     with_gap = replace(walk, truth=replace(walk.truth, valid=valid))
-    recorded: list[Any] = []
+    recorded = []
 
     class Recorder:
-        def predict(self, windows: Any) -> Any:
+        def predict(self, windows):
             recorded.append(windows)
             return np.zeros((len(windows), 3)), np.tile(np.eye(3), (len(windows), 1, 1))
 
@@ -141,7 +132,7 @@ class Counting:
     def __init__(self, seen: int = 0) -> None:
         self.seen = seen
 
-    def stateful_inference(self, updates: int) -> Counting:
+    def stateful_inference(self, updates: int):
         return Counting()
 
     def predict(self, windows: Any) -> Any:
@@ -151,7 +142,7 @@ class Counting:
         return mean, np.tile(np.eye(3), (len(windows), 1, 1))
 
 
-def test_the_memory_of_a_network_ends_at_a_gap(walk: ImuSequence, without: Make) -> None:
+def test_the_memory_of_a_network_ends_at_a_gap(walk, without):
     gaps = [(walk.time > 8.0) & (walk.time < stop) for stop in (8.0, 8.2, 10.0)]
     longest = [
         network_track_true_attitude(Counting(), sequence, CONFIG).trajectory.velocity_W[:, 2].max()
@@ -160,7 +151,7 @@ def test_the_memory_of_a_network_ends_at_a_gap(walk: ImuSequence, without: Make)
     assert longest == pytest.approx([190.0, 108.0, 90.0], abs=2.0)  # ten windows a second
 
 
-def test_tracks_without_a_filter_have_no_covariance(walk: ImuSequence, still_model: Any) -> None:
+def test_tracks_without_a_filter_have_no_covariance(walk, still_model):
     preprocessed = Navigator(still_model).observe(walk)
     for track in (inertial_track(preprocessed), network_track(preprocessed)):
         assert track.covariance is None
@@ -170,9 +161,7 @@ def test_tracks_without_a_filter_have_no_covariance(walk: ImuSequence, still_mod
         }  # fmt: skip
 
 
-def test_every_track_continues_across_gaps_in_the_imu_data(
-    walk: ImuSequence, make_oracle: Make, without: Make
-) -> None:
+def test_every_track_continues_across_gaps_in_the_imu_data(walk, make_oracle, without):
     with_gap = without(walk, (walk.time > 8.0) & (walk.time < 10.0))
     preprocessed = Navigator(make_oracle(with_gap, walk.truth, CONFIG)).observe(with_gap)
     for track in (inertial_track(preprocessed, CONFIG), network_track(preprocessed)):
@@ -185,7 +174,7 @@ def test_every_track_continues_across_gaps_in_the_imu_data(
     np.testing.assert_allclose(moved, 2.0 * inertial.velocity_W[k], rtol=0.02)
 
 
-def test_a_recording_without_poses_is_refused_by_what_it_has() -> None:
+def test_a_recording_without_poses_is_refused_by_what_it_has():
     walk = simulate_imu(generate_walk(0, 5.0), 100.0, PERFECT_IMU, 0)
     waypoints = PositionTrack(np.array([1.0, 2.0, 3.0]), np.zeros((3, 2)), "waypoints")
     with pytest.raises(InputError, match="truth: found 3 waypoints, no poses, expected"):
@@ -218,7 +207,7 @@ def walking_stream(course: np.ndarray, mount: float = 0.0) -> LevelledStream:
 
 @pytest.mark.parametrize("course", [0.0, 2.0, -2.5])
 @pytest.mark.parametrize("mount", [0.0, 1.3, 3.0])
-def test_straight_steps_add_up_to_a_straight_path(course: float, mount: float) -> None:
+def test_straight_steps_add_up_to_a_straight_path(course, mount):
     stream = walking_stream(np.full(6000, course), mount)
     _, ends, displacements = steps_of(stream)
     lengths = np.abs(displacements)
@@ -229,7 +218,7 @@ def test_straight_steps_add_up_to_a_straight_path(course: float, mount: float) -
     assert abs(end) == pytest.approx(lengths.sum(), rel=0.01)
 
 
-def test_a_turn_is_followed_by_the_heading_of_the_device() -> None:
+def test_a_turn_is_followed_by_the_heading_of_the_device():
     course = np.where(np.arange(8000) < 4000, 0.0, np.pi / 2.0)
     path = pedestrian_path(walking_stream(course, mount=-0.7))
     for part, direction in ((path[:3800], 1.0), (path[4200:], 1j)):
@@ -238,7 +227,7 @@ def test_a_turn_is_followed_by_the_heading_of_the_device() -> None:
         assert moved.real > 15.0
 
 
-def test_a_standing_pedestrian_does_not_move() -> None:
+def test_a_standing_pedestrian_does_not_move():
     stream = walking_stream(np.zeros(4000))
     rng = np.random.default_rng(0)
     still = 0.05 * rng.standard_normal(stream.imu_N.shape).astype(np.float32)
@@ -247,14 +236,14 @@ def test_a_standing_pedestrian_does_not_move() -> None:
 
 
 @pytest.mark.skipif(not RIDI.exists(), reason=f"no recordings at {RIDI}")
-def test_a_real_walk_is_reproduced_within_4_percent_of_its_length() -> None:
+def test_a_real_walk_is_reproduced_within_4_percent_of_its_length():
     sequence = read_recording(Path(f"{RIDI}:hang_body_normal1"))
     assert sequence.truth is not None
     found = evaluate_track(pedestrian_track(sequence).trajectory, sequence.truth, alignment="yaw")
     assert found.ate_m < 0.04 * found.path_m
 
 
-def test_position_and_heading_are_kept_across_a_gap() -> None:
+def test_position_and_heading_are_kept_across_a_gap():
     """A straight, a quarter turn and another straight; the gap lies in the second straight."""
     time = np.arange(0.0, 40.0, 0.01)
     rate = np.where((time > 10.0) & (time < 12.0), 0.25 * np.pi, 0.0)

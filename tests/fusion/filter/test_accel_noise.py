@@ -1,7 +1,5 @@
 """The accelerometer's noise factor follows the innovations, but not a few false displacements."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -32,30 +30,28 @@ def final_factor(
     return state.statistics.accel_factor
 
 
-def test_the_factor_rises_for_a_bad_accelerometer_but_not_for_a_good_one(
-    make_walk, make_oracle
-) -> None:
+def test_the_factor_rises_for_a_bad_accelerometer_but_not_for_a_good_one(make_walk, make_oracle):
     walk, config = make_walk(seed=4, seconds=40.0), NavigatorConfig()
     oracle = make_oracle(walk, walk.truth, config, noise=0.03, sigma=0.05)
     assert final_factor(oracle, walk) < 1.5
     assert final_factor(oracle, walk, shake=3.0) > 2.5
 
 
-def test_five_seconds_of_outliers_hardly_raise_the_factor(make_walk, make_oracle) -> None:
+def test_five_seconds_of_outliers_hardly_raise_the_factor(make_walk, make_oracle):
     walk, config = make_walk(seed=4, seconds=40.0), NavigatorConfig()
     oracle = make_oracle(walk, walk.truth, config, noise=0.03, sigma=0.05)
     assert final_factor(oracle, walk, false=range(340, 390)) < 2.5
 
 
 @pytest.mark.parametrize(("nis", "sign"), [(1e9, 1), (0.0, -1)])
-def test_one_displacement_moves_the_log_factor_by_the_gain_at_most(nis: float, sign: int) -> None:
+def test_one_displacement_moves_the_log_factor_by_the_gain_at_most(nis, sign):
     before = InnovationStatistics(log_accel_factor=1.0, gain=0.05)
     after = before.updated(UpdateResult(nis=nis, gate_nis=nis), NavigatorConfig().filter)
     change = after.log_accel_factor - before.log_accel_factor
     assert change == pytest.approx(sign * 0.05, abs=1e-6)
 
 
-def test_an_update_without_innovation_leaves_the_noise_unchanged() -> None:
+def test_an_update_without_innovation_leaves_the_noise_unchanged():
     before = InnovationStatistics(log_accel_factor=1.0, log_error_level=1.0)
     after = before.updated(UpdateResult("value that is not finite"), NavigatorConfig().filter)
     assert replace(after, outlier_share=before.outlier_share) == before

@@ -1,8 +1,5 @@
 """The alternative hypothesis, a filter without outliers, adopted if later displacements fit it."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -21,7 +18,6 @@ from stario.fusion.filter.innovations import InnovationStatistics
 from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.state import NavState
 from stario.sequences.noise import ImuNoise
-from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
 
@@ -33,7 +29,7 @@ SECONDS = 120.0
 @pytest.mark.parametrize(
     "seed", [pytest.param(5, marks=pytest.mark.slow), pytest.param(7, marks=pytest.mark.slow), 10]
 )
-def test_five_seconds_of_false_displacements_leave_no_lasting_error(seed: int) -> None:
+def test_five_seconds_of_false_displacements_leave_no_lasting_error(seed):
     [block] = [fault for fault in faults(SECONDS) if fault.name == "network off by 1 m for 5 s"]
     sequence, config = matched_walk(SECONDS, seed)
     [result] = wide(
@@ -52,9 +48,7 @@ def test_five_seconds_of_false_displacements_leave_no_lasting_error(seed: int) -
         pytest.param(2, "graph", 0.35, marks=pytest.mark.slow),
     ],
 )
-def test_five_false_seconds_leave_no_lasting_error_with_the_default_noise(
-    seed: int, backend: str, limit: float
-) -> None:
+def test_five_false_seconds_leave_no_lasting_error_with_the_default_noise(seed, backend, limit):
     [block] = [fault for fault in faults(SECONDS) if fault.name == "network off by 1 m for 5 s"]
     sequence, _ = matched_walk(SECONDS, seed)
     [result] = wide(
@@ -63,7 +57,7 @@ def test_five_false_seconds_leave_no_lasting_error_with_the_default_noise(
     assert result.error_with < result.error_without + limit
 
 
-def test_the_last_false_displacement_does_not_spoil_the_alternative() -> None:
+def test_the_last_false_displacement_does_not_spoil_the_alternative():
     """In this walk it fits the alternative, by then uncertain; both back ends were 3 m off."""
     [block] = [fault for fault in faults(SECONDS) if fault.name == "network off by 1 m for 5 s"]
     walk = generate_walk(4, SECONDS)
@@ -75,9 +69,7 @@ def test_the_last_false_displacement_does_not_spoil_the_alternative() -> None:
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_a_stream_forgets_false_displacements_too(
-    make_walk: Callable[..., ImuSequence], make_oracle: Callable[..., Any], backend: Any
-) -> None:
+def test_a_stream_forgets_false_displacements_too(make_walk, make_oracle, backend):
     walk = make_walk(3, 30.0)
     oracle = make_oracle(walk, walk.truth, NavigatorConfig(), noise=0.02, sigma=0.05)
     ends = []
@@ -87,7 +79,7 @@ def test_a_stream_forgets_false_displacements_too(
     assert np.linalg.norm(ends[1] - ends[0]) < 1.0
 
 
-def test_single_false_displacements_do_not_widen_the_gyro_bias_prior() -> None:
+def test_single_false_displacements_do_not_widen_the_gyro_bias_prior():
     """The bias varies as much as its prior allows: taken as evidence, that cost 5.5 m."""
     [single] = [fault for fault in faults(SECONDS) if fault.name == "5 % of windows off by 2 m"]
     sequence, config = matched_walk(SECONDS, seed=9)
@@ -119,9 +111,7 @@ CONFIG = NavigatorConfig(
 )
 
 
-def test_a_snapshot_includes_the_alternative(
-    make_walk: Callable[..., ImuSequence], make_oracle: Callable[..., Any]
-) -> None:
+def test_a_snapshot_includes_the_alternative(make_walk, make_oracle):
     walk = make_walk(1, 60.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.02)
     parts = [walk.slice(0.0, 52.0 - 1e-9), walk.slice(52.0, 60.0)]
@@ -145,7 +135,7 @@ def hypotheses(time: float = 10.0) -> Hypotheses:
     return Hypotheses(ekf, AlternativeHypothesis(other, np.zeros(3), (10.0, 10.5)))
 
 
-def test_a_displacement_that_fits_only_the_alternative_adopts_it() -> None:
+def test_a_displacement_that_fits_only_the_alternative_adopts_it():
     pair = hypotheses()
     for fits, fits_filter in ((False, False), (False, True), (True, True)):
         pair, revoked = pair.judged(fits, fits_filter)
@@ -159,7 +149,7 @@ def test_a_displacement_that_fits_only_the_alternative_adopts_it() -> None:
     assert pair.ekf.b_a[0] == 1.0
 
 
-def test_the_alternative_is_dropped_when_both_fit_or_when_it_is_too_old() -> None:
+def test_the_alternative_is_dropped_when_both_fit_or_when_it_is_too_old():
     pair = hypotheses()
     for _ in range(4):
         assert pair.alternative is not None
@@ -177,9 +167,7 @@ def displacement(d_N: np.ndarray, sigma: float) -> WindowDisplacement:
 
 
 @pytest.mark.parametrize(("error", "fits"), [(1.0, False), (0.0, True)])
-def test_an_uncertain_alternative_does_not_take_the_steady_error_for_right(
-    error: float, fits: bool
-) -> None:
+def test_an_uncertain_alternative_does_not_take_the_steady_error_for_right(error, fits):
     ekf, zero = Driven(slots=1), np.zeros(3)
     uncertain = np.diag(np.repeat([1e-2, 1.0, 1.0, 1e-4, 1e-4], 3))
     ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, 1e-4 * np.eye(15)))
@@ -195,7 +183,6 @@ def test_an_uncertain_alternative_does_not_take_the_steady_error_for_right(
     measured = displacement(error * offset_W, 0.1)
     after, *_ = update_with(measured, pair, InnovationStatistics(), FilterConfig())
     alternative = after.alternative
-    assert alternative is not None
     assert (alternative.outliers == (0.0,)) == fits
     # Less the offset, both displacements are zero.
     np.testing.assert_allclose(alternative.ekf.p_W, 0.0, atol=0.05)

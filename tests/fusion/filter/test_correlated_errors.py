@@ -1,8 +1,6 @@
 """The network's correlated errors: part of the covariances, and of no gain."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -37,8 +35,6 @@ F = FilterConfig()
 SPEED = 1.2
 """Speed of a straight walk [m/s]."""
 
-Make = Callable[..., Any]
-
 
 def config(correlated: bool) -> NavigatorConfig:
     return NavigatorConfig(filter=replace(F, correlated_errors=correlated))
@@ -47,7 +43,7 @@ def config(correlated: bool) -> NavigatorConfig:
 # --- the model -----------------------------------------------------------------------------------
 
 
-def test_shares_add_up_along_a_displacement_and_vanish_with_the_level() -> None:
+def test_shares_add_up_along_a_displacement_and_vanish_with_the_level():
     d_W, covariance = np.array([1.2, -0.5, 0.0]), np.diag([0.02, 0.02, 0.01])
     u = d_W[:2] / np.linalg.norm(d_W)
     white, considered = displacement_errors(d_W, covariance, 1.0, F)
@@ -57,7 +53,7 @@ def test_shares_add_up_along_a_displacement_and_vanish_with_the_level() -> None:
     assert u @ (lasting @ lasting.T)[:2, :2] @ u == pytest.approx(0.02 * LASTING)
 
 
-def test_the_floors_slope_is_no_error_of_the_network() -> None:
+def test_the_floors_slope_is_no_error_of_the_network():
     """It is part of the height's variance, lasts longer, and does not depend on the level."""
     d_W, own, slope = np.array([1.2, -0.5, 0.0]), 1e-4, (0.03 * 1.3) ** 2
     covariance = np.diag([0.02, 0.02, own + slope])
@@ -67,7 +63,7 @@ def test_the_floors_slope_is_no_error_of_the_network() -> None:
         assert height == pytest.approx(slope + level * own * (WHITE + DRIFTING))
 
 
-def test_a_second_of_white_errors_is_the_same_at_any_update_rate() -> None:
+def test_a_second_of_white_errors_is_the_same_at_any_update_rate():
     """More windows a second repeat each other's errors instead of averaging them."""
     d_W, covariance = np.array([1.2, -0.5, 0.0]), np.diag([0.02, 0.02, 0.01])
     slow, fast = (
@@ -78,7 +74,7 @@ def test_a_second_of_white_errors_is_the_same_at_any_update_rate() -> None:
     np.testing.assert_allclose(fast.considered, slow.considered)
 
 
-def test_errors_turn_with_the_world() -> None:
+def test_errors_turn_with_the_world():
     rng = np.random.default_rng(0)
     R = about_z(1.1).as_matrix()
     root = rng.normal(size=(3, 3))
@@ -92,14 +88,14 @@ def test_errors_turn_with_the_world() -> None:
 
 
 @pytest.mark.parametrize(("nis", "bound"), [(0.0, MIN_LEVEL), (1e6, MAX_LEVEL)])
-def test_the_level_stays_within_its_bounds(nis: float, bound: float) -> None:
+def test_the_level_stays_within_its_bounds(nis, bound):
     statistics = InnovationStatistics()
     for _ in range(1000):
         statistics = statistics.updated(UpdateResult(nis=nis, gate_nis=nis), F)
     assert statistics.error_level == pytest.approx(bound)
 
 
-def test_the_level_makes_the_mean_nis_three() -> None:
+def test_the_level_makes_the_mean_nis_three():
     """Innovations twice as large as predicted: their variance, and so the level, is four times."""
     rng, statistics, nis = np.random.default_rng(0), InnovationStatistics(), []
     for _ in range(2000):
@@ -108,7 +104,7 @@ def test_the_level_makes_the_mean_nis_three() -> None:
     assert np.mean(nis[200:]) == pytest.approx(3.0, rel=0.1)
 
 
-def test_one_displacement_changes_the_level_by_a_fifth_at_most() -> None:
+def test_one_displacement_changes_the_level_by_a_fifth_at_most():
     after = InnovationStatistics(gain=0.05).updated(UpdateResult(nis=1e6, gate_nis=1e6), F)
     assert after.error_level == pytest.approx(np.exp(0.2))
 
@@ -145,7 +141,7 @@ def straight_walk(rng: np.random.Generator, seconds: int) -> tuple[Driven, np.nd
     return ekf, seconds * speed, float(np.mean(nis[3:]))
 
 
-def test_the_covariance_is_that_of_drawn_errors() -> None:
+def test_the_covariance_is_that_of_drawn_errors():
     """Of 200 walks; what the gains assume is a fraction of it."""
     rng, seconds = np.random.default_rng(1), 30
     filters, ends, nis = zip(*(straight_walk(rng, seconds) for _ in range(200)), strict=True)
@@ -157,17 +153,17 @@ def test_the_covariance_is_that_of_drawn_errors() -> None:
 
 
 @pytest.fixture(scope="module")
-def walk(make_walk: Make) -> ImuSequence:
+def walk(make_walk):
     return make_walk(3, 40.0)
 
 
 @pytest.fixture(scope="module")
-def oracle(walk: ImuSequence, make_oracle: Make) -> Any:
+def oracle(walk, make_oracle):
     return make_oracle(walk, walk.truth, config(True), sigma=0.05)
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_the_track_does_not_depend_on_them(walk: ImuSequence, oracle: Any, backend: Any) -> None:
+def test_the_track_does_not_depend_on_them(walk, oracle, backend):
     white, correlated = (
         Navigator(oracle, config(each), backend=backend).run(walk) for each in (False, True)
     )
@@ -178,9 +174,7 @@ def test_the_track_does_not_depend_on_them(walk: ImuSequence, oracle: Any, backe
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_a_stream_gives_the_covariances_of_its_filter(
-    walk: ImuSequence, oracle: Any, backend: Any
-) -> None:
+def test_a_stream_gives_the_covariances_of_its_filter(walk, oracle, backend):
     recording = Navigator(oracle, config(True), backend="ekf").run(walk)
     navigator = Navigator(oracle, config(True), backend=backend)
     samples = zip(walk.time, walk.gyro, walk.accel, strict=True)
@@ -192,7 +186,7 @@ def test_a_stream_gives_the_covariances_of_its_filter(
         np.testing.assert_allclose(found, expected, rtol=0.2)
 
 
-def test_a_position_fix_removes_them(walk: ImuSequence, oracle: Any) -> None:
+def test_a_position_fix_removes_them(walk, oracle):
     truth = walk.truth.at(np.array([2.0, 20.0, 30.0]))
     fixes = [
         position_fix(t, p, 1e-4 * np.eye(3))
@@ -205,7 +199,7 @@ def test_a_position_fix_removes_them(walk: ImuSequence, oracle: Any) -> None:
     assert variance[after] < 0.05 * variance[before]
 
 
-def test_the_first_fix_after_a_straight_walk_is_believed() -> None:
+def test_the_first_fix_after_a_straight_walk_is_believed():
     """A lasting error moves the end of a straight walk by many sigmas of white errors."""
     ekf = Driven(slots=2)
     zero = np.zeros(3)
@@ -234,14 +228,14 @@ def test_the_first_fix_after_a_straight_walk_is_believed() -> None:
     assert np.linalg.norm(after.p_W - truth) < 1.0
 
 
-def test_a_gap_is_as_uncertain_as_the_gains_assume(walk: ImuSequence) -> None:
+def test_a_gap_is_as_uncertain_as_the_gains_assume(walk):
     """Elsewhere the accelerometer is better than they assume."""
     kept = (walk.time < 20.0) | (walk.time > 22.0)
     samples = (each[kept] for each in (walk.time, walk.gyro, walk.accel))
     intervals, front_end = cut_recording(ImuSequence("gap", *samples), config(True))
     assert front_end.start is not None
     state = estimator.begin(config(True), front_end.start)
-    added: dict[bool, np.ndarray] = {}  # by the first interval of its kind, before biases matter
+    added = {}  # by the first interval of its kind, before biases matter
     for interval in intervals:
         before = state.estimate().covariances[:, 5, 5]
         state, record = estimator.step(state, interval, None, (), config(True))
@@ -250,7 +244,7 @@ def test_a_gap_is_as_uncertain_as_the_gains_assume(walk: ImuSequence) -> None:
     assert added[False][1] < 0.5 * added[False][0]
 
 
-def test_no_measurement_estimates_them() -> None:
+def test_no_measurement_estimates_them():
     """Their gain is zero, also where a fix is weighted by the covariance that contains them."""
     ekf, end, _ = straight_walk(np.random.default_rng(3), 30)
     rows = ekf.state.considered_rows
@@ -283,7 +277,7 @@ def nav_state(covariance: np.ndarray) -> NavState:
     return NavState(0.0, np.eye(3), zero, zero, zero, zero, covariance)
 
 
-def test_a_graph_in_a_turned_frame_gets_the_filters_covariance_turned() -> None:
+def test_a_graph_in_a_turned_frame_gets_the_filters_covariance_turned():
     rng = np.random.default_rng(3)
     P, Q = (random_covariance(rng) for _ in range(2))
     A = frame_rotation(about_z(1.1).as_matrix())
@@ -291,7 +285,7 @@ def test_a_graph_in_a_turned_frame_gets_the_filters_covariance_turned() -> None:
     np.testing.assert_allclose(state.covariance, A @ Q @ A.T, atol=1e-8 * np.abs(Q).max())
 
 
-def test_a_graph_as_certain_as_the_filter_gets_the_filters_covariance() -> None:
+def test_a_graph_as_certain_as_the_filter_gets_the_filters_covariance():
     rng = np.random.default_rng(2)
     P, Q, smaller = (random_covariance(rng) for _ in range(3))
     (state,) = with_actual_covariances([nav_state(P)], [estimate(P, Q)])

@@ -58,13 +58,13 @@ def turn_matrix(yaw: float, ekf: Driven) -> np.ndarray:
 
 
 @pytest.fixture
-def driven() -> Driven:
+def driven():
     ekf = initialised(6)
     drive(ekf, 20)
     return ekf
 
 
-def test_measurements_do_not_observe_yaw(driven: Driven) -> None:
+def test_measurements_do_not_observe_yaw(driven):
     yaw = np.zeros(len(driven.P))
     yaw[2] = 1.0
     yaw[15 + 2 :: 6] = 1.0
@@ -85,7 +85,7 @@ def assert_symmetric_and_positive(ekf: Driven, held: int) -> None:
     assert np.linalg.eigvalsh(ekf.state.nav_state().covariance).min() > 0.0
 
 
-def test_covariance_stays_symmetric_and_positive() -> None:
+def test_covariance_stays_symmetric_and_positive():
     ekf = initialised(6)
     drive(ekf, 400)
     assert_symmetric_and_positive(ekf, 6)
@@ -93,7 +93,7 @@ def test_covariance_stays_symmetric_and_positive() -> None:
 
 
 @pytest.mark.slow
-def test_covariance_stays_positive_over_half_an_hour() -> None:
+def test_covariance_stays_positive_over_half_an_hour():
     ekf = initialised(20)
     for part in range(30):
         drive(ekf, 1200, window=20, seed=part)
@@ -108,9 +108,7 @@ def clone_position_covariance(ekf: Driven, slot: int) -> np.ndarray:
     return plain_covariances([ekf.state.clone_estimate(slot)])[0, 6:9, 6:9]
 
 
-def test_a_precise_fix_of_an_unknown_position_keeps_the_covariance_valid(
-    driven: Driven,
-) -> None:
+def test_a_precise_fix_of_an_unknown_position_keeps_the_covariance_valid(driven):
     """The covariance stays accurate after a fix that is far more precise than the prior."""
     fresh = initialised(6)
     held = [fresh.clone()]
@@ -125,7 +123,7 @@ def test_a_precise_fix_of_an_unknown_position_keeps_the_covariance_valid(
     assert np.trace(clone_position_covariance(fresh, held[0])) < np.trace(between) + 1.0
 
 
-def test_a_clone_is_the_current_pose(driven: Driven) -> None:
+def test_a_clone_is_the_current_pose(driven):
     driven.release(0)
     slot = driven.clone()
     assert slot == 0
@@ -136,9 +134,7 @@ def test_a_clone_is_the_current_pose(driven: Driven) -> None:
     np.testing.assert_array_equal(driven.P[:, 15:21], driven.P[:, pose])
 
 
-def test_replacing_a_clone_equals_releasing_it_and_cloning_again(
-    driven: Driven,
-) -> None:
+def test_replacing_a_clone_equals_releasing_it_and_cloning_again(driven):
     before = driven.state
     driven.release(3)
     driven.clone()
@@ -153,7 +149,7 @@ def test_replacing_a_clone_equals_releasing_it_and_cloning_again(
         driven.clone(instead_of=3)
 
 
-def test_a_released_slot_is_empty(driven: Driven) -> None:
+def test_a_released_slot_is_empty(driven):
     driven.release(2)
     with pytest.raises(InputError, match="slot"):
         driven.state.clone_estimate(2)
@@ -166,7 +162,7 @@ def test_a_released_slot_is_empty(driven: Driven) -> None:
         driven.release(2)
 
 
-def test_cloning_without_a_free_slot_raises_an_error(driven: Driven) -> None:
+def test_cloning_without_a_free_slot_raises_an_error(driven):
     with pytest.raises(InputError, match="release"):
         clone(driven.state)
 
@@ -174,7 +170,7 @@ def test_cloning_without_a_free_slot_raises_an_error(driven: Driven) -> None:
 # --- invariance and observability ----------------------------------------------------------------
 
 
-def test_turning_the_world_turns_the_estimate_and_nothing_else() -> None:
+def test_turning_the_world_turns_the_estimate_and_nothing_else():
     yaw = 1.1
     Z = exp_so3(yaw * YAW)
     ekf, turned = initialised(6), initialised(6)
@@ -206,9 +202,7 @@ def test_turning_the_world_turns_the_estimate_and_nothing_else() -> None:
     np.testing.assert_allclose(turned.P, T @ ekf.P @ T.T, atol=1e-9 * ekf.P.max())
 
 
-def test_displacements_carry_no_information_about_yaw_and_position(
-    driven: Driven,
-) -> None:
+def test_displacements_carry_no_information_about_yaw_and_position(driven):
     """Information N^T P^-1 N about turning or shifting all poses together does not change."""
     newest = max(range(6), key=lambda slot: driven.state.clone_estimate(slot).time)
     driven.release(newest)  # it equals the current pose, P has no inverse with it
@@ -220,7 +214,7 @@ def test_displacements_carry_no_information_about_yaw_and_position(
         N[rho : rho + 3, 1:] = np.eye(3)
     N = N[held]
 
-    def information() -> np.ndarray:
+    def information():
         P = driven.P[np.ix_(held, held)]
         return N.T @ np.linalg.solve(P, N)
 
@@ -232,7 +226,7 @@ def test_displacements_carry_no_information_about_yaw_and_position(
     np.testing.assert_allclose(information(), before, rtol=1e-3, atol=1e-3 * before.max())
 
 
-def test_the_plain_covariance_is_returned_as_it_was_set() -> None:
+def test_the_plain_covariance_is_returned_as_it_was_set():
     ekf = initialised(0)
     A = np.random.default_rng(0).normal(size=(15, 15))
     covariance = A @ A.T
@@ -241,7 +235,7 @@ def test_the_plain_covariance_is_returned_as_it_was_set() -> None:
     np.testing.assert_allclose(ekf.state.nav_state().covariance, covariance, rtol=1e-9, atol=1e-9)
 
 
-def test_a_precise_displacement_sets_the_vector_between_the_poses() -> None:
+def test_a_precise_displacement_sets_the_vector_between_the_poses():
     ekf = initialised(1)
     slot = ekf.clone()
     for segment in segments(20):
@@ -257,7 +251,7 @@ def test_a_precise_displacement_sets_the_vector_between_the_poses() -> None:
 # --- gate and refusals ---------------------------------------------------------------------------
 
 
-def test_outliers_are_inflated_by_their_nis(driven: Driven) -> None:
+def test_outliers_are_inflated_by_their_nis(driven):
     before = driven.state.p_W
     result = driven.update_displacement(0, np.array([50.0, 0, 0]), 0.01 * np.eye(3), gate=7.8)
     assert result.accepted
@@ -265,7 +259,7 @@ def test_outliers_are_inflated_by_their_nis(driven: Driven) -> None:
     assert np.linalg.norm(driven.state.p_W - before) < 3.0
 
 
-def test_outliers_can_be_rejected(driven: Driven) -> None:
+def test_outliers_can_be_rejected(driven):
     P, p = driven.P.copy(), driven.state.p_W
     result = driven.update_displacement(
         0, np.array([50.0, 0, 0]), 0.01 * np.eye(3), gate=7.8, inflation=None
@@ -277,9 +271,7 @@ def test_outliers_can_be_rejected(driven: Driven) -> None:
     np.testing.assert_array_equal(driven.state.p_W, p)
 
 
-def test_a_rejected_displacement_with_lasting_errors_leaves_the_state_unchanged(
-    driven: Driven,
-) -> None:
+def test_a_rejected_displacement_with_lasting_errors_leaves_the_state_unchanged(driven):
     before, d_W, covariance = driven.state, np.array([50.0, 0.0, 0.0]), 0.01 * np.eye(3)
     errors = displacement_errors(d_W, covariance, 1.0, FilterConfig())
     result = driven.update_displacement(0, d_W, covariance, 7.8, inflation=None, errors=errors)
@@ -298,9 +290,7 @@ def test_a_rejected_displacement_with_lasting_errors_leaves_the_state_unchanged(
         ([0, 0, 0], np.ones((3, 3)), "positive definite"),
     ],
 )
-def test_invalid_measurements_are_refused(
-    driven: Driven, d: list[float], covariance: np.ndarray, reason: str
-) -> None:
+def test_invalid_measurements_are_refused(driven, d, covariance, reason):
     P, p = driven.P.copy(), driven.state.p_W
     result = driven.update_displacement(0, np.array(d), covariance, gate=7.8)
     assert not result.accepted
@@ -309,7 +299,7 @@ def test_invalid_measurements_are_refused(
     np.testing.assert_array_equal(driven.state.p_W, p)
 
 
-def test_invalid_initial_values_are_named() -> None:
+def test_invalid_initial_values_are_named():
     zero, eye = np.zeros(3), np.eye(3)
     ekf = Driven(2)
     with pytest.raises(InputError, match="R_WB"):
@@ -322,9 +312,7 @@ def test_invalid_initial_values_are_named() -> None:
         filter_state(NavState(0.0, eye, zero, zero, zero, zero, np.eye(15)), -1)
 
 
-def test_estimates_share_no_memory_with_the_filter(
-    driven: Driven,
-) -> None:
+def test_estimates_share_no_memory_with_the_filter(driven):
     # Views would keep every covariance: an hour at 20 updates a second then took twenty gigabytes.
     for estimate in (driven.state.estimate(), driven.state.clone_estimate(2)):
         assert not np.shares_memory(estimate.covariances, driven.covariances)

@@ -22,12 +22,12 @@ from stario.sequences.attitude.so3 import exp_so3, log_so3, skew
 YAW = np.array([0.0, 0.0, 1.0])
 
 
-def test_displacement_jacobian_agrees_with_finite_differences() -> None:
+def test_displacement_jacobian_agrees_with_finite_differences():
     p_i, p_j = np.array([30.0, -20.0, 1.0]), np.array([31.0, -19.4, 1.2])
     dim, step = 27, 1e-6
     columns = {0: (0, 6), 1: (15, 18)}
 
-    def measured(error: np.ndarray) -> np.ndarray:
+    def measured(error):
         """Displacement measured by a network that is turned by the estimate's yaw error."""
         ends = []
         for pose, p in ((1, p_i), (0, p_j)):
@@ -46,7 +46,7 @@ def test_displacement_jacobian_agrees_with_finite_differences() -> None:
     np.testing.assert_allclose(H, numeric, atol=1e-6)
 
 
-def test_a_gap_is_propagated_as_its_motion_and_its_turn_are_drawn() -> None:
+def test_a_gap_is_propagated_as_its_motion_and_its_turn_are_drawn():
     """The mean and covariance of a pedestrian whose motion nothing measures."""
     seconds, turn_variance, config = 2.0, 0.3**2, NavigatorConfig()
     R, v, p = exp_so3(np.array([0.4, -0.7, 1.0])), np.array([1.0, -0.5, 0.1]), np.ones(3)
@@ -81,7 +81,7 @@ def test_a_gap_is_propagated_as_its_motion_and_its_turn_are_drawn() -> None:
         )
 
 
-def test_a_tilt_is_corrected_by_the_smallest_rotation() -> None:
+def test_a_tilt_is_corrected_by_the_smallest_rotation():
     ekf = initialised(0)
     covariance = ekf.state.nav_state().covariance
     before, p, v = ekf.state.R_WB, ekf.state.p_W, ekf.state.v_W
@@ -98,13 +98,13 @@ def test_a_tilt_is_corrected_by_the_smallest_rotation() -> None:
 
 @pytest.mark.parametrize("kind", ["position", "velocity", "yaw"])
 @pytest.mark.parametrize("seed", range(4))
-def test_jacobians_agree_with_finite_differences(kind: str, seed: int) -> None:
+def test_jacobians_agree_with_finite_differences(kind, seed):
     rng = np.random.default_rng(seed)
     tilt = Rotation.from_rotvec([*rng.normal(0.0, 0.8, 2), 0.0])
     R = (about_z(rng.uniform(-3.0, 3.0)) * tilt).as_matrix()
     v, p = rng.normal(0.0, 2.0, 3), rng.normal(0.0, 20.0, 3)
 
-    def measured(error: np.ndarray) -> np.ndarray:
+    def measured(error):
         turn, shift_v, shift_p = exp_se23(error)
         if kind == "position":
             return turn @ p + shift_p
@@ -134,7 +134,7 @@ def injected(dx: np.ndarray) -> Driven:
     return ekf
 
 
-def test_retraction_agrees_with_its_first_order_expansion() -> None:
+def test_retraction_agrees_with_its_first_order_expansion():
     before, step = injected(np.zeros(21)), 1e-5
     for k in range(21):
         d = step * np.eye(21)[k]
@@ -176,7 +176,7 @@ def test_retraction_agrees_with_its_first_order_expansion() -> None:
         )
 
 
-def test_large_corrections_follow_the_exponential_map() -> None:
+def test_large_corrections_follow_the_exponential_map():
     dx = np.random.default_rng(0).normal(size=21)
     before, after = injected(np.zeros(21)), injected(dx)
     R, v, p = exp_se23(dx[:9])

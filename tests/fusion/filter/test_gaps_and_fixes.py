@@ -1,8 +1,5 @@
 """Fixes before, within and after gaps in which the pedestrian turns unobserved."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -20,7 +17,6 @@ from stario.fusion.state import NavState
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence
 
-Make = Callable[..., Any]
 BACKENDS = ("ekf", "graph")
 
 
@@ -41,8 +37,8 @@ def position_nees(track: Track, walk: ImuSequence, row: int) -> float:
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(("seed", "gap"), [(1, 15.0), (3, 15.0), (4, 3.0)])
 def test_a_position_before_a_gap_does_not_turn_the_track_after_it(
-    make_walk: Make, make_oracle: Make, without: Make, backend: Any, seed: int, gap: float
-) -> None:
+    make_walk, make_oracle, without, backend, seed, gap
+):
     """Its direction was never determined, so that position gives none to the track after it."""
     walk = make_walk(seed, 60.0)
     holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
@@ -62,9 +58,8 @@ def test_a_position_before_a_gap_does_not_turn_the_track_after_it(
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(("seed", "gap", "turn"), [(2, 6.0, 2.5), (18, 10.0, 1.8)])
 def test_fixes_find_the_direction_again_after_a_gap_with_fixes_in_it(
-    make_walk: Make, make_oracle: Make, without: Make,
-    backend: Any, seed: int, gap: float, turn: float,
-) -> None:  # fmt: skip
+    make_walk, make_oracle, without, backend, seed, gap, turn
+):
     walk = turned(make_walk(seed, 60.0), 20.0 + 0.5 * gap, turn)
     holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
     oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
@@ -81,8 +76,8 @@ def test_fixes_find_the_direction_again_after_a_gap_with_fixes_in_it(
     ("seed", "gap", "yaw_first"), [(2, 7.3, False), (2, 7.3, True), (7, 0.9, True)]
 )
 def test_states_before_the_first_position_are_as_uncertain_as_the_motion_until_it(
-    make_walk: Make, make_oracle: Make, without: Make, seed: int, gap: float, yaw_first: bool
-) -> None:
+    make_walk, make_oracle, without, seed, gap, yaw_first
+):
     walk = make_walk(seed, 45.0)
     holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
     oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
@@ -98,8 +93,8 @@ def test_states_before_the_first_position_are_as_uncertain_as_the_motion_until_i
 
 @pytest.mark.parametrize("seed", [3, 7])
 def test_a_first_yaw_that_was_off_is_off_about_the_position_that_places_the_track(
-    make_walk: Make, make_oracle: Make, seed: int
-) -> None:
+    make_walk, make_oracle, seed
+):
     walk = make_walk(seed, 45.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     yaw = yaw_of(walk.truth.at(np.array([5.0])).attitude_WB)[0] + 0.3
@@ -113,8 +108,8 @@ def test_a_first_yaw_that_was_off_is_off_about_the_position_that_places_the_trac
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_short_gaps_after_a_long_one_do_not_lose_the_position(
-    make_walk: Make, make_oracle: Make, without: Make, seed: int
-) -> None:
+    make_walk, make_oracle, without, seed
+):
     """A yaw that was lost once is not lost again because of a turn of a tenth of a radian."""
     walk = make_walk(seed, 60.0)
     gone = (walk.time > 12.0) & (walk.time < 16.0)
@@ -130,9 +125,7 @@ def test_short_gaps_after_a_long_one_do_not_lose_the_position(
     assert np.abs(yaw_error(track, walk, late)).max() < 0.5  # each short gap adds 0.15 rad
 
 
-def test_a_track_not_yet_placed_stays_in_one_piece_across_a_gap(
-    make_walk: Make, make_oracle: Make, without: Make
-) -> None:
+def test_a_track_not_yet_placed_stays_in_one_piece_across_a_gap(make_walk, make_oracle, without):
     walk = make_walk(4, 60.0)
     holed = without(walk, (walk.time > 20.0) & (walk.time < 23.0))
     oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
@@ -151,8 +144,8 @@ def test_a_track_not_yet_placed_stays_in_one_piece_across_a_gap(
 
 @pytest.mark.parametrize("seed", [1, 2, 4])
 def test_fixes_after_a_gap_do_not_determine_the_yaw_before_it(
-    make_walk: Make, make_oracle: Make, without: Make, seed: int
-) -> None:
+    make_walk, make_oracle, without, seed
+):
     walk = make_walk(seed, 60.0)
     holed = without(walk, (walk.time > 20.0) & (walk.time < 35.0))
     oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
@@ -169,14 +162,14 @@ def test_fixes_after_a_gap_do_not_determine_the_yaw_before_it(
     [pytest.param(1.5, marks=pytest.mark.slow), 3.0, pytest.param(7.0, marks=pytest.mark.slow)],
 )
 def test_the_graph_is_no_more_certain_of_the_turn_in_a_gap_than_the_filter(
-    make_walk: Make, make_oracle: Make, without: Make, gap: float
-) -> None:
+    make_walk, make_oracle, without, gap
+):
     walk = make_walk(1, 30.0)
     holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
     oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     after = 20.0 + gap + 0.2
 
-    def sigma(track: Track) -> float:
+    def sigma(track):
         return float(np.sqrt(track.covariance[np.searchsorted(track.time, after), 2, 2]))
 
     expected = sigma(Navigator(oracle, CONFIG, backend="ekf").run(holed))
@@ -189,8 +182,8 @@ def test_the_graph_is_no_more_certain_of_the_turn_in_a_gap_than_the_filter(
 
 @pytest.mark.parametrize("kind", ["yaw", "position"])
 def test_a_fix_within_a_gap_gives_little_information_about_the_track_before_it(
-    make_walk: Make, make_oracle: Make, without: Make, kind: str
-) -> None:
+    make_walk, make_oracle, without, kind
+):
     nees = []
     for seed in range(4):
         walk = make_walk(seed, 30.0)
@@ -209,8 +202,8 @@ def test_a_fix_within_a_gap_gives_little_information_about_the_track_before_it(
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_yaw_within_a_short_gap_of_a_turning_device_is_that_of_its_time(
-    make_walk: Make, make_oracle: Make, without: Make, backend: Any
-) -> None:
+    make_walk, make_oracle, without, backend
+):
     walk = swivelled(make_walk(1, 24.0), 2.0)
     holed = without(walk, (walk.time > 10.0) & (walk.time < 10.8))
     oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
@@ -224,9 +217,7 @@ def test_a_yaw_within_a_short_gap_of_a_turning_device_is_that_of_its_time(
 @pytest.mark.parametrize(
     "jump", [(0.0, 0.0, 8.0), pytest.param((20.0, 0.0, 0.0), marks=pytest.mark.slow)]
 )
-def test_a_streams_graph_follows_the_fixes_where_the_filter_does(
-    make_walk: Make, make_oracle: Make, jump: tuple[float, float, float]
-) -> None:
+def test_a_streams_graph_follows_the_fixes_where_the_filter_does(make_walk, make_oracle, jump):
     """A lift, or a positioning system whose origin has moved."""
     walk = make_walk(2, 42.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
@@ -240,7 +231,7 @@ def test_a_streams_graph_follows_the_fixes_where_the_filter_does(
             assert np.linalg.norm(state.p_W - truth) < 1.5
 
 
-def test_the_moments_of_a_large_turn_agree_with_sampled_turns() -> None:
+def test_the_moments_of_a_large_turn_agree_with_sampled_turns():
     arm, sigma = np.array([3.0, -1.0, 0.5]), 1.2
     zero, no_covariance = np.zeros(3), np.zeros((15, 15))
     turn = FrameTransform(np.eye(3), zero, zero, False, -np.inf, yaw_sigma=sigma)
@@ -255,16 +246,14 @@ def test_the_moments_of_a_large_turn_agree_with_sampled_turns() -> None:
     assert np.linalg.eigvalsh(found).min() > -1e-9
 
 
-def test_a_yaw_that_is_not_an_angle_is_refused_and_counted(
-    make_walk: Make, make_oracle: Make
-) -> None:
+def test_a_yaw_that_is_not_an_angle_is_refused_and_counted(make_walk, make_oracle):
     walk = make_walk(3, 12.0)
     oracle = make_oracle(walk, walk.truth, CONFIG)
     track = Navigator(oracle, CONFIG, backend="ekf").run(walk, fixes=[yaw_fix(6.0, 1.7e9, 0.1)])
     assert track.health.fixes == {"yaw not in radians": 1}
 
 
-def test_a_rotation_rounded_to_four_digits_is_accepted(still_model: Any, make_walk: Make) -> None:
+def test_a_rotation_rounded_to_four_digits_is_accepted(still_model, make_walk):
     walk, zero = make_walk(3, 5.0), np.zeros(3)
     R_WB = np.round(about_z(0.7).as_matrix(), 4)
     states = stream(Navigator(still_model, prior=PriorPose(R_WB, zero, zero)), walk)

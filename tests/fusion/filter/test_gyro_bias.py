@@ -1,7 +1,5 @@
 """The gyroscope bias's prior is replaced exactly and is as wide as the evidence requires."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from initial_ekf import Driven
@@ -24,7 +22,7 @@ def ekf_with_measured_bias(sigma: float) -> Driven:
 
 
 @pytest.mark.parametrize("new", [1e-4, 2e-3, 1e-2])
-def test_replacing_the_prior_equals_having_started_with_it(new: float) -> None:
+def test_replacing_the_prior_equals_having_started_with_it(new):
     old = 1e-3
     ekf = ekf_with_measured_bias(old)
     ekf.state = with_prior_replaced(ekf.state, old**2, new**2)
@@ -33,7 +31,7 @@ def test_replacing_the_prior_equals_having_started_with_it(new: float) -> None:
     np.testing.assert_allclose(ekf.state.P, expected.P, rtol=1e-5, atol=1e-4 * new**2)
 
 
-def test_a_wider_prior_adds_as_much_to_an_error_that_is_larger_than_assumed() -> None:
+def test_a_wider_prior_adds_as_much_to_an_error_that_is_larger_than_assumed():
     """What the gains forget, the error gains; the rest of it stays."""
     ekf = ekf_with_measured_bias(1e-3)
     root = 1e-3 * np.random.default_rng(0).normal(size=ekf.P.shape)
@@ -42,7 +40,7 @@ def test_a_wider_prior_adds_as_much_to_an_error_that_is_larger_than_assumed() ->
     np.testing.assert_allclose(ekf.state.P_actual - ekf.P, root @ root.T, atol=1e-10)
 
 
-def test_a_bias_that_has_wandered_beyond_its_prior_keeps_a_valid_covariance() -> None:
+def test_a_bias_that_has_wandered_beyond_its_prior_keeps_a_valid_covariance():
     """No more information can be removed than there is."""
     ekf = ekf_with_measured_bias(1e-3)
     P = ekf.P.copy()
@@ -66,18 +64,18 @@ def converged(data: float, sigma: float, prior: GyroBiasPrior | None = None) -> 
     return float(np.sqrt(prior.variance))
 
 
-def test_the_prior_follows_a_bias_that_the_data_clearly_show() -> None:
+def test_the_prior_follows_a_bias_that_the_data_clearly_show():
     assert 0.02 < converged(0.05, 1e-3) < 0.05
     assert converged(0.01, 1e-3) < 0.01
 
 
 @pytest.mark.parametrize(("bias", "sigma"), [(8e-3, 2e-2), (1e-3, 3e-4), (0.0, 1e-4)])
-def test_vague_or_small_data_leave_the_prior_narrow(bias: float, sigma: float) -> None:
+def test_vague_or_small_data_leave_the_prior_narrow(bias, sigma):
     """Displacements alone determine it to 2e-2 rad/s: their slow errors look like a bias."""
     assert 1e-3 <= converged(bias, sigma) < 2.5e-3
 
 
-def test_a_bias_that_the_data_no_longer_show_is_forgotten() -> None:
+def test_a_bias_that_the_data_no_longer_show_is_forgotten():
     """What a shaken gyroscope seemed to have does not stay."""
     wide = GyroBiasPrior(1e-3, 0.03**2)
     assert converged(0.0, 1e-3, wide) < 1.5e-3

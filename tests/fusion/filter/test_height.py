@@ -1,6 +1,5 @@
 """The barometer in both estimators: what it observes, and what it must not."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -22,9 +21,8 @@ from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import Barometer, ImuSequence
 from stario.sequences.simulation.barometer import Air, simulate_barometer
-from stario.sequences.simulation.house import HouseWalk, simulate_house
+from stario.sequences.simulation.house import simulate_house
 
-Make = Callable[..., Any]
 CONFIG = NavigatorConfig()
 
 
@@ -47,11 +45,10 @@ def height_variance(s: EkfState) -> float:
     return float(s.nav_state().covariance[8, 8])
 
 
-def test_the_first_height_determines_the_offset_alone() -> None:
+def test_the_first_height_determines_the_offset_alone():
     before = state()
     after, result = with_height(before, sample())
     assert result.accepted
-    assert after.offset is not None
     # A fifth of a second ago it was lower by a fifth of 0.3 m/s.
     assert after.offset.metres == pytest.approx(7.0 - (5.0 - 0.06))
     n = before.covariances.shape[1]
@@ -62,7 +59,7 @@ def test_the_first_height_determines_the_offset_alone() -> None:
     assert height_variance(again) == pytest.approx(height_variance(before), rel=1e-6)
 
 
-def test_jacobian_agrees_with_finite_differences() -> None:
+def test_jacobian_agrees_with_finite_differences():
     s, _ = with_height(state(), sample())
     n, step = s.covariances.shape[1], 1e-6
     root = np.random.default_rng(1).normal(size=(n, n))
@@ -76,13 +73,11 @@ def test_jacobian_agrees_with_finite_differences() -> None:
     assert at_rest.sigma[0] == pytest.approx(expected, rel=1e-5)
 
 
-def test_pressure_tells_a_change_of_height() -> None:
+def test_pressure_tells_a_change_of_height():
     s, _ = with_height(state(), sample())
     climbed, _ = with_height(s, sample(height=10.0, time=9.9, rate=1.0, risen=3.0))
     assert climbed.p_W[2] - s.p_W[2] == pytest.approx(3.0, abs=0.2)
     stepped, _ = with_height(s, sample(height=10.0, time=9.9, stepped=3.0))
-    assert stepped.offset is not None
-    assert s.offset is not None
     assert stepped.offset.metres - s.offset.metres > 2.0
     # Neither tells where the track was before: the first pressure is any height's.
     for after in (climbed, stepped):
@@ -98,9 +93,7 @@ def test_pressure_tells_a_change_of_height() -> None:
         lambda s: s.with_yaw_inflated(np.zeros(3), 2.0).with_lost_yaw_forgotten(),
     ],
 )
-def test_moving_the_map_changes_nothing_that_pressure_tells(
-    transform: Callable[[EkfState], EkfState],
-) -> None:
+def test_moving_the_map_changes_nothing_that_pressure_tells(transform):
     s, _ = with_height(state(), sample())
     now = sample(height=7.4, time=9.9)
     before, after = with_height(s, now)[1], with_height(transform(s), now)[1]
@@ -112,14 +105,14 @@ def test_moving_the_map_changes_nothing_that_pressure_tells(
 
 
 @pytest.fixture(scope="module")
-def house() -> HouseWalk:
+def house():
     """Two minutes: stairs to the first floor, and a lift to the fourth."""
     walk = simulate_house(9, 120.0, rate=100.0, air=Air(weather=0.01, door=0.3))
     return replace(walk, sequence=replace(walk.sequence, magnetometer=None))
 
 
 @pytest.fixture(scope="module")
-def level_oracle(house: HouseWalk, make_oracle: Make) -> Any:
+def level_oracle(house, make_oracle):
     """The true horizontal displacements; the vertical ones are those of a level floor."""
     oracle = make_oracle(house.sequence, house.sequence.truth, CONFIG, noise=0.03, sigma=0.05)
     oracle._displacements = {k: v * [1.0, 1.0, 0.0] for k, v in oracle._displacements.items()}
@@ -134,11 +127,11 @@ def climb_error(track: Track, sequence: ImuSequence) -> float:
 
 
 @pytest.fixture(scope="module")
-def house_track(house: HouseWalk, level_oracle: Any) -> Track:
+def house_track(house, level_oracle):
     return Navigator(level_oracle, CONFIG).run(house.sequence)
 
 
-def test_heights_follow_stairs_and_a_lift(house: HouseWalk, house_track: Track) -> None:
+def test_heights_follow_stairs_and_a_lift(house, house_track):
     true = house.sequence.truth.position_W[:, 2]
     assert np.ptp(true) > 11.0
     assert climb_error(house_track, house.sequence) < 1.0
@@ -146,13 +139,11 @@ def test_heights_follow_stairs_and_a_lift(house: HouseWalk, house_track: Track) 
     assert climb_error(house_track.filtered, house.sequence) < 2.5  # a lift shows after a second
     error = house_track.trajectory.position_W[:, 2] - true[0]
     error -= house.sequence.truth.at(house_track.time).position_W[:, 2] - true[0]
-    assert house_track.covariance is not None
     variance = house_track.covariance[:, 8, 8]
     assert 0.05 < np.mean((error - error[0]) ** 2 / variance) < 3.0
 
 
-def test_floors_are_those_of_the_house(house: HouseWalk, house_track: Track) -> None:
-    assert house_track.health is not None
+def test_floors_are_those_of_the_house(house, house_track):
     found = [(change.after, change.how) for change in house_track.health.floors]
     assert found == [(stay.floor, stay.way) for stay in house.stays[2:]]
     for change, before, after in zip(
@@ -163,7 +154,7 @@ def test_floors_are_those_of_the_house(house: HouseWalk, house_track: Track) -> 
     assert any(str(change) in str(house_track.health) for change in house_track.health.floors)
 
 
-def test_the_check_of_heights_tells_with_from_without(house: HouseWalk, level_oracle: Any) -> None:
+def test_the_check_of_heights_tells_with_from_without(house, level_oracle):
     scores = score_heights(level_oracle, house.sequence, CONFIG, "house")
     assert values(scores, "height_rms", track="pressure")[0] < 0.6
     assert values(scores, "height_rms", track="none")[0] > 2.0
@@ -173,25 +164,21 @@ def test_the_check_of_heights_tells_with_from_without(house: HouseWalk, level_or
         score_heights(level_oracle, replace(house.sequence, barometer=None), CONFIG, "house")
 
 
-def test_the_report_draws_floors_along_the_height(house_track: Track) -> None:
-    assert house_track.health is not None
+def test_the_report_draws_floors_along_the_height(house_track):
     series = trajectory_series(house_track.trajectory, 0.0)
     panels = motion_panels({"track": series}, None, "track", house_track.health.floors)
     labels = [trace.text[0] for trace in panels[0].traces if trace.text]
     assert labels == ["floor 0", "1", "4"]
 
 
-def test_without_a_barometer_they_go_unnoticed(house: HouseWalk, level_oracle: Any) -> None:
+def test_without_a_barometer_they_go_unnoticed(house, level_oracle):
     blind = replace(house.sequence, barometer=None)
     assert climb_error(Navigator(level_oracle, CONFIG).run(blind), blind) > 10.0
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_a_stream_has_the_heights_of_the_recording(
-    house: HouseWalk, level_oracle: Any, house_track: Track, backend: Any
-) -> None:
+def test_a_stream_has_the_heights_of_the_recording(house, level_oracle, house_track, backend):
     sequence = house.sequence.slice(0.0, 60.0)
-    assert sequence.barometer is not None
     pressures = dict(zip(sequence.barometer.time, sequence.barometer.pressure_hPa, strict=True))
     times = list(pressures)
     stream = Navigator(level_oracle, CONFIG, backend=backend)
@@ -209,14 +196,13 @@ def test_a_stream_has_the_heights_of_the_recording(
             states.append(state)
     heights = np.array([state.p_W[2] for state in states])
     expected = house_track.filtered
-    assert expected is not None
     same = np.interp([s.time for s in states], expected.time, expected.trajectory.position_W[:, 2])
     tolerance = 1e-6 if backend == "ekf" else 0.6
     np.testing.assert_allclose(heights, same, atol=tolerance)
     assert stream.health.pressures["applied"] > 100
 
 
-def test_weather_and_doors_on_a_level_floor_are_worth_their_sigma(make_walk: Make) -> None:
+def test_weather_and_doors_on_a_level_floor_are_worth_their_sigma(make_walk):
     walk = make_walk(seed=4, seconds=60.0)
     doors = np.array([20.0, 40.0])
     air = Air(weather=0.03, door=0.5)
@@ -236,14 +222,12 @@ class Level:
 @pytest.mark.parametrize(
     ("pressure", "remedy"), [(101_325.0, "Pa"), (101.325, "kPa"), (29.92, "inHg")]
 )
-def test_pressures_in_other_units_are_refused(
-    pressure: float, remedy: str, still_model: Any
-) -> None:
+def test_pressures_in_other_units_are_refused(pressure, remedy, still_model):
     with pytest.raises(InputError, match=f"from {remedy} to hPa"):
         Navigator(still_model).push_pressure(0.0, pressure)
 
 
-def test_late_and_broken_pressures_are_counted(make_walk: Make, still_model: Any) -> None:
+def test_late_and_broken_pressures_are_counted(make_walk, still_model):
     walk = make_walk()
     stream = Navigator(still_model)
     for row in np.column_stack([walk.time, walk.gyro, walk.accel])[:400].tolist():
@@ -255,14 +239,11 @@ def test_late_and_broken_pressures_are_counted(make_walk: Make, still_model: Any
         stream.push_pressure(4.0, "1000")
 
 
-def test_a_barometer_on_another_clock_is_said_to_be_unused(
-    make_walk: Make, still_model: Any
-) -> None:
+def test_a_barometer_on_another_clock_is_said_to_be_unused(make_walk, still_model):
     walk = make_walk()
     time = walk.time[::20] + 1.7e9
     other = Barometer(time, standard_pressure(np.zeros(len(time))))
     health = Navigator(still_model).run(replace(walk, barometer=other)).health
-    assert health is not None
     assert health.pressures_dropped == len(time)
     assert not health.pressures
 
@@ -278,9 +259,7 @@ def test_a_barometer_on_another_clock_is_said_to_be_unused(
         (0.09, 1.2, 1.0),  # a ramp
     ],
 )
-def test_on_stairs_a_displacement_is_as_long_as_the_climb_allows(
-    rate: float, speed: float, share: float
-) -> None:
+def test_on_stairs_a_displacement_is_as_long_as_the_climb_allows(rate, speed, share):
     network = WindowDisplacement(np.array([0.6, 0.8, 0.0]) * speed, 0.01 * np.eye(3), np.eye(3))
     found = yielding(network, rate)
     np.testing.assert_allclose(found.d_N, share * network.d_N, atol=1e-12)

@@ -1,9 +1,7 @@
 """The magnetic bearing: what it observes, what it must not observe, and how robust it is."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,12 +9,18 @@ from initial_ekf import Driven
 from support import CONFIG, GRAPH, stream_deviation
 from told import health_lines
 
-from stario.fusion import Navigator, NavState, PriorPose, Track
-from stario.fusion.backends import BackendName
+from stario.fusion import Navigator, NavState, PriorPose
 from stario.fusion.config import FilterConfig
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import bearing_jacobian
-from stario.fusion.filter.magnetic import MagneticReference, update_bearing, with_field
+from stario.fusion.filter.magnetic import (
+    HARD_IRON_SECONDS,
+    HARD_IRON_SIGMA,
+    MagneticReference,
+    propagated_field,
+    update_bearing,
+    with_field,
+)
 from stario.fusion.fixes import position_fix
 from stario.fusion.navigator import Navigator as Stream
 from stario.sequences.attitude.rotations import yaw_of
@@ -28,7 +32,6 @@ from stario.sequences.simulation.magnetometer import MagneticField
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 FIELD_W = np.array([15.0, 12.0, -40.0])
-Make = Callable[..., Any]
 
 
 def measured(sequence: ImuSequence, rate: float = 25.0, seed: int = 0) -> Magnetometer:
@@ -40,23 +43,23 @@ def measured(sequence: ImuSequence, rate: float = 25.0, seed: int = 0) -> Magnet
 
 
 @pytest.fixture(scope="module")
-def biased_walk() -> ImuSequence:
+def biased_walk():
     """Two minutes with a gyroscope that drifts by a third of a degree per second."""
     style = WalkStyle(carry="handheld", mount_rotvec=(0.0, 0.0, 0.4))
     walk = generate_walk(3, 120.0, style=style)
-    clean = simulate_imu(walk, 100.0, ImuErrors(gyro_turn_on=1e-4, accel_turn_on=1e-2), 3)
+    clean = simulate_imu(walk, 50.0, ImuErrors(gyro_turn_on=1e-4, accel_turn_on=1e-2), 3)
     sequence = replace(clean, gyro=clean.gyro + np.array([0.0, 0.0, 0.006]))
     return replace(sequence, magnetometer=measured(sequence))
 
 
 @pytest.fixture(scope="module")
-def oracle(biased_walk: ImuSequence, make_oracle: Make) -> Any:
+def oracle(biased_walk, make_oracle):
     """The true displacements of that walk with an error of 0.1 m."""
     return make_oracle(biased_walk, biased_walk.truth, CONFIG, noise=0.1, sigma=0.1)
 
 
 @pytest.fixture(scope="module")
-def biased_track(biased_walk: ImuSequence, oracle: Any) -> Track:
+def biased_track(biased_walk, oracle):
     return Navigator(oracle, CONFIG, backend="ekf").run(biased_walk)
 
 
@@ -69,12 +72,19 @@ def state() -> EkfState:
     return with_field(ekf.state, R_WB.T @ FIELD_W)
 
 
-def test_bearing_jacobian_agrees_with_finite_differences() -> None:
+def with_iron(s: EkfState, iron_B: np.ndarray, sigma: float):
+    """The state with a known hard iron [uT]."""
+    P, rows = s.covariances.copy(), slice(s.field_row + 2, s.field_row + 5)
+    P[:, rows, rows] = sigma**2 * np.eye(3)
+    return replace(s, covariances=P, field=replace(s.field, hard_iron_B=iron_B))
+
+
+def test_bearing_jacobian_agrees_with_finite_differences():
     R = exp_so3(np.array([0.3, -0.5, 1.2]))
     hard_iron, step, n = np.array([3.0, -2.0, 1.0]), 1e-6, 32
     m_B = R.T @ FIELD_W + hard_iron
 
-    def residual(error: np.ndarray) -> float:
+    def residual(error):
         """Azimuth minus bearing of the true state, given its error from the estimate."""
         m_W = exp_so3(error[:3]) @ R @ (m_B - hard_iron - error[29:32])
         return error[27] + error[28] - math.atan2(m_W[1], m_W[0])
@@ -86,12 +96,12 @@ def test_bearing_jacobian_agrees_with_finite_differences() -> None:
     np.testing.assert_allclose(H, numeric, atol=1e-6)
 
 
-def test_a_common_turn_of_yaw_and_azimuth_is_unobservable() -> None:
+def test_a_common_turn_of_yaw_and_azimuth_is_unobservable():
     (_, by_theta), (_, by_field) = bearing_jacobian(np.eye(3), FIELD_W, 27)
     assert by_theta[0, 2] + by_field[0, 0] == 0.0
 
 
-def test_a_turned_frame_turns_the_azimuth() -> None:
+def test_a_turned_frame_turns_the_azimuth():
     before = state()
     turned = before.transformed(exp_so3(np.array([0.0, 0.0, 0.7])), np.array([5.0, 0.0, 0.0]))
     assert turned.field.azimuth - before.field.azimuth == pytest.approx(0.7)
@@ -100,7 +110,7 @@ def test_a_turned_frame_turns_the_azimuth() -> None:
     )
 
 
-def test_bearings_of_a_device_at_rest_leave_its_yaw_unknown() -> None:
+def test_bearings_of_a_device_at_rest_leave_its_yaw_unknown():
     ekf = Driven(2)
     ekf.state = state()
     yaw_variance, reference = ekf.state.P[2, 2], MagneticReference()
@@ -110,7 +120,7 @@ def test_bearings_of_a_device_at_rest_leave_its_yaw_unknown() -> None:
     assert ekf.state.P[2, 2] > 0.99 * yaw_variance
 
 
-def test_a_field_of_unusual_size_has_less_weight() -> None:
+def test_a_field_of_unusual_size_has_less_weight():
     reference = MagneticReference()
     for k in range(20):
         reference = reference.updated(0.5 * k, 45.0, 1.0)
@@ -125,8 +135,8 @@ def test_a_field_of_unusual_size_has_less_weight() -> None:
     assert gains[1] > gains[0]
 
 
-def test_the_bias_is_consistent_in_a_quiet_and_in_a_disturbed_field(make_oracle: Make) -> None:
-    walk = generate_walk(3, 120.0, style=WalkStyle(carry="handheld", mount_rotvec=(0.0, 0.0, 0.4)))
+def test_the_bias_is_consistent_in_a_quiet_and_in_a_disturbed_field(make_oracle):
+    walk = generate_walk(3, 80.0, style=WalkStyle(carry="handheld", mount_rotvec=(0.0, 0.0, 0.4)))
     for disturbance in (0.5, 8.0):
         field = MagneticField(disturbance=disturbance)
         clean = simulate_imu(walk, 100.0, ImuErrors(), 3, magnetic_field=field)
@@ -156,9 +166,7 @@ def pushed(navigator: Stream, sequence: ImuSequence) -> list[NavState]:
     return [s for s in states if s is not None]
 
 
-def test_bearings_determine_the_gyroscope_bias(
-    biased_walk: ImuSequence, oracle: Any, biased_track: Track
-) -> None:
+def test_bearings_determine_the_gyroscope_bias(biased_walk, oracle, biased_track):
     """In a stream as in a batch; without it the error of the bias is larger."""
     track = biased_track
     blind = Navigator(oracle, CONFIG, backend="ekf").run(replace(biased_walk, magnetometer=None))
@@ -172,11 +180,17 @@ def test_bearings_determine_the_gyroscope_bias(
     assert last_yaw_error(states, biased_walk) < math.radians(20.0)
 
 
-def test_a_streams_graph_estimates_the_same_bias_as_its_filter(
-    biased_walk: ImuSequence, make_oracle: Make
-) -> None:
+def test_what_a_magnetometers_calibration_was_is_forgotten_within_minutes():
+    known = with_iron(state(), np.array([20.0, -25.0, 10.0]), sigma=1.0)
+    later = propagated_field(known, 3.0 * HARD_IRON_SECONDS)
+    row = later.field_row + 2
+    assert np.abs(later.field.hard_iron_B).max() < 2.0
+    assert math.sqrt(later.P[row, row]) == pytest.approx(HARD_IRON_SIGMA, rel=0.01)
+
+
+def test_a_streams_graph_estimates_the_same_bias_as_its_filter(biased_walk, make_oracle):
     config = replace(GRAPH, filter=replace(GRAPH.filter, gyro_bias_sigma=1e-2))
-    walk = biased_walk.slice(0.0, 60.0)
+    walk = biased_walk.slice(0.0, 58.0)
     oracle = make_oracle(walk, walk.truth, config, noise=0.1, sigma=0.1)
     filtered = pushed(Stream(oracle, config), walk)[-1]
     with_field, without_field = (
@@ -188,15 +202,15 @@ def test_a_streams_graph_estimates_the_same_bias_as_its_filter(
     )
     assert abs(with_field.b_g[2] - filtered.b_g[2]) < 0.2 * theirs
     assert ours == pytest.approx(theirs, rel=0.1)
-    assert blind > 1.15 * theirs
+    assert blind > 1.1 * theirs
 
 
 @pytest.mark.parametrize(
     "fault", ["axes swapped", pytest.param("axis mirrored", marks=pytest.mark.slow), "stopped"]
 )
 def test_a_field_that_contradicts_the_gyroscope_does_not_turn_the_track(
-    biased_walk: ImuSequence, oracle: Any, biased_track: Track, fault: str
-) -> None:
+    biased_walk, oracle, biased_track, fault
+):
     field, time = biased_walk.magnetometer.field.copy(), biased_walk.magnetometer.time
     if fault == "axes swapped":
         field = field[:, [1, 0, 2]]
@@ -205,17 +219,17 @@ def test_a_field_that_contradicts_the_gyroscope_does_not_turn_the_track(
     else:
         field[time > 40.0] = field[np.searchsorted(time, 40.0)]
     wrong = replace(biased_walk, magnetometer=Magnetometer(time, field))
-    track = Navigator(oracle, CONFIG, backend="ekf").run(wrong)
+    track = Navigator(oracle, CONFIG, backend="ekf").run(wrong.slice(0.0, 70.0))
     bias_error = abs(track.b_g[-1, 2] - 0.006)
     assert bias_error < 3.0 * np.sqrt(track.covariance[-1, 11, 11])
     if fault == "stopped":
         assert track.health.fields_dropped > 50
     else:
-        assert track.health.bearings["contradicts the gyroscope"] > 0.7 * 2 * 120
+        assert track.health.bearings["contradicts the gyroscope"] > 0.7 * 2 * 70
     assert "contradicts the gyroscope" not in biased_track.health.bearings
 
 
-def test_repeated_and_invalid_fields_are_dropped_and_counted(still_model: Any) -> None:
+def test_repeated_and_invalid_fields_are_dropped_and_counted(still_model):
     navigator = Navigator(still_model, CONFIG)
     for time, field in ((0.0, FIELD_W), (0.0, FIELD_W), (1.0, [np.nan, 0.0, 0.0])):
         navigator.push_magnetometer(time, field)
@@ -224,9 +238,7 @@ def test_repeated_and_invalid_fields_are_dropped_and_counted(still_model: Any) -
 
 
 @pytest.mark.parametrize("seconds", [-1e4, 1e4])
-def test_a_field_on_another_clock_is_reported(
-    biased_walk: ImuSequence, still_model: Any, seconds: float
-) -> None:
+def test_a_field_on_another_clock_is_reported(biased_walk, still_model, seconds):
     walk = biased_walk.slice(0.0, 6.0)
     field = replace(walk.magnetometer, time=walk.magnetometer.time + seconds)
     health = (
@@ -240,11 +252,8 @@ def test_a_field_on_another_clock_is_reported(
     ("scale", "named"),
     [(1e-6, "weak"), (1e-3, "weak"), (1e-2, "weak"), (1e3, "strong")],  # T, mT, gauss, nT
 )
-def test_a_field_in_another_unit_is_named_as_such(
-    biased_walk: ImuSequence, make_oracle: Make, scale: float, named: str
-) -> None:
+def test_a_field_in_another_unit_is_named_as_such(biased_walk, make_oracle, scale, named):
     walk = biased_walk.slice(0.0, 20.0)
-    assert walk.magnetometer is not None
     field = replace(walk.magnetometer, field=scale * walk.magnetometer.field)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
     bearings = (
@@ -255,7 +264,7 @@ def test_a_field_in_another_unit_is_named_as_such(
     assert set(bearings) == {f"too {named} to be in uT"}
 
 
-def test_a_disabled_magnetometer_has_no_effect(biased_walk: ImuSequence, make_oracle: Make) -> None:
+def test_a_disabled_magnetometer_has_no_effect(biased_walk, make_oracle):
     short = biased_walk.slice(0.0, 10.0)
     off = replace(CONFIG, filter=replace(CONFIG.filter, magnetometer=False))
     oracle = make_oracle(short, biased_walk.truth, CONFIG)
@@ -265,9 +274,7 @@ def test_a_disabled_magnetometer_has_no_effect(biased_walk: ImuSequence, make_or
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_a_declination_turns_the_track_to_true_north(
-    biased_walk: ImuSequence, make_oracle: Make, backend: BackendName
-) -> None:
+def test_a_declination_turns_the_track_to_true_north(biased_walk, make_oracle, backend):
     """The whole track from the first pose on; the azimuth of the field here is 39 degrees."""
     declination = math.pi / 2.0 - math.atan2(FIELD_W[1], FIELD_W[0])
     settings = replace(GRAPH, filter=replace(GRAPH.filter, declination=declination))
@@ -287,8 +294,8 @@ def test_a_declination_turns_the_track_to_true_north(
 
 
 def test_the_field_does_not_tell_after_a_gap_a_yaw_that_was_unknown_before(
-    biased_walk: ImuSequence, make_oracle: Make, without: Make
-) -> None:
+    biased_walk, make_oracle, without
+):
     whole = biased_walk.slice(0.0, 40.0)
     walk = without(whole, (whole.time > 20.0) & (whole.time < 24.0))
     oracle = make_oracle(walk, biased_walk.truth, GRAPH)
@@ -297,9 +304,7 @@ def test_the_field_does_not_tell_after_a_gap_a_yaw_that_was_unknown_before(
     assert np.sqrt(track.covariance[track.time > 6.0, 2, 2]).min() > 1.5
 
 
-def test_north_is_not_applied_if_the_direction_is_known(
-    biased_walk: ImuSequence, make_oracle: Make
-) -> None:
+def test_north_is_not_applied_if_the_direction_is_known(biased_walk, make_oracle):
     walk = biased_walk.slice(0.0, 20.0)
     settings = replace(CONFIG, filter=replace(CONFIG.filter, declination=0.1))
     oracle = make_oracle(walk, biased_walk.truth, settings)
@@ -309,6 +314,6 @@ def test_north_is_not_applied_if_the_direction_is_known(
 
 
 @pytest.mark.parametrize("declination", [4.0, math.nan, "east"])
-def test_a_declination_that_is_not_an_angle_is_refused(declination: Any) -> None:
+def test_a_declination_that_is_not_an_angle_is_refused(declination):
     with pytest.raises(ConfigError, match="declination"):
         FilterConfig(declination=declination)

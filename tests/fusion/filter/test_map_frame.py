@@ -1,8 +1,5 @@
 """Fixes in map coordinates, after gaps, and refused ones, for the filter and for the graph."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,7 +13,6 @@ from stario.fusion.lie import yaw_twist
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence
 
-Make = Callable[..., Any]
 BACKENDS = ("ekf", "graph")
 MAP = np.array([5.0e5, 4.5e6, 120.0])
 """Offset of a map's coordinates [m], such as UTM's."""
@@ -43,8 +39,8 @@ def stream_with_fixes(navigator: Navigator, walk: ImuSequence, fixes: list[Fix])
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_fixes_far_from_the_maps_origin_are_as_accurate_as_near_ones(
-    make_walk: Make, make_oracle: Make, backend: Any
-) -> None:
+    make_walk, make_oracle, backend
+):
     walk = make_walk(3, 20.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     found = []
@@ -65,9 +61,7 @@ def test_fixes_far_from_the_maps_origin_are_as_accurate_as_near_ones(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_fix_at_the_first_sample_places_the_first_state_too(
-    make_walk: Make, make_oracle: Make, backend: Any
-) -> None:
+def test_a_fix_at_the_first_sample_places_the_first_state_too(make_walk, make_oracle, backend):
     walk = make_walk(3, 5.0)
     oracle = make_oracle(walk, walk.truth, CONFIG)
     fix = position_fix(walk.time[0], MAP, 0.01 * np.eye(3))
@@ -79,8 +73,8 @@ def test_a_fix_at_the_first_sample_places_the_first_state_too(
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("gap", [4.0, 15.0])
 def test_fixes_recover_the_yaw_after_a_gap_that_lost_it(
-    make_walk: Make, make_oracle: Make, without: Make, backend: Any, gap: float
-) -> None:
+    make_walk, make_oracle, without, backend, gap
+):
     """The pedestrian turns in the gap; the track before it stays where the fixes placed it."""
     walk = make_walk(6, 60.0)
     holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
@@ -97,7 +91,7 @@ def test_fixes_recover_the_yaw_after_a_gap_that_lost_it(
     assert np.mean(turn[late] ** 2 / track.covariance[late, 2, 2]) < 6.0
 
 
-def test_the_graph_uses_no_fix_that_the_filter_refused(make_walk: Make, make_oracle: Make) -> None:
+def test_the_graph_uses_no_fix_that_the_filter_refused(make_walk, make_oracle):
     """The yaw of a device that hangs upside down is undefined."""
     walk = make_walk(3, 20.0, mount_rotvec=(np.pi, 0.0, 0.0))
     oracle = make_oracle(walk, walk.truth, CONFIG)
@@ -112,9 +106,7 @@ def test_the_graph_uses_no_fix_that_the_filter_refused(make_walk: Make, make_ora
     np.testing.assert_allclose(*ends, atol=1e-9)
 
 
-def test_a_heading_alone_does_not_make_the_position_uncertain(
-    make_walk: Make, make_oracle: Make
-) -> None:
+def test_a_heading_alone_does_not_make_the_position_uncertain(make_walk, make_oracle):
     walk = make_walk(4, 20.0)
     oracle = make_oracle(walk, walk.truth, CONFIG)
     fixes = [yaw_fix(10.0, 1.0, 0.05)]
@@ -135,9 +127,7 @@ class Climbing:
         return mean + np.array([0.0, 0.0, 0.4]), covariance
 
 
-def test_fixes_that_agree_prevail_over_an_overconfident_track(
-    make_walk: Make, make_oracle: Make
-) -> None:
+def test_fixes_that_agree_prevail_over_an_overconfident_track(make_walk, make_oracle):
     """Otherwise it ends twenty metres too high, as each fix alone looks like an outlier."""
     walk = make_walk(3, 60.0)
     climbing = Climbing(make_oracle(walk, walk.truth, CONFIG, noise=0.02, sigma=0.02))
@@ -149,9 +139,7 @@ def test_fixes_that_agree_prevail_over_an_overconfident_track(
     assert track.health.fixes["gated"] > 3
 
 
-def test_neither_gaps_nor_fixes_make_a_streams_graph_grow(
-    make_walk: Make, make_oracle: Make, without: Make
-) -> None:
+def test_neither_gaps_nor_fixes_make_a_streams_graph_grow(make_walk, make_oracle, without):
     walk = make_walk(5, 25.0)
     holed = without(walk, (walk.time > 5.0) & (walk.time % 3.0 < 0.3))
     for recording, fixes in ((holed, []), (walk, fixes_of(walk, np.arange(3.0, 24.0, 0.1), MAP))):
@@ -173,9 +161,7 @@ def yaw_error(walk: ImuSequence, states: list[NavState]) -> tuple[np.ndarray, np
 @pytest.mark.parametrize(
     "off", [[200.0, 0.0, 0.0], pytest.param([0.0, -60.0, 0.0], marks=pytest.mark.slow)]
 )
-def test_a_wrong_first_position_does_not_turn_the_track(
-    make_walk: Make, make_oracle: Make, backend: Any, off: list[float]
-) -> None:
+def test_a_wrong_first_position_does_not_turn_the_track(make_walk, make_oracle, backend, off):
     walk = make_walk(3, 40.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     fixes = fixes_of(walk, np.arange(2.0, 38.0, 3.0), np.zeros(3))
@@ -190,9 +176,7 @@ def test_a_wrong_first_position_does_not_turn_the_track(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_positions_undo_a_yaw_that_pointed_backwards(
-    make_walk: Make, make_oracle: Make, backend: Any
-) -> None:
+def test_positions_undo_a_yaw_that_pointed_backwards(make_walk, make_oracle, backend):
     walk = make_walk(3, 60.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     wrong = yaw_of(walk.truth.at(np.array([4.0])).attitude_WB)[0] + np.pi
@@ -210,7 +194,7 @@ def test_positions_undo_a_yaw_that_pointed_backwards(
     assert error.max() < 1.0
 
 
-def test_more_accurate_positions_move_a_stationary_track(still_model: Any) -> None:
+def test_more_accurate_positions_move_a_stationary_track(still_model):
     time = np.arange(0.0, 20.0, 0.01)
     still = ImuSequence(
         "still", time, np.zeros((len(time), 3)), np.tile([0.0, 0.0, 9.81], (len(time), 1))
@@ -223,7 +207,7 @@ def test_more_accurate_positions_move_a_stationary_track(still_model: Any) -> No
     assert ((sigma > 0.5) & (sigma < 1.5)).all()
 
 
-def test_a_yaw_too_coarse_to_be_informative_is_refused(make_walk: Make, make_oracle: Make) -> None:
+def test_a_yaw_too_coarse_to_be_informative_is_refused(make_walk, make_oracle):
     walk = make_walk(3, 40.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     fixes = fixes_of(walk, np.arange(2.0, 38.0, 3.0), np.zeros(3))
@@ -236,7 +220,7 @@ def test_a_yaw_too_coarse_to_be_informative_is_refused(make_walk: Make, make_ora
     np.testing.assert_array_equal(with_it.trajectory.position_W, without.trajectory.position_W)
 
 
-def test_the_track_is_turned_about_its_prior_position(make_walk: Make, make_oracle: Make) -> None:
+def test_the_track_is_turned_about_its_prior_position(make_walk, make_oracle):
     walk = make_walk(3, 40.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     far, turn = np.array([100.0, 50.0, 0.0]), about_z(2.0)
@@ -250,16 +234,14 @@ def test_the_track_is_turned_about_its_prior_position(make_walk: Make, make_orac
     assert sigma[-1] < 0.1
 
 
-def test_the_first_positions_drift_is_its_own_error(walk: ImuSequence, still_model: Any) -> None:
+def test_the_first_positions_drift_is_its_own_error(walk, still_model):
     """Else the track's drift to the next position would seem small next to it."""
     navigator = Navigator(still_model)
     stream_with_fixes(navigator, walk, [position_fix(3.0, MAP, 0.3**2 * np.eye(3))])
     assert navigator._stream.state.map_frame.alignment.drift < 0.2
 
 
-def test_uninformative_fixes_in_a_gap_leave_its_turn_as_uncertain(
-    make_walk: Make, without: Any, still_model: Any
-) -> None:
+def test_uninformative_fixes_in_a_gap_leave_its_turn_as_uncertain(make_walk, without, still_model):
     walk = make_walk(3, 20.0)
     broken = without(walk, (walk.time > 8.0) & (walk.time < 8.9))
     prior = PriorPose(walk.truth.attitude_WB[0].as_matrix(), np.zeros(3), walk.truth.position_W[0])
@@ -274,9 +256,7 @@ def test_uninformative_fixes_in_a_gap_leave_its_turn_as_uncertain(
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_false_position_does_not_block_a_yaw(
-    make_walk: Make, make_oracle: Make, backend: Any
-) -> None:
+def test_a_false_position_does_not_block_a_yaw(make_walk, make_oracle, backend):
     walk = make_walk(3, 20.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     first, off = fixes_of(walk, [2.0, 4.0], np.zeros(3))
@@ -289,9 +269,7 @@ def test_a_false_position_does_not_block_a_yaw(
     assert sigma[-1] < 0.2
 
 
-def test_a_horizontal_position_is_kept_over_a_coarser_one_with_height(
-    make_walk: Make, make_oracle: Make
-) -> None:
+def test_a_horizontal_position_is_kept_over_a_coarser_one_with_height(make_walk, make_oracle):
     walk = make_walk(3, 20.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     start = true_at(walk, 1.5)

@@ -1,10 +1,5 @@
 """The direction of a track from several positions together."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 from support import GRAPH as CONFIG
@@ -14,19 +9,14 @@ from stario.fusion.evaluation.checks.fusion import true_fixes
 from stario.fusion.filter.planar_alignment import PlanarAlignment
 from stario.sequences.accuracy.metrics import pose_errors
 
-Make = Callable[..., Any]
 
-
-def test_positions_too_close_to_give_a_direction_alone_give_it_together(
-    make_walk: Make, make_oracle: Make
-) -> None:
+def test_positions_too_close_to_give_a_direction_alone_give_it_together(make_walk, make_oracle):
     walk = make_walk(8, 60.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.02, sigma=0.02)
     farthest = np.linalg.norm(walk.truth.position_W[:, :2] - walk.truth.position_W[0, :2], axis=1)
     sigma = 0.4 * float(farthest.max())
     fixes = true_fixes(walk.truth, 1.0, sigma, seed=3)
     track = Navigator(oracle, CONFIG).run(walk, fixes=fixes)
-    assert track.filtered is not None
     counts = track.filtered.health.fixes
     assert counts["yaw not known"] > 3
     assert counts["applied"] > 10
@@ -52,7 +42,7 @@ def alignment_of(
 
 
 @pytest.mark.parametrize("count", [5, 20])
-def test_the_sigma_of_the_fitted_turn_is_consistent(count: int) -> None:
+def test_the_sigma_of_the_fitted_turn_is_consistent(count):
     rng, errors = np.random.default_rng(0), []
     for turn in rng.uniform(-np.pi, np.pi, 400):
         found, sigma = alignment_of(rng, turn, count, 0.3).turn
@@ -60,7 +50,7 @@ def test_the_sigma_of_the_fitted_turn_is_consistent(count: int) -> None:
     assert 0.8 < np.mean(np.square(errors)) < 1.3
 
 
-def test_fewer_than_two_places_give_no_direction() -> None:
+def test_fewer_than_two_places_give_no_direction():
     assert PlanarAlignment().turn[1] == np.inf
     here = PlanarAlignment()
     for fix in np.random.default_rng(1).normal(0.0, 1.0, (50, 2)):
@@ -68,7 +58,7 @@ def test_fewer_than_two_places_give_no_direction() -> None:
     assert here.turn[1] > 10.0
 
 
-def test_positions_count_for_less_once_the_track_has_drifted() -> None:
+def test_positions_count_for_less_once_the_track_has_drifted():
     steady = alignment_of(np.random.default_rng(2), 0.5, 8, 0.3)
     last = np.array([1.0, 1.0]), np.array([2.0, 2.0])
     kept, drifted = (steady.with_position(*last, 0.09, drift) for drift in (0.0, 5.0))

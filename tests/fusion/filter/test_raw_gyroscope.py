@@ -1,7 +1,5 @@
 """A gyroscope with uncorrected bias: gravity reveals it, and the filter's prior widens."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +17,7 @@ def biased(walk: ImuSequence, bias: np.ndarray) -> ImuSequence:
     return replace(walk, gyro=walk.gyro + bias)
 
 
-def test_a_raw_bias_is_within_its_sigma_on_every_axis(make_walk, make_oracle) -> None:
+def test_a_raw_bias_is_within_its_sigma_on_every_axis(make_walk, make_oracle):
     config = NavigatorConfig()
     walk = biased(make_walk(seed=2, seconds=40.0), RAW)
     track = Navigator(make_oracle(walk, walk.truth, config), config, backend="ekf").run(walk)
@@ -31,7 +29,7 @@ def test_a_raw_bias_is_within_its_sigma_on_every_axis(make_walk, make_oracle) ->
 
 
 @pytest.mark.parametrize("size", [0.0, 6e-3])
-def test_a_corrected_gyroscope_keeps_its_prior(make_walk, make_oracle, size: float) -> None:
+def test_a_corrected_gyroscope_keeps_its_prior(make_walk, make_oracle, size):
     """As wide as such a bias, and no wider."""
     config = NavigatorConfig()
     walk = biased(make_walk(seed=4, seconds=20.0), np.array([size, 0.0, 0.0]))
@@ -42,7 +40,7 @@ def test_a_corrected_gyroscope_keeps_its_prior(make_walk, make_oracle, size: flo
     assert 1e-3 <= np.sqrt(state.bias_prior.variance) < max(2.5e-3, size)
 
 
-def test_the_track_changes_continuously_with_the_bias(make_walk, make_oracle) -> None:
+def test_the_track_changes_continuously_with_the_bias(make_walk, make_oracle):
     """A slightly larger bias widens the prior slightly: similar recordings end close together."""
     ends = []
     for size in (0.030, 0.0302):
@@ -54,7 +52,7 @@ def test_the_track_changes_continuously_with_the_bias(make_walk, make_oracle) ->
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_apparent_rest_that_lasts_long_is_rest(still_model, backend) -> None:
+def test_apparent_rest_that_lasts_long_is_rest(still_model, backend):
     """Flat on a table, gravity does not reveal an uncorrected bias about the vertical."""
     rng, n, bias = np.random.default_rng(1), 4500, np.array([0.002, -0.001, 0.05])
     gyro = bias + rng.normal(0.0, 2e-3, (n, 3))

@@ -1,18 +1,13 @@
 """Rest: detected where nothing moves, never in motion; informative about bias and velocity."""
 
-from __future__ import annotations
-
 import itertools
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from recorded import DATA
 
 from stario.fusion import Navigator, PriorPose, Track
-from stario.fusion.backends import BackendName
 from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.filter.zero_velocity import Stillness
 from stario.fusion.imu.intervals import ImuInterval
@@ -27,8 +22,6 @@ CONFIG = NavigatorConfig()
 NO_STILLNESS = replace(CONFIG, filter=replace(CONFIG.filter, stillness_noise=0.0))
 BIAS = np.array([2e-3, -1e-3, 1.5e-3])
 GRAVITY = np.array([0.0, 0.0, STANDARD_GRAVITY])
-
-Make = Callable[..., Any]
 
 
 def lying(
@@ -57,12 +50,12 @@ def at_rest(intervals: list[ImuInterval]) -> list[bool]:
 
 
 @pytest.mark.parametrize("rate", [50.0, 100.0, 200.0, 1000.0])
-def test_a_device_on_a_table_is_at_rest_after_a_second(rate: float) -> None:
+def test_a_device_on_a_table_is_at_rest_after_a_second(rate):
     assert fraction_at_rest(lying(10.0, rate)) == pytest.approx(91 / 100, abs=0.03)
 
 
 @pytest.mark.parametrize("carry", ["handheld", "pocket", "trolley"])
-def test_a_moving_device_is_not_at_rest(make_walk: Make, carry: str) -> None:
+def test_a_moving_device_is_not_at_rest(make_walk, carry):
     walk = make_walk(5, 20.0, 100.0, PHONE_IMU, carry=carry)
     intervals, _ = cut_recording(walk, CONFIG)
     still = np.array([e.stop for e in intervals])[at_rest(intervals)]
@@ -71,7 +64,7 @@ def test_a_moving_device_is_not_at_rest(make_walk: Make, carry: str) -> None:
         assert np.linalg.norm(moved, axis=1).max() < 0.1  # a simulated trolley creeps smoothly
 
 
-def test_rest_needs_a_whole_second_and_a_gap_ends_it() -> None:
+def test_rest_needs_a_whole_second_and_a_gap_ends_it():
     intervals, _ = cut_recording(lying(6.0), CONFIG)
     intervals[30] = replace(intervals[30], gap=True)
     found = at_rest(intervals)
@@ -86,7 +79,7 @@ def yaw_drift(track: Track) -> float:
     return float(turn.magnitude())
 
 
-def test_rest_measures_the_bias_and_holds_yaw_and_position(still_model: Any) -> None:
+def test_rest_measures_the_bias_and_holds_yaw_and_position(still_model):
     table = lying(30.0)
     with_zero_velocity = Navigator(still_model, CONFIG, backend="ekf").run(table)
     without = Navigator(still_model, NO_STILLNESS, backend="ekf").run(table)
@@ -102,7 +95,7 @@ def test_rest_measures_the_bias_and_holds_yaw_and_position(still_model: Any) -> 
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_a_device_at_rest_does_not_drift_with_the_predictions(backend: BackendName) -> None:
+def test_a_device_at_rest_does_not_drift_with_the_predictions(backend):
     """Trained on walks, the network predicts a centimetre per second on a table."""
     track = Navigator(load_model(), CONFIG, backend=backend).run(lying(60.0))
     assert np.linalg.norm(track.trajectory.position_W[-1]) < 0.05
@@ -110,7 +103,7 @@ def test_a_device_at_rest_does_not_drift_with_the_predictions(backend: BackendNa
     assert error @ np.linalg.solve(P, error) < 12.0
 
 
-def test_a_standing_person_who_sways_teaches_no_bias(still_model: Any) -> None:
+def test_a_standing_person_who_sways_teaches_no_bias(still_model):
     """On a table the gyroscope reads its bias; a person turns it to and fro by 1.5 deg/s."""
     table = lying(40.0, bias=np.zeros(3))
     sway = np.radians(1.5) * np.sin(2.0 * np.pi * 0.2 * table.time)
@@ -120,13 +113,13 @@ def test_a_standing_person_who_sways_teaches_no_bias(still_model: Any) -> None:
     assert np.abs(track.b_g[:, 2]).max() < 2e-3
 
 
-def test_rest_gives_no_information_about_yaw(still_model: Any) -> None:
+def test_rest_gives_no_information_about_yaw(still_model):
     prior = PriorPose(exp_so3(np.array([0.0, 0.0, 1.0])), np.zeros(3), np.zeros(3), yaw_sigma=0.3)
     track = Navigator(still_model, CONFIG, prior, backend="ekf").run(lying(10.0))
     assert np.sqrt(track.covariance[-1, 2, 2]) > 0.3
 
 
-def test_a_steady_glide_is_not_stopped(still_model: Any) -> None:
+def test_a_steady_glide_is_not_stopped(still_model):
     """With no vibration and an uninformative network, the filter's own speed decides."""
     fast = PriorPose(np.eye(3), np.array([1.5, 0.0, 0.0]), np.zeros(3), 1e-3, 0.02, 0.05)
     quiet = replace(CONFIG.filter, accel_bias_sigma=0.02)
@@ -136,7 +129,7 @@ def test_a_steady_glide_is_not_stopped(still_model: Any) -> None:
     assert track.trajectory.velocity_W[-1, 0] > 1.2
 
 
-def test_a_slow_turn_is_not_mistaken_for_bias(still_model: Any) -> None:
+def test_a_slow_turn_is_not_mistaken_for_bias(still_model):
     """Unless it lasts for longer than anybody turns so evenly."""
     track = Navigator(still_model, CONFIG, backend="ekf").run(
         lying(3.0, turn=0.05, bias=np.zeros(3))
@@ -154,7 +147,7 @@ def test_a_slow_turn_is_not_mistaken_for_bias(still_model: Any) -> None:
         ("tumvi/dataset-room1_512_16", False),
     ],
 )
-def test_rest_is_detected_only_where_the_ground_truth_rests(name: str, found: bool) -> None:
+def test_rest_is_detected_only_where_the_ground_truth_rests(name, found):
     if not (DATA / name).exists():
         pytest.skip(f"no {name} at {DATA}")
     recording = read_recording(DATA / name)

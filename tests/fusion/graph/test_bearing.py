@@ -1,10 +1,6 @@
 """Magnetic bearings in a stream's graph: what they say about yaw and bias, as in the filter."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from initial_ekf import Driven
@@ -37,7 +33,7 @@ def ekf_with_field() -> Driven:
     return ekf
 
 
-def test_the_information_gained_gives_the_filters_covariance_and_mean() -> None:
+def test_the_information_gained_gives_the_filters_covariance_and_mean():
     ekf = ekf_with_field()
     before = ekf.state
     turned_B = np.array([15.5, -4.0, -40.0])
@@ -56,7 +52,7 @@ def test_the_information_gained_gives_the_filters_covariance_and_mean() -> None:
     np.testing.assert_allclose(gain * (value + u @ change), change, rtol=0.02, atol=1e-6)
 
 
-def test_an_update_without_yaw_and_bias_gains_nothing() -> None:
+def test_an_update_without_yaw_and_bias_gains_nothing():
     ekf = Driven(slots=0)
     zero = np.zeros(3)
     ekf.initialise(NavState(0.0, np.eye(3), zero, zero, zero, zero, 0.01 * np.eye(15)))
@@ -67,7 +63,6 @@ def test_an_update_without_yaw_and_bias_gains_nothing() -> None:
 
 def last_state(navigator: Navigator, walk: ImuSequence) -> NavState:
     field = walk.magnetometer
-    assert field is not None
     state, due = None, 0
     for time, gyro, accel in zip(walk.time, walk.gyro, walk.accel, strict=True):
         while due < len(field.time) and field.time[due] <= time:
@@ -78,9 +73,7 @@ def last_state(navigator: Navigator, walk: ImuSequence) -> NavState:
     return state
 
 
-def test_the_field_bounds_the_yaw_of_a_stream(
-    make_walk: Callable[..., Any], make_oracle: Callable[..., Any]
-) -> None:
+def test_the_field_bounds_the_yaw_of_a_stream(make_walk, make_oracle):
     """A gyroscope as noisy as this is lost by 0.5 rad after 40 s, but for the magnetic field."""
     truth = make_walk(3, 40.0).truth
     walk = simulate_imu(truth, 50.0, magnetic_field=MagneticField(), seed=3)

@@ -1,7 +1,5 @@
 """Jacobians of the graph's terms against finite differences, and what they must not observe."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gtsam
@@ -65,7 +63,7 @@ def terms(rng: np.random.Generator, values: Any) -> list[Term]:
 
 
 @pytest.mark.parametrize("which", range(11))
-def test_jacobians_agree_with_finite_differences(which: int) -> None:
+def test_jacobians_agree_with_finite_differences(which):
     for seed in range(2):
         rng = np.random.default_rng(seed)
         values = random_values(rng)
@@ -85,7 +83,7 @@ def test_jacobians_agree_with_finite_differences(which: int) -> None:
                 np.testing.assert_allclose(-(ahead - behind) / 2e-5, expected, atol=2e-6)
 
 
-def test_a_linear_factor_weighs_a_residual_by_the_inverse_of_its_correlated_covariance() -> None:
+def test_a_linear_factor_weighs_a_residual_by_the_inverse_of_its_correlated_covariance():
     rng = np.random.default_rng(8)
     values, root = random_values(rng), rng.normal(size=(3, 3))
     term = Position(0, rng.normal(size=3), root @ root.T, 0.4, rng.normal(size=3))
@@ -100,7 +98,7 @@ def test_a_linear_factor_weighs_a_residual_by_the_inverse_of_its_correlated_cova
 
 
 @pytest.mark.parametrize("yaw", [0.0, 2.5])
-def test_in_a_gap_velocity_and_biases_are_constant_and_a_turn_is_any_turn(yaw: float) -> None:
+def test_in_a_gap_velocity_and_biases_are_constant_and_a_turn_is_any_turn(yaw):
     values = random_values(np.random.default_rng(5))
     a, turn = KeyframeState.of(values, 0), exp_so3(np.array([0.0, 0.0, yaw]))
     v = turn @ a.v_W
@@ -113,14 +111,14 @@ def test_in_a_gap_velocity_and_biases_are_constant_and_a_turn_is_any_turn(yaw: f
     np.testing.assert_allclose(residual, [-yaw, *np.zeros(12)], atol=1e-10)
 
 
-def test_motion_in_a_gap_observes_no_turn_but_its_own() -> None:
+def test_motion_in_a_gap_observes_no_turn_but_its_own():
     """Not even where the residual is far from zero, as in a first round."""
     values = random_values(np.random.default_rng(7))
     a, b = (KeyframeState.of(values, k) for k in (0, 1))
     _, blocks = Coasting(0, 1, 1.7, EYE, np.eye(13)).linearise(values)
     H, up = dict(blocks), np.array([0.0, 0.0, 1.0])
 
-    def of_turn(k: int, s: KeyframeState, about: np.ndarray) -> np.ndarray:
+    def of_turn(k, s, about):
         pose = np.concatenate([s.R_WB.T @ up, s.R_WB.T @ np.cross(up, s.p_W - about)])
         return np.asarray(H[X(k)] @ pose + H[V(k)] @ np.cross(up, s.v_W))
 
@@ -129,7 +127,7 @@ def test_motion_in_a_gap_observes_no_turn_but_its_own() -> None:
     np.testing.assert_allclose(of_turn(1, b, a.p_W), [1.0, *np.zeros(12)], atol=1e-10)
 
 
-def test_a_tilt_is_that_of_the_measured_vertical_at_any_yaw() -> None:
+def test_a_tilt_is_that_of_the_measured_vertical_at_any_yaw():
     values = random_values(np.random.default_rng(6))
     R = KeyframeState.of(values, 0).R_WB
     turned = exp_so3(np.array([0.0, 0.0, 1.1])) @ R
@@ -152,7 +150,7 @@ def in_turned_world(values: Any, yaw: float, shift: np.ndarray) -> Any:
     return turned
 
 
-def test_a_displacement_does_not_depend_on_the_turn_of_the_world() -> None:
+def test_a_displacement_does_not_depend_on_the_turn_of_the_world():
     rng = np.random.default_rng(3)
     values = random_values(rng)
     term = terms(rng, values)[0]
@@ -161,7 +159,7 @@ def test_a_displacement_does_not_depend_on_the_turn_of_the_world() -> None:
     np.testing.assert_allclose(ours, theirs, atol=1e-10)
 
 
-def test_a_displacement_gives_no_information_about_tilt() -> None:
+def test_a_displacement_gives_no_information_about_tilt():
     """Turning the first pose about any horizontal axis leaves the residual unchanged."""
     rng = np.random.default_rng(4)
     values = random_values(rng)
@@ -170,7 +168,7 @@ def test_a_displacement_gives_no_information_about_tilt() -> None:
     np.testing.assert_allclose(H_i[:, :3] @ R_i.T @ np.eye(3, 2), 0.0, atol=1e-10)
 
 
-def test_a_prior_without_yaw_information_gains_none_wherever_it_is_linearised() -> None:
+def test_a_prior_without_yaw_information_gains_none_wherever_it_is_linearised():
     """A turn about the vertical stays in its null space as the keyframes move."""
     rng = np.random.default_rng(5)
     there = random_values(rng)
@@ -190,7 +188,7 @@ def test_a_prior_without_yaw_information_gains_none_wherever_it_is_linearised() 
     np.testing.assert_allclose(change, 0.0, atol=1e-10)
 
 
-def test_the_error_from_itself_is_zero_and_of_a_turned_state_is_the_turn() -> None:
+def test_the_error_from_itself_is_zero_and_of_a_turned_state_is_the_turn():
     values = random_values(np.random.default_rng(6))
     state = KeyframeState.of(values, 0)
     turned = KeyframeState.of(in_turned_world(values, 0.7, np.zeros(3)), 0)

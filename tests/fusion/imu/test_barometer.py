@@ -26,13 +26,13 @@ def ramp(rate: float, begin: float = 10.0, end: float = 22.0, until: float = 32.
     return rate * np.clip(time - begin, 0.0, end - begin)
 
 
-def test_a_hectopascal_is_eight_and_a_half_metres_near_the_sea() -> None:
+def test_a_hectopascal_is_eight_and_a_half_metres_near_the_sea():
     altitude = pressure_altitude(np.array([1000.0, 1001.0]))
     assert 8.3 < altitude[0] - altitude[1] < 8.5
     np.testing.assert_allclose(pressure_altitude(standard_pressure(altitude)), altitude, atol=1e-3)
 
 
-def test_heights_count_from_the_first_and_their_sigma_is_that_of_the_data() -> None:
+def test_heights_count_from_the_first_and_their_sigma_is_that_of_the_data():
     for noise in (0.03, 0.3):
         found = [each for each in judged(np.zeros(400), noise) if each is not None]
         assert abs(found[0].height) < 2.0 * noise
@@ -41,7 +41,7 @@ def test_heights_count_from_the_first_and_their_sigma_is_that_of_the_data() -> N
 
 
 @pytest.mark.parametrize("rate", [0.25, -0.3, 1.5])
-def test_stairs_and_lifts_are_climbs_while_they_last(rate: float) -> None:
+def test_stairs_and_lifts_are_climbs_while_they_last(rate):
     found = judged(ramp(rate))
     climbing = {each.time: each.rate for each in found if each is not None and each.rate}
     times = np.array(list(climbing))
@@ -54,14 +54,14 @@ def test_stairs_and_lifts_are_climbs_while_they_last(rate: float) -> None:
     assert risen[0] * rate > 0.0
 
 
-def test_a_level_floor_is_no_climb() -> None:
+def test_a_level_floor_is_no_climb():
     for seed in range(5):
         found = judged(np.zeros(800), noise=0.2, seed=seed)
         assert all(each is not None and each.rate == each.stepped == 0.0 for each in found)
 
 
 @pytest.mark.parametrize("step", [0.6, -0.9])
-def test_a_door_is_held_back_and_then_a_step_of_the_air(step: float) -> None:
+def test_a_door_is_held_back_and_then_a_step_of_the_air(step):
     heights = np.where(np.arange(240) < 100, 0.0, step)
     found = judged(heights)
     assert [each for each in found if each is not None and each.rate] == []
@@ -70,7 +70,7 @@ def test_a_door_is_held_back_and_then_a_step_of_the_air(step: float) -> None:
     assert steps == pytest.approx([step], abs=0.15)
 
 
-def test_a_puff_of_air_is_held_back_and_nothing_else() -> None:
+def test_a_puff_of_air_is_held_back_and_nothing_else():
     heights = np.zeros(240)
     heights[100:108] = 0.8
     found = judged(heights)
@@ -79,7 +79,7 @@ def test_a_puff_of_air_is_held_back_and_nothing_else() -> None:
     assert all(each.rate == each.stepped == 0.0 for each in known)
 
 
-def test_late_repeated_and_impossible_pressures_are_refused() -> None:
+def test_late_repeated_and_impossible_pressures_are_refused():
     buffer = HeightBuffer()
     assert buffer.add(1.0, 1000.0, 1.0)
     assert not buffer.add(1.0, 1000.0, 1.0)
@@ -91,7 +91,7 @@ def test_late_repeated_and_impossible_pressures_are_refused() -> None:
     assert not buffer.add(1.05, 1000.0, 1.2)
 
 
-def test_one_pressure_a_second_is_enough_and_none_is_none() -> None:
+def test_one_pressure_a_second_is_enough_and_none_is_none():
     buffer, found = HeightBuffer(), []
     for k in range(30):
         buffer.add(float(k), float(standard_pressure(np.array(0.3 * max(0, k - 15)))), float(k))

@@ -1,20 +1,16 @@
 """Faulty samples: values at a sensor's limit, a clock that is set back."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from told import health_lines, told
 
-from stario.fusion import Navigator, PriorPose
+from stario.fusion import Navigator, NavigatorConfig, PriorPose
 from stario.fusion.imu.faults import ClockSetBackDetector, ClockSetBackError, OutlierDetector
+from stario.fusion.recording import cut_recording
 from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.sequence import ImuSequence
-
-Make = Callable[..., Any]
-
 
 # --- saturation ------------------------------------------------------------------------------
 
@@ -30,12 +26,12 @@ def count_saturated(gyro_x: np.ndarray, size: int = 11) -> int:
     return sum(found)
 
 
-def test_coarse_values_that_repeat_while_rising_are_not_saturated() -> None:
+def test_coarse_values_that_repeat_while_rising_are_not_saturated():
     rising = 0.1 * np.round(np.arange(0.0, 200.0) / 2.0)  # each value twice
     assert count_saturated(rising) == 0
 
 
-def test_a_clipped_sine_is_saturated_at_its_limit() -> None:
+def test_a_clipped_sine_is_saturated_at_its_limit():
     clipped = np.clip(8.0 * np.sin(np.arange(0.0, 40.0, 0.05)), -5.0, 5.0)
     stuck = int(((clipped[1:] == clipped[:-1]) & (np.abs(clipped[1:]) == 5.0)).sum())
     assert stuck - 2 <= count_saturated(clipped) <= stuck
@@ -44,12 +40,35 @@ def test_a_clipped_sine_is_saturated_at_its_limit() -> None:
 # --- spikes ----------------------------------------------------------------------------------
 
 
-def test_a_spike_is_replaced_by_its_neighbours_mean_and_the_last_sample_by_the_one_before() -> None:
+def test_a_spike_is_replaced_by_its_neighbours_mean_and_the_last_sample_by_the_one_before():
     rows = np.zeros((7, 7))
     rows[:, 0], rows[:, 1] = 0.01 * np.arange(7), np.arange(7.0)
     rows[[3, 6], 1] = 500.0, -500.0
     assert OutlierDetector().detect(rows).spikes == 2
     np.testing.assert_array_equal(rows[:, 1], [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 5.0])
+
+
+@pytest.mark.parametrize("at", [0, 60, 73, 200])
+def test_a_spike_at_the_start_or_after_a_gap_tilts_nothing(make_walk, at):
+    walk = make_walk(3, 4.0).without_truth()
+    kept = np.delete(np.arange(len(walk)), np.arange(120, 200))
+    gyro = walk.gyro.copy()
+    gyro[[at, at + 2]] = [[9e3, -7e3, 8e3], [-6e3, 5e3, 9e3]]
+
+    def attitudes(rates):
+        used = replace(walk, time=walk.time[kept], gyro=rates[kept], accel=walk.accel[kept])
+        intervals, _ = cut_recording(used, NavigatorConfig())
+        return np.array([interval.R_NB[2] for interval in intervals])
+
+    np.testing.assert_allclose(attitudes(gyro), attitudes(walk.gyro), atol=0.05)
+
+
+def test_zeros_of_an_accelerometer_are_no_free_fall(make_walk, still_model):
+    walk = make_walk(3, 4.0).without_truth()
+    accel = walk.accel.copy()
+    accel[250:260] = 0.0
+    health = Navigator(still_model).run(replace(walk, accel=accel)).health
+    assert health.samples["frozen"] == 10
 
 
 # --- a clock that is set back ----------------------------------------------------------------
@@ -60,7 +79,7 @@ def set_back(walk: ImuSequence, by: float, at: float = 8.0) -> ImuSequence:
     return replace(walk.without_truth(), time=np.where(late, walk.time - by, walk.time))
 
 
-def test_a_stream_raises_an_error_and_restarts(make_walk: Make, still_model: Any) -> None:
+def test_a_stream_raises_an_error_and_restarts(make_walk, still_model):
     walk = set_back(make_walk(3, 16.0), 100.0)
     first = PriorPose(np.eye(3), np.zeros(3), np.array([50.0, 0.0, 0.0]))
     navigator, states, errors = Navigator(still_model, prior=first), [], []
@@ -80,9 +99,7 @@ def test_a_stream_raises_an_error_and_restarts(make_walk: Make, still_model: Any
 
 
 @pytest.mark.parametrize("by", [7.0, 100.0])
-def test_a_recordings_track_ends_there_and_its_health_states_why(
-    make_walk: Make, still_model: Any, by: float
-) -> None:
+def test_a_recordings_track_ends_there_and_its_health_states_why(make_walk, still_model, by):
     walk = set_back(make_walk(3, 16.0), by)
     track = Navigator(still_model, backend="ekf").run(walk)
     assert track.time[-1] == pytest.approx(8.0, abs=0.11)
@@ -93,7 +110,7 @@ def test_a_recordings_track_ends_there_and_its_health_states_why(
     assert f"{by - 0.01:.3g} s at 8.0 s" in problem
 
 
-def test_late_samples_and_bursts_are_not_another_clock() -> None:
+def test_late_samples_and_bursts_are_not_another_clock():
     detector = ClockSetBackDetector()
     for k in range(300):  # two sensors in turn, one half a second behind
         detector.on_time()
@@ -105,9 +122,7 @@ def test_late_samples_and_bursts_are_not_another_clock() -> None:
         detector.note_late(9.0 - 0.01 * k, 10.0)
 
 
-def test_a_block_that_is_logged_twice_does_not_change_the_track(
-    make_walk: Make, still_model: Any
-) -> None:
+def test_a_block_that_is_logged_twice_does_not_change_the_track(make_walk, still_model):
     walk = make_walk(3, 16.0).without_truth()
     rows = np.r_[0:800, 600 : len(walk)]
     twice = replace(walk, time=walk.time[rows], gyro=walk.gyro[rows], accel=walk.accel[rows])
@@ -118,7 +133,7 @@ def test_a_block_that_is_logged_twice_does_not_change_the_track(
     np.testing.assert_array_equal(track.trajectory.position_W, plain.trajectory.position_W)
 
 
-def test_shuffled_rows_are_reported_with_the_advice_to_sort_them(make_walk: Make) -> None:
+def test_shuffled_rows_are_reported_with_the_advice_to_sort_them(make_walk):
     walk = make_walk(3, 16.0)
     order = np.random.default_rng(0).permutation(len(walk))
     shuffled = replace(
@@ -129,7 +144,7 @@ def test_shuffled_rows_are_reported_with_the_advice_to_sort_them(make_walk: Make
     assert "ms" not in problems
 
 
-def test_impossible_values_are_reported_and_excluded_from_the_means(make_walk: Make) -> None:
+def test_impossible_values_are_reported_and_excluded_from_the_means(make_walk):
     walk = make_walk(3, 16.0)
     gyro = walk.gyro.copy()
     gyro[::300] = 1e6
@@ -138,7 +153,7 @@ def test_impossible_values_are_reported_and_excluded_from_the_means(make_walk: M
     assert found.gyro_norm < 10.0
 
 
-def test_a_clock_set_back_by_a_few_seconds_is_reported(make_walk: Make, still_model: Any) -> None:
+def test_a_clock_set_back_by_a_few_seconds_is_reported(make_walk, still_model):
     walk = make_walk(3, 16.0)
     track = Navigator(still_model, backend="ekf").run(set_back(walk, 3.0))
     assert any("late for 3.0 s in a row" in line for line in health_lines(track.health))

@@ -1,6 +1,5 @@
 """Intervals cover every moment once; windows span no gap and do not depend on the filter."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 
@@ -66,9 +65,7 @@ def uneven(sequence: ImuSequence, drops: float, jitter: float, seed: int = 0) ->
         (1000.0, 1.0, 0.2),
     ],
 )
-def test_intervals_cover_every_moment_once(
-    make_walk: Callable[..., ImuSequence], rate: float, jitter: float, drops: float
-) -> None:
+def test_intervals_cover_every_moment_once(make_walk, rate, jitter, drops):
     walk = uneven(make_walk(2, 8.0, rate), drops, jitter)
     intervals, front_end = cut_recording(walk, CONFIG)
     assert front_end.counts == SampleCounts(used=len(walk))
@@ -88,9 +85,7 @@ def test_intervals_cover_every_moment_once(
 
 
 @pytest.mark.parametrize("rate", [1, 2, 5, 10, 20])
-def test_windows_come_at_the_update_rate_after_the_first_second(
-    walk: ImuSequence, rate: int
-) -> None:
+def test_windows_come_at_the_update_rate_after_the_first_second(walk, rate):
     intervals, _ = cut_recording(walk, NavigatorConfig(filter=FilterConfig(update_rate=rate)))
     stops = np.array([e.stop for e in intervals if e.window is not None]) - walk.time[0]
     assert stops[0] == pytest.approx(1.0)
@@ -99,9 +94,7 @@ def test_windows_come_at_the_update_rate_after_the_first_second(
 
 
 @pytest.mark.parametrize(("rate", "bound"), [(100.0, 1e-3), (200.0, 1e-3), (1000.0, 5e-3)])
-def test_windows_equal_those_of_training_for_the_same_attitude(
-    make_walk: Callable[..., ImuSequence], rate: float, bound: float
-) -> None:
+def test_windows_equal_those_of_training_for_the_same_attitude(make_walk, rate, bound):
     walk = make_walk(3, 6.0, rate, PERFECT_IMU)
     intervals, front_end = cut_recording(walk, CONFIG)
     # The levelled attitude serves as truth; corrections at the intervals' ends are small steps.
@@ -121,7 +114,7 @@ def test_windows_equal_those_of_training_for_the_same_attitude(
     assert ours.dtype == np.float32
 
 
-def test_windows_start_with_their_stated_attitude(walk: ImuSequence) -> None:
+def test_windows_start_with_their_stated_attitude(walk):
     intervals, _ = cut_recording(walk, CONFIG)
     by_stop = {round(e.stop, 6): e for e in intervals}
     checked = 0
@@ -136,9 +129,7 @@ def test_windows_start_with_their_stated_attitude(walk: ImuSequence) -> None:
     assert checked > 100
 
 
-def test_bad_samples_are_dropped_and_counted_and_do_not_affect_the_rest(
-    walk: ImuSequence, without: Callable[..., ImuSequence]
-) -> None:
+def test_bad_samples_are_dropped_and_counted_and_do_not_affect_the_rest(walk, without):
     time, gyro, accel = walk.time.copy(), walk.gyro.copy(), walk.accel.copy()
     gyro[300, 1], accel[500], time[700], gyro[900] = np.nan, np.inf, np.nan, -np.inf
     time[1000] = time[999]  # repeated
@@ -162,9 +153,7 @@ def samples_within(walk: ImuSequence, start: float, stop: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("length", [0.25, 0.5, 5.0])
-def test_a_gap_is_one_interval_and_no_window_spans_it(
-    walk: ImuSequence, without: Callable[..., ImuSequence], length: float
-) -> None:
+def test_a_gap_is_one_interval_and_no_window_spans_it(walk, without, length):
     start, stop = 6.02, 6.02 + length
     holed = without(walk, samples_within(walk, start + 1e-9, stop - 1e-9))
     intervals, front_end = cut_recording(holed, CONFIG)
@@ -179,9 +168,7 @@ def test_a_gap_is_one_interval_and_no_window_spans_it(
     assert min(after) == pytest.approx(stop + WINDOW_SECONDS)
 
 
-def test_a_hole_is_bridged_and_intervals_and_windows_across_it_are_flagged(
-    walk: ImuSequence, without: Callable[..., ImuSequence]
-) -> None:
+def test_a_hole_is_bridged_and_intervals_and_windows_across_it_are_flagged(walk, without):
     start, stop = 6.02, 6.17
     holed = without(walk, samples_within(walk, start + 1e-9, stop - 1e-9))
     intervals, front_end = cut_recording(holed, CONFIG)
@@ -196,9 +183,7 @@ def test_a_hole_is_bridged_and_intervals_and_windows_across_it_are_flagged(
             assert e.window.flagged == (touches and e.stop > missing[0].start + 1e-9)
 
 
-def test_a_hole_of_a_tenth_of_a_second_is_bridged(
-    walk: ImuSequence, without: Callable[..., ImuSequence]
-) -> None:
+def test_a_hole_of_a_tenth_of_a_second_is_bridged(walk, without):
     holed = without(walk, samples_within(walk, 6.0 + 1e-9, 6.1 - 2e-2))
     intervals, front_end = cut_recording(holed, CONFIG)
     assert front_end.counts.gaps == []
@@ -206,21 +191,16 @@ def test_a_hole_of_a_tenth_of_a_second_is_bridged(
     assert_seamless(intervals, walk.time[0])
 
 
-def test_after_a_gap_in_the_first_second_the_front_end_restarts(
-    walk: ImuSequence, without: Callable[..., ImuSequence]
-) -> None:
+def test_after_a_gap_in_the_first_second_the_front_end_restarts(walk, without):
     holed = without(walk, samples_within(walk, 0.5 + 1e-9, 0.9 - 1e-9))
     intervals, front_end = cut_recording(holed, CONFIG)
     assert front_end.counts.gaps == [(pytest.approx(0.5), pytest.approx(0.4))]
-    assert front_end.start is not None
     assert front_end.start.time == pytest.approx(0.9)
     assert_seamless(intervals, front_end.start.time)
     assert not any(e.gap for e in intervals)
 
 
-def test_two_gaps_with_one_sample_between_them_are_counted_separately(
-    walk: ImuSequence, without: Callable[..., ImuSequence]
-) -> None:
+def test_two_gaps_with_one_sample_between_them_are_counted_separately(walk, without):
     gone = samples_within(walk, 5.0 + 1e-9, 6.0 - 1e-9)
     gone[np.argmin(np.abs(walk.time - 5.5))] = False
     intervals, front_end = cut_recording(without(walk, gone), CONFIG)
@@ -230,9 +210,7 @@ def test_two_gaps_with_one_sample_between_them_are_counted_separately(
     assert_seamless(intervals, walk.time[0])
 
 
-def test_the_newest_gaps_are_listed_and_all_are_counted(
-    walk: ImuSequence,
-) -> None:
+def test_the_newest_gaps_are_listed_and_all_are_counted(walk):
     front_end = FrontEnd(CONFIG)
     for k in range(250):  # 0.5 s of samples, then 0.5 s without, once 0.8 s
         for j in range(50):
@@ -245,17 +223,7 @@ def test_the_newest_gaps_are_listed_and_all_are_counted(
     assert counts.health().lines()[1] == "gaps 249, longest 0.81 s"
 
 
-def test_times_since_1970_give_the_same_windows(walk: ImuSequence) -> None:
-    late = replace(walk, time=walk.time + 1.7e9)
-    ours, theirs = (
-        [e.window.imu_N for e in cut_recording(s, CONFIG)[0] if e.window is not None]
-        for s in (late, walk)
-    )
-    assert len(ours) == len(theirs)
-    assert np.abs(np.stack(ours) - np.stack(theirs)).max() < 2e-3
-
-
-def test_filter_settings_do_not_affect_the_windows(walk: ImuSequence) -> None:
+def test_filter_settings_do_not_affect_the_windows(walk):
     other = NavigatorConfig(
         filter=FilterConfig(update_rate=10, covariance_scale=9.0, gyro_bias_sigma=1.0)
     )
@@ -266,7 +234,7 @@ def test_filter_settings_do_not_affect_the_windows(walk: ImuSequence) -> None:
         assert (ours.window is None) == (theirs.window is None)
 
 
-def test_the_front_end_buffers_no_more_than_a_second(walk: ImuSequence) -> None:
+def test_the_front_end_buffers_no_more_than_a_second(walk):
     front_end = FrontEnd(CONFIG)
     held = 0
     for row in np.column_stack([walk.time, walk.gyro, walk.accel]).tolist():
@@ -275,7 +243,7 @@ def test_the_front_end_buffers_no_more_than_a_second(walk: ImuSequence) -> None:
     assert held <= 1.0 * walk.rate + 2
 
 
-def test_absurd_values_are_dropped_and_counted() -> None:
+def test_absurd_values_are_dropped_and_counted():
     front_end = FrontEnd(CONFIG)
     for k in range(300):
         value = 1e300 if k == 150 else 0.0

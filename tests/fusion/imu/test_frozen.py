@@ -1,8 +1,6 @@
 """Sensors that stop and repeat their last values, both together or one alone."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,11 +12,9 @@ from stario.fusion.imu.faults import FrozenSensorDetector
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 
-Make = Callable[..., Any]
-
 
 @pytest.mark.parametrize("held", ["last", "zeros"])
-def test_a_sensor_that_stops_makes_a_gap(walk: ImuSequence, make_oracle: Make, held: str) -> None:
+def test_a_sensor_that_stops_makes_a_gap(walk, make_oracle, held):
     gyro, accel, time = walk.gyro.copy(), walk.accel.copy(), walk.time
     dead = (time > time[0] + 8.0) & (time < time[0] + 11.0)
     last = np.argmax(dead) - 1
@@ -32,7 +28,7 @@ def test_a_sensor_that_stops_makes_a_gap(walk: ImuSequence, make_oracle: Make, h
     assert length == pytest.approx(3.0, abs=0.2)
 
 
-def test_a_sensor_at_rest_may_repeat_its_values(still_model: Any) -> None:
+def test_a_sensor_at_rest_may_repeat_its_values(still_model):
     """Simulated without noise, or so coarse that its noise does not show."""
     n = 1000
     still = ImuSequence(
@@ -43,7 +39,7 @@ def test_a_sensor_at_rest_may_repeat_its_values(still_model: Any) -> None:
 
 
 @pytest.mark.parametrize("accel", [0.0, 1.0])
-def test_an_unchanging_stream_is_refused_for_its_force(still_model: Any, accel: float) -> None:
+def test_an_unchanging_stream_is_refused_for_its_force(still_model, accel):
     n = 300
     silent = ImuSequence(
         "silent", np.arange(n) / 100.0, np.zeros((n, 3)), np.tile([0.0, 0.0, accel], (n, 1))
@@ -66,9 +62,7 @@ NAMES = {"gyro": "gyroscope", "accel": "accelerometer"}
 
 
 @pytest.mark.parametrize("sensor", NAMES)
-def test_one_sensor_that_stops_makes_a_gap_and_is_named(
-    walk: ImuSequence, make_oracle: Make, sensor: str
-) -> None:
+def test_one_sensor_that_stops_makes_a_gap_and_is_named(walk, make_oracle, sensor):
     stopped = held(walk, sensor, 8.0, 12.0)
     track = Navigator(make_oracle(stopped, walk.truth, CONFIG), backend="ekf").run(stopped)
     ((start, length),) = track.health.gaps
@@ -81,9 +75,7 @@ def test_one_sensor_that_stops_makes_a_gap_and_is_named(
 
 
 @pytest.mark.parametrize("sensor", NAMES)
-def test_a_slow_sensor_may_be_repeated_at_the_rate_of_the_other(
-    walk: ImuSequence, still_model: Any, sensor: str
-) -> None:
+def test_a_slow_sensor_may_be_repeated_at_the_rate_of_the_other(walk, still_model, sensor):
     slow = getattr(walk, sensor)[np.arange(len(walk)) // 10 * 10]
     assert (
         Navigator(still_model, backend="ekf")
@@ -99,7 +91,7 @@ def frozen_samples(time: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> int
     return sum(detector.stopped(tuple(row)) is not None for row in rows)
 
 
-def test_constant_values_that_the_other_sensor_confirms_are_no_fault() -> None:
+def test_constant_values_that_the_other_sensor_confirms_are_no_fault():
     """A coarse gyroscope at rest, a turntable, and turning about the vertical without noise."""
     time = np.arange(0.0, 20.0, 0.01)
     rng = np.random.default_rng(0)
@@ -114,7 +106,7 @@ def test_constant_values_that_the_other_sensor_confirms_are_no_fault() -> None:
         assert frozen_samples(time, *before) == 0
 
 
-def test_a_gap_while_a_value_repeats_shows_no_motion(walk: ImuSequence) -> None:
+def test_a_gap_while_a_value_repeats_shows_no_motion(walk):
     """A phone that sleeps for three seconds repeats the gyroscope's value when it wakes."""
     gyro, keep = walk.gyro.copy(), (walk.time < 8.0) | (walk.time >= 11.0)
     awake = np.flatnonzero(walk.time >= 11.0)
@@ -122,7 +114,7 @@ def test_a_gap_while_a_value_repeats_shows_no_motion(walk: ImuSequence) -> None:
     assert frozen_samples(walk.time[keep], gyro[keep], walk.accel[keep]) == 0
 
 
-def test_a_wild_time_does_not_hide_a_sensor_that_has_stopped(walk: ImuSequence) -> None:
+def test_a_wild_time_does_not_hide_a_sensor_that_has_stopped(walk):
     stopped = held(walk, "gyro", 8.0, 12.0)
     time = stopped.time.copy()
     time[820] = 1e9
@@ -130,9 +122,7 @@ def test_a_wild_time_does_not_hide_a_sensor_that_has_stopped(walk: ImuSequence) 
 
 
 @pytest.mark.parametrize("stop", [8.3, 10.0])
-def test_a_restored_stream_knows_what_has_stopped(
-    walk: ImuSequence, still_model: Any, stop: float
-) -> None:
+def test_a_restored_stream_knows_what_has_stopped(walk, still_model, stop):
     stopped = held(walk, "gyro", 8.0, 12.0)
     whole, first, second = (Navigator(still_model) for _ in range(3))
     stream(whole, stopped)

@@ -1,11 +1,7 @@
 """Gaps of the samples, and the magnetometer's rows between them."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +25,7 @@ def ends(seconds: float, before: np.ndarray, after: np.ndarray) -> np.ndarray:
     return np.array([[5.0, *before, 0.0, 0.0, 0.0], [5.0 + seconds, *after, 0.0, 0.0, 0.0]])
 
 
-def test_a_short_gap_is_turned_through_at_the_rates_of_its_ends() -> None:
+def test_a_short_gap_is_turned_through_at_the_rates_of_its_ends():
     table = ends(0.4, RATE + BIAS, RATE + BIAS)
     expected = Rotation.from_rotvec(0.4 * RATE).as_matrix()
     np.testing.assert_allclose(gap_rotation(table, 0.4, BIAS), expected, atol=1e-9)
@@ -38,7 +34,7 @@ def test_a_short_gap_is_turned_through_at_the_rates_of_its_ends() -> None:
     np.testing.assert_allclose(turned, [0.0, 0.0, 0.8], atol=1e-9)
 
 
-def test_a_long_gap_keeps_the_attitude() -> None:
+def test_a_long_gap_keeps_the_attitude():
     length = INTERPOLATED + 0.1
     np.testing.assert_array_equal(gap_rotation(ends(length, RATE, RATE), length, BIAS), np.eye(3))
 
@@ -52,7 +48,7 @@ def gap_of(length: float, turn_rate: float) -> ImuInterval:
 
 
 @pytest.mark.parametrize("length", [0.3, 0.9, 3.0])
-def test_the_yaw_is_ever_less_certain_until_it_is_unknown(length: float) -> None:
+def test_the_yaw_is_ever_less_certain_until_it_is_unknown(length):
     gap = gap_of(length, 0.5)
     sigma = np.sqrt([yaw_variance(s, gap) for s in np.linspace(0.0, length, 20)])
     assert sigma[0] == 0.0
@@ -64,8 +60,8 @@ def test_the_yaw_is_ever_less_certain_until_it_is_unknown(length: float) -> None
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
 def test_the_yaw_is_kept_through_gaps_while_the_device_turns(
-    make_walk: Callable[..., Any], make_oracle: Any, without: Any, backend: Any
-) -> None:
+    make_walk, make_oracle, without, backend
+):
     """A kept attitude would lose 20 degrees in each of these four gaps, and know as much."""
     walk = swivelled(make_walk(3, 32.0), 1.0)
     gone = (walk.time > 10.0) & (walk.time < 28.0) & (walk.time % 5.0 < 0.35)
@@ -81,7 +77,7 @@ def test_the_yaw_is_kept_through_gaps_while_the_device_turns(
     assert 0.15 < sigma < 0.35
 
 
-def test_the_network_sees_the_same_turn(make_walk: Callable[..., Any], without: Any) -> None:
+def test_the_network_sees_the_same_turn(make_walk, without):
     """The levelled frame, along which a network's displacements are chained, keeps its yaw."""
     walk = swivelled(make_walk(3, 20.0), 1.0)
     holed = without(walk, (walk.time > 10.0) & (walk.time < 10.4))
@@ -94,8 +90,8 @@ def test_the_network_sees_the_same_turn(make_walk: Callable[..., Any], without: 
 
 
 def test_gravity_determines_the_tilt_even_if_the_recording_ends_soon_after_a_gap(
-    make_walk: Callable[..., Any], make_oracle: Any, without: Any
-) -> None:
+    make_walk, make_oracle, without
+):
     walk = make_walk(1, 19.2)
     holed = without(walk, (walk.time > 15.0) & (walk.time < 18.0))
     oracle = make_oracle(holed, walk.truth, GRAPH)
@@ -118,7 +114,7 @@ def noisy(k: int) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     sequence = simulate_imu(generate_walk(3, 20.0), 100.0, PHONE_IMU, 3)
     time = sequence.time[::4]
     field = np.array([noisy(k) for k in range(len(time))])
@@ -130,14 +126,14 @@ def count_with_field(sequence: ImuSequence) -> int:
     return sum(interval.field_B is not None for interval in intervals)
 
 
-def test_a_wild_sample_time_costs_at_most_one_interval_its_field(walk: ImuSequence) -> None:
+def test_a_wild_sample_time_costs_at_most_one_interval_its_field(walk):
     time = walk.time.copy()
     time[1000] += 1e4
     assert count_with_field(replace(walk, time=time)) >= count_with_field(walk) - 1 > 150
 
 
 @pytest.mark.parametrize("wild", [1e4, -1e4, math.nan])
-def test_a_wild_field_time_costs_one_field(wild: float) -> None:
+def test_a_wild_field_time_costs_one_field(wild):
     buffer = FieldBuffer()
     for k in range(200):
         time = 0.02 * k
@@ -146,7 +142,7 @@ def test_a_wild_field_time_costs_one_field(wild: float) -> None:
             assert buffer.at(time) is not None
 
 
-def test_late_repeated_and_infinite_fields_are_refused() -> None:
+def test_late_repeated_and_infinite_fields_are_refused():
     buffer = FieldBuffer()
     assert buffer.add(1.0, FIELD_B, now=1.0)
     assert not buffer.add(1.0, FIELD_B, now=1.0)
@@ -156,7 +152,7 @@ def test_late_repeated_and_infinite_fields_are_refused() -> None:
     assert buffer.at(1.2) is None
 
 
-def test_fields_may_arrive_seconds_before_their_samples() -> None:
+def test_fields_may_arrive_seconds_before_their_samples():
     buffer = FieldBuffer()
     for batch in range(5):
         for k in range(60):
@@ -164,7 +160,7 @@ def test_fields_may_arrive_seconds_before_their_samples() -> None:
         assert buffer.at(3.0 * batch + 0.12) is not None
 
 
-def test_a_block_of_fields_may_come_before_its_samples_and_what_does_not_fit_is_counted() -> None:
+def test_a_block_of_fields_may_come_before_its_samples_and_what_does_not_fit_is_counted():
     buffer = FieldBuffer()
     kept = [buffer.add(0.01 * k, noisy(k), now=-0.01) for k in range(1200)]
     assert kept == [True] * 1000 + [False] * 200
@@ -173,7 +169,7 @@ def test_a_block_of_fields_may_come_before_its_samples_and_what_does_not_fit_is_
     assert len(buffer._waiting) < 50
 
 
-def test_a_field_too_late_for_any_interval_is_refused() -> None:
+def test_a_field_too_late_for_any_interval_is_refused():
     buffer = FieldBuffer()
     assert buffer.add(1.0, FIELD_B, 1.0)
     assert buffer.at(1.5) is None
@@ -181,7 +177,7 @@ def test_a_field_too_late_for_any_interval_is_refused() -> None:
     assert buffer.add(1.45, FIELD_B, 1.5)
 
 
-def test_a_sensor_that_repeats_its_value_has_stopped() -> None:
+def test_a_sensor_that_repeats_its_value_has_stopped():
     buffer = FieldBuffer()
     used = [buffer.add(0.1 * k, FIELD_B, now=0.1 * k) for k in range(20)]
     assert used == [True] * 6 + [False] * 14  # slow sensors are logged several times

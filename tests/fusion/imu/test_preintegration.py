@@ -83,7 +83,7 @@ def interpolated(t: np.ndarray, values: np.ndarray, finer: int) -> np.ndarray:
     return np.stack([np.interp(fine, t, column) for column in values.T], axis=1)
 
 
-def test_a_segment_equals_dead_reckoning_on_fine_samples() -> None:
+def test_a_segment_equals_dead_reckoning_on_fine_samples():
     R, v, p, b_g, b_a = state()
     t, gyro, accel = samples(200)
     finer = 100
@@ -106,7 +106,7 @@ def test_a_segment_equals_dead_reckoning_on_fine_samples() -> None:
     np.testing.assert_allclose(p, expected_p, atol=5e-5)
 
 
-def test_a_device_at_rest_stays_in_place() -> None:
+def test_a_device_at_rest_stays_in_place():
     R, _, p, b_g, b_a = state()
     t = np.linspace(0.0, 1.0, 101)
     gyro = np.tile(b_g, (101, 1))
@@ -118,14 +118,12 @@ def test_a_device_at_rest_stays_in_place() -> None:
     np.testing.assert_allclose(p_end, p, atol=1e-10)
 
 
-def test_coning_and_sculling_corrections_beat_the_midpoint_rule() -> None:
+def test_coning_and_sculling_corrections_beat_the_midpoint_rule():
     t, gyro, accel, R_true, v_true = coning(200)
     corrected = corrected_increments(t, gyro, accel)
     midpoint = np.diff(t), 0.5 * (gyro[1:] + gyro[:-1]), 0.5 * (accel[1:] + accel[:-1])
 
-    def errors(
-        increments: tuple[np.ndarray, ...], R_ref: np.ndarray, v_ref: np.ndarray
-    ) -> np.ndarray:
+    def errors(increments, R_ref, v_ref):
         R, v = integrated(*increments)
         return np.array([np.linalg.norm(log_so3(R @ R_ref.T)), np.linalg.norm(v - v_ref)])
 
@@ -136,11 +134,11 @@ def test_coning_and_sculling_corrections_beat_the_midpoint_rule() -> None:
     assert (errors(corrected, *lines) < 0.02 * errors(midpoint, *lines)).all()
 
 
-def test_transition_agrees_with_finite_differences() -> None:
+def test_transition_agrees_with_finite_differences():
     x = state()
     segment = preintegrate(*samples(200, 0.1), x[3], x[4], NOISE, GRAVITY)
 
-    def across(y: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+    def across(y):
         return (*segment.predict(*y), y[3], y[4])
 
     end, step = across(x), 1e-6
@@ -151,7 +149,7 @@ def test_transition_agrees_with_finite_differences() -> None:
     np.testing.assert_allclose(propagated(segment, *x).transition, numeric, atol=1e-6)
 
 
-def test_transition_of_the_pose_does_not_depend_on_the_state() -> None:
+def test_transition_of_the_pose_does_not_depend_on_the_state():
     x = state()
     segment = preintegrate(*samples(200, 0.1), x[3], x[4], NOISE, GRAVITY)
     other = moved(x, np.r_[0.3, -0.2, 2.0, 5.0, 3.0, 1.0, 50.0, 20.0, 10.0, np.zeros(6)])
@@ -159,7 +157,7 @@ def test_transition_of_the_pose_does_not_depend_on_the_state() -> None:
     np.testing.assert_allclose(here, there, rtol=0.0, atol=1e-10)
 
 
-def test_propagation_keeps_yaw_and_position_unobservable() -> None:
+def test_propagation_keeps_yaw_and_position_unobservable():
     x = state()
     segment = preintegrate(*samples(200), x[3], x[4], NOISE, GRAVITY)
     unobservable = np.zeros((15, 4))
@@ -169,7 +167,7 @@ def test_propagation_keeps_yaw_and_position_unobservable() -> None:
     np.testing.assert_allclose(kept, unobservable, rtol=0.0, atol=1e-10)
 
 
-def test_noise_agrees_with_that_of_perturbed_samples() -> None:
+def test_noise_agrees_with_that_of_perturbed_samples():
     """Sum over each sample's noise and each step of the biases' walks, by finite differences."""
     R, v, p, b_g, b_a = state()
     n, dt = 10, 0.02
@@ -178,7 +176,7 @@ def test_noise_agrees_with_that_of_perturbed_samples() -> None:
     # Perturbed after the corrections for rotation, so that each sample acts on one interval.
     dt_k, rate, force = corrected_increments(t, gyro - b_g, accel - b_a)
 
-    def end(w: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, ...]:
+    def end(w, a):
         y_R, y_v, y_p = R, v, p
         for k in range(n):
             a_W = y_R @ a[k] - [0, 0, GRAVITY]
@@ -210,7 +208,7 @@ def test_noise_agrees_with_that_of_perturbed_samples() -> None:
     )
 
 
-def test_more_white_noise_does_not_change_the_random_walk_of_the_biases() -> None:
+def test_more_white_noise_does_not_change_the_random_walk_of_the_biases():
     x = state()
     loud = replace(NOISE, gyro_noise=3.0 * NOISE.gyro_noise, accel_noise=3.0 * NOISE.accel_noise)
     plain, scaled = (
@@ -221,7 +219,7 @@ def test_more_white_noise_does_not_change_the_random_walk_of_the_biases() -> Non
     np.testing.assert_allclose(scaled[9:, 9:], plain[9:, 9:], rtol=1e-6)
 
 
-def test_a_segment_with_noise_per_sample_equals_its_parts_in_sequence() -> None:
+def test_a_segment_with_noise_per_sample_equals_its_parts_in_sequence():
     """An impact's velocity error acts on the position afterwards, which mean noise would miss."""
     x = state()
     t, gyro, accel = samples(200)
@@ -247,7 +245,7 @@ def test_a_segment_with_noise_per_sample_equals_its_parts_in_sequence() -> None:
     assert other[6, 6] < 0.8 * noise[6, 6]
 
 
-def test_noise_does_not_depend_on_the_sensor_rate() -> None:
+def test_noise_does_not_depend_on_the_sensor_rate():
     x = state()
     slow, fast = (
         propagated(preintegrate(*samples(rate), x[3], x[4], NOISE, GRAVITY), *x).noise[0]
@@ -257,7 +255,7 @@ def test_noise_does_not_depend_on_the_sensor_rate() -> None:
 
 
 @pytest.mark.parametrize("turn", [2.0 * np.pi, 11.0])
-def test_more_than_a_full_turn_in_a_segment_leaves_its_jacobians_bounded(turn: float) -> None:
+def test_more_than_a_full_turn_in_a_segment_leaves_its_jacobians_bounded(turn):
     # As of a gyroscope in deg/s, before the stream is refused.
     time = np.linspace(0.0, 0.1, 11)
     gyro, accel = np.tile([0.0, 0.0, turn / 0.1], (11, 1)), np.tile([0.0, 0.0, 9.81], (11, 1))

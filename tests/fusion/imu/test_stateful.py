@@ -1,7 +1,5 @@
 """Windows of the network: inference, and the direction of its displacements."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -56,7 +54,7 @@ def with_gap(walk, without):
 
 
 @pytest.mark.parametrize("rate", [1, 5])
-def test_memory_is_kept_between_gaps_separately_for_each_series(walk, without, rate) -> None:
+def test_memory_is_kept_between_gaps_separately_for_each_series(walk, without, rate):
     config = NavigatorConfig(filter=FilterConfig(update_rate=rate))
     preprocessed = Navigator(Counting(), config).observe(with_gap(walk, without))
     stretches, all_counts = [[]], []
@@ -74,7 +72,7 @@ def test_memory_is_kept_between_gaps_separately_for_each_series(walk, without, r
     assert len(all_counts) > 15 * rate
 
 
-def test_a_stream_equals_the_batch_also_after_a_restore(walk, without) -> None:
+def test_a_stream_equals_the_batch_also_after_a_restore(walk, without):
     sequence = with_gap(walk, without)
     track = Navigator(Counting(), backend="ekf").run(sequence).trajectory
     navigator = Navigator(Counting())
@@ -90,7 +88,7 @@ def test_a_stream_equals_the_batch_also_after_a_restore(walk, without) -> None:
     np.testing.assert_allclose([s.p_W for s in states], track.position_W[at], atol=1e-6)
 
 
-def test_the_track_with_true_attitude_uses_memory_too(walk) -> None:
+def test_the_track_with_true_attitude_uses_memory_too(walk):
     config = NavigatorConfig(filter=FilterConfig(update_rate=1))
     track = network_track_true_attitude(Counting(), walk, config)
     speed = track.trajectory.velocity_W[:, 2]
@@ -98,7 +96,7 @@ def test_the_track_with_true_attitude_uses_memory_too(walk) -> None:
     assert speed[-1] == pytest.approx(len(track.trajectory.time) - 2)
 
 
-def test_a_model_without_memory_is_called_directly(still_model) -> None:
+def test_a_model_without_memory_is_called_directly(still_model):
     network = StatefulInference(still_model, 10)
     assert not network.is_recurrent
     assert network.memory is None
@@ -114,7 +112,7 @@ class Walking:
         return np.tile([1.5, 0.0, 0.0], (n, 1)), np.tile(1e-4 * np.eye(3), (n, 1, 1))
 
 
-def test_slopes_and_missing_samples_make_displacements_less_certain(walk, without) -> None:
+def test_slopes_and_missing_samples_make_displacements_less_certain(walk, without):
     """A floor of unknown slope (0.03) the height, missing samples all axes: sigma is doubled."""
     holed = without(walk, (walk.time > 6.0) & (walk.time < 6.1))
     measurements = Navigator(Walking(), NavigatorConfig()).observe(holed).measurements

@@ -126,7 +126,8 @@ def test_points_that_a_thread_moves_while_they_are_read_are_sent_again(hub):
             self.revision = 1
             return self.lists.pop(0) if len(self.lists) > 1 else self.lists[0]
 
-    hub.sessions["phone"] = SimpleNamespace(track=SimpleNamespace(drawn=Moving()), status=dict)
+    track = SimpleNamespace(drawn=Moving(), places=SimpleNamespace(drawn=[]))
+    hub.sessions["phone"] = SimpleNamespace(track=track, status=dict)
     viewer = Viewer(hub)
     messages = [viewer.message()["devices"][0] for _ in range(3)]
     assert [message["points"] for message in messages] == [[[1.0]], [[2.0]], []]

@@ -22,6 +22,10 @@ CONFIG = {
 }  # fmt: skip
 
 PRESSURE = {"source": "pressure", "outputs": [{"x": "p"}, {"t": "p t"}]}
+LOCATION = {
+    "source": "location",
+    "outputs": [{k: f"loc {k}"} for k in ("lat", "lon", "z", "v", "dir", "t", "accuracy")],
+}
 
 
 class FakePhone:
@@ -60,6 +64,11 @@ class FakePhone:
         for k, axis in enumerate("xyz"):
             columns[f"g{axis.upper()}"] = self.walk.gyro[known, k]
             columns[f"acc {axis}"] = self.walk.accel[known, k]
+        columns["loc t"] = self.walk.time[known][::100]
+        columns["loc lat"] = 48.1 + 1e-5 * columns["loc t"]
+        columns["loc lon"] = 11.5 + 0.0 * columns["loc t"]
+        for name, value in {"z": np.nan, "v": 1.0, "dir": 90.0, "accuracy": 5.0}.items():
+            columns[f"loc {name}"] = np.full(len(columns["loc t"]), value)
         columns["p t"] = self.walk.time[known][::10]
         columns["p"] = 1000.0 - 0.01 * columns["p t"]
         return columns
@@ -115,6 +124,24 @@ def test_the_pressure_of_an_experiment_that_has_it_is_recorded(
     np.testing.assert_allclose(known.time, 0.1 * np.arange(50), atol=1e-6)
     np.testing.assert_allclose(known.pressure_hPa, 1000.0 - 0.001 * np.arange(50))
     assert session.status()["floor"] == "floor 0"
+
+
+def test_the_places_of_an_experiment_that_has_them_are_recorded(
+    phone, fake, tmp_path, new_navigator
+):
+    """An altitude that the phone does not know ends no buffer."""
+    fake.config = {"inputs": [*CONFIG["inputs"], LOCATION]}
+    session = Session(phone.device, tmp_path, new_navigator)
+    for fake.count in range(50, 501, 50):
+        session.take(phone.fetch(), 1.7e9)
+    session.close()
+    known = read_recording(session.track.path).satellites
+    np.testing.assert_allclose(known.time, np.arange(5), atol=1e-6)
+    np.testing.assert_allclose(known.latlon_deg[:, 0], 48.1 + 1e-5 * np.arange(5))
+    assert known.altitude_m is None
+    assert set(known.radius_m) == {5.0}
+    assert set(known.bearing_deg) == {90.0}
+    assert session.status()["satellites"] == "5 satellite positions compared with the track"
 
 
 def test_an_experiment_without_both_sensors_is_refused():

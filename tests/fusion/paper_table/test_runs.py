@@ -1,7 +1,5 @@
 """Runs of the table: completed once, resumed after a kill; only new ones are completed later."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os
@@ -9,11 +7,9 @@ import pickle
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from training_runs import narrow
 from typer.testing import CliRunner
 
 from stario.fusion.commands.cli import app
@@ -28,13 +24,13 @@ from stario.sequences.datasets.batch import Skipped
 from stario.sequences.errors import ConfigError, InputError, WeightsError
 from stario.sequences.readers import read_recording
 from stario.sequences.readers.csv_writer import write_csv
-from stario.sequences.sequence import ImuSequence, PositionTrack
+from stario.sequences.sequence import PositionTrack
 
 RECIPE: dict[str, object] = {"batch": 6, "device": "cpu", "attitude": "true"}
 
 
 @pytest.fixture(scope="module")
-def dataset(make_walk: Any, tmp_path_factory: pytest.TempPathFactory) -> DataSet:
+def dataset(make_walk, tmp_path_factory):
     folder = tmp_path_factory.mktemp("walks")
     for seed in range(4):
         write_csv(folder / f"walk{seed}.csv", make_walk(seed=seed, seconds=8.0))
@@ -42,14 +38,8 @@ def dataset(make_walk: Any, tmp_path_factory: pytest.TempPathFactory) -> DataSet
 
 
 @pytest.fixture(scope="module")
-def reading(tmp_path_factory: pytest.TempPathFactory) -> ReaderConfig:
+def reading(tmp_path_factory):
     return ReaderConfig(read_recording, {}, tmp_path_factory.mktemp("cache"))
-
-
-@pytest.fixture
-def narrow_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Train a small StarIO, by default the network of the runs here."""
-    narrow(monkeypatch)
 
 
 def run(dataset: DataSet, network: str = "StarIO", seed: int = 0, steps: int = 4) -> Run:
@@ -57,9 +47,7 @@ def run(dataset: DataSet, network: str = "StarIO", seed: int = 0, steps: int = 4
 
 
 @pytest.mark.usefixtures("narrow_network")
-def test_a_filled_run_writes_model_and_errors(
-    dataset: DataSet, reading: ReaderConfig, tmp_path: Path
-) -> None:
+def test_a_filled_run_writes_model_and_errors(dataset, reading, tmp_path):
     done = run(dataset, steps=2)
     complete_run(done, tmp_path, reading)
     folder = tmp_path / "own/StarIO/2-steps/seed-0"
@@ -79,17 +67,16 @@ def test_a_filled_run_writes_model_and_errors(
 
 
 def test_without_recorded_poses_the_legs_alone_select_the_weights(
-    dataset: DataSet, make_walk: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    chosen: list[bool] = []
+    dataset, make_walk, tmp_path, monkeypatch
+):
+    chosen = []
 
-    def trained(*arguments: Any, chosen_by_legs: bool = False, **rest: Any) -> None:
+    def trained(*arguments, chosen_by_legs=False, **rest):
         chosen.append(chosen_by_legs)
         raise InputError("stop", "enough", "no training")
 
-    def waypoints(path: Path) -> ImuSequence:
+    def waypoints(path):
         walk = read_recording(path)
-        assert walk.truth is not None
         time = walk.truth.time[0] + np.arange(0.5, 16.0, 3.0)
         track = PositionTrack(time, walk.truth.at(time).position_W[:, :2], "waypoints")
         return replace(walk, truth=None, positions=track)
@@ -110,15 +97,13 @@ def test_without_recorded_poses_the_legs_alone_select_the_weights(
 
 
 @pytest.mark.usefixtures("narrow_network")
-def test_a_killed_run_resumes_and_gives_the_same_model(
-    dataset: DataSet, reading: ReaderConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_killed_run_resumes_and_gives_the_same_model(dataset, reading, tmp_path, monkeypatch):
     monkeypatch.setattr(training, "_EPOCH_STEPS", 2)
     whole, killed = run(dataset), run(dataset)
     complete_run(whole, tmp_path / "whole", reading)
     with monkeypatch.context() as during:
 
-        def kill(path: Path, seconds: object) -> None:
+        def kill(path, seconds):
             raise KeyboardInterrupt
 
         during.setattr(training, "write_json", kill)
@@ -135,12 +120,12 @@ def test_a_killed_run_resumes_and_gives_the_same_model(
 
 @pytest.mark.usefixtures("narrow_network")
 def test_filled_runs_are_kept_and_only_new_networks_and_seeds_are_trained(
-    dataset: DataSet, reading: ReaderConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    trained: list[str] = []
+    dataset, reading, tmp_path, monkeypatch
+):
+    trained = []
     original = runs_module.train_run
 
-    def counted(dataset: DataSet, recipe: Any, *rest: Any) -> dict[str, object]:
+    def counted(dataset, recipe, *rest):
         trained.append(f"{recipe.architecture} {recipe.seed}")
         return original(dataset, recipe, *rest)
 
@@ -176,8 +161,8 @@ def test_filled_runs_are_kept_and_only_new_networks_and_seeds_are_trained(
 
 @pytest.mark.usefixtures("narrow_network")
 def test_runs_of_another_recipe_are_refused_and_other_step_counts_are_separate(
-    dataset: DataSet, reading: ReaderConfig, tmp_path: Path
-) -> None:
+    dataset, reading, tmp_path
+):
     done = run(dataset, steps=1)
     complete_run(done, tmp_path, reading)
     other = Run(dataset, "StarIO", 0, run_recipe({**RECIPE, "rate": 1e-2}, "StarIO", 0, 1))
@@ -188,7 +173,7 @@ def test_runs_of_another_recipe_are_refused_and_other_step_counts_are_separate(
     assert completed_runs([run(dataset, steps=2)], tmp_path) == {}
 
 
-def test_the_most_important_runs_come_first_and_all_have_equal_steps(dataset: DataSet) -> None:
+def test_the_most_important_runs_come_first_and_all_have_equal_steps(dataset):
     names = ("tyrex", "oxiod", "all")
     sets = [DataSet(n, dataset.training, dataset.validation, dataset.test, "") for n in names]
     runs = table_runs(sets, {**RECIPE, "batch": 10}, steps=600, seeds=2)
@@ -205,24 +190,20 @@ def test_the_most_important_runs_come_first_and_all_have_equal_steps(dataset: Da
         table_runs(sets, RECIPE, networks=["Nobody"])
 
 
-def test_a_run_can_be_pickled_for_other_machines(dataset: DataSet, reading: ReaderConfig) -> None:
+def test_a_run_can_be_pickled_for_other_machines(dataset, reading):
     work = partial(complete_run, out=Path("out"), reading=reading)
     sent = pickle.loads(pickle.dumps((work, run(dataset))))
     assert sent[1] == run(dataset)
     assert sent[1].digest == run(dataset).digest
 
 
-def test_results_belong_to_a_network_a_recipe_and_all_recordings_of_their_set(
-    dataset: DataSet,
-) -> None:
+def test_results_belong_to_a_network_a_recipe_and_all_recordings_of_their_set(dataset):
     sets = [replace(dataset, **{part: ()}) for part in ("training", "validation", "test")]
     others = [*map(run, sets), run(dataset, "R-ResNet"), run(dataset, seed=1)]
     assert len({run(dataset).digest, *(other.digest for other in others)}) == 6
 
 
-def test_new_weights_or_changed_recordings_do_not_keep_old_results(
-    dataset: DataSet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_new_weights_or_changed_recordings_do_not_keep_old_results(dataset, monkeypatch):
     given = Run(dataset, "default", 0, None)
     before = given.digest, run(dataset).digest
     with monkeypatch.context() as patch:
@@ -237,14 +218,12 @@ def test_new_weights_or_changed_recordings_do_not_keep_old_results(
         _ = Run(dataset, "missing", 0, None).digest
 
 
-def test_an_unknown_backend_is_refused() -> None:
+def test_an_unknown_backend_is_refused():
     with pytest.raises(InputError, match="--backend"), backend("mpi"):
         pass
 
 
-def test_the_command_writes_tables_and_figures(
-    dataset: DataSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_writes_tables_and_figures(dataset, tmp_path, monkeypatch):
     folder = dataset.training[0].parent
     monkeypatch.setenv("STARIO_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("stario.network.runtime.survey._RUNS", {1: 1, 64: 1})

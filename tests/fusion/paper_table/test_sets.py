@@ -1,7 +1,5 @@
 """Splits of recordings, what a training passes on, and rows from known errors."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -31,7 +29,7 @@ from stario.sequences.readers.csv_writer import write_csv
 needs_data = pytest.mark.skipif(not (DATA / "archives").exists(), reason=f"no data in {DATA}")
 
 
-def test_a_split_is_disjoint_complete_and_determined_by_the_seed() -> None:
+def test_a_split_is_disjoint_complete_and_determined_by_the_seed():
     recordings = [ListEntry(Path(f"a.h5:{k:02d}"), "a") for k in range(40)]
     first, again, other = (sets._split("a", recordings, seed) for seed in (3, 3, 4))
     assert first == again
@@ -42,7 +40,7 @@ def test_a_split_is_disjoint_complete_and_determined_by_the_seed() -> None:
     assert "seed 3" in first.words
 
 
-def test_two_phones_on_one_walk_are_in_the_same_part() -> None:
+def test_two_phones_on_one_walk_are_in_the_same_part():
     recordings = [
         ListEntry(Path(f"kipd.h5:Walk{k}{p}"), "kipd") for k in range(9) for p in ("S9", "S20")
     ]
@@ -53,7 +51,7 @@ def test_two_phones_on_one_walk_are_in_the_same_part() -> None:
             assert all(walks.count(walk) == 2 for walk in walks)
 
 
-def test_two_phones_on_one_walk_are_validated_together(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_phones_on_one_walk_are_validated_together(monkeypatch):
     phones = [
         ListEntry(Path(f"kipd.h5:Walk{k}{p}"), "kipd") for k in range(9) for p in ("S9", "S20")
     ]
@@ -69,7 +67,7 @@ def test_two_phones_on_one_walk_are_validated_together(monkeypatch: pytest.Monke
 
 
 @needs_data
-def test_the_main_sets_come_first_and_parts_of_a_set_are_disjoint() -> None:
+def test_the_main_sets_come_first_and_parts_of_a_set_are_disjoint():
     found = development_sets(DATA, 0, 2)
     assert tuple(one.name for one in found[:3]) == FIRST
     assert {one.name for one in found} == {*FIRST, "tyrex", "kipd", "ilc"}
@@ -84,7 +82,7 @@ def test_the_main_sets_come_first_and_parts_of_a_set_are_disjoint() -> None:
 
 
 @needs_data
-def test_the_combined_set_is_tested_on_held_out_people_and_places() -> None:
+def test_the_combined_set_is_tested_on_held_out_people_and_places():
     [together] = development_sets(DATA, 0, 2, [ALL])
     learned = [*together.training, *together.validation]
     assert not any("Thibaud" in str(path) or ":dan_" in str(path) for path in learned)
@@ -124,7 +122,7 @@ def trained(ate_m: float) -> Mapping[str, Any]:
     return {**content(ate_m, seconds=1800.0), "trained": work | errors}
 
 
-def test_errors_are_means_over_recordings_in_their_units() -> None:
+def test_errors_are_means_over_recordings_in_their_units():
     rows = set_table(DATASET, {"pdr": {0: content(1.5)}}, {}).rows
     assert rows["ate"].item() == 1.5
     assert rows["pde"].item() == pytest.approx(3.0)  # in %, where it is known
@@ -132,14 +130,14 @@ def test_errors_are_means_over_recordings_in_their_units() -> None:
     assert known == ["ate", "rte", "pde"]
 
 
-def test_recordings_that_weights_have_learned_are_counted_among_the_tested_ones() -> None:
+def test_recordings_that_weights_have_learned_are_counted_among_the_tested_ones():
     learned = {"default": frozenset({TESTED[0].path, *DATASET.training, *DATASET.validation})}
     table = set_table(DATASET, {"default": {0: content(1.0)}, "open": {0: content(1.0)}}, learned)
     rows = table.rows.to_dict("records")
     assert [(row["network"], row["learned"]) for row in rows] == [("default", 1), ("open", 0)]
 
 
-def test_work_is_told_in_core_hours_and_windows_per_second() -> None:
+def test_work_is_told_in_core_hours_and_windows_per_second():
     completed = {"StarIO": {0: trained(1.0), 1: trained(1.2)}}
     work = work_of([completed])
     assert work.loc["StarIO"].tolist() == [14400.0, 3600.0, 200.0]
@@ -150,7 +148,7 @@ def test_work_is_told_in_core_hours_and_windows_per_second() -> None:
     assert "Total: 5.00 core hours, 4.00 for training and 1.00 for evaluation" in text
 
 
-def test_published_figures_are_found_by_set_and_network() -> None:
+def test_published_figures_are_found_by_set_and_network():
     assert published("ridi", "StarIO") == (2.033, 2.274)
     assert published("oxiod", "R-ResNet") == (4.336, 1.595)
     assert published("ridi", "pdr") is None
@@ -158,7 +156,7 @@ def test_published_figures_are_found_by_set_and_network() -> None:
 
 
 @pytest.fixture
-def dataset(make_walk: Any, tmp_path: Path) -> DataSet:
+def dataset(make_walk, tmp_path):
     files = [tmp_path / f"{name}.csv" for name in "abc"]
     for seed, path in enumerate(files):
         write_csv(path, make_walk(seed=seed, seconds=8.0))
@@ -166,13 +164,11 @@ def dataset(make_walk: Any, tmp_path: Path) -> DataSet:
 
 
 @pytest.fixture
-def weights(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
+def weights(monkeypatch):
     """Replace training by a log with three epochs; holds the weight of each stream."""
-    found: dict[str, float] = {}
+    found = {}
 
-    def trained(
-        recipe: Any, streams: Any, weights: Any, held_out: Any, folder: Path, **rest: Any
-    ) -> None:
+    def trained(recipe, streams, weights, held_out, folder, **rest):
         found.update((s.name, w * len(s)) for s, w in zip(streams, weights, strict=True))
         errors = (0.5, 0.1), (0.4, float("nan")), (0.3, 0.2)
         write_json(
@@ -190,15 +186,13 @@ def trained_cell(dataset: DataSet, folder: Path, **values: object) -> dict[str, 
 
 
 def test_the_validation_error_is_that_of_the_epoch_whose_weights_are_kept(
-    dataset: DataSet, weights: dict[str, float], tmp_path: Path
-) -> None:
+    dataset, weights, tmp_path
+):
     done = trained_cell(dataset, tmp_path)
     assert (done["training_error_m2"], done["validation_error_m2"]) == (0.3, 0.1)
 
 
-def test_the_shares_of_the_recipe_are_used(
-    dataset: DataSet, weights: dict[str, float], tmp_path: Path
-) -> None:
+def test_the_shares_of_the_recipe_are_used(dataset, weights, tmp_path):
     trained_cell(dataset, tmp_path, shares={"a.csv": 0.9}, augmentation={"speeds": [1.0, 1.0]})
     shares = np.array([weights["a"], weights["b"]]) / sum(weights.values())
     assert shares == pytest.approx([0.9, 0.1], abs=0.01)

@@ -12,7 +12,7 @@ def windows(count: int, seed: int = 0) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("name", ARCHITECTURES)
-def test_output_has_one_row_per_window_independent_of_other_windows(name: str) -> None:
+def test_output_has_one_row_per_window_independent_of_other_windows(name):
     torch.manual_seed(0)
     network = build_network(name).eval()
     batch = windows(3)
@@ -24,7 +24,7 @@ def test_output_has_one_row_per_window_independent_of_other_windows(name: str) -
 
 
 @pytest.mark.parametrize("name", ARCHITECTURES)
-def test_every_gradient_is_nonzero_and_finite_even_with_a_constant_window(name: str) -> None:
+def test_every_gradient_is_nonzero_and_finite_even_with_a_constant_window(name):
     torch.manual_seed(0)
     network = build_network(name)
     for module in network.modules():
@@ -40,7 +40,7 @@ def test_every_gradient_is_nonzero_and_finite_even_with_a_constant_window(name: 
 
 
 @pytest.mark.parametrize("name", ["TLIO", "RNIN"])
-def test_the_two_heads_are_trained_separately(name: str) -> None:
+def test_the_two_heads_are_trained_separately(name):
     network = build_network(name)
     network(windows(4))[:, :3].square().sum().backward()
     for key, parameter in network.named_parameters():
@@ -50,12 +50,12 @@ def test_the_two_heads_are_trained_separately(name: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def rnin() -> Rnin:
+def rnin():
     torch.manual_seed(0)
     return Rnin().eval()
 
 
-def test_rnin_output_depends_on_previous_windows(rnin: Rnin) -> None:
+def test_rnin_output_depends_on_previous_windows(rnin):
     with torch.inference_mode():
         first, state = rnin.step(windows(1, seed=1), rnin.first_state(windows(1)))
         after = rnin.step(windows(1, seed=2), state)[0]
@@ -64,7 +64,7 @@ def test_rnin_output_depends_on_previous_windows(rnin: Rnin) -> None:
     assert float((after - alone).abs().max()) > 1e-4
 
 
-def test_rnin_gives_the_same_for_a_series_at_once_and_step_by_step(rnin: Rnin) -> None:
+def test_rnin_gives_the_same_for_a_series_at_once_and_step_by_step(rnin):
     series = windows(2 * 5).unflatten(0, (2, 5))
     with torch.inference_mode():
         at_once = rnin(series)
@@ -74,7 +74,7 @@ def test_rnin_gives_the_same_for_a_series_at_once_and_step_by_step(rnin: Rnin) -
             torch.testing.assert_close(outputs, at_once[:, k], rtol=1e-4, atol=1e-6)
 
 
-def test_the_noise_layer_subtracts_a_weighted_copy_of_the_raw_window() -> None:
+def test_the_noise_layer_subtracts_a_weighted_copy_of_the_raw_window():
     layer = NoiseLayer(4)
     features, raw = torch.randn(3, 4), torch.randn(3, 4)
     with torch.no_grad():

@@ -51,14 +51,14 @@ def shallow_rnin() -> DisplacementModel:
 
 
 @pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def exported(tmp_path_factory):
     path = tmp_path_factory.mktemp("export") / "rnin.onnx"
     export_onnx(shallow_rnin(), path)
     return path
 
 
 @pytest.mark.parametrize("name", ["StarIO", "StarIO without MSGCU"])
-def test_an_exported_stario_network_gives_the_same_predictions(name: str, tmp_path: Path) -> None:
+def test_an_exported_stario_network_gives_the_same_predictions(name, tmp_path):
     exported = assert_parity(untrained(name), tmp_path / "star.onnx")
     assert exported.card.calibration == CALIBRATION
     assert exported.name == name
@@ -66,11 +66,11 @@ def test_an_exported_stario_network_gives_the_same_predictions(name: str, tmp_pa
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["default", *ARCHITECTURES])
-def test_every_exported_network_gives_the_same_predictions(name: str, tmp_path: Path) -> None:
+def test_every_exported_network_gives_the_same_predictions(name, tmp_path):
     assert_parity(load_model() if name == "default" else untrained(name), tmp_path / "model.onnx")
 
 
-def test_a_recurrent_network_keeps_its_state_in_both_engines(exported: Path) -> None:
+def test_a_recurrent_network_keeps_its_state_in_both_engines(exported):
     windows, model = random_windows(6), shallow_rnin()
     for found, expected in zip(
         load_model(exported).stateful_inference(2).predict(windows),
@@ -81,7 +81,7 @@ def test_a_recurrent_network_keeps_its_state_in_both_engines(exported: Path) -> 
     assert_close(load_model(exported).predict(windows)[0], model.predict(windows)[0])
 
 
-def test_the_exported_file_describes_its_inputs_and_outputs(exported: Path) -> None:
+def test_the_exported_file_describes_its_inputs_and_outputs(exported):
     session = ort.InferenceSession(exported)
     assert [(n.name, n.shape) for n in session.get_inputs()] == [
         ("windows", ["batch", 6, 200]),
@@ -94,7 +94,7 @@ def test_the_exported_file_describes_its_inputs_and_outputs(exported: Path) -> N
     assert '"architecture": "RNIN"' in metadata["stario_card"]
 
 
-def test_truncated_absent_and_foreign_files_are_refused(exported: Path, tmp_path: Path) -> None:
+def test_truncated_absent_and_foreign_files_are_refused(exported, tmp_path):
     broken = tmp_path / "broken.onnx"
     broken.write_bytes(exported.read_bytes()[:1000])
     with pytest.raises(WeightsError, match=r"broken\.onnx: graph"):
@@ -115,12 +115,12 @@ def test_truncated_absent_and_foreign_files_are_refused(exported: Path, tmp_path
         load_model(broken)
 
 
-def test_an_exported_model_cannot_be_exported_again(exported: Path, tmp_path: Path) -> None:
+def test_an_exported_model_cannot_be_exported_again(exported, tmp_path):
     with pytest.raises(InputError, match="an exported graph"):
         export_onnx(load_model(exported), tmp_path / "again.onnx")
 
 
-def test_a_recurrent_model_depends_on_the_order_of_windows(tmp_path: Path) -> None:
+def test_a_recurrent_model_depends_on_the_order_of_windows(tmp_path):
     model = untrained("RNIN")
     save_model(tmp_path / "rnin.safetensors", model.training_form, model.card)
     loaded = load_model(tmp_path / "rnin.safetensors")
@@ -135,6 +135,6 @@ def test_a_recurrent_model_depends_on_the_order_of_windows(tmp_path: Path) -> No
     assert (np.abs(at_once[3:] - alone[3:]).max(axis=1) > 1e-5).all()
 
 
-def test_a_model_without_memory_is_its_own_stateful_inference() -> None:
+def test_a_model_without_memory_is_its_own_stateful_inference():
     model = untrained("I-MobileNet")
     assert model.stateful_inference(10) is model

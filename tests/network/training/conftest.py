@@ -1,26 +1,22 @@
 """A finished training run, and its model."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 from training_runs import narrow, run
 
 from stario.network.card import card_path
-from stario.network.training.history import EpochReport
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _narrow() -> Iterator[None]:
+def _narrow():
     with pytest.MonkeyPatch.context() as patch:
         narrow(patch)
         yield
 
 
 @pytest.fixture(scope="session")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[EpochReport]]:
+def finished(tmp_path_factory):
     """A run without interruption: the model's path and the reports of its epochs."""
-    reports: list[EpochReport] = []
+    reports = []
     folder = tmp_path_factory.mktemp("finished")
     with pytest.MonkeyPatch.context() as patch:
         narrow(patch)
@@ -28,7 +24,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Epoch
 
 
 @pytest.fixture
-def model(finished: tuple[Path, list[EpochReport]], tmp_path: Path) -> Path:
+def model(finished, tmp_path):
     """A copy of the trained model and its card."""
     path = tmp_path / "model.safetensors"
     path.write_bytes(finished[0].read_bytes())

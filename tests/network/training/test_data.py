@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -32,7 +30,7 @@ def stream(name: str, samples: int) -> WorldStream:
     return WorldStream(name, six, three, two)
 
 
-def test_the_last_fifth_of_each_recording_is_held_out() -> None:
+def test_the_last_fifth_of_each_recording_is_held_out():
     recordings = recordings_of([stream("a", 6000), stream("a", 4000)], [stream("b", 5000)], [])
     first, last = (list(chain(*(r.streams for r in part))) for part in split_off(recordings))
     assert [(s.name, len(s)) for s in first] == [("a", 6000), ("a", 2000), ("b", 4000)]
@@ -40,13 +38,13 @@ def test_the_last_fifth_of_each_recording_is_held_out() -> None:
     assert last[0].imu_W[0, 0] == 2000  # where the first part ends
 
 
-def test_parts_too_short_for_windows_are_dropped() -> None:
+def test_parts_too_short_for_windows_are_dropped():
     first, last = split_off(recordings_of([stream("a", 1500)]))
     assert [len(s) for s in first[0].streams] == [1200]
     assert not last[0].streams
 
 
-def test_recorded_and_generated_streams_get_their_shares() -> None:
+def test_recorded_and_generated_streams_get_their_shares():
     recorded = recordings_of([stream("a", 3000), stream("a", 1000)])
     material = mix_sources(recorded, [stream("c", 700)], {SIMULATED: 0.05})
     drawn = np.array([len(s) for s in material.streams]) * material.weights
@@ -63,7 +61,7 @@ def drawn_shares(material: TrainingData, reach: int = 1) -> dict[str, float]:
     return {name: value / sum(found.values()) for name, value in found.items()}
 
 
-def test_named_sources_get_their_shares_whatever_their_length() -> None:
+def test_named_sources_get_their_shares_whatever_their_length():
     recorded = [
         RecordingStreams(Path("a/long.h5:x"), [moving("x", 1.0)] * 9),
         RecordingStreams(Path("a/short.h5:y"), [moving("y", 1.0)]),
@@ -88,7 +86,7 @@ def test_named_sources_get_their_shares_whatever_their_length() -> None:
         ("walk", "walk.csv"),
     ],
 )
-def test_a_source_is_named_by_a_folder_an_archive_or_a_file(source: str, path: str) -> None:
+def test_a_source_is_named_by_a_folder_an_archive_or_a_file(source, path):
     """Not by a part of such a name: somebody's home may be called /home/ridi-user."""
     other = RecordingStreams(Path("/home/ridi-user/walks/my-archives/x.csv"), [moving("z", 1.0)])
     recorded = [RecordingStreams(Path(path), [moving("x", 1.0)]), other]
@@ -97,7 +95,7 @@ def test_a_source_is_named_by_a_folder_an_archive_or_a_file(source: str, path: s
     )
 
 
-def test_the_share_of_an_absent_source_goes_to_the_other_recordings() -> None:
+def test_the_share_of_an_absent_source_goes_to_the_other_recordings():
     recorded = [
         RecordingStreams(Path("a/ridi.h5:x"), [moving("x", 1.0)]),
         RecordingStreams(Path("other.csv"), [moving("z", 1.0)]),
@@ -110,7 +108,7 @@ def test_the_share_of_an_absent_source_goes_to_the_other_recordings() -> None:
     assert alone["c"] == pytest.approx(0.1)
 
 
-def test_shares_count_the_windows_that_can_be_drawn() -> None:
+def test_shares_count_the_windows_that_can_be_drawn():
     """Stretches hardly longer than a window hold few windows, which are drawn more often."""
     whole = moving("y", 1.0)
     recorded = [
@@ -123,7 +121,7 @@ def test_shares_count_the_windows_that_can_be_drawn() -> None:
     assert found == {"x": pytest.approx(0.5), "y": pytest.approx(0.5), "w": 0.0}
 
 
-def test_shares_that_leave_nothing_are_refused() -> None:
+def test_shares_that_leave_nothing_are_refused():
     recorded = recordings_of([moving("x", 1.0)])
     for given, generated in (({SIMULATED: 1.0}, []), ({SIMULATED: 0.0}, [moving("c", 1.0)])):
         with pytest.raises(ConfigError, match="shares: found 0 for every"):
@@ -133,7 +131,7 @@ def test_shares_that_leave_nothing_are_refused() -> None:
     TrainingConfig(shares={"ridi": 0.7, "kipd": 0.2, "tyrex": 0.1, SIMULATED: 0.5})
 
 
-def test_streams_come_with_the_licence_of_their_archive(tmp_path: Path) -> None:
+def test_streams_come_with_the_licence_of_their_archive(tmp_path):
     walk = simulate_imu(generate_walk(0, 4.0), 100.0, PERFECT_IMU, 0, name="walk")
     licensed = replace(walk, attributes={"licence": "CC BY 4.0"})
     write_archive(tmp_path / "walks.h5", [licensed])
@@ -145,7 +143,7 @@ def test_streams_come_with_the_licence_of_their_archive(tmp_path: Path) -> None:
     assert mix_sources(found, []).words[-1] == "walks.h5, licence CC BY 4.0: 1 recordings, 10 s"
 
 
-def test_recordings_of_one_name_are_told_apart_in_validation() -> None:
+def test_recordings_of_one_name_are_told_apart_in_validation():
     """Their errors would be averaged as those of one recording."""
     outcomes = [[moving("walk", speed)] for speed in (1.0, 2.0, 3.0)]
     paths = [Path(f"{k}/walk.csv") for k in range(3)]
@@ -157,7 +155,7 @@ def recordings_of(*recordings: list[WorldStream]) -> list[RecordingStreams]:
     return [RecordingStreams(Path(str(k)), streams) for k, streams in enumerate(recordings)]
 
 
-def test_recordings_with_more_motion_are_drawn_more_often() -> None:
+def test_recordings_with_more_motion_are_drawn_more_often():
     calm, lively = moving("calm", 0.5), moving("lively", 1.5)
     material = mix_sources(recordings_of([calm], [lively]), [])
     assert material.weights[1] / material.weights[0] == pytest.approx(3.0, rel=1e-3)
@@ -170,9 +168,7 @@ def moving(name: str, acceleration: float) -> WorldStream:
     return WorldStream(name, imu_W, np.zeros((2000, 3), np.float32), np.ones((2000, 2), np.float32))
 
 
-def test_every_clip_of_motion_capture_has_devices_with_a_share_and_a_licence(
-    tmp_path: Path,
-) -> None:
+def test_every_clip_of_motion_capture_has_devices_with_a_share_and_a_licence(tmp_path):
     file = tmp_path / "capture.h5"
     with h5py.File(file, "w") as written:
         for name, frames in (("long", 150), ("short", 40)):

@@ -1,11 +1,8 @@
 """What a training begins with: recipe and initial weights."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,9 +24,7 @@ from stario.network.training.validation import ValidationSet
 from stario.sequences.errors import ConfigError
 
 
-def test_training_that_spoils_its_initial_weights_gives_a_warning(
-    model: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_training_that_spoils_its_initial_weights_gives_a_warning(model, tmp_path, caplog):
     run(tmp_path / "spoilt", replace(TINY, epochs=1, rate=0.1), start_from=load_model(model))
     assert "times those of the initial weights" in caplog.text
     held_out = ValidationSet(VALIDATION, torch.device("cpu"), TINY)
@@ -38,9 +33,7 @@ def test_training_that_spoils_its_initial_weights_gives_a_warning(
     assert "1.41 times those of the initial weights (d: 4 instead of 1)" in words
 
 
-def test_fine_tuned_weights_lie_between_the_initial_and_the_learned(
-    model: Path, tmp_path: Path
-) -> None:
+def test_fine_tuned_weights_lie_between_the_initial_and_the_learned(model, tmp_path):
     first, once = load_model(model), replace(TINY, epochs=1, epoch_windows=16)
     initial, none, half, all_learned = (
         dict(weights.training_form.named_parameters())
@@ -60,9 +53,7 @@ def test_fine_tuned_weights_lie_between_the_initial_and_the_learned(
     assert any(not torch.equal(all_learned[name], before) for name, before in initial.items())
 
 
-def test_a_last_stage_starts_from_weights_and_adopts_a_calibration(
-    model: Path, tmp_path: Path
-) -> None:
+def test_a_last_stage_starts_from_weights_and_adopts_a_calibration(model, tmp_path):
     first = load_model(model)
     slow = replace(TINY, rate=1e-8, epochs=1, epoch_windows=16)
     other = Calibration((1.5, 1.5, 2.0), (0.9, 0.9, 1.1), (0.02, 0.02, 0.03))
@@ -78,7 +69,7 @@ def test_a_last_stage_starts_from_weights_and_adopts_a_calibration(
     assert again.card.trained_on == ["swings", *inherited]
 
 
-def test_errors_on_recordings_that_were_learned_are_named_so(tmp_path: Path) -> None:
+def test_errors_on_recordings_that_were_learned_are_named_so(tmp_path):
     """A last stage trains on the validation recordings, too."""
     everything = [*STREAMS, *VALIDATION]
     once = replace(TINY, epochs=1, epoch_windows=16)
@@ -86,7 +77,7 @@ def test_errors_on_recordings_that_were_learned_are_named_so(tmp_path: Path) -> 
     assert list(load_model(path).card.figures) == ["validation_mse_m2_after_it_was_learned"]
 
 
-def test_the_recipes_dropout_replaces_the_networks_own(tmp_path: Path) -> None:
+def test_the_recipes_dropout_replaces_the_networks_own(tmp_path):
     once = replace(TINY, epochs=1, epoch_windows=16)
     none, most = (
         load_model(run(tmp_path / str(share), replace(once, dropout=share))).training_form
@@ -96,9 +87,7 @@ def test_the_recipes_dropout_replaces_the_networks_own(tmp_path: Path) -> None:
     assert not all(torch.equal(one, other) for one, other in pairs)
 
 
-def test_averaged_weights_of_a_short_run_are_not_the_initial_ones(
-    model: Path, tmp_path: Path
-) -> None:
+def test_averaged_weights_of_a_short_run_are_not_the_initial_ones(model, tmp_path):
     """The first steps are averaged over fewer than the recipe's number."""
     first, short = load_model(model), replace(TINY, epochs=1, epoch_windows=64)
     initial = torch.nn.utils.parameters_to_vector(first.training_form.parameters())
@@ -114,7 +103,7 @@ needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="needs the development
 
 
 @needs_data
-def test_weights_judged_by_what_they_learned_are_named(caplog: pytest.LogCaptureFixture) -> None:
+def test_weights_judged_by_what_they_learned_are_named(caplog):
     held_out = [entry.path for entry in read_packaged_list("holdout", DATA)]
     warn_of_learned(["default", "first-stage", "open", "other.safetensors"], held_out, DATA)
     [record] = caplog.records
@@ -126,14 +115,12 @@ def test_weights_judged_by_what_they_learned_are_named(caplog: pytest.LogCapture
     assert not caplog.records
 
 
-def test_nothing_is_said_of_a_folder_without_the_listed_recordings(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_nothing_is_said_of_a_folder_without_the_listed_recordings(tmp_path, caplog):
     warn_of_learned(["default"], [tmp_path / "walk.csv"], tmp_path)
     assert not caplog.records
 
 
-def test_the_learning_rate_warms_up_and_decays() -> None:
+def test_the_learning_rate_warms_up_and_decays():
     config = TrainingConfig(epochs=100, epoch_windows=128, batch=16, warm_up=0.1, rate=1.0)
     rates = [learning_rate(config, step) for step in range(config.steps)]
     peak = int(np.argmax(rates))
@@ -145,14 +132,14 @@ def test_the_learning_rate_warms_up_and_decays() -> None:
     assert rates[0] > 0.0  # the first step learns, too
 
 
-def test_the_loss_is_minimal_at_the_true_sigma() -> None:
+def test_the_loss_is_minimal_at_the_true_sigma():
     squared = torch.full((1, 3), 0.09)
     log_sigma = torch.full((1, 3), math.log(0.3), requires_grad=True)
     loss_with_sigma(squared, log_sigma).backward()
     torch.testing.assert_close(log_sigma.grad, torch.zeros(1, 3), atol=1e-6, rtol=0.0)
 
 
-def test_sigma_does_not_affect_the_gradient_of_the_mean() -> None:
+def test_sigma_does_not_affect_the_gradient_of_the_mean():
     """The mean's gradient is that of the squared error, whatever sigma is."""
     for sigma in (0.01, 1.0):
         squared = torch.full((1, 3), 0.04, requires_grad=True)
@@ -185,13 +172,13 @@ def test_sigma_does_not_affect_the_gradient_of_the_mean() -> None:
         ({"augmentation": {"speeds": ["slow", "fast"]}}, "augmentation.speeds"),
     ],
 )
-def test_an_invalid_recipe_is_refused(values: dict[str, object], field: str) -> None:
+def test_an_invalid_recipe_is_refused(values, field):
     with pytest.raises(ConfigError) as caught:
         training_config(values)
     assert caught.value.field == field
 
 
-def test_a_recipe_survives_a_round_trip_through_json() -> None:
+def test_a_recipe_survives_a_round_trip_through_json():
     values = json.loads(json.dumps({"batch": 8, "augmentation": {"speeds": [0.7, 1.5]}}))
     config = training_config(values)
     assert config.batch == 8

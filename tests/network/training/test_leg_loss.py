@@ -1,7 +1,5 @@
 """Losses: along legs between known positions, and of held-out data."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -74,7 +72,7 @@ class Stretch:
 
 
 @pytest.fixture(scope="module")
-def drawn() -> tuple[LegBatch, list[Stretch]]:
+def drawn():
     """Stretches in double precision, as a batch and one by one."""
     rng = np.random.default_rng(0)
     imu_N = rng.normal(size=(3200, 6)).astype(np.float32)
@@ -103,7 +101,7 @@ def slope(function: Callable[[FloatArray], float], at: FloatArray) -> FloatArray
     return found
 
 
-def test_loss_and_gradients_follow_the_equations(drawn: tuple[LegBatch, list[Stretch]]) -> None:
+def test_loss_and_gradients_follow_the_equations(drawn):
     """Neither the fitted yaw nor the likelihood's residual passes a gradient to the mean."""
     batch, stretches = drawn
     rng = np.random.default_rng(1)
@@ -113,8 +111,6 @@ def test_loss_and_gradients_follow_the_equations(drawn: tuple[LegBatch, list[Str
     loss, plain = leg_loss(mean, sigma, batch)
     loss = loss - direction_loss((batch.R_NH @ mean[..., None])[..., 0], batch)
     loss.backward()
-    assert mean.grad is not None
-    assert sigma.grad is not None
 
     count = sum(len(stretch.known) for stretch in stretches)
     assert int(batch.known.sum()) == count > 2 * STRETCHES
@@ -151,9 +147,7 @@ def turned_away(d_N: FloatArray, change: FloatArray, size: float) -> float:
     return float(2.0 * VARIANCE_RATE / VELOCITY_SIGMA**2 * max(0.0, abs(c) / 2 - c.real - chance))
 
 
-def test_direction_loss_and_its_gradient_follow_the_equations(
-    drawn: tuple[LegBatch, list[Stretch]],
-) -> None:
+def test_direction_loss_and_its_gradient_follow_the_equations(drawn):
     """Some stretches contradict the accelerometer beyond chance, others do not."""
     batch, d_N = drawn[0], np.random.default_rng(3).normal(size=(STRETCHES, SECONDS, 3))
     predicted = torch.tensor(d_N, requires_grad=True)
@@ -182,7 +176,7 @@ def rotated(stream: WorldStream, yaw: float) -> WorldStream:
     )
 
 
-def test_errors_do_not_depend_on_the_yaw_of_the_world() -> None:
+def test_errors_do_not_depend_on_the_yaw_of_the_world():
     [stream] = world_streams(simulate_imu(generate_walk(3, 10.0), 200.0, PERFECT_IMU, 0))
     torch.manual_seed(0)
     network = DisplacementNetwork(build_network("DeepILS"))
@@ -194,7 +188,7 @@ def test_errors_do_not_depend_on_the_yaw_of_the_world() -> None:
         np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
-def test_errors_are_those_of_a_network_that_always_predicts_the_same() -> None:
+def test_errors_are_those_of_a_network_that_always_predicts_the_same():
     """The device faces along y: walked north means walked forward, along x of the window."""
     t = np.arange(1000) / 200.0
     position_W = np.stack([0.0 * t, 1.2 * t, 0.1 * t], axis=1).astype(np.float32)
@@ -202,7 +196,7 @@ def test_errors_are_those_of_a_network_that_always_predicts_the_same() -> None:
     still = np.tile(np.float32([0.0, 0.0, 0.0, 0.0, 0.0, 9.81]), (len(t), 1))
 
     class Constant(torch.nn.Module):
-        def forward(self, windows: torch.Tensor) -> torch.Tensor:
+        def forward(self, windows):
             return torch.tensor([[1.0, 0.0, 0.0, -1.0, -2.0, -3.0]]).expand(len(windows), 6)
 
     stream = WorldStream("north", still, position_W, facing_W)

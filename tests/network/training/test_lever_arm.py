@@ -19,7 +19,7 @@ def draw_swing(size: int, share: float = 1.0) -> Swing:
     return Swing(*(value.double() for value in vars(swing).values()))
 
 
-def test_acceleration_integrates_to_the_displacement() -> None:
+def test_acceleration_integrates_to_the_displacement():
     swing = draw_swing(64)
     imu, displacement = apply_swing(at_rest(64), torch.zeros(64, 1, 3, dtype=torch.float64), swing)
     # The initial velocity of a window is omega x r.
@@ -36,7 +36,7 @@ def test_acceleration_integrates_to_the_displacement() -> None:
     assert (moved - displacement[:, 0]).abs().max() < 2e-3
 
 
-def test_rate_and_acceleration_belong_to_one_rotation() -> None:
+def test_rate_and_acceleration_belong_to_one_rotation():
     """Centripetal and tangential parts: accel . r = -|omega x r|^2 for a rigid arm."""
     swing = draw_swing(64)
     imu, _ = apply_swing(at_rest(64), torch.zeros(64, 1, 3, dtype=torch.float64), swing)
@@ -47,7 +47,7 @@ def test_rate_and_acceleration_belong_to_one_rotation() -> None:
     assert torch.allclose((accel * lever).sum(1), -(velocity**2).sum(1), atol=1e-5)
 
 
-def test_a_swing_turns_the_rates_that_were_recorded() -> None:
+def test_a_swing_turns_the_rates_that_were_recorded():
     """Rate of the device in the world: its own, turned with it, and that of the swing."""
     swing, imu = draw_swing(8), at_rest(8)
     imu[..., :3] = torch.tensor([0.3, -0.2, 0.5])
@@ -59,13 +59,13 @@ def test_a_swing_turns_the_rates_that_were_recorded() -> None:
         assert torch.allclose(both[:, k, :3] - alone[:, k, :3], turned, atol=1e-5)
 
 
-def test_no_swing_is_faster_than_its_bound() -> None:
+def test_no_swing_is_faster_than_its_bound():
     swing = draw_swing(512)
     time = torch.linspace(0.0, 1.0, 101, dtype=torch.float64)
     assert 1.5 < swing.angle(time)[1].abs().max() <= 2.5
 
 
-def test_windows_without_a_swing_are_unchanged() -> None:
+def test_windows_without_a_swing_are_unchanged():
     imu = torch.randn(16, 200, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     displacement = torch.ones(16, 1, 3, dtype=torch.float64)
     after, moved = apply_swing(imu, displacement, draw_swing(16, share=0.0))
@@ -74,7 +74,7 @@ def test_windows_without_a_swing_are_unchanged() -> None:
 
 
 @pytest.mark.parametrize("share", [0.25, 0.75])
-def test_the_share_of_swung_windows_is_as_requested(share: float) -> None:
+def test_the_share_of_swung_windows_is_as_requested(share):
     swing = draw_swing(4000, share)
     assert (swing.amplitude[:, 0] > 0).double().mean() == pytest.approx(share, abs=0.03)
 

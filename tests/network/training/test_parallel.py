@@ -65,7 +65,7 @@ def epoch_errors(folder: Path) -> list[float]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("network", "tolerance"), [("plain", 1e-4), ("TLIO", 0.25)])
-def test_two_processes_train_like_one(network: str, tolerance: float, tmp_path: Path) -> None:
+def test_two_processes_train_like_one(network, tolerance, tmp_path):
     """Equal up to rounding without batch norms, which see half a batch in each process."""
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
@@ -82,7 +82,7 @@ def test_two_processes_train_like_one(network: str, tolerance: float, tmp_path: 
         torch.testing.assert_close(weights[1][name], value, rtol=1e-4, atol=1e-6)
 
 
-def test_without_a_launcher_the_only_process_is_the_leader() -> None:
+def test_without_a_launcher_the_only_process_is_the_leader():
     with workers("cpu", 7) as group:
         assert group.is_leader
         assert group.mean(3.0) == group.broadcast(3.0) == 3.0
@@ -97,7 +97,7 @@ def launch(monkeypatch: pytest.MonkeyPatch, **variables: str) -> None:
         monkeypatch.setenv(name, value)
 
 
-def test_a_batch_that_cannot_be_divided_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_batch_that_cannot_be_divided_is_refused(monkeypatch):
     launch(monkeypatch, RANK="0", WORLD_SIZE="2", MASTER_ADDR="localhost")
     with pytest.raises(ConfigError, match="7 for 2 processes"), workers("cpu", 7):
         pass
@@ -106,9 +106,7 @@ def test_a_batch_that_cannot_be_divided_is_refused(monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize(
     "variables", [{"WORLD_SIZE": "2"}, {"WORLD_SIZE": "two"}, {"RANK": "1", "WORLD_SIZE": "2"}]
 )
-def test_variables_of_a_job_scheduler_are_not_those_of_the_launcher(
-    monkeypatch: pytest.MonkeyPatch, variables: dict[str, str]
-) -> None:
+def test_variables_of_a_job_scheduler_are_not_those_of_the_launcher(monkeypatch, variables):
     launch(monkeypatch, **variables)
     with workers("cpu", 7) as group:
         assert (group.rank, group.count) == (0, 1)
@@ -116,9 +114,7 @@ def test_variables_of_a_job_scheduler_are_not_those_of_the_launcher(
 
 
 @pytest.mark.parametrize("count", ["two", "", "0", "-1"])
-def test_a_number_of_processes_that_is_none_is_refused(
-    monkeypatch: pytest.MonkeyPatch, count: str
-) -> None:
+def test_a_number_of_processes_that_is_none_is_refused(monkeypatch, count):
     launch(monkeypatch, RANK="0", WORLD_SIZE=count, MASTER_ADDR="localhost")
     with pytest.raises(ConfigError, match=r"WORLD_SIZE: found .*torchrun"), workers("cpu", 7):
         pass

@@ -1,12 +1,9 @@
 """Training: what a run writes, and the weights it keeps."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace
 from itertools import count
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,7 +27,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 
 
-def test_training_learns(finished: tuple[Path, list[EpochReport]]) -> None:
+def test_training_learns(finished):
     reports = finished[1]
     assert [r.epoch for r in reports] == [1, 2, 3, 4]
     assert reports[-1].training_error < 0.75 * reports[0].training_error
@@ -40,19 +37,17 @@ def test_training_learns(finished: tuple[Path, list[EpochReport]]) -> None:
     assert list(reports[-1].validation_by_recording) == ["c", "d"]
 
 
-def test_an_epoch_reports_its_speed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_epoch_reports_its_speed(tmp_path, monkeypatch):
     """With a clock that advances by a second on every reading."""
     clock = count()
     monkeypatch.setattr("stario.network.training.run.perf_counter", lambda: float(next(clock)))
-    reports: list[EpochReport] = []
+    reports = []
     run(tmp_path, replace(TINY, epochs=1, epoch_windows=32), on_epoch=reports.append)
     assert reports[0].windows_per_second == TINY.batch / 2
     assert reports[0].drawing_share == 0.5
 
 
-def test_the_model_reproduces_its_validation_error(
-    finished: tuple[Path, list[EpochReport]],
-) -> None:
+def test_the_model_reproduces_its_validation_error(finished):
     path, reports = finished
     model = load_model(path)
     assert model.card.trained_on == ["swings"]
@@ -66,7 +61,7 @@ def test_the_model_reproduces_its_validation_error(
         assert any(kept == r.validation_by_recording[stream.name] for r in reports[2:])
 
 
-def test_sigma_matches_the_errors_in_validation(tmp_path: Path) -> None:
+def test_sigma_matches_the_errors_in_validation(tmp_path):
     """Squared errors are limited to 25 variances, as in the calibration."""
     streams = [swaying("a", 0.3, 40.0), swaying("b", 1.2, 40.0)]
     other = swaying("c", 0.8, 30.0)
@@ -84,7 +79,7 @@ def _index_of_last_bias(file: Any) -> int:
     return max(int(key.split(".")[1]) for key in names if key.startswith("optimiser."))
 
 
-def test_only_the_likelihood_trains_sigma(finished: tuple[Path, list[EpochReport]]) -> None:
+def test_only_the_likelihood_trains_sigma(finished):
     """The squared error alone gives the weights of sigma no gradient."""
     path, _ = finished
     with safetensors.safe_open(path.parent / "checkpoint.safetensors", framework="pt") as file:
@@ -102,15 +97,13 @@ def test_only_the_likelihood_trains_sigma(finished: tuple[Path, list[EpochReport
     [((2.0, 1.0, 4.0, 3.0), 4), ((2.0, 1.0, 3.0, 4.0), 3), ((2.0, 1.0, math.nan, 4.0), 4),
      ((2.0, 1.0, 3.0, math.nan), 3), ((2.0, 1.0, 3.0, -math.inf), 3), ((2.0, 3.0), 1)],
 )  # fmt: skip
-def test_the_best_epoch_has_the_smallest_finite_error_of_those_that_train_sigma(
-    errors: tuple[float, ...], best: int
-) -> None:
+def test_the_best_epoch_has_the_smallest_finite_error_of_those_that_train_sigma(errors, best):
     """The likelihood begins with the third of four epochs."""
     reports = [EpochReport(epoch, 0.0, error, {}) for epoch, error in enumerate(errors, 1)]
     assert History(TINY, reports).best().epoch == best
 
 
-def test_training_stops_after_epochs_without_progress_that_train_sigma() -> None:
+def test_training_stops_after_epochs_without_progress_that_train_sigma():
     """The likelihood begins with the third epoch, whatever came before."""
     config = replace(TINY, epochs=6, likelihood_from=1.0 / 3.0, patience=2)
     errors = (1.0, 2.0, 3.0, 4.0, 5.0)
@@ -119,11 +112,11 @@ def test_training_stops_after_epochs_without_progress_that_train_sigma() -> None
     assert stops == [False, False, False, False, True]
 
 
-def test_gradients_are_clipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    norms: list[float] = []
+def test_gradients_are_clipped(tmp_path, monkeypatch):
+    norms = []
     average = TrainingRun._average
 
-    def measured(self: TrainingRun) -> None:
+    def measured(self):
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
         norms.append(float(torch.nn.utils.get_total_norm(gradients)))
         average(self)
@@ -133,19 +126,17 @@ def test_gradients_are_clipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert norms == [pytest.approx(0.01, rel=1e-3)]
 
 
-def test_weights_of_an_epoch_without_a_finite_error_are_not_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_weights_of_an_epoch_without_a_finite_error_are_not_kept(tmp_path, monkeypatch):
     """Neither epoch that trains sigma has one: the weights of the better earlier one are kept."""
     original, errors_of = ValidationSet.errors, iter((1.0, 2.0, math.nan, math.nan))
 
-    def errors(self: ValidationSet, *arguments: Any) -> dict[str, float]:
+    def errors(self, *arguments):
         return original(self, *arguments) | {"c": next(errors_of, 0.0), "d": 0.0}
 
-    kept: list[dict[str, torch.Tensor]] = []
+    kept = []
     original_keep = TrainingRun._keep
 
-    def keep(self: TrainingRun, network: DisplacementNetwork) -> None:
+    def keep(self, network):
         original_keep(self, network)
         kept.append(self.best)
 
@@ -156,13 +147,11 @@ def test_weights_of_an_epoch_without_a_finite_error_are_not_kept(
     assert all(torch.equal(kept[-1][f"network.{name}"], value) for name, value in state.items())
 
 
-def test_a_short_run_keeps_the_epoch_that_trained_sigma(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_short_run_keeps_the_epoch_that_trained_sigma(tmp_path, monkeypatch):
     """Training of sigma begins within the second of two epochs, which has the larger error here."""
     original, epoch = ValidationSet.errors, count(1)
 
-    def errors(self: ValidationSet, *arguments: Any) -> dict[str, float]:
+    def errors(self, *arguments):
         return original(self, *arguments) | {"c": float(next(epoch))}
 
     monkeypatch.setattr(ValidationSet, "errors", errors)
@@ -172,10 +161,10 @@ def test_a_short_run_keeps_the_epoch_that_trained_sigma(
     assert all(torch.equal(state[f"averaged.network.{k}"], v) for k, v in kept.items())
 
 
-def test_a_loss_that_is_not_finite_stops_before_it_corrupts_anything(tmp_path: Path) -> None:
+def test_a_loss_that_is_not_finite_stops_before_it_corrupts_anything(tmp_path):
     corrupted = [replace(stream, imu_W=stream.imu_W.copy()) for stream in STREAMS]
 
-    def corrupt(report: EpochReport) -> None:
+    def corrupt(report):
         for stream in corrupted:
             stream.imu_W[:] = np.nan
 
@@ -185,14 +174,12 @@ def test_a_loss_that_is_not_finite_stops_before_it_corrupts_anything(tmp_path: P
     state = safetensors.torch.load_file(tmp_path / "checkpoint.safetensors")
     assert all(value.isfinite().all() for value in state.values() if value.is_floating_point())
     assert not (tmp_path / "model.safetensors").exists()
-    reports: list[EpochReport] = []
+    reports = []
     run(tmp_path, short, on_epoch=reports.append)
     assert [r.epoch for r in reports] == [2]
 
 
-def test_a_gradient_that_is_not_finite_stops_before_the_step(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_gradient_that_is_not_finite_stops_before_the_step(tmp_path, monkeypatch):
     """It is infinite a step before the loss is."""
     monkeypatch.setattr(
         torch.nn.utils, "clip_grad_norm_", lambda parameters, most: torch.tensor(torch.inf)
@@ -201,19 +188,17 @@ def test_a_gradient_that_is_not_finite_stops_before_the_step(
         run(tmp_path, replace(TINY, epochs=1, epoch_windows=16))
 
 
-def test_the_log_holds_every_epoch(finished: tuple[Path, list[EpochReport]]) -> None:
+def test_the_log_holds_every_epoch(finished):
     log = json.loads((finished[0].parent / "log.json").read_text(encoding="utf-8"))
     assert [entry["epoch"] for entry in log] == [1, 2, 3, 4]
 
 
-def test_nothing_to_learn_from_is_refused(tmp_path: Path) -> None:
+def test_nothing_to_learn_from_is_refused(tmp_path):
     with pytest.raises(InputError, match="streams"):
         train(TINY, [], [], VALIDATION, tmp_path)
 
 
-def test_stretches_too_short_for_the_fastest_replay_are_skipped(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_stretches_too_short_for_the_fastest_replay_are_skipped(tmp_path, caplog):
     fast = replace(TINY, epochs=1, epoch_windows=16, augmentation=Augmentation(speeds=(0.6, 1.8)))
     short = swaying("short", 0.3, 1.5)
     train(fast, [*STREAMS, short], [1.0] * 3, VALIDATION, tmp_path / "a")
@@ -227,9 +212,7 @@ def build_network_of(config: TrainingConfig) -> torch.nn.Module:
     return build_network(config.architecture)
 
 
-def test_a_recurrent_network_is_trained_on_successive_windows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_recurrent_network_is_trained_on_successive_windows(tmp_path, monkeypatch):
     shallow(monkeypatch)
     values = {"architecture": "RNIN", "epochs": 1, "epoch_windows": 40, "batch": 20}
     config = training_config({**values, "device": "cpu", "likelihood_from": 0.0})
@@ -248,8 +231,8 @@ def test_a_recurrent_network_is_trained_on_successive_windows(
 
 @pytest.mark.parametrize(("dense", "stride", "minutes"), [(200, 40, 7), (140, 50, 7), (15, 200, 4)])
 def test_long_validation_data_are_thinned_by_minutes_for_recurrent_networks(
-    monkeypatch: pytest.MonkeyPatch, dense: int, stride: int, minutes: int
-) -> None:
+    monkeypatch, dense, stride, minutes
+):
     """Of seven minutes in two recordings, the first of each and every n-th after it are used."""
     monkeypatch.setattr("stario.network.training.validation._DENSE_SAMPLES", 200 * dense)
     streams = [swaying("a", 0.3, 300.0), swaying("b", 0.3, 120.0)]
@@ -274,11 +257,11 @@ def errors_and_log_sigmas(count: int = 20_000) -> tuple[FloatArray, FloatArray]:
     return TRUE_SCALE * np.exp(log_sigma) * rng.standard_normal((count, 3)), log_sigma
 
 
-def test_recovers_a_known_scale() -> None:
+def test_recovers_a_known_scale():
     np.testing.assert_allclose(calibrate(*errors_and_log_sigmas()).scale, TRUE_SCALE, rtol=0.02)
 
 
-def test_recovers_a_network_that_understates_contrasts() -> None:
+def test_recovers_a_network_that_understates_contrasts():
     rng = np.random.default_rng(1)
     log_sigma = rng.uniform(np.log(0.1), np.log(0.5), (20_000, 3))
     error = np.exp(1.5 * log_sigma) * rng.standard_normal(log_sigma.shape)
@@ -287,19 +270,19 @@ def test_recovers_a_network_that_understates_contrasts() -> None:
     np.testing.assert_allclose(calibration.scale, 1.0, rtol=0.08)
 
 
-def test_horizontal_axes_share_their_factor() -> None:
+def test_horizontal_axes_share_their_factor():
     error, log_sigma = errors_and_log_sigmas()
     x, y, _ = calibrate(error * [3.0, 1.0, 1.0], log_sigma).scale
     assert x == y
 
 
-def test_a_few_outliers_do_not_determine_the_scale() -> None:
+def test_a_few_outliers_do_not_determine_the_scale():
     error, log_sigma = errors_and_log_sigmas()
     error[::200] *= 1000.0
     np.testing.assert_allclose(calibrate(error, log_sigma).scale, TRUE_SCALE, rtol=0.15)
 
 
-def test_a_sigma_that_is_wrong_way_round_is_ignored() -> None:
+def test_a_sigma_that_is_wrong_way_round_is_ignored():
     """Its exponent would be negative: certain where errors are large."""
     error, log_sigma = errors_and_log_sigmas()
     found = calibrate(error, -log_sigma)

@@ -1,10 +1,7 @@
 """The leg loss: its invariance to yaw, its sensitivity to length, and its weights."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,11 +15,11 @@ from stario.network.training.legs import LegBatch, LegSampler, ends_covariance, 
 from stario.network.training.parallel import Workers
 from stario.network.training.train import train
 from stario.network.training.validation import ValidationSet
-from stario.network.training.weak_truth import direction_loss, leg_loss, leg_residuals
+from stario.network.training.weak_truth import direction_loss, leg_residuals
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.legs import LegStream, leg_streams
-from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
+from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
 from stario.sequences.windows import world_streams
@@ -32,18 +29,13 @@ SECONDS = 12
 WALK = simulate_imu(generate_walk(3, 60.0), 100.0, PERFECT_IMU, 0, name="walk")
 
 
-def truth_of(walk: ImuSequence) -> Trajectory:
-    assert walk.truth is not None
-    return walk.truth
-
-
 def with_positions(kind: str, every: float, yaw: float = 0.0) -> ImuSequence:
     """The walk with positions in place of poses, on a map rotated by a yaw [rad]."""
     time = np.arange(1.0, 58.0, every)
-    position = truth_of(WALK).at(time).position_W
+    position = WALK.truth.at(time).position_W
     rotated = about_z(yaw).apply(position)
     columns = 2 if kind == "waypoints" else 3
-    track = PositionTrack(time, rotated[:, :columns], kind)  # type: ignore[arg-type]
+    track = PositionTrack(time, rotated[:, :columns], kind)
     return replace(WALK, truth=None, positions=track)
 
 
@@ -60,7 +52,7 @@ def true_displacements(recording: ImuSequence, batch: LegBatch) -> torch.Tensor:
     found = []
     for windows in batch.windows:
         begin = begin_of(windows[0, 5].numpy(), stream)
-        position = truth_of(WALK).at(begin / 200.0 + np.arange(SECONDS + 1.0)).position_W
+        position = WALK.truth.at(begin / 200.0 + np.arange(SECONDS + 1.0)).position_W
         # The rotation from the world to the levelled frame, from the horizontal force.
         part = slice(begin, begin + 2000)
         a, b = (x[part, 3] + 1j * x[part, 4] for x in (world.imu_W, stream.imu_N))
@@ -82,7 +74,7 @@ def rotated(predicted_N: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(("kind", "every"), [("positions", 0.1), ("waypoints", 4.0)])
-def test_true_displacements_leave_no_residual_on_a_rotated_map(kind: str, every: float) -> None:
+def test_true_displacements_leave_no_residual_on_a_rotated_map(kind, every):
     recording = with_positions(kind, every, yaw=2.0)
     for augmentation in (PLAIN, replace(PLAIN, yaw=0.5, any_yaw=0.3)):
         batch = batch_of(recording, augmentation)
@@ -97,7 +89,7 @@ def test_true_displacements_leave_no_residual_on_a_rotated_map(kind: str, every:
         assert longest > 2.0
 
 
-def test_residuals_reveal_displacements_a_third_too_short_but_no_common_rotation() -> None:
+def test_residuals_reveal_displacements_a_third_too_short_but_no_common_rotation():
     recording = with_positions("positions", 0.1)
     batch = batch_of(recording)
     predicted_N = true_displacements(recording, batch)
@@ -109,20 +101,7 @@ def test_residuals_reveal_displacements_a_third_too_short_but_no_common_rotation
     assert float(common) == pytest.approx(float(whole), rel=1e-3)
 
 
-def test_the_gradient_lengthens_displacements_that_are_too_short() -> None:
-    recording = with_positions("positions", 0.1)
-    batch = batch_of(recording)
-    factor = torch.tensor(0.67, requires_grad=True)
-    true_H = (batch.R_NH.mT @ true_displacements(recording, batch)[..., None])[..., 0]
-    predicted = factor * true_H
-    loss, plain = leg_loss(predicted, torch.zeros_like(predicted), batch)
-    loss.backward()
-    assert float(plain) > 0.0
-    assert factor.grad is not None
-    assert float(factor.grad) < 0.0
-
-
-def test_the_velocity_change_is_determined_from_the_accelerometer() -> None:
+def test_the_velocity_change_is_determined_from_the_accelerometer():
     [world] = world_streams(WALK, attitude="true")
     accel_W = torch.from_numpy(world.imu_W[: SECONDS * 200, 3:5]).view(1, SECONDS, 200, 2)
     position = torch.from_numpy(world.position_W[: SECONDS * 200 + 1 : 200, :2])
@@ -133,7 +112,7 @@ def test_the_velocity_change_is_determined_from_the_accelerometer() -> None:
     assert float((velocity_change(accel_W)[0] - changes).norm(dim=-1).max()) < 0.02
 
 
-def test_the_direction_loss_rotates_displacements_back_to_the_true_direction() -> None:
+def test_the_direction_loss_rotates_displacements_back_to_the_true_direction():
     recording = with_positions("positions", 0.1)
     batch = batch_of(recording)
     predicted_N = true_displacements(recording, batch)
@@ -151,7 +130,7 @@ def test_the_direction_loss_rotates_displacements_back_to_the_true_direction() -
     assert right < 0.2 * min(losses)
 
 
-def test_a_waypoint_tapped_late_moves_two_legs_in_opposite_directions() -> None:
+def test_a_waypoint_tapped_late_moves_two_legs_in_opposite_directions():
     start, stop = np.array([0.0, 4.0, 9.0]), np.array([4.0, 8.0, 13.0])
     C = ends_covariance(start, stop, np.full((3, 2), 0.5))
     np.testing.assert_allclose(np.diag(C), 0.5)
@@ -163,9 +142,8 @@ def test_a_waypoint_tapped_late_moves_two_legs_in_opposite_directions() -> None:
     np.testing.assert_allclose(np.cov(legs), C, atol=0.01)
 
 
-def test_jumps_and_rides_of_a_track_make_no_legs() -> None:
+def test_jumps_and_rides_of_a_track_make_no_legs():
     recording = with_positions("positions", 0.1)
-    assert recording.positions is not None
     time, position = recording.positions.time, recording.positions.position_W.copy()
     position[time > 30.0] += [5.0, 0.0, 0.0]
     jumped = replace(recording, positions=PositionTrack(time, position, "positions"))
@@ -182,9 +160,8 @@ def test_jumps_and_rides_of_a_track_make_no_legs() -> None:
 
 
 @pytest.mark.parametrize(("every", "legs"), [(0.1, 28), (0.5, 28), (1.0, 28), (2.5, 22)])
-def test_a_track_at_a_low_rate_has_legs_except_across_its_gaps(every: float, legs: int) -> None:
+def test_a_track_at_a_low_rate_has_legs_except_across_its_gaps(every, legs):
     recording = with_positions("positions", every)
-    assert recording.positions is not None
     [whole] = leg_streams(recording)
     assert len(whole.start) == pytest.approx(legs, abs=1)
     time = recording.positions.time
@@ -195,7 +172,7 @@ def test_a_track_at_a_low_rate_has_legs_except_across_its_gaps(every: float, leg
     assert len(cut.start) < len(whole.start)
 
 
-def test_stretches_are_divided_among_two_processes_but_not_among_three() -> None:
+def test_stretches_are_divided_among_two_processes_but_not_among_three():
     batch, cpu = batch_of(with_positions("positions", 0.1)), torch.device("cpu")
     halves = [batch.shared(Workers(rank, 2, cpu)) for rank in (0, 1)]
     for name, value in vars(batch).items():
@@ -204,24 +181,22 @@ def test_stretches_are_divided_among_two_processes_but_not_among_three() -> None
     assert batch.shared(Workers(1, 3, cpu)) is batch
 
 
-def test_a_recording_without_positions_has_no_legs() -> None:
+def test_a_recording_without_positions_has_no_legs():
     with pytest.raises(InputError, match="positions: found none"):
         leg_streams(WALK)
 
 
-def test_training_with_legs_reduces_the_error_at_positions(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training_with_legs_reduces_the_error_at_positions(tmp_path, monkeypatch):
     """Legs are trained together with windows of full truth from the same walk."""
     [legs] = leg_streams(with_positions("positions", 0.1))
     assert isinstance(legs, LegStream)
     streams = [stream.part(0, 4000) for stream in world_streams(WALK)]
-    monkeypatch.setattr("stario.network.training.validation._STRETCHES", 12)
+    monkeypatch.setattr("stario.network.training.validation._STRETCHES", 6)
     config = TrainingConfig(
-        epochs=4, epoch_windows=256, batch=16, rate=5e-3, seed=2, warm_up=0.0,
+        epochs=3, epoch_windows=192, batch=16, rate=5e-3, seed=2, warm_up=0.0,
         likelihood_from=0.0, track_stretches=2, augmentation=PLAIN,
     )  # fmt: skip
-    reports: list[dict[str, float]] = []
+    reports = []
     train(
         config, streams, [1.0] * len(streams), streams, tmp_path,
         on_epoch=lambda report: reports.append(report.validation_by_recording),
@@ -231,9 +206,7 @@ def test_training_with_legs_reduces_the_error_at_positions(
     assert (tmp_path / "checkpoint.safetensors").exists()
 
 
-def test_a_recurrent_network_is_trained_on_stretches_in_rows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_recurrent_network_is_trained_on_stretches_in_rows(tmp_path, monkeypatch):
     """Its state is kept through a stretch, which must be a whole number of rows."""
     shallow(monkeypatch)
     monkeypatch.setattr("stario.network.training.validation._STRETCHES", 5)
@@ -256,9 +229,8 @@ def test_a_recurrent_network_is_trained_on_stretches_in_rows(
         train(replace(config, track_seconds=12), streams, weights, streams, tmp_path, legs=[legs])
 
 
-def test_invalid_positions_and_those_of_another_clock_make_no_legs() -> None:
+def test_invalid_positions_and_those_of_another_clock_make_no_legs():
     recording = with_positions("positions", 0.1)
-    assert recording.positions is not None
     time, position = recording.positions.time, recording.positions.position_W
     nothing = PositionTrack(time, position, "positions", np.zeros(len(time), dtype=bool))
     assert leg_streams(replace(recording, positions=nothing)) == []
@@ -267,7 +239,7 @@ def test_invalid_positions_and_those_of_another_clock_make_no_legs() -> None:
     assert abs(len(stream.start) - len(usual.start)) <= 1
 
 
-def test_legs_of_short_walks_can_select_the_weights_alone() -> None:
+def test_legs_of_short_walks_can_select_the_weights_alone():
     [legs] = leg_streams(with_positions("positions", 0.1))
     part = replace(legs, imu_N=legs.imu_N[: 8 * 200], facing_N=legs.facing_N[: 8 * 200])
     held_out = ValidationSet(
@@ -284,7 +256,7 @@ def sampler_of(streams: list[LegStream], seconds: int) -> LegSampler:
     return LegSampler(streams, seconds, PLAIN, torch.Generator().manual_seed(0))
 
 
-def test_stretches_begin_where_two_complete_legs_follow(caplog: pytest.LogCaptureFixture) -> None:
+def test_stretches_begin_where_two_complete_legs_follow(caplog):
     """Two legs of ten seconds fit into 21 s only if the stretch begins at a waypoint."""
     [far], [near] = (
         leg_streams(with_positions("waypoints", 10.0)),
@@ -298,7 +270,7 @@ def test_stretches_begin_where_two_complete_legs_follow(caplog: pytest.LogCaptur
     assert float(both.seconds[both.known].max()) == pytest.approx(6.0)
 
 
-def test_waypoints_too_far_apart_are_refused_with_the_seconds_that_suffice() -> None:
+def test_waypoints_too_far_apart_are_refused_with_the_seconds_that_suffice():
     legs = leg_streams(with_positions("waypoints", 25.0))
     expected = r"waypoints: found one every 25.0 s .*two legs within 20 s.*`waypoint_seconds`.* 51$"
     with pytest.raises(InputError, match=expected):
@@ -306,14 +278,14 @@ def test_waypoints_too_far_apart_are_refused_with_the_seconds_that_suffice() -> 
     assert int(sampler_of(legs, 51).batch(4).known.sum()) == 8
 
 
-def test_a_recording_shorter_than_two_legs_is_not_told_to_change_the_recipe() -> None:
+def test_a_recording_shorter_than_two_legs_is_not_told_to_change_the_recipe():
     legs = leg_streams(with_positions("waypoints", 25.0))
     short = [stream.part(0, 30 * 200) for stream in legs]
     with pytest.raises(InputError, match="use longer recordings; `--validation`"):
         sampler_of(short, 20)
 
 
-def test_validation_skips_legs_without_information(caplog: pytest.LogCaptureFixture) -> None:
+def test_validation_skips_legs_without_information(caplog):
     """Their error would be 0, the best possible."""
     held_out = ValidationSet(
         world_streams(WALK), torch.device("cpu"), TrainingConfig(),

@@ -1,7 +1,5 @@
 """Metrics against evo and closed forms, and their invariance to rotations and shifts."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 
@@ -296,7 +294,7 @@ def test_drift_per_metre_of_a_stationary_track_is_nan():
 
 
 @pytest.mark.parametrize(("horizontal", "path"), [(True, 30.0), (False, 50.0)])
-def test_the_path_is_that_of_the_compared_coordinates(horizontal: bool, path: float):
+def test_the_path_is_that_of_the_compared_coordinates(horizontal, path):
     time = np.arange(101) / 10.0
     climb = Trajectory(time, np.outer(time, [3.0, 0.0, 4.0]), about_z(0.0 * time))
     found = evaluate_track(climb, climb, horizontal=horizontal)
@@ -355,7 +353,7 @@ def test_nees_refuses_invalid_covariances():
 
 
 @pytest.mark.parametrize("poses", [1, 600])
-def test_yaw_alignment_of_a_stationary_track_uses_its_attitudes(poses: int) -> None:
+def test_yaw_alignment_of_a_stationary_track_uses_its_attitudes(poses):
     """Millimetre noise in the positions would give an arbitrary yaw; the attitudes do not."""
     rng = np.random.default_rng(0)
     time = np.arange(poses) / 10.0

@@ -35,7 +35,7 @@ def tilt_error(R_NB: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("mount", [(0.0, 0.0, 0.0), (1.4, 0.3, -2.0), (3.14, 0.0, 0.0)])
-def test_a_device_at_rest_starts_level_to_within_its_noise(mount: tuple[float, ...]) -> None:
+def test_a_device_at_rest_starts_level_to_within_its_noise(mount):
     rng = np.random.default_rng(0)
     R_WB = Rotation.from_rotvec(mount)
     time = np.arange(201) / 200.0
@@ -48,7 +48,7 @@ def test_a_device_at_rest_starts_level_to_within_its_noise(mount: tuple[float, .
 
 
 @pytest.mark.parametrize("carry", CARRYING_MODES)
-def test_a_pedestrian_starts_level_to_within_the_stated_sigma(carry: str) -> None:
+def test_a_pedestrian_starts_level_to_within_the_stated_sigma(carry):
     errors = []
     for seed in range(6):
         walk = simulated_walk(seed, 5.0, carry, PHONE_IMU)
@@ -63,7 +63,7 @@ def test_a_pedestrian_starts_level_to_within_the_stated_sigma(carry: str) -> Non
     assert np.sqrt(np.mean(np.square(errors))) < 1.4 * 2.9 * np.sqrt(2.0)
 
 
-def test_levelling_bounds_the_tilt_error_of_a_bias_but_integration_does_not() -> None:
+def test_levelling_bounds_the_tilt_error_of_a_bias_but_integration_does_not():
     levelled, integrated = [], []
     for seed in range(6):
         walk = simulated_walk(seed, 90.0, "handheld", PERFECT_IMU)
@@ -78,7 +78,7 @@ def test_levelling_bounds_the_tilt_error_of_a_bias_but_integration_does_not() ->
     assert np.max(integrated) > 10.0
 
 
-def test_a_grid_rounded_to_beyond_the_last_sample_is_levelled() -> None:
+def test_a_grid_rounded_to_beyond_the_last_sample_is_levelled():
     """0.09 s plus 420 steps of 0.1 s is later than 42.09 s in floating point."""
     walk = simulated_walk(1, 43.0, "handheld", PERFECT_IMU)
     part = slice(9, 4210)
@@ -89,7 +89,7 @@ def test_a_grid_rounded_to_beyond_the_last_sample_is_levelled() -> None:
     np.testing.assert_allclose(longer[:-10], shorter[:-9], rtol=0.0, atol=1e-9)
 
 
-def test_levelling_tolerates_uncorrected_gyroscope_rates() -> None:
+def test_levelling_tolerates_uncorrected_gyroscope_rates():
     """A phone that does not correct its gyroscope: a bias of 5 deg/s about a body axis."""
     walk = simulated_walk(1, 90.0, "handheld", PERFECT_IMU)
     truth = walk.truth.attitude_WB.as_matrix()
@@ -98,7 +98,7 @@ def test_levelling_tolerates_uncorrected_gyroscope_rates() -> None:
     assert np.sqrt(np.mean(np.square(error))) < 3.0
 
 
-def test_levelling_leaves_yaw_unchanged() -> None:
+def test_levelling_leaves_yaw_unchanged():
     """The tilt of a device at rest is corrected about a horizontal axis only."""
     time = np.arange(11) / 200.0
     accel = np.tile(STANDARD_GRAVITY * UP, (11, 1))
@@ -115,7 +115,7 @@ def test_levelling_leaves_yaw_unchanged() -> None:
     assert abs(yaw) < 0.01
 
 
-def test_after_a_gap_the_tilt_is_gravitys_and_bias_and_yaw_are_kept() -> None:
+def test_after_a_gap_the_tilt_is_gravitys_and_bias_and_yaw_are_kept():
     time = np.arange(21) / 200.0
     accel = np.tile(STANDARD_GRAVITY * UP, (21, 1))
     attitude = LevelledAttitude(start_at(np.eye(3)))
@@ -133,7 +133,7 @@ def test_after_a_gap_the_tilt_is_gravitys_and_bias_and_yaw_are_kept() -> None:
 
 
 @pytest.mark.parametrize("after_gap", [False, True])
-def test_a_livelier_start_is_levelled_more_quickly(after_gap: bool) -> None:
+def test_a_livelier_start_is_levelled_more_quickly(after_gap):
     """A runner's first second gives a tilt that is off by ten degrees."""
     time = np.arange(21) / 200.0
     accel = np.tile(STANDARD_GRAVITY * UP, (21, 1))
@@ -154,7 +154,7 @@ def test_a_livelier_start_is_levelled_more_quickly(after_gap: bool) -> None:
     assert errors[2] < 0.6 * errors[1] < 0.5 * tilt_error(off, np.eye(3))
 
 
-def test_levelling_leaves_a_rotating_level_device_unchanged() -> None:
+def test_levelling_leaves_a_rotating_level_device_unchanged():
     time = np.arange(11) / 200.0
     gyro, accel = np.tile([0.0, 0.0, 2.0], (11, 1)), np.tile(STANDARD_GRAVITY * UP, (11, 1))
     attitude = LevelledAttitude(start_at(np.eye(3)))
@@ -164,7 +164,7 @@ def test_levelling_leaves_a_rotating_level_device_unchanged() -> None:
     np.testing.assert_allclose(attitude.R_NB, expected, atol=1e-9)
 
 
-def test_free_fall_and_a_dead_accelerometer_leave_the_attitude_finite() -> None:
+def test_free_fall_and_a_dead_accelerometer_leave_the_attitude_finite():
     time = np.arange(11) / 200.0
     attitude = LevelledAttitude(start_at(np.eye(3)))
     attitude.advance(time, np.full((11, 3), 0.1), np.zeros((11, 3)))
@@ -174,7 +174,7 @@ def test_free_fall_and_a_dead_accelerometer_leave_the_attitude_finite() -> None:
     assert np.isfinite(start.R_WB).all()
 
 
-def test_integration_of_a_constant_rate_is_exact() -> None:
+def test_integration_of_a_constant_rate_is_exact():
     rate = np.array([0.7, -1.9, 2.3])
     time = np.cumsum(np.random.default_rng(0).uniform(0.002, 0.02, 300))
     R = integrate(np.eye(3), time, np.tile(rate, (300, 1)))
@@ -182,7 +182,7 @@ def test_integration_of_a_constant_rate_is_exact() -> None:
     np.testing.assert_allclose(R, expected, atol=1e-10)
 
 
-def test_integration_of_coning_motion_matches_fine_steps() -> None:
+def test_integration_of_coning_motion_matches_fine_steps():
     """The rotation axis itself rotates; integrating the mean rate alone would drift steadily."""
     w = 2.0 * np.pi * 5.0
     time = np.arange(0.0, 2.0001, 1.0 / 100.0)
@@ -190,7 +190,7 @@ def test_integration_of_coning_motion_matches_fine_steps() -> None:
     fine = np.linspace(0.0, time[-1], 100 * (len(time) - 1) + 1)
     between = np.stack([np.interp(fine, time, gyro[:, k]) for k in range(3)], axis=1)
 
-    def by_mean_rates(t: np.ndarray, rate: np.ndarray) -> Rotation:
+    def by_mean_rates(t, rate):
         turns = Rotation.from_rotvec(0.5 * (rate[1:] + rate[:-1]) * np.diff(t)[:, None])
         R = Rotation.identity()
         for turn in turns:

@@ -1,7 +1,5 @@
 """Rotations: exponential and logarithm, products of stacks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
@@ -17,33 +15,33 @@ def rotation_vectors(angle: float) -> np.ndarray:
     return angle * axes / np.linalg.norm(axes, axis=1, keepdims=True)
 
 
-def test_skew_is_the_cross_product() -> None:
+def test_skew_is_the_cross_product():
     a, b = np.random.default_rng(0).normal(size=(2, 4, 3))
     np.testing.assert_allclose((so3.skew(a) @ b[..., None])[..., 0], np.cross(a, b), atol=1e-10)
     np.testing.assert_allclose(so3.cross(a, b), np.cross(a, b), atol=1e-10)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_exp_agrees_with_scipy(angle: float) -> None:
+def test_exp_agrees_with_scipy(angle):
     theta = rotation_vectors(angle)
     expected = Rotation.from_rotvec(theta).as_matrix()
     np.testing.assert_allclose(so3.exp_so3(theta), expected, rtol=0.0, atol=1e-10)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_log_inverts_exp(angle: float) -> None:
+def test_log_inverts_exp(angle):
     theta = rotation_vectors(angle)
     np.testing.assert_allclose(so3.log_so3(so3.exp_so3(theta)), theta, rtol=1e-6, atol=1e-12)
 
 
-def test_log_of_half_turns() -> None:
+def test_log_of_half_turns():
     theta = np.pi * np.eye(3)
     turned = so3.log_so3(so3.exp_so3(theta))
     np.testing.assert_allclose(np.abs(turned), theta, atol=1e-10)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_the_left_jacobian_agrees_with_finite_differences(angle: float) -> None:
+def test_the_left_jacobian_agrees_with_finite_differences(angle):
     step = 1e-6
     for theta in rotation_vectors(angle):
         R = so3.exp_so3(theta)
@@ -54,7 +52,7 @@ def test_the_left_jacobian_agrees_with_finite_differences(angle: float) -> None:
         np.testing.assert_allclose(so3.exp_and_left_jacobian(theta)[1], left, atol=1e-6)
 
 
-def test_exp_of_a_stack_of_mixed_angles_equals_one_at_a_time() -> None:
+def test_exp_of_a_stack_of_mixed_angles_equals_one_at_a_time():
     theta = np.concatenate([rotation_vectors(angle) for angle in ANGLES])
     singly = np.stack([so3.exp_so3(row) for row in theta])
     np.testing.assert_allclose(so3.exp_so3(theta), singly, atol=1e-10)
@@ -65,13 +63,13 @@ def same(found: Rotation, expected: Rotation) -> None:
 
 
 @pytest.mark.parametrize("counts", [(50, 50), (50, None), (None, 50), (None, None), (0, 0)])
-def test_products_are_scipys(counts: tuple[int | None, int | None]) -> None:
+def test_products_are_scipys(counts):
     p, q = (Rotation.random(count, rng=seed) for seed, count in enumerate(counts))
     same(composed(p, q), p * q)
 
 
 @pytest.mark.parametrize("count", [0, 7, 1000])
-def test_interpolated_rotations_are_scipys(count: int) -> None:
+def test_interpolated_rotations_are_scipys(count):
     """At fewer times than are known and at more, in any order, at the ends and at known times."""
     rng = np.random.default_rng(0)
     known = np.cumsum(rng.uniform(0.01, 0.1, 40))

@@ -1,7 +1,5 @@
 """Batches of recordings, and their split into parts."""
 
-from __future__ import annotations
-
 import importlib.resources
 import os
 import time
@@ -13,15 +11,15 @@ from joblib import parallel_config
 from stario.network.training.splits import NAMES, read_packaged_list
 from stario.sequences.datasets.batch import Skipped, each, without_skipped
 from stario.sequences.datasets.splits import hold_out_group, random_split, read_list
-from stario.sequences.errors import InputError, ReadError, StarioError
+from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers import find_recordings
 
 
 @pytest.mark.parametrize("jobs", [None, 1, 2])
-def test_a_failing_item_is_skipped_with_its_reason(jobs: int | None) -> None:
+def test_a_failing_item_is_skipped_with_its_reason(jobs):
     """The errors take arguments of their own, with which plain pickling between processes fails."""
 
-    def halve(number: int) -> int:
+    def halve(number):
         if number % 2:
             raise InputError("number", str(number), "an even one")
         return number // 2
@@ -29,15 +27,15 @@ def test_a_failing_item_is_skipped_with_its_reason(jobs: int | None) -> None:
     odd = Skipped("3", "number: found 3, expected an even one")
     outcomes = list(each(halve, [2, 3, 8], jobs))
     assert outcomes == [1, odd, 4]
-    skipped: list[Skipped] = []
+    skipped = []
     assert list(without_skipped(outcomes, skipped)) == [1, 4]
     assert skipped == [odd]
 
 
-def test_results_are_yielded_one_by_one() -> None:
-    processed: list[int] = []
+def test_results_are_yielded_one_by_one():
+    processed = []
 
-    def record(number: int) -> int:
+    def record(number):
         processed.append(number)
         return number
 
@@ -51,21 +49,21 @@ def double(number: int) -> int:
     return 2 * number
 
 
-def test_a_backend_that_returns_nothing_before_the_end_works_too() -> None:
+def test_a_backend_that_returns_nothing_before_the_end_works_too():
     """Like Ray's; joblib's own backend of this kind runs processes without loky."""
     with parallel_config("multiprocessing"):
         assert list(each(double, [1, 2, 3], 2)) == [2, 4, 6]
 
 
-def test_an_unexpected_exception_costs_one_item_and_its_traceback_is_logged(caplog) -> None:
+def test_an_unexpected_exception_costs_one_item_and_its_traceback_is_logged(caplog):
     outcomes = list(each(lambda number: 1 // number, [1, 0, -1]))
     assert outcomes[::2] == [1, -1]
     assert outcomes[1].reason.startswith("ZeroDivisionError")
     assert "Traceback" in caplog.text
 
 
-def test_several_jobs_run_in_separate_processes() -> None:
-    def process(delay: float) -> int:
+def test_several_jobs_run_in_separate_processes():
+    def process(delay):
         time.sleep(delay)
         return os.getpid()
 
@@ -90,7 +88,7 @@ def phone(path: Path) -> Path:
     return path
 
 
-def test_the_papers_split_is_by_recording_and_reproducible_by_seed() -> None:
+def test_the_papers_split_is_by_recording_and_reproducible_by_seed():
     paths = [Path(f"{k:02d}.csv") for k in range(40)]
     split = random_split(paths, seed=7)
     assert [len(split.training), len(split.validation), len(split.test)] == [32, 4, 4]
@@ -103,7 +101,7 @@ def test_the_papers_split_is_by_recording_and_reproducible_by_seed() -> None:
         random_split(paths[:2], seed=0)
 
 
-def test_a_list_may_mix_formats_folders_and_duplicates(tmp_path: Path) -> None:
+def test_a_list_may_mix_formats_folders_and_duplicates(tmp_path):
     ronin(tmp_path, "a000_1")
     (tmp_path / "own.csv").write_text(ROW)
     imu = phone(tmp_path / "handheld/data1/syn/imu1.csv")
@@ -112,14 +110,14 @@ def test_a_list_may_mix_formats_folders_and_duplicates(tmp_path: Path) -> None:
     assert found == [tmp_path / "a000_1", tmp_path / "own.csv", imu]
 
 
-def test_wrong_entries_are_named_and_the_others_kept(tmp_path: Path) -> None:
+def test_wrong_entries_are_named_and_the_others_kept(tmp_path):
     (tmp_path / "own.csv").write_text(ROW)
     (tmp_path / "empty").mkdir()
     path = tmp_path / "list.txt"
     path.write_text("own.csv\n\n,handheld\ngone.csv\nempty\nlist.txt\n# end\n")
     with pytest.raises(ReadError, match=r"list\.txt: line 3: found an empty entry"):
         find_recordings(path)
-    errors: list[StarioError] = []
+    errors = []
     assert find_recordings(path, errors.append) == [tmp_path / "own.csv"]
     messages = [str(error).removeprefix(str(tmp_path)) for error in errors]
     assert [text.split(", expected")[0] for text in messages] == [
@@ -133,17 +131,17 @@ def test_wrong_entries_are_named_and_the_others_kept(tmp_path: Path) -> None:
         find_recordings(path)
 
 
-def test_a_text_of_something_else_is_one_error(tmp_path: Path) -> None:
+def test_a_text_of_something_else_is_one_error(tmp_path):
     """A log of a serial port, or a list of a hundred recordings next to another data folder."""
     path = tmp_path / "serial.txt"
     path.write_text("".join(f"t: {k} ax: 0.1 ay: 0.2 az: 9.8\n" for k in range(100)))
-    errors: list[StarioError] = []
+    errors = []
     with pytest.raises(ReadError, match="found 100 lines without an existing name, such as t: 0 "):
         find_recordings(path, errors.append)
     assert errors == []
 
 
-def test_lists_name_recordings_below_a_folder_and_their_groups(tmp_path: Path) -> None:
+def test_lists_name_recordings_below_a_folder_and_their_groups(tmp_path):
     for name in ("a.csv", "walks.h5"):
         (tmp_path / name).touch()
     file = tmp_path / "list.txt"
@@ -166,7 +164,7 @@ def test_lists_name_recordings_below_a_folder_and_their_groups(tmp_path: Path) -
         read_list(file, tmp_path)
 
 
-def test_the_packaged_lists_keep_groups_apart() -> None:
+def test_the_packaged_lists_keep_groups_apart():
     folder = importlib.resources.files("stario.network.training.splits")
     names = {}
     for name in NAMES:

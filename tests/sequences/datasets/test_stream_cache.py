@@ -1,7 +1,5 @@
 """Windows kept on disk, and the files they are kept in."""
 
-from __future__ import annotations
-
 import mmap
 import os
 import re
@@ -42,10 +40,9 @@ class Reader:
 
 
 @pytest.fixture
-def recording(tmp_path: Path) -> Path:
+def recording(tmp_path):
     """A walk whose ground truth has a gap, so that it gives two streams."""
     truth = WALK.truth
-    assert truth is not None
     gap = (truth.time > 4.0) & (truth.time < 4.5)
     path = tmp_path / "walk.csv"
     write_csv(path, replace(WALK, truth=replace(truth, valid=~gap)))
@@ -78,7 +75,7 @@ def is_mapped(array: np.ndarray) -> bool:
     return isinstance(map_of(array), mmap.mmap)
 
 
-def test_cached_streams_equal_built_streams(recording: Path, tmp_path: Path) -> None:
+def test_cached_streams_equal_built_streams(recording, tmp_path):
     read = Reader()
     expected = world_streams(read_recording(recording))
     assert len(expected) == 2
@@ -89,16 +86,14 @@ def test_cached_streams_equal_built_streams(recording: Path, tmp_path: Path) -> 
     assert read.calls == 1
 
 
-def test_a_cached_recording_keeps_a_single_file_open(recording: Path, tmp_path: Path) -> None:
+def test_a_cached_recording_keeps_a_single_file_open(recording, tmp_path):
     """Each map does, and a training set has more recordings than a process may open files."""
     streams_of(recording, tmp_path / "cache", Reader())
     streams = streams_of(recording, tmp_path / "cache", Reader())
     assert len({id(map_of(array)) for s in streams for array in (s.imu_W, s.position_W)}) == 1
 
 
-def test_more_recordings_are_mapped_than_a_process_may_open_files(
-    recording: Path, tmp_path: Path
-) -> None:
+def test_more_recordings_are_mapped_than_a_process_may_open_files(recording, tmp_path):
     resource = pytest.importorskip("resource")
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     lowest = os.dup(0)  # descriptors are numbered from below
@@ -111,9 +106,7 @@ def test_more_recordings_are_mapped_than_a_process_may_open_files(
     assert all(is_mapped(s.imu_W) for streams in kept for s in streams)
 
 
-def test_changed_content_options_or_code_change_the_key(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_changed_content_options_or_code_change_the_key(recording, tmp_path, monkeypatch):
     read, folder = Reader(), tmp_path / "cache"
     streams_of(recording, folder, read)
     streams_of(recording, folder, read, axes="y,-x,z")
@@ -132,9 +125,7 @@ def test_changed_content_options_or_code_change_the_key(
 
 
 @pytest.mark.parametrize("damage", ["cut", "header", "empty", "noise", "longer"])
-def test_a_damaged_cache_file_is_rebuilt(
-    recording: Path, tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_damaged_cache_file_is_rebuilt(recording, tmp_path, damage, caplog):
     read, folder = Reader(), tmp_path / "cache"
     expected = world_streams(read_recording(recording))
     streams_of(recording, folder, read)
@@ -154,7 +145,7 @@ def test_a_damaged_cache_file_is_rebuilt(
     assert file.read_bytes() == whole
 
 
-def test_concurrent_writers_do_not_interfere(recording: Path, tmp_path: Path) -> None:
+def test_concurrent_writers_do_not_interfere(recording, tmp_path):
     folder = tmp_path / "cache"
     expected = world_streams(read_recording(recording))
     with ThreadPoolExecutor(8) as pool:
@@ -165,7 +156,7 @@ def test_concurrent_writers_do_not_interfere(recording: Path, tmp_path: Path) ->
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs signals")
-def test_a_killed_writer_leaves_nothing_that_is_read(recording: Path, tmp_path: Path) -> None:
+def test_a_killed_writer_leaves_nothing_that_is_read(recording, tmp_path):
     folder = tmp_path / "cache"
     code = (
         "import os, signal, sys\n"
@@ -190,18 +181,14 @@ def test_a_killed_writer_leaves_nothing_that_is_read(recording: Path, tmp_path: 
     assert [p.name for p in folder.iterdir()] == [whole.name]
 
 
-def test_without_a_writable_folder_streams_are_built_in_memory(
-    recording: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_a_writable_folder_streams_are_built_in_memory(recording, tmp_path, caplog):
     (tmp_path / "file").touch()
     streams = streams_of(recording, tmp_path / "file" / "cache", Reader())
     assert_equal(streams, world_streams(read_recording(recording)))
     assert "not kept" in caplog.text
 
 
-def test_files_of_other_code_are_removed_once_nobody_uses_them(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_of_other_code_are_removed_once_nobody_uses_them(recording, tmp_path, monkeypatch):
     folder = tmp_path / "cache"
     streams_of(recording, folder, Reader())
     (own,) = folder.iterdir()
@@ -216,7 +203,7 @@ def test_files_of_other_code_are_removed_once_nobody_uses_them(
     assert len(left) == 4
 
 
-def test_processes_return_memory_mapped_files(recording: Path, tmp_path: Path) -> None:
+def test_processes_return_memory_mapped_files(recording, tmp_path):
     paths = [recording, tmp_path / "missing.csv", recording]
     first, missing, second = recorded(paths, read_recording, {}, tmp_path / "cache", jobs=2)
     assert isinstance(missing, Skipped)
@@ -226,9 +213,8 @@ def test_processes_return_memory_mapped_files(recording: Path, tmp_path: Path) -
         assert all(is_mapped(s.imu_W) for s in streams)
 
 
-def test_recordings_unsuitable_for_training_are_skipped_with_the_reason(tmp_path: Path) -> None:
+def test_recordings_unsuitable_for_training_are_skipped_with_the_reason(tmp_path):
     truth = WALK.truth
-    assert truth is not None
     unsuitable = {
         "blind": WALK.without_truth(),
         "degrees": replace(WALK, gyro=np.degrees(WALK.gyro)),
@@ -245,10 +231,10 @@ def test_recordings_unsuitable_for_training_are_skipped_with_the_reason(tmp_path
         assert words in reason
 
 
-def test_built_streams_are_cached_by_key(tmp_path: Path) -> None:
-    calls: list[int] = []
+def test_built_streams_are_cached_by_key(tmp_path):
+    calls = []
 
-    def build() -> list[WorldStream]:
+    def build():
         calls.append(1)
         return world_streams(WALK)
 
@@ -258,7 +244,7 @@ def test_built_streams_are_cached_by_key(tmp_path: Path) -> None:
     assert cached({"seed": 3}, list, tmp_path) == []
 
 
-def test_a_recording_of_an_archive_is_cached_by_its_name(tmp_path: Path) -> None:
+def test_a_recording_of_an_archive_is_cached_by_its_name(tmp_path):
     archive, read = tmp_path / "walks.h5", Reader()
     write_archive(archive, [WALK, WALK.slice(0.0, 5.0)])
     whole, part = find_recordings(archive)
@@ -272,10 +258,9 @@ def test_a_recording_of_an_archive_is_cached_by_its_name(tmp_path: Path) -> None
     assert read.calls == 3
 
 
-def test_a_truth_that_contradicts_the_imu_is_skipped_with_the_reason(tmp_path: Path) -> None:
+def test_a_truth_that_contradicts_the_imu_is_skipped_with_the_reason(tmp_path):
     walk = simulate_imu(generate_walk(6, 20.0), 100.0, seed=4, name="walk")
     truth = walk.truth
-    assert truth is not None
     path = tmp_path / "walk.csv"
     write_csv(path, replace(walk, truth=replace(truth, position_W=1e3 * truth.position_W)))
     (outcome,) = recorded([path], Reader(), {}, tmp_path / "cache")
@@ -286,7 +271,7 @@ def test_a_truth_that_contradicts_the_imu_is_skipped_with_the_reason(tmp_path: P
 WALK_FILE = simulate_imu(generate_walk(6, 2.0), 100.0, seed=4, name="walk")
 
 
-def test_the_files_of_a_recording_are_those_that_are_read(tmp_path: Path) -> None:
+def test_the_files_of_a_recording_are_those_that_are_read(tmp_path):
     """Changing a neighbouring file must trigger a rebuild only if the recording reads it."""
     mav = tmp_path / "room" / "mav0"
     for name in ("imu0", "mocap0"):
@@ -311,9 +296,7 @@ def test_the_files_of_a_recording_are_those_that_are_read(tmp_path: Path) -> Non
     assert recording_files(tmp_path / "a.csv") == [tmp_path / "a.csv"]
 
 
-def test_the_cache_folder_is_set_by_environment_variables(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_cache_folder_is_set_by_environment_variables(monkeypatch, tmp_path):
     monkeypatch.setenv("STARIO_CACHE", str(tmp_path))
     assert cache_folder() == tmp_path
     monkeypatch.delenv("STARIO_CACHE")
@@ -323,7 +306,7 @@ def test_the_cache_folder_is_set_by_environment_variables(
     assert cache_folder() == Path.home() / ".cache" / "stario"
 
 
-def test_readers_levelling_windows_and_simulation_are_part_of_the_code() -> None:
+def test_readers_levelling_windows_and_simulation_are_part_of_the_code():
     names = {"/".join(file.parts[-2:]) for file in code_files()}
     assert {
         "sequences/windows.py",
@@ -333,7 +316,7 @@ def test_readers_levelling_windows_and_simulation_are_part_of_the_code() -> None
     } <= names
 
 
-def test_figures_and_metrics_are_not_and_nothing_in_the_code_imports_them() -> None:
+def test_figures_and_metrics_are_not_and_nothing_in_the_code_imports_them():
     """A changed figure must not cost the windows of 100 hours of recordings."""
     names = {"/".join(file.parts[-2:]) for file in code_files()}
     assert not {"drawing/plots.py", "accuracy/metrics.py", "inspection/report.py"} & names

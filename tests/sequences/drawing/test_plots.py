@@ -1,7 +1,5 @@
 """Figures and tables as they are shown."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace
@@ -18,7 +16,7 @@ from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
 
 
 @pytest.fixture
-def truth() -> Trajectory:
+def truth():
     t = np.arange(0.0, 60.0, 0.05)
     position = np.stack([10 * np.sin(0.1 * t), 6 * np.cos(0.13 * t), 0 * t], axis=1)
     return Trajectory(t, position, Rotation.identity(len(t)))
@@ -30,7 +28,7 @@ def with_growing_error(track: Trajectory, growth: float, power: int = 1) -> Traj
 
 
 @pytest.fixture
-def tracks(truth: Trajectory) -> dict[str, Trajectory]:
+def tracks(truth):
     sigma = 0.02 * truth.time + 0.01
     covariance = np.einsum("n,ij->nij", sigma**2, np.eye(3))
     return {
@@ -312,12 +310,12 @@ def test_lost_samples_are_marked_at_the_edge_and_only_gaps_are_shaded(truth):
         assert set(marks.get_ydata()) == {1.0}
 
 
-def test_columns_are_as_wide_as_their_widest_cell_with_space_between_them() -> None:
+def test_columns_are_as_wide_as_their_widest_cell_with_space_between_them():
     lines = aligned([["", "ATE [m]", "n"], ["a walk", "1.5", "12"], ["b", "-", "3"]])
     assert lines == ["         ATE [m]    n", "a walk       1.5   12", "b              -    3"]
 
 
-def test_unknown_values_are_shown_as_a_dash() -> None:
+def test_unknown_values_are_shown_as_a_dash():
     assert [figure(None), figure(float("nan")), figure(0.0), figure(1.25, ".1f")] == [
         "-",
         "-",

@@ -1,7 +1,5 @@
 """The assessment of a magnetometer recovers what was simulated."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -37,7 +35,7 @@ def walk(magnetic_field: MagneticField) -> ImuSequence:
     return simulate_imu(track, 100.0, PERFECT_IMU, 1, magnetic_field=magnetic_field)
 
 
-def test_correlation_lag_hard_iron_dip_and_drift_are_recovered() -> None:
+def test_correlation_lag_hard_iron_dip_and_drift_are_recovered():
     sequence = walk(MagneticField(hard_iron=IRON, lag=0.04))
     drift = np.radians(0.5)
     truth = sequence.truth
@@ -52,7 +50,7 @@ def test_correlation_lag_hard_iron_dip_and_drift_are_recovered() -> None:
     assert "hard iron" in str(magnetic_findings(found)[0])
 
 
-def test_a_short_recording_gives_no_verdict_and_its_span_is_named() -> None:
+def test_a_short_recording_gives_no_verdict_and_its_span_is_named():
     whole = walk(MagneticField())
     for end, verdict, words in (
         (30.0, "too short to tell", "over 30 s: steady to"),
@@ -66,7 +64,7 @@ def test_a_short_recording_gives_no_verdict_and_its_span_is_named() -> None:
 
 
 @pytest.mark.parametrize("lag", [-0.08, 0.2])
-def test_a_lag_outside_the_search_range_is_not_reported_as_measured(lag: float) -> None:
+def test_a_lag_outside_the_search_range_is_not_reported_as_measured(lag):
     inspected = inspect_recording(walk(MagneticField(hard_iron=IRON, lag=lag)))
     found = inspected.magnetic
     assert found.lag_s is None
@@ -77,7 +75,7 @@ def test_a_lag_outside_the_search_range_is_not_reported_as_measured(lag: float) 
     assert found.correlation_with_gyroscope is not None
 
 
-def test_magnets_wrong_axes_apples_sign_and_wrong_units_are_detected() -> None:
+def test_magnets_wrong_axes_apples_sign_and_wrong_units_are_detected():
     good = walk(MagneticField())
     magnets = tuple((t, t + 4.0, 150.0) for t in np.arange(2.0, 56.0, 8.0).tolist())
     disturbed = assess_magnetometer(walk(MagneticField(magnets=magnets)))
@@ -92,7 +90,7 @@ def test_magnets_wrong_axes_apples_sign_and_wrong_units_are_detected() -> None:
     assert "if in nT, give 0.001" in " ".join(told(replace(good, magnetometer=unit)))
 
 
-def test_a_field_extrapolated_by_the_device_is_detected_by_its_constant_norm() -> None:
+def test_a_field_extrapolated_by_the_device_is_detected_by_its_constant_norm():
     measured = walk(MagneticField())
     time, field = measured.magnetometer.time, measured.magnetometer.field
     size = np.linalg.norm(field, axis=1, keepdims=True)
@@ -102,7 +100,7 @@ def test_a_field_extrapolated_by_the_device_is_detected_by_its_constant_norm() -
     assert "extrapolated by the device's own gyroscope 100%" in report[1]
 
 
-def test_a_magnetometer_that_starts_with_zeros_is_assessed() -> None:
+def test_a_magnetometer_that_starts_with_zeros_is_assessed():
     late = walk(MagneticField())
     field = late.magnetometer.field.copy()
     field[:100] = 0.0
@@ -113,7 +111,7 @@ def test_a_magnetometer_that_starts_with_zeros_is_assessed() -> None:
     assert found.held_share < 0.5
 
 
-def test_inspection_reports_a_good_magnetometer_and_a_missing_one() -> None:
+def test_inspection_reports_a_good_magnetometer_and_a_missing_one():
     good = inspect_recording(walk(MagneticField()))
     assert not good.findings
     assert any(line.startswith("magnetometer: ") and "dip 63 deg" in line for line in good.lines())
@@ -133,9 +131,7 @@ def test_inspection_reports_a_good_magnetometer_and_a_missing_one() -> None:
         ("imu2", "coarse", 0.15),
     ],
 )
-def test_recorded_magnetometers_measure_the_gyroscopes_drift(
-    name: str, verdict: str, tolerance: float
-) -> None:
+def test_recorded_magnetometers_measure_the_gyroscopes_drift(name, verdict, tolerance):
     """With its sign, against the drift of the gyroscope's yaw from the true yaw [deg/s]."""
     recording = read_recording(DATA / f"oxiod/handheld/data1/syn/{name}.csv")
     time, gyro, accel = clean_samples(recording)
@@ -150,7 +146,7 @@ def test_recorded_magnetometers_measure_the_gyroscopes_drift(
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the development recordings are not here")
-def test_a_magnetometer_next_to_magnets_is_not_usable() -> None:
+def test_a_magnetometer_next_to_magnets_is_not_usable():
     name = "archives/tyrex.h5:Thibaud_Nexus5_Dist_Texting"
     magnets = assess_magnetometer(read_recording(DATA / name))
     assert magnets.verdict == "not usable"
@@ -160,12 +156,9 @@ def test_a_magnetometer_next_to_magnets_is_not_usable() -> None:
     ("factor", "offset", "words"),
     [(1e3, 0.0, "they seem to be in ms"), (1.0, 500.0, "use one clock for both")],
 )
-def test_a_magnetometer_at_other_times_than_the_samples_is_reported(
-    factor: float, offset: float, words: str
-) -> None:
+def test_a_magnetometer_at_other_times_than_the_samples_is_reported(factor, offset, words):
     sequence = walk(MagneticField())
     field = sequence.magnetometer
-    assert field is not None
     assert clock_findings(sequence) == []
     elsewhere = replace(sequence, magnetometer=replace(field, time=factor * field.time + offset))
     problems = [p for p in told(elsewhere) if "found times from" in p]

@@ -1,7 +1,5 @@
 """Inspection of barometer and satellite positions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +14,6 @@ from stario.sequences.inspection.satellite_findings import SatelliteFindings, as
 from stario.sequences.sequence import (
     Barometer,
     FloatArray,
-    ImuSequence,
     Satellites,
     Trajectory,
 )
@@ -55,11 +52,11 @@ def codes(findings: list[Finding]) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def house() -> ImuSequence:
+def house():
     return simulate_house(1, 120.0, rate=50.0).sequence
 
 
-def test_a_house_is_inspected_in_a_line_for_each_sensor(house: ImuSequence) -> None:
+def test_a_house_is_inspected_in_a_line_for_each_sensor(house):
     inspection = inspect_recording(house)
     lines = inspection.lines()
     assert sum(line.startswith("barometer: ") for line in lines) == 1
@@ -72,14 +69,14 @@ def test_a_house_is_inspected_in_a_line_for_each_sensor(house: ImuSequence) -> N
 
 
 @pytest.mark.parametrize("noise", [0.05, 0.2])
-def test_noise_is_measured_on_stairs_as_well(noise: float) -> None:
+def test_noise_is_measured_on_stairs_as_well(noise):
     stairs = climbing(np.cumsum(np.full(600, 0.035)))
     found = pressure(simulate_barometer(stairs, replace(CALM, noise=noise, rate=5.0)))
     assert found.noise_m == pytest.approx(noise, rel=0.2)
     assert found.height_range_m == pytest.approx(21.0, rel=0.1)
 
 
-def test_a_door_is_a_step_and_stairs_or_a_lift_are_none() -> None:
+def test_a_door_is_a_step_and_stairs_or_a_lift_are_none():
     doors = np.array([20.0])
     stepped = pressure(simulate_barometer(LEVEL, replace(CALM, door=0.8), doors, seed=1))
     [(time, rise)] = stepped.steps
@@ -91,7 +88,7 @@ def test_a_door_is_a_step_and_stairs_or_a_lift_are_none() -> None:
     assert pressure(simulate_barometer(climbing(np.cumsum(0.1 * speed)), CALM)).steps == ()
 
 
-def test_a_jump_that_is_no_height_is_a_problem() -> None:
+def test_a_jump_that_is_no_height_is_a_problem():
     calm = simulate_barometer(LEVEL, CALM)
     hPa = calm.pressure_hPa - 2.0 * (calm.time > 30.0)
     found = pressure(replace(calm, pressure_hPa=hPa)).findings()
@@ -100,7 +97,7 @@ def test_a_jump_that_is_no_height_is_a_problem() -> None:
     assert found[0].values["time_s"] == pytest.approx(30.0, abs=1.0)
 
 
-def test_repeated_samples_and_wind_are_good_to_know() -> None:
+def test_repeated_samples_and_wind_are_good_to_know():
     calm = simulate_barometer(LEVEL, CALM)
     held = replace(calm, pressure_hPa=np.repeat(calm.pressure_hPa[::4], 4)[: len(calm)])
     found = pressure(held)
@@ -119,38 +116,34 @@ def test_repeated_samples_and_wind_are_good_to_know() -> None:
         (0.0, 12.0, "found 12, expected 300 to 1100 hPa: is it an altitude?"),
     ],
 )
-def test_pressure_in_another_unit_is_a_problem(
-    house: ImuSequence, factor: float, offset: float, words: str
-) -> None:
+def test_pressure_in_another_unit_is_a_problem(house, factor, offset, words):
     still = Barometer(house.time[::10], np.full(len(house.time[::10]), 1013.25 * factor + offset))
-    [line] = told(replace(house, barometer=still, satellites=None))
+    [line] = told(replace(house, truth=None, barometer=still, satellites=None))
     assert words in line
 
 
-def test_a_barometer_on_another_clock_is_a_problem(house: ImuSequence) -> None:
-    assert house.barometer is not None
+def test_a_barometer_on_another_clock_is_a_problem(house):
     late = replace(house.barometer, time=house.barometer.time + 5000.0)
     [line] = told(replace(house, barometer=late, satellites=None))
     assert "barometer: found times from 5000 to 5120 s, expected most during the samples" in line
     assert line.endswith("use one clock for both")
 
 
-def test_exchanged_latitude_and_longitude_contradict_the_speed() -> None:
+def test_exchanged_latitude_and_longitude_contradict_the_speed():
     reported = simulate_satellites(LEVEL, Sky(azimuth=1.0, sigma=1.0))
     right = receiver(reported)
     assert right.findings() == []
-    assert right.doppler is not None
     assert right.doppler.correlation > 0.9
     assert right.doppler.scale == pytest.approx(1.0, abs=0.1)
     wrong = receiver(replace(reported, latlon_deg=reported.latlon_deg[:, ::-1]))
     assert codes(wrong.findings()) == ["satellites_exchanged"]
 
 
-def test_positions_far_to_the_east_are_judged_although_they_cannot_be_exchanged() -> None:
+def test_positions_far_to_the_east_are_judged_although_they_cannot_be_exchanged():
     assert receiver(simulate_satellites(LEVEL, Sky(sigma=1.0, longitude=118.9))).findings() == []
 
 
-def test_minutes_in_place_of_decimals_contradict_the_speed() -> None:
+def test_minutes_in_place_of_decimals_contradict_the_speed():
     """48 degrees 7.038 minutes as 48.07038."""
     reported = simulate_satellites(LEVEL, Sky(sigma=1.0, latitude=48.3, longitude=11.3))
     whole, part = np.divmod(reported.latlon_deg, 1.0)
@@ -159,7 +152,7 @@ def test_minutes_in_place_of_decimals_contradict_the_speed() -> None:
     assert found[0].values["scale"] == pytest.approx(0.6, abs=0.05)
 
 
-def test_stale_positions_and_jumps_are_good_to_know() -> None:
+def test_stale_positions_and_jumps_are_good_to_know():
     reported = simulate_satellites(LEVEL, Sky(sigma=1.0))
     place = reported.latlon_deg.copy()
     place[20:40] = place[20]

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -26,7 +24,7 @@ def device_at_rest(seconds: float, rate: float, seed: int = 0) -> ImuSequence:
 
 
 @pytest.mark.parametrize("rate", [50.0, 200.0, 1000.0])
-def test_noise_and_bias_match_the_sensor_at_any_rate(rate: float) -> None:
+def test_noise_and_bias_match_the_sensor_at_any_rate(rate):
     rest = find_rest(device_at_rest(60.0, rate))
     assert rest.seconds == pytest.approx(60.0, abs=0.6)
     assert len(rest.stretches) == 1
@@ -36,11 +34,11 @@ def test_noise_and_bias_match_the_sensor_at_any_rate(rate: float) -> None:
     assert rest.accel_noise == pytest.approx(NOISE.accel_noise, rel=0.1)
 
 
-def test_a_walk_contains_no_rest() -> None:
+def test_a_walk_contains_no_rest():
     assert find_rest(simulate_imu(generate_walk(2, 20.0, style=WalkStyle()), 200.0)) is None
 
 
-def test_rest_is_found_between_motions_but_not_across_a_gap() -> None:
+def test_rest_is_found_between_motions_but_not_across_a_gap():
     still = device_at_rest(10.0, 100.0)
     rng = np.random.default_rng(1)
     gyro = still.gyro.copy()
@@ -56,7 +54,7 @@ def test_rest_is_found_between_motions_but_not_across_a_gap() -> None:
     assert f == pytest.approx(12.0, abs=0.5)
 
 
-def test_a_slow_turn_is_not_mistaken_for_bias() -> None:
+def test_a_slow_turn_is_not_mistaken_for_bias():
     still = device_at_rest(10.0, 100.0)
     about_up = ImuSequence("t", still.time, still.gyro + 0.1 * UP_B, still.accel)
     assert find_rest(about_up) is None
@@ -65,19 +63,19 @@ def test_a_slow_turn_is_not_mistaken_for_bias() -> None:
     assert find_rest(ImuSequence("t", still.time, still.gyro + rate, gravity)) is None
 
 
-def test_a_large_bias_is_one_if_gravity_does_not_turn() -> None:
+def test_a_large_bias_is_one_if_gravity_does_not_turn():
     still, bias = device_at_rest(10.0, 100.0), np.array([-0.12, 0.0, 0.02])
     rest = find_rest(ImuSequence("t", still.time, still.gyro - BIAS + bias, still.accel))
     assert rest.seconds == pytest.approx(10.0, abs=0.6)
     np.testing.assert_allclose(rest.gyro_bias, bias, atol=1e-3)
 
 
-def test_less_than_a_second_of_rest_is_too_short() -> None:
+def test_less_than_a_second_of_rest_is_too_short():
     assert find_rest(device_at_rest(0.8, 100.0)) is None
     assert find_rest(device_at_rest(0.2, 100.0)) is None
 
 
-def test_one_in_a_thousand_stretches_at_rest_fails_the_test_whatever_their_length() -> None:
+def test_one_in_a_thousand_stretches_at_rest_fails_the_test_whatever_their_length():
     for count in (3, 20):
         white = np.random.default_rng(0).normal(size=(200_000 // count, count, 3)) * np.sqrt(100.0)
         squares = np.square(white - white.mean(axis=1, keepdims=True)).sum(axis=(1, 2))

@@ -1,7 +1,5 @@
 """Archives: recordings by name, the three kinds of ground truth, missing entries."""
 
-from __future__ import annotations
-
 import fcntl
 from pathlib import Path
 
@@ -32,7 +30,7 @@ def _archive(path: Path) -> Path:
     return path
 
 
-def test_each_recording_has_its_kind_of_truth(tmp_path: Path) -> None:
+def test_each_recording_has_its_kind_of_truth(tmp_path):
     path = _archive(tmp_path / "walks.h5")
     pose, track, waypoints = (read_recording(found) for found in find_recordings(path))
     assert pose.truth is not None
@@ -40,21 +38,19 @@ def test_each_recording_has_its_kind_of_truth(tmp_path: Path) -> None:
     assert pose.magnetometer is not None
     assert len(pose.magnetometer) == 10
     assert track.truth is None
-    assert track.positions is not None
     assert track.positions.kind == "positions"
     assert track.positions.position_W.shape == (50, 3)
-    assert waypoints.positions is not None
     assert waypoints.positions.kind == "waypoints"
     assert waypoints.positions.position_W.shape == (2, 2)
     assert waypoints.attributes["person"] == "ann"
 
 
-def test_recordings_are_selected_by_attribute(tmp_path: Path) -> None:
+def test_recordings_are_selected_by_attribute(tmp_path):
     path = _archive(tmp_path / "walks.h5")
     assert archive_members(path, {"person": ["ann"]}) == [Path(f"{path}:a"), Path(f"{path}:c")]
 
 
-def test_patterns_lists_and_folders_select_the_same_recordings(tmp_path: Path) -> None:
+def test_patterns_lists_and_folders_select_the_same_recordings(tmp_path):
     path = _archive(tmp_path / "walks.h5")
     of_ann = [Path(f"{path}:a"), Path(f"{path}:c")]
     assert archive_members(path, {"person": ["a*"], "name": ["[ac]"]}) == of_ann
@@ -65,13 +61,13 @@ def test_patterns_lists_and_folders_select_the_same_recordings(tmp_path: Path) -
     assert find_recordings(listed, where={"name": ["c"]}) == of_ann[1:]
 
 
-def test_an_unknown_attribute_value_is_refused_with_the_known_ones(tmp_path: Path) -> None:
+def test_an_unknown_attribute_value_is_refused_with_the_known_ones(tmp_path):
     path = _archive(tmp_path / "walks.h5")
     with pytest.raises(ReadError, match=r"person=eve: found none, .* person to be one of ann, bob"):
         find_recordings(path, where={"person": ["eve"]})
 
 
-def test_an_archive_of_poses_alone_is_refused(tmp_path: Path) -> None:
+def test_an_archive_of_poses_alone_is_refused(tmp_path):
     path = _archive(tmp_path / "walks.h5")
     with h5py.File(path, "a") as file:
         for group in file.values():
@@ -80,18 +76,18 @@ def test_an_archive_of_poses_alone_is_refused(tmp_path: Path) -> None:
         find_recordings(path)
 
 
-def test_an_unknown_name_is_refused_with_the_known_ones(tmp_path: Path) -> None:
+def test_an_unknown_name_is_refused_with_the_known_ones(tmp_path):
     path = _archive(tmp_path / "walks.h5")
     with pytest.raises(ReadError, match="'d', expected a name in it, such as a, b, c"):
         read_recording(f"{path}:d")
 
 
-def test_an_archive_of_several_recordings_requires_a_name(tmp_path: Path) -> None:
+def test_an_archive_of_several_recordings_requires_a_name(tmp_path):
     with pytest.raises(ReadError, match=r"3 recordings, expected the name of one; use walks\.h5:a"):
         read_recording(_archive(tmp_path / "walks.h5"))
 
 
-def test_a_truncated_archive_is_refused_with_its_file_name(tmp_path: Path) -> None:
+def test_a_truncated_archive_is_refused_with_its_file_name(tmp_path):
     path = _archive(tmp_path / "walks.h5")
     path.write_bytes(path.read_bytes()[:3000])
     with pytest.raises(ReadError, match=r"walks\.h5: content: found .*truncated.*complete"):
@@ -122,9 +118,7 @@ def test_a_truncated_archive_is_refused_with_its_file_name(tmp_path: Path) -> No
         ("waypoints/xy", np.ones((2, 4)), r"found shape \(2, 4\), expected \(2, 2\) or \(2, 3\)"),
     ],
 )
-def test_a_dataset_of_another_shape_or_type_is_named(
-    tmp_path: Path, field: str, values: object, error: str
-) -> None:
+def test_a_dataset_of_another_shape_or_type_is_named(tmp_path, field, values, error):
     path = _archive(tmp_path / "walks.h5")
     name = "c" if field.startswith("waypoints") else "a"
     with h5py.File(path, "a") as file:
@@ -135,7 +129,7 @@ def test_a_dataset_of_another_shape_or_type_is_named(
         read_recording(f"{path}:{name}")
 
 
-def test_a_group_in_place_of_a_dataset_is_named(tmp_path: Path) -> None:
+def test_a_group_in_place_of_a_dataset_is_named(tmp_path):
     path = _archive(tmp_path / "walks.h5")
     with h5py.File(path, "a") as file:
         del file["a/imu/accel"]
@@ -144,14 +138,14 @@ def test_a_group_in_place_of_a_dataset_is_named(tmp_path: Path) -> None:
         read_recording(f"{path}:a")
 
 
-def test_the_name_of_a_recording_is_that_of_its_group(tmp_path: Path) -> None:
+def test_the_name_of_a_recording_is_that_of_its_group(tmp_path):
     path = _archive(tmp_path / "walks.h5")
     with h5py.File(path, "a") as file:
         file["a"].attrs["name"] = "b"
     assert archive_members(path, {"name": ["a"]}) == [Path(f"{path}:a")]
 
 
-def test_an_archive_may_begin_with_other_groups_and_datasets(tmp_path: Path) -> None:
+def test_an_archive_may_begin_with_other_groups_and_datasets(tmp_path):
     path = _archive(tmp_path / "walks.h5")
     with h5py.File(path, "a") as file:
         file.create_group("Empty")
@@ -159,7 +153,7 @@ def test_an_archive_may_begin_with_other_groups_and_datasets(tmp_path: Path) -> 
     assert len(find_recordings(path)) == 3
 
 
-def test_an_archive_that_another_program_writes_is_refused_with_the_remedy(tmp_path: Path) -> None:
+def test_an_archive_that_another_program_writes_is_refused_with_the_remedy(tmp_path):
     path = _archive(tmp_path / "walks.h5")
     with path.open() as other:
         fcntl.flock(other, fcntl.LOCK_EX)
@@ -168,10 +162,9 @@ def test_an_archive_that_another_program_writes_is_refused_with_the_remedy(tmp_p
 
 
 @pytest.mark.skipif(not ARCHIVES.is_dir(), reason="the development recordings are not here")
-def test_mean_specific_force_points_up_in_the_true_frame_of_the_archives() -> None:
+def test_mean_specific_force_points_up_in_the_true_frame_of_the_archives():
     for name in ("tyrex.h5:Thibaud_Nexus5_NoDist_Texting", "ridi.h5:dan_bag1", "kipd.h5:07CL"):
         recording = read_recording(ARCHIVES / name)
-        assert recording.truth is not None
         truth = recording.truth.at(recording.time)
         known = truth.valid
         up = truth.attitude_WB.apply(recording.accel)[known].mean(axis=0)

@@ -1,7 +1,5 @@
 """Times as loggers write them for people: dates with zones, times of day, midnight in between."""
 
-from __future__ import annotations
-
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -49,16 +47,14 @@ def written(path: Path, header: str, form: str, start: datetime, count: int = 20
         "%m/%d/%Y %H:%M:%S.%f",
     ],
 )
-def test_times_are_read_with_any_date_and_zone(
-    tmp_path: Path, header: str, start: datetime, form: str
-) -> None:
+def test_times_are_read_with_any_date_and_zone(tmp_path, header, start, form):
     read = read_recording(written(tmp_path / "own.csv", header, form, start))
     np.testing.assert_allclose(read.time, 0.01 * np.arange(200), atol=1e-9)
     np.testing.assert_allclose(read.gyro[-1], [0.1, 0.2, 0.3])
 
 
 @pytest.mark.parametrize("header", [GENERIC, WIDE])
-def test_days_of_a_spreadsheet_are_times(tmp_path: Path, header: str) -> None:
+def test_days_of_a_spreadsheet_are_times(tmp_path, header):
     """Days since the end of 1899; ten decimals are eight microseconds."""
     separator = max(",;", key=header.count)
     days = [f"{45413.524268391 + 0.01 * k / 86400.0:.10f}" for k in range(200)]
@@ -68,7 +64,7 @@ def test_days_of_a_spreadsheet_are_times(tmp_path: Path, header: str) -> None:
     assert "taken as" not in read.source
 
 
-def test_zones_and_names_of_months_give_the_same_instant() -> None:
+def test_zones_and_names_of_months_give_the_same_instant():
     noon = "1714564800.5"
     for text in ("2024-05-01T12:00:00.5Z", "2024-05-01 14:00:00.5 +02:00", "2024/05/01 12:00:00.5",
                  "2024-05-01 08:30:00.5 GMT-0330", "01-May-2024 12:00:00.5",
@@ -76,13 +72,13 @@ def test_zones_and_names_of_months_give_the_same_instant() -> None:
         assert with_seconds([text]) == [noon]
 
 
-def test_a_cell_after_a_blank_is_no_zone() -> None:
+def test_a_cell_after_a_blank_is_no_zone():
     assert with_seconds(["12:00:00.5 -12 3"])[0].endswith(".5 -12 3")
 
 
 @pytest.mark.parametrize("header", [GENERIC, WIDE])
 @pytest.mark.parametrize("digits", [14, 17])
-def test_dates_without_separators_are_refused(tmp_path: Path, header: str, digits: int) -> None:
+def test_dates_without_separators_are_refused(tmp_path, header, digits):
     """Taken for a number, the time would jump by 40 s at each full minute."""
     path = written(tmp_path / "own.csv", header, "%Y%m%d%H%M%S%f", NOON)
     lines = path.read_text().splitlines()
@@ -96,14 +92,14 @@ def test_dates_without_separators_are_refused(tmp_path: Path, header: str, digit
         read_recording(path)
 
 
-def test_midnight_passes_in_every_column_of_times_and_for_late_rows() -> None:
+def test_midnight_passes_in_every_column_of_times_and_for_late_rows():
     lines = ["23:59:59.9,23:59:58.9", "00:00:00.1,23:59:59.1", "23:59:59.95,00:00:00.1"]
     first, second = np.array([[float(x) for x in row.split(",")] for row in with_seconds(lines)]).T
     np.testing.assert_allclose(first - first[0], [0.0, 0.2, 0.05], atol=1e-9)
     np.testing.assert_allclose(second - second[0], [0.0, 0.2, 1.2], atol=1e-9)
 
 
-def test_milliseconds_after_a_colon_may_lack_zeros() -> None:
+def test_milliseconds_after_a_colon_may_lack_zeros():
     lines = ["12:00:00:5", "12:00:00:15", "12:00:00:105", "12:00:01:0", "12:00:02"]
     time = np.array(with_seconds(lines), dtype=np.float64)
     np.testing.assert_allclose(time - time[0], [0.0, 0.01, 0.1, 0.995, 1.995], atol=1e-9)
@@ -112,16 +108,16 @@ def test_milliseconds_after_a_colon_may_lack_zeros() -> None:
 
 
 @pytest.mark.parametrize("text", ["24:60:00", "2024-13-01 12:00:00", "01-Foo-2024 12:00:00"])
-def test_what_is_no_time_stays_as_it_is(text: str) -> None:
+def test_what_is_no_time_stays_as_it_is(text):
     assert with_seconds([text]) == [text]
     assert with_seconds([f"D4:22:CD:{text[-8:]}"]) == [f"D4:22:CD:{text[-8:]}"]
 
 
-def test_a_comma_after_the_seconds_separates_cells() -> None:
+def test_a_comma_after_the_seconds_separates_cells():
     assert with_seconds(["00:00:01,5,6"])[0].endswith(",5,6")
 
 
-def test_a_comma_before_fractions_that_separates_cells_is_refused(tmp_path: Path) -> None:
+def test_a_comma_before_fractions_that_separates_cells_is_refused(tmp_path):
     """As Python's logging writes times: all values would be read from the column to their left."""
     rows = [f"2024-05-01 12:00:0{k // 100},{10 * k % 1000:03d},0,0,0,0,0,9" for k in range(200)]
     path = write_lines(tmp_path / "own.csv", GENERIC.replace(";", ","), *rows)
@@ -131,13 +127,13 @@ def test_a_comma_before_fractions_that_separates_cells_is_refused(tmp_path: Path
     assert read_recording(path).rate == pytest.approx(100.0)
 
 
-def test_a_date_beside_the_time_leaves_the_unit_of_the_time(tmp_path: Path) -> None:
+def test_a_date_beside_the_time_leaves_the_unit_of_the_time(tmp_path):
     rows = [f"2024-05-01 12:00:00,{10 * k},0.1,0.2,0.3,1,2,9" for k in range(200)]
     path = write_lines(tmp_path / "own.csv", "date,t [ms],gx,gy,gz,ax,ay,az", *rows)
     assert read_recording(path).rate == pytest.approx(100.0)
 
 
-def test_times_in_whole_seconds_are_refused(tmp_path: Path) -> None:
+def test_times_in_whole_seconds_are_refused(tmp_path):
     path = written(tmp_path / "own.csv", GENERIC, "%H:%M:%S", NOON, 500)
     with pytest.raises(InputError, match="export them with fractions of a second"):
         check_units(read_recording(path))

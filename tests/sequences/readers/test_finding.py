@@ -1,9 +1,6 @@
 """Recordings found below a path: what is one, what is a list of them, and what is passed over."""
 
-from __future__ import annotations
-
 import os
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -19,20 +16,16 @@ needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DA
 
 
 @pytest.mark.parametrize("read", [read_recording, find_recordings])
-def test_a_pipe_is_refused_before_it_is_read(
-    read: Callable[[Path], object], tmp_path: Path
-) -> None:
+def test_a_pipe_is_refused_before_it_is_read(read, tmp_path):
     os.mkfifo(tmp_path / "walk.csv")  # nobody writes to it: opening it would wait forever
     with pytest.raises(ReadError, match="found a pipe or device, expected a recording"):
         read(tmp_path / "walk.csv")
 
 
-def test_folders_without_permission_are_passed_over(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_folders_without_permission_are_passed_over(tmp_path, monkeypatch):
     listed = Path.iterdir
 
-    def iterdir(folder: Path) -> Iterator[Path]:
+    def iterdir(folder):
         if folder.name == "private":
             raise PermissionError(13, "Permission denied")
         return listed(folder)
@@ -44,12 +37,12 @@ def test_folders_without_permission_are_passed_over(
 
 
 @needs_data
-def test_every_recording_is_found() -> None:
+def test_every_recording_is_found():
     assert sum(len(find_recordings(DATA / name)) for name in ("oxiod", "tumvi", "euroc")) == 18
     assert len(find_recordings(DATA / "archives")) == 1180
 
 
-def test_a_text_file_with_rows_of_numbers_is_not_a_list(tmp_path: Path) -> None:
+def test_a_text_file_with_rows_of_numbers_is_not_a_list(tmp_path):
     """Whatever its header and separator: each row would name a recording that does not exist."""
     path = tmp_path / "samples.txt"
     for mark in ",;\t ":
@@ -61,7 +54,7 @@ def test_a_text_file_with_rows_of_numbers_is_not_a_list(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("stem", ["walk_{}", "{}", "{}_1"])
-def test_recordings_named_by_letters_are_not_the_sensors_of_one(stem: str, tmp_path: Path) -> None:
+def test_recordings_named_by_letters_are_not_the_sensors_of_one(stem, tmp_path):
     """Letters a, b, g and m also name the accelerometer, magnetometer and gyroscope."""
     walk = simulate_imu(generate_walk(4, 14.0), rate=200.0, errors=PHONE_IMU)
     for number, letter in enumerate("abgm"):

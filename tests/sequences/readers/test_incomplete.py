@@ -1,9 +1,6 @@
 """Folders that lack a part of their recording: the error names the part and its fault."""
 
-from __future__ import annotations
-
 import os
-from pathlib import Path
 
 import numpy as np
 import published_formats as formats
@@ -12,17 +9,14 @@ from phone_files import save
 
 from stario.sequences import ReadError, find_recordings, read_recording
 from stario.sequences.datasets.convert import write_euroc
-from stario.sequences.sequence import ImuSequence
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     return formats.walk_of(100.0, 3.0)
 
 
-def test_an_euroc_folder_without_its_imu_is_no_recording_of_its_truth(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_an_euroc_folder_without_its_imu_is_no_recording_of_its_truth(walk, tmp_path):
     """Its truth has columns of gyroscope and accelerometer: their biases."""
     write_euroc(tmp_path / "V1", walk)
     (tmp_path / "V1/mav0/imu0/data.csv").unlink()
@@ -39,7 +33,7 @@ def test_an_euroc_folder_without_its_imu_is_no_recording_of_its_truth(
         read_recording(tmp_path / "V1")
 
 
-def test_an_empty_file_in_a_folder_is_named(tmp_path: Path) -> None:
+def test_an_empty_file_in_a_folder_is_named(tmp_path):
     (tmp_path / "dan/processed").mkdir(parents=True)
     (tmp_path / "dan/processed/data.csv").touch()
     with pytest.raises(
@@ -48,7 +42,7 @@ def test_an_empty_file_in_a_folder_is_named(tmp_path: Path) -> None:
         read_recording(tmp_path / "dan")
 
 
-def test_a_column_of_a_code_is_no_axis_of_a_sensor(walk: ImuSequence, tmp_path: Path) -> None:
+def test_a_column_of_a_code_is_no_axis_of_a_sensor(walk, tmp_path):
     """ADVIO's `imu-gyro.csv` holds time, a code and other values: not the gyroscope."""
     folder, code = tmp_path / "advio-01/iphone", np.full((len(walk), 1), 34.0)
     (tmp_path / "advio-01/ground-truth").mkdir(parents=True)
@@ -61,16 +55,14 @@ def test_a_column_of_a_code_is_no_axis_of_a_sensor(walk: ImuSequence, tmp_path: 
     assert "no rows with a time that grows" in str(error.value)
 
 
-def test_files_whose_rows_are_all_out_of_order_are_named(walk: ImuSequence, tmp_path: Path) -> None:
+def test_files_whose_rows_are_all_out_of_order_are_named(walk, tmp_path):
     for name, values in (("Gyroscope", walk.gyro), ("Accelerometer", walk.accel)):
         save(tmp_path / f"{name}.csv", "", walk.time[::-1], values)
     with pytest.raises(ReadError, match=r"found none, .*Gyroscope\.csv: no rows with"):
         read_recording(tmp_path)
 
 
-def test_a_sensor_file_without_permission_is_named(
-    walk: ImuSequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sensor_file_without_permission_is_named(walk, tmp_path, monkeypatch):
     save(tmp_path / "Accelerometer.csv", "", walk.time, walk.accel)
     gyro = tmp_path / "Gyroscope.csv"
     gyro.touch()  # whose content is as unknown as without permission, which the root user has
@@ -80,9 +72,7 @@ def test_a_sensor_file_without_permission_is_named(
         read_recording(tmp_path)
 
 
-def test_a_line_of_words_among_rows_is_named_with_the_remedy(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_a_line_of_words_among_rows_is_named_with_the_remedy(walk, tmp_path):
     imu, *_ = write_euroc(tmp_path / "V1", walk)
     lines = imu.read_text().splitlines()
     imu.write_text("\n".join([*lines[:9], "recording paused", *lines[9:]]))
@@ -90,9 +80,7 @@ def test_a_line_of_words_among_rows_is_named_with_the_remedy(
         read_recording(tmp_path / "V1")
 
 
-def test_poses_out_of_order_are_counted(
-    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_poses_out_of_order_are_counted(walk, tmp_path, caplog):
     _, truth = write_euroc(tmp_path / "V1", walk)
     header, *poses = truth.read_text().splitlines()
     truth.write_text(
@@ -104,9 +92,7 @@ def test_poses_out_of_order_are_counted(
     assert f"dropped 50 of {len(poses)} poses: their times do not increase" in caplog.text
 
 
-def test_poses_of_imunet_that_go_back_in_time_are_counted(
-    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_poses_of_imunet_that_go_back_in_time_are_counted(walk, tmp_path, caplog):
     path = formats.imunet_raw(tmp_path / "seq", walk).path
     header, *poses = (path / "pose.txt").read_text().splitlines()
     early = poses[3].split()[0]
@@ -117,9 +103,7 @@ def test_poses_of_imunet_that_go_back_in_time_are_counted(
     assert f"pose.txt: dropped 2 of {len(poses)} poses: their times do not" in caplog.text
 
 
-def test_an_euroc_file_whose_titles_are_in_another_order_is_not_read_by_position(
-    tmp_path: Path, walk: ImuSequence
-) -> None:
+def test_an_euroc_file_whose_titles_are_in_another_order_is_not_read_by_position(tmp_path, walk):
     imu, *_ = write_euroc(tmp_path / "V1", walk)
     header, *rows = imu.read_text().splitlines()
     titles = header.split(",")
@@ -135,9 +119,7 @@ def test_an_euroc_file_whose_titles_are_in_another_order_is_not_read_by_position
 @pytest.mark.parametrize(
     ("gyro", "accel"), [("Gyroscope", "WatchAccelerometer"), ("left_gyro_1", "right_accel_2")]
 )
-def test_sensors_of_different_devices_are_not_mixed(
-    walk: ImuSequence, tmp_path: Path, gyro: str, accel: str
-) -> None:
+def test_sensors_of_different_devices_are_not_mixed(walk, tmp_path, gyro, accel):
     save(tmp_path / "w" / f"{gyro}.csv", "time,x,y,z", walk.time, walk.gyro)
     save(tmp_path / "w" / f"{accel}.csv", "time,x,y,z", walk.time, walk.accel)
     message = rf"w: sensors: found files of different devices .*\({gyro}\.csv, {accel}\.csv\)"
@@ -146,9 +128,7 @@ def test_sensors_of_different_devices_are_not_mixed(
             read(tmp_path / "w")
 
 
-def test_sensors_whose_files_differ_in_a_number_are_of_one_recording(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_sensors_whose_files_differ_in_a_number_are_of_one_recording(walk, tmp_path):
     save(tmp_path / "w/left_gyro_1.csv", "time,x,y,z", walk.time, walk.gyro)
     save(tmp_path / "w/left_accel_2.csv", "time,x,y,z", walk.time, walk.accel)
     assert len(read_recording(tmp_path / "w")) == len(walk)

@@ -1,6 +1,6 @@
 """Tables whose times are in several columns, in a file of their own, or nowhere."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -44,16 +44,14 @@ def utc_without_a_date(walk: ImuSequence) -> tuple[list[str], list[tuple[int, ..
 
 
 @pytest.mark.parametrize("clock", [seconds_and_nanoseconds, utc_without_a_date])
-def test_times_in_several_columns_are_joined(
-    tmp_path: Path, walk: ImuSequence, clock: Callable[[ImuSequence], tuple[list[str], list]]
-) -> None:
+def test_times_in_several_columns_are_joined(tmp_path, walk, clock):
     titles, times = clock(walk)
     values = zip(times, walk.gyro.tolist(), walk.accel.tolist(), strict=True)
     path = table(tmp_path / "a.csv", [*titles, *SENSORS], [[*t, *g, *a] for t, g, a in values])
     check(read_recording(path), walk)
 
 
-def test_a_cut_row_is_named_by_its_line(tmp_path: Path, walk: ImuSequence) -> None:
+def test_a_cut_row_is_named_by_its_line(tmp_path, walk):
     titles, times = seconds_and_nanoseconds(walk)
     rows = [[*t, *g, *a] for t, g, a in zip(times, walk.gyro, walk.accel, strict=True)]
     rows[5] = rows[5][:4]
@@ -61,9 +59,7 @@ def test_a_cut_row_is_named_by_its_line(tmp_path: Path, walk: ImuSequence) -> No
         read_recording(table(tmp_path / "a.csv", [*titles, *SENSORS], rows))
 
 
-def test_messages_that_ros2_topic_echo_wrote_as_csv_are_read(
-    tmp_path: Path, walk: ImuSequence
-) -> None:
+def test_messages_that_ros2_topic_echo_wrote_as_csv_are_read(tmp_path, walk):
     covariance = [0.0] * 9
     rows = [
         [*parts(t), "imu_link", 0, 0, 0, 1, *covariance, *g, *covariance, *a, *covariance]
@@ -73,9 +69,7 @@ def test_messages_that_ros2_topic_echo_wrote_as_csv_are_read(
 
 
 @pytest.mark.parametrize("names", [("gyro-0", "accel-0", "time"), ("gyr", "acc", "timestamps")])
-def test_one_file_per_sensor_and_one_of_times_are_joined_by_row(
-    tmp_path: Path, walk: ImuSequence, names: Sequence[str]
-) -> None:
+def test_one_file_per_sensor_and_one_of_times_are_joined_by_row(tmp_path, walk, names):
     folder = tmp_path / "set" / "walk"
     folder.mkdir(parents=True)
     for name, values in zip(names, (walk.gyro, walk.accel, walk.time[:, None]), strict=True):
@@ -88,7 +82,7 @@ def test_one_file_per_sensor_and_one_of_times_are_joined_by_row(
         read_recording(folder)
 
 
-def test_a_table_without_times_is_read_at_the_rate_given(tmp_path: Path, walk: ImuSequence) -> None:
+def test_a_table_without_times_is_read_at_the_rate_given(tmp_path, walk):
     rows = np.column_stack([np.arange(len(walk)), walk.gyro, walk.accel]).tolist()
     path = table(tmp_path / "a.csv", ["count", *SENSORS], rows)
     check(read_recording(path, rate="200"), walk)

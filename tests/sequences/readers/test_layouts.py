@@ -136,12 +136,12 @@ def close(read: FloatArray, written: FloatArray) -> None:
 
 
 @pytest.mark.parametrize("names", NAMES)
-def test_a_table_is_read_back(names: str, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_a_table_is_read_back(names, tmp_path_factory):
     folder = tmp_path_factory.mktemp("tables")
 
-    @settings(max_examples=80, deadline=None)
+    @settings(max_examples=50, deadline=None)
     @given(texts(names))
-    def check(text: Text) -> None:
+    def check(text):
         path = text.write(folder / "own.csv")
         assert find_recordings(path) == [path]
         read = read_recording(path)

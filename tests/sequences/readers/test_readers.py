@@ -1,5 +1,4 @@
 import logging
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers import FORMATS, find_recordings, read_recording, write_csv
 from stario.sequences.readers.published.euroc import read_euroc
 from stario.sequences.readers.published.oxiod import read_oxiod
-from stario.sequences.sequence import BoolArray, ImuSequence, Trajectory
+from stario.sequences.sequence import BoolArray, ImuSequence
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
@@ -32,19 +31,14 @@ MOUNT_VB = Rotation.from_euler("zyx", [172.0, 3.0, -4.0], degrees=True)
 TILT_WW = Rotation.from_euler("xy", [0.5, -0.6], degrees=True)
 
 
-def true_track(sequence: ImuSequence) -> Trajectory:
-    assert sequence.truth is not None
-    return sequence.truth
-
-
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     style = WalkStyle(carry="handheld", preferred_speed=1.0)
     return simulate_imu(generate_walk(4, 40.0, style=style), rate=200.0, errors=PHONE_IMU)
 
 
 @pytest.fixture(scope="module")
-def phone_walk() -> ImuSequence:
+def phone_walk():
     return simulate_imu(generate_walk(4, 60.0, style=WalkStyle("rig")), 100.0, PERFECT_IMU)
 
 
@@ -54,7 +48,7 @@ def write_euroc(
     """Write EuRoC (with velocity) or TUM-VI; truth at 100 Hz without the first 2 s and last 3 s."""
     rows = formats.text(formats.stamps_ns(imu.time), imu.gyro, imu.accel)
     formats.save(folder / "mav0/imu0/data.csv", EUROC_IMU, rows)
-    truth = true_track(imu)
+    truth = imu.truth
     part = slice(400, -600, 2)
     quat_wxyz = truth.quat_xyzw[:, [3, 0, 1, 2]]
     table = np.hstack([truth.position_W, quat_wxyz])
@@ -71,7 +65,7 @@ def write_oxiod(
     folder: Path, imu: ImuSequence, lag_rows: int = 3, flip_row: int | None = None
 ) -> Path:
     """Write OxIOD files: Apple's signs, a mounted and lagging tracked body, a tilted world."""
-    truth = true_track(imu)
+    truth = imu.truth
     force = imu.accel / -9.81
     gravity = truth.attitude_WB.apply([0.0, 0.0, -1.0], inverse=True)
     angles = np.zeros((len(imu), 3))
@@ -94,10 +88,10 @@ def write_oxiod(
 
 
 @pytest.mark.parametrize("velocity", [True, False], ids=["euroc", "tumvi"])
-def test_euroc_and_tumvi_are_read_back(tmp_path: Path, walk: ImuSequence, velocity: bool) -> None:
+def test_euroc_and_tumvi_are_read_back(tmp_path, walk, velocity):
     write_euroc(tmp_path / "room", walk, velocity)
     read = read_recording(tmp_path / "room")
-    truth, given = true_track(read), true_track(walk)
+    truth, given = read.truth, walk.truth
     assert read.name == "room"
     assert np.abs(read.time - walk.time).max() < 2e-9
     assert np.abs(read.gyro - walk.gyro).max() < 1e-10
@@ -111,7 +105,7 @@ def test_euroc_and_tumvi_are_read_back(tmp_path: Path, walk: ImuSequence, veloci
         assert np.abs(truth.velocity_W - given.velocity_W[400:-600:2]).max() < 1e-6
 
 
-def test_euroc_is_found_by_folder_mav0_and_file(tmp_path: Path, walk: ImuSequence) -> None:
+def test_euroc_is_found_by_folder_mav0_and_file(tmp_path, walk):
     write_euroc(tmp_path / "room", walk, velocity=False)
     for inner in ("", "mav0", "mav0/imu0/data.csv"):
         read = read_recording(tmp_path / "room" / inner)
@@ -119,11 +113,11 @@ def test_euroc_is_found_by_folder_mav0_and_file(tmp_path: Path, walk: ImuSequenc
         assert read.truth is not None
 
 
-def test_a_gap_in_the_truth_stays_a_gap(tmp_path: Path, walk: ImuSequence) -> None:
+def test_a_gap_in_the_truth_stays_a_gap(tmp_path, walk):
     keep = np.ones(len(walk.time[400:-600:2]), dtype=np.bool_)
     keep[1000:1500] = False
     write_euroc(tmp_path, walk, velocity=False, keep=keep)
-    pose = true_track(read_euroc(tmp_path)).at(walk.time)
+    pose = read_euroc(tmp_path).truth.at(walk.time)
     lost = (walk.time > 11.991) & (walk.time < 16.999)
     outside = (walk.time < 1.999) | (walk.time > walk.time[-600] + 0.01)
     assert not pose.valid[lost].any()
@@ -131,32 +125,15 @@ def test_a_gap_in_the_truth_stays_a_gap(tmp_path: Path, walk: ImuSequence) -> No
     assert pose.valid[~lost & (walk.time > 2.001) & (walk.time < walk.time[-604])].all()
 
 
-def test_truth_that_is_not_the_imus_pose_is_ignored(tmp_path: Path, walk: ImuSequence) -> None:
+def test_truth_that_is_not_the_imus_pose_is_ignored(tmp_path, walk):
     write_euroc(tmp_path, walk, velocity=False)
     (tmp_path / "mav0/mocap0").rename(tmp_path / "mav0/vicon0")
     assert read_euroc(tmp_path).truth is None
 
 
-def test_a_sample_that_is_not_a_number_is_kept_for_the_health_report(
-    tmp_path: Path, walk: ImuSequence
-) -> None:
-    write_euroc(tmp_path, walk, velocity=False)
-    imu = tmp_path / "mav0/imu0/data.csv"
-    lines = imu.read_text().splitlines()
-    lines[11] = lines[11].split(",")[0] + ",nan,nan,nan,,,"
-    imu.write_text("\n".join(lines))
-    read = read_euroc(tmp_path)
-    assert len(read) == len(walk)
-    assert np.isnan(read.gyro[10]).all()
-    assert np.isnan(read.accel[10]).all()
-    assert np.isfinite(read.gyro[11:]).all()
-
-
-def test_oxiod_returns_the_imus_pose_in_a_level_world(
-    tmp_path: Path, phone_walk: ImuSequence
-) -> None:
+def test_oxiod_returns_the_imus_pose_in_a_level_world(tmp_path, phone_walk):
     read = read_recording(write_oxiod(tmp_path / "handheld/data9", phone_walk))
-    truth = true_track(read)
+    truth = read.truth
     assert read.name == "handheld-data9-imu1"
     assert np.abs(read.time - phone_walk.time).max() < 1e-9
     assert np.abs(read.gyro - phone_walk.gyro).max() < 1e-9
@@ -168,13 +145,13 @@ def test_oxiod_returns_the_imus_pose_in_a_level_world(
     assert truth.valid.mean() > 0.97
 
 
-def test_oxiod_flip_of_the_tracked_body_is_undone(tmp_path: Path, phone_walk: ImuSequence) -> None:
-    truth = true_track(read_oxiod(write_oxiod(tmp_path, phone_walk, flip_row=3000)))
+def test_oxiod_flip_of_the_tracked_body_is_undone(tmp_path, phone_walk):
+    truth = read_oxiod(write_oxiod(tmp_path, phone_walk, flip_row=3000)).truth
     assert truth.valid[3100:-20].mean() > 0.95
     assert_same_poses(truth, phone_walk, 2.0, 0.1)
 
 
-def test_oxiod_without_a_capture_file_has_no_truth(tmp_path: Path, phone_walk: ImuSequence) -> None:
+def test_oxiod_without_a_capture_file_has_no_truth(tmp_path, phone_walk):
     imu = write_oxiod(tmp_path, phone_walk)
     (tmp_path / "syn/vi1.csv").unlink()
     assert read_recording(imu).truth is None
@@ -182,19 +159,17 @@ def test_oxiod_without_a_capture_file_has_no_truth(tmp_path: Path, phone_walk: I
     assert read_recording(renamed).truth is None  # a file is not taken as its own truth
 
 
-def test_oxiod_gaps_in_the_imu_do_not_affect_the_truth(
-    tmp_path: Path, phone_walk: ImuSequence
-) -> None:
+def test_oxiod_gaps_in_the_imu_do_not_affect_the_truth(tmp_path, phone_walk):
     imu = write_oxiod(tmp_path, phone_walk)
     lines = imu.read_text().splitlines()
     lines[2000] = ",".join(["1.4955e+11", *["nan"] * 15])
     imu.write_text("\n".join(lines))
     read = read_oxiod(imu)
     assert np.isnan(read.gyro[2000]).all()
-    assert_same_poses(true_track(read), phone_walk, 2.0, 0.1)
+    assert_same_poses(read.truth, phone_walk, 2.0, 0.1)
 
 
-def test_oxiod_poses_next_to_missing_ones_are_used(tmp_path: Path, phone_walk: ImuSequence) -> None:
+def test_oxiod_poses_next_to_missing_ones_are_used(tmp_path, phone_walk):
     imu = write_oxiod(tmp_path, phone_walk)
     vicon = tmp_path / "syn/vi1.csv"
     rows = [line.split(",") for line in vicon.read_text().splitlines()]
@@ -202,14 +177,12 @@ def test_oxiod_poses_next_to_missing_ones_are_used(tmp_path: Path, phone_walk: I
         row[-7:] = ["nan"] * 7
     vicon.write_text("\n".join(",".join(row) for row in rows))
     read = read_oxiod(imu)
-    assert true_track(read).covers(read.time[50:-50]).mean() > 0.97
-    assert_same_poses(true_track(read), phone_walk, 2.0, 0.1)
+    assert read.truth.covers(read.time[50:-50]).mean() > 0.97
+    assert_same_poses(read.truth, phone_walk, 2.0, 0.1)
 
 
 @pytest.mark.parametrize("rows", [1, 20, 500])
-def test_oxiod_too_short_to_determine_the_mount_has_no_truth(
-    tmp_path: Path, phone_walk: ImuSequence, rows: int, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_oxiod_too_short_to_determine_the_mount_has_no_truth(tmp_path, phone_walk, rows, caplog):
     imu = write_oxiod(tmp_path, phone_walk)
     for path in (imu, tmp_path / "syn/vi1.csv"):
         path.write_text("\n".join(path.read_text().splitlines()[:rows]))
@@ -220,9 +193,7 @@ def test_oxiod_too_short_to_determine_the_mount_has_no_truth(
     assert "to find the mount" in caplog.text
 
 
-def test_oxiod_requires_as_many_truth_rows_as_imu_rows(
-    tmp_path: Path, phone_walk: ImuSequence
-) -> None:
+def test_oxiod_requires_as_many_truth_rows_as_imu_rows(tmp_path, phone_walk):
     imu = write_oxiod(tmp_path, phone_walk)
     vicon = tmp_path / "syn/vi1.csv"
     vicon.write_text("\n".join(vicon.read_text().splitlines()[:-100]))
@@ -243,12 +214,7 @@ def test_oxiod_requires_as_many_truth_rows_as_imu_rows(
     ],
     ids=["truncated", "missing column", "not a number", "no time", "nan time", "header", "empty"],
 )
-def test_malformed_files_are_named_in_one_line(
-    tmp_path: Path,
-    walk: ImuSequence,
-    corrupt: Callable[[list[str]], list[str]],
-    message: str,
-) -> None:
+def test_malformed_files_are_named_in_one_line(tmp_path, walk, corrupt, message):
     write_euroc(tmp_path, walk, velocity=False)
     imu = tmp_path / "mav0/imu0/data.csv"
     imu.write_text("\n".join(corrupt(imu.read_text().splitlines())))
@@ -259,9 +225,7 @@ def test_malformed_files_are_named_in_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_formats_are_recognised_by_content(
-    tmp_path: Path, walk: ImuSequence, phone_walk: ImuSequence
-) -> None:
+def test_formats_are_recognised_by_content(tmp_path, walk, phone_walk):
     write_csv(tmp_path / "imu7.csv", walk.without_truth())  # named like OxIOD's
     assert np.array_equal(read_recording(tmp_path / "imu7.csv").gyro, walk.gyro)
     oxiod = write_oxiod(tmp_path, phone_walk).rename(tmp_path / "mine.csv")
@@ -270,7 +234,7 @@ def test_formats_are_recognised_by_content(
         read_recording(oxiod, format="csv")
 
 
-def test_unknown_content_is_shown_with_the_known_formats(tmp_path: Path) -> None:
+def test_unknown_content_is_shown_with_the_known_formats(tmp_path):
     path = tmp_path / "imu.csv"
     for text, seen in (
         ("0.0,1,2,3,4,5,6\n", "0.0,1,2,3,4,5,6"),
@@ -293,9 +257,7 @@ def test_unknown_content_is_shown_with_the_known_formats(tmp_path: Path) -> None
         read_recording(path, format="bags")
 
 
-def test_find_recordings_searches_folders_in_order(
-    tmp_path: Path, walk: ImuSequence, phone_walk: ImuSequence
-) -> None:
+def test_find_recordings_searches_folders_in_order(tmp_path, walk, phone_walk):
     imu = write_oxiod(tmp_path / "b/data1", phone_walk)
     raw = tmp_path / "b/data1/raw"
     raw.mkdir()
@@ -323,10 +285,10 @@ RECORDED = [
 
 @needs_data
 @pytest.mark.parametrize(("name", "least", "tilt_deg"), RECORDED)
-def test_recorded_truth_agrees_with_the_sensors(name: str, least: float, tilt_deg: float) -> None:
+def test_recorded_truth_agrees_with_the_sensors(name, least, tilt_deg):
     """The gyroscope is the derivative of the attitude; the mean force is gravity, pointing up."""
     sequence = read_recording(DATA / name)
-    truth = true_track(sequence)
+    truth = sequence.truth
     inside = (sequence.time >= truth.time[0]) & (sequence.time <= truth.time[-1])
     pose = truth.at(sequence.time[inside])
     stride = round(0.04 * sequence.rate)

@@ -1,7 +1,5 @@
 """Tracks in TUM format are read back as written; a bad line is named."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
+from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulation.body import PLACES, carried_on, places_on, virtual_imu
 from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.simulation.motion_capture import BodyMotion, body_clips, read_body
@@ -57,8 +57,8 @@ def write_hdf5(path: Path, motion: BodyMotion) -> None:
 
 def strapdown_error(sequence: object) -> float:
     """Largest difference between truth and what integration of perfect samples gives [m]."""
-    truth, t = sequence.truth, sequence.time  # type: ignore[attr-defined]
-    force_W = truth.attitude_WB.apply(sequence.accel)  # type: ignore[attr-defined]
+    truth, t = sequence.truth, sequence.time
+    force_W = truth.attitude_WB.apply(sequence.accel)
     acceleration = force_W - [0.0, 0.0, STANDARD_GRAVITY]
     steps = np.diff(t)[:, None]
     velocity = truth.velocity_W[0] + np.cumsum(
@@ -71,7 +71,7 @@ def strapdown_error(sequence: object) -> float:
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_samples_and_truth_of_every_place_agree(place: str) -> None:
+def test_samples_and_truth_of_every_place_agree(place):
     device = virtual_imu(walker(), place, 200.0, PERFECT_IMU, seed=3)
 
     assert strapdown_error(device) < 2e-3
@@ -80,7 +80,7 @@ def test_samples_and_truth_of_every_place_agree(place: str) -> None:
     assert device.attributes == {"licence": "none needed", "carry": place}
 
 
-def test_heading_of_the_person_turns_the_track_and_changes_no_sample() -> None:
+def test_heading_of_the_person_turns_the_track_and_changes_no_sample():
     ahead = virtual_imu(walker(), "front-pocket", errors=PERFECT_IMU, seed=1)
     left = virtual_imu(walker(yaw=np.pi / 2), "front-pocket", errors=PERFECT_IMU, seed=1)
 
@@ -91,7 +91,7 @@ def test_heading_of_the_person_turns_the_track_and_changes_no_sample() -> None:
     )
 
 
-def test_a_pocket_is_ahead_of_the_thigh_and_the_ear_beside_the_head() -> None:
+def test_a_pocket_is_ahead_of_the_thigh_and_the_ear_beside_the_head():
     motion = walker(speed=0.0)
     thigh = motion.position_W["l_thigh"].mean(axis=0)
     pockets = [carried_on(motion, "front-pocket", k).position_W.mean(axis=0) for k in range(6)]
@@ -101,10 +101,10 @@ def test_a_pocket_is_ahead_of_the_thigh_and_the_ear_beside_the_head() -> None:
     assert {round(float(p[1]), 1) for p in ears} == {-0.1, 0.1}  # either side
 
 
-def test_landing_feet_shake_a_pocket_more_than_a_hand() -> None:
-    def high(place: str) -> float:
+def test_landing_feet_shake_a_pocket_more_than_a_hand():
+    def high(place):
         device = virtual_imu(walker(), place, 100.0, PERFECT_IMU, seed=5)
-        force: FloatArray = np.linalg.norm(device.accel, axis=1)
+        force = np.linalg.norm(device.accel, axis=1)
         spectrum = np.abs(np.fft.rfft((force - force.mean()) * np.hanning(len(force)))) ** 2
         f = np.fft.rfftfreq(len(force), 0.01)
         return float(np.sqrt(8.0 / 3.0 * 2.0 * spectrum[(f > 9) & (f < 20)].sum()) / len(force))
@@ -112,14 +112,14 @@ def test_landing_feet_shake_a_pocket_more_than_a_hand() -> None:
     assert high("front-pocket") > 2.0 * high("in-front") > 0.0
 
 
-def test_seed_decides_everything() -> None:
+def test_seed_decides_everything():
     one, same, other = (virtual_imu(walker(), "bag", seed=k) for k in (1, 1, 2))
 
     assert np.array_equal(one.accel, same.accel)
     assert not np.allclose(one.accel, other.accel, atol=0.1)
 
 
-def test_hdf5_clip_is_read(tmp_path: Path) -> None:
+def test_hdf5_clip_is_read(tmp_path):
     motion = walker(yaw=0.3)
     write_hdf5(tmp_path / "body.h5", motion)
 
@@ -180,7 +180,7 @@ def write_bvh(path: Path, scale: float = 1.0) -> None:
     path.write_text(text.replace("-42", f"{-42 * scale:g}"))
 
 
-def test_bvh_is_brought_to_metres_with_z_up(tmp_path: Path) -> None:
+def test_bvh_is_brought_to_metres_with_z_up(tmp_path):
     write_bvh(tmp_path / "walk.bvh")
     motion = read_body(tmp_path / "walk.bvh")
 
@@ -196,13 +196,13 @@ def test_bvh_is_brought_to_metres_with_z_up(tmp_path: Path) -> None:
     assert set(places_on(motion)) == {"front-pocket", "back-pocket", "belt", "ear", "head", "foot"}
 
 
-def test_bvh_of_no_known_unit_is_refused(tmp_path: Path) -> None:
+def test_bvh_of_no_known_unit_is_refused(tmp_path):
     write_bvh(tmp_path / "giant.bvh", scale=5.0)
     with pytest.raises(ReadError, match="legs 420 long"):
         read_body(tmp_path / "giant.bvh")
 
 
-def test_damaged_bvh_is_refused(tmp_path: Path) -> None:
+def test_damaged_bvh_is_refused(tmp_path):
     write_bvh(tmp_path / "walk.bvh")
     text = (tmp_path / "walk.bvh").read_text()
     (tmp_path / "cut.bvh").write_text(text[:-40])
@@ -210,7 +210,7 @@ def test_damaged_bvh_is_refused(tmp_path: Path) -> None:
         read_body(tmp_path / "cut.bvh")
 
 
-def test_a_place_without_its_joint_is_refused() -> None:
+def test_a_place_without_its_joint_is_refused():
     motion = walker()
     del motion.position_W["head"]
     with pytest.raises(InputError, match="has no head"):

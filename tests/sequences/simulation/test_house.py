@@ -1,7 +1,5 @@
 """Simulated walks through a house: floors, pressure and satellites."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -11,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.atmosphere import standard_pressure
 from stario.sequences.errors import InputError
 from stario.sequences.geodesy import east_north
-from stario.sequences.sequence import BoolArray, FloatArray, Trajectory
+from stario.sequences.sequence import FloatArray, Trajectory
 from stario.sequences.simulation.barometer import Air, simulate_barometer
-from stario.sequences.simulation.house import SHORTEST, HouseWalk, simulate_house
+from stario.sequences.simulation.house import SHORTEST, simulate_house
 from stario.sequences.simulation.receiver import Sky, simulate_satellites
 from stario.sequences.simulation.walks import WalkStyle
 
@@ -22,7 +20,7 @@ STILL_AIR = Air(weather=0.0, door=0.0, noise=0.0)
 
 
 @pytest.fixture(scope="module")
-def walk() -> HouseWalk:
+def walk():
     return simulate_house(2, 120.0, rate=50.0)
 
 
@@ -35,9 +33,8 @@ def height(pressure_hPa: FloatArray) -> FloatArray:
     return METRES_PER_HPA * (pressure_hPa[0] - pressure_hPa)
 
 
-def test_each_stay_is_on_the_level_of_its_floor(walk: HouseWalk) -> None:
+def test_each_stay_is_on_the_level_of_its_floor(walk):
     truth = walk.sequence.truth
-    assert truth is not None
     assert len({stay.floor for stay in walk.stays}) > 1
     ground = truth.slice(0.0, walk.stays[0].stop).position_W[:, 2].mean()
     for stay in walk.stays:
@@ -46,26 +43,24 @@ def test_each_stay_is_on_the_level_of_its_floor(walk: HouseWalk) -> None:
         assert level.std() < 0.05
 
 
-def test_the_shortest_walk_changes_floors() -> None:
+def test_the_shortest_walk_changes_floors():
     for seed in range(5):
         stays = simulate_house(seed, SHORTEST, rate=20.0).stays
         assert any(one.floor != stays[0].floor for one in stays)
         assert stays[-1].stop == SHORTEST
 
 
-def test_waypoints_name_the_floor_at_both_ends_of_a_stay(walk: HouseWalk) -> None:
+def test_waypoints_name_the_floor_at_both_ends_of_a_stay(walk):
     known = walk.sequence.positions
-    assert known is not None
     np.testing.assert_array_equal(known.floor, np.repeat([s.floor for s in walk.stays[1:]], 2))
     np.testing.assert_allclose(known.time, [t for s in walk.stays[1:] for t in (s.start, s.stop)])
 
 
 @pytest.mark.parametrize("way", ["stairs", "lift"])
-def test_stairs_are_climbed_step_by_step_and_a_lift_stands(way: str) -> None:
+def test_stairs_are_climbed_step_by_step_and_a_lift_stands(way):
     """On stairs the trunk bounces at every step; in a lift the accelerometer shows its start."""
     walk = next(w for k in range(9) if (w := simulate_house(k, 120.0, 50.0)).stays[2].way == way)
     sequence, ride = walk.sequence, slice(walk.stays[1].stop + 7.0, walk.stays[2].start - 4.0)
-    assert sequence.truth is not None
     inside = sequence.truth.slice(ride.start, ride.stop)
     climb = abs(np.polyfit(inside.time, inside.position_W[:, 2], 1)[0])
     force = np.linalg.norm(sequence.slice(ride.start, ride.stop).accel, axis=1)
@@ -73,16 +68,15 @@ def test_stairs_are_climbed_step_by_step_and_a_lift_stands(way: str) -> None:
     assert (force.std() > 0.5) == (way == "stairs")
 
 
-def test_pressure_falls_with_height_as_in_the_standard_atmosphere(walk: HouseWalk) -> None:
+def test_pressure_falls_with_height_as_in_the_standard_atmosphere(walk):
     truth = walk.sequence.truth
-    assert truth is not None
     found = simulate_barometer(truth, replace(STILL_AIR, altitude=110.0), np.array([30.0]))
     true = truth.at(found.time).position_W[:, 2]
     np.testing.assert_allclose(height(found.pressure_hPa), true - true[0], atol=0.2)
     np.testing.assert_allclose(standard_pressure(np.array([0.0, 1000.0])), [1013.25, 898.75], 1e-4)
 
 
-def test_weather_doors_and_noise_have_the_stated_sizes() -> None:
+def test_weather_doors_and_noise_have_the_stated_sizes():
     trajectory = standing(6000.0)
     air = Air(weather=0.02, door=0.0, noise=0.0)
     wandered = height(simulate_barometer(trajectory, air).pressure_hPa)[:: 60 * 8]
@@ -95,7 +89,7 @@ def test_weather_doors_and_noise_have_the_stated_sizes() -> None:
     assert noisy.std() == pytest.approx(0.1, rel=0.1)
 
 
-def test_errors_of_satellites_last_and_are_larger_between_houses() -> None:
+def test_errors_of_satellites_last_and_are_larger_between_houses():
     trajectory = standing(20_000.0)
     sky = Sky(sigma=2.5, street=3.0, lasting=30.0)
     between = trajectory.time > 10_000.0
@@ -109,24 +103,19 @@ def test_errors_of_satellites_last_and_are_larger_between_houses() -> None:
         assert kept == pytest.approx(share, abs=0.15)
 
 
-def test_a_receiver_indoors_repeats_its_last_position(walk: HouseWalk) -> None:
+def test_a_receiver_indoors_repeats_its_last_position(walk):
     found, entered = walk.sequence.satellites, walk.stays[0].stop
-    assert found is not None
-    indoors: BoolArray = found.time > entered
+    indoors = found.time > entered
     assert 30 < indoors.sum() < len(found) - 20
     assert (found.latlon_deg[indoors] == found.latlon_deg[~indoors][-1]).all()
-    assert found.radius_m is not None
     assert (found.radius_m[indoors] == 9.0).all()
     assert (np.diff(found.latlon_deg[~indoors], axis=0) != 0.0).all()
 
 
-def test_doppler_velocity_and_positions_agree_on_where_north_is(walk: HouseWalk) -> None:
+def test_doppler_velocity_and_positions_agree_on_where_north_is(walk):
     truth, entered = walk.sequence.truth, walk.stays[0].stop
-    assert truth is not None
     sky = Sky(azimuth=2.0, sigma=0.0)
     found = simulate_satellites(truth, sky).slice(1.0, entered - 1.0)
-    assert found is not None
-    assert found.speed_m_s is not None
     assert found.bearing_deg is not None
     bearing = np.radians(found.bearing_deg)
     velocity = found.speed_m_s[:, None] * np.stack([np.sin(bearing), np.cos(bearing)], axis=1)
@@ -138,17 +127,17 @@ def test_doppler_velocity_and_positions_agree_on_where_north_is(walk: HouseWalk)
     np.testing.assert_allclose(place, sky.east_north(true - true[0])[:, :2], atol=0.02)
 
 
-def test_other_air_changes_no_other_sensor(walk: HouseWalk) -> None:
+def test_other_air_changes_no_other_sensor(walk):
     other = simulate_house(2, 120.0, rate=50.0, air=STILL_AIR)
     np.testing.assert_array_equal(other.sequence.accel, walk.sequence.accel)
     assert other.stays == walk.stays
 
 
-def test_a_walk_too_short_for_a_house_is_refused() -> None:
+def test_a_walk_too_short_for_a_house_is_refused():
     with pytest.raises(InputError, match="duration: found 30 s, expected at least 120 s"):
         simulate_house(0, 30.0)
 
 
-def test_a_trolley_takes_no_stairs() -> None:
+def test_a_trolley_takes_no_stairs():
     with pytest.raises(InputError, match="trolley"):
         simulate_house(0, style=WalkStyle(carry="trolley"))

@@ -1,7 +1,5 @@
 """Simulated sensors: IMU and magnetometer."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -40,43 +38,14 @@ def standing(duration: float, rate: float = 1.0) -> Trajectory:
     return Trajectory(t, np.zeros((len(t), 3)), Rotation.identity(len(t)))
 
 
-def strapdown(imu: ImuSequence) -> tuple[FloatArray, Rotation]:
-    """Pose at every fourth sample from the first true pose and the samples, by Simpson's rule."""
-    truth = imu.truth
-    h = 2.0 / imu.rate
-    w0, w1, w2 = imu.gyro[:-2:2], imu.gyro[1:-1:2], imu.gyro[2::2]
-    # Magnus expansion of fourth order: Simpson's mean and the first coning term.
-    turns = Rotation.from_rotvec(h / 6.0 * (w0 + 4.0 * w1 + w2) + h**2 / 12.0 * np.cross(w0, w2))
-    attitudes = [truth.attitude_WB[0]]
-    for turn in turns:
-        attitudes.append(attitudes[-1] * turn)
-    R_WB = Rotation.concatenate(attitudes)
-    a = R_WB.apply(np.array(imu.accel[::2])) - UP
-    a0, a1, a2, h = a[:-2:2], a[1:-1:2], a[2::2], 2.0 * h
-    origin = np.zeros((1, 3))
-    gained = np.cumsum(h / 6.0 * (a0 + 4.0 * a1 + a2), axis=0)
-    velocity = truth.velocity_W[0] + np.concatenate([origin, gained])
-    # The double integral of the parabola through a0, a1, a2: their weights are 1/6, 1/3 and 0.
-    moved = np.cumsum(h * velocity[:-1] + h**2 / 6.0 * (a0 + 2.0 * a1), axis=0)
-    return truth.position_W[0] + np.concatenate([origin, moved]), R_WB[::2]
-
-
-def test_strapdown_of_a_perfect_imu_returns_the_trajectory() -> None:
-    imu = simulate_imu(waving(), rate=400.0, errors=PERFECT_IMU)
-    position, R_WB = strapdown(imu)
-    off = (R_WB.inv() * imu.truth.attitude_WB[::4]).magnitude()
-    assert off.max() < 1e-7
-    assert np.abs(position - imu.truth.position_W[::4]).max() < 1e-5
-
-
-def test_truth_passes_through_the_given_poses() -> None:
+def test_truth_passes_through_the_given_poses():
     given = waving()
     truth = simulate_imu(given, rate=200.0, errors=PERFECT_IMU).truth
     assert np.abs(truth.position_W[::2] - given.position_W).max() < 1e-9
     assert (truth.attitude_WB[::2].inv() * given.attitude_WB).magnitude().max() < 1e-7
 
 
-def test_velocity_gyro_and_accel_are_the_derivatives_of_truth() -> None:
+def test_velocity_gyro_and_accel_are_the_derivatives_of_truth():
     imu = simulate_imu(waving(), rate=2000.0, errors=PERFECT_IMU)
     truth, h = imu.truth, 1.0 / 2000.0
     p = truth.position_W
@@ -89,7 +58,7 @@ def test_velocity_gyro_and_accel_are_the_derivatives_of_truth() -> None:
     assert np.abs(turned - imu.gyro[1:-1]).max() < 1e-5
 
 
-def test_gyro_and_accel_of_a_known_motion() -> None:
+def test_gyro_and_accel_of_a_known_motion():
     """A turntable: rate along z, centripetal acceleration inward, gravity's reaction upward."""
     t = np.arange(1001) / 100.0
     rate, radius = 1.5, 0.5
@@ -103,14 +72,14 @@ def test_gyro_and_accel_of_a_known_motion() -> None:
 
 
 @pytest.mark.parametrize("rate", [50.0, 400.0])
-def test_white_noise_has_its_density_at_any_rate(rate: float) -> None:
+def test_white_noise_has_its_density_at_any_rate(rate):
     errors = ImuErrors(noise=ImuNoise(2e-3, 3e-2, 0.0, 0.0))
     imu = simulate_imu(standing(200.0), rate=rate, errors=errors, seed=3)
     assert np.allclose(imu.gyro.std(axis=0), 2e-3 * math.sqrt(rate), rtol=0.04)
     assert np.allclose((imu.accel - UP).std(axis=0), 3e-2 * math.sqrt(rate), rtol=0.04)
 
 
-def test_bias_walk_grows_with_the_square_root_of_time() -> None:
+def test_bias_walk_grows_with_the_square_root_of_time():
     errors = ImuErrors(noise=ImuNoise(0.0, 0.0, 1e-3, 2e-2))
     for lag in (1.0, 10.0):
         gyro, accel = [], []
@@ -123,7 +92,7 @@ def test_bias_walk_grows_with_the_square_root_of_time() -> None:
         assert np.concatenate(accel).std() == pytest.approx(2e-2 * math.sqrt(lag), rel=0.1)
 
 
-def test_turn_on_bias_scale_and_misalignment_have_their_deviations() -> None:
+def test_turn_on_bias_scale_and_misalignment_have_their_deviations():
     errors = ImuErrors(
         noise=PERFECT_IMU.noise, gyro_turn_on=0.01, accel_turn_on=0.1, accel_scale=0.02
     )
@@ -138,7 +107,7 @@ def test_turn_on_bias_scale_and_misalignment_have_their_deviations() -> None:
     assert np.allclose(np.linalg.norm(rows, axis=1), STANDARD_GRAVITY)
 
 
-def test_saturation_clips_the_samples() -> None:
+def test_saturation_clips_the_samples():
     free = simulate_imu(waving(), errors=PERFECT_IMU)
     errors = ImuErrors(noise=PERFECT_IMU.noise, gyro_range=1.0, accel_range=9.0)
     clipped = simulate_imu(waving(), errors=errors)
@@ -147,14 +116,14 @@ def test_saturation_clips_the_samples() -> None:
     assert np.array_equal(clipped.accel, np.clip(free.accel, -9.0, 9.0))
 
 
-def test_a_seed_reproduces_and_another_differs() -> None:
+def test_a_seed_reproduces_and_another_differs():
     first, again, other = (simulate_imu(waving(), seed=seed) for seed in (5, 5, 6))
     assert np.array_equal(first.gyro, again.gyro)
     assert np.array_equal(first.accel, again.accel)
     assert not np.array_equal(first.gyro, other.gyro)
 
 
-def test_presets_are_ordered_by_their_errors() -> None:
+def test_presets_are_ordered_by_their_errors():
     true = simulate_imu(waving(), errors=PERFECT_IMU)
     off = [np.abs(simulate_imu(waving(), errors=e).gyro - true.gyro).mean() for e in (
         GOOD_IMU, PHONE_IMU)]  # fmt: skip
@@ -162,14 +131,14 @@ def test_presets_are_ordered_by_their_errors() -> None:
 
 
 @pytest.mark.parametrize("rate", [50.0, 200.0, 333.0])
-def test_samples_cover_the_track_at_the_given_rate(rate: float) -> None:
+def test_samples_cover_the_track_at_the_given_rate(rate):
     imu = simulate_imu(waving(duration=7.0), rate=rate)
     assert imu.rate == pytest.approx(rate)
     assert imu.time[0] == 0.0
     assert 7.0 - 1.0 / rate < imu.time[-1] <= 7.0
 
 
-def test_short_gaps_are_bridged_and_long_ones_refused() -> None:
+def test_short_gaps_are_bridged_and_long_ones_refused():
     track = waving()
     valid = np.ones(len(track), dtype=bool)
     valid[500:505] = False
@@ -183,7 +152,7 @@ def test_short_gaps_are_bridged_and_long_ones_refused() -> None:
         simulate_imu(Trajectory(track.time, bad, track.attitude_WB, valid=valid))
 
 
-def test_missing_poses_are_a_gap_like_invalid_ones() -> None:
+def test_missing_poses_are_a_gap_like_invalid_ones():
     """A spline across 5 s without poses is neither a walk nor ground truth."""
     track = waving()
     kept = (track.time < 10.0) | (track.time > 15.0)
@@ -192,7 +161,7 @@ def test_missing_poses_are_a_gap_like_invalid_ones() -> None:
         simulate_imu(gappy)
 
 
-def test_tracks_and_parameters_that_cannot_be_simulated_are_refused() -> None:
+def test_tracks_and_parameters_that_cannot_be_simulated_are_refused():
     with pytest.raises(InputError, match="at least 6"):
         simulate_imu(standing(4.0))
     with pytest.raises(InputError, match="rate"):
@@ -205,7 +174,7 @@ def test_tracks_and_parameters_that_cannot_be_simulated_are_refused() -> None:
         ImuErrors(accel_range=0.0)
 
 
-def test_the_last_pose_is_measured_despite_rounding() -> None:
+def test_the_last_pose_is_measured_despite_rounding():
     """In floating point, 0.29 s at 100 Hz are 28.999999999999996 steps."""
     track = waving(duration=0.29)
     assert len(simulate_imu(track, 100.0, PERFECT_IMU)) == len(track) == 30
@@ -215,7 +184,7 @@ QUIET = MagneticField(noise=0.0)
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     return simulate_imu(generate_walk(3, 30.0), 100.0, seed=1)
 
 
@@ -225,7 +194,7 @@ def in_world(walk: ImuSequence, magnetic_field: MagneticField) -> FloatArray:
     return np.asarray(at.attitude_WB.apply(seen.field))
 
 
-def test_the_earths_field_is_constant_in_the_world(walk: ImuSequence) -> None:
+def test_the_earths_field_is_constant_in_the_world(walk):
     field_W = in_world(walk, replace(QUIET, azimuth=0.7))
     np.testing.assert_allclose(np.linalg.norm(field_W, axis=1), 48.0)
     np.testing.assert_allclose(np.ptp(field_W, axis=0), 0.0, atol=1e-9)
@@ -233,7 +202,7 @@ def test_the_earths_field_is_constant_in_the_world(walk: ImuSequence) -> None:
     assert field_W[0, 2] == pytest.approx(-48.0 * math.sin(QUIET.dip))
 
 
-def test_a_buildings_field_has_its_strength_and_depends_on_position_only(walk: ImuSequence) -> None:
+def test_a_buildings_field_has_its_strength_and_depends_on_position_only(walk):
     building = replace(QUIET, strength=0.0, disturbance=8.0, length=2.0, rate=100.0)
     time = np.arange(0.0, 400.0, 0.01)
     path = np.stack([0.9 * time, 30.0 * np.sin(0.01 * time), 0.0 * time], axis=1)
@@ -248,7 +217,7 @@ def test_a_buildings_field_has_its_strength_and_depends_on_position_only(walk: I
     )
 
 
-def test_magnets_act_while_near_and_hard_iron_always(walk: ImuSequence) -> None:
+def test_magnets_act_while_near_and_hard_iron_always(walk):
     iron = (3.0, -2.0, 4.0)
     disturbed = replace(QUIET, hard_iron=iron, magnets=((10.0, 20.0, 150.0),), lag=0.03)
     plain = simulate_magnetometer(walk.truth, QUIET)
@@ -260,7 +229,7 @@ def test_magnets_act_while_near_and_hard_iron_always(walk: ImuSequence) -> None:
     np.testing.assert_allclose(np.linalg.norm(added[near] - iron, axis=1), 150.0)
 
 
-def test_the_imu_is_the_same_with_and_without_a_magnetometer(walk: ImuSequence) -> None:
+def test_the_imu_is_the_same_with_and_without_a_magnetometer(walk):
     both = simulate_imu(walk.truth, 100.0, seed=1, magnetic_field=MagneticField())
     alone = simulate_imu(walk.truth, 100.0, seed=1)
     np.testing.assert_array_equal(both.gyro, alone.gyro)
@@ -271,6 +240,6 @@ def test_the_imu_is_the_same_with_and_without_a_magnetometer(walk: ImuSequence) 
 @pytest.mark.parametrize(
     "change", [{"rate": 0.0}, {"length": -1.0}, {"noise": -1.0}, {"hard_iron": (math.nan, 0, 0)}]
 )
-def test_invalid_field_parameters_are_refused(change: dict[str, float]) -> None:
+def test_invalid_field_parameters_are_refused(change):
     with pytest.raises(InputError, match=next(iter(change))):
         replace(QUIET, **change)

@@ -1,7 +1,5 @@
 """A moment is inserted into a recording so that its samples agree with the extended truth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +13,7 @@ from stario.sequences.simulation.barometer import Air, simulate_barometer
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
 from stario.sequences.simulation.insertion import Inserted, insert_moment
 from stario.sequences.simulation.magnetometer import MagneticField
-from stario.sequences.simulation.moments import MOMENTS, Moment
+from stario.sequences.simulation.moments import MOMENTS
 from stario.sequences.simulation.receiver import simulate_satellites
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.units import METRES_PER_HPA
@@ -29,12 +27,12 @@ def walk_of(errors=PERFECT_IMU) -> ImuSequence:
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     return walk_of()
 
 
 @pytest.fixture
-def perfect(monkeypatch: pytest.MonkeyPatch) -> None:
+def perfect(monkeypatch):
     monkeypatch.setattr(insertion, "GYRO_ERROR", 0.0)
     monkeypatch.setattr(insertion, "_ERRORS", PERFECT_IMU)
 
@@ -51,13 +49,10 @@ def within(found: Inserted) -> ImuSequence:
 @pytest.mark.usefixtures("perfect")
 @pytest.mark.parametrize("moment", MOMENTS, ids=lambda moment: moment.name)
 @pytest.mark.parametrize("share", [0.0, 0.5])
-def test_samples_lead_from_each_true_pose_to_the_next(
-    walk: ImuSequence, moment: Moment, share: float
-) -> None:
+def test_samples_lead_from_each_true_pose_to_the_next(walk, moment, share):
     """Across the moment's ends, too; impacts are shorter than the samples' step."""
     assert walk.truth is not None
     whole = insert_moment(walk, walk.truth, moment, share, seed=1).sequence
-    assert whole.truth is not None
     assert (np.diff(whole.time) > 0.0).all()
     np.testing.assert_allclose(whole.truth.time, whole.time, atol=1e-6)
     attitude = GyroIntegral(whole.time, whole.gyro).attitude(whole.time)
@@ -74,9 +69,7 @@ def test_samples_lead_from_each_true_pose_to_the_next(
     assert np.sqrt(np.mean(np.square(off))) < 0.25
 
 
-def test_the_rest_of_a_recording_is_unchanged_but_for_its_time_and_a_lifts_height(
-    walk: ImuSequence,
-) -> None:
+def test_the_rest_of_a_recording_is_unchanged_but_for_its_time_and_a_lifts_height(walk):
     found = inserted(walk, "lift")
     whole, later = found.sequence, found.stop - found.start
     assert later == pytest.approx(24.0)
@@ -85,16 +78,14 @@ def test_the_rest_of_a_recording_is_unchanged_but_for_its_time_and_a_lifts_heigh
     np.testing.assert_allclose(whole.time[rest], np.r_[walk.time[before], walk.time[after] + later])
     np.testing.assert_allclose(whole.gyro[rest], walk.gyro)
     np.testing.assert_allclose(whole.accel[rest], walk.accel)
-    assert whole.truth is not None
-    assert walk.truth is not None
     moved = whole.truth.position_W[rest] - walk.truth.position_W
     np.testing.assert_allclose(moved[before], 0.0, atol=1e-9)
     np.testing.assert_allclose(np.abs(moved[after]), np.tile([0.0, 0.0, 12.0], (after.sum(), 1)),
                                atol=0.1)  # fmt: skip
 
 
-def test_every_moment_is_what_its_name_says(walk: ImuSequence) -> None:
-    def sizes(name: str) -> tuple[np.ndarray, np.ndarray]:
+def test_every_moment_is_what_its_name_says(walk):
+    def sizes(name):
         part = within(inserted(walk, name))
         return np.linalg.norm(part.gyro, axis=1), np.linalg.norm(part.accel, axis=1)
 
@@ -114,12 +105,10 @@ def test_every_moment_is_what_its_name_says(walk: ImuSequence) -> None:
     assert np.ptp(force[300:-300]) > 1.5
 
 
-def test_a_lift_turns_the_field_and_weakens_it_and_standing_does_not(walk: ImuSequence) -> None:
-    def field_W(name: str) -> np.ndarray:
+def test_a_lift_turns_the_field_and_weakens_it_and_standing_does_not(walk):
+    def field_W(name):
         whole = inserted(walk, name)
         part = whole.sequence.slice(whole.start + 6.0, whole.stop - 6.0)
-        assert part.magnetometer is not None
-        assert whole.sequence.truth is not None
         at = whole.sequence.truth.at(part.magnetometer.time)
         return at.attitude_WB.apply(part.magnetometer.field)
 
@@ -130,17 +119,16 @@ def test_a_lift_turns_the_field_and_weakens_it_and_standing_does_not(walk: ImuSe
     np.testing.assert_allclose(np.arctan2(standing[:, 1], standing[:, 0]), 0.0, atol=0.2)
 
 
-def test_the_gyroscope_keeps_its_bias(walk: ImuSequence) -> None:
+def test_the_gyroscope_keeps_its_bias(walk):
     bias = np.array([0.03, -0.02, 0.01])
     part = within(inserted(replace(walk, gyro=walk.gyro + bias), "table"))
     lying = (part.time > part.time[0] + 5.0) & (part.time < part.time[0] + 15.0)
     np.testing.assert_allclose(part.gyro[lying].mean(axis=0), bias, atol=2e-3)
 
 
-def test_errors_of_scale_and_alignment_grow_with_the_rotation() -> None:
+def test_errors_of_scale_and_alignment_grow_with_the_rotation():
     found = inserted(walk_of(PHONE_IMU), "shake 25 s")
     whole = found.sequence
-    assert whole.truth is not None
     ends = np.array([found.start, found.stop])
     turn = GyroIntegral(whole.time, whole.gyro).attitude(ends)
     true = whole.truth.at(ends).attitude_WB
@@ -148,18 +136,16 @@ def test_errors_of_scale_and_alignment_grow_with_the_rotation() -> None:
     assert np.degrees(wrong) > 5.0
 
 
-def test_known_positions_after_the_moment_come_later(walk: ImuSequence) -> None:
-    assert walk.truth is not None
+def test_known_positions_after_the_moment_come_later(walk):
     time = np.array([2.0, 8.0, 15.0])
     known = PositionTrack(time, walk.truth.at(time).position_W[:, :2], "waypoints")
     without = replace(walk, truth=None, positions=known)
     found = insert_moment(without, walk.truth, BY_NAME["table"], 0.5, seed=1).sequence
-    assert found.positions is not None
     np.testing.assert_allclose(found.positions.time, [2.0, 8.0, 35.0])
     np.testing.assert_allclose(found.positions.position_W, known.position_W)
 
 
-def test_pressure_goes_on_in_a_moment_and_satellites_after_it(walk: ImuSequence) -> None:
+def test_pressure_goes_on_in_a_moment_and_satellites_after_it(walk):
     assert walk.truth is not None
     full = replace(
         walk,
@@ -168,21 +154,17 @@ def test_pressure_goes_on_in_a_moment_and_satellites_after_it(walk: ImuSequence)
     )
     found = insert_moment(full, walk.truth, BY_NAME["table"], 0.5, seed=1)
     pressure, reported = found.sequence.barometer, found.sequence.satellites
-    assert pressure is not None
     assert np.diff(pressure.time).max() < 0.3
-    assert found.sequence.truth is not None
     true = found.sequence.truth.at(pressure.time).position_W[:, 2]
     height = METRES_PER_HPA * (pressure.pressure_hPa[0] - pressure.pressure_hPa)
     np.testing.assert_allclose(height - height.mean(), true - true.mean(), atol=0.2)
-    assert full.satellites is not None
-    assert reported is not None
     late = full.satellites.time >= found.start
     moved = np.where(late, found.stop - found.start, 0.0)
     np.testing.assert_allclose(reported.time, full.satellites.time + moved)
     np.testing.assert_array_equal(reported.latlon_deg, full.satellites.latlon_deg)
 
 
-def test_a_seed_gives_the_same_moment_and_another_one_another(walk: ImuSequence) -> None:
+def test_a_seed_gives_the_same_moment_and_another_one_another(walk):
     assert walk.truth is not None
     moment = BY_NAME["shake 10 s"]
     first, again, other = (

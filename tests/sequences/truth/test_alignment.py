@@ -1,7 +1,5 @@
 """Lag, clock offset, mount and axes between a tracked body and its IMU."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -38,7 +36,7 @@ def captured(truth: Trajectory, noise_rad: float, seed: int = 0) -> tuple[np.nda
     return position, truth.attitude_WB * MOUNT_VB.inv() * shaken
 
 
-def test_cumulative_rotations_equal_products_taken_one_by_one() -> None:
+def test_cumulative_rotations_equal_products_taken_one_by_one():
     steps = Rotation.random(200, rng=np.random.default_rng(1))
     one_by_one = [Rotation.identity()]
     for step in steps:
@@ -49,12 +47,12 @@ def test_cumulative_rotations_equal_products_taken_one_by_one() -> None:
     assert len(cumulative_rotations(Rotation.identity(1)[:0])) == 1
 
 
-def test_a_span_shorter_than_a_step_is_one_step() -> None:
+def test_a_span_shorter_than_a_step_is_one_step():
     assert samples_in(0.03, np.arange(10) / 10.0) == 1
 
 
 @pytest.mark.parametrize("ahead", [0.4, -1.65, 3000.0])
-def test_the_clock_offset_is_found(ahead: float) -> None:
+def test_the_clock_offset_is_found(ahead):
     """Clocks seconds apart or of another origin; the capture starts later and ends earlier."""
     imu, truth = recorded("handheld", 60.0)
     _, attitude_WV = captured(truth, 0.003)
@@ -75,7 +73,7 @@ def mount_errors(carry: str, noise_rad: float) -> list[float]:
     return [float(np.degrees((MOUNT_VB.inv() * x.mounts[0][2]).magnitude())) for x in found]
 
 
-def test_on_a_trolley_the_accelerometer_determines_the_mounts_heading() -> None:
+def test_on_a_trolley_the_accelerometer_determines_the_mounts_heading():
     """The gyroscope alone hardly determines a rotation about the only axis the body turns about."""
     gyro_alone, both = mount_errors("trolley", 0.008)
     assert gyro_alone > 3.0
@@ -83,7 +81,7 @@ def test_on_a_trolley_the_accelerometer_determines_the_mounts_heading() -> None:
 
 
 @pytest.mark.parametrize("late", [-0.031, 0.0, 0.052])
-def test_the_lag_is_found_within_a_millisecond_even_with_little_rotation(late: float) -> None:
+def test_the_lag_is_found_within_a_millisecond_even_with_little_rotation(late):
     imu, truth = recorded("trolley")
     position, attitude_WV = captured(truth, 0.004)
     valid = np.ones(len(truth), dtype=np.bool_)
@@ -94,14 +92,14 @@ def test_the_lag_is_found_within_a_millisecond_even_with_little_rotation(late: f
     assert aligned.correlation > 0.9
 
 
-def test_a_mount_determined_by_the_gyroscope_is_kept() -> None:
+def test_a_mount_determined_by_the_gyroscope_is_kept():
     gyro_alone, both = mount_errors("handheld", 0.004)
     assert gyro_alone < 0.7
     assert both < 0.7
 
 
 @pytest.mark.parametrize("error_deg", [-6.0, 4.0])
-def test_a_turned_mount_is_detected_despite_lever_arm_and_bias(error_deg: float) -> None:
+def test_a_turned_mount_is_detected_despite_lever_arm_and_bias(error_deg):
     imu, truth = recorded("trolley")
     position, _ = captured(truth, 0.0)
     up_B = truth.attitude_WB.apply([0.0, 0.0, 1.0], inverse=True).mean(axis=0)
@@ -114,7 +112,7 @@ def test_a_turned_mount_is_detected_despite_lever_arm_and_bias(error_deg: float)
     assert np.degrees((wrong * turn).magnitude()) < 1.0
 
 
-def test_too_little_data_leaves_the_mount_unchanged() -> None:
+def test_too_little_data_leaves_the_mount_unchanged():
     imu, truth = recorded("trolley", 10.0)
     valid = np.zeros(len(truth), dtype=np.bool_)
     valid[::2] = True  # no stretch is unbroken
@@ -122,7 +120,7 @@ def test_too_little_data_leaves_the_mount_unchanged() -> None:
     assert turn.magnitude() == 0.0
 
 
-def test_single_frames_rotated_about_any_axis_are_masked() -> None:
+def test_single_frames_rotated_about_any_axis_are_masked():
     imu, truth = recorded("handheld")
     _, attitude_WV = captured(truth, 0.004)
     rng = np.random.default_rng(2)
@@ -141,7 +139,7 @@ def test_single_frames_rotated_about_any_axis_are_masked() -> None:
 
 @pytest.mark.parametrize("gap", [(50.0, 53.0), (50.0, 61.0), (113.0, 115.0)])
 @pytest.mark.parametrize("flips", [False, True])
-def test_rotation_during_an_imu_gap_is_not_a_flip(gap: tuple[float, float], flips: bool) -> None:
+def test_rotation_during_an_imu_gap_is_not_a_flip(gap, flips):
     """The gap leaves the mount unchanged; a flip that the IMU observes changes it."""
     imu, truth = recorded("handheld")
     _, attitude_WV = captured(truth, 0.004)
@@ -162,7 +160,7 @@ def test_rotation_during_an_imu_gap_is_not_a_flip(gap: tuple[float, float], flip
     assert aligned.correlation > 0.95
 
 
-def test_a_recording_hardly_too_short_is_not_said_to_be_long_enough() -> None:
+def test_a_recording_hardly_too_short_is_not_said_to_be_long_enough():
     imu, truth = recorded("handheld", 12.0)
     imu = imu.slice(0.0, 9.995)
     valid = np.ones(len(truth), dtype=np.bool_)
@@ -171,15 +169,13 @@ def test_a_recording_hardly_too_short_is_not_said_to_be_long_enough() -> None:
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     style = WalkStyle(mount_rotvec=(0.3, -0.2, 0.9))
     return simulate_imu(generate_walk(2, 20.0, style=style), 100.0, PERFECT_IMU)
 
 
 @pytest.mark.parametrize("axes", ["z,x,y", "x,-z,y", "-z,-y,-x"])
-def test_another_order_of_the_axes_is_undone(
-    walk: ImuSequence, axes: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_another_order_of_the_axes_is_undone(walk, axes, caplog):
     assert walk.truth is not None
     logged = replace(walk, accel=walk.accel @ axes_matrix(axes).T)
     np.testing.assert_allclose(accel_axes(logged, walk.truth).accel, walk.accel, atol=1e-9)
@@ -187,13 +183,13 @@ def test_another_order_of_the_axes_is_undone(
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["up", "apple"])
-def test_the_gyroscopes_own_axes_are_kept_with_either_sign(walk: ImuSequence, sign: float) -> None:
+def test_the_gyroscopes_own_axes_are_kept_with_either_sign(walk, sign):
     assert walk.truth is not None
     signed = replace(walk, accel=sign * walk.accel)
     assert accel_axes(signed, walk.truth) is signed
 
 
-def test_axes_that_a_device_at_rest_cannot_tell_apart_are_kept() -> None:
+def test_axes_that_a_device_at_rest_cannot_tell_apart_are_kept():
     time = np.arange(500) / 100.0
     truth = Trajectory(time, np.zeros((500, 3)), Rotation.identity(500))
     sideways = np.tile([STANDARD_GRAVITY, 0.0, 0.0], (500, 1))

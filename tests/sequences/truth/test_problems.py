@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -25,7 +23,7 @@ LATE_S = 20.0
 
 
 @pytest.fixture(scope="module")
-def walk() -> ImuSequence:
+def walk():
     """A walk whose truth is noisy and slow, as a phone's visual odometry."""
     walk = simulate_imu(generate_walk(8, 40.0, style=WalkStyle()), 100.0, PHONE_IMU, 2, name="w")
     truth = walk.truth.at(np.arange(0.0, 40.0, 0.05))
@@ -61,14 +59,13 @@ POSITIONS = {
 
 
 @pytest.mark.parametrize("found", POSITIONS)
-def test_wrong_positions_are_named_with_the_remedy(walk: ImuSequence, found: str) -> None:
+def test_wrong_positions_are_named_with_the_remedy(walk, found):
     change, fix = POSITIONS[found]
     wrong = moved(walk, change)
     (problem,) = told(wrong)
     assert problem.startswith("truth: ")
     assert found in problem
     assert fix in problem
-    assert [str(found) for found in truth_findings(wrong)] == [problem]
     with pytest.raises(
         InputError, match=r"w: truth: found a? ?position.*expected poses that agree"
     ):
@@ -76,7 +73,7 @@ def test_wrong_positions_are_named_with_the_remedy(walk: ImuSequence, found: str
 
 
 @pytest.mark.parametrize("carry", CARRYING_MODES)
-def test_right_positions_raise_nothing_however_the_device_is_carried(carry: str) -> None:
+def test_right_positions_raise_nothing_however_the_device_is_carried(carry):
     style = WalkStyle(carry=carry, vigor=1.5)
     walk = simulate_imu(generate_walk(3, 40.0, style=style), 100.0, PHONE_IMU, 3)
     kept = (walk.time % 9.0) > 0.5
@@ -84,12 +81,11 @@ def test_right_positions_raise_nothing_however_the_device_is_carried(carry: str)
     for recording in (walk, gappy, replace(walk, truth=walk.truth.at(np.arange(0.0, 40.0, 0.1)))):
         assert truth_findings(recording) == []
         found = examine_truth(recording)
-        assert found.positions is not None
         assert found.positions.scale == pytest.approx(1.0, abs=0.2)
         assert not found.positions.mirrored
 
 
-def test_positions_of_a_device_that_hardly_accelerates_are_not_compared() -> None:
+def test_positions_of_a_device_that_hardly_accelerates_are_not_compared():
     time = np.arange(0.0, 40.0, 0.01)
     attitude_WB = Rotation.from_euler("xyz", np.column_stack([np.sin(time), np.cos(time), time]))
     steady = Trajectory(time, np.outer(time, [0.3, 0.0, 0.0]), attitude_WB)
@@ -100,7 +96,7 @@ def test_positions_of_a_device_that_hardly_accelerates_are_not_compared() -> Non
     assert truth_findings(mirrored) == []
 
 
-def test_lost_tracking_written_as_zeros_is_not_taken_for_a_wrong_clock(walk: ImuSequence) -> None:
+def test_lost_tracking_written_as_zeros_is_not_taken_for_a_wrong_clock(walk):
     truth = walk.truth
     lost = (truth.time > 15.0) & (truth.time < 23.0)
     quat_xyzw = np.where(lost[:, None], [0.0, 0.0, 0.0, 1.0], truth.quat_xyzw)
@@ -110,9 +106,7 @@ def test_lost_tracking_written_as_zeros_is_not_taken_for_a_wrong_clock(walk: Imu
     assert "repeats exactly for 7.9 s" in problem
 
 
-def test_a_jump_of_the_attitude_is_not_taken_for_an_error_of_the_gyroscope(
-    walk: ImuSequence,
-) -> None:
+def test_a_jump_of_the_attitude_is_not_taken_for_an_error_of_the_gyroscope(walk):
     truth = walk.truth
     turn = Rotation.from_euler("z", np.where(truth.time > LATE_S, 3.0, 0.0)[:, None])
     flipped = replace(walk, truth=replace(truth, attitude_WB=turn * truth.attitude_WB))
@@ -125,7 +119,7 @@ def test_a_jump_of_the_attitude_is_not_taken_for_an_error_of_the_gyroscope(
 @pytest.mark.parametrize(
     ("late", "named"), [(5.08, "add -5.08 s"), (1e6, "none of them at a sample's time")]
 )
-def test_a_truth_on_a_distant_clock_is_named(walk: ImuSequence, late: float, named: str) -> None:
+def test_a_truth_on_a_distant_clock_is_named(walk, late, named):
     shifted = replace(walk, truth=replace(walk.truth, time=walk.truth.time + late))
     (problem,) = told(shifted)
     assert named in problem
@@ -133,7 +127,7 @@ def test_a_truth_on_a_distant_clock_is_named(walk: ImuSequence, late: float, nam
         check_truth(shifted)
 
 
-def test_the_comparison_is_part_of_the_findings(walk: ImuSequence) -> None:
+def test_the_comparison_is_part_of_the_findings(walk):
     found = inspect_recording(walk)
     values = found.as_dict()["positions_against_accelerometer"]
     assert values["axes"] == ["x", "y", "z"]
@@ -142,19 +136,17 @@ def test_the_comparison_is_part_of_the_findings(walk: ImuSequence) -> None:
 
 
 @pytest.mark.parametrize("of", ["imu", "truth"])
-def test_positions_are_not_compared_across_gaps(of: str) -> None:
+def test_positions_are_not_compared_across_gaps(of):
     walk = simulate_imu(generate_walk(3, 60.0, style=WalkStyle()), 100.0, seed=1)
     known = walk.time % 3.0 > 0.5
-    assert walk.truth is not None
     position = walk.truth.position_W + np.cumsum(~known)[:, None] * [0.01, 0.0, 0.0]  # relocalised
     lost = replace(walk.truth, position_W=position, valid=known)
     gappy = walk.select(known) if of == "imu" else replace(walk, truth=lost)
     fit = fit_positions(gappy, 0.0)
-    assert fit is not None
     assert fit.correlation > 0.99
 
 
-def test_a_shift_while_tracking_is_lost_is_not_a_jump(walk: ImuSequence) -> None:
+def test_a_shift_while_tracking_is_lost_is_not_a_jump(walk):
     assert walk.truth is not None
     lost = replace(walk.truth, position_W=jumping(walk.truth))
     assert len(tracking_faults(replace(walk, truth=lost)).jumps) == 1
@@ -162,12 +154,11 @@ def test_a_shift_while_tracking_is_lost_is_not_a_jump(walk: ImuSequence) -> None
     assert tracking_faults(replace(walk, truth=blank)).jumps == ()
 
 
-def test_a_truth_too_short_to_compare_is_no_problem(walk: ImuSequence) -> None:
-    assert walk.truth is not None
+def test_a_truth_too_short_to_compare_is_no_problem(walk):
     assert examine_truth(replace(walk, truth=walk.truth.slice(10.0, 18.0))).findings == ()
 
 
-def test_only_poses_whose_attitude_repeats_as_well_are_lost(walk: ImuSequence) -> None:
+def test_only_poses_whose_attitude_repeats_as_well_are_lost(walk):
     still = moved(walk, lambda truth: 0.0 * truth.position_W)
     assert still.truth is not None
     assert tracking_faults(still).lost.sum() == 1  # the first, which the others repeat
@@ -175,9 +166,7 @@ def test_only_poses_whose_attitude_repeats_as_well_are_lost(walk: ImuSequence) -
     assert tracking_faults(replace(still, truth=frozen)).lost.all()
 
 
-def test_a_wrong_unit_of_the_accelerometer_is_not_blamed_on_the_positions(
-    walk: ImuSequence,
-) -> None:
+def test_a_wrong_unit_of_the_accelerometer_is_not_blamed_on_the_positions(walk):
     in_mg = replace(walk, accel=1e3 * walk.accel / STANDARD_GRAVITY)
     (problem,) = examine_truth(in_mg).findings
     assert problem.text.startswith("truth: positions that")
@@ -185,7 +174,7 @@ def test_a_wrong_unit_of_the_accelerometer_is_not_blamed_on_the_positions(
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
-def test_the_truth_of_a_device_at_rest_is_not_called_wrong(noise: float) -> None:
+def test_the_truth_of_a_device_at_rest_is_not_called_wrong(noise):
     """No rotation is there to be compared: neither of them turns."""
     rng, time = np.random.default_rng(0), np.arange(0.0, 40.0, 0.01)
     gyro = [0.0, 0.0, 0.005] + 2e-3 * rng.normal(size=(len(time), 3))

@@ -1,10 +1,7 @@
 """A walk with exact sensors, for judging."""
 
-from __future__ import annotations
-
 import pytest
 
-from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
@@ -12,11 +9,11 @@ STYLE = WalkStyle(carry="trolley")  # without sway, which windows that overlap s
 
 
 @pytest.fixture(scope="session")
-def walk() -> ImuSequence:
+def walk():
     return simulate_imu(generate_walk(9, 75.0, style=STYLE), 100.0, PERFECT_IMU, 3, name="walk")
 
 
 @pytest.fixture(scope="session")
-def stepping() -> ImuSequence:
+def stepping():
     """A person's walk, whose steps can be seen."""
     return simulate_imu(generate_walk(9, 75.0), 100.0, PERFECT_IMU, 3, name="steps")

@@ -1,7 +1,5 @@
 """Benchmark of networks alone by groups, with a stub that predicts a known share of the truth."""
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Callable, Mapping
@@ -44,7 +42,7 @@ def of_person(recording: ImuSequence, person: str) -> ImuSequence:
 
 
 @pytest.fixture(scope="module")
-def pair(walk: ImuSequence) -> Benchmark:
+def pair(walk):
     recordings = {"one": of_person(walk, "a"), "two": of_person(with_waypoints(walk), "b")}
     scales = {"walks a": 0.95, "walks b": 0.9}
     models = {
@@ -54,24 +52,19 @@ def pair(walk: ImuSequence) -> Benchmark:
     return judged(recordings, models, {"one": "walks a", "two": "walks b"})
 
 
-def test_a_recording_that_cannot_be_used_is_skipped_and_a_wrong_truth_warned_of(
-    stepping: ImuSequence, caplog: pytest.LogCaptureFixture
-) -> None:
-    assert stepping.truth is not None
+def test_a_recording_that_cannot_be_used_is_skipped_and_a_wrong_truth_warned_of(stepping, caplog):
     mirrored = stepping.truth.position_W * [-1.0, 1.0, 1.0]
     wrong = replace(stepping, truth=replace(stepping.truth, position_W=mirrored))
     recordings = {Path("wrong"): wrong, Path("blind"): stepping.without_truth()}
-    models: Makers = {"ours": lambda group: Stub(stepping)}
+    models = {"ours": lambda group: Stub(stepping)}
     _, skipped = benchmark(dict.fromkeys(recordings, ""), models, recordings.__getitem__)
     assert [one.item for one in skipped] == ["blind"]
     assert "steps: truth: positions mirrored" in caplog.text
 
 
-def test_a_recording_with_two_waypoints_is_named_as_not_compared(
-    walk: ImuSequence, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_recording_with_two_waypoints_is_named_as_not_compared(walk, caplog):
     few, enough = with_waypoints(walk, 50.0), with_waypoints(walk)
-    models: Makers = {"ours": lambda group: Stub(walk)}
+    models = {"ours": lambda group: Stub(walk)}
     found = judged({"50": few, "8": enough}, models)
     assert [record.getMessage()[:17] for record in caplog.records] == ["50: not compared,"]
     assert (values(found.scores, "path_m") > 0.0).tolist() == [False, True]
@@ -81,14 +74,11 @@ def test_a_recording_with_two_waypoints_is_named_as_not_compared(
     assert record.getMessage().startswith("2 of 3 recordings, the first 50: not compared,")
 
 
-def test_a_device_at_rest_counts_in_no_median_or_ratio(
-    walk: ImuSequence, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_device_at_rest_counts_in_no_median_or_ratio(walk, caplog):
     """Its errors relative to its path, the noise of its truth, would be a thousand percent."""
-    assert walk.truth is not None
     still = 1e-4 * np.random.default_rng(0).normal(size=walk.truth.position_W.shape)
     resting = replace(walk, name="rest", truth=replace(walk.truth, position_W=still))
-    models: Makers = {"ours": lambda group: Stub(walk), "theirs": lambda group: Stub(walk, 0.8)}
+    models = {"ours": lambda group: Stub(walk), "theirs": lambda group: Stub(walk, 0.8)}
     found, walking = judged({"walk": walk, "rest": resting}, models), judged({"walk": walk}, models)
     assert "rest: not compared, because the ground truth moves by less" in caplog.text
     both, alone = (part.rows("set", "ours", "theirs").iloc[-1] for part in (found, walking))
@@ -96,7 +86,7 @@ def test_a_device_at_rest_counts_in_no_median_or_ratio(
     assert both["recordings"] == 1
 
 
-def test_rows_compare_weights_by_group_and_pooled(walk: ImuSequence, pair: Benchmark) -> None:
+def test_rows_compare_weights_by_group_and_pooled(walk, pair):
     rows = pair.rows("person", "ours", "theirs").set_index(["group", "weights"])
     assert list(rows.index.unique("group")) == ["a", "b", "all"]
     a, b, pooled = (rows.loc[name, "ours"] for name in ("a", "b", "all"))
@@ -108,9 +98,7 @@ def test_rows_compare_weights_by_group_and_pooled(walk: ImuSequence, pair: Bench
     assert rows.loc[("a", "theirs"), "length_ratio"] == pytest.approx(0.8, abs=0.02)
 
 
-def test_without_a_list_intervals_are_drawn_over_the_persons_of_an_archive(
-    walk: ImuSequence,
-) -> None:
+def test_without_a_list_intervals_are_drawn_over_the_persons_of_an_archive(walk):
     """Over recordings alone, those of one person would pass for those of many."""
     scales = {"r.h5:1": ("a", 0.95), "r.h5:2": ("b", 0.9), "r.h5:3": ("b", 0.9)}
     recordings = {name: of_person(walk, person) for name, (person, _) in scales.items()}
@@ -124,20 +112,18 @@ def test_without_a_list_intervals_are_drawn_over_the_persons_of_an_archive(
     assert pooled["ratio_1s"].ratio == pytest.approx(np.sqrt(0.25 * 0.5), rel=0.01)
 
 
-def test_a_file_named_without_its_folder_belongs_to_the_set_of_that_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_named_without_its_folder_belongs_to_the_set_of_that_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert labels(Path("walk.csv"), {})["set"] == tmp_path.name
 
 
-def test_a_recording_without_errors_has_no_ratio(pair: Benchmark) -> None:
+def test_a_recording_without_errors_has_no_ratio(pair):
     """Of a device at rest, for example."""
     perfect = replace(pair, blocks=pair.blocks.assign(squares=0.0))
     assert perfect.rows("set", "ours", "theirs")[[*RATIOS]].isna().all(axis=None)
 
 
-def test_a_benchmark_is_written_as_tables_and_figure(pair: Benchmark, tmp_path: Path) -> None:
+def test_a_benchmark_is_written_as_tables_and_figure(pair, tmp_path):
     rows = pair.rows("set", "ours", "theirs")
     assert "ratio over 10 s" in benchmark_text(rows, "ours", "theirs")
     write_benchmark(tmp_path, pair, rows, "ours", "theirs")
@@ -152,7 +138,7 @@ def test_a_benchmark_is_written_as_tables_and_figure(pair: Benchmark, tmp_path: 
     assert (tmp_path / "groups.png").stat().st_size > 10_000
 
 
-def test_a_group_may_be_called_all(pair: Benchmark) -> None:
+def test_a_group_may_be_called_all(pair):
     named = pair.scores.assign(person=pair.scores["person"].replace("b", POOLED))
     found = replace(pair, scores=named)
     rows = found.rows("person", "ours", "theirs")

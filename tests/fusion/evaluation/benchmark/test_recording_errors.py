@@ -1,15 +1,12 @@
 """Errors of a network alone on one recording, against a known share of the truth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from displacement_stub import Stub, errors_of, horizontal_path, streams_of, with_waypoints, yaw_WN
+from displacement_stub import Stub, errors_of, horizontal_path, streams_of, with_waypoints
 from recorded import DATA
-from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.benchmark.displacement_error import (
     _AtTicks,
@@ -18,11 +15,8 @@ from stario.fusion.evaluation.benchmark.displacement_error import (
     _Sums,
     known_truth,
 )
-from stario.fusion.evaluation.benchmark.pieces import Piece
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
-from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
-from stario.sequences.levelled_stream import LevelledStream
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import ImuSequence, PositionTrack, is_gap
 
@@ -31,12 +25,11 @@ ARCHIVES = DATA / "archives"
 
 def with_positions(walk: ImuSequence, jump: float = 0.0) -> ImuSequence:
     truth = walk.truth
-    assert truth is not None
     position_W = truth.position_W + np.where(truth.time > 40.0, jump, 0.0)[:, None]
     return replace(walk, truth=None, positions=PositionTrack(truth.time, position_W, "positions"))
 
 
-def test_with_poses_displacements_of_nine_tenths_give_that_length_ratio(walk: ImuSequence) -> None:
+def test_with_poses_displacements_of_nine_tenths_give_that_length_ratio(walk):
     stub = Stub(walk)
     size = float(np.sqrt(np.mean(np.sum(stub.displacement_H**2, axis=1))))
     found = errors_of(walk, Stub(walk, 0.9))
@@ -50,28 +43,16 @@ def test_with_poses_displacements_of_nine_tenths_give_that_length_ratio(walk: Im
     assert np.sqrt(total / count) == pytest.approx(found.figures["rms_1s_m"])
 
 
-def test_the_yaw_from_the_levelled_frame_to_the_world_is_the_truths(walk: ImuSequence) -> None:
-    [stream] = streams_of(walk)
-    assert walk.truth is not None
-    true_WB = walk.truth.at(stream.ticks)
-    levelled = about_z(yaw_WN(walk, stream)) * Rotation.from_matrix(stream.R_NB)
-    off = (levelled * true_WB.attitude_WB.inv())[true_WB.valid]
-    assert off.magnitude().max() < 0.1  # what levelling is off by
-
-
 @pytest.mark.parametrize("count", [0, 1])
-def test_a_recording_without_usable_truth_is_refused(walk: ImuSequence, count: int) -> None:
+def test_a_recording_without_usable_truth_is_refused(walk, count):
     with pytest.raises(InputError, match="truth: found none"):
         known_truth(walk.without_truth())
-    assert walk.truth is not None
     valid = np.arange(len(walk.truth.time)) < count
     with pytest.raises(InputError, match=f"truth: found {count} valid"):
         known_truth(replace(walk, truth=replace(walk.truth, valid=valid)))
 
 
-def test_with_poses_a_rotation_raises_displacement_errors_but_not_the_fitted_ate(
-    walk: ImuSequence,
-) -> None:
+def test_with_poses_a_rotation_raises_displacement_errors_but_not_the_fitted_ate(walk):
     exact = errors_of(walk, Stub(walk)).figures
     assert exact["rms_1s_m"] < 1e-9
     assert exact["rms_30s_m"] < 0.1  # windows overlap: a track through them is smoother
@@ -83,9 +64,7 @@ def test_with_poses_a_rotation_raises_displacement_errors_but_not_the_fitted_ate
     assert turned["rms_1s_m"] > 0.3
 
 
-def test_with_positions_yaw_is_fitted_and_nothing_is_compared_across_a_jump(
-    walk: ImuSequence,
-) -> None:
+def test_with_positions_yaw_is_fitted_and_nothing_is_compared_across_a_jump(walk):
     smooth = errors_of(with_positions(walk), Stub(walk, 0.9, yaw=2.0))
     jumped = errors_of(with_positions(walk, jump=9.0), Stub(walk, 0.9, yaw=2.0))
     for found in (smooth, jumped):
@@ -96,8 +75,7 @@ def test_with_positions_yaw_is_fitted_and_nothing_is_compared_across_a_jump(
     assert jumped.blocks["10"][:, 1].sum() < smooth.blocks["10"][:, 1].sum()
 
 
-def test_positions_at_1_hz_give_the_same_errors(walk: ImuSequence) -> None:
-    assert walk.truth is not None
+def test_positions_at_1_hz_give_the_same_errors(walk):
     time = np.arange(1.0, 74.0)
     track = PositionTrack(time, walk.truth.at(time).position_W, "positions")
     slow = replace(walk, truth=None, positions=track)
@@ -107,7 +85,7 @@ def test_positions_at_1_hz_give_the_same_errors(walk: ImuSequence) -> None:
     assert found.figures["rms_10s_m"] == pytest.approx(frequent.figures["rms_10s_m"], rel=0.05)
 
 
-def test_with_waypoints_yaw_and_position_are_fitted_first(walk: ImuSequence) -> None:
+def test_with_waypoints_yaw_and_position_are_fitted_first(walk):
     exact = errors_of(with_waypoints(walk), Stub(walk, yaw=-1.0))
     short = errors_of(with_waypoints(walk), Stub(walk, 0.9))
     assert exact.figures["ate_fit_m"] < 0.1
@@ -115,7 +93,6 @@ def test_with_waypoints_yaw_and_position_are_fitted_first(walk: ImuSequence) -> 
     assert short.figures["length_ratio"] == pytest.approx(0.9, abs=0.02)
     # A track scaled about its centre has an error of a tenth of the waypoints' spread.
     time = np.arange(1.0, 70.0, 8.0)
-    assert walk.truth is not None
     xy = walk.truth.at(time).position_W[:, :2]
     spread = float(np.sqrt(np.mean(np.sum((xy - xy.mean(axis=0)) ** 2, axis=1))))
     assert short.figures["ate_fit_m"] == pytest.approx(0.1 * spread, rel=0.15)
@@ -123,9 +100,8 @@ def test_with_waypoints_yaw_and_position_are_fitted_first(walk: ImuSequence) -> 
     assert np.sqrt(total / count) == pytest.approx(short.figures["ate_fit_m"])
 
 
-def test_positions_are_unknown_in_their_gaps_and_beyond_their_ends(walk: ImuSequence) -> None:
+def test_positions_are_unknown_in_their_gaps_and_beyond_their_ends(walk):
     whole = with_positions(walk).positions
-    assert whole is not None
     time = whole.time
     known = ((time > 5.0) & (time < 20.0)) | ((time > 30.0) & (time < 70.0))
     ticks = np.arange(0.0, 75.0, 0.5)
@@ -138,13 +114,6 @@ def test_positions_are_unknown_in_their_gaps_and_beyond_their_ends(walk: ImuSequ
     assert len(set(breaks[(ticks > 5.1) & (ticks < 69.9)])) == 2  # before and after the gap
 
 
-def test_equal_displacements_give_a_straight_track_at_constant_speed() -> None:
-    displacement = np.tile([1.2, -0.4, 0.0], (9, 1))
-    stream = LevelledStream(0.0, np.empty((0, 6)), np.empty((0, 2)), np.empty((11, 3, 3)))
-    track = Piece(stream, displacement, np.tile(np.eye(3), (9, 1, 1))).track()
-    np.testing.assert_allclose(track, (0.6 - 0.2j) * np.arange(11))
-
-
 @pytest.mark.skipif(not ARCHIVES.exists(), reason=f"no recordings at {ARCHIVES}")
 @pytest.mark.parametrize(
     ("name", "kind", "path_m", "error"),
@@ -154,9 +123,7 @@ def test_equal_displacements_give_a_straight_track_at_constant_speed() -> None:
         ("ilc.h5:site2_F1_5dd35c7527889b0006b76852", "waypoints", 65.2, "ate_fit_percent"),
     ],
 )
-def test_pedestrian_dead_reckoning_is_near_the_truth_on_real_recordings(
-    name: str, kind: str, path_m: float, error: str
-) -> None:
+def test_pedestrian_dead_reckoning_is_near_the_truth_on_real_recordings(name, kind, path_m, error):
     recording = read_recording(Path(f"{ARCHIVES}/{name}"))
     found = errors_of(recording, PedestrianDeadReckoning())
     assert known_truth(recording)[0] == kind
@@ -165,7 +132,7 @@ def test_pedestrian_dead_reckoning_is_near_the_truth_on_real_recordings(
     assert found.figures[error] < 15.0
 
 
-def test_pedestrian_dead_reckoning_is_judged_like_a_network(stepping: ImuSequence) -> None:
+def test_pedestrian_dead_reckoning_is_judged_like_a_network(stepping):
     [stream] = streams_of(stepping)
     predicted = PedestrianDeadReckoning().piece(stream)
     np.testing.assert_allclose(predicted.covariance_N[0], 0.3**2 * np.eye(3))  # its usual error
@@ -173,7 +140,7 @@ def test_pedestrian_dead_reckoning_is_judged_like_a_network(stepping: ImuSequenc
     assert 0.5 < found.figures["length_ratio"] < 1.6
 
 
-def test_the_share_of_the_path_is_that_of_the_pieces_between_gaps(stepping: ImuSequence) -> None:
+def test_the_share_of_the_path_is_that_of_the_pieces_between_gaps(stepping):
     """Pieces are fitted one by one: a share of the whole path would shrink with every gap."""
     kept = np.abs(stepping.time - stepping.time.mean()) > 0.5
     samples = {name: getattr(stepping, name)[kept] for name in ("time", "gyro", "accel")}
@@ -182,7 +149,7 @@ def test_the_share_of_the_path_is_that_of_the_pieces_between_gaps(stepping: ImuS
     assert found.figures["ate_fit_percent"] == pytest.approx(share, rel=0.1)
 
 
-def test_stretches_at_rest_have_no_error_relative_to_their_path() -> None:
+def test_stretches_at_rest_have_no_error_relative_to_their_path():
     rng, sums = np.random.default_rng(0), _Sums()
     track, truth = (0.01 * (rng.normal(size=100) + 1j * rng.normal(size=100)) for _ in range(2))
     breaks = np.zeros(100, dtype=np.int64)

@@ -1,7 +1,5 @@
 """Any sequence of faults leaves finite states, valid covariances and increasing times."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -149,8 +147,8 @@ def assert_valid(state: NavState) -> None:
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
-@pytest.mark.parametrize("examples", [10, pytest.param(200, marks=pytest.mark.slow)])
-def test_no_sequence_of_faults_breaks_a_stream(backend: str, examples: int) -> None:
+@pytest.mark.parametrize("examples", [6, pytest.param(200, marks=pytest.mark.slow)])
+def test_no_sequence_of_faults_breaks_a_stream(backend, examples):
     @settings(
         max_examples=examples,
         deadline=None,
@@ -158,7 +156,7 @@ def test_no_sequence_of_faults_breaks_a_stream(backend: str, examples: int) -> N
         suppress_health_check=list(HealthCheck),
     )
     @given(WALK)
-    def run(walk: list[tuple[str, int, float]]) -> None:
+    def run(walk):
         stream = Stream(backend)
         try:
             stream.samples(80, "fine", 0.0)

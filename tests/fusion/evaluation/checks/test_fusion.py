@@ -1,10 +1,6 @@
 """Checks of recordings by group: fusion and network, fixes, missing samples."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -28,9 +24,7 @@ from stario.fusion.state import Track
 from stario.network.model import load_model
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
-
-Make = Callable[..., Any]
+from stario.sequences.sequence import PositionTrack, Trajectory
 
 
 def of(scores: pd.DataFrame, metric: str, track: str = "filtered") -> float:
@@ -44,7 +38,7 @@ def row(name: str, group: str, ratio: float, network: float, **fused: float) -> 
     )
 
 
-def test_ratios_are_geometric_means_by_group() -> None:
+def test_ratios_are_geometric_means_by_group():
     rows = [
         row("a", "x", 0.5, 1.0, nis=3.0, nees=1.0, yaw_error=0.01, yaw_good=1.0),
         row("b", "x", 2.0, 1.0, nis=3.0, nees=5.0, yaw_error=-0.9, yaw_good=0.0),
@@ -58,9 +52,7 @@ def test_ratios_are_geometric_means_by_group() -> None:
     assert pooled.split()[:2] == ["all", "3"]
 
 
-def test_the_error_of_the_fusion_at_waypoints_agrees_with_its_error_at_poses(
-    walk: ImuSequence, make_oracle: Make
-) -> None:
+def test_the_error_of_the_fusion_at_waypoints_agrees_with_its_error_at_poses(walk, make_oracle):
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
     poses = fusion_gain(oracle, walk, CONFIG, "walks", ("ekf",))
     every = slice(None, None, 500)
@@ -75,9 +67,7 @@ def test_the_error_of_the_fusion_at_waypoints_agrees_with_its_error_at_poses(
     assert of(waypoints, "percent") == pytest.approx(100.0 * of(waypoints, "error_m") / legs)
 
 
-def test_the_yaw_error_is_that_since_the_start_next_to_the_sigma_of_yaw(
-    walk: ImuSequence, make_oracle: Make
-) -> None:
+def test_the_yaw_error_is_that_since_the_start_next_to_the_sigma_of_yaw(walk, make_oracle):
     """A world whose axes point elsewhere changes neither."""
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
     turn, truth = about_z(2.0), walk.truth
@@ -98,7 +88,7 @@ def test_the_yaw_error_is_that_since_the_start_next_to_the_sigma_of_yaw(
     assert of(shorter, "yaw_sigma") == pytest.approx(np.sqrt(track.covariance[at_its_end, 2, 2]))
 
 
-def test_too_little_truth_is_refused(walk: ImuSequence, still_model: Any) -> None:
+def test_too_little_truth_is_refused(walk, still_model):
     with pytest.raises(InputError, match="truth"):
         fusion_gain(still_model, replace(walk, truth=None), CONFIG, "walks")
     # A group's mean would be NaN with a single waypoint within the track.
@@ -107,7 +97,7 @@ def test_too_little_truth_is_refused(walk: ImuSequence, still_model: Any) -> Non
         fusion_gain(still_model, replace(walk, truth=None, positions=at_waypoints), CONFIG, "walks")
 
 
-def test_true_fixes_keep_a_track_near_the_truth(walk: ImuSequence, make_oracle: Make) -> None:
+def test_true_fixes_keep_a_track_near_the_truth(walk, make_oracle):
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
     scores = track_with_fixes(oracle, walk, CONFIG, "walks", every=2.0, sigma=0.05)
     [found] = wide(scores).itertuples()
@@ -119,9 +109,7 @@ def test_true_fixes_keep_a_track_near_the_truth(walk: ImuSequence, make_oracle: 
     assert row[-1] == "100.0%"
 
 
-def test_errors_and_sigmas_are_those_of_the_second_half(
-    walk: ImuSequence, still_model: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_errors_and_sigmas_are_those_of_the_second_half(walk, still_model, monkeypatch):
     """A track that is lost at first, then off by (0.3, 0.4, 0) m and 0.02 rad."""
     truth = walk.truth
     off = np.where(truth.time > truth.time[-1] / 2.0, 1.0, 100.0)
@@ -150,24 +138,21 @@ def test_errors_and_sigmas_are_those_of_the_second_half(
     ]  # fmt: skip
 
 
-def test_errors_of_fixes_match_their_stated_sigma(walk: ImuSequence) -> None:
+def test_errors_of_fixes_match_their_stated_sigma(walk):
     fixes = true_fixes(walk.truth, 0.05, 0.2, seed=1)
     at = walk.truth.at(np.array([fix.time for fix in fixes])).position_W
     error = np.array([fix.value for fix in fixes]) - at
     assert np.sqrt((error**2).mean()) == pytest.approx(0.2, rel=0.1)
 
 
-def test_missing_poses_and_too_few_fixes_are_refused(walk: ImuSequence, still_model: Any) -> None:
+def test_missing_poses_and_too_few_fixes_are_refused(walk, still_model):
     with pytest.raises(InputError, match="truth"):
         track_with_fixes(still_model, replace(walk, truth=None), CONFIG, "walks")
     with pytest.raises(InputError, match="fixes"):
         track_with_fixes(still_model, walk, CONFIG, "walks", every=15.0)
 
 
-def test_truth_before_the_first_sample_gives_no_fixes(
-    walk: ImuSequence, make_oracle: Make, caplog: pytest.LogCaptureFixture
-) -> None:
-    assert walk.truth is not None
+def test_truth_before_the_first_sample_gives_no_fixes(walk, make_oracle, caplog):
     time = walk.truth.time.copy()
     time[0] = walk.time[0] - 1.0
     earlier = replace(walk, truth=replace(walk.truth, time=time))
@@ -177,9 +162,7 @@ def test_truth_before_the_first_sample_gives_no_fixes(
     assert values(scores, "applied") > 0.9
 
 
-def test_gaps_of_a_tenth_of_a_second_and_5_percent_loss_hardly_move_the_end(
-    walk: ImuSequence,
-) -> None:
+def test_gaps_of_a_tenth_of_a_second_and_5_percent_loss_hardly_move_the_end(walk):
     found = wide(end_shifts(load_model("default"), walk, NavigatorConfig(), "walks"))
     assert len(found) == 7
     assert set(found["recording"]) == {walk.name}
@@ -192,16 +175,14 @@ def test_gaps_of_a_tenth_of_a_second_and_5_percent_loss_hardly_move_the_end(
     assert dropped.degrees < 0.5
 
 
-def test_a_stationary_recording_is_refused(walk: ImuSequence, still_model: Any) -> None:
+def test_a_stationary_recording_is_refused(walk, still_model):
     force = np.tile([0.0, 0.0, 9.81], (len(walk), 1))
     still = replace(walk, gyro=0.0 * walk.gyro, accel=force, truth=None)
     with pytest.raises(InputError, match="metre"):
         end_shifts(still_model, still, NavigatorConfig(), "table")
 
 
-def test_a_shift_is_a_share_of_the_path_and_a_turn_in_degrees(
-    still_model: Any, walk: ImuSequence, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_shift_is_a_share_of_the_path_and_a_turn_in_degrees(still_model, walk, monkeypatch):
     """Three ends: the unmodified one, one 0.5 m and 20 degrees off, the others not at all."""
     time, position = np.arange(3.0), np.outer(np.arange(3.0), [5.0, 0.0, 0.0])
     turned = about_z(np.radians([0.0, 10.0, -20.0]))

@@ -1,11 +1,10 @@
 import pytest
 
-from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 
 @pytest.fixture(scope="session")
-def walk() -> ImuSequence:
+def walk():
     style = WalkStyle(carry="handheld", preferred_speed=1.0, mount_rotvec=(0.3, -0.5, 0.4))
     return simulate_imu(generate_walk(4, 15.0, style=style), 100.0, PERFECT_IMU)

@@ -1,17 +1,13 @@
 """Files and zips that no reader of phone apps takes are refused in one line that names why."""
 
-from __future__ import annotations
-
 import zipfile
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
-from phone_exports import get_sensor_data, pose, trace
+from phone_exports import get_sensor_data, trace
 from phone_files import ns, save, zyx
 
-from stario.sequences import ImuSequence, ReadError, read_recording
+from stario.sequences import ReadError, read_recording
 from stario.sequences.clean_samples import clean_samples
 
 
@@ -23,13 +19,13 @@ from stario.sequences.clean_samples import clean_samples
         (b"\x1f\x8b\x08\0\0\0", "compressed with gzip"),
     ],
 )
-def test_an_unsupported_container_is_named(start: bytes, message: str, tmp_path: Path) -> None:
+def test_an_unsupported_container_is_named(start, message, tmp_path):
     (tmp_path / "export.data").write_bytes(start)
     with pytest.raises(ReadError, match=rf"found [\w ,]*{message}.*; export as CSV"):
         read_recording(tmp_path / "export.data")
 
 
-def test_two_recordings_in_a_zip_are_named(walk: ImuSequence, tmp_path: Path) -> None:
+def test_two_recordings_in_a_zip_are_named(walk, tmp_path):
     zyx(tmp_path / "s", walk, TotalAcceleration=walk.accel, Gyroscope=walk.gyro)
     with zipfile.ZipFile(tmp_path / "two.zip", "w") as file:
         for one in (tmp_path / "s").iterdir():
@@ -41,7 +37,7 @@ def test_two_recordings_in_a_zip_are_named(walk: ImuSequence, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("first", [0, 1])
-def test_a_count_of_rows_is_no_time(first: int, walk: ImuSequence, tmp_path: Path) -> None:
+def test_a_count_of_rows_is_no_time(first, walk, tmp_path):
     count = first + np.arange(len(walk))
     wide = ",".join(f"{name} {axis}" for name in ("Gyroscope", "Accelerometer") for axis in "XYZ")
     save(tmp_path / "wide.csv", f"timestamp,{wide}", count, walk.gyro, walk.accel)
@@ -54,7 +50,7 @@ def test_a_count_of_rows_is_no_time(first: int, walk: ImuSequence, tmp_path: Pat
             read_recording(tmp_path / name)
 
 
-def test_sensors_without_a_time_are_refused_as_such(walk: ImuSequence, tmp_path: Path) -> None:
+def test_sensors_without_a_time_are_refused_as_such(walk, tmp_path):
     wide = ",".join(f"{name}_{axis}" for name in ("Gyr", "Acc") for axis in "XYZ")
     columns = np.arange(len(walk)), walk.gyro, walk.accel
     save(tmp_path / "MT.csv", f"// Update Rate: 100.0Hz\nPacketCounter,{wide}", *columns)
@@ -72,9 +68,7 @@ def test_sensors_without_a_time_are_refused_as_such(walk: ImuSequence, tmp_path:
         ('[{"sensor": "Gyroscope", "time": "1"}]', r"x\.json: .*found"),
     ],
 )
-def test_a_malformed_json_export_is_refused_in_one_line(
-    text: str, message: str, tmp_path: Path
-) -> None:
+def test_a_malformed_json_export_is_refused_in_one_line(text, message, tmp_path):
     (tmp_path / "x.json").write_text(text)
     with pytest.raises(ReadError, match=message) as error:
         read_recording(tmp_path / "x.json")
@@ -82,9 +76,7 @@ def test_a_malformed_json_export_is_refused_in_one_line(
     assert "stario-" not in str(error.value)
 
 
-def test_a_sensors_file_without_samples_is_named(
-    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_sensors_file_without_samples_is_named(walk, tmp_path, caplog):
     zyx(tmp_path, walk, Gyroscope=walk.gyro, GyroscopeUncalibrated=walk.gyro)
     (tmp_path / "TotalAcceleration.csv").write_text("time,seconds_elapsed,z,y,x\n")
     lacking = "no rows with a time that grows and three values"
@@ -97,9 +89,7 @@ def test_a_sensors_file_without_samples_is_named(
     assert "Gyroscope.csv: not read: it has no rows" in caplog.text
 
 
-def test_samples_without_an_accelerometer_are_counted(
-    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_samples_without_an_accelerometer_are_counted(walk, tmp_path, caplog):
     """It stopped halfway, say; that it starts a little late needs no mention."""
     for part, dropped in ((slice(10, None), False), (slice(0, 751), True)):
         zyx(tmp_path, walk, Gyroscope=walk.gyro)
@@ -110,9 +100,7 @@ def test_samples_without_an_accelerometer_are_counted(
         assert ("dropped" in caplog.text) == dropped
 
 
-def test_a_file_of_one_sensor_names_that_of_the_gyroscope(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_a_file_of_one_sensor_names_that_of_the_gyroscope(walk, tmp_path):
     zyx(tmp_path, walk, Gyroscope=walk.gyro, TotalAcceleration=walk.accel)
     message = r"found one sensor of a recording, .*; name its gyroscope: .*/Gyroscope\.csv$"
     with pytest.raises(ReadError, match=message):
@@ -120,15 +108,13 @@ def test_a_file_of_one_sensor_names_that_of_the_gyroscope(
     assert len(read_recording(tmp_path / "Gyroscope.csv")) == len(walk)
 
 
-def test_single_wild_samples_are_no_reason_to_refuse_a_file(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_single_wild_samples_are_no_reason_to_refuse_a_file(walk, tmp_path):
     """They would spoil the comparison with the phone's attitude, which tells Apple's sign."""
     gyro, accel = walk.gyro.copy(), -walk.accel
     gyro[500, 1], gyro[600, 0], accel[700, 2], accel[900, 0] = 1e30, 1e5, np.inf, -1e15
     zyx(tmp_path, walk, Gyroscope=gyro, TotalAcceleration=accel)
     header = "time,seconds_elapsed,qz,qy,qx,qw"
-    quat_xyzw = pose(walk).quat_xyzw[:, [2, 1, 0, 3]]
+    quat_xyzw = walk.truth.quat_xyzw[:, [2, 1, 0, 3]]
     save(tmp_path / "Orientation.csv", header, ns(walk), walk.time, quat_xyzw)
     time, rate, force = clean_samples(read_recording(tmp_path))
     assert len(time) == len(walk) - 2
@@ -136,7 +122,7 @@ def test_single_wild_samples_are_no_reason_to_refuse_a_file(
     assert np.abs(force - np.delete(walk.accel, [500, 600], axis=0)).max() < 2.0
 
 
-def test_a_clock_in_another_unit_than_its_title_says(walk: ImuSequence, tmp_path: Path) -> None:
+def test_a_clock_in_another_unit_than_its_title_says(walk, tmp_path):
     for name, values in (("Gyroscope", walk.gyro), ("TotalAcceleration", walk.accel)):
         save(tmp_path / f"{name}.csv", "t [s],x,y,z", ns(walk), values)
     with pytest.raises(ReadError, match=r"time: found .*; is its unit the one that the header"):
@@ -168,10 +154,7 @@ def test_a_clock_in_another_unit_than_its_title_says(walk: ImuSequence, tmp_path
         (get_sensor_data, "\nPOSI;7.000;1;", "\nPOSI\nPOSI;7;1;", "POSI, line 1 .*cut line"),
     ],
 )
-def test_a_damaged_event_line_is_named(
-    walk: ImuSequence, tmp_path: Path, write: Callable[[Path, ImuSequence], None], whole: str,
-    changed: str, error: str,
-) -> None:  # fmt: skip
+def test_a_damaged_event_line_is_named(walk, tmp_path, write, whole, changed, error):
     write(tmp_path / "walk", walk)
     (file,) = (tmp_path / "walk").iterdir()
     file.write_text(file.read_text().replace(whole, changed, 1))
@@ -182,10 +165,7 @@ def test_a_damaged_event_line_is_named(
 @pytest.mark.parametrize(
     ("write", "cell"), [(trace, "TYPE_GYROSCOPE\t"), (get_sensor_data, "\nACCE;5.010;0.0100;")]
 )
-def test_an_event_that_is_not_finite_is_dropped_with_a_warning(
-    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture,
-    write: Callable[[Path, ImuSequence], None], cell: str,
-) -> None:  # fmt: skip
+def test_an_event_that_is_not_finite_is_dropped_with_a_warning(walk, tmp_path, caplog, write, cell):
     write(tmp_path / "walk", walk)
     (file,) = (tmp_path / "walk").iterdir()
     before, _, after = file.read_text().rpartition(cell)

@@ -8,7 +8,7 @@ from phone_exports import get_sensor_data, phyphox, prefixed, sensor_logger
 from phone_files import START_NS, save
 from recorded import DATA
 
-from stario.sequences import Barometer, ImuSequence, read_recording
+from stario.sequences import Barometer, read_recording
 from stario.sequences.sequence import FloatArray
 
 RAW = DATA / "raw"
@@ -45,14 +45,14 @@ def assert_pressure(found: Barometer, time: FloatArray, pressure_hPa: FloatArray
     ],
 )
 def test_pressure_is_read_in_the_unit_of_its_title_or_else_of_its_size(
-    walk: ImuSequence, tmp_path: Path, header: str, factor: float
-) -> None:
+    walk, tmp_path, header, factor
+):
     phyphox(tmp_path / "p", walk)
     save(tmp_path / "p/Barometer.csv", header, TIME, factor * HPA)
     assert_pressure(pressure_of(tmp_path / "p"), TIME, HPA)
 
 
-def test_pressure_without_titles_is_read(walk: ImuSequence, tmp_path: Path) -> None:
+def test_pressure_without_titles_is_read(walk, tmp_path):
     prefixed(tmp_path / "p", walk)
     stamps = [f"{1606391908305 + 1e3 * t:.18e}" for t in TIME]
     rows = [f"{t} {p:.18e}" for t, p in zip(stamps, HPA, strict=True)]
@@ -60,7 +60,7 @@ def test_pressure_without_titles_is_read(walk: ImuSequence, tmp_path: Path) -> N
     assert_pressure(pressure_of(tmp_path / "p"), TIME, HPA)
 
 
-def test_sensor_loggers_pressure_is_on_the_sensors_clock(walk: ImuSequence, tmp_path: Path) -> None:
+def test_sensor_loggers_pressure_is_on_the_sensors_clock(walk, tmp_path):
     sensor_logger(tmp_path / "s", walk)
     time = np.append(-3.0, TIME)  # delivered before the first sample of the others
     stamps = [START_NS + round(t * 1e9) for t in time]
@@ -70,9 +70,7 @@ def test_sensor_loggers_pressure_is_on_the_sensors_clock(walk: ImuSequence, tmp_
     assert_pressure(pressure_of(tmp_path / "s"), TIME, HPA)
 
 
-def test_pressure_repeated_in_every_row_of_a_wide_file_is_read_once(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_pressure_repeated_in_every_row_of_a_wide_file_is_read_once(walk, tmp_path):
     names = [f"{sensor} {axis}" for sensor in ("ACCELEROMETER", "GYROSCOPE") for axis in "XYZ"]
     header = ",".join(["time (s)", *names, "ATMOSPHERIC PRESSURE (hPa)"])
     held = 1013.0 - 0.01 * np.floor(walk.time)
@@ -93,13 +91,8 @@ def test_pressure_repeated_in_every_row_of_a_wide_file_is_read_once(
     ],
 )
 def test_an_altitude_in_place_of_pressure_is_named_in_one_line(
-    walk: ImuSequence,
-    tmp_path: Path,
-    title: str,
-    values: FloatArray,
-    words: str,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    walk, tmp_path, title, values, words, caplog
+):
     phyphox(tmp_path / "p", walk)
     save(tmp_path / "p/Barometer.csv", f"time,{title}", TIME, values)
     assert read_recording(tmp_path / "p").barometer is None
@@ -108,9 +101,7 @@ def test_an_altitude_in_place_of_pressure_is_named_in_one_line(
     assert line.endswith("is it an altitude?")
 
 
-def test_pressure_of_another_clock_is_named_in_one_line(
-    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_pressure_of_another_clock_is_named_in_one_line(walk, tmp_path, caplog):
     phyphox(tmp_path / "p", walk)
     save(tmp_path / "p/Barometer.csv", "time (s),pressure (hPa)", TIME + 7200.0, HPA)
     assert read_recording(tmp_path / "p").barometer is None
@@ -118,27 +109,23 @@ def test_pressure_of_another_clock_is_named_in_one_line(
     assert "found times from 7200 to 7212 s after the first sample" in caplog.text
 
 
-def test_a_walk_through_a_bar_is_no_pressure(walk: ImuSequence, tmp_path: Path) -> None:
+def test_a_walk_through_a_bar_is_no_pressure(walk, tmp_path):
     for sensor, values in (("gyr", walk.gyro), ("acc", walk.accel)):
         save(tmp_path / f"bar_{sensor}.csv", "time (s),x,y,z", walk.time, values)
     assert read_recording(tmp_path / "bar_gyr.csv").barometer is None
 
 
-def test_lines_of_pressure_satellites_and_floors_are_read(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_lines_of_pressure_satellites_and_floors_are_read(walk, tmp_path):
     get_sensor_data(tmp_path / "g", walk)
     read = read_recording(tmp_path / "g/log.txt")
     assert read.barometer is not None
     assert_pressure(read.barometer, np.array([0.5, 1.5]), np.array([1013.055, 1013.065]))
     found = read.satellites
-    assert found is not None
     np.testing.assert_allclose(found.time, [0.75, 1.75], atol=1e-3)
     assert found.altitude_m is not None
     np.testing.assert_array_equal(found.altitude_m, [5.5, 6.5])
     stated = (found.bearing_deg, found.radius_m, found.speed_m_s)
     np.testing.assert_array_equal(stated, [[90.0] * 2, [4.5] * 2, [1.25] * 2])
-    assert read.positions is not None
     np.testing.assert_array_equal(read.positions.floor, [0.0, -1.0])
     np.testing.assert_array_equal(read.positions.latlon_deg, [[40.0, -3.0], [40.0001, -3.0]])
 
@@ -154,7 +141,7 @@ def test_lines_of_pressure_satellites_and_floors_are_read(
         ("advio/advio-15", 0.9),
     ],
 )
-def test_the_apps_own_pressure_stays_within_a_floor_of_a_level_walk(name: str, rate: float) -> None:
+def test_the_apps_own_pressure_stays_within_a_floor_of_a_level_walk(name, rate):
     found = pressure_of(RAW / name)
     assert found.rate == pytest.approx(rate, rel=0.1)
     assert np.ptp(8.43 * found.pressure_hPa) < 2.5

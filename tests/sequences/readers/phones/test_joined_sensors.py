@@ -1,7 +1,5 @@
 """Sensors in files of their own, whose times differ: joined to one recording, or reported."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +22,7 @@ def written(folder: Path, walk: ImuSequence, gyro_time: FloatArray, accel_time: 
     return folder
 
 
-def test_a_second_session_in_the_same_files_does_not_mix_with_the_first(
-    tmp_path: Path, walk: ImuSequence, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_second_session_in_the_same_files_does_not_mix_with_the_first(tmp_path, walk, caplog):
     gyro_time, accel_time = walk.time[:500], walk.time[:500] + 0.004
     folder = written(tmp_path, walk, gyro_time, accel_time)
     for file in folder.iterdir():  # the app restarts its clock and appends
@@ -40,9 +36,7 @@ def test_a_second_session_in_the_same_files_does_not_mix_with_the_first(
     assert "accelerometer: dropped 499 of 1000 samples whose times go back" in caplog.text
 
 
-def test_times_of_batches_of_the_accelerometer_are_reported(
-    tmp_path: Path, walk: ImuSequence, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_times_of_batches_of_the_accelerometer_are_reported(tmp_path, walk, caplog):
     folder = written(tmp_path, walk, walk.time, walk.time)
     in_batches = walk.time[np.arange(len(walk)) // 4 * 4]
     save(folder / "Accelerometer.csv", HEADER, in_batches, walk.accel)
@@ -50,25 +44,19 @@ def test_times_of_batches_of_the_accelerometer_are_reported(
     assert "accelerometer: found 3.99 samples on average at each time" in caplog.text
 
 
-def test_samples_logged_twice_are_not_reported(
-    tmp_path: Path, walk: ImuSequence, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_samples_logged_twice_are_not_reported(tmp_path, walk, caplog):
     folder = written(tmp_path, walk, walk.time, walk.time)
     save(folder / "Accelerometer.csv", HEADER, walk.time.repeat(2), walk.accel.repeat(2, axis=0))
     np.testing.assert_allclose(read_recording(folder).accel, walk.accel)
     assert "samples" not in caplog.text
 
 
-def test_a_slow_accelerometer_is_reported(
-    tmp_path: Path, walk: ImuSequence, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_slow_accelerometer_is_reported(tmp_path, walk, caplog):
     read_recording(written(tmp_path, walk, walk.time, walk.time[::6]))
     assert "accelerometer: found 16.7 samples/s, expected 50 to 1000" in caplog.text
 
 
-def test_sensors_that_start_late_keep_the_order_and_unit_of_their_titles(
-    tmp_path: Path, walk: ImuSequence
-) -> None:
+def test_sensors_that_start_late_keep_the_order_and_unit_of_their_titles(tmp_path, walk):
     for name, unit, values in (
         ("Gyroscope", "deg/s", np.degrees(walk.gyro)), ("Accelerometer", "g", walk.accel / 9.80665)
     ):  # fmt: skip
@@ -82,9 +70,7 @@ def test_sensors_that_start_late_keep_the_order_and_unit_of_their_titles(
 
 
 @pytest.mark.parametrize("titles", ["Uhrzeit,#", "ts,accuracy,#", "#,ticks"])
-def test_axes_are_those_of_the_titles_if_the_clocks_is_unknown(
-    titles: str, tmp_path: Path, walk: ImuSequence
-) -> None:
+def test_axes_are_those_of_the_titles_if_the_clocks_is_unknown(titles, tmp_path, walk):
     for name, unit, values in (
         ("Gyroscope", "deg/s", np.degrees(walk.gyro)), ("Accelerometer", "m/s^2", walk.accel)
     ):  # fmt: skip
@@ -99,9 +85,7 @@ def test_axes_are_those_of_the_titles_if_the_clocks_is_unknown(
     np.testing.assert_allclose(read.accel, walk.accel, atol=1e-9)
 
 
-def test_copies_that_a_browser_numbers_are_another_recording(
-    tmp_path: Path, walk: ImuSequence
-) -> None:
+def test_copies_that_a_browser_numbers_are_another_recording(tmp_path, walk):
     folder = written(tmp_path, walk, walk.time, walk.time)
     save(folder / "Gyroscope (1).csv", HEADER, walk.time, -walk.gyro)
     np.testing.assert_allclose(read_recording(folder).gyro, walk.gyro)

@@ -1,7 +1,5 @@
 """Exports of further loggers and devices: each must be read as the walk written."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -164,18 +162,14 @@ LOGGERS: dict[str, Callable[[Path, ImuSequence], None]] = {
 
 
 @pytest.mark.parametrize("logger", LOGGERS)
-def test_a_loggers_export_is_read_as_the_walk(
-    logger: str, walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_a_loggers_export_is_read_as_the_walk(logger, walk, tmp_path):
     LOGGERS[logger](tmp_path / "s", walk)
     (found,) = find_recordings(tmp_path / "s")
     assert_same_samples(read_recording(found), walk)
 
 
 @pytest.mark.parametrize("second_clock", [False, True])
-def test_swapped_rows_at_the_start_of_a_file_without_titles(
-    second_clock: bool, walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_swapped_rows_at_the_start_of_a_file_without_titles(second_clock, walk, tmp_path):
     order = np.arange(len(walk))
     order[[4, 5, 12, 13]] = [5, 4, 13, 12]
     clocks = [[stamp, stamp] if second_clock else [stamp] for stamp in ns(walk)]

@@ -1,9 +1,6 @@
 """One table in which each row names its sensor."""
 
-from __future__ import annotations
-
 import logging
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,9 +30,7 @@ def rows_of(walk: ImuSequence, names: tuple[str, ...], separator: str = ",") -> 
 
 @pytest.mark.parametrize("names", NAMES.values(), ids=NAMES)
 @pytest.mark.parametrize("header", ["time,sensor,x,y,z", "timestamp;sensor_name;v_x;v_y;v_z", ""])
-def test_rows_are_sorted_by_their_sensor(
-    names: tuple[str, ...], header: str, walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_rows_are_sorted_by_their_sensor(names, header, walk, tmp_path):
     rows = rows_of(walk, names, ";" if ";" in header else ",")
     path = tmp_path / "own.csv"
     write_lines(path, *([header, *rows] if header else rows))
@@ -44,18 +39,17 @@ def test_rows_are_sorted_by_their_sensor(
     assert read.name == "own"
     assert "the sensor named in each row" in read.summary()
     assert_same_samples(read, walk)
-    assert read.magnetometer is not None
     np.testing.assert_allclose(read.magnetometer.field, field(walk), atol=1e-9)
 
 
-def test_one_sensor_after_the_other_is_read_too(walk: ImuSequence, tmp_path: Path) -> None:
+def test_one_sensor_after_the_other_is_read_too(walk, tmp_path):
     rows = rows_of(walk, NAMES["codes"])
     ordered = [row for code in ("ACC", "GYR") for row in rows if code in row]
     path = write_lines(tmp_path / "own.csv", "time,sensor,x,y,z", *ordered)
     assert_same_samples(read_recording(path), walk)
 
 
-def test_times_may_be_those_of_the_day(walk: ImuSequence, tmp_path: Path) -> None:
+def test_times_may_be_those_of_the_day(walk, tmp_path):
     rows = [row.split(",", 1) for row in rows_of(walk, NAMES["words"])]
     path = tmp_path / "own.csv"
     lines = [f"12:00:{float(t):07.4f},{rest}" for t, rest in rows]
@@ -63,16 +57,14 @@ def test_times_may_be_those_of_the_day(walk: ImuSequence, tmp_path: Path) -> Non
     assert_same_samples(read_recording(path), walk)
 
 
-def test_a_sensor_spelled_in_two_ways_is_one(walk: ImuSequence, tmp_path: Path) -> None:
+def test_a_sensor_spelled_in_two_ways_is_one(walk, tmp_path):
     rows = rows_of(walk, ("gyro (1)", "acc", "mag"))
     rows[3::6] = [row.replace("gyro (1)", "gyro-1-") for row in rows[3::6]]
     path = write_lines(tmp_path / "own.csv", "time,sensor,x,y,z", *rows)
     assert_same_samples(read_recording(path), walk)
 
 
-def test_messages_name_the_file_and_the_sensor(
-    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_messages_name_the_file_and_the_sensor(walk, tmp_path, caplog):
     path = tmp_path / "own.csv"
     rows = rows_of(walk, NAMES["codes"])
     write_lines(path, "time,sensor,x,y,z", *rows)

@@ -1,9 +1,6 @@
 """Files as apps export them (`phone_exports`): each must be read as the walk written."""
 
-from __future__ import annotations
-
 import zipfile
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +12,6 @@ from phone_exports import (
     Y_UP,
     androsensor,
     get_sensor_data,
-    pose,
     prefixed,
     senslogs_ios,
     sensor_logger,
@@ -28,7 +24,6 @@ from recorded import DATA
 from scipy.spatial.transform import Rotation
 
 from stario.sequences import (
-    ImuSequence,
     Magnetometer,
     ReadError,
     find_recordings,
@@ -42,7 +37,7 @@ RAW = DATA / "raw"
 
 
 @pytest.mark.parametrize("app", APPS)
-def test_an_apps_export_is_read_as_the_walk(app: str, walk: ImuSequence, tmp_path: Path) -> None:
+def test_an_apps_export_is_read_as_the_walk(app, walk, tmp_path):
     APPS[app](tmp_path / "s", walk)
     (found,) = find_recordings(tmp_path / "s")
     read = read_recording(found)
@@ -52,7 +47,7 @@ def test_an_apps_export_is_read_as_the_walk(app: str, walk: ImuSequence, tmp_pat
     np.testing.assert_allclose(read.magnetometer.time, walk.time, atol=1e-3)
 
 
-def test_old_unit_symbols_and_other_languages_are_read(walk: ImuSequence, tmp_path: Path) -> None:
+def test_old_unit_symbols_and_other_languages_are_read(walk, tmp_path):
     androsensor(tmp_path / "s", walk)
     (path,) = (tmp_path / "s").iterdir()
     path.write_bytes(path.read_text().replace("μ", "µ").encode("latin-1"))
@@ -65,9 +60,7 @@ def test_old_unit_symbols_and_other_languages_are_read(walk: ImuSequence, tmp_pa
     np.testing.assert_allclose(read_recording(tmp_path / "t").accel, walk.accel)
 
 
-def test_a_linear_acceleration_of_about_one_is_not_mistaken_for_gravity_in_g(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_a_linear_acceleration_of_about_one_is_not_mistaken_for_gravity_in_g(walk, tmp_path):
     """Its norm is about 1, as in g; the gravity file next to it shows what it is."""
     sensor_logger_ios(tmp_path / "s", walk)
     (tmp_path / "s/Metadata.csv").unlink()
@@ -79,29 +72,23 @@ def test_a_linear_acceleration_of_about_one_is_not_mistaken_for_gravity_in_g(
 
 
 @pytest.mark.parametrize("app", [sensor_logger_attitude, senslogs_ios])
-def test_the_phones_own_attitude_is_read_too(
-    app: Callable[[Path, ImuSequence], None], walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_the_phones_own_attitude_is_read_too(app, walk, tmp_path):
     """With quaternions in either order and direction, as determined by the gyroscope."""
     app(tmp_path / "s", walk)
     read = read_recording(tmp_path / "s")
-    assert read.device_attitude is not None
     np.testing.assert_allclose(read.device_attitude.time, walk.time, atol=1e-3)
-    error = (read.device_attitude.attitude_WB * pose(walk).attitude_WB.inv()).magnitude()
+    error = (read.device_attitude.attitude_WB * walk.truth.attitude_WB.inv()).magnitude()
     assert error.max() < 1e-6
     bare = replace(read, accel=read.accel - gravity(walk))
     np.testing.assert_allclose(with_gravity(bare).accel, walk.accel, atol=0.02)
     turned = with_axes(read, "y,-x,z").device_attitude
-    assert turned is not None
     up = turned.attitude_WB.apply(with_axes(read, "y,-x,z").accel)
-    np.testing.assert_allclose(up, pose(walk).attitude_WB.apply(walk.accel), atol=1e-5)
+    np.testing.assert_allclose(up, walk.truth.attitude_WB.apply(walk.accel), atol=1e-5)
 
 
 @pytest.mark.parametrize("inner", ["", "walk/"])
 @pytest.mark.parametrize("app", ["sensor_logger", "phyphox"])
-def test_a_zip_is_read_like_the_folder_in_it(
-    app: str, inner: str, walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_a_zip_is_read_like_the_folder_in_it(app, inner, walk, tmp_path):
     folder = tmp_path / "s"
     APPS[app](folder, walk)
     (tmp_path / "zips").mkdir()
@@ -119,7 +106,7 @@ def test_a_zip_is_read_like_the_folder_in_it(
         read_recording(path)
 
 
-def test_an_error_in_a_zip_names_the_zip_and_the_file(walk: ImuSequence, tmp_path: Path) -> None:
+def test_an_error_in_a_zip_names_the_zip_and_the_file(walk, tmp_path):
     sensor_logger(tmp_path / "s", walk)
     path = tmp_path / "export.zip"
     with zipfile.ZipFile(path, "w") as file:
@@ -132,9 +119,7 @@ def test_an_error_in_a_zip_names_the_zip_and_the_file(walk: ImuSequence, tmp_pat
         read_recording(path)
 
 
-def test_messages_about_a_zip_name_the_zip_and_the_file(
-    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_messages_about_a_zip_name_the_zip_and_the_file(walk, tmp_path, caplog):
     for name, values in (("Gyroscope", walk.gyro), ("TotalAcceleration", walk.accel)):
         save(tmp_path / f"s/{name}.csv", "time,x,y,z", walk.time, values)
     path = tmp_path / "export.zip"
@@ -155,11 +140,9 @@ def test_messages_about_a_zip_name_the_zip_and_the_file(
 
 @pytest.mark.parametrize("order", ["xyzw", "wxyz"])
 @pytest.mark.parametrize("turn", ["x,y,z", "camera"])
-def test_poses_next_to_the_imu_are_read_as_truth_in_its_axes(
-    order: str, turn: str, walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_poses_next_to_the_imu_are_read_as_truth_in_its_axes(order, turn, walk, tmp_path):
     """30 Hz, y up, of the camera or the sensor, in either quaternion order despite the header."""
-    truth, every = pose(walk), slice(None, None, 3)
+    truth, every = walk.truth, slice(None, None, 3)
     mount = Rotation.from_euler("z", 90.0 if turn == "camera" else 0.0, degrees=True)
     attitude = (Y_UP * truth.attitude_WB * mount.inv())[every].as_quat()
     quat = attitude if order == "xyzw" else attitude[:, [3, 0, 1, 2]]
@@ -170,7 +153,6 @@ def test_poses_next_to_the_imu_are_read_as_truth_in_its_axes(
     save(Path(f"{stem}_IMU.txt"), "Timestamp,Ax,Ay,Az,Gx,Gy,Gz", ns(walk), walk.accel, walk.gyro)
     (found,) = find_recordings(tmp_path)
     read = read_recording(found)
-    assert read.truth is not None
     assert read.truth.valid.mean() > 0.9
     np.testing.assert_allclose(read.truth.time, truth.time[every], atol=0.01)
     error = (read.truth.attitude_WB * truth.attitude_WB[every].inv()).as_rotvec()
@@ -179,9 +161,7 @@ def test_poses_next_to_the_imu_are_read_as_truth_in_its_axes(
 
 
 @pytest.mark.parametrize("columns", [7, 12])
-def test_a_pose_file_without_any_rotation_gives_a_warning(
-    columns: int, walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_pose_file_without_any_rotation_gives_a_warning(columns, walk, tmp_path, caplog):
     rows = np.ones((len(walk), columns))
     for name, values in (("acce", walk.accel), ("gyro", walk.gyro), ("ARKit_pose", rows)):
         save(tmp_path / f"s/{name}.txt", "# a", ns(walk), values, sep=" ")
@@ -189,15 +169,15 @@ def test_a_pose_file_without_any_rotation_gives_a_warning(
     assert "no row in ARKit_pose.txt holds a pose" in caplog.text
 
 
-def test_poses_without_an_imu_are_refused_as_such(walk: ImuSequence, tmp_path: Path) -> None:
-    rows = np.hstack([pose(walk).position_W, pose(walk).quat_xyzw])
+def test_poses_without_an_imu_are_refused_as_such(walk, tmp_path):
+    rows = np.hstack([walk.truth.position_W, walk.truth.quat_xyzw])
     save(tmp_path / "s/ARCore_sensor_pose.txt", "# by a logger", ns(walk), rows, sep=" ")
     for read in (read_recording, find_recordings):
         with pytest.raises(ReadError, match=r"only poses, ARCore_sensor_pose\.txt, expected a gyr"):
             read(tmp_path / "s")
 
 
-def test_a_missing_sensor_is_named(walk: ImuSequence, tmp_path: Path) -> None:
+def test_a_missing_sensor_is_named(walk, tmp_path):
     save(tmp_path / "s/Accelerometer.csv", "time,x,y,z", walk.time, walk.accel)
     save(tmp_path / "s/Magnetometer.csv", "time,x,y,z", walk.time, field(walk))
     message = "only accel and mag, expected a gyroscope and an accelerometer"
@@ -211,13 +191,11 @@ def test_a_missing_sensor_is_named(walk: ImuSequence, tmp_path: Path) -> None:
         read_recording(tmp_path / "a.csv")
 
 
-def test_an_accelerometer_in_other_axes_than_the_gyroscope_is_corrected(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_accelerometer_in_other_axes_than_the_gyroscope_is_corrected(tmp_path, caplog):
     style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.5, 0.4))
     walk = simulate_imu(generate_walk(3, 60.0, style=style), 50.0, PERFECT_IMU)
     poses = np.hstack(
-        [Y_UP.apply(pose(walk).position_W), (Y_UP * pose(walk).attitude_WB).as_quat()]
+        [Y_UP.apply(walk.truth.position_W), (Y_UP * walk.truth.attitude_WB).as_quat()]
     )
     wrong = -walk.accel[:, [1, 0, 2]]
     for name, values in (("acce", wrong), ("gyro", walk.gyro), ("ARKit_pose", poses)):
@@ -227,9 +205,7 @@ def test_an_accelerometer_in_other_axes_than_the_gyroscope_is_corrected(
     np.testing.assert_allclose(read.accel, walk.accel, atol=1e-9)
 
 
-def test_timestamps_among_the_values_are_named_with_their_file_and_columns(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_timestamps_among_the_values_are_named_with_their_file_and_columns(walk, tmp_path):
     for name in ("accel", "gyro"):
         values = np.column_stack([ns(walk), walk.gyro[:, :2]])
         save(tmp_path / f"s/{name}.csv", "time,x,y,z", walk.time, values)
@@ -238,23 +214,18 @@ def test_timestamps_among_the_values_are_named_with_their_file_and_columns(
         read_recording(tmp_path / "s")
 
 
-def test_waypoints_and_reference_points_are_read_as_positions(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_waypoints_and_reference_points_are_read_as_positions(walk, tmp_path):
     trace(tmp_path / "t", walk)
     waypoints = read_recording(tmp_path / "t/5d07.txt").positions
-    assert waypoints is not None
     np.testing.assert_allclose(waypoints.time, [2.0, 7.0], atol=1e-3)
     np.testing.assert_allclose(waypoints.position_W, [[200.5, 7.25], [700.5, 7.25]])
     get_sensor_data(tmp_path / "g", walk)
     points = read_recording(tmp_path / "g/log.txt").positions
-    assert points is not None
     np.testing.assert_allclose(points.time, [2.0, 4.0], atol=1e-3)
     np.testing.assert_allclose(points.position_W, [[0.0, 0.0], [0.0, 11.10]], atol=0.01)
     prefixed(tmp_path / "p", walk)
     (tmp_path / "p/Eight_ref.csv").write_text("1606391910305 566578.7 5932830.4 19.6\n" * 2)
     references = read_recording(tmp_path / "p").positions
-    assert references is not None
     np.testing.assert_allclose(references.time, [2.0])
 
 
@@ -269,7 +240,7 @@ KINDS = {
 
 @pytest.mark.skipif(not RAW.is_dir(), reason="the apps' own files are not here")
 @pytest.mark.parametrize("name", KINDS)
-def test_the_apps_own_files_contain_gravity_and_the_expected_truth(name: str) -> None:
+def test_the_apps_own_files_contain_gravity_and_the_expected_truth(name):
     read = read_recording(RAW / name)
     assert 9.0 < np.median(np.linalg.norm(read.accel, axis=1)) < 12.0
     assert 0.1 < np.median(np.linalg.norm(read.gyro, axis=1)) < 3.0

@@ -10,8 +10,7 @@ from phone_exports import androsensor, phyphox, sensor_logger
 from phone_files import START_NS, save
 from recorded import DATA
 
-from stario.sequences import ImuSequence, read_recording
-from stario.sequences.geodesy import east_north
+from stario.sequences import read_recording
 from stario.sequences.sequence import FloatArray, PositionTrack
 
 PHYPHOX = '"Time (s)","Latitude (°)","Longitude (°)","Height (m)","Velocity (m/s)","Direction (°)"'
@@ -33,19 +32,12 @@ def degrees(metres: FloatArray) -> FloatArray:
 
 def positions_of(path: Path) -> PositionTrack:
     found = read_recording(path).positions
-    assert found is not None
     assert found.kind == "positions"
     return found
 
 
-def test_a_degree_has_its_length_on_the_ellipsoid() -> None:
-    north, east = east_north(np.array([[45.0, 7.0], [45.001, 7.0], [45.0, 7.001]]))[1:]
-    np.testing.assert_allclose(north, [0.0, 1e-3 * NORTH], atol=0.02)
-    np.testing.assert_allclose(east, [1e-3 * EAST, 0.0], atol=0.02)
-
-
 @pytest.mark.parametrize("title", ["accuracy", "hAcc (m)", "h_acc", "HACC"])
-def test_the_radius_may_be_named_briefly(walk: ImuSequence, tmp_path: Path, title: str) -> None:
+def test_the_radius_may_be_named_briefly(walk, tmp_path, title):
     phyphox(tmp_path / "p", walk)
     radius = np.full(len(TIME), 4.53)
     save(tmp_path / "p/gps.csv", f"time,lat,lon,{title}", TIME, degrees(METRES), radius)
@@ -54,14 +46,7 @@ def test_the_radius_may_be_named_briefly(walk: ImuSequence, tmp_path: Path, titl
     np.testing.assert_allclose(sigma, 3.0)
 
 
-def test_the_antimeridian_is_no_jump() -> None:
-    _, there = east_north(np.array([[0.0, 179.999], [0.0, -179.999]]))
-    np.testing.assert_allclose(there, [222.64, 0.0], atol=0.01)
-
-
-def test_positions_of_phyphox_are_read_with_their_accuracy(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_positions_of_phyphox_are_read_with_their_accuracy(walk, tmp_path):
     phyphox(tmp_path / "p", walk)
     radius = np.where(TIME == 5.0, 200.0, 4.53)  # one from the cells of the network
     header = f'{PHYPHOX},"Horizontal Accuracy (m)","Vertical Accuracy (°)"'
@@ -69,16 +54,13 @@ def test_positions_of_phyphox_are_read_with_their_accuracy(
     found = positions_of(tmp_path / "p")
     np.testing.assert_allclose(found.time, TIME, atol=1e-9)
     np.testing.assert_allclose(found.position_W, METRES - METRES[0], atol=0.02)
-    assert found.sigma is not None
     np.testing.assert_allclose(found.sigma[found.valid], 3.0)
     np.testing.assert_array_equal(found.valid, TIME != 5.0)
     summary = read_recording(tmp_path / "p").truth_summary()
     assert summary == "11 positions (sigma 3 m per axis) without attitude, no poses"
 
 
-def test_sensor_loggers_own_clock_is_used_and_satellites_are_preferred(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_sensor_loggers_own_clock_is_used_and_satellites_are_preferred(walk, tmp_path):
     sensor_logger(tmp_path / "s", walk)
     time = np.append(-20.0, TIME)  # the last position known before the recording
     stamps = [START_NS + round(t * 1e9) for t in time]
@@ -92,7 +74,7 @@ def test_sensor_loggers_own_clock_is_used_and_satellites_are_preferred(
     np.testing.assert_allclose(found.position_W, METRES - METRES[0], atol=0.02)
 
 
-def test_positions_repeated_in_every_row_are_read_once(walk: ImuSequence, tmp_path: Path) -> None:
+def test_positions_repeated_in_every_row_are_read_once(walk, tmp_path):
     androsensor(tmp_path / "a", walk)
     [file] = (tmp_path / "a").glob("*.csv")
     header, *rows = file.read_text(encoding="utf-8").splitlines()
@@ -110,9 +92,7 @@ def test_positions_repeated_in_every_row_are_read_once(walk: ImuSequence, tmp_pa
     np.testing.assert_allclose(found.sigma, 4.0)
 
 
-def test_each_recording_of_a_folder_has_its_own_positions(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_each_recording_of_a_folder_has_its_own_positions(walk, tmp_path):
     for name, speed in (("one", 1.0), ("two", -1.0)):
         for sensor, values in (("gyr", walk.gyro), ("acc", walk.accel)):
             save(tmp_path / f"{name}_{sensor}.csv", "time (s),x,y,z", walk.time, values)
@@ -123,22 +103,20 @@ def test_each_recording_of_a_folder_has_its_own_positions(
         np.testing.assert_allclose(found.position_W, speed * (METRES - METRES[0]), atol=0.02)
 
 
-def test_a_latitude_that_grows_is_no_clock(walk: ImuSequence, tmp_path: Path) -> None:
+def test_a_latitude_that_grows_is_no_clock(walk, tmp_path):
     phyphox(tmp_path / "p", walk)
     save(tmp_path / "p/gps.csv", "lat,lon,alt", np.stack([TIME, TIME, TIME], axis=1))
     assert read_recording(tmp_path / "p").satellites is None
 
 
-def test_lateral_forces_are_no_positions(walk: ImuSequence, tmp_path: Path) -> None:
+def test_lateral_forces_are_no_positions(walk, tmp_path):
     phyphox(tmp_path / "p", walk)
     header = "time (s),acc_lat,acc_long,gps speed"
     save(tmp_path / "p/GPS.csv", header, TIME, METRES, TIME)
     assert read_recording(tmp_path / "p").positions is None
 
 
-def test_dates_of_positions_and_samples_may_be_in_different_zones(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_dates_of_positions_and_samples_may_be_in_different_zones(walk, tmp_path):
     for name, values in (("Accelerometer", walk.accel), ("Gyroscope", walk.gyro)):
         save(tmp_path / f"w/{name}.csv", "time,x,y,z", dates(walk.time, hours=2), values)
     columns = dates(TIME, hours=-3), degrees(METRES), np.full(len(TIME), 4.53)
@@ -155,9 +133,7 @@ def dates(time: FloatArray, hours: int) -> list[list[str]]:
     return [[(start + timedelta(seconds=t)).isoformat()] for t in time.tolist()]
 
 
-def test_positions_known_no_better_than_a_room_are_skipped_with_a_warning(
-    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_positions_known_no_better_than_a_room_are_skipped_with_a_warning(walk, tmp_path, caplog):
     phyphox(tmp_path / "p", walk)
     radius = np.where(TIME == 5.0, 8.0, 120.0)
     save(tmp_path / "p/gps.csv", "time,lat,lon,accuracy", TIME, degrees(METRES), radius)
@@ -174,13 +150,8 @@ def test_positions_known_no_better_than_a_room_are_skipped_with_a_warning(
     ],
 )
 def test_positions_in_another_unit_than_degrees_are_skipped_with_a_warning(
-    walk: ImuSequence,
-    tmp_path: Path,
-    titles: str,
-    factor: float,
-    found: str,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    walk, tmp_path, titles, factor, found, caplog
+):
     phyphox(tmp_path / "p", walk)
     save(tmp_path / "p/gps.csv", f"time,{titles}", TIME, factor * degrees(METRES))
     assert read_recording(tmp_path / "p").positions is None
@@ -188,9 +159,7 @@ def test_positions_in_another_unit_than_degrees_are_skipped_with_a_warning(
     assert "expected degrees" in caplog.text
 
 
-def test_degrees_and_minutes_are_named_in_one_line(
-    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_degrees_and_minutes_are_named_in_one_line(walk, tmp_path, caplog):
     """NMEA's 4807.038 is 48 degrees 7.038 minutes; its hemisphere is in a column of its own."""
     phyphox(tmp_path / "p", walk)
     place = np.stack([4807.038 + 0.001 * TIME, 1131.0 - 0.001 * TIME], axis=1)
@@ -201,14 +170,11 @@ def test_degrees_and_minutes_are_named_in_one_line(
     assert line.endswith("NMEA's degrees and minutes? That latitude is 48.117317")
 
 
-def test_latitude_and_longitude_that_can_only_be_exchanged_are(
-    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_latitude_and_longitude_that_can_only_be_exchanged_are(walk, tmp_path, caplog):
     phyphox(tmp_path / "p", walk)
     place = degrees(METRES) + np.array([0.0, 120.0])
     save(tmp_path / "p/gps.csv", "time,lat,lon", TIME, place[:, ::-1])
     found = read_recording(tmp_path / "p").satellites
-    assert found is not None
     np.testing.assert_array_equal(found.latlon_deg, place)
     assert "latitude and longitude are exchanged: read the other way round" in caplog.text
 
@@ -226,13 +192,7 @@ def test_latitude_and_longitude_that_can_only_be_exchanged_are(
         ),
     ],
 )
-def test_positions_that_cannot_be_used_cost_no_recording(
-    walk: ImuSequence,
-    tmp_path: Path,
-    rows: str,
-    words: str | None,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_positions_that_cannot_be_used_cost_no_recording(walk, tmp_path, rows, words, caplog):
     phyphox(tmp_path / "p", walk)
     (tmp_path / "p/Location.csv").write_text(f"{PHYPHOX}\n{rows}", encoding="utf-8")
     recording = read_recording(tmp_path / "p")
@@ -242,7 +202,7 @@ def test_positions_that_cannot_be_used_cost_no_recording(
     assert words is None or words in caplog.text
 
 
-def test_what_a_receiver_reports_is_kept_as_measured(walk: ImuSequence, tmp_path: Path) -> None:
+def test_what_a_receiver_reports_is_kept_as_measured(walk, tmp_path):
     """Repeated positions too; what it does not know is NaN, in m, m/s and degrees."""
     phyphox(tmp_path / "p", walk)
     place = degrees(METRES)
@@ -256,7 +216,6 @@ def test_what_a_receiver_reports_is_kept_as_measured(walk: ImuSequence, tmp_path
     save(tmp_path / "p/Location.csv", header, TIME, *columns)
     read = read_recording(tmp_path / "p")
     found = read.satellites
-    assert found is not None
     np.testing.assert_allclose(found.time, TIME, atol=1e-9)
     np.testing.assert_allclose(found.latlon_deg, place, atol=1e-12)
     expected = {
@@ -267,19 +226,16 @@ def test_what_a_receiver_reports_is_kept_as_measured(walk: ImuSequence, tmp_path
     }
     for name, values in expected.items():
         np.testing.assert_allclose(getattr(found, name), values, err_msg=name)
-    assert read.positions is not None
     np.testing.assert_allclose(read.positions.time, TIME[:7], atol=1e-9)
     np.testing.assert_allclose(read.positions.latlon_deg, place[:7], atol=1e-12)
 
 
-def test_a_file_of_advio_without_titles_is_read() -> None:
+def test_a_file_of_advio_without_titles_is_read():
     path = DATA / "raw/advio/advio-15"
     if not path.is_dir():
         pytest.skip("ADVIO is not here")
     found = read_recording(path).satellites
-    assert found is not None
     np.testing.assert_allclose(found.latlon_deg, [[60.187, 24.8215]] * len(found), atol=1e-3)
-    assert found.radius_m is not None
     assert found.altitude_m is not None
     assert found.radius_m.min() >= 5.0
     assert found.radius_m.max() <= 200.0

@@ -1,15 +1,11 @@
 """Files with the sensors of several IMUs: one is read and named, or none; they are never mixed."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from alike import assert_same_samples
 from phone_files import save
 
-from stario.sequences import ImuSequence, ReadError, read_recording
+from stario.sequences import ReadError, read_recording
 
 
 def titles(*names: str) -> str:
@@ -25,9 +21,7 @@ def titles(*names: str) -> str:
         ("imu1_a#", "imu1_g#", "imu2_a#", "imu2_g#"),
     ],
 )
-def test_the_first_of_two_imus_is_read_and_named(
-    names: tuple[str, ...], walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_first_of_two_imus_is_read_and_named(names, walk, tmp_path, caplog):
     columns = walk.time, walk.accel, walk.gyro, walk.accel + 1.0, walk.gyro + 1.0
     save(tmp_path / "own.csv", titles(*names), *columns)
     assert_same_samples(read_recording(tmp_path / "own.csv"), walk)
@@ -35,9 +29,7 @@ def test_the_first_of_two_imus_is_read_and_named(
     assert f"read the one with {first}, not those with {', '.join(others)}" in caplog.text
 
 
-def test_a_second_imu_beside_the_columns_of_a_generic_csv_is_named(
-    walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_second_imu_beside_the_columns_of_a_generic_csv_is_named(walk, tmp_path, caplog):
     names = titles("g#", "a#", "gyro2_#", "acc_raw_#")
     columns = walk.gyro, walk.accel, walk.gyro + 1.0, walk.accel + 1.0
     save(tmp_path / "own.csv", names, walk.time, *columns)
@@ -45,7 +37,7 @@ def test_a_second_imu_beside_the_columns_of_a_generic_csv_is_named(
     assert "another IMU are not read: gyro2_x, gyro2_y, gyro2_z\n" in caplog.text
 
 
-def test_the_sensors_of_two_imus_are_not_mixed(walk: ImuSequence, tmp_path: Path) -> None:
+def test_the_sensors_of_two_imus_are_not_mixed(walk, tmp_path):
     """The right accelerometer comes first, but the left gyroscope."""
     names = titles("right_acc_#", "left_acc_#", "left_gyro_#", "right_gyro_#")
     save(tmp_path / "own.csv", names, walk.time, walk.accel + 1.0, walk.accel, walk.gyro,
@@ -53,9 +45,7 @@ def test_the_sensors_of_two_imus_are_not_mixed(walk: ImuSequence, tmp_path: Path
     assert_same_samples(read_recording(tmp_path / "own.csv"), walk)
 
 
-def test_two_accelerometers_and_a_gyroscope_of_neither_are_refused(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_two_accelerometers_and_a_gyroscope_of_neither_are_refused(walk, tmp_path):
     names = titles("gyro_#", "acc_wrist_#", "acc_hip_#")
     save(tmp_path / "own.csv", names, walk.time, walk.gyro, walk.accel, walk.accel)
     message = r"several IMUs \(acc_wrist_x and acc_hip_x\), expected one; keep the columns"
@@ -71,16 +61,14 @@ def test_two_accelerometers_and_a_gyroscope_of_neither_are_refused(
         ("Accel_WR_#", "Accel_LN_#", "Gyro_Uncal_#", "Gyro_#"),
     ],
 )
-def test_variants_of_one_sensor_are_no_second_imu(
-    names: tuple[str, ...], walk: ImuSequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_variants_of_one_sensor_are_no_second_imu(names, walk, tmp_path, caplog):
     columns = walk.time, walk.accel + 1.0, walk.accel, walk.gyro + 1.0, walk.gyro
     save(tmp_path / "own.csv", titles(*names), *columns)
     assert_same_samples(read_recording(tmp_path / "own.csv"), walk)
     assert "several IMUs" not in caplog.text
 
 
-def test_numbered_imus_in_alternating_rows_are_refused(walk: ImuSequence, tmp_path: Path) -> None:
+def test_numbered_imus_in_alternating_rows_are_refused(walk, tmp_path):
     """As in the messages `IMU` of ArduPilot, in which `T` is the temperature."""
     header = "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,T"
     micros = 5_000_000 + np.round(1e6 * walk.time).astype(int)
@@ -97,9 +85,7 @@ def test_numbered_imus_in_alternating_rows_are_refused(walk: ImuSequence, tmp_pa
 
 @pytest.mark.parametrize("title", ["device", "Device ID", "mac_address", "side"])
 @pytest.mark.parametrize("sensors", ["gx,gy,gz,ax,ay,az", "Gyro X,Gyro Y,Gyro Z,Acc X,Acc Y,Acc Z"])
-def test_rows_of_named_devices_are_refused(
-    sensors: str, title: str, walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_rows_of_named_devices_are_refused(sensors, title, walk, tmp_path):
     header = f"time [s],{title},{sensors}"
     rows = walk.time, np.repeat("left", len(walk)), walk.gyro, walk.accel
     save(tmp_path / "one.csv", header, *rows)
@@ -112,9 +98,7 @@ def test_rows_of_named_devices_are_refused(
         read_recording(tmp_path / "two.csv")
 
 
-def test_devices_of_rows_without_imu_samples_do_not_count(
-    walk: ImuSequence, tmp_path: Path
-) -> None:
+def test_devices_of_rows_without_imu_samples_do_not_count(walk, tmp_path):
     file = tmp_path / "own.csv"
     save(file, "t [s],device,gx,gy,gz,ax,ay,az", walk.time, ["left"] * len(walk), walk.gyro,
          walk.accel)  # fmt: skip

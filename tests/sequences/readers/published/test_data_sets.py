@@ -8,7 +8,7 @@ from stario.sequences.readers import FORMATS, find_recordings, read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY
 
 
-def test_a_recording_is_read_back_as_written(written) -> None:
+def test_a_recording_is_read_back_as_written(written):
     _, recording = written
     expected = recording.expected
     read = read_recording(recording.path)
@@ -19,7 +19,6 @@ def test_a_recording_is_read_back_as_written(written) -> None:
     if expected.truth is None:
         assert read.truth is None
         return
-    assert read.truth is not None
     assert len(read.truth) == len(expected.truth)
     assert read.truth.valid.all()
     assert np.abs(read.truth.time - expected.truth.time).max() < 1e-8
@@ -28,7 +27,7 @@ def test_a_recording_is_read_back_as_written(written) -> None:
     assert error.max() < 1e-6
 
 
-def test_the_magnetometer_is_read_back_too(written) -> None:
+def test_the_magnetometer_is_read_back_too(written):
     _, recording = written
     expected, read = recording.expected.magnetometer, read_recording(recording.path).magnetometer
     assert (read is None) == (expected is None)
@@ -37,7 +36,7 @@ def test_the_magnetometer_is_read_back_too(written) -> None:
         np.testing.assert_allclose(read.field, expected.field, atol=1e-9)
 
 
-def test_each_format_is_recognised_by_its_content_alone(written) -> None:
+def test_each_format_is_recognised_by_its_content_alone(written):
     name, recording = written
     assert next(n for n, known in FORMATS.items() if known.recognises(recording.path)) == name
     assert find_recordings(recording.path) == [recording.path]
@@ -45,14 +44,14 @@ def test_each_format_is_recognised_by_its_content_alone(written) -> None:
     assert np.array_equal(read.gyro, read_recording(recording.path).gyro)
 
 
-def test_each_format_is_found_below_a_folder(written) -> None:
+def test_each_format_is_found_below_a_folder(written):
     _, recording = written
     whole = recording.path.parent if recording.path.suffix == ".csv" else recording.path
     folder = next(p for p in recording.path.parents if p.name.startswith("set"))
     assert find_recordings(folder) == [whole]
 
 
-def test_mean_force_is_gravity_and_rate_is_the_attitudes_derivative(written) -> None:
+def test_mean_force_is_gravity_and_rate_is_the_attitudes_derivative(written):
     """A check by physics, not by the writer: a wrong order, sign or frame would fail."""
     _, recording = written
     read = read_recording(recording.path)

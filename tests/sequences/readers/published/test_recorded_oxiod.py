@@ -23,7 +23,6 @@ ALL = find_recordings(OXIOD) if OXIOD.is_dir() else []
 def assert_consistent(path: Path) -> None:
     sequence = read_recording(path)
     truth = sequence.truth
-    assert truth is not None
     stride = 10
     true, measured = turned_and_measured(sequence, truth, stride)
     inside = (truth.time > sequence.time[0]) & (truth.time < sequence.time[-1]) & truth.valid
@@ -42,7 +41,6 @@ def assert_consistent(path: Path) -> None:
     assert np.degrees(np.arctan2(np.hypot(*force[:2]), force[2])) < 0.1
     assert np.linalg.norm(force) == pytest.approx(9.8, abs=0.15)
     field = sequence.magnetometer
-    assert field is not None
     inside = (field.time >= truth.time[0]) & (field.time <= truth.time[-1])
     pose = truth.at(field.time[inside])
     field_W = pose.attitude_WB.apply(field.field[inside])[pose.valid]
@@ -52,12 +50,12 @@ def assert_consistent(path: Path) -> None:
 
 @needs_data
 @pytest.mark.parametrize("name", SELECTED)
-def test_selected_recordings_are_self_consistent(name: str) -> None:
+def test_selected_recordings_are_self_consistent(name):
     assert_consistent(OXIOD / name)
 
 
 @needs_data
 @pytest.mark.slow
 @pytest.mark.parametrize("path", ALL, ids=str)
-def test_every_recording_is_self_consistent(path: Path) -> None:
+def test_every_recording_is_self_consistent(path):
     assert_consistent(path)

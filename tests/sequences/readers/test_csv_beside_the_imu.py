@@ -1,6 +1,4 @@
-"""Pressure and satellite positions in a generic CSV."""
-
-from __future__ import annotations
+"""Beside the IMU in a generic CSV: positions, their accuracy, pressure and satellites."""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -13,8 +11,83 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from stario.sequences import Barometer, Satellites
+from stario.sequences.errors import ReadError
 from stario.sequences.readers import read_recording, write_csv
-from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.readers.generic_csv import read_generic_csv
+from stario.sequences.sequence import (
+    FloatArray,
+    ImuSequence,
+    PositionTrack,
+)
+
+
+@pytest.mark.parametrize(
+    ("every", "columns", "kind"), [(4.0, 2, "waypoints"), (0.5, 3, "positions")]
+)
+def test_positions_without_attitude_are_kept_as_such(tmp_path, walk, every, columns, kind):
+    time = np.arange(walk.time[0] + 0.3, walk.time[-1], every)
+    position = walk.truth.at(time).position_W[:, :columns]
+    known = PositionTrack(time, position, kind)
+    write_csv(tmp_path / "walk.csv", replace(walk, truth=None, positions=known))
+    found = read_recording(tmp_path / "walk.csv")
+    assert found.truth is None
+    assert found.positions.kind == kind
+    np.testing.assert_allclose(found.positions.time, time - walk.time[0], atol=1e-9)
+    np.testing.assert_array_equal(found.positions.position_W, position)
+    np.testing.assert_array_equal(found.accel, walk.accel)
+
+
+def test_the_accuracy_of_positions_is_kept(tmp_path, walk):
+    time = np.arange(1.0, 6.0)
+    place, sigma = np.stack([time, -time], axis=1), 0.5 * time
+    known = PositionTrack(time, place, "positions", sigma=sigma)
+    write_csv(tmp_path / "walk.csv", replace(walk, truth=None, positions=known))
+    found = read_recording(tmp_path / "walk.csv").positions
+    assert found.sigma is not None
+    np.testing.assert_array_equal(found.position_W, place)
+    np.testing.assert_array_equal(found.sigma, sigma)
+
+
+@pytest.mark.parametrize(
+    ("cells", "times", "error"),
+    [
+        (("3.0", "2.0", "4.0"), [0.2, 0.5, 0.8], ""),
+        (("3.0", "", "4.0"), [0.2, 0.8], ""),
+        (("3.0", "0.0", "4.0"), [], "line 52, sp: found 0, expected a standard deviation above 0"),
+    ],
+)
+def test_a_position_without_its_accuracy_is_none(tmp_path, cells, times, error):
+    rows = [f"{0.01 * k:.2f},{ROW},,," for k in range(100)]
+    for k, cell in zip((20, 50, 80), cells, strict=True):
+        rows[k] = f"{0.01 * k:.2f},{ROW},{k},0,{cell}"
+    path = write_lines(tmp_path / "a.csv", "t [s],gx,gy,gz,ax,ay,az,px,py,sp [m]", *rows)
+    if error:
+        with pytest.raises(ReadError, match=error):
+            read_generic_csv(path)
+    else:
+        known = read_generic_csv(path).positions
+        np.testing.assert_allclose(known.time, times)
+
+
+def test_an_accuracy_next_to_poses_is_ignored(tmp_path, walk):
+    write_csv(tmp_path / "walk.csv", walk)
+    header, *rows = (tmp_path / "walk.csv").read_text().splitlines()
+    write_lines(tmp_path / "sp.csv", f"{header},sp", *(f"{row},3.0" for row in rows))
+    found = read_recording(tmp_path / "sp.csv")
+    assert found.truth is not None
+    assert found.positions is None
+
+
+def test_waypoints_listed_below_the_samples_may_be_in_any_order(tmp_path):
+    samples = [f"{0.01 * k:.2f},{ROW},," for k in range(1000)]
+    waypoints = [f"{time},,,,,,,{time + 1},0" for time in (8, 2, 5)]
+    header = "t,gx,gy,gz,ax,ay,az,px,py"
+    known = read_generic_csv(
+        write_lines(tmp_path / "a.csv", header, *samples, *waypoints)
+    ).positions
+    assert known.time.tolist() == [2.0, 5.0, 8.0]
+    assert known.position_W[:, 0].tolist() == [3.0, 6.0, 9.0]
+
 
 SECONDS = 2.0
 IMU = ImuSequence(
@@ -62,7 +135,7 @@ def receivers(draw: st.DrawFn) -> Satellites:
 
 def assert_same(found: object, expected: object) -> None:
     assert type(found) is type(expected)
-    for field in fields(expected) if expected is not None else ():  # type: ignore[arg-type]
+    for field in fields(expected) if expected is not None else ():
         one, other = (getattr(part, field.name) for part in (found, expected))
         assert (one is None) == (other is None), field.name
         if one is not None:
@@ -71,11 +144,7 @@ def assert_same(found: object, expected: object) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(barometer=st.none() | barometers(), satellites=st.none() | receivers())
-def test_what_is_written_is_read_back(
-    tmp_path_factory: pytest.TempPathFactory,
-    barometer: Barometer | None,
-    satellites: Satellites | None,
-) -> None:
+def test_what_is_written_is_read_back(tmp_path_factory, barometer, satellites):
     path = tmp_path_factory.mktemp("csv") / "walk.csv"
     write_csv(path, replace(IMU, barometer=barometer, satellites=satellites))
     found = read_recording(path)
@@ -90,12 +159,10 @@ def file_of(folder: Path, titles: str, cells: str) -> Path:
     return write_lines(folder / "walk.csv", f"t,gx,gy,gz,ax,ay,az{titles}", *rows)
 
 
-def test_columns_may_name_other_units(tmp_path: Path) -> None:
+def test_columns_may_name_other_units(tmp_path):
     titles = ",pressure [kPa],latitude [deg],longitude [deg],altitude [ft],speed [km/h]"
     found = read_recording(file_of(tmp_path, titles, "100.5,48.5,11.5,100,36"))
-    assert found.barometer is not None
     np.testing.assert_allclose(found.barometer.pressure_hPa, 1005.0)
-    assert found.satellites is not None
     np.testing.assert_array_equal(found.satellites.latlon_deg, [[48.5, 11.5]] * len(found))
     assert found.satellites.altitude_m is not None
     np.testing.assert_allclose(found.satellites.altitude_m, 30.48)
@@ -111,9 +178,7 @@ def test_columns_may_name_other_units(tmp_path: Path) -> None:
         (",lat,lon", "48.5N,11.5E", "pressure and satellites skipped: "),
     ],
 )
-def test_columns_that_hold_something_else_cost_no_recording(
-    tmp_path: Path, titles: str, cells: str, words: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_columns_that_hold_something_else_cost_no_recording(tmp_path, titles, cells, words, caplog):
     found = read_recording(file_of(tmp_path, titles, cells))
     assert len(found) == 20
     assert found.barometer is None

@@ -1,0 +1,11 @@
+"""A walk for the checks of units, axes, times and values."""
+
+import pytest
+
+from stario.sequences.simulation.imu import simulate_imu
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return simulate_imu(generate_walk(4, 30.0, style=WalkStyle()), rate=200.0)

@@ -1,0 +1,239 @@
+"""Tables of text: their heads, ragged rows, rows of one sensor alone, zeros and clocks."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from csv_lines import write_lines
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from stario.sequences.errors import ReadError
+from stario.sequences.readers import read_recording
+from stario.sequences.readers.columns import HEADER
+from stario.sequences.readers.table_head import TableHead, first_row, table_heads
+from stario.sequences.readers.text import RowFormat
+from stario.sequences.sequence import FloatArray
+
+
+def head_of(folder: Path, *lines: str) -> TableHead:
+    file = folder / "table.csv"
+    file.write_text("\n".join(lines))
+    *_, last = table_heads(file)
+    return last
+
+
+def test_a_first_row_of_integers_has_the_decimal_mark_of_the_rows_below():
+    rows = ["Zeit;x;y;z", "0;0;0;0", "0,01;0,5;-0,25;9,8", "0,02;0,5;-0,25;9,8"]
+    assert first_row(rows) == RowFormat(1, ";", ",")
+    points = [row.replace(",", ".") for row in rows]
+    assert first_row(points) == RowFormat(1, ";", ".")
+
+
+def test_words_above_rows_with_blanks_are_no_titles(tmp_path):
+    assert head_of(tmp_path, "made by a logger on a phone", "0 1 2 3", "1 1 2 3").titles == []
+    assert head_of(tmp_path, "t x y z", "0 1 2 3", "1 1 2 3").titles == ["t", "x", "y", "z"]
+
+
+def test_titles_may_be_separated_in_another_way_than_the_rows(tmp_path):
+    """As NumPy's `savetxt` does: without its titles, columns z, y, x would be read as x, y, z."""
+    assert head_of(tmp_path, "# time,z,y,x", "0 1 2 3", "1 1 2 3").titles == ["time", "z", "y", "x"]
+
+
+@pytest.mark.parametrize(
+    "between",
+    [
+        ("0,,,", "1,,,"),
+        ("0,NaN,NaN,NaN",),
+        ("0,null,,1",),
+        ("Started 12:00",),
+        ("# walk",),
+        ("int64,float,float,float",),
+    ],
+)
+def test_incomplete_rows_and_remarks_may_follow_the_titles(tmp_path, between):
+    """Without its titles, columns z, y, x would be read as x, y, z."""
+    head = head_of(tmp_path, "by a logger", "time,z,y,x", *between, "2,1,2,3", "3,1,2,3")
+    assert head.titles == ["time", "z", "y", "x"]
+    assert head.row_format.skip == 2 + len(between)
+
+
+def test_incomplete_rows_without_titles_are_none(tmp_path):
+    assert head_of(tmp_path, "0,,,", "2,1,2,3", "3,1,2,3").titles == []
+
+
+TITLES = ["gx [rad/s]", "gy [rad/s]", "gz [rad/s]", "ax [m/s^2]", "ay [m/s^2]", "az [m/s^2]"]
+ROWS = 40
+
+
+def table(time_at: int) -> list[list[str]]:
+    """Return titles and rows with the times in one of the seven columns."""
+    rows = [["0.1", "0.2", "0.3", "1.0", "2.0", f"9.{k % 10}"] for k in range(ROWS)]
+    lines = [list(TITLES), *rows]
+    for k, line in enumerate(lines):
+        line.insert(time_at, f"{0.01 * k:.2f}" if k else "t [s]")
+    return lines
+
+
+@given(
+    time_at=st.integers(0, 6),
+    row=st.integers(1, ROWS),
+    kept=st.integers(0, 6),
+    separator=st.sampled_from(",;\t"),
+)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
+def test_a_row_that_lacks_cells_is_named(tmp_path, time_at, row, kept, separator):
+    """The last one, cut short when the recorder was killed, is skipped."""
+    lines = table(time_at)
+    lines[row] = lines[row][:kept]
+    text = [separator.join(line) for line in lines]
+    path = tmp_path / "a.csv"
+    if row == ROWS:
+        path.write_text("\n".join(text))
+    else:
+        write_lines(path, *text)
+    if row == ROWS or not kept:  # a blank line is none
+        assert len(read_recording(path)) == ROWS - 1
+    else:
+        with pytest.raises(ReadError, match=rf"line {row + 1}: found {kept} values, expected 7"):
+            read_recording(path)
+
+
+@pytest.mark.parametrize("row", [1, ROWS // 2, ROWS])
+def test_a_ragged_row_of_a_sensor_is_refused_within_and_skipped_at_an_end(tmp_path, row):
+    """An app writes its first rows before all sensors have begun, and its last as it is killed."""
+    for name in ("accelerometer", "gyroscope"):
+        lines = [f"{0.01 * k:.2f},5.66,5.66,5.66" for k in range(ROWS)]
+        if name == "gyroscope":
+            lines[row - 1] = lines[row - 1].rsplit(",", 1)[0]
+        write_lines(tmp_path / f"{name}.csv", "time [s],x,y,z", *lines)
+    if row in (1, ROWS):
+        assert len(read_recording(tmp_path)) == ROWS - 1
+    else:
+        with pytest.raises(ReadError, match=f"line {row + 1}"):
+            read_recording(tmp_path)
+
+
+GYRO_TIMES = 0.01 * np.arange(300)
+ACCEL_TIMES = GYRO_TIMES[::2] + 0.003
+WIDE = "time,Gyroscope X,Gyroscope Y,Gyroscope Z,Accelerometer X,Accelerometer Y,Accelerometer Z"
+
+
+def rate(t: float) -> list[float]:
+    return [0.1 + t, -0.2, 0.3 * t]
+
+
+def force(t: float) -> list[float]:
+    """Linear in time, so that interpolation is exact."""
+    return [1.0 + t, 2.0 - t, 9.0]
+
+
+def text(values: list[float]) -> str:
+    return ",".join(map(repr, values))
+
+
+def expected(times: FloatArray, start: float) -> tuple[FloatArray, FloatArray]:
+    return np.array([rate(t + start) for t in times]), np.array([force(t + start) for t in times])
+
+
+@pytest.mark.parametrize("header", [HEADER, WIDE])
+def test_blank_cells_of_the_other_sensor_are_interpolated(tmp_path, header):
+    rows = [(t, f"{t:.3f},{text(rate(t))},,,") for t in GYRO_TIMES.tolist()]
+    rows += [(t, f"{t:.3f},,,,{text(force(t))}") for t in ACCEL_TIMES.tolist()]
+    path = write_lines(tmp_path / "own.csv", header, *(row for _, row in sorted(rows)))
+    read = read_recording(path)
+    assert read.rate == pytest.approx(100.0)
+    assert len(read) == 298  # between the first and the last accelerometer sample
+    gyro, accel = expected(read.time, 0.01)
+    np.testing.assert_allclose(read.gyro, gyro, atol=1e-9)
+    np.testing.assert_allclose(read.accel, accel, atol=1e-9)
+
+
+def test_a_slower_accelerometer_is_interpolated(tmp_path):
+    cells = [text(force(t)) if k % 3 == 0 else ",," for k, t in enumerate(GYRO_TIMES.tolist())]
+    rows = [f"{t},{text(rate(t))},{cells[k]}" for k, t in enumerate(GYRO_TIMES.tolist())]
+    path = write_lines(tmp_path / "own.csv", HEADER, *rows)
+    read = read_recording(path)
+    assert len(read) == 298
+    np.testing.assert_allclose(read.accel, expected(read.time, 0.0)[1], atol=1e-9)
+
+
+def test_an_accelerometer_that_fails_halfway_leaves_its_rows_to_be_counted(tmp_path):
+    cells = [text(force(t)) if t < 1.0 else "nan,nan,nan" for t in GYRO_TIMES.tolist()]
+    rows = [f"{t},{text(rate(t))},{cells[k]}" for k, t in enumerate(GYRO_TIMES.tolist())]
+    path = write_lines(tmp_path / "own.csv", HEADER, *rows)
+    read = read_recording(path)
+    assert len(read) == 300
+    assert np.isnan(read.accel).all(axis=1).sum() == 200
+
+
+def test_ground_truth_in_rows_of_its_own_stays_on_the_samples_clock(tmp_path):
+    header = f"{HEADER},px,py,pz,qx,qy,qz,qw"
+    rows = [(t, f"{t:.3f},{text(rate(t))},,,,,,,,,,") for t in GYRO_TIMES.tolist()]
+    rows += [(t, f"{t:.3f},,,,{text(force(t))},,,,,,,") for t in ACCEL_TIMES.tolist()]
+    rows += [(t, f"{t:.3f},,,,,,,{t},0,0,0,0,0,1") for t in (GYRO_TIMES[::5] + 0.001).tolist()]
+    path = write_lines(tmp_path / "own.csv", header, *(row for _, row in sorted(rows)))
+    read = read_recording(path)
+    np.testing.assert_allclose(read.truth.position_W[:, 0], read.truth.time + 0.01, atol=1e-9)
+    np.testing.assert_allclose(read.gyro, expected(read.time, 0.01)[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("accel", ["a", "lin_acc_"])
+def test_gravity_in_columns_of_its_own_is_added(tmp_path, accel):
+    names = [f"{name}{axis}" for name in ("g", accel, "gravity_") for axis in "xyz"]
+    rows = [f"{t},{text(rate(t))},{t},{-t},0.5,1,2,8.5" for t in GYRO_TIMES.tolist()]
+    path = write_lines(tmp_path / "own.csv", ",".join(["t", *names]), *rows)
+    np.testing.assert_allclose(read_recording(path).accel, expected(GYRO_TIMES, 0.0)[1], atol=1e-9)
+
+
+SECONDS = 5.0
+TICKS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9, "100 ns": 10**7}
+"""Ticks in a second of clocks since 1970; the last are Windows' since 1601."""
+TO_1970 = 11_644_473_600
+"""Seconds from 1601 to 1970."""
+OURS = "t,gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2]"
+
+
+@given(
+    rates=st.tuples(st.integers(60, 400), st.integers(60, 400)),
+    phase=st.floats(0.0001, 0.002),
+    seed=st.integers(0, 99),
+)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25)
+def test_zeros_of_the_sensor_that_was_not_read_are_no_samples(tmp_path, rates, phase, seed):
+    rng = np.random.default_rng(seed)
+    rows = []
+    for sensor, rate in enumerate(rates):
+        for t in np.arange(phase * sensor, SECONDS, 1.0 / rate):
+            values = np.zeros(6)
+            values[3 * sensor : 3 * sensor + 3] = rng.normal([0.0, 0.0, 9.8 * sensor], 0.3)
+            rows.append([t, *values])
+    rows.sort(key=lambda row: row[0])
+    path = tmp_path / "a.csv"
+    lines = [",".join(map(repr, map(float, row))) for row in rows]
+    write_lines(path, OURS.replace("t,", "t [s],"), *lines)
+    read = read_recording(path)
+    # Where both are, both are measured: nothing is 0, and gravity is whole.
+    assert not (read.gyro == 0.0).all(axis=1).any()
+    assert np.median(read.accel[:, 2]) == pytest.approx(9.8, abs=0.2)
+    assert read.duration == pytest.approx(SECONDS, abs=0.1)
+
+
+@given(
+    unit=st.sampled_from(list(TICKS)),
+    begin=st.integers(946_684_800, 4_090_000_000),  # 2000 to 2099
+    rate=st.sampled_from([50, 100, 200, 1000]),
+)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40)
+def test_integer_clocks_of_any_epoch_give_the_rate(tmp_path, unit, begin, rate):
+    since = begin + (TO_1970 if unit == "100 ns" else 0)
+    ticks = TICKS[unit]
+    lines = []
+    for k in range(4 * rate):
+        stamp = str(since * ticks + k * ticks // rate) if ticks > 1 else f"{since + k / rate:.3f}"
+        lines.append(f"{stamp},0.1,{0.01 * (k % 7)},0.3,1.0,2.0,9.{k % 10}")
+    path = tmp_path / "a.csv"
+    write_lines(path, OURS, *lines)
+    read = read_recording(path)
+    assert read.duration == pytest.approx(4.0 - 1.0 / rate, abs=2e-3)
+    assert len(read) == 4 * rate
