@@ -149,7 +149,7 @@ def test_a_recording_without_a_known_carry_is_refused():
 def test_the_table_has_a_row_of_each_kind_and_says_what_is_missing(still_model):
     walk = simulated_walk("bag", 1, 20.0)
     simulated = motion_scores(still_model, walk, NavigatorConfig(), "bag", SIMULATED)
-    assert values(simulated, "network") > 20.0  # % of the path: the network says that it rests
+    assert values(simulated, "network_percent") > 20.0  # the network says that it rests
     assert "none given" in motion_table(simulated)
     assert wide(simulated)["track_percent"].notna().all()
     both = joined([simulated, simulated.assign(track=RECORDED)])
