@@ -74,7 +74,7 @@ def backends(
     split: Annotated[str, typer.Option(help="With --data: split to use.")] = "validation",
     as_json: JsonOption = False,
 ) -> None:
-    """Compare EKF, graph and fixed-lag graph: accuracy, consistency, speed, slowest update.
+    """Compare filter, graph and fixed-lag graph: accuracy, consistency, speed, slowest update.
 
     Without PATH or --data, use simulated walks, measured with white noise of known magnitude.
     """

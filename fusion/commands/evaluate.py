@@ -78,8 +78,8 @@ def evaluate(
             "name stands for each recording's group, or its first word: leave-one-out."
         ),
     ] = None,
-    ekf: Annotated[
-        bool, flag("--ekf", help="With --by: also report the mean NIS of the EKF; slow.")
+    filtered: Annotated[
+        bool, flag("--filtered", help="With --by: also report the filter's mean NIS; slow.")
     ] = False,
     models: Annotated[
         str | None,
@@ -110,7 +110,7 @@ def evaluate(
     if data is not None:
         warn_of_learned(named, files, data)
     if by is not None:
-        found, failed = _groups(listed, reading, by, estimating.model, against, ekf, jobs)
+        found, failed = _groups(listed, reading, by, estimating.model, against, filtered, jobs)
     elif models is not None:
         found, failed = _networks(named, runs, files, reading, estimating, convention, jobs)
     else:
@@ -125,7 +125,7 @@ def evaluate(
 def _refuse_unused(context: typer.Context, by: str | None, models: str | None) -> None:
     """Refuse options that the chosen kind of evaluation does not use."""
     if by is None:
-        refuse(context, "without --by", "a grouping, such as --by set", "against", "ekf")
+        refuse(context, "without --by", "a grouping, such as --by set", "against", "filtered")
     else:
         refuse(context, "with --by", "--model and --against", "models")
         alone = "use without: the network alone is judged"
@@ -219,7 +219,7 @@ def _groups(
     by: str,
     ours: str,
     theirs: str | None,
-    ekf: bool,
+    filtered: bool,
     jobs: int,
 ) -> tuple[_Found | None, list[Skipped]]:
     """Return the table of groups, and the recordings that were skipped."""
@@ -240,7 +240,7 @@ def _groups(
             _for_group(name, "")  # fail on unloadable weights before preparing anything
     groups = {entry.path: entry.group for entry in recordings}
     with progress_bar("evaluate", len(groups)) as progress:
-        found, skipped = benchmark(groups, models, reading.read, jobs, ekf, progress)
+        found, skipped = benchmark(groups, models, reading.read, jobs, filtered, progress)
     if found is None:
         return None, skipped
     rows = found.rows(grouping, ours, theirs)

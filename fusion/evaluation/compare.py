@@ -60,6 +60,9 @@ TRACK_WORDS = {
 
 TRACKS = tuple(TRACK_WORDS)
 
+TRACK_OF = {"ekf": "filtered", "graph": "track"}
+"""Name of the track that a back end makes of a recording."""
+
 DEMONSTRATION_SEED = 2**31 + 49
 """Seed of the bundled demonstration: training seeds are below 2^31 and exclude this walk. 49 is the
 number of the issue that asked for it, so chosen before its result was known."""

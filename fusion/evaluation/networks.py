@@ -1,7 +1,7 @@
 """Networks side by side over many recordings: the paper's table.
 
 Each network yields three tracks of each recording: chained displacements with the true attitude
-(the papers' protocol), the same with the attitude levelled from the IMU, and the EKF's. Several
+(the papers' protocol), the same with the attitude levelled from the IMU, and the filter's. Several
 weights of one network, for example from different training seeds, are averaged, with their spread.
 """
 
@@ -38,12 +38,12 @@ from stario.sequences.drawing.text_table import aligned
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.truth.problems import warn_of_truth
 
-TRUE_ATTITUDE, OWN_ATTITUDE, EKF = "network_true_attitude", "network", "ekf"
+TRUE_ATTITUDE, OWN_ATTITUDE, FILTERED = "network_true_attitude", "network", "filtered"
 
 PROTOCOLS = {
     TRUE_ATTITUDE: "network, true attitude",
     OWN_ATTITUDE: "network, own attitude",
-    EKF: "EKF",
+    FILTERED: "filtered",
 }
 """Tracks of the table and their titles."""
 
@@ -215,7 +215,7 @@ def protocol_figures(
     tracks = {
         TRUE_ATTITUDE: network_track_true_attitude(model, sequence, config).trajectory,
         OWN_ATTITUDE: network_track(preprocessed).trajectory,
-        EKF: navigator.track(preprocessed).trajectory,
+        FILTERED: navigator.track(preprocessed).trajectory,
     }
     figures = {name: metrics_of(track, truth, convention) for name, track in tracks.items()}
     return figures, pose_errors(align(tracks[TRUE_ATTITUDE], truth, "first"), truth)

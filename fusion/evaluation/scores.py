@@ -80,7 +80,7 @@ class Column:
         metric: metric.
         form: format of the number.
         over: function of the known values (n,), of which there is at least one.
-        where: labels of the rows, such as `{"track": "ekf"}`.
+        where: labels of the rows, such as `{"track": "filtered"}`.
     """
 
     title: str

@@ -98,9 +98,10 @@ def error_words(found: Comparison, name: str = "track") -> str:
     share = 100.0 * metrics["ate_m"] / max(path, 1e-9)
     if share >= 100.0:
         return f"{distance(metrics['ate_m'])} rms from the truth"
+    fitted = 100.0 * metrics["ate_fit_m"] / path
     words = (
         f"{metrics['ate_m']:.2f} m rms from the truth ({share:.1f} % of its {path:.1f} m), "
-        f"{metrics['ate_fit_m']:.2f} m after a yaw fit"
+        f"{metrics['ate_fit_m']:.2f} m ({fitted:.1f} %) after the best shift and turn"
     )
     covariance = found.aligned()[name].position_covariance_W
     if covariance is not None:

@@ -3,7 +3,8 @@
 (() => {
   const element = (id) => document.getElementById(id);
   const [map, time, connection] = [element("map"), element("time"), element("connection")];
-  const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00", "#56B4E9", "#7F5539"];
+  // Neighbours differ in lightness too; lines end in their device's symbol.
+  const COLOURS = ["#0072B2", "#E69F00", "#000000", "#CC79A7", "#009E73", "#56B4E9", "#D55E00", "#7F5539"];
   const SYMBOLS = ["circle", "square", "diamond", "triangle-up"];
   const BESIDE = ["top center", "bottom center", "middle right", "middle left"];
   const MOST_DRAWN = 1200;
@@ -91,7 +92,8 @@
           before = y;
           return jumps ? null : y;
         });
-        timeTraces.push({ x: points.map((p) => p[0]), y: ys, mode: "lines", line, xaxis: `x${k ? k + 1 : ""}`,
+        const marker = { color: d.colour, symbol: d.symbol, size: points.map((_, n) => n === points.length - 1 ? 9 : 0), opacity: 1 };
+        timeTraces.push({ x: points.map((p) => p[0]), y: ys, mode: "lines+markers", line, marker, xaxis: `x${k ? k + 1 : ""}`,
           yaxis: `y${k ? k + 1 : ""}`, hovertemplate: `${plain(d.label)} %{y:.2f}<extra></extra>` });
       });
     }

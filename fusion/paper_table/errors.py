@@ -1,7 +1,7 @@
 """Errors of a network on its test recordings, for every kind of ground truth.
 
-With poses: the paper's protocol, own attitude and EKF. With any truth: the network alone along its
-own attitude, by `stario.fusion.evaluation.benchmark.displacement_error`.
+With poses: the paper's protocol, own attitude and filtered. With any truth: the network alone along
+its own attitude, by `stario.fusion.evaluation.benchmark.displacement_error`.
 """
 
 from __future__ import annotations

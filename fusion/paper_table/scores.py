@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 
 from stario.fusion.evaluation.bootstrap import block_rows, ranks
-from stario.fusion.evaluation.networks import EKF, OWN_ATTITUDE, TRUE_ATTITUDE
+from stario.fusion.evaluation.networks import FILTERED, OWN_ATTITUDE, TRUE_ATTITUDE
 from stario.fusion.evaluation.pedestrian import NAME as PDR
 from stario.fusion.evaluation.scores import Spread, joined, scored
 from stario.fusion.paper_table.runs import Run, read_run
@@ -35,8 +35,8 @@ COLUMNS = {
     "pde": _column("PDE [%]", TRUE_ATTITUDE, "pde", 100.0),
     "own_ate": _column("own attitude: ATE [m]", OWN_ATTITUDE, "ate_m"),
     "own_rte": _column("own attitude: RTE [m]", OWN_ATTITUDE, "rte_m"),
-    "ekf_ate": _column("EKF: ATE [m]", EKF, "ate_m"),
-    "ekf_rte": _column("EKF: RTE [m]", EKF, "rte_m"),
+    "filtered_ate": _column("filtered: ATE [m]", FILTERED, "ate_m"),
+    "filtered_rte": _column("filtered: RTE [m]", FILTERED, "rte_m"),
     "waypoints_m": _column("waypoints [m]", "waypoints", "ate_fit_m"),
     "waypoints_percent": _column("waypoints [%]", "waypoints", "ate_fit_percent"),
     "waypoints_length": _column("length ratio", "waypoints", "length_ratio"),

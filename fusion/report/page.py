@@ -173,13 +173,13 @@ def _legend(names: Sequence[str], known: PositionTrack | None, corrections: int)
 
     Known positions and corrections have words only.
     """
-    dashes = {"solid": "none", "dash": "7 4", "dot": "2 3", "dashdot": "7 3 2 3"}
     buttons = []
     for name in names:
         label, colour, dash = style(name)
+        lengths = "none" if dash == "solid" else dash
         line = (
             '<svg width="28" height="8" aria-hidden="true"><line x1="0" y1="4" x2="28" y2="4" '
-            f'stroke="{colour}" stroke-width="3" stroke-dasharray="{dashes[dash]}"/></svg>'
+            f'stroke="{colour}" stroke-width="3" stroke-dasharray="{lengths}"/></svg>'
         )
         buttons.append(
             f'<button type="button" aria-pressed="true" data-track="{html.escape(name)}">'

@@ -12,12 +12,17 @@ from stario.fusion.floors import FloorChange
 from stario.fusion.report.series import Series
 from stario.fusion.state import Innovations
 from stario.sequences.arrays import evenly_spaced, interpolated
-from stario.sequences.drawing.figures import TRACK_STYLES, split_at_gaps, split_at_nan
+from stario.sequences.drawing.figures import (
+    BROWN,
+    DASHES,
+    TRACK_STYLES,
+    split_at_gaps,
+    split_at_nan,
+)
 from stario.sequences.sequence import BoolArray, FloatArray
 
 INK, GRID, FAINT = "#222222", "#E3E6EA", "#767676"
 TRUTH = "truth"
-_DASHES = {"filtered": "dash", "network": "dot", "network_true_attitude": "dashdot"}
 _MAX_INNOVATIONS = 600
 _MAX_POINTS = 600
 """Maximum number of points of a curve: a panel is as many pixels wide, and the file stays small."""
@@ -39,11 +44,11 @@ class Panel(NamedTuple):
 
 
 def style(name: str) -> tuple[str, str, str]:
-    """Return label, colour and dash of a track."""
+    """Return label, colour and dash of a track, as lengths of line and gap."""
     if name == TRUTH:
         return TRUTH, "#000000", "solid"
-    label, colour = TRACK_STYLES.get(name, (name, "#7F5539"))
-    return label, colour, _DASHES.get(name, "solid")
+    label, colour, dash = TRACK_STYLES.get(name, (name, BROWN, "dash"))
+    return label, colour, ",".join(f"{2.0 * length:g}px" for length in DASHES[dash]) or "solid"
 
 
 def motion_panels(

@@ -16,18 +16,31 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's palette: distinguishable for the colour-blind and, mostly, in grey.
+# Okabe and Ito's palette: most of it can be told apart by the colour-blind, not all, and little in
+# grey. Tracks therefore also differ in dash.
 BLUE, ORANGE, GREEN, PINK = "#0072B2", "#E69F00", "#009E73", "#CC79A7"
 RED, SKY, GREY, INK, BROWN = "#D55E00", "#56B4E9", "#999999", "#333333", "#7F5539"
 TRACK_STYLES = {
-    "track": ("StarIO", BLUE),
-    "filtered": ("filter, as in a stream", PINK),
-    "network": ("network alone", ORANGE),
-    "network_true_attitude": ("network, true attitude", GREEN),
-    "pdr": ("steps (PDR)", BROWN),
-    "dead_reckoning": ("dead reckoning (IMU alone)", GREY),
+    "track": ("StarIO", BLUE, "solid"),
+    "filtered": ("filter, as in a stream", PINK, "dash"),
+    "network": ("network alone", ORANGE, "dot"),
+    "network_true_attitude": ("network, true attitude", GREEN, "dashdot"),
+    "pdr": ("steps (PDR)", BROWN, "longdash"),
+    "dead_reckoning": ("dead reckoning (IMU alone)", GREY, "longdashdot"),
 }
-_SPARE_COLOURS = (RED, SKY, "#6A4C93")
+"""Label, colour and dash of tracks."""
+
+DASHES = {
+    "solid": (),
+    "dash": (3.7, 1.6),
+    "dot": (1.0, 1.4),
+    "dashdot": (5.0, 1.5, 1.0, 1.5),
+    "longdash": (8.0, 2.5),
+    "longdashdot": (8.0, 2.0, 1.0, 2.0),
+}
+"""Dashes: lengths of line and gap, in widths of the line."""
+
+_SPARES = ((RED, "dash"), (SKY, "dot"), ("#6A4C93", "dashdot"))
 LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 9}
 ABOVE_LEFT = {**LEGEND, "loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "ncols": 3}
 ABOVE_RIGHT = {**LEGEND, "loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 4}
@@ -76,9 +89,11 @@ def apply_style(axes: Axes) -> None:
     axes.set_axisbelow(True)
 
 
-def style_of(name: str, index: int) -> tuple[str, str]:
-    """Return a track's legend text and colour; unknown names take spare colours by index."""
-    return TRACK_STYLES.get(name, (name, _SPARE_COLOURS[index % len(_SPARE_COLOURS)]))
+def line_of(name: str, index: int) -> dict[str, Any]:
+    """Return label, colour and dash of a track's line; unknown names take spare ones by index."""
+    label, colour, dash = TRACK_STYLES.get(name, (name, *_SPARES[index % len(_SPARES)]))
+    style = (0.0, DASHES[dash]) if dash != "solid" else "-"
+    return {"label": label, "color": colour, "linestyle": style}
 
 
 def split_at_gaps(

@@ -16,9 +16,9 @@ from stario.sequences.drawing.figures import (
     clock,
     distance,
     indices_after_gaps,
+    line_of,
     new_figure,
     split_at_gaps,
-    style_of,
 )
 from stario.sequences.drawing.plots import draw_error
 from stario.sequences.drawing.timed_path import draw_scale_bar, draw_timed_path, round_times
@@ -89,18 +89,18 @@ def plan_view(
         end = true_path[np.isfinite(true_path).all(axis=1)][-1]
         axes.plot(*end, "s", ms=11, mfc=_TRUTH, mec=INK, mew=1.0, zorder=3.2)
     for k, name in enumerate(boxes):
-        label, colour = style_of(name, k)
+        line = line_of(name, k)
         if name in leaves:
-            label += f" (leaves the figure by {distance(beyond[name])})"
+            line["label"] += f" (leaves the figure by {distance(beyond[name])})"
         if k == 0:
-            colours, main_colour = draw_timed_path(axes, tracks[name], label, fine)
+            colours, main_colour = draw_timed_path(axes, tracks[name], line["label"], fine)
             ticks = round_times(float(np.ptp(tracks[name].time)))
             bar = fig.colorbar(colours, ax=axes, shrink=0.5, aspect=30, pad=0.02, ticks=ticks)
             bar.ax.set_yticklabels([clock(tick) for tick in ticks])
             bar.set_label("time [min:s]", fontsize=9)
             bar.ax.tick_params(labelsize=8)
         else:
-            axes.plot(*paths[name].T, color=colour, lw=1.3 * fine, label=label, zorder=3)
+            axes.plot(*paths[name].T, **line, lw=1.3 * fine, zorder=3)
     _mark_gaps(axes, tracks, frame)
     if known is not None:
         _draw_known(axes, known)

@@ -28,11 +28,11 @@ from stario.sequences.drawing.figures import (
     SKY,
     distance,
     draw_samples,
+    line_of,
     new_figure,
     panels_of,
     reach_of,
     split_at_gaps,
-    style_of,
 )
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import (
@@ -81,17 +81,17 @@ def error_over_time(
     fig = new_figure(9.0, 9.0, title)
     panels = panels_of(fig, 1.7, 1, 1, 1)
     for k, name in enumerate(tracks):
-        label, colour = style_of(name, k)
+        line = line_of(name, k)
         if name not in good:
-            label += f" (leaves the figure, up to {distance(largest[name])})"
+            line["label"] += f" (leaves the figure, up to {distance(largest[name])})"
         time, norm = split_at_gaps(errors[name].estimate.time, norms[name][:, None])
-        panels[0].plot(time, norm[:, 0], color=colour, lw=1.3, label=label)
+        panels[0].plot(time, norm[:, 0], **line, lw=1.3)
     panels[0].set_ylim(0, 1.08 * max(largest[name] for name in good) or 1.0)
     panels[0].set_ylabel("horizontal error [m]")
     with_covariance = [n for n in tracks if errors[n].estimate.position_covariance_W is not None]
     for k, name in enumerate(tracks):
         if name in (with_covariance or good):
-            _draw_axis_errors(panels[1:], errors[name], *style_of(name, k))
+            _draw_axis_errors(panels[1:], errors[name], line_of(name, k))
     panels[-1].set_xlabel("time [s]")
     fig.align_ylabels()
     panels[0].legend(**ABOVE_LEFT)
@@ -125,8 +125,10 @@ def draw_error(
                 sigma = np.sqrt(P[:, 0, 0] + P[:, 1, 1])
                 reach = max(reach, float(sigma.max()))
                 axes.plot(*_unbroken(elapsed, sigma), "--", color=INK, lw=1.2, label="its sigma")
-        shade, width = (colour, 2.0) if k == 0 else (style_of(name, k)[1], 1.2)
-        axes.plot(*_unbroken(elapsed, norm), color=shade, lw=width)
+        own = (
+            {"color": colour, "lw": 2.0} if k == 0 else {**line_of(name, k), "label": "", "lw": 1.2}
+        )
+        axes.plot(*_unbroken(elapsed, norm), **own)
     axes.set(xlabel="time [s]", ylabel="distance from the truth [m]")
     axes.set_ylim(0.0, 1.3 * reach or 1.0)
     if axes.get_legend_handles_labels()[0]:
@@ -250,14 +252,16 @@ def _speed(truth: Trajectory) -> tuple[FloatArray, FloatArray]:
     return ticks[:-1] + 0.5, np.where(known, speed, np.nan)
 
 
-def _draw_axis_errors(panels: list[Axes], errors: PoseErrors, label: str, colour: str) -> None:
-    time = errors.estimate.time
+def _draw_axis_errors(panels: list[Axes], errors: PoseErrors, line: dict[str, Any]) -> None:
+    time, colour = errors.estimate.time, line["color"]
+    edge = {**line, "label": "", "lw": 0.7}
     for k, (axes, axis) in enumerate(zip(panels, "xyz", strict=True)):
-        ticks, error = split_at_gaps(time, errors.position_W[:, [k]])
-        axes.plot(ticks, error[:, 0], color=colour, lw=1.2, label=label)
+        axes.plot(*_unbroken(time, errors.position_W[:, k]), **line, lw=1.2)
         if errors.estimate.position_covariance_W is not None:
             sigma = np.sqrt(errors.estimate.position_covariance_W[:, k, k])
-            _draw_band(axes, time, sigma, color=colour, label=f"{label}, 3 sigma")
+            _draw_band(axes, time, sigma, color=colour, label=f"{line['label']}, 3 sigma")
+            for bound in (-3.0 * sigma, 3.0 * sigma):
+                axes.plot(*_unbroken(time, bound), **edge)
         axes.set_ylabel(f"error in {axis} [m]")
 
 

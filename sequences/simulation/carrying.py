@@ -7,13 +7,13 @@ that of the stride, the trunk rises, falls and surges with phi and sways with ph
 strike excites ringing in what carries the device: the thigh, the hip, the arm, a strap.
 
 The phase offsets between these motions are those of real people, with some spread, never arbitrary:
-they distinguish forward from backward. The trunk is highest at mid-stance (phi = 0) and slowest
-there too (kinetic energy has become potential), and every heel strike brakes it (Cavagna et al.,
-1976).
+they distinguish forward from backward and the sides from both. The trunk is highest at mid-stance
+(phi = 0), slowest there too (kinetic energy has become potential), and farthest over the leg that
+stands; every heel strike brakes it (Cavagna et al., 1976).
 
-Bounce, strength, resonance and damping of each mode are those that `stario check simulation` finds
-in recordings carried so: phones in pockets, read, swung and at the ear (tyrex), in bags (RIDI), in
-a hand in front (KIPD, RIDI, rfbr) and flat on it (Indoor Location).
+Bounce, surge, strength, resonance and damping of each mode are those that `stario check simulation`
+finds in recordings carried so: phones in pockets, read, swung and at the ear (tyrex), in bags
+(RIDI), in a hand in front (KIPD, RIDI, rfbr) and flat on it (Indoor Location).
 """
 
 from __future__ import annotations
@@ -36,8 +36,14 @@ the ringing are about 0.3 rad/s per m/s^2, wherever a phone is carried."""
 _STRIKE_LAG = 0.9
 """Phase [rad] between the trunk's lowest point and the blow: the other leg has taken the weight."""
 
-_TRUNK_BOUNCE = 2.0
-"""Typical root mean square of the trunk's vertical acceleration at effort 1 [m/s^2]."""
+_TRUNK_BOUNCE, _TRUNK_SURGE, _HELD_SURGE, _SWAY = 2.0, 1.0, 0.45, 0.42
+"""Typical root mean square [m/s^2] at effort 1 of the trunk's vertical acceleration, of that
+forward and back (arms take half of it), and of that to the sides: by the true attitudes of RIDI,
+KIPD, rfbr, tyrex and OxIOD 1.0 to 1.4 on the body, 0.3 to 0.65 in a hand; 0.2 to 0.5 to the
+sides."""
+
+_SLOW = 0.2
+"""Effort of a slow walk, at which surge and sway have half of the size that they grow to."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,27 +104,37 @@ class Strike:
     one_sided: bool = False
 
 
-_ARM = (5.0, 0.4)
+_ARM = (5.5, 0.3)
 """Resonance [Hz] and damping ratio of a device at the end of an arm."""
 
 
-def trunk(gait: Gait, bounce: float) -> FloatArray:
+def _hardly_growing(effort: FloatArray) -> FloatArray:
+    """Return the strength of what a walk starts and a faster one hardly changes; 1 at effort 1."""
+    return np.asarray((1.0 + _SLOW) * effort / (effort + _SLOW))
+
+
+def trunk(gait: Gait, bounce: float, surge: float) -> FloatArray:
     """Return the trunk's motion (N, 3) in H [m]: bounce and surge per step, sway per stride.
 
-    Its acceleration, not its height, grows with the effort: slow steps are short, not rare.
-    `bounce` [m/s^2] is the root mean square of the vertical acceleration at effort 1.
+    Its acceleration, not its height, grows with the effort: slow steps are short, not rare. Surge
+    and sway hardly grow: phones show as much of them at 0.5 as at 1.3 m/s.
+
+    Args:
+        gait: the gait.
+        bounce: root mean square of the vertical acceleration at effort 1 [m/s^2].
+        surge: that of the acceleration forward and back [m/s^2].
     """
     rng, phi = gait.rng, gait.phase
-    size, sway, surge, limp = rng.uniform([0.85, 0.5, 0.3, 0.0], [1.15, 1.4, 0.9, 0.25])
-    per_acceleration = np.sqrt(2.0) * gait.effort / (2.0 * np.pi * gait.step_rate) ** 2
-    rise = size * bounce * per_acceleration
+    rise, side, ahead, limp = rng.uniform([0.85, 0.5, 0.6, 0.0], [1.15, 1.4, 1.4, 0.25])
+    per_acceleration = np.sqrt(2.0) / (2.0 * np.pi * gait.step_rate) ** 2
+    hardly = _hardly_growing(gait.effort)
     shift = rng.uniform(-np.pi, np.pi, 4)
-    shift[2] = np.pi + rng.normal(0.0, 0.3)  # slowest at the highest point
-    z = rise * (np.cos(phi) + limp * np.cos(phi / 2.0 + shift[0]))
-    y = 0.018 * sway * gait.effort * (np.sin(phi / 2.0) + 0.15 * np.sin(1.5 * phi + shift[1]))
-    x = 0.5 * surge * _TRUNK_BOUNCE * per_acceleration
-    x = x * (np.sin(phi + shift[2]) + 0.3 * np.sin(phi / 2 + shift[3]))
-    return np.stack([x, y, z], axis=1)
+    shift[2] = np.pi + rng.normal(0.2, 0.3)  # slowest about the highest point
+    z = rise * bounce * gait.effort * (np.cos(phi) + limp * np.cos(phi / 2.0 + shift[0]))
+    # Over the standing leg at mid-stance. A stride takes two steps: a quarter of the frequency^2.
+    y = 4.0 * side * _SWAY * hardly * (np.cos(phi / 2.0) + 0.08 * np.sin(1.5 * phi + shift[1]))
+    x = ahead * surge * hardly * (np.sin(phi + shift[2]) + 0.8 * np.sin(phi / 2.0 + shift[3]))
+    return np.stack([per_acceleration * x, per_acceleration * y, per_acceleration * z], axis=1)
 
 
 def heel_strikes(gait: Gait, strike: Strike) -> CarryMotion:
@@ -159,24 +175,37 @@ def _held(gait: Gait, bounce: float, strike: Strike, tremor: float, wobble: floa
     """
     rng, n = gait.rng, len(gait)
     ring = heel_strikes(gait, strike)
-    offset = trunk(gait, bounce) + ring.offset_H + 0.012 * drift(rng, n, gait.rate, 0.6, 3)
+    offset = trunk(gait, bounce, _HELD_SURGE) + ring.offset_H
+    offset += 0.012 * drift(rng, n, gait.rate, 0.6, 3)
     turn = ring.turn_H + 0.08 * drift(rng, n, gait.rate, 0.7, 3)
     turn += 0.8 * tremor / (2.0 * np.pi * 3.0) * band_noise(rng, n, gait.rate, 1.5, 5.0, 3)
     turn += tremor / (2.0 * np.pi * 8.0) * band_noise(rng, n, gait.rate, 5.0, 11.0, 3)
-    shift, size = rng.uniform(-0.7, 0.7, (2, 3)), rng.uniform(0.3, 1.0, (2, 3))
-    size[:, ::2] *= rng.choice([-1.0, 1.0], (2, 2))  # to the left as often as to the right
-    for k, order in enumerate((0.5, 1.0)):
-        swing = np.cos(order * gait.phase[:, None] + shift[k]) * size[k]
-        turn += wobble * gait.effort[:, None] * swing
+    turn += _wobble(gait, wobble)
     # The tremor about the wrist also displaces the device: about 0.1 m/s^2.
     offset += 0.12 / (2.0 * np.pi * 8.0) ** 2 * band_noise(rng, n, gait.rate, 5.0, 11.0, 3)
     return CarryMotion(offset, turn)
 
 
+def _wobble(gait: Gait, wobble: float) -> FloatArray:
+    """Return the turning (N, 3) [rad] of a held device with the gait, of a size [rad].
+
+    With the stride, roll and yaw follow the sway from side to side; with the step, pitch does the
+    bounce (KIPD, rfbr, RIDI and tyrex by their true attitudes).
+    """
+    rng, phi = gait.rng, gait.phase[:, None]
+    shift, size = rng.uniform(-0.7, 0.7, (2, 3)), rng.uniform(0.3, 1.0, (2, 3))
+    size *= [[0.8, 0.3, -1.6], [0.3, 1.0, 0.3]]
+    size[1, ::2] *= rng.choice([-1.0, 1.0], 2)  # to the left as often as to the right
+    stride = np.sin(phi / 2.0 + shift[0] + [0.0, 0.0, 0.6]) * size[0]
+    step = np.cos(phi + shift[1]) * size[1]
+    effort = gait.effort[:, None]
+    return np.asarray(wobble * (_hardly_growing(effort) * stride + effort * step))
+
+
 def _handheld(gait: Gait) -> CarryMotion:
     """Return the motion of a device held in front, not quite as lively as the trunk."""
     rng = gait.rng
-    strike, wobble = Strike(rng.uniform(0.3, 0.6), *_ARM, 2.0, 1.0), rng.uniform(0.02, 0.04)
+    strike, wobble = Strike(rng.uniform(0.3, 0.6), *_ARM, 1.5, 0.6), rng.uniform(0.02, 0.04)
     motion = _held(gait, rng.uniform(1.3, 1.8), strike, rng.uniform(0.05, 0.15), wobble)
     return _displaced(motion, rng.uniform(0.2, 0.45), rng.uniform(-0.2, 0.2), 0.7 * gait.height)
 
@@ -184,7 +213,7 @@ def _handheld(gait: Gait) -> CarryMotion:
 def _in_front(gait: Gait) -> CarryMotion:
     """Return the motion of a device laid flat on a hand, which bounces more than the trunk."""
     rng = gait.rng
-    strike, wobble = Strike(rng.uniform(1.3, 2.5), *_ARM, 0.8, 0.6), rng.uniform(0.03, 0.07)
+    strike, wobble = Strike(rng.uniform(1.1, 2.1), *_ARM, 0.8, 0.6), rng.uniform(0.03, 0.07)
     motion = _held(gait, rng.uniform(2.9, 4.3), strike, rng.uniform(0.05, 0.15), wobble)
     return _displaced(motion, rng.uniform(0.2, 0.45), rng.uniform(-0.2, 0.2), 0.7 * gait.height)
 
@@ -192,8 +221,8 @@ def _in_front(gait: Gait) -> CarryMotion:
 def _texting(gait: Gait) -> CarryMotion:
     """Return the motion of a device that is read: the arms keep it steadier than the trunk."""
     rng = gait.rng
-    strike = Strike(rng.uniform(0.9, 2.0), *_ARM, 0.7, 0.5)
-    wobble, tremor = rng.uniform(0.04, 0.09), rng.uniform(0.02, 0.07)
+    strike = Strike(rng.uniform(0.75, 1.7), *_ARM, 0.4, 0.3)
+    wobble, tremor = rng.uniform(0.05, 0.12), rng.uniform(0.02, 0.07)
     motion = _held(gait, rng.uniform(0.75, 1.25), strike, tremor, wobble)
     return _displaced(motion, rng.uniform(0.2, 0.4), rng.uniform(-0.1, 0.1), 0.72 * gait.height)
 
@@ -204,10 +233,10 @@ def _displaced(motion: CarryMotion, x: float, y: float, z: float) -> CarryMotion
 
 def _call(gait: Gait) -> CarryMotion:
     rng, n = gait.rng, len(gait)
-    strike = Strike(rng.uniform(0.8, 1.6), *_ARM, 0.7, 0.5)
-    wobble, tremor = rng.uniform(0.04, 0.08), rng.uniform(0.03, 0.1)
+    strike = Strike(rng.uniform(0.7, 1.35), *_ARM, 0.4, 0.4)
+    wobble, tremor = rng.uniform(0.06, 0.12), rng.uniform(0.03, 0.1)
     motion = _held(gait, rng.uniform(0.9, 1.4), strike, tremor, wobble)
-    head = 0.35 * drift(rng, n, gait.rate, 1.0)
+    head = 0.4 * drift(rng, n, gait.rate, 1.0)
     arm = np.array([0.05, rng.choice([-1.0, 1.0]) * 0.1, 0.0])
     offset = motion.offset_H + np.array([0.0, 0.0, 0.93 * gait.height]) + _about(2, head, arm)
     turn = motion.turn_H + np.stack([0 * head, 0 * head, head], axis=1)
@@ -226,7 +255,11 @@ def _swinging(gait: Gait) -> CarryMotion:
     ring = heel_strikes(gait, Strike(rng.uniform(0.9, 1.5), 5.5, 0.4, 0.9, 0.5))
     # Forward the hand also comes inward: the plane of the swing is turned.
     inward = Rotation.from_rotvec([0.0, 0.0, -side * rng.uniform(0.15, 0.4)])
-    offset = pivot + inward.apply(_about(1, -angle, arm)) + trunk(gait, rng.uniform(1.7, 2.8))
+    offset = (
+        pivot
+        + inward.apply(_about(1, -angle, arm))
+        + trunk(gait, rng.uniform(1.7, 2.8), _TRUNK_SURGE)
+    )
     offset += ring.offset_H + 0.008 * drift(rng, n, gait.rate, 0.5, 3)
     twist = rng.uniform(0.1, 0.5) * angle + 0.08 * drift(rng, n, gait.rate, 0.7)
     roll = 0.08 * drift(rng, n, gait.rate, 0.7)
@@ -240,7 +273,7 @@ def _pocket(gait: Gait) -> CarryMotion:
     amplitude = np.radians(rng.uniform(11.0, 18.0))
     place = (0.08, -rng.uniform(0.05, 0.12) * gait.height)
     strike = Strike(rng.uniform(2.2, 4.0), 8.5, 0.25, 0.7, 0.7, True)
-    return _on_thigh(gait, amplitude, place, rng.uniform(1.2, 2.0), strike)
+    return _on_thigh(gait, amplitude, place, rng.uniform(1.2, 2.0), _TRUNK_SURGE, strike)
 
 
 def _back_pocket(gait: Gait) -> CarryMotion:
@@ -249,11 +282,16 @@ def _back_pocket(gait: Gait) -> CarryMotion:
     amplitude = np.radians(rng.uniform(9.0, 14.0))
     place = (-0.1, -rng.uniform(0.0, 0.04) * gait.height)
     strike = Strike(rng.uniform(2.3, 4.1), 7.0, 0.3, 0.7, 0.7, True)
-    return _on_thigh(gait, amplitude, place, rng.uniform(1.0, 1.8), strike)
+    return _on_thigh(gait, amplitude, place, rng.uniform(1.0, 1.6), _HELD_SURGE, strike)
 
 
 def _on_thigh(
-    gait: Gait, amplitude: float, place: tuple[float, float], bounce: float, strike: Strike
+    gait: Gait,
+    amplitude: float,
+    place: tuple[float, float],
+    bounce: float,
+    surge: float,
+    strike: Strike,
 ) -> CarryMotion:
     """Return the motion of a device at a place (x, z) [m] from the hip that swings with a leg."""
     rng, n = gait.rng, len(gait)
@@ -262,7 +300,7 @@ def _on_thigh(
     hip = np.array([0.0, rng.choice([-1.0, 1.0]) * 0.1, 0.52 * gait.height])
     ring = heel_strikes(gait, strike)
     offset = hip + _about(1, -angle, np.array([place[0], 0.0, place[1]]))
-    offset += trunk(gait, bounce) + ring.offset_H
+    offset += trunk(gait, bounce, surge) + ring.offset_H
     shift = rng.uniform(-0.7, 0.7, 2)
     yaw = 0.2 * gait.effort * np.cos(gait.phase / 2.0 + shift[0])
     roll = 0.06 * gait.effort * np.cos(gait.phase + shift[1]) + 0.03 * drift(rng, n, gait.rate, 1.0)
@@ -282,7 +320,7 @@ def _bag(gait: Gait) -> CarryMotion:
     strap = np.array([0.0, 0.0, -hang])
     # A bag knocks against the body: its ringing is damped most.
     ring = heel_strikes(gait, Strike(rng.uniform(0.8, 1.7), 6.5, 0.5, 1.3, 1.6))
-    offset = body + np.cross(turn, strap) + strap + trunk(gait, rng.uniform(1.5, 2.4))
+    offset = body + np.cross(turn, strap) + strap + trunk(gait, rng.uniform(1.5, 2.4), _TRUNK_SURGE)
     return CarryMotion(offset + ring.offset_H, turn + ring.turn_H)
 
 

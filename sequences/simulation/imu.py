@@ -79,7 +79,7 @@ PERFECT_IMU = ImuErrors(noise=ImuNoise(0.0, 0.0, 0.0, 0.0))
 
 PHONE_IMU = ImuErrors(
     noise=PHONE_NOISE,
-    gyro_turn_on=5e-3,
+    gyro_turn_on=3e-3,
     accel_turn_on=0.05,
     gyro_scale=0.01,
     accel_scale=0.005,
@@ -87,7 +87,9 @@ PHONE_IMU = ImuErrors(
     gyro_range=math.radians(2000.0),
     accel_range=8.0 * STANDARD_GRAVITY,
 )
-"""A factory-calibrated phone IMU, with the biases and scale errors that remain."""
+"""A factory-calibrated phone IMU, with the biases and scale errors that remain: the yaw of Android
+phones drifts by 0.08 to 0.23 deg/s (root mean square by phone, true attitudes of tyrex, KIPD and
+RIDI; the raw rates of iPhones by 0.5 to 2.6)."""
 
 GOOD_IMU = ImuErrors(
     noise=ImuNoise(gyro_noise=5e-5, accel_noise=5e-4, gyro_walk=2e-6, accel_walk=5e-5),

@@ -123,7 +123,7 @@ def test_report_opens_at_the_start_with_the_whole_track_and_its_scale(show, repo
     assert page.evaluate("+document.body.dataset.time") == pytest.approx(0.0, abs=0.05)
     inside = "() => { const m = document.getElementById('map'), r = a => m.layout[a].range;"
     inside += " const within = (v, [low, high]) => v === null || (low < v && v < high);"
-    inside += " return m.data.filter(t => t.legendgroup === 'ekf')"
+    inside += " return m.data.filter(t => t.legendgroup === 'track')"
     inside += ".every(t => ['x', 'y'].every(a => t[a].every(v => within(v, r(`${a}axis`))))); }"
     assert page.evaluate(inside)
     bar = page.locator("#scale").bounding_box()["width"]

@@ -60,7 +60,7 @@ FIGURES = {
     "one-minute walk at constant speed it is accurate to only about 30 degrees",
     "nis": "mean of error^T covariance^-1 error of single windows, scaled to three axes "
     "(expected: 3)",
-    "nis_ekf": "mean NIS of the EKF in its default settings (expected: 3), if requested",
+    "nis_filtered": "mean NIS of the filter in its default settings (expected: 3), if requested",
 }
 """Figures of a recording and their meaning; NaN if its kind of truth does not provide one."""
 
@@ -187,7 +187,7 @@ def recording_errors(sequence: ImuSequence, pieces: Sequence[Piece]) -> Recordin
         "stretch_percent": 100.0 * sums.rms("stretch"),
         "direction_deg": abs(np.degrees(total_direction.turn)),
         "nis": sums.rms("nis") ** 2,
-        "nis_ekf": float("nan"),
+        "nis_filtered": float("nan"),
     }
     blocks = {name: np.concatenate(parts) for name, parts in sums.blocks.items()}
     return RecordingErrors(sums.path, figures, blocks)

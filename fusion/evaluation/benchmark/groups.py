@@ -127,7 +127,7 @@ def benchmark(
     models: Mapping[str, Callable[[str], Model]],
     read: Callable[[Path], ImuSequence],
     jobs: int | None = 1,
-    ekf: bool = False,
+    filtered: bool = False,
     progress: Progress = silent,
 ) -> tuple[Benchmark | None, list[Skipped]]:
     """Run every recording through every network; return None if none can be used.
@@ -138,13 +138,13 @@ def benchmark(
             differ between groups if each group was held out of training in turn.
         read: function that reads a path; like the models picklable.
         jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
-        ekf: whether the EKF is run for its mean NIS, which is slow.
+        filtered: whether the filter is run for its mean NIS, which is slow.
         progress: called with the share of the work done.
     """
     skipped: list[Skipped] = []
     scores: list[pd.DataFrame] = []
     blocks = [block_rows([], **dict.fromkeys(("set", "group", "recording", "network", "metric")))]
-    work = partial(_scores, groups=recordings, models=models, read=read, ekf=ekf)
+    work = partial(_scores, groups=recordings, models=models, read=read, filtered=filtered)
     for done, outcome in enumerate(each(work, recordings, jobs), 1):
         progress(done / len(recordings))
         if isinstance(outcome, Skipped):
@@ -161,7 +161,7 @@ def _scores(
     groups: Mapping[Path, str],
     models: Mapping[str, Callable[[str], Model]],
     read: Callable[[Path], ImuSequence],
-    ekf: bool,
+    filtered: bool,
 ) -> tuple[pd.DataFrame, list[pd.DataFrame]]:
     """Return a recording's rows of `Benchmark.scores` and of its blocks."""
     sequence = read(path)
@@ -173,9 +173,9 @@ def _scores(
         model = make(named["group"])
         pieces = [piece_of(model, stream) for stream in streams]
         errors[name] = recording_errors(sequence, pieces)
-        if ekf and not isinstance(model, PedestrianDeadReckoning):
+        if filtered and not isinstance(model, PedestrianDeadReckoning):
             nis = Navigator(model, backend="ekf").run(sequence).nis
-            errors[name].figures["nis_ekf"] = nis or np.nan
+            errors[name].figures["nis_filtered"] = nis or np.nan
     figures = {n: {"path_m": found.path_m, **found.figures} for n, found in errors.items()}
     others = {key: name for key, name in named.items() if key != "group"}
     unit = {"set": named["set"], "group": named["group"], "recording": str(path)}
@@ -260,7 +260,7 @@ _TITLES = {
     "rms_30s_m": ("30 s [m]", ".2f"),
     "direction_deg": ("direction [deg]", ".0f"),
     "nis": ("NIS", ".2f"),
-    "nis_ekf": ("EKF NIS", ".2f"),
+    "nis_filtered": ("filtered NIS", ".2f"),
 }
 """Titles and formats of the figures of a benchmark."""
 

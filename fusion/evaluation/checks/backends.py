@@ -16,6 +16,7 @@ from stario.fusion.evaluation.checks.faults import (
     matched_config,
     with_true_displacements,
 )
+from stario.fusion.evaluation.compare import TRACK_OF
 from stario.fusion.evaluation.scores import Column, parts, scored, table, wide
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.filter.record import innovations_of
@@ -31,8 +32,9 @@ from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, ImuErrors, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
 
-ESTIMATORS = {"ekf": "EKF", "graph": "graph", "fixed_lag": "fixed-lag"}
-"""The filter, the graph of the whole recording, and the newest states of the fixed-lag graph."""
+ESTIMATORS = {"filtered": "filtered", "track": "track", "fixed_lag": "fixed-lag"}
+"""The filter's track, that of the graph of the whole recording, and the newest states of the
+fixed-lag graph."""
 
 DISPLACEMENT_NOISE = 0.03
 """White noise of the simulated displacements, per axis [m]."""
@@ -95,12 +97,12 @@ def summary(scores: pd.DataFrame) -> dict[str, object]:
     """
     table = wide(scores).set_index(["recording", "track"])[[*_FIELDS]].unstack("track")
     medians, errors = table.median(), table["ate_m"]
-    logs = np.log(errors.div(errors["ekf"], axis=0))
+    logs = np.log(errors.div(errors["filtered"], axis=0))
     ratios = np.exp(logs.mean())
     figures = {
         "median_ate_m": medians["ate_m"],
-        "median_ate_to_ekf": medians["ate_m"] / medians["ate_m"]["ekf"],
-        "mean_ratio_to_ekf": ratios,
+        "median_ate_to_filtered": medians["ate_m"] / medians["ate_m"]["filtered"],
+        "mean_ratio_to_filtered": ratios,
         "mean_ratio_error": ratios * logs.sem().fillna(0.0),
         "median_nees": medians["nees"],
         "s_per_min": medians["s_per_min"],
@@ -115,14 +117,15 @@ def summary(scores: pd.DataFrame) -> dict[str, object]:
 def score_table(scores: pd.DataFrame) -> str:
     """Return the scores as text."""
     found: Any = summary(scores)
-    to_ekf, mean, error = (
-        found[name] for name in ("median_ate_to_ekf", "mean_ratio_to_ekf", "mean_ratio_error")
+    to_filtered, mean, error = (
+        found[name]
+        for name in ("median_ate_to_filtered", "mean_ratio_to_filtered", "mean_ratio_error")
     )
-    others = [name for name in ESTIMATORS if name != "ekf"]
-    ratios = [f"{ESTIMATORS[name]} {to_ekf[name]:.2f}" for name in others]
+    others = [name for name in ESTIMATORS if name != "filtered"]
+    ratios = [f"{ESTIMATORS[name]} {to_filtered[name]:.2f}" for name in others]
     means = [f"{ESTIMATORS[name]} {mean[name]:.2f} +- {error[name]:.2f}" for name in others]
     notes = (
-        f"median ATE relative to the EKF's: {', '.join(ratios)}; "
+        f"median ATE relative to filtered: {', '.join(ratios)}; "
         f"geometric mean over recordings: {', '.join(means)}",
         f"fixed-lag {60.0 / found['s_per_min']['fixed_lag']:.0f} times real time, slowest update "
         f"{found['slowest_update_ms']:.1f} ms",
@@ -139,11 +142,11 @@ def _scored(
     for backend in get_args(BackendName):
         navigator = Navigator(DummyPredictor(), config, backend=backend)
         began = process_time()
-        tracks[backend] = navigator.track(preprocessed)
-        seconds[backend] = process_time() - began
+        tracks[TRACK_OF[backend]] = navigator.track(preprocessed)
+        seconds[TRACK_OF[backend]] = process_time() - began
     tracks["fixed_lag"], times = _streamed(preprocessed, config)
     seconds["fixed_lag"] = float(times.sum())
-    duration = float(tracks["ekf"].time[-1] - tracks["ekf"].time[0])
+    duration = float(tracks["filtered"].time[-1] - tracks["filtered"].time[0])
     figures = {
         name: {
             "ate_m": evaluate_track(track.trajectory, truth).ate_m,

@@ -115,7 +115,7 @@ def consistency(
     found = []
     for k in range(runs):
         found.append(
-            scored(f"walk {seed + k}", {"ekf": _run(config, yaw_sigma, seconds, seed + k)})
+            scored(f"walk {seed + k}", {"filtered": _run(config, yaw_sigma, seconds, seed + k)})
         )
         progress((k + 1) / runs)
     return joined(found)

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.evaluation.compare import TRACK_OF
 from stario.fusion.evaluation.scores import Column, joined, rows_of, scored
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.health import Health
@@ -187,7 +188,7 @@ def run_faults(
     backends: Sequence[BackendName] = get_args(BackendName),
     only: Sequence[Fault] | None = None,
 ) -> pd.DataFrame:
-    """Score a recording with each fault, the rows' group, through each back end, their track.
+    """Score a recording with each fault, the rows' group, by the track of each back end.
 
     Figures: absolute trajectory error [m] without and with the fault (`error_without`,
     `error_with`); distance from the truth at the end (`end_error`) and its reported standard
@@ -234,7 +235,9 @@ def run_faults(
                 assert track.health is not None
                 figures, words = _figures(track, truth), reported(track.health)
             figures = {"error_without": without, **figures}
-            found.append(scored(sequence.name, {backend: figures}, fault.name, reported=words))
+            found.append(
+                scored(sequence.name, {TRACK_OF[backend]: figures}, fault.name, reported=words)
+            )
     return joined(found)
 
 
@@ -247,7 +250,7 @@ def fault_table(scores: pd.DataFrame) -> str:
         Column("sigma [m]", "end_sigma", ".3f"),
     )
     rows = list(scores.groupby(["group", "track"], sort=False))
-    lines = aligned(rows_of(rows, columns, "fault", "back end"))
+    lines = aligned(rows_of(rows, columns, "fault", "track"))
     finite = Column("", "finite", over=np.min)
     reports = [
         ("" if finite.value(part) else "NOT FINITE, ") + part["reported"].iloc[0]

@@ -1,8 +1,8 @@
 """The fusion on recordings, by group: beside its network, with fixes, and with samples missing.
 
-- Benefit: errors of filter and graph relative to the network's, whose displacements are chained
-  along the attitude levelled from the IMU. They are horizontal, root mean square after a fit of yaw
-  and position: over all poses, or at the waypoints.
+- Benefit: errors of the filtered and the smoothed track relative to the network's, whose
+  displacements are chained along the attitude levelled from the IMU. They are horizontal, root mean
+  square after a fit of yaw and position: over all poses, or at the waypoints.
 - Fixes: true positions at equal intervals with white errors; is the error as large as reported?
   Only the second half of each track counts: by then several fixes have determined the direction.
 - Missing samples: a short gap at each of several instants, and samples dropped at random. Results
@@ -22,7 +22,7 @@ from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.benchmark.displacement_error import known_truth
 from stario.fusion.evaluation.checks.faults import drops, gap
-from stario.fusion.evaluation.compare import Metrics, measure
+from stario.fusion.evaluation.compare import TRACK_OF, Metrics, measure
 from stario.fusion.evaluation.known_positions import MIN_POSITIONS, true_path
 from stario.fusion.evaluation.scores import (
     Column,
@@ -92,10 +92,11 @@ def fusion_gain(
         track = Navigator(model, config, backend=name).track(preprocessed)
         measured = measure(track, sequence)
         error = fitted_error(measured)
-        figures[name] = {"error_m": error, "percent": 100.0 * error / path if path else None}
-        figures[name] |= {"ratio": error / alone, "nis": measured["nis_mean"]}
+        of_track: Metrics = {"error_m": error, "percent": 100.0 * error / path if path else None}
+        of_track |= {"ratio": error / alone, "nis": measured["nis_mean"]}
         if truth is not None:
-            figures[name] |= {"nees": measured["nees_median"], **_yaw_at_the_end(track, truth)}
+            of_track |= {"nees": measured["nees_median"], **_yaw_at_the_end(track, truth)}
+        figures[TRACK_OF[name]] = of_track
     return scored(sequence.name, figures, group)
 
 
@@ -127,13 +128,13 @@ def _percentile_95(ratios: FloatArray) -> float:
 
 def fusion_gain_table(scores: pd.DataFrame) -> str:
     """Return a row for each group: ratios to the network, NIS, and yaw error at the end."""
-    backends = [name for name in scores["track"].unique() if name != "network"]
-    network, first = {"track": "network"}, {"track": backends[0]}
+    tracks = [name for name in scores["track"].unique() if name != "network"]
+    network, first = {"track": "network"}, {"track": tracks[0]}
     columns = [
         Column("n", "error_m", ".0f", len, network),
         Column("network", "error_m", where=network),
     ]
-    for name in backends:
+    for name in tracks:
         where = {"track": name}
         columns += [
             Column(f"{name} mean", "ratio", ".2f", geometric_mean, where),
@@ -195,7 +196,7 @@ def track_with_fixes(
         "yaw_nees": float((yaw**2 / P[:, 2, 2]).mean()),
         "yaw_covered": float((np.abs(yaw) < SIGMA_BOUND * np.sqrt(P[:, 2, 2])).mean()),
     }
-    return scored(sequence.name, {backend: figures}, group)
+    return scored(sequence.name, {TRACK_OF[backend]: figures}, group)
 
 
 def true_fixes(truth: Trajectory, every: float, sigma: float, seed: int) -> list[Fix]:

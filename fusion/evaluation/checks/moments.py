@@ -18,6 +18,7 @@ from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position, known_truth
 from stario.fusion.evaluation.checks.simulation import simulated_walk
+from stario.fusion.evaluation.compare import TRACK_OF
 from stario.fusion.evaluation.scores import Column, geometric_mean, joined, parts, scored, table
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.direction import Complex
@@ -80,7 +81,7 @@ def moment_costs(
     backends: Sequence[BackendName] = ("ekf",),
     seed: int = 0,
 ) -> pd.DataFrame:
-    """Score a recording without and with each moment and place, the rows' group, by back end.
+    """Score a recording without and with each moment and place, the rows' group, by track.
 
     Figures: error of the rest [m], its parts fitted separately (`error_without`, `error_with`,
     their `ratio`) or as a whole (`joined_...`); largest correction of position [m] and attitude
@@ -101,7 +102,7 @@ def moment_costs(
             inserted = insert_moment(sequence, poses, moment, share, seed)
             observed = first.observe(inserted.sequence)
             figures = {
-                str(name): _cost(sequence, inserted, without[name], navigator.track(observed))
+                TRACK_OF[name]: _cost(sequence, inserted, without[name], navigator.track(observed))
                 for name, navigator in navigators.items()
             }
             found.append(scored(sequence.name, figures, f"{moment.name}, {place}"))
@@ -109,10 +110,10 @@ def moment_costs(
 
 
 def moment_table(scores: pd.DataFrame) -> str:
-    """Return a row for each moment, place and back end: ratios of errors, largest corrections."""
+    """Return a row for each moment, place and track: ratios of errors, largest corrections."""
     rows = [
-        ((group, str(backend)), part)
-        for backend, chosen in scores.groupby("track", sort=False)
+        ((group, str(track)), part)
+        for track, chosen in scores.groupby("track", sort=False)
         for group, part in parts(chosen)
     ]
     step, turn = (Column("", f"{m}_without", over=np.max).value(scores) for m in ("step", "turn"))
@@ -123,7 +124,7 @@ def moment_table(scores: pd.DataFrame) -> str:
         f"step, turn: largest correction between two outputs (without moments {step:.2f} m, "
         f"{turn:.1f} deg); share with at most {MAX_STEP:g} m and {MAX_TURN:g} deg",
     ]
-    return table(rows, _COLUMNS, ("moment", "back end"), notes)
+    return table(rows, _COLUMNS, ("moment", "track"), notes)
 
 
 def _with_truth(sequence: ImuSequence) -> ImuSequence:

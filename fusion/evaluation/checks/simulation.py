@@ -88,7 +88,7 @@ def carry_of(sequence: ImuSequence) -> str:
 def motion_scores(
     model: Predictor, sequence: ImuSequence, config: NavigatorConfig, carry: str, kind: str
 ) -> pd.DataFrame:
-    """Score a recording's motion, as `motion`, and the errors of network and graph [%] of its path.
+    """Score a recording's motion, as `motion`, and the errors of network and track [%] of its path.
 
     Args:
         model: network.
@@ -105,8 +105,8 @@ def motion_scores(
     observed = navigator.observe(sequence)
     figures: Metrics = dict(motion(sequence))
     figures["speed"] = length / sequence.duration
-    for name, track in (("network", network_track(observed)), ("graph", navigator.track(observed))):
-        figures[name] = 100.0 * fitted_error(measure(track, sequence)) / length
+    for name, track in (("network", network_track(observed)), ("track", navigator.track(observed))):
+        figures[f"{name}_percent"] = 100.0 * fitted_error(measure(track, sequence)) / length
     return scored(sequence.name, {kind: figures}, carry)
 
 
@@ -144,13 +144,13 @@ def motion_table(scores: pd.DataFrame) -> str:
         Column("rate", "rate", ".2f"),
         Column("steps", "step_rate", ".2f"),
         Column("speed", "speed", ".2f"),
-        Column("network %", "network", ".1f"),
-        Column("graph %", "graph", ".1f"),
+        Column("network %", "network_percent", ".1f"),
+        Column("track %", "track_percent", ".1f"),
     ]
     notes = [
         "medians; force by band [m/s^2]: root mean square of its norm; rate: of the angular rate "
         "[rad/s]; steps [Hz]; speed: path over time [m/s]",
-        "network, graph: error after a fit of yaw and position, in % of the path",
+        "network, track: error after a fit of yaw and position, in % of the path",
     ]
     if RECORDED not in set(scores["track"]):
         notes.append("recordings to compare with: none given (PATH: archives with attribute carry)")

@@ -32,7 +32,7 @@ def test_compare_sets_the_track_against_dead_reckoning(stario, recording):
     assert all(line.startswith(("! ", "  ")) for line in findings)
     assert re.fullmatch(
         r"walk: StarIO's track: [\d.]+ m rms from the truth \([\d.]+ % of its [\d.]+ m\), "
-        r"[\d.]+ m after a yaw fit; its sigma says [\d.]+ m; "
+        r"[\d.]+ m \([\d.]+ %\) after the best shift and turn; its sigma says [\d.]+ m; "
         r"dead reckoning: [\d.]+ m",
         seen,
     )
@@ -60,7 +60,9 @@ def test_check_fusion_compares_the_fusion_with_its_network(stario, recording, tm
     (tmp_path / "walk.csv").write_bytes(recording.read_bytes())
     done = stario("check", "fusion", recording, "walk.csv", "--json")
     assert done.code == 0
-    first, second = (one for one in json.loads(done.out) if one["track"] == "network")
+    scores = json.loads(done.out)
+    assert {one["track"] for one in scores} <= set(TRACKS)  # as `run` and `compare` name them
+    first, second = (one for one in scores if one["track"] == "network")
     assert [first["recording"], second["recording"]] == ["walk", "walk-2"]
     assert first["error_m"] == second["error_m"] > 0.0
     refused = stario("check", "fusion", recording, "--by", "colour")
@@ -88,7 +90,7 @@ def test_check_moments_reports_what_a_bad_moment_costs(stario, recording, monkey
     assert done.code == 0
     found = json.loads(done.out)
     assert [(one["recording"], one["group"], one["track"]) for one in found] == [
-        ("walk", "lift, middle", backend) for backend in ("ekf", "graph")
+        ("walk", "lift, middle", track) for track in ("filtered", "track")
     ]
     assert all(one["error_with"] > 0.0 for one in found)
     monkeypatch.setattr(f"{checks}.simulated_walks", lambda: [read_generic_csv(recording)])
@@ -178,8 +180,8 @@ def test_evaluate_compares_with_other_weights_by_groups(stario, recording, tmp_p
     (tmp_path / "walks").mkdir()
     stario("simulate", "walks/long.csv", "--seconds", 25, "--carry", "handheld", "--rate", 100)
     done = stario(
-        "evaluate", recording, "walks/long.csv", "--by", "set", "--against", "default", "--ekf",
-        "--out", "out", "--json",
+        "evaluate", recording, "walks/long.csv", "--by", "set", "--against", "default",
+        "--filtered", "--out", "out", "--json",
     )  # fmt: skip
     assert done.code == 0, done.err
     groups = {(group["group"], group["role"]): group for group in json.loads(done.out)["groups"]}
@@ -189,7 +191,7 @@ def test_evaluate_compares_with_other_weights_by_groups(stario, recording, tmp_p
     assert (long["ratio_1s"], long["ratio_10s"]) == (equal, equal)
     assert long["length_ratio"] == pytest.approx(1.0, abs=0.5)  # of a walk of 25 s
     assert long["rms_1s_m"] < long["rms_10s_m"] < 10.0 * long["rms_1s_m"]
-    assert 0.5 < long["nis_ekf"] < 6.0  # 3 is expected of a consistent filter
+    assert 0.5 < long["nis_filtered"] < 6.0  # 3 is expected of a consistent filter
     written = json.loads((tmp_path / "out/groups.json").read_text())["groups"]
     assert {(group["group"], group["role"]): group for group in written} == groups
 
@@ -228,7 +230,7 @@ def test_backends_compares_filter_and_graph(stario):
     done = stario("check", "backends", "--walks", "1", "--seconds", "10", "--json")
     assert done.code == 0
     content = json.loads(done.out)
-    assert set(content["summary"]["median_ate_m"]) == {"ekf", "graph", "fixed_lag"}
+    assert set(content["summary"]["median_ate_m"]) == {"filtered", "track", "fixed_lag"}
     assert content["scores"][0]["recording"] == "walk 0"
 
 

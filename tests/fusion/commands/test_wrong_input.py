@@ -70,7 +70,7 @@ def test_a_line_that_is_cut_short_is_named(stario, recording, tmp_path):
         (["evaluate", "--data", ".", "--where", "person=dan"], ["--where", "--data"]),
         (["evaluate", "RECORDING", "--by", "mood"], ["--by", "mood"]),
         (["evaluate", "RECORDING", "--against", "default"], ["--against", "--by"]),
-        (["evaluate", "RECORDING", "--ekf"], ["--ekf", "--by"]),
+        (["evaluate", "RECORDING", "--filtered"], ["--filtered", "--by"]),
         (["evaluate", "RECORDING", "--by", "set", "--models", "default"], ["--models", "--by"]),
         (["run", "RECORDING", "--format", "fax"], ["format", "fax"]),
         (["run", "RECORDING", "--gyro-unit", "rpm"], [".csv: --gyro-unit: found 'rpm'"]),

@@ -59,7 +59,7 @@ def test_a_filled_run_writes_model_and_errors(dataset, reading, tmp_path):
     assert trained["seconds"] > 0.0
     [one] = json.loads((folder / "errors.json").read_text())["recordings"]
     assert len(one["drawn"]["track"]) == len(one["drawn"]["truth"]) == len(one["drawn"]["time"])
-    assert set(one["tracks"]) == {"network_true_attitude", "network", "ekf"}
+    assert set(one["tracks"]) == {"network_true_attitude", "network", "filtered"}
     total, count = map(sum, zip(*one["blocks"]["ate"], strict=True))
     assert one["tracks"]["network_true_attitude"]["ate_m"] == pytest.approx(
         (total / count / 2) ** 0.5

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stario.sequences.drawing.figures import TRACK_STYLES
 from stario.sequences.drawing.plan import plan_view
 from stario.sequences.drawing.plots import error_over_time, imu_overview, innovations
 from stario.sequences.drawing.text_table import aligned, figure
@@ -73,6 +74,16 @@ def test_colours_depend_on_the_track_name_only(truth, tracks):
         assert line(all_axes, label).get_color() == line(two_axes, label).get_color()
     shown = ("truth", "StarIO", "network alone", "dead reckoning")
     assert len({line(all_axes, label).get_color() for label in shown}) == len(shown)
+
+
+def test_tracks_differ_without_their_colours(truth):
+    """In grey, and to many eyes, only the dashes of lines are left."""
+    named = {name: with_growing_error(truth, 0.01) for name in TRACK_STYLES}
+    for axes in (plan_view(named, truth, "").axes[0], error_over_time(named, truth).axes[0]):
+        tracks = [line(axes, label) for label, *_ in TRACK_STYLES.values()]
+        # The first track of a plan is drawn in pieces, by its time.
+        assert len({str(track._dash_pattern) for track in tracks[1:]}) == len(tracks) - 1
+        assert all(track.is_dashed() for track in tracks[1:])
 
 
 def luminance(colours: np.ndarray) -> np.ndarray:
@@ -230,6 +241,7 @@ def test_matplotlib_is_imported_lazily_and_pyplot_never():
 import sys
 import numpy as np
 from stario.sequences import ImuSequence
+from stario.sequences.drawing.figures import TRACK_STYLES
 from stario.sequences.drawing.plan import plan_view
 from stario.sequences.drawing.plots import imu_overview
 assert "matplotlib" not in sys.modules

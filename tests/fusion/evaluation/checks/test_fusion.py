@@ -27,13 +27,15 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import PositionTrack, Trajectory
 
 
-def of(scores: pd.DataFrame, metric: str, track: str = "ekf") -> float:
+def of(scores: pd.DataFrame, metric: str, track: str = "filtered") -> float:
     [found] = values(scores, metric, track=track)
     return float(found)
 
 
-def row(name: str, group: str, ratio: float, network: float, **ekf: float) -> pd.DataFrame:
-    return scored(name, {"network": {"error_m": network}, "ekf": {"ratio": ratio, **ekf}}, group)
+def row(name: str, group: str, ratio: float, network: float, **fused: float) -> pd.DataFrame:
+    return scored(
+        name, {"network": {"error_m": network}, "filtered": {"ratio": ratio, **fused}}, group
+    )
 
 
 def test_ratios_are_geometric_means_by_group():

@@ -35,13 +35,13 @@ def cost(walk: int, ratio: float, step: float, turn: float, place: str = "start"
     small = float(step <= 1.0 and turn <= 10.0)
     figures = {"error_without": 2.0, "ratio": ratio, "joined_ratio": 2.0, "small": small}
     figures |= {"step": step, "turn": turn, "step_without": 0.1, "turn_without": 1.0}
-    return scored(f"walk {walk}", {"ekf": figures}, f"drop, {place}")
+    return scored(f"walk {walk}", {"filtered": figures}, f"drop, {place}")
 
 
 def test_the_table_counts_small_ratios_and_small_corrections():
     found = [cost(0, 1.0, 0.5, 20.0), cost(1, 4.0, 0.5, 5.0), cost(0, 1.1, 0.2, 2.0, "end")]
     lines = moment_table(joined(found)).splitlines()
-    assert lines[1].split()[:4] == ["drop,", "end", "ekf", "1"]
+    assert lines[1].split()[:4] == ["drop,", "end", "filtered", "1"]
     start = lines[2].split()
     assert start[3:] == ["2", "2.00", "2.00", "4.00", "2.00", "2.00", "50%", "0.5", "20.0", "50%"]
     assert lines[3].split()[0] == "all"
@@ -84,7 +84,7 @@ def test_a_phone_laid_down_and_taken_up_costs_the_rest_little(walk, monkeypatch)
     monkeypatch.setattr(moments, "MOMENTS", (BY_NAME["table"],))
     monkeypatch.setattr(moments, "PLACES", {"middle": 0.5})
     [found] = wide(moment_costs(load_model("default"), walk, NavigatorConfig())).itertuples()
-    assert (found.group, found.track) == ("table, middle", "ekf")
+    assert (found.group, found.track) == ("table, middle", "filtered")
     assert 0.0 < found.error_with < 2.0 * found.error_without
     assert 0.0 < found.step_without < moments.MAX_STEP
 
@@ -149,8 +149,9 @@ def test_a_recording_without_a_known_carry_is_refused():
 def test_the_table_has_a_row_of_each_kind_and_says_what_is_missing(still_model):
     walk = simulated_walk("bag", 1, 20.0)
     simulated = motion_scores(still_model, walk, NavigatorConfig(), "bag", SIMULATED)
-    assert values(simulated, "network") > 20.0  # % of the path: the network says that it rests
+    assert values(simulated, "network_percent") > 20.0  # the network says that it rests
     assert "none given" in motion_table(simulated)
+    assert wide(simulated)["track_percent"].notna().all()
     both = joined([simulated, simulated.assign(track=RECORDED)])
     text = motion_table(both)
     assert "bag, simulated" in text
