@@ -294,15 +294,16 @@ class EkfState:
 
         Once the yaw is known to no more than `LOST_YAW`, its error is no small angle: what an
         update tells about other errors must neither turn nor move the track through it. With c the
-        error of the current yaw and position, x = N c + (I - N C) x splits off the motion N c of
-        all poses and of the field with them, and the covariance between both parts is dropped.
+        error of the current yaw and of the current position, which a tilt leaves where it is,
+        x = N c + (I - N C) x splits off the motion N c of all poses and of the field with them, and
+        the covariance between both parts is dropped.
         """
         if self.P[2, 2] < LOST_YAW**2:
             return self
         n = self.covariances.shape[1]
         C, N = np.zeros((4, n)), np.zeros((n, 4))
         C[0, 2] = 1.0
-        C[1:, 6:9] = np.eye(3)
+        C[1:, :2], C[1:, 6:9] = -skew(self.p_W)[:, :2], np.eye(3)
         for first, rho in self._poses():
             N[first + 2, 0] = 1.0
             N[rho : rho + 3, 1:] = np.eye(3)

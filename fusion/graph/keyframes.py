@@ -39,6 +39,16 @@ from stario.sequences.sequence import FloatArray
 _CONVERGED = 1e-3
 """The optimisation stops after a round that moves no keyframe further than this [m]."""
 
+_FULL_STEPS, _SMALL_TURNS = 50, 200
+"""Maximum number of Gauss-Newton steps, and of those that turn only so far."""
+
+_MAX_TURN = 0.3
+"""Largest turn of a keyframe in one of these [rad]: the tangent leaves the circle by 4 % of the
+radius."""
+
+_NEARLY_CONVERGED = 0.1
+"""A track that the last step still moves by more [m] has no figure that could be given out."""
+
 _UNDETERMINED_SIGMA = 1e5
 """A state this uncertain [m, m/s, rad, ...] is undetermined: no walk is so far, fast or biased."""
 
@@ -125,21 +135,22 @@ class KeyframeGraph:
         self._terms.append(Whitened.of(term, limit))
         self._solution = None
 
-    def solve(self, max_rounds: int = 50, trusted_rounds: int = 0) -> None:
+    def solve(self, max_rounds: int | None = None, trusted_rounds: int = 0) -> None:
         """Optimise the keyframes by Gauss-Newton steps.
 
         Args:
-            max_rounds: maximum number of linearisations of the measurements.
+            max_rounds: number of linearisations of the measurements after which it need not have
+                converged; None if it must.
             trusted_rounds: number of first rounds in which none is down-weighted: a poor start must
                 not decide which of them are false.
 
         Raises:
-            IndeterminateError: a state is not determined, or the optimisation diverged; the
-                keyframes are then unchanged.
+            IndeterminateError: a state is not determined, or the optimisation does not converge;
+                the keyframes are then unchanged.
         """
         start = self._states
         try:
-            values = self._optimise(max_rounds, trusted_rounds)
+            values = self._optimised(max_rounds, trusted_rounds)
             self._states = {k: KeyframeState.of(values, k) for k in self._time}
             self._check_determined()
         except (RuntimeError, IndeterminateError) as error:
@@ -220,26 +231,53 @@ class KeyframeGraph:
         self.last += 1
         self._time[self.last], self._states[self.last], self._solution = time, state, None
 
-    def _optimise(self, max_rounds: int, trusted_rounds: int) -> Any:
+    def _optimised(self, max_rounds: int | None, trusted_rounds: int) -> Any:
         """Take full Gauss-Newton steps, which follow the IMU's stiff factors as a filter does.
 
         From a poor start, a correct step may increase their error by its second-order terms.
         Levenberg-Marquardt's damping is then slow, and a stream would output unconverged states.
+        Where hardly anything tells the heading for a long time, full steps lead from one end of
+        what is possible to the other: then small turns, one after the other, converge.
         """
+        if max_rounds is not None:
+            return self._after_steps(max_rounds, trusted_rounds, math.inf)[0]
+        for rounds, max_turn in ((_FULL_STEPS, math.inf), (_SMALL_TURNS, _MAX_TURN)):
+            values, change = self._after_steps(rounds, trusted_rounds, max_turn)
+            if change < _NEARLY_CONVERGED:
+                return values
+        raise IndeterminateError("the optimisation does not converge")
+
+    def _after_steps(self, rounds: int, trusted_rounds: int, max_turn: float) -> tuple[Any, float]:
+        """Return the values after steps that turn no keyframe by more, and the last change [m]."""
         factors, values, ordering = self._imu_factors(), self._values(), self._ordering(self._time)
-        for _round in range(max_rounds):
+        change = math.inf
+        for k in range(rounds):
             linear = factors.linearize(values)
             for term in self._terms:
-                linear.push_back(term.factor(values, trusted=_round < trusted_rounds))
+                linear.push_back(term.factor(values, trusted=k < trusted_rounds))
             self._solution = LinearSolution(linear, ordering)
+            step = self._solution.step()
+            if max_turn < math.inf:
+                step = self._limited(step, max_turn)
             before = self._positions(values)
-            values = values.retract(self._solution.step())
+            values = values.retract(step)
             change = float(np.abs(self._positions(values) - before).max())
             if not change > _CONVERGED:
                 break
         if not np.isfinite(change):
             raise IndeterminateError("the optimisation diverged")
-        return values
+        return values, change
+
+    def _limited(self, step: Any, max_turn: float) -> Any:
+        """Return a step of gtsam's, or the part of it that turns no keyframe by more [rad]."""
+        turn = max(float(np.linalg.norm(step.at(X(k))[:3])) for k in self._time)
+        if not turn > max_turn:
+            return step
+        part = gtsam.VectorValues()
+        for k in self._time:
+            for key in self._states[k].keys(k):
+                part.insert(key, max_turn / turn * step.at(key))
+        return part
 
     def _positions(self, values: Any) -> FloatArray:
         return np.array([values.atPose3(X(k)).translation() for k in self._time])

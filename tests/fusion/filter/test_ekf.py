@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from initial_ekf import Driven, initialised
@@ -200,6 +202,18 @@ def test_turning_the_world_turns_the_estimate_and_nothing_else():
     T = turn_matrix(yaw, ekf)
     T[9:15, 9:15] = np.eye(6)
     np.testing.assert_allclose(turned.P, T @ ekf.P @ T.T, atol=1e-9 * ekf.P.max())
+
+
+def test_once_the_yaw_is_lost_levelling_a_far_track_leaves_it_where_it_is():
+    ekf = Driven(2)
+    state = NavState(0.0, np.eye(3), *np.zeros((4, 3)), 1e-4 * np.eye(15))
+    ekf.initialise(replace(state, p_W=np.array([300.0, -200.0, 0.0])))
+    ekf.clone()
+    ekf.state = ekf.state.with_yaw_inflated(np.zeros(3), 1.5).with_lost_yaw_forgotten()
+    before = ekf.state.p_W
+    ekf.update_tilt(exp_so3(np.array([0.05, 0.05, 0.0]))[2], 1e-3)
+    assert np.abs(ekf.state.R_WB[2, :2]).max() > 0.04
+    assert np.linalg.norm(ekf.state.p_W - before) < 0.1
 
 
 def test_displacements_carry_no_information_about_yaw_and_position(driven):

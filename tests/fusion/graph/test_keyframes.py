@@ -10,12 +10,14 @@ from support import GRAPH as CONFIG
 from support import Broken, ate, stream
 from told import health_lines
 
-from stario.fusion import Navigator
+from stario.fusion import Navigator, backends
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks.backends import score_walk, summary
 from stario.fusion.evaluation.scores import joined
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import position_fix, velocity_fix, yaw_fix
+from stario.fusion.graph import keyframes
+from stario.fusion.graph.batch import smooth
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.graph.whitening import IndeterminateError
@@ -72,6 +74,43 @@ def test_the_track_follows_the_imu_between_keyframes(walk, make_oracle):
     truth = walk.truth.at(track.time)
     turned = (track.attitude_WB * truth.attitude_WB.inv()).magnitude()
     assert np.abs(np.diff(turned)).max() < 0.01
+
+
+def smooth_turned(filtered, *others):
+    """Smooth from headings that are off by 6 rad in the end."""
+    turns = about_z([0.1 * (state.time - filtered[0].time) for state in filtered]).as_matrix()
+    lost = [
+        replace(state, R_WB=turn @ state.R_WB, v_W=turn @ state.v_W, p_W=turn @ state.p_W)
+        for state, turn in zip(filtered, turns, strict=True)
+    ]
+    return smooth(lost, *others)
+
+
+@pytest.mark.parametrize("full_steps", [50, 1])
+def test_the_track_does_not_depend_on_a_heading_that_the_filter_lost(
+    make_walk, make_oracle, monkeypatch, full_steps
+):
+    """With full steps, and with small turns where these do not converge."""
+    walk = make_walk(3, 60.0)
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    expected = graph(oracle).run(walk)
+    monkeypatch.setattr(backends, "smooth", smooth_turned)
+    monkeypatch.setattr(keyframes, "_FULL_STEPS", full_steps)
+    found = graph(oracle).run(walk)
+    assert found.health.notes == []
+    off = found.trajectory.position_W - expected.trajectory.position_W
+    assert np.linalg.norm(off, axis=1).max() < 0.05
+
+
+def test_a_track_that_does_not_converge_is_not_given_out(walk, make_oracle, monkeypatch):
+    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    filtered = Navigator(oracle, CONFIG, backend="ekf").run(walk)
+    monkeypatch.setattr(backends, "smooth", smooth_turned)
+    monkeypatch.setattr(keyframes, "_FULL_STEPS", 1)
+    monkeypatch.setattr(keyframes, "_SMALL_TURNS", 1)
+    found = graph(oracle).run(walk)
+    np.testing.assert_array_equal(found.trajectory.position_W, filtered.trajectory.position_W)
+    assert "converge" in " ".join(found.health.notes)
 
 
 # --- symmetries ------------------------------------------------------------------------------
