@@ -237,18 +237,35 @@ class KeyframeGraph:
         From a poor start, a correct step may increase their error by its second-order terms.
         Levenberg-Marquardt's damping is then slow, and a stream would output unconverged states.
         Where hardly anything tells the heading for a long time, full steps lead from one end of
-        what is possible to the other: then small turns, one after the other, converge.
+        what is possible to the other, by more than half a turn: then small turns, one after the
+        other, converge.
         """
         if max_rounds is not None:
-            return self._after_steps(max_rounds, trusted_rounds, math.inf)[0]
-        for rounds, max_turn in ((_FULL_STEPS, math.inf), (_SMALL_TURNS, _MAX_TURN)):
-            values, change = self._after_steps(rounds, trusted_rounds, max_turn)
+            return self._after_steps(max_rounds, trusted_rounds)[0]
+        for rounds, limits in (
+            (_FULL_STEPS, (math.pi, None)),
+            (_SMALL_TURNS, (math.inf, _MAX_TURN)),
+        ):
+            values, change = self._after_steps(rounds, trusted_rounds, *limits)
             if change < _NEARLY_CONVERGED:
                 return values
         raise IndeterminateError("the optimisation does not converge")
 
-    def _after_steps(self, rounds: int, trusted_rounds: int, max_turn: float) -> tuple[Any, float]:
-        """Return the values after steps that turn no keyframe by more, and the last change [m]."""
+    def _after_steps(
+        self,
+        rounds: int,
+        trusted_rounds: int,
+        no_turn: float = math.inf,
+        max_turn: float | None = None,
+    ) -> tuple[Any, float]:
+        """Return the values after Gauss-Newton steps, and how far the last one moved any [m].
+
+        Args:
+            rounds: maximum number of steps.
+            trusted_rounds: as for `solve`.
+            no_turn: turn of a keyframe [rad] from which a step is not taken, which is given up.
+            max_turn: turn to which steps are scaled [rad]; None takes them in full.
+        """
         factors, values, ordering = self._imu_factors(), self._values(), self._ordering(self._time)
         change = math.inf
         for k in range(rounds):
@@ -257,8 +274,11 @@ class KeyframeGraph:
                 linear.push_back(term.factor(values, trusted=k < trusted_rounds))
             self._solution = LinearSolution(linear, ordering)
             step = self._solution.step()
-            if max_turn < math.inf:
-                step = self._limited(step, max_turn)
+            turn = max(float(np.linalg.norm(step.at(X(n))[:3])) for n in self._time)
+            if turn > no_turn:
+                return values, math.inf
+            if max_turn is not None and turn > max_turn:
+                step = self._scaled(step, max_turn / turn)
             before = self._positions(values)
             values = values.retract(step)
             change = float(np.abs(self._positions(values) - before).max())
@@ -268,15 +288,12 @@ class KeyframeGraph:
             raise IndeterminateError("the optimisation diverged")
         return values, change
 
-    def _limited(self, step: Any, max_turn: float) -> Any:
-        """Return a step of gtsam's, or the part of it that turns no keyframe by more [rad]."""
-        turn = max(float(np.linalg.norm(step.at(X(k))[:3])) for k in self._time)
-        if not turn > max_turn:
-            return step
+    def _scaled(self, step: Any, share: float) -> Any:
+        """Return a part of a step of gtsam's."""
         part = gtsam.VectorValues()
         for k in self._time:
             for key in self._states[k].keys(k):
-                part.insert(key, max_turn / turn * step.at(key))
+                part.insert(key, share * step.at(key))
         return part
 
     def _positions(self, values: Any) -> FloatArray:
