@@ -39,7 +39,7 @@ from stario.sequences.sequence import FloatArray
 _CONVERGED = 1e-3
 """The optimisation stops after a round that moves no keyframe further than this [m]."""
 
-_FULL_STEPS, _SMALL_TURNS = 50, 200
+_FULL_STEPS, _SMALL_TURNS = 50, 60
 """Maximum number of Gauss-Newton steps, and of those that turn only so far."""
 
 _MAX_TURN = 0.3
