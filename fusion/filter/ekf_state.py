@@ -303,7 +303,7 @@ class EkfState:
         n = self.covariances.shape[1]
         C, N = np.zeros((4, n)), np.zeros((n, 4))
         C[0, 2] = 1.0
-        C[1:, :2], C[1:, 6:9] = -skew(self.p_W)[:, :2], np.eye(3)
+        C[1:, :2], C[1:, 6:9] = -skew(self.X[0, :, 4])[:, :2], np.eye(3)
         for first, rho in self._poses():
             N[first + 2, 0] = 1.0
             N[rho : rho + 3, 1:] = np.eye(3)
