@@ -169,7 +169,7 @@
     element("tap").hidden = id === null;
     if (id !== null) {
       element("tap-text").textContent = `Tap the map where ${devices.get(id).label} is now`;
-      if (window.innerWidth <= 900) element("tap").scrollIntoView();
+      element("tap").scrollIntoView();  // beside many phones the map may be out of sight
     }
   };
   element("tap-cancel").addEventListener("click", () => tap(null));
