@@ -21,7 +21,8 @@ from stario.sequences.attitude.stacks import composed
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, Trajectory
 from stario.sequences.settings import check_number
-from stario.sequences.simulation.carrying import CARRIES, CarryMotion, Gait
+from stario.sequences.simulation.carrying import CARRIES
+from stario.sequences.simulation.gait import CarryMotion, Gait
 from stario.sequences.simulation.routes import RISER, Route, drift, integral, random_route, smoothed
 
 CARRYING_MODES = tuple(CARRIES)

@@ -112,14 +112,19 @@ def test_a_phone_is_polled_until_all_samples_are_recorded(serve, fake):
         listener.shutdown()
 
 
-def test_the_pressure_of_an_experiment_that_has_it_is_recorded(
-    phone, fake, tmp_path, new_navigator
-):
-    fake.config = {"inputs": [*CONFIG["inputs"], PRESSURE]}
-    session = Session(phone.device, tmp_path, new_navigator)
+def recorded(phone, fake, session, sensor):
+    """The session, ended after five seconds of an experiment that has one more sensor."""
+    fake.config = {"inputs": [*CONFIG["inputs"], sensor]}
     for fake.count in range(50, 501, 50):
         session.take(phone.fetch(), 1.7e9)
     session.close()
+    return session
+
+
+def test_the_pressure_of_an_experiment_that_has_it_is_recorded(
+    phone, fake, tmp_path, new_navigator
+):
+    session = recorded(phone, fake, Session(phone.device, tmp_path, new_navigator), PRESSURE)
     known = read_recording(session.track.path).barometer
     np.testing.assert_allclose(known.time, 0.1 * np.arange(50), atol=1e-6)
     np.testing.assert_allclose(known.pressure_hPa, 1000.0 - 0.001 * np.arange(50))
@@ -130,11 +135,7 @@ def test_the_places_of_an_experiment_that_has_them_are_recorded(
     phone, fake, tmp_path, new_navigator
 ):
     """An altitude that the phone does not know ends no buffer."""
-    fake.config = {"inputs": [*CONFIG["inputs"], LOCATION]}
-    session = Session(phone.device, tmp_path, new_navigator)
-    for fake.count in range(50, 501, 50):
-        session.take(phone.fetch(), 1.7e9)
-    session.close()
+    session = recorded(phone, fake, Session(phone.device, tmp_path, new_navigator), LOCATION)
     known = read_recording(session.track.path).satellites
     np.testing.assert_allclose(known.time, np.arange(5), atol=1e-6)
     np.testing.assert_allclose(known.latlon_deg[:, 0], 48.1 + 1e-5 * np.arange(5))

@@ -7,7 +7,7 @@ from scipy.signal import welch
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, Trajectory
-from stario.sequences.simulation.carrying import Gait, Strike, heel_strikes, trunk
+from stario.sequences.simulation.gait import Gait, Strike, heel_strikes, trunk
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.routes import Route, band_noise, drift, random_route
 from stario.sequences.simulation.walks import (
