@@ -67,7 +67,7 @@ def simulated_walk(carry: str, seed: int, seconds: float = 120.0) -> ImuSequence
     rng = generator(seed)
     speed = SPEEDS[carry] * float(rng.uniform(0.8, 1.2))
     style = replace(WalkStyle.random(rng), carry=carry, next_carry="", preferred_speed=speed)
-    walk = generate_walk(seed, seconds, style=style)
+    walk = generate_walk(seed, seconds, style=style, corridors=True)
     name = f"{carry} {seed}"
     return simulate_imu(walk, _RATE, PHONE_IMU, seed, name=name, magnetic_field=INDOOR_FIELD)
 
