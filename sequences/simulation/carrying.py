@@ -214,9 +214,11 @@ def _bag(gait: Gait) -> CarryMotion:
     # A bag knocks against the body: its ringing is damped most.
     ring = heel_strikes(
         gait,
-        Strike(0.9, 6.5, 0.5, (1.5, -142.0), 1.55, (0.27, 103.0), (0.33, -75.0), (0.22, 79.0), 0.7),
+        Strike(
+            1.25, 6.5, 0.5, (1.5, -142.0), 1.55, (0.27, 103.0), (0.33, -75.0), (0.22, 79.0), 0.7
+        ),
     )
-    offset = body + np.cross(turn, strap) + strap + trunk(gait, 1.65, 0.75, 2.0 * SWAY)
+    offset = body + np.cross(turn, strap) + strap + trunk(gait, 1.85, 0.75, 2.0 * SWAY)
     return CarryMotion(offset + ring.offset_H, turn + ring.turn_H)
 
 

@@ -22,8 +22,8 @@ from stario.sequences.sequence import FloatArray
 _STRIKE_HARMONICS = 20
 """Harmonics of the stride in the ringing."""
 
-_STRAY = 1.2
-"""Largest stray [rad] of each harmonic's phases: the coherence of the axes is then about 0.6."""
+_STRAY = np.array([1.2, 1.2, 0.4, 1.2, 1.2, 1.2])
+"""Largest stray [rad] of a harmonic's phases along x, y, z and about them: as coherent are axes."""
 
 _STRIKE_LAG = 0.9
 """Phase [rad] between the trunk's lowest point and the blow: the other leg has taken the weight."""
@@ -162,7 +162,7 @@ def heel_strikes(gait: Gait, strike: Strike) -> CarryMotion:
     strength = (gait.vigor * gait.effort)[:, None]
     for k, gain, up, aside in zip(0.5 * n, response, even, odd, strict=True):
         angle = k * (gait.phase - np.pi - _STRIKE_LAG)[:, None] + np.angle(gain)
-        angle = angle + lead + rng.uniform(-_STRAY, _STRAY, 6)
+        angle = angle + lead + rng.uniform(-_STRAY, _STRAY)
         omega = 2.0 * np.pi * k * gait.step_rate[:, None]
         ring = (
             np.abs(gain)
