@@ -27,7 +27,7 @@ from stario.sequences.readers.checked import finite_rows, magnetometer, rotation
 from stario.sequences.readers.clocks import resample_to_gyro
 from stario.sequences.readers.lines import first_bytes
 from stario.sequences.readers.phones.attitude import agreeing_attitude, device_attitude
-from stario.sequences.readers.phones.sensor_table import Samples
+from stario.sequences.readers.phones.samples import Samples
 from stario.sequences.readers.pressure import barometer
 from stario.sequences.readers.satellites import RADIUS_PER_SIGMA, satellites
 from stario.sequences.readers.text import IntArray, seconds
@@ -107,11 +107,7 @@ def _barometer(path: Path, received: _Messages | None, start_ns: np.int64) -> Ba
     if received is None:
         return None
     time = seconds(received.stamps_ns, start_ns)
-    try:
-        return barometer(path, received.topic, time, received.values[:, 0], "Pa")
-    except ReadError as error:  # the barometer is optional
-        _log.warning("pressure skipped: %s", error)
-        return None
+    return barometer(path, received.topic, time, received.values[:, 0], "Pa")
 
 
 def _satellites(received: _Messages | None, start_ns: np.int64) -> Satellites | None:

@@ -17,12 +17,12 @@ from stario.sequences.readers.phones.sensor_words import (
     is_uncalibrated,
     sensor_of,
 )
+from stario.sequences.readers.satellites import DEGREES, OPTIONAL, UNITS
 from stario.sequences.units import (
     ACCEL_UNITS,
     GYRO_UNITS,
     MAGNETIC_UNITS,
     PRESSURE_UNITS,
-    SPEED_UNITS,
     TIME_UNITS,
     unit_named,
 )
@@ -66,12 +66,10 @@ RARE = (PRESSURE, *SATELLITE_HEADER)
 """Quantities that some rows hold; a column of one in another unit is not read."""
 QUANTITIES = (*IMU, *MAGNETIC, *TRUTH, SIGMA, *RARE)
 
-_DEGREES, _METRES = {"deg": 1.0, "": 1.0, "°": 1.0}, {"m": 1.0, "": 1.0, "ft": 0.3048}
 RARE_UNITS: dict[str, Mapping[str, float]] = {
     PRESSURE: PRESSURE_UNITS | {"": math.nan},
-    **dict.fromkeys(("lat", "lon", "bearing"), _DEGREES),
-    **dict.fromkeys(("alt", "acc"), _METRES),
-    "speed": SPEED_UNITS | {"": 1.0},
+    **dict.fromkeys(("lat", "lon"), DEGREES),
+    **{name: UNITS[attribute] for name, attribute in OPTIONAL.items()},
 }
 """Factors of their units; that of a pressure without one is told from its size."""
 

@@ -304,12 +304,8 @@ def _barometer(path: Path, header: Header, rows: _Rows) -> Barometer | None:
     if PRESSURE not in rows.table:
         return None
     column = header.columns[PRESSURE]
-    unit = unit_named(column.unit)
-    try:
-        return barometer(path, column.title, rows.time, rows.table[PRESSURE], unit)
-    except ReadError as error:  # the barometer is optional
-        _log.warning("pressure skipped: %s", error)
-        return None
+    values = rows.table[PRESSURE]
+    return barometer(path, column.title, rows.time, values, unit_named(column.unit))
 
 
 def _satellites(path: Path, header: Header, rows: _Rows) -> Satellites | None:

@@ -24,28 +24,34 @@ def barometer(
 ) -> Barometer | None:
     """Return the pressure in hPa at the times that advance; None if there is none.
 
+    None too, with a warning, if the values are no pressure in any unit: a barometer is optional.
+
     Args:
         path: the file, for messages.
         title: title of its column, for messages.
         time: (N,) [s].
         values: (N,) pressure; NaN, zero or negative where there is none.
         unit: its unit in the tables' spelling; empty to tell it by the size.
-
-    Raises:
-        ReadError: the values are no pressure in any unit.
     """
     kept = np.isfinite(time) & np.isfinite(values) & (values > 0.0)
     kept[kept] = increasing_mask(time[kept])
     if not kept.any():
         return None
-    time, values = time[kept], values[kept]
+    try:
+        return Barometer(time[kept], _in_hPa(path, title, values[kept], unit))
+    except ReadError as error:
+        _log.warning("pressure skipped: %s", error)
+        return None
+
+
+def _in_hPa(path: Path, title: str, values: FloatArray, unit: str) -> FloatArray:
     pressure_hPa = values * _factor(path, title, float(np.median(values)), unit)
     steps = np.abs(np.diff(pressure_hPa))
     step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
     if not unit and step > _LARGEST_STEP_HPA:
         found = f"steps of {step:.2g} hPa, which is {8.4 * step:.0f} m of height"
         raise ReadError(path, title, found, *_expected())
-    return Barometer(time, pressure_hPa)
+    return np.asarray(pressure_hPa)
 
 
 def _factor(path: Path, title: str, value: float, unit: str) -> float:

@@ -11,6 +11,7 @@ import numpy as np
 from stario.sequences.errors import ReadError
 from stario.sequences.sequence import BoolArray, FloatArray, Satellites
 from stario.sequences.time_order import increasing_mask
+from stario.sequences.units import SPEED_UNITS
 
 _log = logging.getLogger(__name__)
 
@@ -21,6 +22,16 @@ OPTIONAL = {
     "bearing": "bearing_deg",
 }
 """Optional attributes of `Satellites` by their columns in a generic CSV."""
+
+DEGREES = {"deg": 1.0, "": 1.0, "°": 1.0}
+_METRES = {"m": 1.0, "": 1.0, "ft": 0.3048}
+UNITS = {
+    "altitude_m": _METRES,
+    "radius_m": _METRES,
+    "speed_m_s": SPEED_UNITS | {"": 1.0},
+    "bearing_deg": DEGREES,
+}
+"""Factors of the units of these attributes, without a unit as well."""
 
 RADIUS_PER_SIGMA = 1.51
 """Radius that holds 68 % of a Gaussian in the plane, in standard deviations per axis."""

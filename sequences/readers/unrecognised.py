@@ -16,8 +16,8 @@ from stario.sequences.readers.phones.files import (
     unmatched_files,
     unread_files,
 )
-from stario.sequences.readers.phones.long_form import is_echo
 from stario.sequences.readers.poses import pose_files
+from stario.sequences.readers.unpacking import is_echo
 
 _EXPORT = "export as CSV, or as the zip or folder that the app writes"
 _CONTAINERS = {

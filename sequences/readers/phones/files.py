@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from stario.sequences.readers.lines import head_lines
-from stario.sequences.readers.phones.sensor_table import SensorTable, sensor_table
+from stario.sequences.readers.phones.sensor_layout import SensorTable, sensor_table
 from stario.sequences.readers.phones.sensor_words import (
     Sensor,
     axis_of,
