@@ -11,18 +11,25 @@ from stario.sequences.arrays import check_type
 from stario.sequences.clean_samples import finite_samples, usable
 from stario.sequences.errors import InputError
 from stario.sequences.findings import Finding, verdict
-from stario.sequences.inspection.barometer_findings import PressureFindings, assess_barometer
 from stario.sequences.inspection.checks import unit_findings
 from stario.sequences.inspection.constant_values import dead_axes
 from stario.sequences.inspection.gyro_axes import GyroAxes, compare_gyro_axes
-from stario.sequences.inspection.magnetic import assess_magnetometer
-from stario.sequences.inspection.magnetic_findings import MagneticFindings, magnetic_findings
+from stario.sequences.inspection.magnetic import (
+    MagneticFindings,
+    assess_magnetometer,
+    magnetic_findings,
+)
+from stario.sequences.inspection.outside_sensors import (
+    PressureFindings,
+    SatelliteFindings,
+    assess_barometer,
+    assess_satellites,
+)
 from stario.sequences.inspection.samples import (
     clock_findings,
     sample_findings,
     without_times_ahead,
 )
-from stario.sequences.inspection.satellite_findings import SatelliteFindings, assess_satellites
 from stario.sequences.inspection.stillness import Rest, find_rest
 from stario.sequences.sequence import (
     GAP_STEPS,

@@ -29,8 +29,8 @@ from stario.sequences.readers.table_head import table_heads
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.time_order import increasing_mask
-from stario.sequences.truth.accel_axes import accel_axes
 from stario.sequences.truth.alignment import BodyAlignment, align_tracked_body, clock_offset
+from stario.sequences.truth.positions import accel_axes
 
 _log = logging.getLogger(__name__)
 

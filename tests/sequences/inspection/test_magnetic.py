@@ -20,8 +20,7 @@ from stario.sequences import (
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.clean_samples import clean_samples
-from stario.sequences.inspection.magnetic import assess_magnetometer
-from stario.sequences.inspection.magnetic_findings import magnetic_findings
+from stario.sequences.inspection.magnetic import assess_magnetometer, magnetic_findings
 from stario.sequences.inspection.samples import clock_findings
 from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
