@@ -30,9 +30,8 @@ from stario.sequences.readers.phones.event_lines import is_event_lines, read_eve
 from stario.sequences.readers.phones.phone import is_phone, is_wide, read_phone, read_wide
 from stario.sequences.readers.published.advio import is_advio, read_advio
 from stario.sequences.readers.published.euroc import is_euroc, read_euroc
-from stario.sequences.readers.published.imunet import is_imunet, read_imunet
 from stario.sequences.readers.published.oxiod import is_oxiod, read_oxiod
-from stario.sequences.readers.published.ridi import is_ridi, read_ridi
+from stario.sequences.readers.published.ridi import is_imunet, is_ridi, read_imunet, read_ridi
 from stario.sequences.readers.published.rnin import is_rnin, read_rnin
 from stario.sequences.readers.published.ronin import is_ronin, read_ronin
 from stario.sequences.readers.published.tlio import is_tlio, read_tlio

@@ -10,7 +10,8 @@ record who carried which device where. Poses may come with
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal
@@ -18,11 +19,10 @@ from typing import Any, Literal
 import numpy as np
 
 from stario.sequences.arrays import first_of
-from stario.sequences.errors import ReadError
+from stario.sequences.errors import ReadError, StarioError
 from stario.sequences.lazy import optional_package
-from stario.sequences.readers.checked import checked, pose_mask, rotations
-from stario.sequences.readers.hdf5 import DAMAGED, is_hdf5, opened_hdf5
-from stario.sequences.readers.satellites import OPTIONAL
+from stario.sequences.readers.checked import OPTIONAL, checked, pose_mask, rotations
+from stario.sequences.readers.lines import first_bytes
 from stario.sequences.sequence import (
     Barometer,
     BoolArray,
@@ -321,3 +321,39 @@ def _plain(value: Any) -> str | float:
         return value if isinstance(value, str) else float(value)
     except (TypeError, ValueError):
         return str(value)
+
+
+_MAGIC = b"\x89HDF\r\n\x1a\n"
+
+DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, AttributeError)
+"""Exceptions of h5py and NumPy for a damaged file, or for one with other content."""
+
+
+def is_hdf5(path: Path) -> bool:
+    """Return whether a file is HDF5, by its first bytes; never raises."""
+    return first_bytes(path, len(_MAGIC)) == _MAGIC
+
+
+@contextmanager
+def opened_hdf5(path: Path, expected: str) -> Iterator[Any]:
+    """Open a file for reading; damage or other content found in the block becomes a ReadError.
+
+    Args:
+        path: the file.
+        expected: what the file should be, for the error.
+
+    Raises:
+        ReadError: the file or what the block reads from it is damaged.
+        MissingPackageError: h5py is not installed.
+    """
+    h5py = optional_package("h5py", "readers")
+    try:
+        with h5py.File(path) as file:
+            yield file
+    except StarioError:
+        raise
+    except DAMAGED as error:
+        found = " ".join(str(error).split())[:200] or type(error).__name__
+        locked = isinstance(error, BlockingIOError) or "already open for write" in found
+        fix = "close it in the program that writes it" if locked else "is the download complete?"
+        raise ReadError(path, "content", found, expected, fix) from error

@@ -23,13 +23,19 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.lazy import optional_package
-from stario.sequences.readers.checked import finite_rows, magnetometer, rotations, trajectory
+from stario.sequences.readers.checked import (
+    RADIUS_PER_SIGMA,
+    barometer,
+    finite_rows,
+    magnetometer,
+    rotations,
+    satellites,
+    trajectory,
+)
 from stario.sequences.readers.clocks import resample_to_gyro
 from stario.sequences.readers.lines import first_bytes
 from stario.sequences.readers.phones.attitude import agreeing_attitude, device_attitude
 from stario.sequences.readers.phones.samples import Samples
-from stario.sequences.readers.pressure import barometer
-from stario.sequences.readers.satellites import RADIUS_PER_SIGMA, satellites
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import Barometer, FloatArray, ImuSequence, Satellites, Trajectory
 from stario.sequences.units import MAGNETIC_UNITS

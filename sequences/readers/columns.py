@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TypeVar
 
 from stario.sequences.errors import ReadError
+from stario.sequences.readers.checked import DEGREES, OPTIONAL, UNITS
 from stario.sequences.readers.phones.sensor_words import (
     axis_of,
     is_time,
     is_uncalibrated,
     sensor_of,
 )
-from stario.sequences.readers.satellites import DEGREES, OPTIONAL, UNITS
 from stario.sequences.units import (
     ACCEL_UNITS,
     GYRO_UNITS,

@@ -37,7 +37,13 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import magnetometer
+from stario.sequences.readers.checked import (
+    OPTIONAL,
+    barometer,
+    in_degrees,
+    magnetometer,
+    satellites,
+)
 from stario.sequences.readers.clocks import (
     LATEST_S,
     assumed_unit,
@@ -61,8 +67,6 @@ from stario.sequences.readers.columns import (
     read_header,
     unit_factor,
 )
-from stario.sequences.readers.dates import with_seconds
-from stario.sequences.readers.devices import refuse_several_devices
 from stario.sequences.readers.lines import (
     decimal_mark,
     ends_within_a_row,
@@ -70,9 +74,9 @@ from stario.sequences.readers.lines import (
     is_row,
     read_lines,
     unquoted,
+    with_seconds,
 )
-from stario.sequences.readers.pressure import barometer
-from stario.sequences.readers.satellites import OPTIONAL, in_degrees, satellites
+from stario.sequences.readers.table_head import refuse_several_devices
 from stario.sequences.readers.text import RowFormat, Table, is_missing, read_table, seconds
 from stario.sequences.sequence import (
     Barometer,

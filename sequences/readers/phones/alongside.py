@@ -19,21 +19,21 @@ import numpy as np
 
 from stario.sequences.errors import ReadError
 from stario.sequences.geodesy import east_north
+from stario.sequences.readers.checked import (
+    LARGEST_RADIUS,
+    RADIUS_PER_SIGMA,
+    UNITS,
+    USUAL_RADIUS,
+    barometer,
+    in_degrees,
+    known_places,
+    satellites,
+)
 from stario.sequences.readers.clocks import unit_within
 from stario.sequences.readers.columns import Column
 from stario.sequences.readers.phones.files import SUFFIXES
 from stario.sequences.readers.phones.sensor_layout import clock_of
 from stario.sequences.readers.phones.sensor_words import is_time, sensor_of, unit_of, words_of
-from stario.sequences.readers.pressure import barometer
-from stario.sequences.readers.satellites import (
-    LARGEST_RADIUS,
-    RADIUS_PER_SIGMA,
-    UNITS,
-    USUAL_RADIUS,
-    in_degrees,
-    known_places,
-    satellites,
-)
 from stario.sequences.readers.table_head import TableHead, table_heads
 from stario.sequences.readers.text import IntArray, Table, seconds
 from stario.sequences.sequence import Barometer, BoolArray, FloatArray, PositionTrack, Satellites

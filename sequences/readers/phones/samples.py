@@ -11,9 +11,9 @@ import numpy as np
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.clocks import assumed_unit, refuse_counts_and_dates, time_unit
 from stario.sequences.readers.columns import unit_factor
-from stario.sequences.readers.devices import refuse_several_devices
 from stario.sequences.readers.phones.sensor_layout import SensorTable
 from stario.sequences.readers.phones.sensor_words import SENSORS, Sensor
+from stario.sequences.readers.table_head import refuse_several_devices
 from stario.sequences.readers.text import IntArray
 from stario.sequences.sequence import BoolArray, FloatArray
 

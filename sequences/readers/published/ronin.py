@@ -24,13 +24,13 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.errors import ReadError
+from stario.sequences.readers.archive import is_hdf5, opened_hdf5
 from stario.sequences.readers.checked import (
     finite_rows,
     magnetometer,
     rotations,
     trajectory,
 )
-from stario.sequences.readers.hdf5 import is_hdf5, opened_hdf5
 from stario.sequences.readers.published.by_name import JsonFields
 from stario.sequences.readers.text import IntArray
 from stario.sequences.sequence import FloatArray, ImuSequence
