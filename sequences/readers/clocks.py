@@ -120,13 +120,9 @@ def _sorted_samples(
     order = np.argsort(stamps_ns, kind="stable")
     stamps_ns, values = stamps_ns[order], values[order]
     fresh = np.append(True, np.diff(stamps_ns) > 0)
-    _warn_of_few_times(path, name, stamps_ns[fresh], fresh | _differing(values))
+    differing = np.append(True, np.diff(values, axis=0).any(axis=1))
+    _warn_of_few_times(path, name, stamps_ns[fresh], fresh | differing)
     return stamps_ns[fresh], values[fresh]
-
-
-def _differing(values: FloatArray) -> BoolArray:
-    """Return which of the rows (N, 3) differ from the one above."""
-    return np.append(True, np.diff(values, axis=0).any(axis=1))
 
 
 def _warn_of_few_times(path: Path, name: str, stamps_ns: IntArray, samples: BoolArray) -> None:
