@@ -29,7 +29,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 from typing import Literal
 
@@ -112,9 +111,6 @@ _ZERO_ROWS, _EITHER = 0.05, 0.9
 """Share of rows of zeros of each sensor, and of rows with just one sensor, from which they are
 separate rows: neither sensor at rest reads exactly 0, 0, 0."""
 
-_MARK_ROWS = 200
-"""Number of rows that determine the decimal mark."""
-
 _HEAD_LINES = 200
 """Number of lines within which the header must be for a file to be recognised."""
 
@@ -188,8 +184,7 @@ def _read_rows(path: Path, lines: list[str], header: Header) -> _Rows:
         ReadError: there is none, or one is malformed; names its line and column.
     """
     separator, columns, clock = header.separator, header.columns, header.columns["t"]
-    below = filter(is_row, lines[header.lines :])
-    decimal = decimal_mark(list(islice(below, _MARK_ROWS)), separator)
+    decimal = decimal_mark(lines[header.lines :], separator)
     cells = _first_cells(path, lines, header, decimal)
     dated = with_seconds(cells[clock.index : clock.index + 1])
     row_format = RowFormat(header.lines, separator, decimal, dated != cells[clock.index :][:1])

@@ -5,16 +5,14 @@ from __future__ import annotations
 import csv
 import json
 import logging
-import math
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
 from stario.sequences.files import opened, opened_text
 
@@ -22,6 +20,10 @@ _log = logging.getLogger(__name__)
 
 _HEAD_BYTES = 32768
 _TAIL_BYTES = 16384
+_MARK = re.compile(r'(?:^|[;\t"])\s*[-+]?\d*([.,])\d+(?:[eE][-+]?\d+)?\s*(?=[;\t"]|$)')
+_QUOTED_MARK = re.compile(
+    r'(?:^|[,"])\s*[-+]?\d*(\.|,(?=\d+(?:[eE][-+]?\d+)?\s*"))\d'  # a comma only within quotes
+)
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 """Byte order marks, with which spreadsheets begin a file of Unicode text."""
 
@@ -153,17 +155,13 @@ def _decoded(content: bytes) -> str:
         return content.decode("latin-1")
 
 
-def decimal_mark(rows: Sequence[str], delimiter: str | None) -> str:
-    """Return the decimal mark that gives the most numbers in rows, a point if both do.
+def decimal_mark(lines: Iterable[str], delimiter: str) -> str:
+    """Return the decimal mark of a file's numbers, that of the first one with a fraction.
 
     A comma that separates cells is one only within quotes.
     """
-
-    def numbers(mark: str) -> int:
-        cells = (unquoted(row, delimiter, mark).split(delimiter) for row in rows)
-        return sum(math.isfinite(number_in(cell.strip(" \"'"))) for row in cells for cell in row)
-
-    return max(".", ",", key=numbers)
+    mark = _QUOTED_MARK if delimiter == "," else _MARK
+    return next((match[1] for line in lines if (match := mark.search(line))), ".")
 
 
 def unquoted(line: str, delimiter: str | None, decimal: str = ".") -> str:

@@ -17,7 +17,7 @@ import numpy as np
 from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.columns import Column, with_units_below
-from stario.sequences.readers.lines import decimal_mark, head_lines, unquoted, with_seconds
+from stario.sequences.readers.lines import head_lines, unquoted, with_seconds
 from stario.sequences.readers.phones.sensor_words import axis_of, is_time, words_of
 from stario.sequences.readers.text import RowFormat, Table, is_missing, read_table
 from stario.sequences.sequence import FloatArray
@@ -147,9 +147,7 @@ def first_row(lines: list[str], least: int = 4) -> RowFormat | None:
             cells = row_format.cells(line)
             numbers = _count_numbers(cells)
             if numbers >= least and 2 * numbers >= sum(bool(cell.strip()) for cell in cells):
-                mark, rows = row_format.delimiter, lines[k : k + _MARK_ROWS]
-                decimal = row_format.decimal if mark == "," else decimal_mark(rows, mark)
-                return replace(row_format, decimal=decimal, skip=k)
+                return replace(_with_most_numbers(lines[k : k + _MARK_ROWS], row_format), skip=k)
     return None
 
 
@@ -160,6 +158,17 @@ def number_of(cell: str) -> float:
 
 def _count_numbers(cells: list[str]) -> int:
     return sum(math.isfinite(number_of(cell)) for cell in cells)
+
+
+def _with_most_numbers(rows: list[str], first: RowFormat) -> RowFormat:
+    """Return the decimal mark that gives the most numbers: a row of integers fits either."""
+    if first.delimiter == ",":
+        return first
+
+    def numbers(row_format: RowFormat) -> int:
+        return sum(_count_numbers(row_format.cells(line)) for line in rows)
+
+    return max(first, replace(first, decimal="." if first.decimal == "," else ","), key=numbers)
 
 
 _TITLES = {
