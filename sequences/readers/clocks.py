@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-import math
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -45,13 +45,6 @@ _FEW_LOST = 0.05
 
 _FEW_ROWS = 10
 """Number of rows below which a count may be a coincidence."""
-
-_DATE_FIELDS = (
-    *((1e10, math.inf, 1970, 2100), (1e8, 100, 1, 13), (1e6, 100, 1, 32)),
-    *((1e4, 100, 0, 24), (1e2, 100, 0, 60), (1, 100, 0, 60)),
-)
-"""Year, month, day, hour, minute and second in the digits of a date: unit and number of values of
-each field, its smallest value and its limit. The year alone rules out nearly all other numbers."""
 
 
 def resample_to_gyro(
@@ -160,17 +153,18 @@ def refuse_counts_and_dates(file: Path, title: str, time: FloatArray) -> None:
         fix = f"name a column of times `t [s]`; if these are times, name their unit: `{title} [ms]`"
         raise ReadError(file, title, found, "times", fix)
     known = time[np.isfinite(time)]
-    if _is_date(known) or _is_date(known // 1000.0):
+    if len(known) and all(_is_date(f"{one:.0f}") for one in known.tolist()):
         expected = "seconds, or dates such as 2024-05-01 12:00:59.990"
         raise ReadError(file, title, f"{time[0]:.0f}, a date without separators", expected)
 
 
-def _is_date(time: FloatArray) -> bool:
-    """Return whether the digits of all times are year, month, day, hour, minute and second."""
-    return len(time) > 0 and all(
-        bool(((time // unit % size >= least) & (time // unit % size < limit)).all())
-        for unit, size, least, limit in _DATE_FIELDS
-    )
+def _is_date(digits: str) -> bool:
+    """Return whether they are year, month, day, hour, minute and second, perhaps milliseconds."""
+    try:
+        year = datetime.strptime(digits[:14], "%Y%m%d%H%M%S").year
+    except ValueError:
+        return False
+    return len(digits) in (14, 17) and 1970 <= year < 2100
 
 
 def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.int64) -> int:

@@ -188,20 +188,15 @@ def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
             raise ReadError(path, f"line {number}, {name}", found, "one column")
         else:
             columns[name] = Column(index, title, unit)
-    if not {"lat", "lon"} <= set(columns):
-        ignored += [columns.pop(name).title for name in SATELLITE_HEADER if name in columns]
-    missing = [name for name in ("t", *IMU) if name not in columns]
-    if not set(POSITION) & set(columns):  # attitude alone is not a track
-        ignored += [columns.pop(name).title for name in QUAT if name in columns]
-    if not set(POSITION) & set(columns) or set(QUAT) & set(columns):
-        ignored += [columns.pop(SIGMA).title] if SIGMA in columns else []
+    placed, posed = (bool(set(names) & set(columns)) for names in (POSITION, QUAT))
+    useless = [] if {"lat", "lon"} <= set(columns) else [*SATELLITE_HEADER]
+    useless += [] if placed else QUAT  # attitude alone is not a track
+    useless += [] if placed and not posed else [SIGMA]
+    ignored += [columns.pop(name).title for name in useless if name in columns]
     truth = [name for name in TRUTH if name in columns]
-    if set(QUAT) & set(columns):
-        missing += [name for name in TRUTH if name not in columns]
-    elif truth:
-        missing += [name for name in POSITION[:2] if name not in columns]
-    if set(MAGNETIC) & set(columns):
-        missing += [name for name in MAGNETIC if name not in columns]
+    needed = ["t", *IMU, *((TRUTH if posed else POSITION[:2]) if placed else ())]
+    needed += MAGNETIC if set(MAGNETIC) & set(columns) else ()
+    missing = [name for name in needed if name not in columns]
     if missing:
         fix = "or remove the truth columns" if truth and not set(missing) & {"t", *IMU} else ""
         if missing == ["t"]:

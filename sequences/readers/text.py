@@ -56,7 +56,9 @@ class RowFormat:
         Raises:
             ReadError: the file cannot be read or has none.
         """
-        lines = [unquoted(line, self.delimiter, self.decimal) for line in read_lines(path)]
+        lines = read_lines(path)
+        if self.decimal != "." or any('"' in line for line in lines):
+            lines = [unquoted(line, self.delimiter, self.decimal) for line in lines]
         lines = with_seconds(lines) if self.dated else lines
         rows = [row for row in enumerate(lines[self.skip :], self.skip + 1) if is_row(row[1])]
         if not rows:
@@ -90,8 +92,8 @@ class Table:
     def cells(self, column: int) -> list[str]:
         """Return the text of a column of the file, empty in rows that are too short."""
         mark = self.row_format.delimiter
-        after = ((*line.split(mark, column + 1), *[""] * (column + 1)) for _, line in self.rows)
-        return [cells[column].strip() for cells in after]
+        cells = (line.split(mark, column + 1) for _, line in self.rows)
+        return [row[column].strip() if column < len(row) else "" for row in cells]
 
     def stamps_ns(
         self, column: int = 0, unit_ns: int = 1, kept: IntArray | None = None

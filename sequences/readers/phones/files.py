@@ -92,7 +92,7 @@ class PhoneFiles:
 
 def phone_recordings(folder: Path) -> list[PhoneFiles]:
     """Return the recordings whose gyroscope and accelerometer are in a folder; never raises."""
-    groups = _groups(folder)
+    groups = groups_of(folder)
     complete = [group for group in groups if is_complete(group.tables)]
     if complete:
         return complete
@@ -100,20 +100,8 @@ def phone_recordings(folder: Path) -> list[PhoneFiles]:
     return [merged] if is_complete(merged.tables) else []
 
 
-def recording_with(file: Path) -> PhoneFiles | None:
-    """Return the recording in a file's folder that the file is a part of; never raises."""
-    if not file.is_file():
-        return None
-    return next((one for one in phone_recordings(file.parent) if file in one.files), None)
-
-
-def unread_files(folder: Path) -> list[Path]:
-    """Return a folder's files of gyroscopes and accelerometers without samples; never raises."""
-    return [file for group in _groups(folder) for file in group.unread]
-
-
-def _groups(folder: Path) -> list[PhoneFiles]:
-    """Return a folder's files of each recording, complete or not."""
+def groups_of(folder: Path) -> list[PhoneFiles]:
+    """Return a folder's files of each recording, complete or not; never raises."""
     named = [(file, words_of(file.stem)) for file in sorted(folder.iterdir()) if may_hold(file)]
     groups: dict[str, PhoneFiles] = {}
     for file, words in sorted(named, key=lambda item: _preference(*item)):
@@ -131,29 +119,9 @@ def _groups(folder: Path) -> list[PhoneFiles]:
     return list(groups.values())
 
 
-def unmatched_files(folder: Path) -> list[Path]:
-    """Return the gyroscope and accelerometer files of a folder without a recording; never raises.
-
-    Empty if it lacks either: these are of different devices or recordings, by their names.
-    """
-    kinds: tuple[tuple[Sensor, ...], ...] = (("gyro",), ("accel", "linear"))
-    tables = [group.tables for group in _groups(folder)]
-    files = [{t.file for one in tables for s in kind for t in one.get(s, [])} for kind in kinds]
-    return sorted(set.union(*files)) if all(files) else []
-
-
 def is_complete(sensors: Collection[str | None]) -> bool:
     """Return whether sensors include a gyroscope and an accelerometer of either kind."""
     return "gyro" in sensors and bool({"accel", "linear"} & set(sensors))
-
-
-def incomplete_sensors(path: Path) -> list[Sensor]:
-    """Return the sensors of a folder or a wide file that lacks a gyroscope or an accelerometer.
-
-    Empty if it holds both, or no sensor at all.
-    """
-    sensors = _sensors(path)
-    return [] if is_complete(sensors) else sensors
 
 
 def names_both_sensors(path: Path) -> bool:
@@ -165,7 +133,8 @@ def names_both_sensors(path: Path) -> bool:
     return False
 
 
-def _sensors(path: Path) -> list[Sensor]:
+def sensors_in(path: Path) -> list[Sensor]:
+    """Return the sensors of a folder or of a wide file; never raises."""
     if not path.is_dir():
         table = sensor_table(path) if may_hold(path) else None
         order: tuple[Sensor, ...] = ("accel", "linear", "gyro", "mag")
