@@ -97,15 +97,6 @@ def test_a_processed_recording_is_preferred_to_the_raw_files_next_to_it(tmp_path
     assert find_recordings(tmp_path) == [tmp_path / "seq"]
 
 
-def same_samples(a, b) -> bool:
-    arrays = [(x.time, x.gyro, x.accel) for x in (a, b)]
-    if (a.truth is None) != (b.truth is None):
-        return False
-    if a.truth is not None:
-        arrays = [(*x, y.truth.position_W) for x, y in zip(arrays, (a, b), strict=True)]
-    return all(np.array_equal(x, y, equal_nan=True) for x, y in zip(*arrays, strict=True))
-
-
 def test_an_error_within_a_row_is_named(tmp_path, walks):
     path = formats.ridi(tmp_path / "seq", walks(200.0)).path
     csv = path / "processed/data.csv"
