@@ -10,8 +10,8 @@ from functools import partial
 from pathlib import Path
 
 from stario.sequences.arrays import check_choice, shown
+from stario.sequences.clean_samples import in_order
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.inspection.samples import in_order
 from stario.sequences.readers.archive import (
     AttributeFilter,
     archive_members,

@@ -11,11 +11,10 @@ import numpy as np
 from stario.sequences.arrays import interpolated
 from stario.sequences.clean_samples import MAX_RATE, MIN_RATE, SHARED_TIMES
 from stario.sequences.errors import ReadError
-from stario.sequences.inspection.samples import disorder
 from stario.sequences.readers.phones.sensor_words import XSENS_CLOCK
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray
-from stario.sequences.time_order import MAX_IMU_GAP, increasing_mask
+from stario.sequences.time_order import MAX_IMU_GAP, disorder, increasing_mask
 from stario.sequences.units import FILETIME_1970, FILETIME_NS, TIME_UNITS
 
 _log = logging.getLogger(__name__)
