@@ -140,6 +140,32 @@ class MagneticFindings:
             )
         return lines
 
+    def findings(self) -> list[Finding]:
+        """Return what stands out."""
+        result = []
+        iron = certain_iron(self.hard_iron_uT, self.hard_iron_sigma_uT)
+        agreement, size = self.correlation_with_gyroscope, self.size_median_uT
+        if not _SIZES_UT[0] < size < _SIZES_UT[1]:
+            text = f"magnetometer: found {size:.3g} uT, expected the earth's 25 to 65"
+            fix = magnetic_advice(size) or "is it uncalibrated, in another unit or near a magnet?"
+            result.append(Finding("field_size", text, fix, values={"size_uT": size}))
+        if agreement is not None and agreement < _VERDICTS[-1][2]:
+            text = f"magnetometer: does not follow the gyroscope (correlation {agreement:.2f})"
+            fix = "a disturbed field, stale readings or different axes"
+            result.append(Finding("field_axes", text, fix, values={"correlation": agreement}))
+        if iron is not None:
+            offset = ", ".join(f"{b:+.0f}" for b in iron)
+            text = f"magnetometer: the device adds a constant field of {offset} uT (hard iron)"
+            result.append(
+                Finding("hard_iron", text, level="note", values={"iron_uT": iron.tolist()})
+            )
+        if self.dip_rad < -_UP_RAD:
+            up = math.degrees(-self.dip_rad)
+            text = f"magnetometer: points up by {up:.0f} degrees, as south of the magnetic equator"
+            fix = "elsewhere, the accelerometer has Apple's sign: pass `--accel-sign apple`"
+            result.append(Finding("field_up", text, fix, values={"up_deg": up}))
+        return result
+
     def _lag_words(self) -> str:
         if self.lag_s is None or self.hard_iron_uT is None or self.hard_iron_sigma_uT is None:
             first, last = (1e3 * lag for lag in (LAGS_S[0], LAGS_S[-1]))
@@ -155,31 +181,6 @@ def certain_iron(iron: FloatArray | None, sigma: FloatArray | None) -> FloatArra
         return None
     sure = np.abs(iron) > _SURE * sigma
     return iron if np.linalg.norm(iron[sure]) > _IRON_UT else None
-
-
-def magnetic_findings(found: MagneticFindings) -> list[Finding]:
-    """Return what stands out about a magnetometer."""
-    result = []
-    iron = certain_iron(found.hard_iron_uT, found.hard_iron_sigma_uT)
-    agreement, size = found.correlation_with_gyroscope, found.size_median_uT
-    if not _SIZES_UT[0] < size < _SIZES_UT[1]:
-        text = f"magnetometer: found {size:.3g} uT, expected the earth's 25 to 65"
-        fix = magnetic_advice(size) or "is it uncalibrated, in another unit or near a magnet?"
-        result.append(Finding("field_size", text, fix, values={"size_uT": size}))
-    if agreement is not None and agreement < _VERDICTS[-1][2]:
-        text = f"magnetometer: does not follow the gyroscope (correlation {agreement:.2f})"
-        fix = "a disturbed field, stale readings or different axes"
-        result.append(Finding("field_axes", text, fix, values={"correlation": agreement}))
-    if iron is not None:
-        offset = ", ".join(f"{b:+.0f}" for b in iron)
-        text = f"magnetometer: the device adds a constant field of {offset} uT (hard iron)"
-        result.append(Finding("hard_iron", text, level="note", values={"iron_uT": iron.tolist()}))
-    if found.dip_rad < -_UP_RAD:
-        up = math.degrees(-found.dip_rad)
-        text = f"magnetometer: points up by {up:.0f} degrees, as south of the magnetic equator"
-        fix = "elsewhere, the accelerometer has Apple's sign: pass `--accel-sign apple`"
-        result.append(Finding("field_up", text, fix, values={"up_deg": up}))
-    return result
 
 
 _LONGEST_S = 600.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -17,7 +18,6 @@ from stario.sequences.inspection.gyro_axes import GyroAxes, compare_gyro_axes
 from stario.sequences.inspection.magnetic import (
     MagneticFindings,
     assess_magnetometer,
-    magnetic_findings,
 )
 from stario.sequences.inspection.outside_sensors import (
     PressureFindings,
@@ -115,9 +115,8 @@ class Inspection:
         findings: what stands out.
         truth: description of the ground truth.
         device_attitude: number of attitudes logged by the device's own sensor fusion.
-        magnetic: findings about the magnetometer; None without one or with too few samples.
-        pressure: findings about the barometer, likewise.
-        satellites: findings about the satellite positions, likewise.
+        sensors: findings about "magnetometer", "barometer" and "satellites"; None without one or
+            with too few samples.
         yaw: drift of the gyroscope's yaw from the true one; None if it cannot be determined.
         axes: agreement of the gyroscope with gravity; None if units are wrong.
     """
@@ -132,9 +131,7 @@ class Inspection:
     positions: PositionFit | None
     findings: tuple[Finding, ...]
     truth: str
-    magnetic: MagneticFindings | None
-    pressure: PressureFindings | None
-    satellites: SatelliteFindings | None
+    sensors: Mapping[str, MagneticFindings | PressureFindings | SatelliteFindings | None]
     device_attitude: int
     yaw: YawDrift | None
     axes: GyroAxes | None
@@ -162,9 +159,7 @@ class Inspection:
             "positions_against_accelerometer": self.positions and positions_as_dict(self.positions),
             "device_attitudes": self.device_attitude,
             "known_of_truth": self.truth,
-            "magnetometer": self.magnetic and self.magnetic.as_dict(),
-            "barometer": self.pressure and self.pressure.as_dict(),
-            "satellites": self.satellites and self.satellites.as_dict(),
+            **{name: found and found.as_dict() for name, found in self.sensors.items()},
             "verdict": [asdict(finding) for finding in verdict(self.findings)],
         }
 
@@ -175,9 +170,7 @@ class Inspection:
             f"accelerometer: {self.accel_norm:.3f} m/s^2 on average; "
             f"gyroscope: {self.gyro_norm:.3f} rad/s",
             *self._rest_lines(),
-            *(self.magnetic.lines() if self.magnetic else []),
-            *(self.pressure.lines() if self.pressure else []),
-            *(self.satellites.lines() if self.satellites else []),
+            *(line for found in self.sensors.values() if found for line in found.lines()),
             *([f"device's own attitudes: {self.device_attitude}"] if self.device_attitude else []),
             *self._truth_lines(),
             *([] if self.refused else [self._axes_line()]),
@@ -274,11 +267,13 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         rest, magnetic = find_rest(sequence), assess_magnetometer(sequence)
     except InputError:  # an invalid rate, which was reported
         rest = magnetic = None
-    findings += magnetic_findings(magnetic) if magnetic else ()
-    pressure = assess_barometer(sequence.barometer)
-    satellites = assess_satellites(sequence.satellites)
-    findings += pressure.findings() if pressure else ()
-    findings += satellites.findings() if satellites else ()
+    sensors = {
+        "magnetometer": magnetic,
+        "barometer": assess_barometer(sequence.barometer),
+        "satellites": assess_satellites(sequence.satellites),
+    }
+    for found in sensors.values():
+        findings += found.findings() if found else ()
     findings += clock_findings(sequence) + known_position_findings(sequence)
     return Inspection(
         name=sequence.name,
@@ -292,9 +287,7 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         findings=tuple(findings),
         truth=sequence.truth_summary(),
         device_attitude=0 if sequence.device_attitude is None else len(sequence.device_attitude),
-        magnetic=magnetic,
-        pressure=pressure,
-        satellites=satellites,
+        sensors=sensors,
         yaw=yaw,
         axes=axes,
     )
