@@ -86,8 +86,18 @@ class PressureFindings:
     def findings(self) -> list[Finding]:
         """Return what stands out."""
         if not LOWEST_HPA <= self.pressure_median_hPa <= HIGHEST_HPA:
-            return [_other_unit(self.pressure_median_hPa)]
-        found = [_jumping(self.jumps)] if self.jumps else []
+            value = self.pressure_median_hPa
+            text = f"barometer: found {value:.6g}, expected {LOWEST_HPA:g} to {HIGHEST_HPA:g} hPa"
+            unit = pressure_unit_of(value)
+            fix = f"it seems to be in {unit}" if unit else "is it an altitude?"
+            return [Finding("pressure_size", text, fix, values={"pressure": value})]
+        found = list[Finding]()
+        if self.jumps:
+            time, rise = max(self.jumps, key=lambda jump: abs(jump[1]))
+            text = f"barometer: jumps by {rise:+.0f} m at {time:.0f} s, as no height does"
+            fix = "was the sensor pressed, or blown on? Or is it an altitude?"
+            values = {"count": len(self.jumps), "time_s": time, "rise_m": rise}
+            found.append(Finding("pressure_jump", text, fix, values=values))
         if self.noise_m > _NOISY_M:
             text = f"barometer: a noise of {self.noise_m:.1f} m, as of wind or in a tight pocket"
             values = {"noise_m": self.noise_m}
@@ -100,21 +110,6 @@ class PressureFindings:
             values = {"rate_hz": self.rate_hz, "repeated_share": self.repeated_share}
             found.append(Finding("pressure_held", text, level="note", values=values))
         return found
-
-
-def _other_unit(value: float) -> Finding:
-    text = f"barometer: found {value:.6g}, expected {LOWEST_HPA:g} to {HIGHEST_HPA:g} hPa"
-    unit = pressure_unit_of(value)
-    fix = f"it seems to be in {unit}" if unit else "is it an altitude?"
-    return Finding("pressure_size", text, fix, values={"pressure": value})
-
-
-def _jumping(jumps: Changes) -> Finding:
-    time, rise = max(jumps, key=lambda jump: abs(jump[1]))
-    text = f"barometer: jumps by {rise:+.0f} m at {time:.0f} s, as no height does"
-    fix = "was the sensor pressed, or blown on? Or is it an altitude?"
-    values = {"count": len(jumps), "time_s": time, "rise_m": rise}
-    return Finding("pressure_jump", text, fix, values=values)
 
 
 def assess_barometer(barometer: Barometer | None) -> PressureFindings | None:

@@ -165,6 +165,9 @@ class Inspection:
 
     def lines(self) -> list[str]:
         """Return the findings as lines to print."""
+        compared = "units: compared; the device tilts too seldom to compare the sensors' axes"
+        if self.fit or (self.axes and self.axes.compared):
+            compared = "units, signs and axes: compared"
         return [
             *self._timing_lines(),
             f"accelerometer: {self.accel_norm:.3f} m/s^2 on average; "
@@ -173,18 +176,13 @@ class Inspection:
             *(line for found in self.sensors.values() if found for line in found.lines()),
             *([f"device's own attitudes: {self.device_attitude}"] if self.device_attitude else []),
             *self._truth_lines(),
-            *([] if self.refused else [self._axes_line()]),
+            *([] if self.refused else [compared]),
         ]
 
     @property
     def refused(self) -> bool:
         """Whether no track can be computed: units or samples are wrong."""
         return any(found.code == "refused" for found in self.findings)
-
-    def _axes_line(self) -> str:
-        if self.fit or (self.axes and self.axes.compared):
-            return "units, signs and axes: compared"
-        return "units: compared; the device tilts too seldom to compare the sensors' axes"
 
     def _timing_lines(self) -> list[str]:
         t = self.timing

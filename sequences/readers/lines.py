@@ -275,19 +275,10 @@ def _whole_seconds(date: str | None, clock: str, half: str | None, zone: str | N
         datetime(2000, 1, 1, hour, minute, second)  # refuses what is no time
         # Counted from the midnight before, so that a step back across one stays positive.
         return _DAY_S + (60 * hour + minute) * 60 + second
-    time = datetime(*_day(date), hour, minute, second, tzinfo=UTC)
-    return int((time - _offset(zone or "")).timestamp())
-
-
-def _day(date: str) -> tuple[int, int, int]:
     first, middle, last = re.split("[-/]", date)
-    if middle.isdecimal():
-        return int(first), int(middle), int(last)
-    return int(last), _MONTHS.index(middle.lower()) + 1, int(first)
-
-
-def _offset(zone: str) -> timedelta:
-    """Return how far a zone such as `+02:00`, `UTC-0330` or `Z` is ahead of UTC."""
-    digits = re.sub(r"\D", "", zone)
+    month = int(middle) if middle.isdecimal() else _MONTHS.index(middle.lower()) + 1
+    year, day = (first, last) if len(first) == 4 else (last, first)
+    time = datetime(int(year), month, int(day), hour, minute, second, tzinfo=UTC)
+    digits = re.sub(r"\D", "", zone or "")
     ahead = timedelta(hours=int(digits[:2] or 0), minutes=int(digits[2:] or 0))
-    return -ahead if "-" in zone else ahead
+    return int((time + ahead if "-" in (zone or "") else time - ahead).timestamp())

@@ -141,8 +141,11 @@ def unpack_json(path: Path, folder: Path) -> None:
     Raises:
         ReadError: the file is not a JSON array of objects that name sensors.
     """
+    objects = read_json(path)
+    if not isinstance(objects, list) or not all(isinstance(row, dict) for row in objects):
+        raise ReadError(path, "file", "other JSON", "an array of objects, one for each sample")
     sensors: dict[str, list[dict[str, Any]]] = {}
-    for row in _rows(path):
+    for row in objects:
         name = row.get("sensor")
         if isinstance(name, str) and _NAME.fullmatch(name):  # skips notes and the like
             sensors.setdefault(name, []).append(row)
@@ -154,13 +157,6 @@ def unpack_json(path: Path, folder: Path) -> None:
             writer = csv.DictWriter(text, titles, extrasaction="ignore")
             writer.writeheader()
             writer.writerows(rows)
-
-
-def _rows(path: Path) -> list[dict[str, Any]]:
-    rows = read_json(path)
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise ReadError(path, "file", "other JSON", "an array of objects, one for each sample")
-    return rows
 
 
 _HEAD_ROWS = 50

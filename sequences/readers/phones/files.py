@@ -103,9 +103,16 @@ def phone_recordings(folder: Path) -> list[PhoneFiles]:
 def groups_of(folder: Path) -> list[PhoneFiles]:
     """Return a folder's files of each recording, complete or not; never raises."""
     named = [(file, words_of(file.stem)) for file in sorted(folder.iterdir()) if may_hold(file)]
+
+    def preference(item: tuple[Path, list[str]]) -> tuple[bool, bool, bool]:
+        """Return a sort key: uncalibrated files last, total force first, then calibrated files."""
+        words = item[1]
+        return is_uncalibrated(words), "total" not in words, not {"calibrated", "mot"} & {*words}
+
     groups: dict[str, PhoneFiles] = {}
-    for file, words in sorted(named, key=lambda item: _preference(*item)):
-        sensor = _sensor_of(words)
+    for file, words in sorted(named, key=preference):
+        # iOS Logger's `Motion.txt` is an attitude.
+        sensor: Sensor | None = "attitude" if words == ["motion"] else sensor_of(words)
         table = sensor_table(file) if sensor else None
         # A file with both sensors is a recording by itself, such as the first walk, `walk_a.csv`.
         if sensor is None or (table is not None and is_complete(table.axes)):
@@ -147,17 +154,6 @@ def sensors_in(path: Path) -> list[Sensor]:
 def may_hold(file: Path) -> bool:
     """Return whether a file may hold samples as text, by its name; never raises."""
     return file.suffix.lower() in SUFFIXES and file.is_file() and not file.name.startswith(".")
-
-
-def _sensor_of(words: list[str]) -> Sensor | None:
-    """Return the sensor in a file's name; iOS Logger's `Motion.txt` is an attitude."""
-    return "attitude" if words == ["motion"] else sensor_of(words)
-
-
-def _preference(file: Path, words: list[str]) -> tuple[bool, bool, bool, Path]:
-    """Return a sort key: uncalibrated files last, total force first, then calibrated files."""
-    calibrated = {"calibrated", "mot"} & set(words)
-    return is_uncalibrated(words), "total" not in words, not calibrated, file
 
 
 def _merged_groups(groups: list[PhoneFiles]) -> PhoneFiles:

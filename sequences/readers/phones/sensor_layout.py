@@ -269,7 +269,9 @@ def _by_rows(head: TableHead) -> SensorTable | None:
             start += 1
         if start + 3 > width or not np.isfinite(rows[:, start : start + 3]).all():
             continue
-        if width > 4 and named is None and _is_code(rows[:, start]):  # as in ADVIO's `imu-gyro.csv`
+        code = rows[0, start]  # of a sensor, the same in every row: ADVIO's `imu-gyro.csv`
+        coded = code != 0.0 and code.is_integer() and not np.ptp(rows[:, start])
+        if width > 4 and named is None and coded:
             continue
         rest = width - start
         raw = rest == 6 and start and not np.ptp(rows[:, start + 3 :], axis=0).any()
@@ -291,12 +293,6 @@ def _named_axes(titles: list[str]) -> Axes | None:
         if (axis := axis_of(title)) is not None:
             named.setdefault(axis[0], Column(k, title, unit_of(title)))
     return (named["x"], named["y"], named["z"]) if len(named) == 3 else None
-
-
-def _is_code(column: FloatArray) -> bool:
-    """Return whether a column holds the number of a sensor, the same in every row."""
-    code = float(column[0])
-    return code != 0.0 and code.is_integer() and not np.ptp(column)
 
 
 def _is_clock(column: FloatArray, time: FloatArray) -> bool:

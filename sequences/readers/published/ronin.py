@@ -53,7 +53,9 @@ _TRUSTED_DEG = 20.0
 
 def read_ronin(path: Path) -> ImuSequence:
     """Read a recording from its folder or its `data.hdf5`."""
-    file = _data_file(path)
+    file = path / "data.hdf5" if path.is_dir() else path
+    if not file.is_file():
+        raise ReadError(file, "file", "no such file", "the recording's HDF5 file")
     info = JsonFields(file.with_name("info.json"))
     fields = _fields(file)
     required = np.column_stack([fields[name] for name in _FIELDS])
@@ -79,13 +81,6 @@ def read_ronin(path: Path) -> ImuSequence:
 def is_ronin(path: Path) -> bool:
     """Return whether a path is an HDF5 file or a folder with `data.hdf5`."""
     return (path / "data.hdf5").is_file() or is_hdf5(path)
-
-
-def _data_file(path: Path) -> Path:
-    file = path / "data.hdf5" if path.is_dir() else path
-    if not file.is_file():
-        raise ReadError(file, "file", "no such file", "the recording's HDF5 file")
-    return file
 
 
 def _fields(file: Path) -> dict[str, FloatArray]:
