@@ -195,28 +195,24 @@ def barometer(
 
 
 def _in_hPa(path: Path, title: str, values: FloatArray, unit: str) -> FloatArray:
-    pressure_hPa = values * _factor(path, title, float(np.median(values)), unit)
+    """Return pressures (N,) in the named unit, or in the one that fits a typical value, in hPa."""
+    value = float(np.median(values))
+    if unit and unit not in PRESSURE_UNITS:
+        raise ReadError(path, title, f"{value:.6g} {unit}", *_expected())
+    likely = unit
+    if not (unit and LOWEST_HPA <= PRESSURE_UNITS[unit] * value <= HIGHEST_HPA):
+        if not (likely := pressure_unit_of(value)):
+            raise ReadError(path, title, f"{value:.6g} {unit}".rstrip(), *_expected())
+        if unit:
+            words = "%s: %s: %.6g is no pressure in %s: read as %s"
+            _log.warning(words, path, title, value, unit, likely)
+    pressure_hPa = values * PRESSURE_UNITS[likely]
     steps = np.abs(np.diff(pressure_hPa))
     step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
     if not unit and step > _LARGEST_STEP_HPA:
         found = f"steps of {step:.2g} hPa, which is {8.4 * step:.0f} m of height"
         raise ReadError(path, title, found, *_expected())
     return np.asarray(pressure_hPa)
-
-
-def _factor(path: Path, title: str, value: float, unit: str) -> float:
-    """Return the factor to hPa of the named unit, or of the one that fits a typical value."""
-    if unit and unit not in PRESSURE_UNITS:
-        raise ReadError(path, title, f"{value:.6g} {unit}", *_expected())
-    if unit and LOWEST_HPA <= PRESSURE_UNITS[unit] * value <= HIGHEST_HPA:
-        return PRESSURE_UNITS[unit]
-    if not (likely := pressure_unit_of(value)):
-        raise ReadError(path, title, f"{value:.6g} {unit}".rstrip(), *_expected())
-    if unit:
-        _log.warning(
-            "%s: %s: %.6g is no pressure in %s: read as %s", path, title, value, unit, likely
-        )
-    return PRESSURE_UNITS[likely]
 
 
 def _expected() -> tuple[str, str]:

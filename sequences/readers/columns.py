@@ -12,6 +12,7 @@ from typing import TypeVar
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import DEGREES, OPTIONAL, UNITS
+from stario.sequences.readers.lines import first_lines
 from stario.sequences.readers.phones.sensor_words import (
     axis_of,
     is_time,
@@ -98,6 +99,9 @@ _LIKE_TRUTH = re.compile(
 _UNITS = {*ACCEL_UNITS, *GYRO_UNITS, *MAGNETIC_UNITS, *TIME_UNITS}
 _QUOTES = " \"'"
 
+_HEAD_LINES = 200
+"""Number of lines within which the header must be for a file to be recognised."""
+
 _FEWEST_UNITS = 3
 """Number of cells that make a row of units: those of one sensor."""
 
@@ -152,8 +156,9 @@ def _header_index(lines: list[str]) -> int | None:
     return None
 
 
-def columns_named(lines: list[str]) -> set[str]:
-    """Return the canonical names of the columns in a header, empty without one."""
+def named_columns(path: Path) -> set[str]:
+    """Return the canonical names of the columns that a file's header names, empty without one."""
+    lines = first_lines(path, _HEAD_LINES, comments=True)
     index = _header_index(lines)
     return set() if index is None else {*canonical_names(lines[index])} - {""}
 

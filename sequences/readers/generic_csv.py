@@ -63,14 +63,13 @@ from stario.sequences.readers.columns import (
     TRUTH,
     Column,
     Header,
-    columns_named,
+    named_columns,
     read_header,
     unit_factor,
 )
 from stario.sequences.readers.lines import (
     decimal_mark,
     ends_within_a_row,
-    first_lines,
     is_row,
     read_lines,
     unquoted,
@@ -111,9 +110,6 @@ _ZERO_ROWS, _EITHER = 0.05, 0.9
 """Share of rows of zeros of each sensor, and of rows with just one sensor, from which they are
 separate rows: neither sensor at rest reads exactly 0, 0, 0."""
 
-_HEAD_LINES = 200
-"""Number of lines within which the header must be for a file to be recognised."""
-
 
 def read_generic_csv(path: Path) -> ImuSequence:
     """Read a generic CSV in the format that the module's docstring describes."""
@@ -151,11 +147,6 @@ def read_generic_csv(path: Path) -> ImuSequence:
 def is_generic_csv(path: Path) -> bool:
     """Return whether a file starts with a header that names IMU columns of this format."""
     return bool(named_columns(path) & set(IMU))
-
-
-def named_columns(path: Path) -> set[str]:
-    """Return the canonical names of the columns that a file's header names."""
-    return columns_named(first_lines(path, _HEAD_LINES, comments=True))
 
 
 @dataclass(frozen=True)

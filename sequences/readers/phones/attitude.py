@@ -21,9 +21,10 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.arrays import integral, interpolated
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
+from stario.sequences.readers.clocks import time_unit
 from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.files import PhoneFiles
-from stario.sequences.readers.phones.samples import Samples, read_quaternion
+from stario.sequences.readers.phones.samples import Samples
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import DeviceAttitude, FloatArray
 from stario.sequences.time_order import increasing_mask
@@ -43,10 +44,12 @@ def logged_attitude(files: PhoneFiles, gyro: Samples) -> tuple[IntArray, Rotatio
     if table is None or not table.quaternion:
         return None
     try:
-        stamps, quaternion = read_quaternion(table)
+        rows = table.read([table.clock, *table.quaternion])
+        unit_ns = time_unit(table.file, rows.values[:, 0], table.clock.unit)
+        stamps = rows.stamps_ns(table.clock.index, unit_ns)
     except ReadError:  # attitude is optional
         return None
-    return agreeing_attitude(stamps, quaternion, gyro, table.quaternion[0].title != "")
+    return agreeing_attitude(stamps, rows.values[:, 1:], gyro, table.quaternion[0].title != "")
 
 
 def device_attitude(

@@ -28,8 +28,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import resample_to_gyro, source_words
-from stario.sequences.readers.columns import IMU, POSITION
-from stario.sequences.readers.generic_csv import named_columns
+from stario.sequences.readers.columns import IMU, POSITION, named_columns
 from stario.sequences.readers.lines import head_lines, may_be_read
 from stario.sequences.readers.phones.alongside import (
     Recording,

@@ -104,14 +104,3 @@ def _sound_samples(file: Path, sensor: Sensor, titles: str, values: FloatArray) 
     if not sound.all():
         _log.warning("%s: dropped %d wild samples of the %s", file, (~sound).sum(), sensor)
     return np.asarray(sound)
-
-
-def read_quaternion(table: SensorTable) -> tuple[IntArray, FloatArray]:
-    """Read the times (N,) [ns] and quaternions (N, 4) of an attitude, in the table's order.
-
-    Raises:
-        ReadError: a row is malformed.
-    """
-    rows = table.read([table.clock, *table.quaternion])
-    unit_ns = time_unit(table.file, rows.values[:, 0], table.clock.unit)
-    return rows.stamps_ns(table.clock.index, unit_ns), rows.values[:, 1:]
