@@ -26,7 +26,6 @@ from stario.sequences.readers.checked import OPTIONAL, checked, pose_mask, rotat
 from stario.sequences.readers.lines import first_bytes
 from stario.sequences.sequence import (
     Barometer,
-    BoolArray,
     DeviceAttitude,
     FloatArray,
     ImuSequence,
@@ -220,8 +219,12 @@ def _part(
         valid = np.asarray(_column(path, group, f"{stem}/valid", time.shape), dtype=np.bool_)
     for name, rows in required.items():
         shapes = [(len(time), *row) for row in rows]
-        columns[name] = _column(path, group, f"{stem}/{name}", *shapes, finite=not known)
-        _check_known(path, f"{stem}/{name}", columns[name], valid)
+        values = _column(path, group, f"{stem}/{name}", *shapes, finite=not known)
+        if (bad := valid & ~np.isfinite(values.reshape(len(time), -1)).all(axis=1)).any():
+            where, fix = f"row {int(np.argmax(bad)) + 1}, {stem}/{name}", f"{stem}/valid"
+            found = "a value that is not finite"
+            raise ReadError(path, where, found, "finite numbers", f"write False there in {fix}")
+        columns[name] = values
     for name, row in (optional or {}).items():
         if f"{stem}/{name}" in group:
             shape = len(time), *row
@@ -257,15 +260,6 @@ def _positions(
     optional = {name: (2,) if name == "latlon_deg" else () for name in POSITIONS_OPTIONAL}
     found = _part(path, group, stem, {place: [(2,), (3,)]}, optional, known=True)
     return PositionTrack(position_W=found.pop(place), kind=kind, **found) if found else None
-
-
-def _check_known(path: Path, field: str, values: FloatArray, valid: BoolArray) -> None:
-    """Check that the truth's values (N, K) are finite where it is valid."""
-    bad = valid & ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
-    if bad.any():
-        where = f"row {int(np.argmax(bad)) + 1}, {field}"
-        fix = f"write False there in {field.split('/')[0]}/valid"
-        raise ReadError(path, where, "a value that is not finite", "finite numbers", fix)
 
 
 def _column(

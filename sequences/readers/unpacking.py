@@ -208,11 +208,9 @@ def _column_of_sensors(lines: list[str]) -> tuple[RowFormat, int] | None:
     rows = [written.cells(line) for line in lines[written.skip : written.skip + _HEAD_ROWS]]
     rows = [row for row in rows if len(row) == len(rows[0])]
     for column, cells in enumerate(zip(*rows, strict=True)):
-        if len(rows) > 1 and sum(map(_names_sensor, cells)) >= _MIN_SHARE * len(cells):
+        # By more than a letter or two: not `n/a`.
+        words = ([word for word in words_of(cell) if len(word) > 2] for cell in cells)
+        named = sum(sensor_of(some) is not None for some in words)
+        if len(rows) > 1 and named >= _MIN_SHARE * len(cells):
             return written, column
     return None
-
-
-def _names_sensor(cell: str) -> bool:
-    """Return whether a cell names a sensor by more than a letter or two: not `n/a`."""
-    return sensor_of(word for word in words_of(cell) if len(word) > 2) is not None

@@ -158,16 +158,12 @@ def _tables_alongside(
         for head in table_heads(file, least):
             if len(head.rows) < 2 or not (places := places_in(head, own)):
                 continue
-            if clock := clock_of(head.titles, head.rows) or _first_column(head, places):
+            clock = clock_of(head.titles, head.rows)
+            if clock is None and all(place.index for place in places.values()):
+                clock = clock_of(["time"], head.rows[:, :1])  # the first column, if it grows
+            if clock is not None:
                 yield _Columns(head, head.clock(clock), places, held=own)
                 break
-
-
-def _first_column(head: TableHead, places: dict[str, Column]) -> Column | None:
-    """Return the first column of a table whose titles name no clock, if it grows."""
-    if any(place.index == 0 for place in places.values()):
-        return None
-    return clock_of(["time"], head.rows[:, :1])
 
 
 def _files_named(recording: Recording, names: set[str]) -> list[Path]:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
@@ -186,11 +186,11 @@ def assemble_recording(
         _log.warning("%s: not read: %s", file, why)
     gyro = _read(files.tables["gyro"][0], "gyro")
     attitude = logged_attitude(files, gyro)
-    accel = _force(files, attitude, core_motion)
+    accel, converted, maybe_apple = _force(files, attitude, core_motion)
     stamps, rate, force = resample_to_gyro(
-        folder, gyro.stamps_ns, gyro.values, accel.samples.stamps_ns, accel.samples.values
+        folder, gyro.stamps_ns, gyro.values, accel.stamps_ns, accel.values
     )
-    converted = {"gyro": gyro.unit not in ("", "rad/s"), **accel.converted}
+    converted["gyro"] = gyro.unit not in ("", "rad/s")
     recording = Recording(files.gyro, files.key, stamps[0], stamps[-1])
     reported = reported_positions(recording)
     first = next(reported, None)
@@ -205,7 +205,7 @@ def assemble_recording(
         barometer=recorded_pressure(recording),
         satellites=first,
         source="" if core_motion else source_words(app_of(files), gyro.assumed_time_unit),
-        maybe_apple=accel.maybe_apple,
+        maybe_apple=maybe_apple,
     )
     sequence = with_pose(sequence, stamps[0], poses, orders)
     if sequence.truth is not None:
@@ -225,19 +225,13 @@ def _read(table: SensorTable, sensor: Sensor) -> Samples:
     return read_samples(table, sensor, axes)
 
 
-@dataclass(frozen=True)
-class _Force:
-    """Specific force, which of unit and sign were converted, and whether Apple's sign is left."""
-
-    samples: Samples
-    converted: dict[str, bool]
-    maybe_apple: bool
-
-
 def _force(
     files: PhoneFiles, attitude: tuple[IntArray, Rotation] | None, core_motion: bool
-) -> _Force:
-    """Return the specific force, with gravity added if that was logged apart."""
+) -> tuple[Samples, dict[str, bool], bool]:
+    """Return the specific force, with gravity added if that was logged apart.
+
+    Which of unit and sign were converted follows, and whether it may have Apple's sign.
+    """
     candidates = [_read(table, "accel") for table in files.tables.get("accel", [])]
     gravity_table = files.first("gravity")
     gravity = None if gravity_table is None else _read(gravity_table, "gravity")
@@ -257,14 +251,12 @@ def _force(
     factor = -1.0 if inverted else 1.0
     # In g without a sign, `check_units` asks for both unless the caller has given them.
     factor *= STANDARD_GRAVITY if in_g and inverted else 1.0
-    return _Force(
-        samples=replace(accel, values=factor * accel.values),
-        converted={
-            "accel": inverted or accel.unit.removeprefix("-") not in ("", "m/s^2"),
-            "sign": inverted or accel.unit.startswith("-"),
-        },
-        maybe_apple=sign is None and in_two_parts and not in_g,
-    )
+    converted = {
+        "accel": inverted or accel.unit.removeprefix("-") not in ("", "m/s^2"),
+        "sign": inverted or accel.unit.startswith("-"),
+    }
+    maybe_apple = sign is None and in_two_parts and not in_g
+    return replace(accel, values=factor * accel.values), converted, maybe_apple
 
 
 def _with_gravity(candidates: list[Samples], or_g: bool) -> Samples | None:

@@ -64,7 +64,10 @@ def read_ronin(path: Path) -> ImuSequence:
     bias, scale = info.array("imu_acce_bias", 3), info.array("imu_acce_scale", 3)
     accel = scale * (fields["synced/acce"] - bias)
     attitude_WB = _device_attitude(file, info, fields, gyro, rows)
-    start = int(np.searchsorted(rows, _start_frame(info, int(rows[-1]))))
+    frame, last = info.get("start_frame", 0), int(rows[-1])
+    if not isinstance(frame, int) or not 0 <= frame <= last:
+        raise ReadError(info.path, "start_frame", repr(frame), f"a row from 0 to {last}")
+    start = int(np.searchsorted(rows, frame))
     rows, attitude_WB = rows[start:], attitude_WB[start:]
     time = fields["synced/time"][rows]
     time = time - time[0]
@@ -137,10 +140,3 @@ def _source(info: JsonFields, has_ekf: bool) -> str:
     if errors.get("game_rv", 0.0) <= _TRUSTED_DEG:
         return "game_rv"
     return min(errors, key=lambda name: errors[name])
-
-
-def _start_frame(info: JsonFields, last: int) -> int:
-    start = info.get("start_frame", 0)
-    if not isinstance(start, int) or not 0 <= start <= last:
-        raise ReadError(info.path, "start_frame", repr(start), f"a row from 0 to {last}")
-    return start
