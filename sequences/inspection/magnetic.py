@@ -55,6 +55,28 @@ _SURE = 5.0
 """Upward dip and hard iron above which a problem is reported; components of hard iron count if they
 exceed this many of their standard deviations."""
 
+_LONGEST_S = 600.0
+
+_SHORTEST_S = 10.0
+
+_STEP_S = 0.05
+
+_SPAN_S = 0.1
+
+_TURNING_RAD_S = 0.1
+"""Rate (root mean square) below which neither hard iron nor lag can be determined."""
+
+HELD_CHANGE = 2e-3
+"""Minimum relative change in magnitude of a measured field within half a second. Some phones report
+a calibrated field that they extrapolate with their own gyroscope: its magnitude stays constant to
+1e-4 for seconds, while that of a measured field changes by 1e-2."""
+
+_NO_FIELD_UT = 1e-9
+"""Smallest magnitude to divide by [uT], for a sensor that reports zeros."""
+
+_HALF_SECOND, _TURNED_RAD = 0.5, 0.05
+"""Half seconds in which the field turns by more than this in the sensor's axes are examined."""
+
 
 @dataclass(frozen=True, eq=False)
 class MagneticFindings:
@@ -181,26 +203,6 @@ def certain_iron(iron: FloatArray | None, sigma: FloatArray | None) -> FloatArra
         return None
     sure = np.abs(iron) > _SURE * sigma
     return iron if np.linalg.norm(iron[sure]) > _IRON_UT else None
-
-
-_LONGEST_S = 600.0
-_SHORTEST_S = 10.0
-_STEP_S = 0.05
-_SPAN_S = 0.1
-
-_TURNING_RAD_S = 0.1
-"""Rate (root mean square) below which neither hard iron nor lag can be determined."""
-
-HELD_CHANGE = 2e-3
-"""Minimum relative change in magnitude of a measured field within half a second. Some phones report
-a calibrated field that they extrapolate with their own gyroscope: its magnitude stays constant to
-1e-4 for seconds, while that of a measured field changes by 1e-2."""
-
-_NO_FIELD_UT = 1e-9
-"""Smallest magnitude to divide by [uT], for a sensor that reports zeros."""
-
-_HALF_SECOND, _TURNED_RAD = 0.5, 0.05
-"""Half seconds in which the field turns by more than this in the sensor's axes are examined."""
 
 
 def assess_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:

@@ -37,6 +37,24 @@ _NOISY_M, _SLOW_HZ, _HELD_SHARE = 0.3, 0.5, 0.5
 Changes = tuple[tuple[float, float], ...]
 """Time [s] and rise in height [m] of each sudden change of the pressure."""
 
+_STALE_S, _STALE_ROWS = 8.0, 4
+"""Time [s] and reports from which an equal position is repeated rather than measured."""
+
+_FAST_M_S, _RADII = 6.0, 2.0
+"""Speed of a step, and its length relative to the sum of the radii at both ends, that no pedestrian
+takes."""
+
+_WALKING_M_S, _LONGEST_STEP_S, _FEWEST = 0.7, 3.0, 15
+"""Doppler speed and step between reports that are compared, and how many are needed."""
+
+_AGREES, _CONTRADICTS = 0.6, 0.2
+
+_SCALED, _SURE = 1.35, 4.0
+"""Correlations of positions' and Doppler velocities, and the factor between them and its standard
+deviations from one, that are told."""
+
+_COARSE_M = 30.0
+
 
 @dataclass(frozen=True)
 class PressureFindings:
@@ -162,24 +180,6 @@ def _sudden_changes(time: FloatArray, height: FloatArray) -> tuple[Changes, Chan
         tuple(change for change in told if abs(change[1]) <= _JUMP_M),
         tuple(change for change in told if abs(change[1]) > _JUMP_M),
     )
-
-
-_STALE_S, _STALE_ROWS = 8.0, 4
-"""Time [s] and reports from which an equal position is repeated rather than measured."""
-
-_FAST_M_S, _RADII = 6.0, 2.0
-"""Speed of a step, and its length relative to the sum of the radii at both ends, that no pedestrian
-takes."""
-
-_WALKING_M_S, _LONGEST_STEP_S, _FEWEST = 0.7, 3.0, 15
-"""Doppler speed and step between reports that are compared, and how many are needed."""
-
-_AGREES, _CONTRADICTS = 0.6, 0.2
-_SCALED, _SURE = 1.35, 4.0
-"""Correlations of positions' and Doppler velocities, and the factor between them and its standard
-deviations from one, that are told."""
-
-_COARSE_M = 30.0
 
 
 @dataclass(frozen=True)

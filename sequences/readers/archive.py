@@ -47,6 +47,11 @@ _OF_POSES = {"velocity": (3,), "position_covariance": (3, 3)}
 POSITIONS_OPTIONAL = ("sigma", "latlon_deg", "floor")
 SATELLITES_OPTIONAL = tuple(OPTIONAL.values())
 
+_MAGIC = b"\x89HDF\r\n\x1a\n"
+
+DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, AttributeError)
+"""Exceptions of h5py and NumPy for a damaged file, or for one with other content."""
+
 
 def split_name(path: Path) -> tuple[Path, str | None]:
     """Split `file.h5:name` into the archive's file and the recording's name, None without one."""
@@ -290,12 +295,6 @@ def _plain(value: Any) -> str | float:
         return value if isinstance(value, str) else float(value)
     except (TypeError, ValueError):
         return str(value)
-
-
-_MAGIC = b"\x89HDF\r\n\x1a\n"
-
-DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, AttributeError)
-"""Exceptions of h5py and NumPy for a damaged file, or for one with other content."""
 
 
 def is_hdf5(path: Path) -> bool:

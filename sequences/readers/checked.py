@@ -37,6 +37,40 @@ _log = logging.getLogger(__name__)
 
 _HELD_SHARE = 1.0 / 3.0
 
+_LARGEST_STEP_HPA = 0.3
+"""Median step between different neighbours of anything but pressure; of barometers it is below 0.1,
+and 0.2 in a lift at 1 Hz. Altitudes in metres taken for hPa have larger ones."""
+
+OPTIONAL = {
+    "alt": "altitude_m",
+    "acc": "radius_m",
+    "speed": "speed_m_s",
+    "bearing": "bearing_deg",
+}
+"""Optional attributes of `Satellites` by their columns in a generic CSV."""
+
+DEGREES = {"deg": 1.0, "": 1.0, "°": 1.0}
+
+_METRES = {"m": 1.0, "": 1.0, "ft": 0.3048}
+
+UNITS = {
+    "altitude_m": _METRES,
+    "radius_m": _METRES,
+    "speed_m_s": SPEED_UNITS | {"": 1.0},
+    "bearing_deg": DEGREES,
+}
+"""Factors of the units of these attributes, without a unit as well."""
+
+RADIUS_PER_SIGMA = 1.51
+"""Radius that holds 68 % of a Gaussian in the plane, in standard deviations per axis."""
+
+USUAL_RADIUS, LARGEST_RADIUS = 10.0, 30.0
+"""Radius [m] where none is stated, and the largest: more is that of positions from the network's
+cells or of rooms without reception."""
+
+_LARGEST_DEGREES = 90.0, 180.0
+"""Largest latitude and longitude."""
+
 
 def checked(path: Path, field: str, values: FloatArray) -> FloatArray:
     """Return values (N,) or (N, K) if all are finite.
@@ -164,11 +198,6 @@ def trajectory(
     )
 
 
-_LARGEST_STEP_HPA = 0.3
-"""Median step between different neighbours of anything but pressure; of barometers it is below 0.1,
-and 0.2 in a lift at 1 Hz. Altitudes in metres taken for hPa have larger ones."""
-
-
 def barometer(
     path: Path, title: str, time: FloatArray, values: FloatArray, unit: str = ""
 ) -> Barometer | None:
@@ -218,35 +247,6 @@ def _in_hPa(path: Path, title: str, values: FloatArray, unit: str) -> FloatArray
 def _expected() -> tuple[str, str]:
     expected = f"pressure of {LOWEST_HPA:g} to {HIGHEST_HPA:g} hPa, or in Pa, kPa or inHg"
     return expected, "is it an altitude?"
-
-
-OPTIONAL = {
-    "alt": "altitude_m",
-    "acc": "radius_m",
-    "speed": "speed_m_s",
-    "bearing": "bearing_deg",
-}
-"""Optional attributes of `Satellites` by their columns in a generic CSV."""
-
-DEGREES = {"deg": 1.0, "": 1.0, "°": 1.0}
-_METRES = {"m": 1.0, "": 1.0, "ft": 0.3048}
-UNITS = {
-    "altitude_m": _METRES,
-    "radius_m": _METRES,
-    "speed_m_s": SPEED_UNITS | {"": 1.0},
-    "bearing_deg": DEGREES,
-}
-"""Factors of the units of these attributes, without a unit as well."""
-
-RADIUS_PER_SIGMA = 1.51
-"""Radius that holds 68 % of a Gaussian in the plane, in standard deviations per axis."""
-
-USUAL_RADIUS, LARGEST_RADIUS = 10.0, 30.0
-"""Radius [m] where none is stated, and the largest: more is that of positions from the network's
-cells or of rooms without reception."""
-
-_LARGEST_DEGREES = 90.0, 180.0
-"""Largest latitude and longitude."""
 
 
 def known_places(latlon_deg: FloatArray) -> BoolArray:

@@ -27,6 +27,25 @@ _QUOTED_MARK = re.compile(
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 """Byte order marks, with which spreadsheets begin a file of Unicode text."""
 
+_DAY_S = 86400
+
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+
+_TIME = re.compile(
+    r"(?<![\w:.])"
+    r"(?:(?:(?P<date>\d{4}[-/]\d\d[-/]\d\d|\d\d-[a-z]{3}-\d{4})"
+    r"|\d\d?[./]\d\d?[./]\d\d(?:\d\d)?)[t _])?"
+    r"(?P<clock>\d?\d:\d\d:\d\d)"
+    r"(?:(?::(?P<count>\d+))|(?:\.|,(?=\d+[;\t]))(?P<fraction>\d+))?"
+    r"(?: ?(?P<half>am|pm)\b)?"
+    r"(?P<zone> ?(?:z|(?:utc|gmt)?[+-]\d\d:?\d\d|utc|gmt)|[+-]\d\d)?"
+    r"(?![\w:])",
+    flags=re.IGNORECASE,
+)
+"""A time of day, with a date before it or a zone after it if there is one."""
+
+_COUNT = re.compile(r"\d:\d\d:\d\d:(\d+)")
+
 
 def read_lines(path: Path) -> list[str]:
     """Return the lines of a text file.
@@ -206,26 +225,6 @@ def ends_within_a_row(path: Path, delimiter: str | None) -> bool:
     ends = [cells[-1].strip(' "') for cells in earlier]
     shortest = min((len(end) for end in ends if not end[:1].isalpha()), default=0)  # no titles
     return len(last) < len(earlier[-1]) or len(last[-1].strip(' "')) < shortest
-
-
-_DAY_S = 86400
-
-_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
-
-_TIME = re.compile(
-    r"(?<![\w:.])"
-    r"(?:(?:(?P<date>\d{4}[-/]\d\d[-/]\d\d|\d\d-[a-z]{3}-\d{4})"
-    r"|\d\d?[./]\d\d?[./]\d\d(?:\d\d)?)[t _])?"
-    r"(?P<clock>\d?\d:\d\d:\d\d)"
-    r"(?:(?::(?P<count>\d+))|(?:\.|,(?=\d+[;\t]))(?P<fraction>\d+))?"
-    r"(?: ?(?P<half>am|pm)\b)?"
-    r"(?P<zone> ?(?:z|(?:utc|gmt)?[+-]\d\d:?\d\d|utc|gmt)|[+-]\d\d)?"
-    r"(?![\w:])",
-    flags=re.IGNORECASE,
-)
-"""A time of day, with a date before it or a zone after it if there is one."""
-
-_COUNT = re.compile(r"\d:\d\d:\d\d:(\d+)")
 
 
 def with_seconds(lines: Iterable[str]) -> list[str]:

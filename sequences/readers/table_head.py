@@ -36,6 +36,16 @@ _MARK_ROWS = 5
 _HEAD_LINES, _HEAD_ROWS = 96, 24
 """Number of lines within which the rows must begin, and of the rows that show what columns hold."""
 
+_TITLES = {
+    *map("".join, product(("device", "imu", "node"), ("", "id", "name", "number", "address"))),
+    *("i", "instance", "mac", "macaddress", "serial", "serialnumber"),
+    *("side", "limb", "placement", "bodypart", "sensorlocation", "sensorplacement"),
+}
+"""Titles, without blanks and the like, of such a column; `I` is that of ArduPilot's logs."""
+
+_MOST = 9
+"""Number of different values above which a column says something else."""
+
 
 @dataclass(frozen=True)
 class TableHead:
@@ -169,17 +179,6 @@ def _with_most_numbers(rows: list[str], first: RowFormat) -> RowFormat:
         return sum(_count_numbers(row_format.cells(line)) for line in rows)
 
     return max(first, replace(first, decimal="." if first.decimal == "," else ","), key=numbers)
-
-
-_TITLES = {
-    *map("".join, product(("device", "imu", "node"), ("", "id", "name", "number", "address"))),
-    *("i", "instance", "mac", "macaddress", "serial", "serialnumber"),
-    *("side", "limb", "placement", "bodypart", "sensorlocation", "sensorplacement"),
-}
-"""Titles, without blanks and the like, of such a column; `I` is that of ArduPilot's logs."""
-
-_MOST = 9
-"""Number of different values above which a column says something else."""
 
 
 def refuse_several_devices(table: Table, titles: Sequence[str], column: int) -> None:

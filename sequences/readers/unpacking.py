@@ -40,6 +40,18 @@ _MAX_BYTES = 4 * 2**30
 _MAX_FILES = 5000
 """Maximum number of text files, far more than any export has; unpacking 70,000 takes long."""
 
+_DAMAGED = (OSError, EOFError, zlib.error, zipfile.BadZipFile, RuntimeError, NotImplementedError)
+"""Exceptions raised for a zip that is damaged, encrypted or compressed in a rare way."""
+
+_FIRST = re.compile(r"\ufeff?\s*\[\s*\{[^{}]*\"sensor\"\s*:")
+
+_NAME = re.compile(r"\w+")
+
+_HEAD_ROWS = 50
+
+_MIN_SHARE = 0.5
+"""Share of the first rows that must name a known sensor; others are of other sensors."""
+
 
 def is_zip(path: Path) -> bool:
     """Return whether a file is a zip with text files in it; never raises."""
@@ -66,10 +78,6 @@ def unpack_zip(path: Path, folder: Path) -> None:
     except _DAMAGED as error:
         found = " ".join(str(error).split())
         raise ReadError(path, "zip", found, "an intact zip", "is the zip complete?") from None
-
-
-_DAMAGED = (OSError, EOFError, zlib.error, zipfile.BadZipFile, RuntimeError, NotImplementedError)
-"""Exceptions raised for a zip that is damaged, encrypted or compressed in a rare way."""
 
 
 def _extract(path: Path, inner: Path, folder: Path, max_bytes: int) -> int:
@@ -124,10 +132,6 @@ def named_after(path: Path, folder: Path) -> Iterator[None]:
             logger.removeFilter(rename)
 
 
-_FIRST = re.compile(r"\ufeff?\s*\[\s*\{[^{}]*\"sensor\"\s*:")
-_NAME = re.compile(r"\w+")
-
-
 def is_json_export(path: Path) -> bool:
     """Return whether a file begins with such an array; never raises."""
     if path.suffix.lower() != ".json" or not path.is_file():
@@ -157,11 +161,6 @@ def unpack_json(path: Path, folder: Path) -> None:
             writer = csv.DictWriter(text, titles, extrasaction="ignore")
             writer.writeheader()
             writer.writerows(rows)
-
-
-_HEAD_ROWS = 50
-_MIN_SHARE = 0.5
-"""Share of the first rows that must name a known sensor; others are of other sensors."""
 
 
 def is_long_form(path: Path) -> bool:

@@ -46,6 +46,24 @@ _SECOND_AXIS_RAD_S = 0.005
 """Rate about a second axis (root mean square) that both must have measured. On a trolley it is
 0.009; noise of both, which is independent, leaves less."""
 
+_H_S = 0.3
+
+_TURN_S = 0.1
+"""Interval over which gyroscope and attitude are compared [s]."""
+
+_LEVER_M = 0.3
+
+_BIAS_M_S2 = 0.3
+"""Prior sigmas of lever arm and bias, which bound them where a track determines them poorly."""
+
+_CAUTION = 2.5
+"""Factor by which the accelerometer's deviation is taken to exceed that of its residuals: results
+of recordings of one session, and of halves of one recording, differ by that much."""
+
+_MIN_ROWS = 100
+
+_PASSES = 5
+
 
 def disagreeing(time: FloatArray, attitude_WV: Rotation, attitude_B: Rotation) -> BoolArray:
     """Return whether each sample's rotation to most neighbours contradicts the gyroscope."""
@@ -204,22 +222,6 @@ def _fit(
         scale = max(float(np.median(residual)), 1e-4)
         weights = 1.0 / (1.0 + (residual / (2 * scale)) ** 2)
     return mount
-
-
-_H_S = 0.3
-_TURN_S = 0.1
-"""Interval over which gyroscope and attitude are compared [s]."""
-
-_LEVER_M = 0.3
-_BIAS_M_S2 = 0.3
-"""Prior sigmas of lever arm and bias, which bound them where a track determines them poorly."""
-
-_CAUTION = 2.5
-"""Factor by which the accelerometer's deviation is taken to exceed that of its residuals: results
-of recordings of one session, and of halves of one recording, differ by that much."""
-
-_MIN_ROWS = 100
-_PASSES = 5
 
 
 def heading_turn(

@@ -40,6 +40,14 @@ _MIN_MOTION = 0.12
 _OUTLIER = 3.0
 """Factor on the 98th percentile above which a row is left out: a jump of the positions."""
 
+_log = logging.getLogger(__name__)
+
+_GRAVITY_KEPT = 0.9
+"""Minimum ratio of the mean force along the vertical to its mean magnitude if axes are right."""
+
+_BETTER, _SHARPER = 0.2, 0.02
+"""Margins by which another axis order must exceed the logged and the next best in that ratio."""
+
 
 @dataclass(frozen=True, eq=False)
 class PositionFit:
@@ -142,15 +150,6 @@ def _second_difference(ticks: FloatArray, time: FloatArray, values: FloatArray) 
 def _inliers(rows: FloatArray) -> BoolArray:
     size = np.linalg.norm(rows - np.median(rows, axis=0), axis=1)
     return np.asarray(size <= _OUTLIER * np.percentile(size, 98))
-
-
-_log = logging.getLogger(__name__)
-
-_GRAVITY_KEPT = 0.9
-"""Minimum ratio of the mean force along the vertical to its mean magnitude if axes are right."""
-
-_BETTER, _SHARPER = 0.2, 0.02
-"""Margins by which another axis order must exceed the logged and the next best in that ratio."""
 
 
 def accel_axes(sequence: ImuSequence, truth: Trajectory) -> ImuSequence:

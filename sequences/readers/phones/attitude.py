@@ -37,6 +37,19 @@ _EXPLAINED = 0.5
 
 _MAX_STEP_S = 0.3
 
+_log = logging.getLogger(__name__)
+
+_G_RANGE = (0.7, 1.4)
+
+_STEADY = 0.4
+"""With gravity, fewer than a tenth of the samples fall below this share of their median."""
+
+_CORE_MOTION = ("arkit", "arposes", "motarh", "motmagnfull", "devicemotion")
+"""Beginnings of names of files that only loggers on iOS write."""
+
+_SURE = 0.7
+"""Minimum mean cosine between an attitude's vertical and the force that determines the sign."""
+
 
 def logged_attitude(files: PhoneFiles, gyro: Samples) -> tuple[IntArray, Rotation] | None:
     """Return times (N,) [ns] and N rotations, body to a world with z up; None if none fits."""
@@ -106,19 +119,6 @@ def _explained(stamps_ns: IntArray, attitude_WB: Rotation, gyro: Samples) -> flo
         for steps in (measured, logged[inside] - measured)
     )
     return 1.0 - left / size if size > 0.0 else 0.0
-
-
-_log = logging.getLogger(__name__)
-
-_G_RANGE = (0.7, 1.4)
-_STEADY = 0.4
-"""With gravity, fewer than a tenth of the samples fall below this share of their median."""
-
-_CORE_MOTION = ("arkit", "arposes", "motarh", "motmagnfull", "devicemotion")
-"""Beginnings of names of files that only loggers on iOS write."""
-
-_SURE = 0.7
-"""Minimum mean cosine between an attitude's vertical and the force that determines the sign."""
 
 
 def is_in_g(values: FloatArray) -> bool:

@@ -65,6 +65,9 @@ from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Magnetomete
 
 _log = logging.getLogger(__name__)
 
+_GRAVITY_REMOVED = 5.0
+"""Median force [m/s^2] below which gravity was removed."""
+
 
 def read_phone(path: Path) -> ImuSequence:
     """Read a logger's folder, or the recording of one gyroscope file in a folder with several."""
@@ -155,10 +158,6 @@ def _chosen(path: Path) -> PhoneFiles:
         fix = "put each recording into a separate folder"
         raise ReadError(folder, "files", names, expected, fix)
     return chosen[0]
-
-
-_GRAVITY_REMOVED = 5.0
-"""Median force [m/s^2] below which gravity was removed."""
 
 
 def assemble_recording(

@@ -54,6 +54,8 @@ _OWN = ("rv_x", "rv_w", "ori_w", "linacce_x", "grav_x")
 _PICKLES = ("data.pkl", "data.pickle")
 _MAX_TILT_RAD = np.deg2rad(20.0)
 
+_FILES = ("acce.txt", "gyro.txt", "orientation.txt", "pose.txt")
+
 
 def read_ridi(path: Path) -> ImuSequence:
     """Read a recording from its folder, its `processed` folder or its `data.csv`."""
@@ -112,9 +114,6 @@ def y_is_up(path: Path, attitude_WB: Rotation, accel: FloatArray) -> bool:
 def _name(file: Path) -> str:
     folder = file.resolve().parent
     return folder.parent.name if folder.name == "processed" else folder.name
-
-
-_FILES = ("acce.txt", "gyro.txt", "orientation.txt", "pose.txt")
 
 
 def read_imunet(path: Path) -> ImuSequence:
