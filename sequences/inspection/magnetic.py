@@ -56,13 +56,9 @@ _SURE = 5.0
 exceed this many of their standard deviations."""
 
 _LONGEST_S = 600.0
-
 _SHORTEST_S = 10.0
-
 _STEP_S = 0.05
-
 _SPAN_S = 0.1
-
 _TURNING_RAD_S = 0.1
 """Rate (root mean square) below which neither hard iron nor lag can be determined."""
 

@@ -48,7 +48,6 @@ _WALKING_M_S, _LONGEST_STEP_S, _FEWEST = 0.7, 3.0, 15
 """Doppler speed and step between reports that are compared, and how many are needed."""
 
 _AGREES, _CONTRADICTS = 0.6, 0.2
-
 _SCALED, _SURE = 1.35, 4.0
 """Correlations of positions' and Doppler velocities, and the factor between them and its standard
 deviations from one, that are told."""

@@ -36,7 +36,6 @@ from stario.sequences.units import (
 _log = logging.getLogger(__name__)
 
 _HELD_SHARE = 1.0 / 3.0
-
 _LARGEST_STEP_HPA = 0.3
 """Median step between different neighbours of anything but pressure; of barometers it is below 0.1,
 and 0.2 in a lift at 1 Hz. Altitudes in metres taken for hPa have larger ones."""

@@ -28,9 +28,7 @@ _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 """Byte order marks, with which spreadsheets begin a file of Unicode text."""
 
 _DAY_S = 86400
-
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
-
 _TIME = re.compile(
     r"(?<![\w:.])"
     r"(?:(?:(?P<date>\d{4}[-/]\d\d[-/]\d\d|\d\d-[a-z]{3}-\d{4})"

@@ -32,7 +32,6 @@ from stario.sequences.readers.table_head import first_row
 from stario.sequences.readers.text import RowFormat
 
 _PACKAGE = "stario.sequences"
-
 _SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".json", ".properties", ".zip")
 _MAX_BYTES = 4 * 2**30
 """Maximum unpacked text [bytes], more than any recording has; guards against zip bombs."""
@@ -44,11 +43,8 @@ _DAMAGED = (OSError, EOFError, zlib.error, zipfile.BadZipFile, RuntimeError, Not
 """Exceptions raised for a zip that is damaged, encrypted or compressed in a rare way."""
 
 _FIRST = re.compile(r"\ufeff?\s*\[\s*\{[^{}]*\"sensor\"\s*:")
-
 _NAME = re.compile(r"\w+")
-
 _HEAD_ROWS = 50
-
 _MIN_SHARE = 0.5
 """Share of the first rows that must name a known sensor; others are of other sensors."""
 

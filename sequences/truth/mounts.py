@@ -37,7 +37,6 @@ _FLIP_RAD = np.deg2rad(15.0)
 _GLITCH_RAD = np.deg2rad(6.0)
 _SAME_MOUNT_RAD = np.deg2rad(30.0)
 _MIN_PIECE_S, _GAP_S = 1.0, 0.5
-
 _MIN_OWN_S, _OWN_BETTER = 3.0, 0.5
 """Length of a piece [s] that can tell that it was mounted anew, and the share of the carried
 mount's residual that its own fit must leave."""
@@ -47,12 +46,10 @@ _SECOND_AXIS_RAD_S = 0.005
 0.009; noise of both, which is independent, leaves less."""
 
 _H_S = 0.3
-
 _TURN_S = 0.1
 """Interval over which gyroscope and attitude are compared [s]."""
 
 _LEVER_M = 0.3
-
 _BIAS_M_S2 = 0.3
 """Prior sigmas of lever arm and bias, which bound them where a track determines them poorly."""
 
@@ -61,7 +58,6 @@ _CAUTION = 2.5
 of recordings of one session, and of halves of one recording, differ by that much."""
 
 _MIN_ROWS = 100
-
 _PASSES = 5
 
 

@@ -40,7 +40,6 @@ _MAX_STEP_S = 0.3
 _log = logging.getLogger(__name__)
 
 _G_RANGE = (0.7, 1.4)
-
 _STEADY = 0.4
 """With gravity, fewer than a tenth of the samples fall below this share of their median."""
 

@@ -53,7 +53,6 @@ _OWN = ("rv_x", "rv_w", "ori_w", "linacce_x", "grav_x")
 
 _PICKLES = ("data.pkl", "data.pickle")
 _MAX_TILT_RAD = np.deg2rad(20.0)
-
 _FILES = ("acce.txt", "gyro.txt", "orientation.txt", "pose.txt")
 
 
