@@ -92,7 +92,7 @@ def _in_front(gait: Gait) -> CarryMotion:
     """Return the motion of a device laid flat on a hand, which bounces more than the trunk."""
     rng = gait.rng
     strike, wobble = (
-        Strike(1.7, *_ARM, (0.34, -77.0), 0.25, (0.36, 24.0), (0.17, 59.0), (0.22, -99.0), 0.4),
+        Strike(1.85, *_ARM, (0.34, -77.0), 0.25, (0.36, 24.0), (0.17, 59.0), (0.22, -99.0), 0.4),
         0.05,
     )
     motion = _held(gait, 3.3, strike, 0.1, wobble, 0.15)
@@ -103,7 +103,7 @@ def _texting(gait: Gait) -> CarryMotion:
     """Return the motion of a device that is read: the arms keep it steadier than the trunk."""
     rng = gait.rng
     strike = Strike(1.5, *_ARM, (0.41, -166.0), 0.39, (0.6, 49.0), (0.29, 28.0), (0.35, -67.0), 0.4)
-    motion = _held(gait, 1.15, strike, 0.04, 0.085, 0.12, 0.6)
+    motion = _held(gait, 1.15, strike, 0.04, 0.1, 0.12, 0.6)
     return _displaced(motion, rng.uniform(0.2, 0.4), rng.uniform(-0.1, 0.1), 0.72 * gait.height)
 
 
@@ -113,8 +113,8 @@ def _displaced(motion: CarryMotion, x: float, y: float, z: float) -> CarryMotion
 
 def _call(gait: Gait) -> CarryMotion:
     rng, n = gait.rng, len(gait)
-    strike = Strike(1.2, *_ARM, (0.65, 33.0), 0.49, (0.3, 50.0), (0.22, -63.0), (0.44, 169.0), 0.4)
-    motion = _held(gait, 1.05, strike, 0.06, 0.09, 0.05, 0.5)
+    strike = Strike(1.35, *_ARM, (0.65, 33.0), 0.49, (0.3, 50.0), (0.22, -63.0), (0.44, 169.0), 0.4)
+    motion = _held(gait, 1.05, strike, 0.06, 0.11, 0.05, 0.5)
     head = 0.4 * drift(rng, n, gait.rate, 1.0)
     arm = np.array([0.05, rng.choice([-1.0, 1.0]) * 0.1, 0.0])
     offset = motion.offset_H + np.array([0.0, 0.0, 0.93 * gait.height]) + _about(2, head, arm)
