@@ -62,6 +62,21 @@ def true_path(sequence: ImuSequence) -> float:
     return float(np.linalg.norm(np.diff(known.position_W, axis=0), axis=1).sum())
 
 
+def length_ratio(track: Track, sequence: ImuSequence) -> float:
+    """Return a track's length per true length, by lines between known positions within it.
+
+    Those of true poses count once a second. NaN for fewer than `MIN_POSITIONS`. Unlike an error it
+    does not depend on how often the way returns.
+    """
+    known = _known(sequence)
+    fitted = None if known is None else placed(track, known)
+    if fitted is None or len(fitted) < MIN_POSITIONS:
+        return float("nan")
+    truth, told = fitted.position_W, _track_at(track, fitted.time)
+    told_m, true_m = (np.linalg.norm(np.diff(p, axis=0), axis=1).sum() for p in (told, truth))
+    return float(told_m / true_m)
+
+
 def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:
     """Return the horizontal error [m] at known positions after a fit of yaw and position.
 
