@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import typer
 
-from stario.fusion.commands.options import EstimatorOptions, ReadingOptions
+from stario.fusion.commands import options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ _NAMED = 3
 
 def map_recordings(
     title: str,
-    reading: ReadingOptions,
+    reading: options.Reading,
     paths: Sequence[Path],
     work: Callable[[Path, ImuSequence], Result],
 ) -> tuple[list[Result], list[Skipped]]:
@@ -57,7 +57,7 @@ def map_recordings(
 
 
 def process_each(
-    reading: ReadingOptions,
+    reading: options.Reading,
     paths: Sequence[Path],
     out: Path | None,
     work: Callable[[ImuSequence, Path], tuple[dict[str, object], str]],
@@ -199,8 +199,8 @@ def print_result(as_json: bool, record: object, text: str = "") -> None:
 
 def origin_of(
     paths: Sequence[Path],
-    reading: ReadingOptions,
-    estimating: EstimatorOptions,
+    reading: options.Reading,
+    estimating: options.Estimator,
     network: DisplacementModel,
     fixes: Path | None = None,
 ) -> dict[str, object]:
@@ -218,7 +218,7 @@ def origin_of(
     }
 
 
-def training_command(paths: Sequence[Path], reading: ReadingOptions) -> str:
+def training_command(paths: Sequence[Path], reading: options.Reading) -> str:
     """Return the command that trains weights on these recordings, read in the same way."""
     options = [
         f"--{name.replace('_', '-')}={each}"

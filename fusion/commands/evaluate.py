@@ -2,38 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple, get_args
 
 import typer
 
-from stario.fusion.commands.common import (
-    exit_if_skipped,
-    names_in,
-    origin_of,
-    print_result,
-    progress_bar,
-)
-from stario.fusion.commands.options import (
-    DataOption,
-    EstimatorOptions,
-    EvaluateOutOption,
-    JobsOption,
-    JsonOption,
-    OptionalPathsArgument,
-    ReadingOptions,
-    RunsOption,
-    expand_option_groups,
-    flag,
-    refuse,
-    refuse_unused_sources,
-)
+from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
+    from stario.fusion.config import NavigatorConfig
     from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
+    from stario.fusion.recording import Progress
     from stario.network.model import DisplacementModel
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.splits import ListEntry
@@ -49,13 +31,13 @@ class _Found(NamedTuple):
     write: Callable[[Path], object]
 
 
-@expand_option_groups
+@options.expanded
 def evaluate(
     context: typer.Context,
-    reading: ReadingOptions,
-    estimating: EstimatorOptions,
-    paths: OptionalPathsArgument = None,
-    data: DataOption = None,
+    reading: options.Reading,
+    estimating: options.Estimator,
+    paths: options.OptionalPaths = None,
+    data: options.Data = None,
     split: Annotated[
         str,
         typer.Option(
@@ -79,7 +61,7 @@ def evaluate(
         ),
     ] = None,
     filtered: Annotated[
-        bool, flag("--filtered", help="With --by: also report the filter's mean NIS; slow.")
+        bool, options.flag("--filtered", help="With --by: also report the filter's mean NIS; slow.")
     ] = False,
     models: Annotated[
         str | None,
@@ -88,13 +70,13 @@ def evaluate(
             "default, or weights files; several weights of one network are averaged.",
         ),
     ] = None,
-    runs: RunsOption = Path("runs"),
+    runs: options.Runs = Path("runs"),
     convention: Annotated[
         str, typer.Option(help="How --models averages position errors: rms, ronin or mean.")
     ] = "rms",
-    jobs: JobsOption = 1,
-    out: EvaluateOutOption = None,
-    as_json: JsonOption = False,
+    jobs: options.Jobs = 1,
+    out: options.EvaluateOut = None,
+    as_json: options.Json = False,
 ) -> None:
     """Evaluate accuracy and consistency over recordings with ground truth: medians and means."""
     from stario.fusion.evaluation.folders import check_folder
@@ -102,42 +84,52 @@ def evaluate(
 
     if out is not None:
         check_folder(out)
-    refuse_unused_sources(context, paths, data)
+    options.refuse_unused_sources(context, paths, data)
     _refuse_unused(context, by, models)
     listed, skipped = _listed(reading, paths or [], data, split)
     files = [entry.path for entry in listed]
-    named = [estimating.model, against or ""] if models is None else names_in(models)
+    named = [estimating.model, against or ""] if models is None else common.names_in(models)
     if data is not None:
         warn_of_learned(named, files, data)
-    if by is not None:
-        found, failed = _groups(listed, reading, by, estimating.model, against, filtered, jobs)
-    elif models is not None:
-        found, failed = _networks(named, runs, files, reading, estimating, convention, jobs)
-    else:
-        found, failed = _tracks(files, reading, estimating, jobs, out)
+    with common.progress_bar("evaluate", 100 * len(files)) as progress:
+        if by is not None:
+            groups = {entry.path: entry.group for entry in listed}
+            ours = estimating.model
+            found, failed = _groups(groups, reading, by, ours, against, filtered, jobs, progress)
+        elif models is not None:
+            settings = estimating.settings()
+            found, failed = _networks(
+                named, runs, files, reading, settings, convention, jobs, progress
+            )
+        else:
+            found, failed = _tracks(files, reading, estimating, jobs, out, progress)
     if found is not None:
         if out is not None:
             found.write(out)
-        print_result(as_json, found.record, found.text)
-    exit_if_skipped(skipped + failed)
+        common.print_result(as_json, found.record, found.text)
+    common.exit_if_skipped(skipped + failed)
 
 
 def _refuse_unused(context: typer.Context, by: str | None, models: str | None) -> None:
     """Refuse options that the chosen kind of evaluation does not use."""
     if by is None:
-        refuse(context, "without --by", "a grouping, such as --by set", "against", "filtered")
+        options.refuse(
+            context, "without --by", "a grouping, such as --by set", "against", "filtered"
+        )
     else:
-        refuse(context, "with --by", "--model and --against", "models")
+        options.refuse(context, "with --by", "--model and --against", "models")
         alone = "use without: the network alone is judged"
-        refuse(context, "with --by", alone, "config", "magnetometer", "declination")
+        options.refuse(context, "with --by", alone, "config", "magnetometer", "declination")
     if models is None:
-        refuse(context, "without --models", "networks named with --models", "convention", "runs")
+        options.refuse(
+            context, "without --models", "networks named with --models", "convention", "runs"
+        )
     else:
-        refuse(context, "with --models", "one of the two", "model")
+        options.refuse(context, "with --models", "one of the two", "model")
 
 
 def _listed(
-    reading: ReadingOptions, paths: list[Path], data: Path | None, split: str
+    reading: options.Reading, paths: list[Path], data: Path | None, split: str
 ) -> tuple[list[ListEntry], list[Skipped]]:
     """Return the named recordings, or else those of the split, and the skipped paths."""
     from stario.network.training.splits import read_packaged_list
@@ -153,34 +145,37 @@ def _listed(
 
 def _tracks(
     files: list[Path],
-    reading: ReadingOptions,
-    estimating: EstimatorOptions,
+    reading: options.Reading,
+    estimating: options.Estimator,
     jobs: int,
     out: Path | None,
+    progress: Progress,
 ) -> tuple[_Found | None, list[Skipped]]:
     """Return the table of recordings, whose tracks are written one by one, and those skipped."""
     from stario.fusion.evaluation.compare import compare_recordings
     from stario.fusion.evaluation.results import write_recording, write_summary
-    from stario.fusion.evaluation.summary import Scores, scores_of, summary, summary_table
+    from stario.fusion.evaluation.summary import scores_of, summary, summary_table
     from stario.sequences.datasets.batch import without_skipped
 
     settings, network = estimating.settings(), estimating.network()
     model = estimating.for_processes(network, jobs)
-    origin = origin_of(files, reading, estimating, network)
     skipped: list[Skipped] = []
-    scores: list[Scores] = []
-    with progress_bar("evaluate", 100 * len(files)) as progress:
-        outcomes = compare_recordings(
-            files, model, settings, reading.read, jobs, truth_needed=True, progress=progress
-        )
-        for comparison in without_skipped(outcomes, skipped):
-            if out is not None:
-                write_recording(out, comparison)
-            scores.append(scores_of(comparison))
+    scores = []
+    outcomes = compare_recordings(
+        files, model, settings, reading.read, jobs, truth_needed=True, progress=progress
+    )
+    for comparison in without_skipped(outcomes, skipped):
+        if out is not None:
+            write_recording(out, comparison)
+        scores.append(scores_of(comparison))
     if not scores:
         return None, skipped
-    records = {each.name: each.record for each in scores}
-    write = partial(write_summary, records=records, config=settings, origin=origin)
+    write = partial(
+        write_summary,
+        records={each.name: each.record for each in scores},
+        config=settings,
+        origin=common.origin_of(files, reading, estimating, network),
+    )
     return _Found(summary(scores), summary_table(scores), write), skipped
 
 
@@ -188,65 +183,54 @@ def _networks(
     names: Sequence[str],
     runs: Path,
     files: list[Path],
-    reading: ReadingOptions,
-    estimating: EstimatorOptions,
+    reading: options.Reading,
+    settings: NavigatorConfig,
     convention: str,
     jobs: int,
+    progress: Progress,
 ) -> tuple[_Found | None, list[Skipped]]:
     """Return the table of networks, and the recordings that were skipped."""
     from stario.fusion.evaluation.figures import write_table
-    from stario.fusion.evaluation.networks import compare_networks, networks_text, table_dict
+    from stario.fusion.evaluation.networks import compare_networks
     from stario.network.model import load_model, weights_named
     from stario.sequences.accuracy.metrics import Convention
     from stario.sequences.arrays import check_choice
 
     averaging: Convention = check_choice("convention", convention, get_args(Convention))
-    networks = [(name, load_model(weights_named(name, runs))) for name in names]
-    settings = estimating.settings()
-    with progress_bar("evaluate", 100 * len(files)) as progress:
-        table, skipped = compare_networks(
-            files, networks, settings, reading.read, averaging, jobs, progress
-        )
+    models = [(name, load_model(weights_named(name, runs))) for name in names]
+    table, skipped = compare_networks(
+        files, models, settings, reading.read, averaging, jobs, progress
+    )
     if table is None:
         return None, skipped
-    write = partial(write_table, table=table)
-    return _Found(table_dict(table), networks_text(table), write), skipped
+    return _Found(table.as_dict(), table.text(), partial(write_table, table=table)), skipped
 
 
 def _groups(
-    recordings: list[ListEntry],
-    reading: ReadingOptions,
+    groups: Mapping[Path, str],
+    reading: options.Reading,
     by: str,
     ours: str,
     theirs: str | None,
     filtered: bool,
     jobs: int,
+    progress: Progress,
 ) -> tuple[_Found | None, list[Skipped]]:
     """Return the table of groups, and the recordings that were skipped."""
-    from stario.fusion.evaluation.benchmark.groups import (
-        By,
-        benchmark,
-        benchmark_dict,
-        benchmark_text,
-    )
     from stario.fusion.evaluation.figures import write_benchmark
+    from stario.fusion.evaluation.groups import By, benchmark
     from stario.sequences.arrays import check_choice
 
     grouping: By = check_choice("--by", by, get_args(By))
-    names = [ours] if theirs is None else [ours, theirs]
-    models = {name: partial(_for_group, name) for name in names}
-    for name in names:
+    for name in (ours, theirs or ours):
         if _GROUP not in name and _SET not in name:
             _for_group(name, "")  # fail on unloadable weights before preparing anything
-    groups = {entry.path: entry.group for entry in recordings}
-    with progress_bar("evaluate", len(groups)) as progress:
-        found, skipped = benchmark(groups, models, reading.read, jobs, filtered, progress)
+    found, skipped = benchmark(
+        groups, _for_group, reading.read, ours, theirs, grouping, jobs, filtered, progress
+    )
     if found is None:
         return None, skipped
-    rows = found.rows(grouping, ours, theirs)
-    write = partial(write_benchmark, found=found, rows=rows, ours=ours, theirs=theirs)
-    record = benchmark_dict(found, rows, ours, theirs)
-    return _Found(record, benchmark_text(rows, ours, theirs), write), skipped
+    return _Found(found.as_dict(), found.text(), partial(write_benchmark, found=found)), skipped
 
 
 @cache

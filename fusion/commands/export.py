@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from stario.fusion.commands.options import RunsOption
+from stario.fusion.commands import options
 from stario.sequences.errors import InputError
 
 
@@ -18,7 +18,7 @@ def export(
             help="Network: a name from `stario check models`, default, or weights with their card.",
         ),
     ] = "default",
-    runs: RunsOption = Path("runs"),
+    runs: options.Runs = Path("runs"),
     out: Annotated[Path | None, typer.Option(help="File to write. Default: ./NETWORK.onnx")] = None,
 ) -> None:
     """Export a network with its calibration as ONNX; `--model FILE.onnx` then runs it anywhere."""

@@ -10,13 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import process_each, training_command
-from stario.fusion.commands.options import (
-    JsonOption,
-    PathsArgument,
-    ReadingOptions,
-    expand_option_groups,
-)
+from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -24,25 +18,25 @@ if TYPE_CHECKING:
     from stario.sequences.sequence import ImuSequence
 
 
-@expand_option_groups
+@options.expanded
 def inspect(
-    paths: PathsArgument,
-    reading: ReadingOptions,
+    paths: options.Paths,
+    reading: options.Reading,
     model: Annotated[
         str, typer.Option(help="Weights that the recording is tried with.")
     ] = "default",
     out: Annotated[
         Path | None, typer.Option(help="Folder for figure and findings. Default: runs/NAME.")
     ] = None,
-    as_json: JsonOption = False,
+    as_json: options.Json = False,
 ) -> None:
     """Inspect recordings: timing, noise, units, signs, magnetometer, truth, track."""
     from stario.fusion.navigator import Navigator
     from stario.network.model import load_model
 
-    train = training_command(paths, reading)
+    train = common.training_command(paths, reading)
     work = partial(_inspect, navigator=Navigator(load_model(model)), train=train)
-    process_each(reading, paths, out, work, as_json)
+    common.process_each(reading, paths, out, work, as_json)
 
 
 def _inspect(

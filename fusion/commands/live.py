@@ -7,19 +7,13 @@ from typing import Annotated
 
 import typer
 
-from stario.fusion.commands.options import (
-    EstimatorOptions,
-    MapOptions,
-    TilesOption,
-    expand_option_groups,
-    flag,
-)
+from stario.fusion.commands import options
 
 
-@expand_option_groups
+@options.expanded
 def live(
-    estimating: EstimatorOptions,
-    placing: MapOptions,
+    estimating: options.Estimator,
+    placing: options.Map,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of page and pushes.")] = 8000,
     host: Annotated[
         str, typer.Option(help="Address to listen on; 0.0.0.0 admits phones, with a token.")
@@ -27,8 +21,8 @@ def live(
     phyphox: Annotated[
         list[str] | None, typer.Option(help="Address of a phone running phyphox; repeatable.")
     ] = None,
-    tiles: TilesOption = "",
-    demo: Annotated[bool, flag("--demo", help="Let a simulated phone walk.")] = False,
+    tiles: options.Tiles = "",
+    demo: Annotated[bool, options.flag("--demo", help="Let a simulated phone walk.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for the recordings.")] = Path("runs/live"),
 ) -> None:
     """Show live tracks on a web page, from Sensor Logger, phyphox or any device that posts JSON."""

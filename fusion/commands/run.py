@@ -8,27 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from stario.fusion.commands.common import (
-    explain,
-    origin_of,
-    process_each,
-    progress_bar,
-    training_command,
-)
-from stario.fusion.commands.options import (
-    EstimatorOptions,
-    ExplainOption,
-    FixesOption,
-    JsonOption,
-    PathsArgument,
-    PlaceOptions,
-    ReadingOptions,
-    ReportOption,
-    RunOutOption,
-    TilesOption,
-    expand_option_groups,
-    flag,
-)
+from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,24 +18,25 @@ if TYPE_CHECKING:
     from stario.sequences.sequence import ImuSequence
 
 
-@expand_option_groups
+@options.expanded
 def run(
-    paths: PathsArgument,
-    reading: ReadingOptions,
-    estimating: EstimatorOptions,
-    placing: PlaceOptions,
-    fixes: FixesOption = None,
-    out: RunOutOption = None,
+    paths: options.Paths,
+    reading: options.Reading,
+    estimating: options.Estimator,
+    placing: options.Place,
+    fixes: options.Fixes = None,
+    out: options.RunOut = None,
     filtered: Annotated[
-        bool, flag("--filtered", help="Also write the filter's track, as a stream gives it.")
+        bool,
+        options.flag("--filtered", help="Also write the filter's track, as a stream gives it."),
     ] = False,
-    report: ReportOption = False,
-    tiles: TilesOption = "",
+    report: options.Report = False,
+    tiles: options.Tiles = "",
     view: Annotated[
-        bool, flag("--view", help="Open the rerun 3-D viewer; its file is kept in --out.")
+        bool, options.flag("--view", help="Open the rerun 3-D viewer; its file is kept in --out.")
     ] = False,
-    as_json: JsonOption = False,
-    explained: ExplainOption = False,
+    as_json: options.Json = False,
+    explained: options.Explain = False,
 ) -> None:
     """Fuse each recording into a smooth track with attitude, velocity, biases and covariance."""
     from stario.fusion.fix_file import read_fixes
@@ -76,19 +57,19 @@ def run(
     navigator = Navigator(network, placing.settings(estimating.settings()))
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
     if explained:
-        explain()
+        common.explain()
     work = partial(
         _run,
         navigator=navigator,
         fixes=absolute_fixes,
-        origin=origin_of(paths, reading, estimating, network, fixes),
+        origin=common.origin_of(paths, reading, estimating, network, fixes),
         filtered=filtered,
         report=report,
         tiles=tiles,
         view=view,
-        train=training_command(paths, reading),
+        train=common.training_command(paths, reading),
     )
-    process_each(reading, paths, out, work, as_json, "--fixes" if fixes else "")
+    common.process_each(reading, paths, out, work, as_json, "--fixes" if fixes else "")
 
 
 def _run(
@@ -109,7 +90,7 @@ def _run(
     from stario.fusion.fix_file import check_within
 
     check_within(fixes, sequence)
-    with progress_bar(f"run {sequence.name}") as progress:
+    with common.progress_bar(f"run {sequence.name}") as progress:
         track = navigator.run(sequence, progress, fixes)
     tracks = {"track": track}
     if filtered and track.filtered is not None:

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import check_new, print_result
-from stario.fusion.commands.options import JsonOption, OverwriteOption, flag, refuse
+from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -45,19 +44,19 @@ def simulate(
     ] = None,
     imu: Annotated[str, typer.Option(help="Sensor model: phone, good or perfect.")] = "phone",
     magnetometer: Annotated[
-        bool, flag("--magnetometer", help="Also simulate a magnetometer inside a building.")
+        bool, options.flag("--magnetometer", help="Also simulate a magnetometer inside a building.")
     ] = False,
     floors: Annotated[
         bool,
-        flag(
+        options.flag(
             "--floors",
             help="Walk from the street through a house with stairs and a lift, with magnetometer, "
             "barometer and satellites.",
         ),
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of walk and sensor.")] = 0,
-    overwrite: OverwriteOption = False,
-    as_json: JsonOption = False,
+    overwrite: options.Overwrite = False,
+    as_json: options.Json = False,
 ) -> None:
     """Write a simulated walk, or a device on motion capture, with its truth as a CSV recording."""
     from stario.sequences.arrays import check_choice
@@ -67,15 +66,15 @@ def simulate(
     if path.suffix.lower() != ".csv":
         fix = "use `stario convert` for other formats and folders"
         raise InputError("path", str(path), "a file name ending in .csv", fix)
-    check_new("path", path, overwrite)
+    common.check_new("path", path, overwrite)
     sensors = {"phone": PHONE_IMU, "good": GOOD_IMU, "perfect": PERFECT_IMU}
     errors = sensors[check_choice("--imu", imu, sensors)]
     stays = []
     if body is not None:
-        refuse(context, "with --body", "use without", "seconds", "magnetometer", "floors")
+        options.refuse(context, "with --body", "use without", "seconds", "magnetometer", "floors")
         sequence = _on_body(body, carry, rate, errors, seed)
     elif floors:
-        refuse(context, "with --floors", "use without", "magnetometer")
+        options.refuse(context, "with --floors", "use without", "magnetometer")
         walk = _through_house(path.stem, carry, seconds, rate, errors, seed)
         sequence, stays = walk.sequence, walk.stays
     else:
@@ -92,7 +91,7 @@ def simulate(
     if stays:
         figures["stays"] = [asdict(stay) for stay in stays]
         amount += f", floors {', '.join(str(stay.floor) for stay in stays[1:])}"
-    print_result(as_json, figures, f"{path}: {amount}")
+    common.print_result(as_json, figures, f"{path}: {amount}")
 
 
 def _walk(

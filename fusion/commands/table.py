@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import exit_if_skipped, names_in
-from stario.fusion.commands.options import CacheOption, ReadingOptions, assignment, refuse
+from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -50,7 +49,7 @@ def table(
     config: Annotated[
         Path | None, typer.Option(help="TOML or JSON file with the recipe. Default: the package's.")
     ] = None,
-    cache: CacheOption = None,
+    cache: options.Cache = None,
     jobs: Annotated[
         int | None, typer.Option(help="Runs to run in parallel; -1 for as many as possible.")
     ] = None,
@@ -74,9 +73,9 @@ def table(
     from stario.sequences.settings import read_settings
 
     if data is None:
-        refuse(context, "without --data", "use with --data", "sets", "per_group")
+        options.refuse(context, "without --data", "use with --data", "sets", "per_group")
     datasets = _data_sets(data, sets, published or [], split_seed, per_group)
-    chosen = None if networks is None else names_in(networks)
+    chosen = None if networks is None else common.names_in(networks)
     packaged = importlib.resources.files("stario.network.weights") / "recipe-table.json"
     recipe = read_settings(config or Path(str(packaged)))
     runs = table_runs(datasets, recipe, steps, chosen, seeds)
@@ -84,8 +83,8 @@ def table(
     requested = {run.network for run in runs}
     costs = known_costs([name for name in ARCHITECTURES if name in requested], out)
     learned = {} if data is None else learned_from(data)
-    options = ReadingOptions()
-    reading = ReaderConfig(options.read, options.as_read(), cache or cache_folder())
+    usual = options.Reading()
+    reading = ReaderConfig(usual.read, usual.as_read(), cache or cache_folder())
     skipped = []
     with on_backend(backend):
         if jobs is None and backend != "loky":
@@ -98,7 +97,7 @@ def table(
             typer.echo(f"{done} of {len(runs)}: {run}: {status}", err=True)
             write_results(runs, out, costs, learned, drawn=False)
     typer.echo(write_results(runs, out, costs, learned), nl=False)
-    exit_if_skipped(skipped)
+    common.exit_if_skipped(skipped)
 
 
 def _data_sets(
@@ -110,10 +109,10 @@ def _data_sets(
         raise InputError("data", "none", "recordings", "pass --data or --set NAME=FOLDER")
     datasets: list[DataSet] = []
     if data is not None:
-        names = None if sets is None else names_in(sets)
+        names = None if sets is None else common.names_in(sets)
         datasets += development_sets(data, seed, per_group, names)
     for word in published:
-        name, folder = assignment("--set", word, "NAME=FOLDER", "such as ronin=/data/RoNIN")
+        name, folder = options.assignment("--set", word, "NAME=FOLDER", "such as ronin=/data/RoNIN")
         if name in {dataset.name for dataset in datasets}:
             raise InputError("--set", repr(name), "a name of its own", f"or drop {name} by --sets")
         datasets.append(folder_set(name, Path(folder), seed))

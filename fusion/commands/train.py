@@ -8,16 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stario.fusion.commands.common import list_skipped, training_progress
-from stario.fusion.commands.options import (
-    READING,
-    CacheOption,
-    OptionalPathsArgument,
-    ReadingOptions,
-    expand_option_groups,
-    flag,
-    refuse,
-)
+from stario.fusion.commands import common, options
 from stario.fusion.commands.training_data import (
     packaged_lists,
     recorded_streams,
@@ -44,11 +35,11 @@ calibration: `first-stage` calibrated on 15 s of a person had an NIS of up to 22
 other recordings, on 80 s of up to 9, and with its own calibration of 2.8 to 5."""
 
 
-@expand_option_groups
+@options.expanded
 def train(
     context: typer.Context,
-    reading: ReadingOptions,
-    paths: OptionalPathsArgument = None,
+    reading: options.Reading,
+    paths: options.OptionalPaths = None,
     model: Annotated[
         str | None,
         typer.Option(
@@ -92,7 +83,7 @@ def train(
         int | None, typer.Option(min=0, help=f"Simulated walks of 60 s. Default: {_GENERATED}.")
     ] = None,
     recorded_only: Annotated[
-        bool, flag("--recorded-only", help="Train without simulated walks.")
+        bool, options.flag("--recorded-only", help="Train without simulated walks.")
     ] = False,
     body: Annotated[
         list[Path] | None,
@@ -120,7 +111,7 @@ def train(
             "weights, which were trained without them.",
         ),
     ] = None,
-    cache: CacheOption = None,
+    cache: options.Cache = None,
     jobs: Annotated[
         int,
         typer.Option(
@@ -174,7 +165,7 @@ def train(
     )
     calibration = load_model(calibrated_by).card.calibration if calibrated_by else None
     if is_leader():
-        list_skipped(skipped)  # before hours of training
+        common.list_skipped(skipped)  # before hours of training
         for words in material.words:
             typer.echo(words, err=True)
     path = _trained(recipe, material, held, out, folder, first, calibration)
@@ -193,12 +184,12 @@ def _check_sources(
 ) -> None:
     """Refuse options that nothing uses, and a run without anything to learn from."""
     if data is not None:
-        refuse(context, "with --data", "use with PATH: name the archive", "where")
+        options.refuse(context, "with --data", "use with PATH: name the archive", "where")
         return
     needed = "use with the development recordings"
-    refuse(context, "without --data", needed, "leave_out", "learn_from")
+    options.refuse(context, "without --data", needed, "leave_out", "learn_from")
     if not paths and not validation:
-        refuse(context, "without recordings", "use with PATH", *READING)
+        options.refuse(context, "without recordings", "use with PATH", *options.READING)
     if not paths and generated is None:
         raise InputError("PATH", "none", "recordings, --data, or --generated for walks only")
 
@@ -219,7 +210,7 @@ def _trained(
 
     # Sigma needs windows with full ground truth; if there are none, use simulated walks.
     windows = held.streams or cached_walks(10, recipe.seed + 1, folder, recipe.attitude)
-    with training_progress(recipe.steps, shown=is_leader()) as progress:
+    with common.training_progress(recipe.steps, shown=is_leader()) as progress:
         return train_network(
             recipe,
             material.streams,

@@ -6,8 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stario.fusion.commands.common import exit_if_skipped, with_bar
-from stario.fusion.commands.options import ReadingOptions
+from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -49,7 +48,7 @@ def packaged_lists(
 
 
 def recorded_streams(
-    reading: ReadingOptions,
+    reading: options.Reading,
     paths: list[Path],
     validation: list[Path],
     lists: tuple[list[Path], list[Path]],
@@ -82,21 +81,21 @@ def recorded_streams(
     held_out, held_failed = streams_of(held_files)
     skipped = missing + failed + held_missing + held_failed
     if skipped and not (recordings and (held_out or not validation)):
-        exit_if_skipped(skipped)
+        common.exit_if_skipped(skipped)
     if held_files or not files:
         return recordings, held_out, skipped
     return *split_off(recordings), skipped
 
 
 def streams_of_files(
-    reading: ReadingOptions, attitude: Attitude, folder: Path, jobs: int, files: list[Path]
+    reading: options.Reading, attitude: Attitude, folder: Path, jobs: int, files: list[Path]
 ) -> tuple[list[RecordingStreams], list[Skipped]]:
     """Return the streams of files, cached in a folder, and the recordings that cannot be used."""
     from stario.network.training.data import recording_streams
     from stario.sequences.datasets.stream_cache import recorded
 
     outcomes = recorded(files, reading.read, reading.as_read(), folder, jobs, attitude)
-    return recording_streams(with_bar("read", zip(files, outcomes, strict=True), len(files)))
+    return recording_streams(common.with_bar("read", zip(files, outcomes, strict=True), len(files)))
 
 
 def training_material(

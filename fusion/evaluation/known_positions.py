@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position, known_truth
+from stario.fusion.evaluation.displacement_error import fit_yaw_and_position, known_truth
 from stario.fusion.imu.direction import Complex
 from stario.fusion.state import Track
 from stario.sequences.arrays import even_grid, interpolated

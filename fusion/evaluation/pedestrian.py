@@ -20,7 +20,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, find_peaks, hilbert, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.benchmark.pieces import UPDATES, Piece, predicted
+from stario.fusion.evaluation.displacement_error import UPDATES, Piece, predicted
 from stario.fusion.imu.direction import Complex
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.state import Track

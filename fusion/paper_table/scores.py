@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,8 @@ from stario.network.architectures import ARCHITECTURES
 REFERENCE_NETWORK = "StarIO"
 """Reference network that the others' errors are compared with."""
 
-Completed = dict[str, dict[int, Mapping[str, Any]]]
-"""Results (`read_run`) of a set's runs, by network and seed."""
+Completed = Sequence[Mapping[str, Any]]
+"""Results (`read_run`) of a set's runs."""
 
 
 def _column(title: str, track: str, name: str, scale: float = 1.0) -> Spread:
@@ -94,18 +94,16 @@ class SetTable:
         }
 
 
-def completed_runs(runs: Iterable[Run], out: Path) -> dict[str, Completed]:
+def completed_runs(runs: Iterable[Run], out: Path) -> dict[str, list[Mapping[str, Any]]]:
     """Return the results of the completed runs, by set.
 
     Raises:
         ConfigError: a run was completed with another recipe, other weights or other recordings.
     """
-    found: dict[str, Completed] = {}
+    found: dict[str, list[Mapping[str, Any]]] = {}
     for run in runs:
-        content = read_run(run, out)
-        if content is not None:
-            networks = found.setdefault(run.dataset.name, {})
-            networks.setdefault(run.network, {})[run.seed] = content
+        if (content := read_run(run, out)) is not None:
+            found.setdefault(run.dataset.name, []).append(content)
     return found
 
 
@@ -116,23 +114,22 @@ def set_table(
 
     `learned` has the recordings that packaged weights were trained on, by the weights' name.
     """
-    contents = [content for seeds in completed.values() for content in seeds.values()]
-    recordings = contents[0]["recordings"]
-    poses = all(one["kind"] == "poses" for content in contents for one in content["recordings"])
+    recordings = completed[0]["recordings"]
+    poses = all(one["kind"] == "poses" for content in completed for one in content["recordings"])
     measure = "ate" if poses else "10"
-    order = sorted(completed, key=[PDR, *ARCHITECTURES, *completed].index)
+    names = [content["network"] for content in completed]
     test = {entry.path for entry in dataset.test}
     scores = _scores(completed)
     rows = pd.DataFrame(
-        {"network": name, "seeds": sorted(completed[name])}
+        {"network": name, "seeds": sorted(c["seed"] for c in completed if c["network"] == name)}
         | {"learned": len(test & learned.get(name, set()))}
         | _means(scores[scores["network"] == name])
-        for name in order
+        for name in sorted(set(names), key=[PDR, *ARCHITECTURES, *names].index)
     )
-    skipped = [
-        f"{failure['item']}: {failure['reason']}"
-        for c in contents
-        for failure in [*c["skipped"], *c.get("trained", {}).get("skipped", [])]
+    failures = [
+        failure
+        for content in completed
+        for failure in [*content["skipped"], *content.get("trained", {}).get("skipped", [])]
     ]
     return SetTable(
         dataset,
@@ -141,7 +138,7 @@ def set_table(
         len(recordings),
         float(sum(recording["path_m"] for recording in recordings)),
         _MEASURES[measure],
-        list(dict.fromkeys(skipped)),
+        list(dict.fromkeys(f"{failure['item']}: {failure['reason']}" for failure in failures)),
     )
 
 
@@ -154,34 +151,31 @@ def _means(scores: pd.DataFrame) -> dict[str, float | None]:
 
 def _scores(completed: Completed) -> pd.DataFrame:
     found = [scored("", {}, path="", network="", seed=0)]
-    for network, seeds in completed.items():
-        for seed, content in seeds.items():
-            labels: dict[str, Any] = {"network": network, "seed": seed}
-            for one in content["recordings"]:
-                figures = {**one["tracks"], one["kind"]: one["figures"]}
-                found.append(
-                    scored(one["recording"], figures, one["group"], path=one["path"], **labels)
-                )
-            if trained := content.get("trained"):
-                errors = {key: trained[key] for key in ("training_error_m2", "validation_error_m2")}
-                found.append(scored("", {"trained": errors}, path="", **labels))
+    for content in completed:
+        labels: dict[str, Any] = {key: content[key] for key in ("network", "seed")}
+        for one in content["recordings"]:
+            figures = {**one["tracks"], one["kind"]: one["figures"]}
+            labels["path"] = one["path"]
+            found.append(scored(one["recording"], figures, one["group"], **labels))
+        if trained := content.get("trained"):
+            errors = {key: trained[key] for key in ("training_error_m2", "validation_error_m2")}
+            found.append(scored("", {"trained": errors}, **labels | {"path": ""}))
     return joined(found)
 
 
 def _blocks(completed: Completed, measure: str, dataset: DataSet) -> pd.DataFrame:
     """Return the blocks of squared errors of networks that have some with every seed."""
     units = {str(e.path): {"set": set_of(e), "group": e.group} for e in dataset.test}
-    found = [block_rows([], set="", group="", recording="", network="", seed=0)]
-    for network, seeds in completed.items():
-        runs = [
-            [
-                block_rows(sums, **units[path], recording=path, network=network, seed=seed)
-                for one in content["recordings"]
-                for path in [one["path"]]
-                if (sums := one["blocks"].get(measure))
-            ]
-            for seed, content in seeds.items()
-        ]
-        if all(runs):
-            found += [table for run in runs for table in run]
-    return joined(found)
+    found, without = [block_rows([], set="", group="", recording="", network="", seed=0)], set()
+    for content in completed:
+        run = {key: content[key] for key in ("network", "seed")}
+        known = {
+            one["path"]: one["blocks"][measure]
+            for one in content["recordings"]
+            if one["blocks"].get(measure)
+        }
+        if not known:
+            without.add(content["network"])
+        found += [block_rows(b, **units[path], recording=path, **run) for path, b in known.items()]
+    table = joined(found)
+    return table[~table["network"].isin(without)]

@@ -12,22 +12,25 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
+from stario.fusion.evaluation.bootstrap import Interval
 from stario.fusion.evaluation.figures import write_table
-from stario.fusion.evaluation.networks import (
-    METRICS,
-    PROTOCOLS,
-    TRUE_ATTITUDE,
-    NetworkTable,
-    Sample,
-    add_track,
+from stario.fusion.evaluation.networks import METRICS, PROTOCOLS, NetworkTable, Sample
+from stario.fusion.evaluation.pedestrian import NAME as PDR
+from stario.fusion.paper_table.runs import CONVENTION, Run
+from stario.fusion.paper_table.scores import (
+    COLUMNS,
+    REFERENCE_NETWORK,
+    Completed,
+    SetTable,
+    completed_runs,
+    set_table,
 )
-from stario.fusion.paper_table.errors import CONVENTION
-from stario.fusion.paper_table.runs import Run
-from stario.fusion.paper_table.scores import COLUMNS, Completed, SetTable, completed_runs, set_table
-from stario.fusion.paper_table.text import WORDS, table_text
+from stario.fusion.paper_table.sets import published
 from stario.network.architectures import ARCHITECTURES
 from stario.network.runtime.cost import table_cost
-from stario.network.runtime.survey import ModelRow, survey
+from stario.network.runtime.survey import BATCHES, ModelRow, survey
+from stario.network.training.config import TrainingConfig
+from stario.sequences.accuracy.metrics import CONVENTIONS
 from stario.sequences.files import atomic_write, write_json, write_rows
 from stario.sequences.sequence import Trajectory
 
@@ -39,14 +42,13 @@ def work_of(tables: Iterable[Completed]) -> pd.DataFrame:
     """
     rows = [
         {
-            "network": network,
+            "network": content["network"],
             "training_s": content.get("trained", {}).get("seconds", 0.0),
             "evaluation_s": content["seconds"],
             "windows_per_s": content.get("trained", {}).get("windows_per_s"),
         }
         for completed in tables
-        for network, seeds in completed.items()
-        for content in seeds.values()
+        for content in completed
     ]
     over = {"training_s": "sum", "evaluation_s": "sum", "windows_per_s": "mean"}
     return pd.DataFrame(rows, columns=["network", *over]).groupby("network").agg(over)
@@ -118,23 +120,123 @@ def _for_figures(table: SetTable, completed: Completed) -> NetworkTable | None:
         return None
     found = scores[chosen].rename(columns={"seed": "weights"})
     found["weights"] = "seed " + found["weights"].astype(str)
-    firsts = {network: completed[network].get(0, {}) for network in parameters}
-    return NetworkTable(CONVENTION, parameters, found, _samples(firsts))
-
-
-def _samples(firsts: Mapping[str, Mapping[str, Any]]) -> list[Sample]:
-    """Return tracks of some recordings, by the first seed of each network."""
     samples: dict[str, Sample] = {}
-    for network, content in firsts.items():
-        for one in content.get("recordings", ()):
-            name, drawn = one["recording"], one.get("drawn")
-            if drawn:
-                truth, track = (_level(drawn["time"], drawn[key]) for key in ("truth", "track"))
-                sample = samples.setdefault(name, Sample(name, truth, {}, {}))
-                add_track(sample, network, track, one["tracks"][TRUE_ATTITUDE])
-    return list(samples.values())
+    firsts = [content for content in completed if content["seed"] == 0]
+    for content in sorted(firsts, key=lambda content: [*parameters].index(content["network"])):
+        for one in content["recordings"]:
+            if drawn := one.get("drawn"):
+                truth = np.pad(np.array(drawn["truth"]), ((0, 0), (0, 1)))
+                path = Trajectory(np.array(drawn["time"]), truth, Rotation.identity(len(truth)))
+                sample = samples.setdefault(one["recording"], Sample(one["recording"], path, {}))
+                sample.tracks[content["network"]] = np.array(drawn["track"])
+    return NetworkTable(CONVENTION, parameters, found, list(samples.values()))
 
 
-def _level(time: Sequence[float], xy: Sequence[Sequence[float]]) -> Trajectory:
-    flat = np.column_stack([xy, np.zeros(len(xy))])
-    return Trajectory(np.array(time), flat, Rotation.identity(len(xy)))
+def table_text(
+    tables: Sequence[SetTable],
+    costs: Sequence[ModelRow],
+    work: pd.DataFrame,
+    recipe: TrainingConfig,
+) -> str:
+    """Return the tables of all sets, the costs and the conventions as Markdown.
+
+    The recipe is common to all networks except for its network and seed.
+    """
+    words = (
+        f"All networks: {recipe.steps} training steps of {recipe.batch} windows, peak learning "
+        f"rate {recipe.rate:g}, {recipe.precision}, {recipe.attitude} attitude. On sets with weak "
+        f"truth, each step also learns from stretches of {recipe.waypoint_seconds} s between "
+        f"waypoints ({recipe.waypoint_stretches} per step) and of {recipe.track_seconds} s along "
+        f"positions ({recipe.track_stretches} per step)."
+    )
+    sets = [_set_text(table) for table in tables]
+    return "\n\n".join([words, *sets, _cost_text(costs, work), WORDS]) + "\n"
+
+
+def _set_text(table: SetTable) -> str:
+    dataset, known = table.dataset, table.rows[[*COLUMNS]].notna().any()
+    columns = [column for key, column in COLUMNS.items() if known[key]]
+    titles = ["network", *(column.title for column in columns), "seeds", "rank"]
+    lines = [[*titles, f"error / {REFERENCE_NETWORK}'s", "paper: ATE, RTE [m]"]]
+    for row in table.rows.to_dict("records"):
+        part = table.scores[table.scores["network"] == row["network"]]
+        rank, ratio, errors = "-", "-", "-"
+        if not np.isnan(row["rank"]):
+            rank = "{rank:.0f} [{rank_low:.0f}, {rank_high:.0f}]".format(**row)
+        if isinstance(row["ratio"], Interval):
+            ratio = f"{row['ratio']:.2f}"
+        if paper := published(dataset.name, row["network"]):
+            errors = "{:.3f}, {:.3f}".format(*paper)
+        cells = [column.text(part) for column in columns]
+        title = _title(row, table.tested)
+        lines.append([title, *cells, str(len(row["seeds"])), rank, ratio, errors])
+    return "\n".join(
+        [
+            f"### {dataset.title}",
+            "",
+            f"{len(dataset.training)} recordings for training, {len(dataset.validation)} for "
+            f"validation, {table.tested} for testing ({table.path_m:.0f} m); {dataset.words}. "
+            "Ranks and ratios are based on the geometric mean over recordings of the "
+            f"{table.measure}.",
+            "",
+            *_markdown(lines),
+            *(["", f"Skipped: {len(table.skipped)} recordings, listed in `table.json`."]
+              if table.skipped else []),
+        ]
+    )  # fmt: skip
+
+
+def _title(row: Mapping[str, Any], tested: int) -> str:
+    if row["network"] == PDR:
+        return "pedestrian dead reckoning (`pdr`)"
+    if row["network"] in ARCHITECTURES:
+        return str(row["network"])
+    note = f", trained on {row['learned']} of these {tested}" if row["learned"] else ""
+    return f"weights `{row['network']}`{note}"
+
+
+def _cost_text(costs: Sequence[ModelRow], work: pd.DataFrame) -> str:
+    times = [f"ms per window, batch {batch}" for batch in BATCHES]
+    titles = ["network", "parameters [10^6] (paper)", "FLOPs [10^6] (paper)", "memory [MB]", *times]
+    rows = [[*titles, "core hours", "training windows / s"]]
+    done = work.reindex([row.name for row in costs])
+    for row, (_, spent) in zip(costs, done.iterrows(), strict=True):
+        milliseconds = row.milliseconds["torch"] or {}
+        hours = spent[["training_s", "evaluation_s"]].sum() / 3600.0
+        speed = spent["windows_per_s"]
+        cells = [f"{milliseconds[str(batch)]:.2f}" for batch in BATCHES]
+        cells = [f"{row.peak_memory_mb:.1f}", *cells, f"{hours:.2f}"]
+        rows.append([row.name, *row.counts(), *cells, "-" if np.isnan(speed) else f"{speed:.0f}"])
+    training, testing = work[["training_s", "evaluation_s"]].sum() / 3600.0
+    return "\n".join(
+        [
+            *("### Costs", "", *_markdown(rows), ""),
+            f"Total: {training + testing:.2f} core hours, {training:.2f} for training and "
+            f"{testing:.2f} for evaluation. Time per window: on this machine, one thread per core "
+            "that PyTorch uses; memory: weights and results of one inference "
+            "(`stario check models`).",
+        ]
+    )
+
+
+def _markdown(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return a table's lines without columns that have no value; the first row holds the titles."""
+    columns = [c for c in zip(*rows, strict=True) if any(cell != "-" for cell in c[1:])]
+    head, *body = (f"| {' | '.join(cells)} |" for cells in zip(*columns, strict=True))
+    return [head, f"|{'---|' * len(columns)}", *body]
+
+
+WORDS = (
+    "ATE, RTE and PDE: horizontal, means over recordings, first poses aligned in yaw and position; "
+    f"{CONVENTIONS['ate_m']}; {CONVENTIONS['rte_m']}; {CONVENTIONS['pde']}. "
+    "Squares are also averaged over coordinates, as in RoNIN's code and the paper: multiply by "
+    "sqrt(2) for the norm. The first three columns follow the paper's protocol: windows turned "
+    "by the true attitude. Waypoints: residual after a fit in yaw and position, in m and in % "
+    "of the path, and the length of the track over that of the truth. Positions: error within "
+    "stretches of 20 s, each fitted, in % of the path. Training and validation error: mean "
+    "squared displacement error of windows [m^2] in the last epoch and in the best one, whose "
+    "weights are kept (in validation, legs count in m^2/s). +-: standard error over training "
+    "seeds, for one split. Ranks and ratios: equal weights of sets and of the groups (people, "
+    "places) in a set. Intervals (95 %): bootstrap over groups, recordings and blocks of 30 s, "
+    "with the same draws for all networks; seeds are averaged."
+)

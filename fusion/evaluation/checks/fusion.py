@@ -20,9 +20,9 @@ import pandas as pd
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.benchmark.displacement_error import known_truth
 from stario.fusion.evaluation.checks.faults import drops, gap
 from stario.fusion.evaluation.compare import TRACK_OF, Metrics, measure
+from stario.fusion.evaluation.displacement_error import known_truth
 from stario.fusion.evaluation.known_positions import MIN_POSITIONS, true_path
 from stario.fusion.evaluation.scores import (
     Column,
@@ -65,7 +65,6 @@ def fusion_gain(
     model: Predictor,
     sequence: ImuSequence,
     config: NavigatorConfig,
-    group: str,
     backends: Sequence[BackendName] = get_args(BackendName),
 ) -> pd.DataFrame:
     """Score the network alone and the back ends: `error_m`, its `ratio` to the network's, NIS.
@@ -97,7 +96,7 @@ def fusion_gain(
         if truth is not None:
             of_track |= {"nees": measured["nees_median"], **_yaw_at_the_end(track, truth)}
         figures[TRACK_OF[name]] = of_track
-    return scored(sequence.name, figures, group)
+    return scored(sequence.name, figures)
 
 
 def fitted_error(figures: Metrics) -> float:
@@ -162,7 +161,6 @@ def track_with_fixes(
     model: Predictor,
     sequence: ImuSequence,
     config: NavigatorConfig,
-    group: str,
     every: float = 5.0,
     sigma: float = 0.3,
     backend: BackendName = "ekf",
@@ -196,7 +194,7 @@ def track_with_fixes(
         "yaw_nees": float((yaw**2 / P[:, 2, 2]).mean()),
         "yaw_covered": float((np.abs(yaw) < SIGMA_BOUND * np.sqrt(P[:, 2, 2])).mean()),
     }
-    return scored(sequence.name, {TRACK_OF[backend]: figures}, group)
+    return scored(sequence.name, {TRACK_OF[backend]: figures})
 
 
 def true_fixes(truth: Trajectory, every: float, sigma: float, seed: int) -> list[Fix]:
@@ -224,9 +222,7 @@ def fixes_table(scores: pd.DataFrame) -> str:
     return table(parts(scores), columns, notes=[note])
 
 
-def end_shifts(
-    model: Predictor, sequence: ImuSequence, config: NavigatorConfig, group: str
-) -> pd.DataFrame:
+def end_shifts(model: Predictor, sequence: ImuSequence, config: NavigatorConfig) -> pd.DataFrame:
     """Score a track without a few samples, in several ways: the shift of its end.
 
     `metres` is the horizontal distance between the ends over the length of the track, `degrees`
@@ -252,7 +248,7 @@ def end_shifts(
         degrees = abs(math.degrees(yaw_twist(turn)))
         within = float(shift <= MAX_SHIFT and degrees <= MAX_TURN)
         figures[name] = {"metres": shift, "degrees": degrees, "within": within}
-    return scored(sequence.name, figures, group)
+    return scored(sequence.name, figures)
 
 
 def end_shift_table(scores: pd.DataFrame) -> str:

@@ -17,7 +17,6 @@ from stario.fusion.navigator import Navigator
 from stario.fusion.state import Track
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
-from stario.sequences.simulation.house import simulate_house
 
 FLOOR_METRES = 3.0
 """Distance of floors [m] for which waypoints count."""
@@ -31,9 +30,7 @@ _NOTE = (
 )
 
 
-def score_heights(
-    model: Predictor, sequence: ImuSequence, config: NavigatorConfig, group: str
-) -> pd.DataFrame:
+def score_heights(model: Predictor, sequence: ImuSequence, config: NavigatorConfig) -> pd.DataFrame:
     """Score a recording's tracks: with the barometer, filtered, and without.
 
     Figures of each: `height_rms` and `height_max` [m], share `within` 0.8 m, median
@@ -58,7 +55,7 @@ def score_heights(
             figures[name]["horizontal"] = position_error(each, positions)[0]
         if positions.floor is not None:
             figures["pressure"]["floors"] = _right_floors(track, positions)
-    return scored(sequence.name, figures, group)
+    return scored(sequence.name, figures)
 
 
 def _known_heights(sequence: ImuSequence) -> tuple[FloatArray, FloatArray]:
@@ -109,12 +106,6 @@ _COLUMNS = (
     Column("horizontal m", "horizontal"),
     Column("floors right", "floors", ".0%", np.mean),
 )
-
-
-def score_house(model: Predictor, seed: int, *, config: NavigatorConfig) -> pd.DataFrame:
-    """Score a simulated walk through a house with stairs and a lift."""
-    walk = simulate_house(seed, name=f"house-{seed}")
-    return score_heights(model, walk.sequence, config, "simulated")
 
 
 def heights_table(scores: pd.DataFrame) -> str:

@@ -16,9 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position, known_truth
-from stario.fusion.evaluation.checks.simulation import simulated_walk
 from stario.fusion.evaluation.compare import TRACK_OF
+from stario.fusion.evaluation.displacement_error import fit_yaw_and_position, known_truth
 from stario.fusion.evaluation.scores import Column, geometric_mean, joined, parts, scored, table
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.direction import Complex
@@ -51,7 +50,7 @@ _FIRST_SECONDS = 1.05
 _MIN_KNOWN = 3
 """Minimum number of known positions in a part of the track for its error to count."""
 
-_CARRIES = ("handheld", "pocket", "swinging", "bag")
+CARRIES = ("handheld", "pocket", "swinging", "bag")
 """How the device is carried in the simulated walks, one each."""
 
 
@@ -67,11 +66,6 @@ _COLUMNS = (
     Column("turn [deg]", "turn", ".1f", np.max),
     Column("both small", "small", ".0%", np.mean),
 )
-
-
-def simulated_walks() -> list[ImuSequence]:
-    """Simulate a walk of each carrying mode, with a phone's sensors in a building."""
-    return [simulated_walk(carry, seed) for seed, carry in enumerate(_CARRIES)]
 
 
 def moment_costs(

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from displacement_stub import Stub, horizontal_path, with_waypoints
 
-from stario.fusion.evaluation.benchmark.groups import (
+from stario.fusion.evaluation.figures import groups_figure, write_benchmark
+from stario.fusion.evaluation.groups import (
     POOLED,
     RATIOS,
     Benchmark,
@@ -20,7 +21,6 @@ from stario.fusion.evaluation.benchmark.groups import (
     labels,
     verdict,
 )
-from stario.fusion.evaluation.figures import groups_figure, write_benchmark
 from stario.fusion.evaluation.scores import values
 from stario.sequences.sequence import ImuSequence
 

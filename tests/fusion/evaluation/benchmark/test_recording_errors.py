@@ -8,7 +8,7 @@ import pytest
 from displacement_stub import Stub, errors_of, horizontal_path, streams_of, with_waypoints
 from recorded import DATA
 
-from stario.fusion.evaluation.benchmark.displacement_error import (
+from stario.fusion.evaluation.displacement_error import (
     _AtTicks,
     _interpolated,
     _stretches,

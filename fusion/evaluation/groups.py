@@ -9,26 +9,21 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 import pandas as pd
 
-from stario.fusion.evaluation.benchmark.displacement_error import (
+from stario.fusion.evaluation import bootstrap
+from stario.fusion.evaluation.bootstrap import Interval, block_rows, paired_ratio
+from stario.fusion.evaluation.displacement_error import (
     FIGURES,
     HORIZONS,
     known_truth,
     recording_errors,
-)
-from stario.fusion.evaluation.benchmark.pieces import usable_streams
-from stario.fusion.evaluation.bootstrap import (
-    CONFIDENCE,
-    REPLICATES,
-    Interval,
-    block_rows,
-    paired_ratio,
+    usable_streams,
 )
 from stario.fusion.evaluation.pedestrian import Model, PedestrianDeadReckoning, piece_of
 from stario.fusion.evaluation.scores import joined, parts, records, scored, values, wide
@@ -55,38 +50,62 @@ _NOT_COMPARED = (
     "known positions nor three waypoints within an unbroken stretch of samples"
 )
 
-
 RATIOS = {f"ratio_{horizon}s": f"rms_{horizon}s_m" for horizon in HORIZONS}
 """Ratios of errors, and the figure that each is of."""
 
 _DECISIVE = "ratio_10s"
-_MAX_GROUP_RATIO = 1.1
+_MAX_GROUP_RATIO, _MIN_GROUPS = 1.1, 3
+"""Largest acceptable ratio of a group, and minimum number of groups for a verdict: intervals from
+fewer do not generalise to others."""
 
 WORDS: dict[str, str] = {
     **FIGURES,
     "medians": "over the recordings of a group",
     "ratio": "root mean square errors, ours over theirs: geometric mean over groups (for all sets, "
-    f"over sets); [{CONFIDENCE:.0%} interval] of {REPLICATES} bootstrap replicates that draw "
-    "groups, recordings and blocks of 30 s; for waypoints, their residuals replace the 10 s errors",
+    f"over sets); [{bootstrap.CONFIDENCE:.0%} interval] of {bootstrap.REPLICATES} bootstrap "
+    "replicates that draw groups, recordings and blocks of 30 s; for waypoints, their residuals "
+    "replace the 10 s errors",
 }
 """Meaning of each figure."""
+
+_TITLES = {
+    "ate_fit_m": ("fit [m]", ".2f"),
+    "ate_fit_percent": ("fit [%]", ".2f"),
+    "ate_first_m": ("first [m]", ".2f"),
+    "stretch_percent": ("20 s [%]", ".2f"),
+    "length_ratio": ("length", ".3f"),
+    "rms_1s_m": ("1 s [m]", ".3f"),
+    "rms_10s_m": ("10 s [m]", ".2f"),
+    "rms_30s_m": ("30 s [m]", ".2f"),
+    "direction_deg": ("direction [deg]", ".0f"),
+    "nis": ("NIS", ".2f"),
+    "nis_filtered": ("filtered NIS", ".2f"),
+}
+"""Titles and formats of the figures of a benchmark."""
 
 
 @dataclass(frozen=True, eq=False)
 class Benchmark:
-    """Scores of networks, whose weights are the tracks.
+    """Networks compared by groups of recordings.
 
     Attributes:
         scores: `path_m` and `FIGURES` of each recording, named by its path, with its set, person,
-            device, place and carry, and the kind of its `truth`.
+            device, place and carry, and the kind of its `truth`; the weights are the tracks.
         blocks: blocks of squared errors of each recording and horizon.
+        by: label that recordings are grouped by.
+        ours: the weights.
+        theirs: those that they are compared with, if any.
     """
 
     scores: pd.DataFrame
     blocks: pd.DataFrame
+    by: By
+    ours: str
+    theirs: str | None
 
-    def rows(self, by: By, ours: str, theirs: str | None) -> pd.DataFrame:
-        """Return rows "theirs", if any, and "ours" (`role`) of each `group`; then over all groups.
+    @cached_property
+    def rows(self) -> pd.DataFrame:
+        """Rows "theirs", if any, and "ours" (`role`) of each `group`; then over all groups.
 
         The other columns are the `weights`; the medians of `FIGURES` over recordings; the number of
         `recordings` compared, without those with fewer than three waypoints; the length `path_km`
@@ -94,38 +113,89 @@ class Benchmark:
         in those of ours the `RATIOS` of errors to theirs, as `Interval`s where there are any. For
         waypoints, the residuals replace the 10 s errors.
         """
-        found = parts(wide(self.scores), by, POOLED)
+        found = parts(wide(self.scores), self.by, POOLED)
         return pd.DataFrame(
             row
             for k, (name, part) in enumerate(found)
-            for row in self._rows(name, part, 0 < k == len(found) - 1, ours, theirs)
+            for row in self._rows(name, part, 0 < k == len(found) - 1)
         )
 
-    def _rows(
-        self, name: str, part: pd.DataFrame, pooled: bool, ours: str, theirs: str | None
-    ) -> list[dict[str, Any]]:
+    def _rows(self, name: str, part: pd.DataFrame, pooled: bool) -> list[dict[str, Any]]:
         medians = part.groupby("track")[[*FIGURES]].median().to_dict("index")
         blocks = self.blocks[self.blocks["recording"].isin(part["recording"])]
         ratios = {
-            key: theirs and paired_ratio(blocks[blocks["metric"] == metric], ours, theirs)
+            key: self.theirs
+            and paired_ratio(blocks[blocks["metric"] == metric], self.ours, self.theirs)
             for key, metric in RATIOS.items()
         }
-        paths = part.loc[part["track"] == ours, "path_m"]
+        paths = part.loc[part["track"] == self.ours, "path_m"]
         known = {"recordings": int((paths > 0.0).sum()), "path_km": paths.sum() / 1e3}
         return [
             {"group": name, "pooled": pooled, "role": role, "weights": weights}
             | known
             | medians[weights]
             | (ratios if role == "ours" else dict.fromkeys(RATIOS))
-            for role, weights in (("theirs", theirs), ("ours", ours))
+            for role, weights in (("theirs", self.theirs), ("ours", self.ours))
             if weights
         ]
+
+    @property
+    def verdict(self) -> str:
+        """Verdict on replacing the weights compared with; empty without several groups.
+
+        Weights are accepted if the pooled interval is below 1 and no group is worse by over a
+        tenth.
+        """
+        compared = [r for r in self.rows.to_dict("records") if isinstance(r[_DECISIVE], Interval)]
+        ratios = {str(r["group"]): r[_DECISIVE] for r in compared if not r["pooled"]}
+        pooled = next((r[_DECISIVE] for r in compared if r["pooled"]), None)
+        if pooled is None:
+            return ""
+        if len(ratios) < _MIN_GROUPS:
+            return f"not decided, {len(ratios)} groups are too few: pooled {pooled:.3f} over 10 s"
+        worst = max(ratios, key=lambda name: ratios[name].ratio)
+        accepted = pooled.high < 1.0 and ratios[worst].ratio <= _MAX_GROUP_RATIO
+        words = f"pooled {pooled:.3f} over 10 s, worst {worst} {ratios[worst]:.3f}"
+        return f"{'accepted' if accepted else 'not accepted'}: {words}"
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the result as plain values, including the recordings."""
+        return {
+            "ours": self.ours,
+            "theirs": self.theirs,
+            "verdict": self.verdict,
+            "groups": self.rows.to_dict("records"),
+            "recordings": records(self.scores.rename(columns={"track": "weights"})),
+            "words": WORDS,
+        }
+
+    def text(self) -> str:
+        """Return for every group rows "theirs" and "ours", the ratios, the verdict, the words."""
+        rows = self.rows.to_dict("records")
+        cells = [["", "", "n", "km", *(title for title, _ in _TITLES.values())]]
+        for row in rows:
+            known = [row["group"], row["role"], str(row["recordings"]), f"{row['path_km']:.2f}"]
+            cells.append([*known, *(figure(row[key], form) for key, (_, form) in _TITLES.items())])
+        head, *body = aligned(cells)
+        lines = [head]
+        for line, row in zip(body, rows, strict=True):
+            lines.append(line)
+            for key, metric in RATIOS.items():
+                if isinstance(row[key], Interval):
+                    title = _TITLES[metric][0].split(" [")[0]
+                    lines.append(f"{row['group']}: ratio over {title}: {row[key]:.3f}")
+        lines += [self.verdict] if self.verdict else []
+        lines += [f"ours: {self.ours}", *([f"theirs: {self.theirs}"] if self.theirs else [])]
+        return "\n".join([*lines, *(f"{key}: {words}." for key, words in WORDS.items())])
 
 
 def benchmark(
     recordings: Mapping[Path, str],
-    models: Mapping[str, Callable[[str], Model]],
+    model: Callable[[str, str], Model],
     read: Callable[[Path], ImuSequence],
+    ours: str,
+    theirs: str | None = None,
+    by: By = "set",
     jobs: int | None = 1,
     filtered: bool = False,
     progress: Progress = silent,
@@ -134,9 +204,12 @@ def benchmark(
 
     Args:
         recordings: group of each recording, by path; empty for the name of the set.
-        models: by name of the weights, a function that returns the network for a group: networks
+        model: function that returns the network by the name of its weights for a group: networks
             differ between groups if each group was held out of training in turn.
-        read: function that reads a path; like the models picklable.
+        read: function that reads a path; like `model` picklable.
+        ours: name of the weights.
+        theirs: name of those that they are compared with.
+        by: label that recordings are grouped by.
         jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
         filtered: whether the filter is run for its mean NIS, which is slow.
         progress: called with the share of the work done.
@@ -144,6 +217,7 @@ def benchmark(
     skipped: list[Skipped] = []
     scores: list[pd.DataFrame] = []
     blocks = [block_rows([], **dict.fromkeys(("set", "group", "recording", "network", "metric")))]
+    models = {name: partial(model, name) for name in (ours, theirs) if name is not None}
     work = partial(_scores, groups=recordings, models=models, read=read, filtered=filtered)
     for done, outcome in enumerate(each(work, recordings, jobs), 1):
         progress(done / len(recordings))
@@ -153,7 +227,9 @@ def benchmark(
             scores.append(outcome[0])
             blocks += outcome[1]
     _warn_of_not_compared(scores)
-    return Benchmark(joined(scores), joined(blocks)) if scores else None, skipped
+    if not scores:
+        return None, skipped
+    return Benchmark(joined(scores), joined(blocks), by, ours, theirs), skipped
 
 
 def _scores(
@@ -211,76 +287,3 @@ def labels(path: Path, attributes: Mapping[str, object], group: str = "") -> dic
     known = {key: str(attributes.get(key) or _UNKNOWN) for key in get_args(By)[2:]}
     of_person = set_name if known["person"] == _UNKNOWN else f"{set_name} {known['person']}"
     return {"set": set_name, "group": group or of_person, **known}
-
-
-_MIN_GROUPS = 3
-"""Minimum number of groups for a verdict: intervals from fewer do not generalise to others."""
-
-
-def verdict(rows: pd.DataFrame) -> str:
-    """Return the verdict on replacing the weights compared with; empty without several groups.
-
-    Weights are accepted if the pooled interval is below 1 and no group is worse by over a tenth.
-    """
-    compared = [r for r in rows.to_dict("records") if isinstance(r[_DECISIVE], Interval)]
-    ratios = {str(r["group"]): r[_DECISIVE] for r in compared if not r["pooled"]}
-    pooled = next((r[_DECISIVE] for r in compared if r["pooled"]), None)
-    if pooled is None:
-        return ""
-    worst = max(ratios, key=lambda name: ratios[name].ratio)
-    accepted = pooled.high < 1.0 and ratios[worst].ratio <= _MAX_GROUP_RATIO
-    if len(ratios) < _MIN_GROUPS:
-        return f"not decided, {len(ratios)} groups are too few: pooled {pooled:.3f} over 10 s"
-    words = f"pooled {pooled:.3f} over 10 s, worst {worst} {ratios[worst]:.3f}"
-    return f"{'accepted' if accepted else 'not accepted'}: {words}"
-
-
-def benchmark_dict(
-    found: Benchmark, rows: pd.DataFrame, ours: str, theirs: str | None
-) -> dict[str, object]:
-    """Return the result as plain values, including the recordings."""
-    return {
-        "ours": ours,
-        "theirs": theirs,
-        "verdict": verdict(rows),
-        "groups": rows.to_dict("records"),
-        "recordings": records(found.scores.rename(columns={"track": "weights"})),
-        "words": WORDS,
-    }
-
-
-_TITLES = {
-    "ate_fit_m": ("fit [m]", ".2f"),
-    "ate_fit_percent": ("fit [%]", ".2f"),
-    "ate_first_m": ("first [m]", ".2f"),
-    "stretch_percent": ("20 s [%]", ".2f"),
-    "length_ratio": ("length", ".3f"),
-    "rms_1s_m": ("1 s [m]", ".3f"),
-    "rms_10s_m": ("10 s [m]", ".2f"),
-    "rms_30s_m": ("30 s [m]", ".2f"),
-    "direction_deg": ("direction [deg]", ".0f"),
-    "nis": ("NIS", ".2f"),
-    "nis_filtered": ("filtered NIS", ".2f"),
-}
-"""Titles and formats of the figures of a benchmark."""
-
-
-def benchmark_text(rows: pd.DataFrame, ours: str, theirs: str | None) -> str:
-    """Return for every group rows "theirs" and "ours", then the ratios, the verdict, the words."""
-    cells = [["", "", "n", "km", *(title for title, _ in _TITLES.values())]]
-    for row in rows.to_dict("records"):
-        known = [row["group"], row["role"], str(row["recordings"])]
-        found = [figure(row[key], form) for key, (_, form) in _TITLES.items()]
-        cells.append([*known, f"{row['path_km']:.2f}", *found])
-    head, *body = aligned(cells)
-    lines = [head]
-    for line, row in zip(body, rows.to_dict("records"), strict=True):
-        lines.append(line)
-        for key, metric in RATIOS.items():
-            if isinstance(row[key], Interval):
-                title = _TITLES[metric][0].split(" [")[0]
-                lines.append(f"{row['group']}: ratio over {title}: {row[key]:.3f}")
-    if conclusion := verdict(rows):
-        lines.append(conclusion)
-    lines += [f"ours: {ours}", *([f"theirs: {theirs}"] if theirs else [])]
-    return "\n".join([*lines, *(f"{key}: {words}." for key, words in WORDS.items())])
