@@ -28,9 +28,9 @@ _Graph = Annotated[bool, options.flag("--graph", help="Also run the graph (slowe
 
 
 def models(
-    names: Annotated[
-        list[str] | None, typer.Argument(help="Networks. Default: all of the paper's table.")
-    ] = None,
+    names: list[str] | None = typer.Argument(
+        None, help="Networks. Default: all of the paper's table."
+    ),
     as_json: options.Json = False,
 ) -> None:
     """List parameters, FLOPs, time and memory of each network next to the paper's values."""
@@ -49,10 +49,10 @@ def backends(
     reading: options.Reading,
     estimating: options.Estimator,
     paths: options.OptionalPaths = None,
-    walks: Annotated[int, typer.Option(min=1, help="Number of simulated walks.")] = 20,
-    seconds: Annotated[float, typer.Option(min=5.0, help="Duration of each walk in s.")] = 120.0,
+    walks: int = typer.Option(20, min=1, help="Number of simulated walks."),
+    seconds: float = typer.Option(120.0, min=5.0, help="Duration of each walk in s."),
     data: options.Data = None,
-    split: Annotated[str, typer.Option(help="With --data: split to use.")] = "validation",
+    split: str = typer.Option("validation", help="With --data: split to use."),
     as_json: options.Json = False,
 ) -> None:
     """Compare filter, graph and fixed-lag graph: accuracy, consistency, speed, slowest update.
@@ -85,20 +85,17 @@ def faults(
     context: typer.Context,
     reading: options.Reading,
     estimating: options.Estimator,
-    path: Annotated[
-        Path | None,
-        typer.Argument(help="Recording with true poses. Default: a simulated walk."),
-    ] = None,
-    network: Annotated[
-        bool,
-        options.flag(
-            "--network",
-            help="Use the network's displacements instead of true ones with white noise.",
-        ),
-    ] = False,
-    seed: Annotated[
-        int, typer.Option(min=0, help="Seed of the faults and of the simulated walk, if any.")
-    ] = 0,
+    path: Path | None = typer.Argument(
+        None, help="Recording with true poses. Default: a simulated walk."
+    ),
+    network: bool = options.flag(
+        False,
+        "--network",
+        help="Use the network's displacements instead of true ones with white noise.",
+    ),
+    seed: int = typer.Option(
+        0, min=0, help="Seed of the faults and of the simulated walk, if any."
+    ),
     as_json: options.Json = False,
 ) -> None:
     """Inject faults into a recording one at a time; print the resulting error and the report."""
@@ -124,10 +121,10 @@ def faults(
 
 def consistency(
     config: options.Config = None,
-    yaw: Annotated[float, typer.Option(min=0.0, help="Sigma of the initial yaw in deg.")] = 10.0,
-    runs: Annotated[int, typer.Option(min=1, help="Number of simulated walks.")] = 20,
-    seconds: Annotated[float, typer.Option(min=2.0, help="Duration of each walk in s.")] = 300.0,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the first walk.")] = 0,
+    yaw: float = typer.Option(10.0, min=0.0, help="Sigma of the initial yaw in deg."),
+    runs: int = typer.Option(20, min=1, help="Number of simulated walks."),
+    seconds: float = typer.Option(300.0, min=2.0, help="Duration of each walk in s."),
+    seed: int = typer.Option(0, min=0, help="Seed of the first walk."),
     as_json: options.Json = False,
 ) -> None:
     """Run a Monte Carlo test on simulated walks: are NEES, NIS and yaw error consistent?"""
@@ -171,9 +168,9 @@ def fixes(
     paths: options.Paths,
     reading: options.Reading,
     estimating: options.Estimator,
-    every: Annotated[float, typer.Option(min=0.1, help="Interval between fixes in s.")] = 5.0,
-    sigma: Annotated[float, typer.Option(min=0.001, help="Fix sigma per axis \\[m].")] = 0.3,
-    backend: Annotated[str, typer.Option(help="Estimator: ekf or graph.")] = "ekf",
+    every: float = typer.Option(5.0, min=0.1, help="Interval between fixes in s."),
+    sigma: float = typer.Option(0.3, min=0.001, help="Fix sigma per axis \\[m]."),
+    backend: str = typer.Option("ekf", help="Estimator: ekf or graph."),
     by: options.By = "set",
     as_json: options.Json = False,
 ) -> None:
@@ -193,7 +190,7 @@ def heights(
     reading: options.Reading,
     estimating: options.Estimator,
     paths: options.OptionalPaths = None,
-    walks: Annotated[int, typer.Option(min=1, help="Number of simulated walks.")] = 40,
+    walks: int = typer.Option(40, min=1, help="Number of simulated walks."),
     by: options.By = "set",
     as_json: options.Json = False,
 ) -> None:
@@ -238,7 +235,7 @@ def moments(
     estimating: options.Estimator,
     paths: options.OptionalPaths = None,
     graph: _Graph = False,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the moments.")] = 0,
+    seed: int = typer.Option(0, min=0, help="Seed of the moments."),
     as_json: options.Json = False,
 ) -> None:
     """Insert bad moments (shake, drop, table, standing, lift); report what the rest of tracks pays.
@@ -263,8 +260,8 @@ def simulation(
     reading: options.Reading,
     estimating: options.Estimator,
     paths: options.OptionalPaths = None,
-    walks: Annotated[int, typer.Option(min=1, help="Simulated walks of each way.")] = 10,
-    seconds: Annotated[float, typer.Option(min=10.0, help="Duration of each walk in s.")] = 120.0,
+    walks: int = typer.Option(10, min=1, help="Simulated walks of each way."),
+    seconds: float = typer.Option(120.0, min=10.0, help="Duration of each walk in s."),
     as_json: options.Json = False,
 ) -> None:
     """Compare simulated walks with recordings by way of carrying: motion by band, steps, errors.

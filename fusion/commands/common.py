@@ -32,27 +32,31 @@ _NAMED = 3
 """Number of skipped recordings with the same reason that are listed one by one."""
 
 
+def _named_apart(reading: options.Reading) -> Callable[[Path], ImuSequence]:
+    """Return a function that reads recordings, each under a name of its own."""
+    from stario.fusion.evaluation.compare import distinct_name
+
+    names: set[str] = set()
+
+    def read(file: Path) -> ImuSequence:
+        sequence = reading.read(file)
+        return replace(sequence, name=distinct_name(sequence.name, names))
+
+    return read
+
+
 def map_recordings(
     title: str,
     reading: options.Reading,
     paths: Sequence[Path],
     work: Callable[[Path, ImuSequence], Result],
 ) -> tuple[list[Result], list[Skipped]]:
-    """Apply `work` to each path and its recording, under a name of its own.
-
-    Return results and failures.
-    """
-    from stario.fusion.evaluation.compare import distinct_name
+    """Apply `work` to each path and its recording; return results and failures."""
     from stario.sequences.datasets.batch import each, without_skipped
 
     files, skipped = reading.recordings(paths)
-    names: set[str] = set()
-
-    def of_named(file: Path) -> Result:
-        sequence = reading.read(file)
-        return work(file, replace(sequence, name=distinct_name(sequence.name, names)))
-
-    outcomes = each(of_named, files, jobs=1)
+    read = _named_apart(reading)
+    outcomes = each(lambda file: work(file, read(file)), files, jobs=1)
     return list(without_skipped(with_bar(title, outcomes, len(files)), skipped)), skipped
 
 
@@ -69,7 +73,6 @@ def process_each(
     The folder is `out` for a single recording, else within it; None for `runs`/NAME. An option that
     allows only one recording is named by `single`.
     """
-    from stario.fusion.evaluation.compare import distinct_name
     from stario.fusion.evaluation.folders import check_folder
     from stario.sequences.datasets.batch import each, without_skipped
 
@@ -78,12 +81,11 @@ def process_each(
         raise InputError(single, f"{len(files)} recordings", "one recording")
     if out is not None:
         check_folder(out)
-    names: set[str] = set()
+    read = _named_apart(reading)
 
     def recorded(file: Path) -> dict[str, object]:
-        sequence = reading.read(file)
-        name = distinct_name(sequence.name, names)
-        folder = out if out and len(files) == 1 else (out or Path("runs")) / name
+        sequence = read(file)
+        folder = out if out and len(files) == 1 else (out or Path("runs")) / sequence.name
         record, text = work(sequence, folder)
         if not as_json:
             typer.echo(text)

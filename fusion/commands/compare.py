@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -32,13 +32,11 @@ def compare(
     fixes: options.Fixes = None,
     jobs: options.Jobs = 1,
     out: options.CompareOut = None,
-    tracks: Annotated[
-        str,
-        typer.Option(
-            help="Further tracks, also as a table: filtered, network, network_true_attitude, pdr "
-            "(from steps), separated by commas, or all."
-        ),
-    ] = "",
+    tracks: str = typer.Option(
+        "",
+        help="Further tracks, also as a table: filtered, network, network_true_attitude, pdr "
+        "(from steps), separated by commas, or all.",
+    ),
     report: options.Report = False,
     as_json: options.Json = False,
     explained: options.Explain = False,

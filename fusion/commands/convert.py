@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -18,19 +18,16 @@ if TYPE_CHECKING:
 
 @options.expanded
 def convert(
-    paths: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="IN... OUT",
-            help="Recordings, folders or list files, then the file or new folder to write. "
-            "An archive (.h5) takes any number of recordings, the other layouts one.",
-        ),
-    ],
     reading: options.Reading,
-    to: Annotated[
-        str | None,
-        typer.Option(help="csv, euroc or archive. Default: by OUT's suffix: .csv, none or .h5."),
-    ] = None,
+    paths: list[Path] = typer.Argument(
+        ...,
+        metavar="IN... OUT",
+        help="Recordings, folders or list files, then the file or new folder to write. "
+        "An archive (.h5) takes any number of recordings, the other layouts one.",
+    ),
+    to: str | None = typer.Option(
+        None, help="csv, euroc or archive. Default: by OUT's suffix: .csv, none or .h5."
+    ),
     overwrite: options.Overwrite = False,
 ) -> None:
     """Convert recordings to a CSV, the EuRoC layout or an archive; warn about what they lose."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple, get_args
+from typing import TYPE_CHECKING, NamedTuple, get_args
 
 import typer
 
@@ -38,42 +38,34 @@ def evaluate(
     estimating: options.Estimator,
     paths: options.OptionalPaths = None,
     data: options.Data = None,
-    split: Annotated[
-        str,
-        typer.Option(
-            help="With --data: test, validation, training, holdout, all, open, or a list file "
-            "with lines of name, group."
-        ),
-    ] = "test",
-    by: Annotated[
-        str | None,
-        typer.Option(
-            help="Evaluate the network alone by set, group, person, device, place or carry. "
-            "Ground truth may be poses, positions or waypoints.",
-        ),
-    ] = None,
-    against: Annotated[
-        str | None,
-        typer.Option(
-            help="With --by: weights to compare with, or pdr (pedestrian dead reckoning without a "
-            "network), by paired error ratios with 95 % intervals. {group} or {set} in a weights "
-            "name stands for each recording's group, or its first word: leave-one-out."
-        ),
-    ] = None,
-    filtered: Annotated[
-        bool, options.flag("--filtered", help="With --by: also report the filter's mean NIS; slow.")
-    ] = False,
-    models: Annotated[
-        str | None,
-        typer.Option(
-            help="Networks to compare, separated by commas: names from `stario check models`, "
-            "default, or weights files; several weights of one network are averaged.",
-        ),
-    ] = None,
+    split: str = typer.Option(
+        "test",
+        help="With --data: test, validation, training, holdout, all, open, or a list file "
+        "with lines of name, group.",
+    ),
+    by: str | None = typer.Option(
+        None,
+        help="Evaluate the network alone by set, group, person, device, place or carry. "
+        "Ground truth may be poses, positions or waypoints.",
+    ),
+    against: str | None = typer.Option(
+        None,
+        help="With --by: weights to compare with, or pdr (pedestrian dead reckoning without a "
+        "network), by paired error ratios with 95 % intervals. {group} or {set} in a weights "
+        "name stands for each recording's group, or its first word: leave-one-out.",
+    ),
+    filtered: bool = options.flag(
+        False, "--filtered", help="With --by: also report the filter's mean NIS; slow."
+    ),
+    models: str | None = typer.Option(
+        None,
+        help="Networks to compare, separated by commas: names from `stario check models`, "
+        "default, or weights files; several weights of one network are averaged.",
+    ),
     runs: options.Runs = Path("runs"),
-    convention: Annotated[
-        str, typer.Option(help="How --models averages position errors: rms, ronin or mean.")
-    ] = "rms",
+    convention: str = typer.Option(
+        "rms", help="How --models averages position errors: rms, ronin or mean."
+    ),
     jobs: options.Jobs = 1,
     out: options.EvaluateOut = None,
     as_json: options.Json = False,

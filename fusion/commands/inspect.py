@@ -6,7 +6,7 @@ from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -22,12 +22,10 @@ if TYPE_CHECKING:
 def inspect(
     paths: options.Paths,
     reading: options.Reading,
-    model: Annotated[
-        str, typer.Option(help="Weights that the recording is tried with.")
-    ] = "default",
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for figure and findings. Default: runs/NAME.")
-    ] = None,
+    model: str = typer.Option("default", help="Weights that the recording is tried with."),
+    out: Path | None = typer.Option(
+        None, help="Folder for figure and findings. Default: runs/NAME."
+    ),
     as_json: options.Json = False,
 ) -> None:
     """Inspect recordings: timing, noise, units, signs, magnetometer, truth, track."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
@@ -14,16 +13,16 @@ from stario.fusion.commands import options
 def live(
     estimating: options.Estimator,
     placing: options.Map,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of page and pushes.")] = 8000,
-    host: Annotated[
-        str, typer.Option(help="Address to listen on; 0.0.0.0 admits phones, with a token.")
-    ] = "127.0.0.1",
-    phyphox: Annotated[
-        list[str] | None, typer.Option(help="Address of a phone running phyphox; repeatable.")
-    ] = None,
+    port: int = typer.Option(8000, min=0, max=65535, help="Port of page and pushes."),
+    host: str = typer.Option(
+        "127.0.0.1", help="Address to listen on; 0.0.0.0 admits phones, with a token."
+    ),
+    phyphox: list[str] | None = typer.Option(
+        None, help="Address of a phone running phyphox; repeatable."
+    ),
     tiles: options.Tiles = "",
-    demo: Annotated[bool, options.flag("--demo", help="Let a simulated phone walk.")] = False,
-    out: Annotated[Path, typer.Option(help="Folder for the recordings.")] = Path("runs/live"),
+    demo: bool = options.flag(False, "--demo", help="Let a simulated phone walk."),
+    out: Path = typer.Option(Path("runs/live"), help="Folder for the recordings."),
 ) -> None:
     """Show live tracks on a web page, from Sensor Logger, phyphox or any device that posts JSON."""
     from stario.sequences.errors import InputError

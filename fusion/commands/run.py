@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
@@ -26,15 +26,14 @@ def run(
     placing: options.Place,
     fixes: options.Fixes = None,
     out: options.RunOut = None,
-    filtered: Annotated[
-        bool,
-        options.flag("--filtered", help="Also write the filter's track, as a stream gives it."),
-    ] = False,
+    filtered: bool = options.flag(
+        False, "--filtered", help="Also write the filter's track, as a stream gives it."
+    ),
     report: options.Report = False,
     tiles: options.Tiles = "",
-    view: Annotated[
-        bool, options.flag("--view", help="Open the rerun 3-D viewer; its file is kept in --out.")
-    ] = False,
+    view: bool = options.flag(
+        False, "--view", help="Open the rerun 3-D viewer; its file is kept in --out."
+    ),
     as_json: options.Json = False,
     explained: options.Explain = False,
 ) -> None:

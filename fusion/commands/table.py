@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -17,45 +17,37 @@ if TYPE_CHECKING:
 
 def table(
     context: typer.Context,
-    out: Annotated[
-        Path, typer.Option(help="Folder of the finished runs; a repetition resumes there.")
-    ],
-    data: Annotated[Path | None, typer.Option(help="Folder of the development recordings.")] = None,
-    sets: Annotated[
-        str | None,
-        typer.Option(help="Sets of --data to use. Default: oxiod,ridi,all,tyrex,kipd,ilc."),
-    ] = None,
-    published: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", help="Published data set, NAME=FOLDER, such as ronin=/data/RoNIN; repeatable."
-        ),
-    ] = None,
-    networks: Annotated[
-        str | None,
-        typer.Option(help="Networks of `stario check models`, comma-separated. Default: all."),
-    ] = None,
-    steps: Annotated[
-        int | None, typer.Option(min=1, help="Training steps per network; overrides the recipe.")
-    ] = None,
-    seeds: Annotated[
-        int,
-        typer.Option(min=1, help="Seeds for StarIO with and without MSGCU, R-ResNet and DeepILS."),
-    ] = 3,
-    split_seed: Annotated[int, typer.Option(min=0, help="Seed of the recording split.")] = 0,
-    per_group: Annotated[
-        int, typer.Option(min=1, help="Maximum test recordings per group in the set all.")
-    ] = 2,
-    config: Annotated[
-        Path | None, typer.Option(help="TOML or JSON file with the recipe. Default: the package's.")
-    ] = None,
+    out: Path = typer.Option(..., help="Folder of the finished runs; a repetition resumes there."),
+    data: Path | None = typer.Option(None, help="Folder of the development recordings."),
+    sets: str | None = typer.Option(
+        None, help="Sets of --data to use. Default: oxiod,ridi,all,tyrex,kipd,ilc."
+    ),
+    published: list[str] | None = typer.Option(
+        None,
+        "--set",
+        help="Published data set, NAME=FOLDER, such as ronin=/data/RoNIN; repeatable.",
+    ),
+    networks: str | None = typer.Option(
+        None, help="Networks of `stario check models`, comma-separated. Default: all."
+    ),
+    steps: int | None = typer.Option(
+        None, min=1, help="Training steps per network; overrides the recipe."
+    ),
+    seeds: int = typer.Option(
+        3, min=1, help="Seeds for StarIO with and without MSGCU, R-ResNet and DeepILS."
+    ),
+    split_seed: int = typer.Option(0, min=0, help="Seed of the recording split."),
+    per_group: int = typer.Option(
+        2, min=1, help="Maximum test recordings per group in the set all."
+    ),
+    config: Path | None = typer.Option(
+        None, help="TOML or JSON file with the recipe. Default: the package's."
+    ),
     cache: options.Cache = None,
-    jobs: Annotated[
-        int | None, typer.Option(help="Runs to run in parallel; -1 for as many as possible.")
-    ] = None,
-    backend: Annotated[
-        str, typer.Option(help="Where runs run: loky (this machine), dask or ray.")
-    ] = "loky",
+    jobs: int | None = typer.Option(
+        None, help="Runs to run in parallel; -1 for as many as possible."
+    ),
+    backend: str = typer.Option("loky", help="Where runs run: loky (this machine), dask or ray."),
 ) -> None:
     """Train and test every network on every data set; a rerun adds only missing runs.
 

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
 from stario.fusion.commands import common, options
-from stario.fusion.commands.training_data import (
-    packaged_lists,
-    recorded_streams,
-    streams_of_files,
-    training_material,
-    validation_material,
-)
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.network.card import Calibration
     from stario.network.model import DisplacementModel
     from stario.network.training.config import TrainingConfig
-    from stario.network.training.data import TrainingData
+    from stario.network.training.data import RecordingStreams, TrainingData
     from stario.network.training.history import EpochReport
+    from stario.sequences.datasets.batch import Skipped
+    from stario.sequences.windows import Attitude
+
+    Streams = tuple[list[RecordingStreams], list[Skipped]]
 
 
 _GENERATED = 150
@@ -40,86 +38,60 @@ def train(
     context: typer.Context,
     reading: options.Reading,
     paths: options.OptionalPaths = None,
-    model: Annotated[
-        str | None,
-        typer.Option(
-            help="Network to train, from `stario check models`. Default: that of --start-from."
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of the run, resumed if it holds a checkpoint. Default: runs/NETWORK."
-        ),
-    ] = None,
-    validation: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Recordings to select and calibrate on. Default: the last fifth of each."
-        ),
-    ] = None,
-    data: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of the development recordings: train on all that the package lists except "
-            "the test recordings; select and calibrate on those of its list `holdout`."
-        ),
-    ] = None,
-    learn_from: Annotated[
-        str,
-        typer.Option(
-            help="With --data: all, open (those whose licence allows any use) or few (the eight "
-            "recordings of the paper's comparison)."
-        ),
-    ] = "all",
-    leave_out: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="With --data: neither learn from this set or group nor select on it: tyrex, or "
-            "'ridi dan'. Repeatable."
-        ),
-    ] = None,
-    generated: Annotated[
-        int | None, typer.Option(min=0, help=f"Simulated walks of 60 s. Default: {_GENERATED}.")
-    ] = None,
-    recorded_only: Annotated[
-        bool, options.flag("--recorded-only", help="Train without simulated walks.")
-    ] = False,
-    body: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Motion capture (HDF5 or BVH) to learn from virtual devices on; a share of the "
-            "recipe may name the file. Repeatable."
-        ),
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option(help="TOML or JSON file with recipe settings.")
-    ] = None,
-    epochs: Annotated[int | None, typer.Option(min=1, help="Epochs; overrides --config.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed; overrides --config.")] = None,
-    start_from: Annotated[
-        str | None,
-        typer.Option(
-            help="Weights to fine-tune: default, another name, or a safetensors file. Without "
-            "--config they are changed only a little."
-        ),
-    ] = None,
-    last_stage: Annotated[
-        str | None,
-        typer.Option(
-            help="Also train on the validation recordings; sigma takes the calibration of these "
-            "weights, which were trained without them.",
-        ),
-    ] = None,
+    model: str | None = typer.Option(
+        None, help="Network to train, from `stario check models`. Default: that of --start-from."
+    ),
+    out: Path | None = typer.Option(
+        None, help="Folder of the run, resumed if it holds a checkpoint. Default: runs/NETWORK."
+    ),
+    validation: list[Path] | None = typer.Option(
+        None, help="Recordings to select and calibrate on. Default: the last fifth of each."
+    ),
+    data: Path | None = typer.Option(
+        None,
+        help="Folder of the development recordings: train on all that the package lists except "
+        "the test recordings; select and calibrate on those of its list `holdout`.",
+    ),
+    learn_from: str = typer.Option(
+        "all",
+        help="With --data: all, open (those whose licence allows any use) or few (the eight "
+        "recordings of the paper's comparison).",
+    ),
+    leave_out: list[str] | None = typer.Option(
+        None,
+        help="With --data: neither learn from this set or group nor select on it: tyrex, or "
+        "'ridi dan'. Repeatable.",
+    ),
+    generated: int | None = typer.Option(
+        None, min=0, help=f"Simulated walks of 60 s. Default: {_GENERATED}."
+    ),
+    recorded_only: bool = options.flag(
+        False, "--recorded-only", help="Train without simulated walks."
+    ),
+    body: list[Path] | None = typer.Option(
+        None,
+        help="Motion capture (HDF5 or BVH) to learn from virtual devices on; a share of the "
+        "recipe may name the file. Repeatable.",
+    ),
+    config: Path | None = typer.Option(None, help="TOML or JSON file with recipe settings."),
+    epochs: int | None = typer.Option(None, min=1, help="Epochs; overrides --config."),
+    seed: int | None = typer.Option(None, min=0, help="Seed; overrides --config."),
+    start_from: str | None = typer.Option(
+        None,
+        help="Weights to fine-tune: default, another name, or a safetensors file. Without "
+        "--config they are changed only a little.",
+    ),
+    last_stage: str | None = typer.Option(
+        None,
+        help="Also train on the validation recordings; sigma takes the calibration of these "
+        "weights, which were trained without them.",
+    ),
     cache: options.Cache = None,
-    jobs: Annotated[
-        int,
-        typer.Option(
-            min=1,
-            help="Processes that read recordings into the cache; to train in several, use "
-            "torchrun.",
-        ),
-    ] = 1,
+    jobs: int = typer.Option(
+        1,
+        min=1,
+        help="Processes that read recordings into the cache; to train in several, use torchrun.",
+    ),
 ) -> None:
     """Train a network on recordings with ground truth and on simulated walks; a rerun resumes.
 
@@ -143,23 +115,23 @@ def train(
     recipe = _recipe(config, first, architecture=model, epochs=epochs, seed=seed)
     _check_sources(context, paths, validation, data, generated)
     folder = cache or cache_folder()
-    streams_of = partial(streams_of_files, reading, recipe.attitude, folder, jobs)
     lists = packaged_lists(data, leave_out or [], learn_from)
     if data is not None and (judged := last_stage or start_from):
         warn_of_learned([judged], lists[1], data)
-    recorded, held_out, skipped = recorded_streams(
+    streams_of = partial(_streams_of, reading, recipe.attitude, folder, jobs)
+    recorded, held_out, skipped = _recorded(
         reading, paths or [], validation or [], lists, streams_of
     )
     out = out or Path("runs") / recipe.architecture
     make_folder(out)
     virtual = virtual_recordings(body or [], recipe.seed, folder)
     learned = recorded + virtual + (held_out if last_stage is not None else [])
-    held = validation_material(held_out, required=bool(recorded))
+    held = _validation(held_out, required=bool(recorded))
     if walks and is_leader():
         typer.echo(
             f"simulating {walks} walks of a minute, or reading them from the cache", err=True
         )
-    material = training_material(learned, walks, recipe, folder)
+    material = _material(learned, walks, recipe, folder)
     calibrated_by = last_stage or (
         start_from if seconds_of(held.streams) < _CALIBRATING_S else None
     )
@@ -192,6 +164,113 @@ def _check_sources(
         options.refuse(context, "without recordings", "use with PATH", *options.READING)
     if not paths and generated is None:
         raise InputError("PATH", "none", "recordings, --data, or --generated for walks only")
+
+
+def packaged_lists(
+    data: Path | None, left_out: list[str], name: str
+) -> tuple[list[Path], list[Path]]:
+    """Return the training and held-out recordings from the lists in the package.
+
+    Args:
+        data: folder of the development recordings; None for no recordings at all.
+        left_out: sets or groups that are neither learned from nor selected on.
+        name: all, open or few.
+
+    Raises:
+        InputError: a list or group does not exist.
+    """
+    from stario.network.training.splits import read_packaged_list, without_holdout
+    from stario.sequences.arrays import check_choice
+    from stario.sequences.datasets.splits import hold_out_group
+
+    if data is None:
+        return [], []
+    check_choice("--learn-from", name, ("all", "open", "few"))
+    everything = (
+        read_packaged_list("training", data) + read_packaged_list("validation", data)
+        if name == "few"
+        else read_packaged_list(name, data)
+    )
+    for group in left_out:
+        everything, _ = hold_out_group(everything, group)
+    outside, inside = without_holdout(everything, data)
+    return [entry.path for entry in outside], [entry.path for entry in inside]
+
+
+def _recorded(
+    reading: options.Reading,
+    paths: list[Path],
+    validation: list[Path],
+    lists: tuple[list[Path], list[Path]],
+    streams_of: Callable[[list[Path]], Streams],
+) -> tuple[list[RecordingStreams], list[RecordingStreams], list[Skipped]]:
+    """Return training, held-out and skipped recordings; exit at once if too few are usable.
+
+    Without any to hold out, the last fifth of each is; `lists` names further ones of both kinds.
+    """
+    from stario.network.training.data import split_off
+
+    files, missing = reading.recordings(paths)
+    held_files, held_missing = reading.recordings(validation)
+    files, held_files = files + lists[0], held_files + lists[1]
+    known = {path.resolve() for path in held_files}
+    if both := [path for path in files if path.resolve() in known]:  # would hide overfitting
+        raise InputError(
+            "--validation", f"{both[0]}, which is also trained on", "other recordings",
+            "remove it; without --validation the last fifth of each recording is held out",
+        )  # fmt: skip
+    recordings, failed = streams_of(files)
+    held_out, held_failed = streams_of(held_files)
+    skipped = missing + failed + held_missing + held_failed
+    if skipped and not (recordings and (held_out or not validation)):
+        common.exit_if_skipped(skipped)
+    if held_files or not files:
+        return recordings, held_out, skipped
+    return *split_off(recordings), skipped
+
+
+def _streams_of(
+    reading: options.Reading, attitude: Attitude, folder: Path, jobs: int, files: list[Path]
+) -> Streams:
+    """Return the streams of files, cached in a folder, and the recordings that cannot be used."""
+    from stario.network.training.data import recording_streams
+    from stario.sequences.datasets.stream_cache import recorded
+
+    outcomes = recorded(files, reading.read, reading.as_read(), folder, jobs, attitude)
+    return recording_streams(common.with_bar("read", zip(files, outcomes, strict=True), len(files)))
+
+
+def _material(
+    recorded: list[RecordingStreams], walks: int, recipe: TrainingConfig, folder: Path
+) -> TrainingData:
+    """Return what is learned from, if anything has full ground truth."""
+    from stario.network.training.data import cached_walks, mix_sources
+
+    simulated = cached_walks(walks, recipe.seed, folder, recipe.attitude)
+    material = mix_sources(recorded, simulated, recipe.shares, recipe.reach)
+    if not walks and material.legs and not material.streams:
+        raise InputError(
+            "simulated walks",
+            "none, and only positions or waypoints to learn from",
+            "some recordings with poses",
+            "omit --recorded-only: the poses of simulated walks will do",
+        )
+    return material
+
+
+def _validation(recorded: list[RecordingStreams], required: bool) -> TrainingData:
+    """Return what is selected and calibrated on, if there is any or none is required."""
+    from stario.network.training.data import mix_sources
+
+    held = mix_sources(recorded, [])
+    if required and not (held.streams or held.legs):
+        raise InputError(
+            "recordings",
+            "none whose last fifth has 2 s of poses, or two legs between known positions",
+            "validation data to select and calibrate on",
+            "name recordings with --validation",
+        )
+    return held
 
 
 def _trained(

@@ -139,31 +139,12 @@ class Benchmark:
             if weights
         ]
 
-    @property
-    def verdict(self) -> str:
-        """Verdict on replacing the weights compared with; empty without several groups.
-
-        Weights are accepted if the pooled interval is below 1 and no group is worse by over a
-        tenth.
-        """
-        compared = [r for r in self.rows.to_dict("records") if isinstance(r[_DECISIVE], Interval)]
-        ratios = {str(r["group"]): r[_DECISIVE] for r in compared if not r["pooled"]}
-        pooled = next((r[_DECISIVE] for r in compared if r["pooled"]), None)
-        if pooled is None:
-            return ""
-        if len(ratios) < _MIN_GROUPS:
-            return f"not decided, {len(ratios)} groups are too few: pooled {pooled:.3f} over 10 s"
-        worst = max(ratios, key=lambda name: ratios[name].ratio)
-        accepted = pooled.high < 1.0 and ratios[worst].ratio <= _MAX_GROUP_RATIO
-        words = f"pooled {pooled:.3f} over 10 s, worst {worst} {ratios[worst]:.3f}"
-        return f"{'accepted' if accepted else 'not accepted'}: {words}"
-
     def as_dict(self) -> dict[str, object]:
         """Return the result as plain values, including the recordings."""
         return {
             "ours": self.ours,
             "theirs": self.theirs,
-            "verdict": self.verdict,
+            "verdict": verdict(self.rows),
             "groups": self.rows.to_dict("records"),
             "recordings": records(self.scores.rename(columns={"track": "weights"})),
             "words": WORDS,
@@ -184,9 +165,28 @@ class Benchmark:
                 if isinstance(row[key], Interval):
                     title = _TITLES[metric][0].split(" [")[0]
                     lines.append(f"{row['group']}: ratio over {title}: {row[key]:.3f}")
-        lines += [self.verdict] if self.verdict else []
+        lines += [conclusion] if (conclusion := verdict(self.rows)) else []
         lines += [f"ours: {self.ours}", *([f"theirs: {self.theirs}"] if self.theirs else [])]
         return "\n".join([*lines, *(f"{key}: {words}." for key, words in WORDS.items())])
+
+
+def verdict(rows: pd.DataFrame) -> str:
+    """Return the verdict on replacing the weights compared with; empty without several groups.
+
+    Weights are accepted if the pooled interval is below 1 and no group is worse by over a
+    tenth.
+    """
+    compared = [r for r in rows.to_dict("records") if isinstance(r[_DECISIVE], Interval)]
+    ratios = {str(r["group"]): r[_DECISIVE] for r in compared if not r["pooled"]}
+    pooled = next((r[_DECISIVE] for r in compared if r["pooled"]), None)
+    if pooled is None:
+        return ""
+    if len(ratios) < _MIN_GROUPS:
+        return f"not decided, {len(ratios)} groups are too few: pooled {pooled:.3f} over 10 s"
+    worst = max(ratios, key=lambda name: ratios[name].ratio)
+    accepted = pooled.high < 1.0 and ratios[worst].ratio <= _MAX_GROUP_RATIO
+    words = f"pooled {pooled:.3f} over 10 s, worst {worst} {ratios[worst]:.3f}"
+    return f"{'accepted' if accepted else 'not accepted'}: {words}"
 
 
 def benchmark(

@@ -121,14 +121,14 @@ def _for_figures(table: SetTable, completed: Completed) -> NetworkTable | None:
     found = scores[chosen].rename(columns={"seed": "weights"})
     found["weights"] = "seed " + found["weights"].astype(str)
     samples: dict[str, Sample] = {}
-    firsts = [content for content in completed if content["seed"] == 0]
-    for content in sorted(firsts, key=lambda content: [*parameters].index(content["network"])):
-        for one in content["recordings"]:
+    firsts = {content["network"]: content for content in completed if content["seed"] == 0}
+    for network in parameters:
+        for one in firsts[network]["recordings"] if network in firsts else ():
             if drawn := one.get("drawn"):
                 truth = np.pad(np.array(drawn["truth"]), ((0, 0), (0, 1)))
                 path = Trajectory(np.array(drawn["time"]), truth, Rotation.identity(len(truth)))
                 sample = samples.setdefault(one["recording"], Sample(one["recording"], path, {}))
-                sample.tracks[content["network"]] = np.array(drawn["track"])
+                sample.tracks[network] = np.array(drawn["track"])
     return NetworkTable(CONVENTION, parameters, found, list(samples.values()))
 
 

@@ -10,14 +10,7 @@ import pytest
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.figures import figures, write_table
-from stario.fusion.evaluation.networks import (
-    METRICS,
-    PROTOCOLS,
-    NetworkTable,
-    compare_networks,
-    networks_text,
-    table_dict,
-)
+from stario.fusion.evaluation.networks import METRICS, PROTOCOLS, NetworkTable, compare_networks
 from stario.fusion.evaluation.scores import scored, values
 from stario.network.model import weights_named
 from stario.sequences.errors import WeightsError
@@ -93,7 +86,7 @@ def test_a_recording_at_rest_has_no_share_of_its_path_and_no_warning():
     figures = {"ate_m": 0.1, "rte_m": 0.1, "pde": None}
     scores = scored("rest", dict.fromkeys(PROTOCOLS, figures), network="StarIO", weights="a")
     known = NetworkTable("rms", {"StarIO": 1}, scores, [])
-    rows = {tuple(line.split()) for line in networks_text(known).splitlines()}
+    rows = {tuple(line.split()) for line in known.text().splitlines()}
     assert {("rest", "0.100"), ("rest", "-"), ("mean", "-")} < rows
 
 
@@ -106,11 +99,11 @@ def test_the_ronin_convention_is_smaller_by_the_square_root_of_two(table, read):
         for found in (table, ronin)
     )
     assert theirs == pytest.approx(ours / np.sqrt(2))
-    assert "convention ronin" in networks_text(ronin)
+    assert "convention ronin" in ronin.text()
 
 
 def test_text_names_networks_recordings_convention_and_units(table):
-    text = networks_text(table)
+    text = table.text()
     for word in ("StarIO", "R-ResNet", "walk-1", "walk-2", "+-", "convention rms", "RTE [m]"):
         assert word in text
 
@@ -128,7 +121,7 @@ def test_csv_and_json_hold_the_same_figures(table, tmp_path):
     with (tmp_path / "networks.csv").open() as file:
         rows = list(csv.DictReader(file))
     content = json.loads((tmp_path / "networks.json").read_text())
-    assert content == json.loads(json.dumps(table_dict(table)))
+    assert content == json.loads(json.dumps(table.as_dict()))
     for row, entry in zip(rows, content["entries"], strict=True):
         assert row["recording"] == entry["recording"]
         for metric in METRICS:
