@@ -139,7 +139,7 @@ def consistency(
 
 def benchmark(as_json: options.Json = False) -> None:
     """Measure speed on this machine: filter against dense algebra, network, whole run."""
-    from stario.fusion.evaluation.checks.speed import speed_report, speed_table
+    from stario.fusion.evaluation.checks.backends import speed_report, speed_table
     from stario.network.model import load_model
 
     report = speed_report(load_model("default"))
@@ -198,7 +198,7 @@ def heights(
 
     Without PATH, use simulated walks through a house with stairs and a lift.
     """
-    from stario.fusion.evaluation.checks.heights import heights_table, score_heights
+    from stario.fusion.evaluation.checks.fusion import heights_table, score_heights
     from stario.sequences.simulation.house import simulate_house
 
     if paths:

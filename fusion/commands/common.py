@@ -73,7 +73,7 @@ def process_each(
     The folder is `out` for a single recording, else within it; None for `runs`/NAME. An option that
     allows only one recording is named by `single`.
     """
-    from stario.fusion.evaluation.folders import check_folder
+    from stario.fusion.evaluation.results import check_folder
     from stario.sequences.datasets.batch import each, without_skipped
 
     files, skipped = reading.recordings(paths)

@@ -46,8 +46,7 @@ def compare(
     Without PATH, that of a simulated walk.
     """
     from stario.fusion.evaluation.compare import TRACKS, compare_recordings, demonstration
-    from stario.fusion.evaluation.folders import check_folder
-    from stario.fusion.evaluation.results import metrics_dict, write_comparison
+    from stario.fusion.evaluation.results import check_folder, metrics_dict, write_comparison
     from stario.fusion.fix_file import read_fixes
     from stario.sequences.arrays import check_choice
     from stario.sequences.datasets.batch import without_skipped

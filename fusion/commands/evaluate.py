@@ -71,7 +71,7 @@ def evaluate(
     as_json: options.Json = False,
 ) -> None:
     """Evaluate accuracy and consistency over recordings with ground truth: medians and means."""
-    from stario.fusion.evaluation.folders import check_folder
+    from stario.fusion.evaluation.results import check_folder
     from stario.network.training.splits import warn_of_learned
 
     if out is not None:
@@ -146,7 +146,7 @@ def _tracks(
     """Return the table of recordings, whose tracks are written one by one, and those skipped."""
     from stario.fusion.evaluation.compare import compare_recordings
     from stario.fusion.evaluation.results import write_recording, write_summary
-    from stario.fusion.evaluation.summary import scores_of, summary, summary_table
+    from stario.fusion.evaluation.text import scores_of, summary, summary_table
     from stario.sequences.datasets.batch import without_skipped
 
     settings, network = estimating.settings(), estimating.network()

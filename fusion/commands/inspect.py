@@ -41,7 +41,7 @@ def _inspect(
     sequence: ImuSequence, folder: Path, navigator: Navigator, train: str
 ) -> tuple[dict[str, object], str]:
     """Write one recording's figure and findings; return its record and the findings in words."""
-    from stario.fusion.evaluation.folders import make_folder
+    from stario.fusion.evaluation.results import make_folder
     from stario.fusion.evaluation.verdict import recording_verdict
     from stario.sequences.drawing.figures import save_figure
     from stario.sequences.drawing.plots import imu_overview

@@ -31,7 +31,7 @@ def live(
     for package in ("starlette", "uvicorn", "plotly", "segno"):
         optional_package(package, "live")
     from stario.fusion import demonstration
-    from stario.fusion.evaluation.folders import check_folder
+    from stario.fusion.evaluation.results import check_folder
     from stario.fusion.live.run import LiveServer
     from stario.fusion.navigator import Navigator
 

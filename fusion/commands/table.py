@@ -53,7 +53,7 @@ def table(
 
     The paper's protocol: 8:1:1 by recordings, true attitude, same recipe and steps for all.
     """
-    from stario.fusion.evaluation.folders import make_folder
+    from stario.fusion.evaluation.results import make_folder
     from stario.fusion.paper_table.runs import backend as on_backend
     from stario.fusion.paper_table.runs import complete, table_runs
     from stario.fusion.paper_table.table import known_costs, write_results

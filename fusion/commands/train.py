@@ -99,7 +99,7 @@ def train(
     default weights on your own walks. All networks share one recipe. In several processes:
     torchrun --nproc-per-node 2 --no-python stario train ...
     """
-    from stario.fusion.evaluation.folders import make_folder
+    from stario.fusion.evaluation.results import make_folder
     from stario.network.model import load_model
     from stario.network.training.data import seconds_of, virtual_recordings
     from stario.network.training.parallel import is_leader

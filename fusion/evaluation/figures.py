@@ -15,9 +15,9 @@ import numpy as np
 import pandas as pd
 
 from stario.fusion.evaluation.bootstrap import Interval
-from stario.fusion.evaluation.folders import Files, figure_files, write_results
 from stario.fusion.evaluation.groups import RATIOS, Benchmark
 from stario.fusion.evaluation.networks import PROTOCOLS, TRUE_ATTITUDE, NetworkTable, Sample
+from stario.fusion.evaluation.results import Files, figure_files, write_results
 from stario.fusion.evaluation.scores import records, values
 from stario.sequences.drawing.figures import BLUE, INK, apply_style, new_figure, split_at_gaps
 from stario.sequences.files import json_text, write_json, write_rows

@@ -8,7 +8,7 @@ import pytest
 from initial_ekf import Driven
 
 from stario.fusion import Navigator, NavigatorConfig, NavState, Track
-from stario.fusion.evaluation.checks.heights import heights_table, score_heights
+from stario.fusion.evaluation.checks.fusion import heights_table, score_heights
 from stario.fusion.evaluation.scores import values
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.height import with_height, yielding
