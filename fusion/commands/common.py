@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -45,19 +45,28 @@ def _named_apart(reading: options.Reading) -> Callable[[Path], ImuSequence]:
     return read
 
 
+def each_used(
+    title: str, work: Callable[[Path], Result], files: Collection[Path], jobs: int = 1
+) -> tuple[list[Result], list[Skipped]]:
+    """Apply `work` to each file, with a progress bar; return the results, and what was skipped."""
+    from stario.sequences.datasets.batch import each, without_skipped
+
+    skipped: list[Skipped] = []
+    outcomes = with_bar(title, each(work, files, jobs), len(files))
+    return list(without_skipped(outcomes, skipped)), skipped
+
+
 def map_recordings(
     title: str,
     reading: options.Reading,
     paths: Sequence[Path],
     work: Callable[[Path, ImuSequence], Result],
 ) -> tuple[list[Result], list[Skipped]]:
-    """Apply `work` to each path and its recording; return results and failures."""
-    from stario.sequences.datasets.batch import each, without_skipped
-
+    """Apply `work` to each path and its recording; return the results, and what was skipped."""
     files, skipped = reading.recordings(paths)
     read = _named_apart(reading)
-    outcomes = each(lambda file: work(file, read(file)), files, jobs=1)
-    return list(without_skipped(with_bar(title, outcomes, len(files)), skipped)), skipped
+    found, failed = each_used(title, lambda file: work(file, read(file)), files)
+    return found, skipped + failed
 
 
 def process_each(

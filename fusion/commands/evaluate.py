@@ -15,7 +15,6 @@ from stario.sequences.errors import InputError
 if TYPE_CHECKING:
     from stario.fusion.config import NavigatorConfig
     from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
-    from stario.fusion.recording import Progress
     from stario.network.model import DisplacementModel
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.splits import ListEntry
@@ -83,23 +82,19 @@ def evaluate(
     named = [estimating.model, against or ""] if models is None else common.names_in(models)
     if data is not None:
         warn_of_learned(named, files, data)
-    with common.progress_bar("evaluate", 100 * len(files)) as progress:
-        if by is not None:
-            groups = {entry.path: entry.group for entry in listed}
-            ours = estimating.model
-            found, failed = _groups(groups, reading, by, ours, against, filtered, jobs, progress)
-        elif models is not None:
-            settings = estimating.settings()
-            found, failed = _networks(
-                named, runs, files, reading, settings, convention, jobs, progress
-            )
-        else:
-            found, failed = _tracks(files, reading, estimating, jobs, out, progress)
+    if by is not None:
+        groups = {entry.path: entry.group for entry in listed}
+        found, failed = _groups(groups, reading, by, estimating.model, against, filtered, jobs)
+    elif models is not None:
+        settings = estimating.settings()
+        found, failed = _networks(named, runs, files, reading, settings, convention, jobs)
+    else:
+        found, failed = _tracks(files, reading, estimating, jobs, out)
     if found is not None:
         if out is not None:
             found.write(out)
         common.print_result(as_json, found.record, found.text)
-    common.exit_if_skipped(skipped + failed)
+    common.exit_if_skipped([*skipped, *failed])
 
 
 def _refuse_unused(context: typer.Context, by: str | None, models: str | None) -> None:
@@ -141,7 +136,6 @@ def _tracks(
     estimating: options.Estimator,
     jobs: int,
     out: Path | None,
-    progress: Progress,
 ) -> tuple[_Found | None, list[Skipped]]:
     """Return the table of recordings, whose tracks are written one by one, and those skipped."""
     from stario.fusion.evaluation.compare import compare_recordings
@@ -151,23 +145,21 @@ def _tracks(
 
     settings, network = estimating.settings(), estimating.network()
     model = estimating.for_processes(network, jobs)
+    origin = common.origin_of(files, reading, estimating, network)
     skipped: list[Skipped] = []
     scores = []
-    outcomes = compare_recordings(
-        files, model, settings, reading.read, jobs, truth_needed=True, progress=progress
-    )
-    for comparison in without_skipped(outcomes, skipped):
-        if out is not None:
-            write_recording(out, comparison)
-        scores.append(scores_of(comparison))
+    with common.progress_bar("evaluate", 100 * len(files)) as progress:
+        outcomes = compare_recordings(
+            files, model, settings, reading.read, jobs, truth_needed=True, progress=progress
+        )
+        for comparison in without_skipped(outcomes, skipped):
+            if out is not None:
+                write_recording(out, comparison)
+            scores.append(scores_of(comparison))
     if not scores:
         return None, skipped
-    write = partial(
-        write_summary,
-        records={each.name: each.record for each in scores},
-        config=settings,
-        origin=common.origin_of(files, reading, estimating, network),
-    )
+    records = {each.name: each.record for each in scores}
+    write = partial(write_summary, records=records, config=settings, origin=origin)
     return _Found(summary(scores), summary_table(scores), write), skipped
 
 
@@ -179,22 +171,23 @@ def _networks(
     settings: NavigatorConfig,
     convention: str,
     jobs: int,
-    progress: Progress,
 ) -> tuple[_Found | None, list[Skipped]]:
     """Return the table of networks, and the recordings that were skipped."""
     from stario.fusion.evaluation.figures import write_table
-    from stario.fusion.evaluation.networks import compare_networks
+    from stario.fusion.evaluation.networks import network_table, networks_on
     from stario.network.model import load_model, weights_named
     from stario.sequences.accuracy.metrics import Convention
     from stario.sequences.arrays import check_choice
 
     averaging: Convention = check_choice("convention", convention, get_args(Convention))
     models = [(name, load_model(weights_named(name, runs))) for name in names]
-    table, skipped = compare_networks(
-        files, models, settings, reading.read, averaging, jobs, progress
+    work = partial(
+        networks_on, models=models, config=settings, read=reading.read, convention=averaging
     )
-    if table is None:
+    found, skipped = common.each_used("evaluate", work, files, jobs)
+    if not found:
         return None, skipped
+    table = network_table(found, models, averaging)
     return _Found(table.as_dict(), table.text(), partial(write_table, table=table)), skipped
 
 
@@ -206,23 +199,30 @@ def _groups(
     theirs: str | None,
     filtered: bool,
     jobs: int,
-    progress: Progress,
 ) -> tuple[_Found | None, list[Skipped]]:
     """Return the table of groups, and the recordings that were skipped."""
     from stario.fusion.evaluation.figures import write_benchmark
-    from stario.fusion.evaluation.groups import By, benchmark
+    from stario.fusion.evaluation.groups import By, alone_on, benchmark
     from stario.sequences.arrays import check_choice
 
     grouping: By = check_choice("--by", by, get_args(By))
-    for name in (ours, theirs or ours):
+    weights = list(dict.fromkeys([ours, theirs or ours]))
+    for name in weights:
         if _GROUP not in name and _SET not in name:
             _for_group(name, "")  # fail on unloadable weights before preparing anything
-    found, skipped = benchmark(
-        groups, _for_group, reading.read, ours, theirs, grouping, jobs, filtered, progress
+    work = partial(
+        alone_on,
+        groups=groups,
+        model=_for_group,
+        weights=weights,
+        read=reading.read,
+        filtered=filtered,
     )
-    if found is None:
+    found, skipped = common.each_used("evaluate", work, groups, jobs)
+    if not found:
         return None, skipped
-    return _Found(found.as_dict(), found.text(), partial(write_benchmark, found=found)), skipped
+    table = benchmark(found, grouping, ours, theirs)
+    return _Found(table.as_dict(), table.text(), partial(write_benchmark, found=table)), skipped
 
 
 @cache

@@ -19,9 +19,10 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.imu.direction import Complex, Direction, direction, weighted_force
@@ -104,7 +105,7 @@ class Piece(NamedTuple):
     @property
     def windows(self) -> Complex:
         """Horizontal displacements (M,) [m]."""
-        return np.asarray(self.displacement_N[:, 0] + 1j * self.displacement_N[:, 1])
+        return planar(self.displacement_N)
 
     def track(self) -> Complex:
         """Return the horizontal position (K,) [m] at the stream's ticks, 0 at the first."""
@@ -322,7 +323,7 @@ def _waypoints(piece: Piece, known: PositionTrack, errors: _Errors) -> None:
     track = piece.track()
     ticks = piece.stream.ticks[: len(track)]
     inside = (known.time >= ticks[0]) & (known.time <= ticks[-1])
-    time, truth = known.time[inside], known.position_W[inside, 0] + 1j * known.position_W[inside, 1]
+    time, truth = known.time[inside], planar(known.position_W[inside])
     if len(time) < 3:
         return
     estimated = np.interp(time, ticks, track.real) + 1j * np.interp(time, ticks, track.imag)
@@ -337,6 +338,11 @@ def block_sums(seconds: FloatArray, squares: FloatArray) -> FloatArray:
     block = np.floor(seconds / BLOCK_SECONDS).astype(int)
     rows = np.stack([np.bincount(block, squares), np.bincount(block)], axis=1)
     return np.asarray(rows[rows[:, 1] > 0])
+
+
+def planar(position: NDArray[np.floating[Any]]) -> Complex:
+    """Return horizontal positions x + iy (n,) of positions (n, 2 or 3)."""
+    return np.asarray(position[:, 0] + 1j * position[:, 1])
 
 
 def fit_yaw_and_position(track: Complex, truth: Complex) -> Complex:

@@ -7,9 +7,9 @@ intervals.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -28,8 +28,6 @@ from stario.fusion.evaluation.displacement_error import (
 from stario.fusion.evaluation.pedestrian import Model, PedestrianDeadReckoning, piece_of
 from stario.fusion.evaluation.scores import joined, parts, records, scored, values, wide
 from stario.fusion.navigator import Navigator
-from stario.fusion.recording import Progress, silent
-from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.readers.archive import split_name
 from stario.sequences.sequence import ImuSequence
@@ -82,6 +80,9 @@ _TITLES = {
     "nis_filtered": ("filtered NIS", ".2f"),
 }
 """Titles and formats of the figures of a benchmark."""
+
+
+_NO_BLOCKS = block_rows([], set="", group="", recording="", network="", seed=0, metric="")
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,78 +190,52 @@ def verdict(rows: pd.DataFrame) -> str:
     return f"{'accepted' if accepted else 'not accepted'}: {words}"
 
 
-def benchmark(
-    recordings: Mapping[Path, str],
-    model: Callable[[str, str], Model],
-    read: Callable[[Path], ImuSequence],
-    ours: str,
-    theirs: str | None = None,
-    by: By = "set",
-    jobs: int | None = 1,
-    filtered: bool = False,
-    progress: Progress = silent,
-) -> tuple[Benchmark | None, list[Skipped]]:
-    """Run every recording through every network; return None if none can be used.
-
-    Args:
-        recordings: group of each recording, by path; empty for the name of the set.
-        model: function that returns the network by the name of its weights for a group: networks
-            differ between groups if each group was held out of training in turn.
-        read: function that reads a path; like `model` picklable.
-        ours: name of the weights.
-        theirs: name of those that they are compared with.
-        by: label that recordings are grouped by.
-        jobs: number of processes, as for `stario.sequences.datasets.batch.each`.
-        filtered: whether the filter is run for its mean NIS, which is slow.
-        progress: called with the share of the work done.
-    """
-    skipped: list[Skipped] = []
-    scores: list[pd.DataFrame] = []
-    blocks = [block_rows([], **dict.fromkeys(("set", "group", "recording", "network", "metric")))]
-    models = {name: partial(model, name) for name in (ours, theirs) if name is not None}
-    work = partial(_scores, groups=recordings, models=models, read=read, filtered=filtered)
-    for done, outcome in enumerate(each(work, recordings, jobs), 1):
-        progress(done / len(recordings))
-        if isinstance(outcome, Skipped):
-            skipped.append(outcome)
-        else:
-            scores.append(outcome[0])
-            blocks += outcome[1]
-    _warn_of_not_compared(scores)
-    if not scores:
-        return None, skipped
-    return Benchmark(joined(scores), joined(blocks), by, ours, theirs), skipped
-
-
-def _scores(
+def alone_on(
     path: Path,
     groups: Mapping[Path, str],
-    models: Mapping[str, Callable[[str], Model]],
+    model: Callable[[str, str], Model],
+    weights: Collection[str],
     read: Callable[[Path], ImuSequence],
-    filtered: bool,
-) -> tuple[pd.DataFrame, list[pd.DataFrame]]:
-    """Return a recording's rows of `Benchmark.scores` and of its blocks."""
+    filtered: bool = False,
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Score networks alone on a recording; return rows of a benchmark's scores and of its blocks.
+
+    Args:
+        path: path of the recording.
+        groups: group of each recording, by path; empty for the name of the set.
+        model: function that returns the network by the name of its weights for a group: networks
+            differ between groups if each group was held out of training in turn.
+        weights: names of the weights.
+        read: function that reads a path.
+        filtered: whether the filter is run for its mean NIS, which is slow.
+    """
     sequence = read(path)
     streams, (kind, _) = usable_streams(sequence), known_truth(sequence)
     warn_of_truth(sequence)
     named = labels(path, sequence.attributes, groups[path])
-    errors = {}
-    for name, make in models.items():
-        model = make(named["group"])
-        pieces = [piece_of(model, stream) for stream in streams]
-        errors[name] = recording_errors(sequence, pieces)
-        if filtered and not isinstance(model, PedestrianDeadReckoning):
-            nis = Navigator(model, backend="ekf").run(sequence).nis
-            errors[name].figures["nis_filtered"] = nis or np.nan
-    figures = {n: {"path_m": found.path_m, **found.figures} for n, found in errors.items()}
-    others = {key: name for key, name in named.items() if key != "group"}
-    unit = {"set": named["set"], "group": named["group"], "recording": str(path)}
-    blocks = [
-        block_rows(sums, **unit, network=name, seed=0, metric=f"rms_{horizon}s_m")
-        for name, found in errors.items()
-        for horizon, sums in found.blocks.items()
-    ]
-    return scored(str(path), figures, named["group"], **others, truth=kind), blocks
+    group, others = named["group"], {key: n for key, n in named.items() if key != "group"}
+    unit = {"set": named["set"], "group": group, "recording": str(path)}
+    figures, blocks = {}, [_NO_BLOCKS]
+    for name in weights:
+        network = model(name, group)
+        errors = recording_errors(sequence, [piece_of(network, stream) for stream in streams])
+        if filtered and not isinstance(network, PedestrianDeadReckoning):
+            nis = Navigator(network, backend="ekf").run(sequence).nis
+            errors.figures["nis_filtered"] = nis or np.nan
+        figures[name] = {"path_m": errors.path_m, **errors.figures}
+        for horizon, sums in errors.blocks.items():
+            metric = f"rms_{horizon}s_m"
+            blocks.append(block_rows(sums, **unit, network=name, seed=0, metric=metric))
+    return scored(str(path), figures, group, **others, truth=kind), joined(blocks)
+
+
+def benchmark(
+    found: Sequence[tuple[pd.DataFrame, pd.DataFrame]], by: By, ours: str, theirs: str | None = None
+) -> Benchmark:
+    """Return the benchmark of the recordings that `alone_on` scored; at least one."""
+    scores, blocks = zip(*found, strict=True)
+    _warn_of_not_compared(scores)
+    return Benchmark(joined(scores), joined(blocks), by, ours, theirs)
 
 
 def _warn_of_not_compared(scores: Sequence[pd.DataFrame]) -> None:

@@ -7,9 +7,8 @@ weights of one network, for example from different training seeds, are averaged,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -21,7 +20,6 @@ from stario.fusion.evaluation.scores import Spread, joined, records, scored, tab
 from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude, true_poses
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
-from stario.fusion.recording import Progress, silent
 from stario.network.model import DisplacementModel
 from stario.network.runtime.cost import table_cost
 from stario.sequences.accuracy.metrics import (
@@ -32,7 +30,6 @@ from stario.sequences.accuracy.metrics import (
     evaluate_track,
     pose_errors,
 )
-from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.truth.problems import warn_of_truth
 
@@ -131,48 +128,17 @@ Models = Sequence[tuple[str, DisplacementModel]]
 """Models, each with the name by which its weights were requested."""
 
 
-def compare_networks(
-    paths: Sequence[Path],
-    models: Models,
-    config: NavigatorConfig,
-    read: Callable[[Path], ImuSequence],
-    convention: Convention = "rms",
-    jobs: int | None = None,
-    progress: Progress = silent,
-) -> tuple[NetworkTable | None, list[Skipped]]:
-    """Compute the tracks of networks, given with distinct names, on recordings with true poses.
-
-    Recordings that cannot be used are returned, too; None if all of them are. `read` must be
-    picklable; `jobs` is as for `stario.sequences.datasets.batch.each`.
-    """
-    scores: list[pd.DataFrame] = []
-    samples: list[Sample] = []
-    skipped: list[Skipped] = []
-    names: set[str] = set()
-    work = partial(_tracks, models=models, config=config, read=read, convention=convention)
-    for done, outcome in enumerate(each(work, paths, jobs), 1):
-        if isinstance(outcome, Skipped):
-            skipped.append(outcome)
-        else:
-            found, sample = outcome
-            name = distinct_name(sample.recording, names)
-            scores.append(found.assign(recording=name))
-            if len(samples) < MAX_DRAWN:
-                samples.append(replace(sample, recording=name))
-        progress(done / len(paths))
-    if not scores:
-        return None, skipped
-    parameters = {model.name: table_cost(model.name).parameters for _, model in models}
-    return NetworkTable(convention, parameters, joined(scores), samples), skipped
-
-
-def _tracks(
+def networks_on(
     path: Path,
     models: Models,
     config: NavigatorConfig,
     read: Callable[[Path], ImuSequence],
-    convention: Convention,
+    convention: Convention = "rms",
 ) -> tuple[pd.DataFrame, Sample]:
+    """Score networks, given with distinct names, on a recording with true poses.
+
+    Returns the rows of `NetworkTable.scores`, and the tracks.
+    """
     sequence = read(path)
     scores: list[pd.DataFrame] = []
     tracks: dict[str, FloatArray] = {}
@@ -182,6 +148,20 @@ def _tracks(
         tracks.setdefault(model.name, errors.estimate.position_W[:, :2])
     warn_of_truth(sequence)
     return joined(scores), Sample(sequence.name, errors.truth, tracks)
+
+
+def network_table(
+    found: Iterable[tuple[pd.DataFrame, Sample]], models: Models, convention: Convention
+) -> NetworkTable:
+    """Return the table of the recordings that `networks_on` scored, under distinct names."""
+    names: set[str] = set()
+    scores, samples = [], []
+    for rows, sample in found:
+        name = distinct_name(sample.recording, names)
+        scores.append(rows.assign(recording=name))
+        samples.append(replace(sample, recording=name))
+    parameters = {model.name: table_cost(model.name).parameters for _, model in models}
+    return NetworkTable(convention, parameters, joined(scores), samples[:MAX_DRAWN])
 
 
 def protocol_figures(

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import TRACK_OF
-from stario.fusion.evaluation.displacement_error import fit_yaw_and_position, known_truth
+from stario.fusion.evaluation.displacement_error import fit_yaw_and_position, known_truth, planar
 from stario.fusion.evaluation.scores import Column, geometric_mean, joined, parts, scored, table
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.direction import Complex
@@ -170,11 +170,7 @@ def _known(sequence: ImuSequence, track: Track) -> tuple[FloatArray, Complex, Co
         inside = sequence.positions.valid & track.trajectory.covers(sequence.positions.time)
         time, position = sequence.positions.time[inside], sequence.positions.position_W[inside]
     estimate = interpolated(time, track.time, track.trajectory.position_W)
-    return time, _horizontal(position), _horizontal(estimate)
-
-
-def _horizontal(position_W: FloatArray) -> Complex:
-    return np.asarray(position_W[:, 0] + 1j * position_W[:, 1])
+    return time, planar(position), planar(estimate)
 
 
 def _errors(truth: Complex, estimate: Complex, before: BoolArray) -> tuple[float, float]:

@@ -10,10 +10,16 @@ import pytest
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.figures import figures, write_table
-from stario.fusion.evaluation.networks import METRICS, PROTOCOLS, NetworkTable, compare_networks
+from stario.fusion.evaluation.networks import (
+    METRICS,
+    PROTOCOLS,
+    NetworkTable,
+    network_table,
+    networks_on,
+)
 from stario.fusion.evaluation.scores import scored, values
 from stario.network.model import weights_named
-from stario.sequences.errors import WeightsError
+from stario.sequences.errors import InputError, WeightsError
 
 
 class ConstantDisplacement:
@@ -35,20 +41,34 @@ MODELS = [
 
 
 @pytest.fixture(scope="module")
-def read(make_walk):
-    def read(path):
-        walk = make_walk(seed=int(path.stem), seconds=12.0)
-        return walk.without_truth() if path.suffix == ".blind" else walk
+def compared(make_walk):
+    """Return a function that compares models on simulated walks of some seeds."""
 
-    return read
+    def compared(seeds, models=MODELS, convention="rms"):
+        found = [
+            networks_on(
+                Path("walk"),
+                models,
+                NavigatorConfig(),
+                lambda path, seed=seed: make_walk(seed=seed, seconds=12.0),
+                convention,
+            )
+            for seed in seeds
+        ]
+        return network_table(found, models, convention)
+
+    return compared
 
 
 @pytest.fixture(scope="module")
-def table(read):
-    paths = [Path("1.walk"), Path("2.walk"), Path("3.blind")]
-    table, skipped = compare_networks(paths, MODELS, NavigatorConfig(), read, jobs=1)
-    assert [s.item for s in skipped] == ["3.blind"]
-    return table
+def table(compared):
+    return compared([1, 2])
+
+
+def test_a_recording_without_true_poses_is_refused(make_walk):
+    blind = make_walk(seed=3, seconds=12.0).without_truth()
+    with pytest.raises(InputError, match="truth"):
+        networks_on(Path("blind"), MODELS, NavigatorConfig(), lambda path: blind)
 
 
 def test_every_network_has_every_track_of_every_recording(table):
@@ -59,10 +79,8 @@ def test_every_network_has_every_track_of_every_recording(table):
         assert found.shape == (count,)
 
 
-def test_recordings_with_the_same_name_are_distinguished(read):
-    twice, _ = compare_networks(
-        [Path("1.walk"), Path("1.walk")], MODELS[:1], NavigatorConfig(), read, jobs=1
-    )
+def test_recordings_with_the_same_name_are_distinguished(compared):
+    twice = compared([1, 1], MODELS[:1])
     assert set(twice.scores["recording"]) == {"walk-1", "walk-1-2"}
     assert [sample.recording for sample in twice.samples] == ["walk-1", "walk-1-2"]
 
@@ -90,10 +108,8 @@ def test_a_recording_at_rest_has_no_share_of_its_path_and_no_warning():
     assert {("rest", "0.100"), ("rest", "-"), ("mean", "-")} < rows
 
 
-def test_the_ronin_convention_is_smaller_by_the_square_root_of_two(table, read):
-    ronin, _ = compare_networks(
-        [Path("1.walk")], MODELS[2:], NavigatorConfig(), read, "ronin", jobs=1
-    )
+def test_the_ronin_convention_is_smaller_by_the_square_root_of_two(table, compared):
+    ronin = compared([1], MODELS[2:], "ronin")
     ours, theirs = (
         values(found.scores, "ate_m", track="network", network="R-ResNet")[0]
         for found in (table, ronin)

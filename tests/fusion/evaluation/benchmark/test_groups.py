@@ -17,11 +17,13 @@ from stario.fusion.evaluation.groups import (
     RATIOS,
     Benchmark,
     By,
+    alone_on,
     benchmark,
     labels,
     verdict,
 )
 from stario.fusion.evaluation.scores import values
+from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 
 Makers = dict[str, Callable[[str], Any]]
@@ -35,16 +37,17 @@ def judged(
     groups: Mapping[str, str] | None = None,
 ) -> Benchmark:
     paths = {Path(name): (groups or {}).get(name, "") for name in recordings}
-    found, skipped = benchmark(
-        paths,
-        lambda name, group: models[name](group),
-        lambda path: recordings[str(path)],
-        *models,
-        by=by,
-    )
-    assert found is not None
-    assert skipped == []
-    return found
+    found = [
+        alone_on(
+            path,
+            paths,
+            lambda name, group: models[name](group),
+            models,
+            lambda path: recordings[str(path)],
+        )
+        for path in paths
+    ]
+    return benchmark(found, by, *models)
 
 
 def of_person(recording: ImuSequence, person: str) -> ImuSequence:
@@ -62,16 +65,14 @@ def pair(walk):
     return judged(recordings, models, "person", {"one": "walks a", "two": "walks b"})
 
 
-def test_a_recording_that_cannot_be_used_is_skipped_and_a_wrong_truth_warned_of(stepping, caplog):
+def test_a_recording_without_truth_is_refused_and_a_wrong_truth_warned_of(stepping, caplog):
     mirrored = stepping.truth.position_W * [-1.0, 1.0, 1.0]
     wrong = replace(stepping, truth=replace(stepping.truth, position_W=mirrored))
-    recordings = {Path("wrong"): wrong, Path("blind"): stepping.without_truth()}
-    stub = Stub(stepping)
-    _, skipped = benchmark(
-        dict.fromkeys(recordings, ""), lambda name, group: stub, recordings.__getitem__, "ours"
-    )
-    assert [one.item for one in skipped] == ["blind"]
+    models = {"ours": lambda group: Stub(stepping)}
+    judged({"wrong": wrong}, models)
     assert "steps: truth: positions mirrored" in caplog.text
+    with pytest.raises(InputError, match="truth"):
+        judged({"blind": stepping.without_truth()}, models)
 
 
 def test_a_recording_with_two_waypoints_is_named_as_not_compared(walk, caplog):
