@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     from stario.network.training.data import RecordingStreams, TrainingData
     from stario.network.training.history import EpochReport
     from stario.sequences.datasets.batch import Skipped
-    from stario.sequences.windows import Attitude
 
     Streams = tuple[list[RecordingStreams], list[Skipped]]
 
@@ -101,10 +99,11 @@ def train(
     """
     from stario.fusion.evaluation.results import make_folder
     from stario.network.model import load_model
-    from stario.network.training.data import seconds_of, virtual_recordings
+    from stario.network.training.data import recording_streams, seconds_of, virtual_recordings
     from stario.network.training.parallel import is_leader
     from stario.network.training.splits import warn_of_learned
     from stario.sequences.datasets.cache_files import cache_folder
+    from stario.sequences.datasets.stream_cache import recorded as recorded_streams
 
     if recorded_only and generated:
         raise InputError("--generated", "use with --recorded-only", "one of the two")
@@ -118,7 +117,12 @@ def train(
     lists = packaged_lists(data, leave_out or [], learn_from)
     if data is not None and (judged := last_stage or start_from):
         warn_of_learned([judged], lists[1], data)
-    streams_of = partial(_streams_of, reading, recipe.attitude, folder, jobs)
+
+    def streams_of(files: list[Path]) -> Streams:
+        given = reading.read, reading.as_read(), folder, jobs, recipe.attitude
+        outcomes = zip(files, recorded_streams(files, *given), strict=True)
+        return recording_streams(common.with_bar("read", outcomes, len(files)))
+
     recorded, held_out, skipped = _recorded(
         reading, paths or [], validation or [], lists, streams_of
     )
@@ -227,17 +231,6 @@ def _recorded(
     if held_files or not files:
         return recordings, held_out, skipped
     return *split_off(recordings), skipped
-
-
-def _streams_of(
-    reading: options.Reading, attitude: Attitude, folder: Path, jobs: int, files: list[Path]
-) -> Streams:
-    """Return the streams of files, cached in a folder, and the recordings that cannot be used."""
-    from stario.network.training.data import recording_streams
-    from stario.sequences.datasets.stream_cache import recorded
-
-    outcomes = recorded(files, reading.read, reading.as_read(), folder, jobs, attitude)
-    return recording_streams(common.with_bar("read", zip(files, outcomes, strict=True), len(files)))
 
 
 def _material(
