@@ -16,8 +16,8 @@ from stario.fusion.commands.cli import app
 from stario.fusion.paper_table import runs as runs_module
 from stario.fusion.paper_table import training
 from stario.fusion.paper_table.runs import LEADING, Run, backend, complete, complete_run, table_runs
-from stario.fusion.paper_table.scores import completed_runs, set_table
 from stario.fusion.paper_table.sets import DataSet, folder_set
+from stario.fusion.paper_table.table import completed_runs, set_table
 from stario.fusion.paper_table.training import ReaderConfig, run_recipe
 from stario.network.architectures import ARCHITECTURES
 from stario.sequences.datasets.batch import Skipped

@@ -10,9 +10,8 @@ import pytest
 from recorded import DATA
 
 from stario.fusion.paper_table import sets, training
-from stario.fusion.paper_table.scores import COLUMNS, set_table
 from stario.fusion.paper_table.sets import ALL, FIRST, DataSet, development_sets, published
-from stario.fusion.paper_table.table import table_text, work_of
+from stario.fusion.paper_table.table import COLUMNS, set_table, table_text, work_of
 from stario.fusion.paper_table.training import ReaderConfig, run_recipe, train_run
 from stario.network.runtime.survey import ModelRow
 from stario.network.training import splits
