@@ -306,14 +306,9 @@ READING = tuple(field.name for field in fields(Reading))
 def refuse(context: typer.Context, found: str, expected: str, *names: str) -> None:
     """Refuse options of the command line that would do nothing, rather than ignore them.
 
-    Args:
-        context: the command's call.
-        found: why they would do nothing, such as "without PATH".
-        expected: when they do something.
-        names: parameters of the options.
-
     Raises:
-        InputError: one was given.
+        InputError: one of the named parameters was given; `found` says why it would do nothing,
+            such as "without PATH", `expected` when it does something.
     """
     for option in context.command.params:
         source = context.get_parameter_source(str(option.name))

@@ -175,10 +175,8 @@ def packaged_lists(
 ) -> tuple[list[Path], list[Path]]:
     """Return the training and held-out recordings from the lists in the package.
 
-    Args:
-        data: folder of the development recordings; None for no recordings at all.
-        left_out: sets or groups that are neither learned from nor selected on.
-        name: all, open or few.
+    Without a folder there are none. Sets or groups are left out of both; the list is all, open or
+    few.
 
     Raises:
         InputError: a list or group does not exist.

@@ -249,12 +249,8 @@ def table_runs(
 ) -> list[Run]:
     """Return the runs: the sets of `FIRST` with one seed, their other seeds, the other sets.
 
-    Args:
-        sets: data sets.
-        recipe: training settings common to all runs.
-        steps: steps of every training; None for the recipe's.
-        networks: networks to train; None for all of the paper's table.
-        seeds: number of seeds for the networks of `LEADING`; the others have one.
+    The recipe is common to all runs; without steps they are the recipe's, without networks all of
+    the paper's table. Those of `LEADING` have so many seeds, the others one.
 
     Raises:
         InputError: a network is unknown.

@@ -96,13 +96,8 @@ def consistency(
     (`nees_end`); NEES of `yaw` (1); `nis` of the measurements (3); at the end, the yaw's reported
     standard deviation `yaw_sigma` and its error `yaw_error` [rad].
 
-    Args:
-        config: configuration of the filter and noise of the simulated IMU.
-        yaw_sigma: standard deviation of the initial yaw [rad].
-        runs: number of walks.
-        seconds: length of each walk [s].
-        seed: seed of the first run, increased by one for each further run.
-        progress: called with the share of the work done.
+    The configuration is that of the filter and of the simulated IMU's noise; `yaw_sigma` [rad] is
+    that of the initial yaw. Walks have seeds from `seed` on, and are `seconds` long.
 
     Raises:
         InputError: there are no runs, or they are shorter than two seconds.

@@ -196,13 +196,8 @@ def run_faults(
     (`finite`). The label `reported` has the faults counted in the health report, in words, or why
     the recording is refused.
 
-    Args:
-        sequence: a recording with true poses.
-        config: configuration of the navigator.
-        model: network; None for the true displacements under white noise.
-        seed: seed of the random faults.
-        backends: back ends to run.
-        only: faults to run; None for all of them.
+    Without a network, displacements are the true ones under white noise. `seed` is that of random
+    faults; without `only`, all of them are run.
 
     Raises:
         InputError: the recording has no true poses, or is too short.
