@@ -330,10 +330,9 @@ def refuse_unused_sources(
 
 
 def expanded(command: Callable[..., None]) -> Callable[..., None]:
-    """Expand a command's parameters of an option group into one typer option per field.
+    """Expand a command's parameters of an option group into its options, defined only once.
 
-    Groups are `Reading`, `Estimator`, `Map` and `Place`: each option is
-    thus defined only once.
+    Groups are `Reading`, `Estimator`, `Map` and `Place`.
     """
     options: list[inspect.Parameter] = []
     groups: dict[str, tuple[type, list[str]]] = {}
