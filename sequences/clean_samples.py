@@ -9,7 +9,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import MAX_SENSOR_VALUE, BoolArray, FloatArray, ImuSequence
-from stario.sequences.time_order import MAX_IMU_GAP, ahead_mask, increasing_mask
+from stario.sequences.time_order import MAX_IMU_GAP, ahead_mask, disorder, increasing_mask
 
 log = logging.getLogger(__name__)
 
@@ -60,6 +60,24 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
             fix = "most samples are not finite"
         raise InputError(f"{sequence.name}: rate", found, "50 Hz to 1 kHz", fix)
     return time, sequence.gyro[index], sequence.accel[index]
+
+
+def in_order(sequence: ImuSequence) -> ImuSequence:
+    """Sort a recording by time if many rows are out of order, each by little.
+
+    Some loggers write samples of a few milliseconds in any order. Dropping them, as is done with a
+    few, would lose a twentieth of the samples. Rows that are far out of order are not sorted.
+    """
+    time = sequence.time
+    if not disorder(time):
+        return sequence
+    back = float((np.maximum.accumulate(time) - time).max())
+    if not back < MAX_IMU_GAP:
+        return sequence
+    log.warning(
+        "%s: %s, by up to %.0f ms: sorted by time", sequence.name, disorder(time), 1e3 * back
+    )
+    return sequence.select(np.argsort(time, kind="stable"))
 
 
 def unbroken(time: FloatArray) -> list[tuple[int, int]]:

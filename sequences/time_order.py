@@ -23,6 +23,10 @@ CONFIRMED, CONFIRMED_FAR = 2, 20
 """Samples that confirm a jump ahead in time, and a far jump or one without earlier samples."""
 
 
+_OUT_OF_ORDER = 0.05
+"""Share of backward steps above which the rows are out of order."""
+
+
 def increasing_mask(time: FloatArray) -> BoolArray:
     """Return which of the finite times (N,) [s] to keep, so that kept times strictly increase.
 
@@ -71,3 +75,10 @@ def _first_refuted(time: FloatArray, parts: list[tuple[int, int]], following: Fl
             if len(later) and later[0] < time[start]:
                 first = k
     return first
+
+
+def disorder(time: FloatArray) -> str:
+    """Return how many of the times (n,) [s] go back, in words; empty if few do."""
+    back = int((np.diff(time[np.isfinite(time)]) < 0.0).sum())
+    many = back > _OUT_OF_ORDER * len(time)
+    return f"{back} of {len(time)} times earlier than the one above" if many else ""

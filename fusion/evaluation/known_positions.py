@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position, known_truth
 from stario.fusion.imu.direction import Complex
 from stario.fusion.state import Track
+from stario.sequences.accuracy.metrics import align, pose_errors
 from stario.sequences.arrays import even_grid, interpolated
 from stario.sequences.findings import Finding
 from stario.sequences.geodesy import Georeference
@@ -17,6 +20,7 @@ from stario.sequences.sequence import (
     FloatArray,
     ImuSequence,
     PositionTrack,
+    Trajectory,
 )
 
 MIN_POSITIONS = 2
@@ -38,6 +42,10 @@ _MIRRORED, _MIRRORED_M = 0.4, 2.0
 
 _APART_M = 3.0
 """Distance from their centre [m] that positions must have to tell the direction of a track."""
+
+_TURNED_RAD = math.radians(45.0)
+"""Angle between the track's direction and the true one, both as the device sees them, that
+contradicts the weights: half of a quarter turn."""
 
 _SIGMAS = 3.0
 """Error in standard deviations, both over the whole track, that contradicts the track."""
@@ -168,6 +176,7 @@ def position_findings(track: Track, sequence: ImuSequence) -> list[Finding]:
     return [
         *_mirror_image(known.kind, truth, estimate, error),
         *_scale(known, fitted.time, truth, estimate),
+        *_direction(track, sequence.truth),
         *_beyond_sigma(track, known, fitted.time, error),
     ]
 
@@ -226,6 +235,22 @@ def _length_ratio(
     if walked.sum() < _MIN_CHORDS:
         return None
     return float(moved[walked].sum() / max(float(told[walked].sum()), 1e-3))
+
+
+def _direction(track: Track, truth: Trajectory | None) -> list[Finding]:
+    """Compare the directions of both ways as the device sees them, which takes true attitudes."""
+    if truth is None:
+        return []
+    fitted = pose_errors(align(track.trajectory, truth, "yaw"), truth)
+    spread = float(np.sqrt(fitted.truth.position_W[:, :2].var(axis=0).sum()))
+    error = float(np.sqrt(np.mean(np.sum(fitted.position_W[:, :2] ** 2, axis=1))))
+    turn, sigma = -float(np.angle(np.exp(1j * fitted.yaw).mean())), error / max(spread, 1e-3)
+    if abs(turn) < max(_TURNED_RAD, _SIGMAS * sigma) or spread < _APART_M:
+        return []
+    degrees = math.degrees(turn)
+    text = f"Seen from the device, the track's direction is {degrees:.0f} degrees off the true one."
+    advice = "These weights do not know this motion or carrying: rely on no direction of the track."
+    return [Finding("network_direction", text, advice, values={"turn_deg": degrees})]
 
 
 def _beyond_sigma(

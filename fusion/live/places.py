@@ -12,7 +12,7 @@ from stario.fusion.fixes import Fix
 from stario.fusion.live.payload import Vector
 from stario.fusion.satellites import reliable, satellite_fixes
 from stario.sequences.geodesy import Georeference
-from stario.sequences.readers.satellites import OPTIONAL, satellites
+from stario.sequences.readers.checked import OPTIONAL, satellites
 from stario.sequences.sequence import Satellites
 
 Place = list[float]

@@ -36,7 +36,14 @@ def dead_axes(sequence: ImuSequence) -> list[Finding]:
     gyro, accel = sequence.gyro[given], sequence.accel[given]
     if len(gyro) < 2:
         return []
-    dead = {"gyroscope": _dead_gyro_axes(gyro), "accelerometer": _dead_accel_axes(gyro, accel)}
+    varies = gyro.std(axis=0) > _VARIES_RAD_S
+    turned = np.cross(accel.mean(axis=0), gyro).std(axis=0)  # the force's rate of change
+    constant = _constant(accel)
+    alone = constant.sum() < 3  # otherwise the whole sensor is dead
+    dead = {
+        "gyroscope": _constant(gyro) & (varies.sum() == 2),
+        "accelerometer": constant & alone & (turned > _TILTING_RAD_S * STANDARD_GRAVITY),
+    }
     found = {sensor: " and ".join(np.array(["x", "y", "z"])[axes]) for sensor, axes in dead.items()}
     return [
         Finding(
@@ -48,20 +55,6 @@ def dead_axes(sequence: ImuSequence) -> list[Finding]:
         for sensor, axes in found.items()
         if axes
     ]
-
-
-def _dead_gyro_axes(gyro: FloatArray) -> BoolArray:
-    """Return which axes (3,) of rates (n, 3) are constant while both others vary."""
-    varies = gyro.std(axis=0) > _VARIES_RAD_S
-    return np.asarray(_constant(gyro) & (varies.sum() == 2))
-
-
-def _dead_accel_axes(gyro: FloatArray, accel: FloatArray) -> BoolArray:
-    """Return which axes (3,) of forces (n, 3) are constant while gravity turns into them."""
-    turned = np.cross(accel.mean(axis=0), gyro).std(axis=0)  # the force's rate of change
-    constant = _constant(accel)
-    alone = constant.sum() < 3  # otherwise the whole sensor is dead
-    return np.asarray(constant & alone & (turned > _TILTING_RAD_S * STANDARD_GRAVITY))
 
 
 def _constant(values: FloatArray) -> BoolArray:

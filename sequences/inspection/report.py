@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -11,18 +12,24 @@ from stario.sequences.arrays import check_type
 from stario.sequences.clean_samples import finite_samples, usable
 from stario.sequences.errors import InputError
 from stario.sequences.findings import Finding, verdict
-from stario.sequences.inspection.barometer_findings import PressureFindings, assess_barometer
 from stario.sequences.inspection.checks import unit_findings
 from stario.sequences.inspection.constant_values import dead_axes
 from stario.sequences.inspection.gyro_axes import GyroAxes, compare_gyro_axes
-from stario.sequences.inspection.magnetic import assess_magnetometer
-from stario.sequences.inspection.magnetic_findings import MagneticFindings, magnetic_findings
+from stario.sequences.inspection.magnetic import (
+    MagneticFindings,
+    assess_magnetometer,
+)
+from stario.sequences.inspection.outside_sensors import (
+    PressureFindings,
+    SatelliteFindings,
+    assess_barometer,
+    assess_satellites,
+)
 from stario.sequences.inspection.samples import (
     clock_findings,
     sample_findings,
     without_times_ahead,
 )
-from stario.sequences.inspection.satellite_findings import SatelliteFindings, assess_satellites
 from stario.sequences.inspection.stillness import Rest, find_rest
 from stario.sequences.sequence import (
     GAP_STEPS,
@@ -108,9 +115,8 @@ class Inspection:
         findings: what stands out.
         truth: description of the ground truth.
         device_attitude: number of attitudes logged by the device's own sensor fusion.
-        magnetic: findings about the magnetometer; None without one or with too few samples.
-        pressure: findings about the barometer, likewise.
-        satellites: findings about the satellite positions, likewise.
+        sensors: findings about "magnetometer", "barometer" and "satellites"; None without one or
+            with too few samples.
         yaw: drift of the gyroscope's yaw from the true one; None if it cannot be determined.
         axes: agreement of the gyroscope with gravity; None if units are wrong.
     """
@@ -125,9 +131,7 @@ class Inspection:
     positions: PositionFit | None
     findings: tuple[Finding, ...]
     truth: str
-    magnetic: MagneticFindings | None
-    pressure: PressureFindings | None
-    satellites: SatelliteFindings | None
+    sensors: Mapping[str, MagneticFindings | PressureFindings | SatelliteFindings | None]
     device_attitude: int
     yaw: YawDrift | None
     axes: GyroAxes | None
@@ -155,36 +159,30 @@ class Inspection:
             "positions_against_accelerometer": self.positions and positions_as_dict(self.positions),
             "device_attitudes": self.device_attitude,
             "known_of_truth": self.truth,
-            "magnetometer": self.magnetic and self.magnetic.as_dict(),
-            "barometer": self.pressure and self.pressure.as_dict(),
-            "satellites": self.satellites and self.satellites.as_dict(),
+            **{name: found and found.as_dict() for name, found in self.sensors.items()},
             "verdict": [asdict(finding) for finding in verdict(self.findings)],
         }
 
     def lines(self) -> list[str]:
         """Return the findings as lines to print."""
+        compared = "units: compared; the device tilts too seldom to compare the sensors' axes"
+        if self.fit or (self.axes and self.axes.compared):
+            compared = "units, signs and axes: compared"
         return [
             *self._timing_lines(),
             f"accelerometer: {self.accel_norm:.3f} m/s^2 on average; "
             f"gyroscope: {self.gyro_norm:.3f} rad/s",
             *self._rest_lines(),
-            *(self.magnetic.lines() if self.magnetic else []),
-            *(self.pressure.lines() if self.pressure else []),
-            *(self.satellites.lines() if self.satellites else []),
+            *(line for found in self.sensors.values() if found for line in found.lines()),
             *([f"device's own attitudes: {self.device_attitude}"] if self.device_attitude else []),
             *self._truth_lines(),
-            *([] if self.refused else [self._axes_line()]),
+            *([] if self.refused else [compared]),
         ]
 
     @property
     def refused(self) -> bool:
         """Whether no track can be computed: units or samples are wrong."""
         return any(found.code == "refused" for found in self.findings)
-
-    def _axes_line(self) -> str:
-        if self.fit or (self.axes and self.axes.compared):
-            return "units, signs and axes: compared"
-        return "units: compared; the device tilts too seldom to compare the sensors' axes"
 
     def _timing_lines(self) -> list[str]:
         t = self.timing
@@ -267,11 +265,13 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         rest, magnetic = find_rest(sequence), assess_magnetometer(sequence)
     except InputError:  # an invalid rate, which was reported
         rest = magnetic = None
-    findings += magnetic_findings(magnetic) if magnetic else ()
-    pressure = assess_barometer(sequence.barometer)
-    satellites = assess_satellites(sequence.satellites)
-    findings += pressure.findings() if pressure else ()
-    findings += satellites.findings() if satellites else ()
+    sensors = {
+        "magnetometer": magnetic,
+        "barometer": assess_barometer(sequence.barometer),
+        "satellites": assess_satellites(sequence.satellites),
+    }
+    for found in sensors.values():
+        findings += found.findings() if found else ()
     findings += clock_findings(sequence) + known_position_findings(sequence)
     return Inspection(
         name=sequence.name,
@@ -285,9 +285,7 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         findings=tuple(findings),
         truth=sequence.truth_summary(),
         device_attitude=0 if sequence.device_attitude is None else len(sequence.device_attitude),
-        magnetic=magnetic,
-        pressure=pressure,
-        satellites=satellites,
+        sensors=sensors,
         yaw=yaw,
         axes=axes,
     )

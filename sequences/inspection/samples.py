@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-
 import numpy as np
 
 from stario.sequences.arrays import runs
@@ -13,13 +11,8 @@ from stario.sequences.errors import InputError
 from stario.sequences.findings import Finding
 from stario.sequences.inspection.constant_values import stuck_findings
 from stario.sequences.sequence import FloatArray, ImuSequence
-from stario.sequences.time_order import MAX_IMU_GAP, ahead_mask, increasing_mask
+from stario.sequences.time_order import ahead_mask, disorder, increasing_mask
 from stario.sequences.units import TIME_UNITS
-
-_log = logging.getLogger(__name__)
-
-_OUT_OF_ORDER = 0.05
-"""Share of backward steps above which the rows are out of order."""
 
 _SET_BACK = 5.0
 """Late samples that are late by more than this [s] come from a clock that was set back."""
@@ -124,31 +117,6 @@ def limit_words(sensor: str, values: FloatArray, unit: str, large: float) -> str
         f"{sensor}: {share_lost:.1%} of its samples are at its limit of {limit:.3g} {unit}: "
         "stronger motion was not recorded"
     )
-
-
-def disorder(time: FloatArray) -> str:
-    """Return how many of the times (n,) [s] go back, in words; empty if few do."""
-    back = int((np.diff(time[np.isfinite(time)]) < 0.0).sum())
-    many = back > _OUT_OF_ORDER * len(time)
-    return f"{back} of {len(time)} times earlier than the one above" if many else ""
-
-
-def in_order(sequence: ImuSequence) -> ImuSequence:
-    """Sort a recording by time if many rows are out of order, each by little.
-
-    Some loggers write samples of a few milliseconds in any order. Dropping them, as is done with a
-    few, would lose a twentieth of the samples. Rows that are far out of order are not sorted.
-    """
-    time = sequence.time
-    if not disorder(time):
-        return sequence
-    back = float((np.maximum.accumulate(time) - time).max())
-    if not back < MAX_IMU_GAP:
-        return sequence
-    _log.warning(
-        "%s: %s, by up to %.0f ms: sorted by time", sequence.name, disorder(time), 1e3 * back
-    )
-    return sequence.select(np.argsort(time, kind="stable"))
 
 
 def without_times_ahead(sequence: ImuSequence) -> ImuSequence:

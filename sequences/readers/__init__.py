@@ -10,8 +10,8 @@ from functools import partial
 from pathlib import Path
 
 from stario.sequences.arrays import check_choice, shown
+from stario.sequences.clean_samples import in_order
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.inspection.samples import in_order
 from stario.sequences.readers.archive import (
     AttributeFilter,
     archive_members,
@@ -27,18 +27,23 @@ from stario.sequences.readers.joined import is_joined, is_untimed, unpack_joined
 from stario.sequences.readers.lines import may_be_read
 from stario.sequences.readers.lists import is_list, list_entries
 from stario.sequences.readers.phones.event_lines import is_event_lines, read_event_lines
-from stario.sequences.readers.phones.json_export import is_json_export, unpack_json
-from stario.sequences.readers.phones.long_form import is_long_form, unpack_long_form
 from stario.sequences.readers.phones.phone import is_phone, is_wide, read_phone, read_wide
 from stario.sequences.readers.published.advio import is_advio, read_advio
 from stario.sequences.readers.published.euroc import is_euroc, read_euroc
-from stario.sequences.readers.published.imunet import is_imunet, read_imunet
 from stario.sequences.readers.published.oxiod import is_oxiod, read_oxiod
-from stario.sequences.readers.published.ridi import is_ridi, read_ridi
+from stario.sequences.readers.published.ridi import is_imunet, is_ridi, read_imunet, read_ridi
 from stario.sequences.readers.published.rnin import is_rnin, read_rnin
 from stario.sequences.readers.published.ronin import is_ronin, read_ronin
 from stario.sequences.readers.published.tlio import is_tlio, read_tlio
-from stario.sequences.readers.unpacking import is_zip, named_after, unpack_zip
+from stario.sequences.readers.unpacking import (
+    is_json_export,
+    is_long_form,
+    is_zip,
+    named_after,
+    unpack_json,
+    unpack_long_form,
+    unpack_zip,
+)
 from stario.sequences.readers.unrecognised import unrecognised
 from stario.sequences.sequence import ImuSequence
 

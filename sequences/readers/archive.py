@@ -10,22 +10,22 @@ record who carried which device where. Poses may come with
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from stario.sequences.arrays import first_of
-from stario.sequences.errors import ReadError
+from stario.sequences.errors import ReadError, StarioError
 from stario.sequences.lazy import optional_package
-from stario.sequences.readers.checked import checked, pose_mask, rotations
-from stario.sequences.readers.hdf5 import DAMAGED, is_hdf5, opened_hdf5
-from stario.sequences.readers.satellites import OPTIONAL
+from stario.sequences.readers.checked import OPTIONAL, checked, pose_mask, rotations
+from stario.sequences.readers.lines import first_bytes
 from stario.sequences.sequence import (
     Barometer,
-    BoolArray,
     DeviceAttitude,
     FloatArray,
     ImuSequence,
@@ -43,13 +43,14 @@ AttributeFilter = Mapping[str, Sequence[str]]
 
 _RONIN = "data.hdf5"
 _EXPECTED = "an intact HDF5 archive"
-_OPTIONAL = {
-    "velocity_W": ("truth/velocity", (3,)),
-    "position_covariance_W": ("truth/position_covariance", (3, 3)),
-}
-
+_OF_POSES = {"velocity": (3,), "position_covariance": (3, 3)}
 POSITIONS_OPTIONAL = ("sigma", "latlon_deg", "floor")
 SATELLITES_OPTIONAL = tuple(OPTIONAL.values())
+
+_MAGIC = b"\x89HDF\r\n\x1a\n"
+
+DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, AttributeError)
+"""Exceptions of h5py and NumPy for a damaged file, or for one with other content."""
 
 
 def split_name(path: Path) -> tuple[Path, str | None]:
@@ -172,10 +173,14 @@ def read_archive(path: Path) -> ImuSequence:
 
 
 def _sequence(path: Path, name: str, group: Any) -> ImuSequence:
-    truth, positions = _truth(path, group)
-    field = _samples(path, group, "mag", "field", 3)
-    pressure = _samples(path, group, "pressure", "hPa")
+    part = partial(_part, path, group)
     time = _column(path, group, "imu/t", finite=False)
+    truth, positions = _truth(path, group)
+    field, pressure = part("mag", {"field": [(3,)]}), part("pressure", {"hPa": [()]})
+    own = part("attitude", {"quat_xyzw": [(4,)]})
+    reported = part("satellites", {"latlon_deg": [(2,)]}, dict.fromkeys(SATELLITES_OPTIONAL, ()))
+    if own is not None:
+        own["attitude_WB"] = rotations(path, "attitude/quat_xyzw", own.pop("quat_xyzw"), "xyzw")
     return ImuSequence(
         name=name,
         time=time,
@@ -183,114 +188,83 @@ def _sequence(path: Path, name: str, group: Any) -> ImuSequence:
         accel=_column(path, group, "imu/accel", (len(time), 3), finite=False),
         truth=truth,
         converted=frozenset({"gyro", "accel", "sign"}),
-        magnetometer=None if field is None else Magnetometer(*field),
+        magnetometer=Magnetometer(**field) if field else None,
         positions=positions,
-        device_attitude=_device_attitude(path, group),
-        barometer=None if pressure is None else Barometer(*pressure),
-        satellites=_satellites(path, group),
+        device_attitude=DeviceAttitude(**own) if own else None,
+        barometer=Barometer(*pressure.values()) if pressure else None,
+        satellites=Satellites(**reported) if reported else None,
         attributes=_attributes(group),
     )
 
 
-def _samples(
-    path: Path, group: Any, stem: str, name: str, *columns: int
-) -> tuple[FloatArray, FloatArray] | None:
-    """Return times (N,) that increase and values (N, *columns) of a sensor; None without it."""
+def _part(
+    path: Path,
+    group: Any,
+    stem: str,
+    required: Mapping[str, Sequence[tuple[int, ...]]],
+    optional: Mapping[str, tuple[int, ...]] | None = None,
+    known: bool = False,
+) -> dict[str, Any] | None:
+    """Return the times that increase and the columns of a part by name; None without it.
+
+    Args:
+        path: the recording, for errors.
+        group: its group.
+        stem: name of the part.
+        required: shapes, any of which a row of a column may have.
+        optional: shapes of those that may lack, and may hold NaN.
+        known: whether it is a truth: others may then hold NaN too, but where it is "valid".
+    """
     if stem not in group:
         return None
     time = _column(path, group, f"{stem}/t")
-    values = _column(path, group, f"{stem}/{name}", (len(time), *columns))
-    keep = increasing_mask(time)
-    return time[keep], values[keep]
-
-
-def _device_attitude(path: Path, group: Any) -> DeviceAttitude | None:
-    found = _samples(path, group, "attitude", "quat_xyzw", 4)
-    if found is None:
-        return None
-    return DeviceAttitude(found[0], rotations(path, "attitude/quat_xyzw", found[1], "xyzw"))
-
-
-def _satellites(path: Path, group: Any) -> Satellites | None:
-    if "satellites" not in group:
-        return None
-    time = _column(path, group, "satellites/t")
-    latlon_deg = _column(path, group, "satellites/latlon_deg", (len(time), 2))
-    keep = increasing_mask(time)
-    rest = _optional(path, group, "satellites", SATELLITES_OPTIONAL, time)
-    return Satellites(time[keep], latlon_deg[keep], **{k: v[keep] for k, v in rest.items()})
-
-
-def _optional(
-    path: Path, group: Any, stem: str, names: Iterable[str], time: FloatArray
-) -> dict[str, FloatArray]:
-    """Return the columns of a part that are there, which may hold NaN."""
-    shapes = {"latlon_deg": (len(time), 2)}
-    return {
-        name: _column(path, group, f"{stem}/{name}", shapes.get(name, time.shape), finite=False)
-        for name in names
-        if f"{stem}/{name}" in group
-    }
+    columns: dict[str, Any] = {"time": time}
+    valid = np.ones(len(time), dtype=np.bool_)
+    if known and f"{stem}/valid" in group:
+        valid = np.asarray(_column(path, group, f"{stem}/valid", time.shape), dtype=np.bool_)
+    for name, rows in required.items():
+        shapes = [(len(time), *row) for row in rows]
+        values = _column(path, group, f"{stem}/{name}", *shapes, finite=not known)
+        if (bad := valid & ~np.isfinite(values.reshape(len(time), -1)).all(axis=1)).any():
+            where, fix = f"row {int(np.argmax(bad)) + 1}, {stem}/{name}", f"{stem}/valid"
+            found = "a value that is not finite"
+            raise ReadError(path, where, found, "finite numbers", f"write False there in {fix}")
+        columns[name] = values
+    for name, row in (optional or {}).items():
+        if f"{stem}/{name}" in group:
+            shape = len(time), *row
+            columns[name] = _column(path, group, f"{stem}/{name}", shape, finite=False)
+    keep = pose_mask(path, time) if known else increasing_mask(time)
+    columns |= {"valid": valid} if known else {}
+    return {name: values[keep] for name, values in columns.items()}
 
 
 def _truth(path: Path, group: Any) -> tuple[Trajectory | None, PositionTrack | None]:
     """Return the poses, and the positions or waypoints."""
-    positions = None
-    if "waypoints" in group:
-        place = "waypoints/xy" if "waypoints/xy" in group else "waypoints/p"
-        positions = _positions(path, group, "waypoints", place)
-    if "truth" not in group:
-        return None, positions
+    place = "xy" if "waypoints/xy" in group else "p"
+    positions = _positions(path, group, "waypoints", "waypoints", place)
     if "truth/quat_xyzw" not in group:
-        return None, _positions(path, group, "positions", "truth/p")
-    time = _column(path, group, "truth/t")
-    keep = pose_mask(path, time)
-    valid = _valid(path, group, "truth", time)
-    quat = _column(path, group, "truth/quat_xyzw", (len(time), 4), finite=False)
-    _check_known(path, "truth/quat_xyzw", quat, valid)
+        return None, _positions(path, group, "truth", "positions", "p") or positions
+    poses = _part(
+        path, group, "truth", {"quat_xyzw": [(4,)], "p": [(3,)]},
+        _OF_POSES, known=True,
+    )  # fmt: skip
+    assert poses is not None
     # Invalid rows may hold anything, but each must become a rotation.
-    finite = np.isfinite(quat).all(axis=1)
-    quat = np.where(finite.reshape(-1, 1), quat, [0.0, 0.0, 0.0, 1.0])
-    attitude_WB = rotations(path, "truth/quat_xyzw", quat[keep], "xyzw")
-    optional = {
-        name: _column(path, group, field, (len(time), *shape), finite=False)[keep]
-        for name, (field, shape) in _OPTIONAL.items()
-        if field in group
-    }
-    position_W = _column(path, group, "truth/p", (len(time), 3), finite=False)
-    _check_known(path, "truth/p", position_W, valid)
-    truth = Trajectory(time[keep], position_W[keep], attitude_WB, valid=valid[keep], **optional)
+    quat = poses.pop("quat_xyzw")
+    quat = np.where(np.isfinite(quat).all(axis=1)[:, None], quat, [0.0, 0.0, 0.0, 1.0])
+    attitude_WB = rotations(path, "truth/quat_xyzw", quat, "xyzw")
+    named = {f"{name}_W": poses.pop(name) for name in _OF_POSES if name in poses}
+    truth = Trajectory(position_W=poses.pop("p"), attitude_WB=attitude_WB, **poses, **named)
     return truth, positions
 
 
 def _positions(
-    path: Path, group: Any, kind: Literal["positions", "waypoints"], field: str
-) -> PositionTrack:
-    stem = field.split("/")[0]
-    time = _column(path, group, f"{stem}/t")
-    keep = pose_mask(path, time)
-    valid = _valid(path, group, stem, time)
-    position_W = _column(path, group, field, (len(time), 2), (len(time), 3), finite=False)
-    _check_known(path, field, position_W, valid)
-    rest = _optional(path, group, stem, POSITIONS_OPTIONAL, time)
-    known = {name: values[keep] for name, values in rest.items()}
-    return PositionTrack(time[keep], position_W[keep], kind, valid[keep], **known)
-
-
-def _valid(path: Path, group: Any, stem: str, time: FloatArray) -> BoolArray:
-    field = f"{stem}/valid"
-    if field not in group:
-        return np.ones(len(time), dtype=np.bool_)
-    return np.asarray(_column(path, group, field, (len(time),)), dtype=np.bool_)
-
-
-def _check_known(path: Path, field: str, values: FloatArray, valid: BoolArray) -> None:
-    """Check that the truth's values (N, K) are finite where it is valid."""
-    bad = valid & ~np.isfinite(values).all(axis=1)
-    if bad.any():
-        where = f"row {int(np.argmax(bad)) + 1}, {field}"
-        fix = f"write False there in {field.split('/')[0]}/valid"
-        raise ReadError(path, where, "a value that is not finite", "finite numbers", fix)
+    path: Path, group: Any, stem: str, kind: Literal["positions", "waypoints"], place: str
+) -> PositionTrack | None:
+    optional = {name: (2,) if name == "latlon_deg" else () for name in POSITIONS_OPTIONAL}
+    found = _part(path, group, stem, {place: [(2,), (3,)]}, optional, known=True)
+    return PositionTrack(position_W=found.pop(place), kind=kind, **found) if found else None
 
 
 def _column(
@@ -321,3 +295,33 @@ def _plain(value: Any) -> str | float:
         return value if isinstance(value, str) else float(value)
     except (TypeError, ValueError):
         return str(value)
+
+
+def is_hdf5(path: Path) -> bool:
+    """Return whether a file is HDF5, by its first bytes; never raises."""
+    return first_bytes(path, len(_MAGIC)) == _MAGIC
+
+
+@contextmanager
+def opened_hdf5(path: Path, expected: str) -> Iterator[Any]:
+    """Open a file for reading; damage or other content found in the block becomes a ReadError.
+
+    Args:
+        path: the file.
+        expected: what the file should be, for the error.
+
+    Raises:
+        ReadError: the file or what the block reads from it is damaged.
+        MissingPackageError: h5py is not installed.
+    """
+    h5py = optional_package("h5py", "readers")
+    try:
+        with h5py.File(path) as file:
+            yield file
+    except StarioError:
+        raise
+    except DAMAGED as error:
+        found = " ".join(str(error).split())[:200] or type(error).__name__
+        locked = isinstance(error, BlockingIOError) or "already open for write" in found
+        fix = "close it in the program that writes it" if locked else "is the download complete?"
+        raise ReadError(path, "content", found, expected, fix) from error

@@ -19,19 +19,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.lazy import optional_package
-from stario.sequences.readers.checked import finite_rows, magnetometer, rotations, trajectory
+from stario.sequences.readers.checked import (
+    RADIUS_PER_SIGMA,
+    barometer,
+    finite_rows,
+    magnetometer,
+    rotations,
+    satellites,
+    trajectory,
+)
 from stario.sequences.readers.clocks import resample_to_gyro
 from stario.sequences.readers.lines import first_bytes
 from stario.sequences.readers.phones.attitude import agreeing_attitude, device_attitude
-from stario.sequences.readers.phones.sensor_table import Samples
-from stario.sequences.readers.pressure import barometer
-from stario.sequences.readers.satellites import RADIUS_PER_SIGMA, satellites
+from stario.sequences.readers.phones.samples import Samples
 from stario.sequences.readers.text import IntArray, seconds
-from stario.sequences.sequence import Barometer, FloatArray, ImuSequence, Satellites, Trajectory
+from stario.sequences.sequence import FloatArray, ImuSequence, Satellites, Trajectory
 from stario.sequences.units import MAGNETIC_UNITS
 
 _log = logging.getLogger(__name__)
@@ -84,50 +89,35 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
         stamps, gyro, accel = resample_to_gyro(
             path, stamps, gyro, force.stamps_ns, force.values[:, _ACCEL]
         )
-    sensors = (_IMU, _APART, *_OTHERS)
-    truth = next((m for kind, m in messages.items() if kind not in sensors), None)
-    magnetic = None
-    if (field := messages.get(_MAGNETIC)) is not None:
-        tesla = field.values[:, :3]
-        magnetic = magnetometer(seconds(field.stamps_ns, stamps[0]), tesla * MAGNETIC_UNITS["T"])
+    time = {kind: seconds(m.stamps_ns, stamps[0]) for kind, m in messages.items()}
+    values = {kind: m.values for kind, m in messages.items()}
+    poses = next((m for kind, m in messages.items() if kind not in (_IMU, _APART, *_OTHERS)), None)
+    field, pressure, places = (values.get(kind) for kind in _OTHERS)
+    own = agreeing_attitude(
+        imu.stamps_ns, imu.values[:, _ORIENTATION], Samples(imu.stamps_ns, imu.values[:, _GYRO])
+    )
     return ImuSequence(
         name=path.resolve().stem,
         time=seconds(stamps, stamps[0]),
         gyro=gyro,
         accel=accel,
-        truth=None if truth is None else _truth(path, truth, stamps[0]),
-        magnetometer=magnetic,
-        device_attitude=device_attitude(_own_attitude(imu), stamps[0]),
-        barometer=_barometer(path, messages.get(_PRESSURE), stamps[0]),
-        satellites=_satellites(messages.get(_SATELLITES), stamps[0]),
+        truth=None if poses is None else _truth(path, poses, stamps[0]),
+        magnetometer=None
+        if field is None
+        else magnetometer(time[_MAGNETIC], field[:, :3] * MAGNETIC_UNITS["T"]),
+        device_attitude=device_attitude(own, stamps[0]),
+        barometer=None
+        if pressure is None
+        else barometer(path, messages[_PRESSURE].topic, time[_PRESSURE], pressure[:, 0], "Pa"),
+        satellites=None if places is None else _satellites(places, time[_SATELLITES]),
     )
 
 
-def _barometer(path: Path, received: _Messages | None, start_ns: np.int64) -> Barometer | None:
-    if received is None:
-        return None
-    time = seconds(received.stamps_ns, start_ns)
-    try:
-        return barometer(path, received.topic, time, received.values[:, 0], "Pa")
-    except ReadError as error:  # the barometer is optional
-        _log.warning("pressure skipped: %s", error)
-        return None
-
-
-def _satellites(received: _Messages | None, start_ns: np.int64) -> Satellites | None:
-    if received is None:
-        return None
-    values = received.values
+def _satellites(values: FloatArray, time: FloatArray) -> Satellites | None:
     variance = 0.5 * (values[:, 3] + values[:, 7])  # zero if unknown
     radius = RADIUS_PER_SIGMA * np.sqrt(np.maximum(variance, 0.0))
     rest = {"altitude_m": values[:, 2], "radius_m": radius}
-    return satellites(seconds(received.stamps_ns, start_ns), values[:, :2], rest)
-
-
-def _own_attitude(imu: _Messages) -> tuple[IntArray, Rotation] | None:
-    """Return the attitude in the IMU's messages if it agrees with their gyroscope."""
-    samples = Samples(imu.stamps_ns, imu.values[:, _GYRO])
-    return agreeing_attitude(imu.stamps_ns, imu.values[:, _ORIENTATION], samples)
+    return satellites(time, values[:, :2], rest)
 
 
 def is_bag(path: Path) -> bool:
@@ -177,9 +167,8 @@ def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messag
 
 
 def _imu_topic(path: Path, topics: dict[str, str], wanted: str) -> str:
-    candidates = [topic for topic, kind in sorted(topics.items()) if kind == _IMU]
-    if wanted:
-        return _named(path, "imu topic", wanted, candidates)
+    imus = [topic for topic, kind in sorted(topics.items()) if kind == _IMU]
+    candidates = _named(path, "imu topic", wanted, imus)
     if len(candidates) != 1:
         others = [f"{t} ({k.split('/')[-1]})" for t, k in topics.items()][:8]
         found = ", ".join(candidates or others)
@@ -196,12 +185,11 @@ def _sensor_topics(topics: dict[str, str]) -> list[str]:
 
 
 def _truth_topic(path: Path, topics: dict[str, str], wanted: str) -> list[str]:
-    sensors = (_IMU, *_OTHERS)
-    candidates = [t for t, k in sorted(topics.items()) if k in _DOUBLES and k not in sensors]
     if wanted == NO_TRUTH:
         return []
-    if wanted:
-        return [_named(path, "truth topic", wanted, candidates)]
+    sensors = (_IMU, *_OTHERS)
+    poses = [t for t, k in sorted(topics.items()) if k in _DOUBLES and k not in sensors]
+    candidates = _named(path, "truth topic", wanted, poses)
     if len(candidates) > 1:
         fix = f"name one: --truth-topic {candidates[0]}, or --truth-topic {NO_TRUTH}"
         raise ReadError(path, "topics", ", ".join(candidates), "one topic with poses", fix)
@@ -216,12 +204,12 @@ def _nearest_topic(topics: dict[str, str], wanted: str, imu_topic: str) -> list[
     return [candidates[shared.index(max(shared))]] if candidates else []
 
 
-def _named(path: Path, field: str, wanted: str, candidates: list[str]) -> str:
-    if wanted not in candidates:
-        raise ReadError(
-            path, field, repr(wanted), f"one of {', '.join(candidates) or '(none in this bag)'}"
-        )
-    return wanted
+def _named(path: Path, field: str, wanted: str, candidates: list[str]) -> list[str]:
+    """Return the candidate that the user wants, or all of them."""
+    if wanted and wanted not in candidates:
+        known = f"one of {', '.join(candidates) or '(none in this bag)'}"
+        raise ReadError(path, field, repr(wanted), known)
+    return [wanted] if wanted else candidates
 
 
 def _decoded(

@@ -1,8 +1,13 @@
-"""Parts of a recording as files give them, checked: numbers, rotations, poses, magnetic field."""
+"""Parts of a recording as files give them, checked.
+
+These are numbers, rotations and poses, the magnetic field, the pressure of the air (in which unit,
+and whether it is pressure at all) and positions of a satellite receiver, as measurements.
+"""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +16,59 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.text import IntArray
-from stario.sequences.sequence import BoolArray, FloatArray, Magnetometer, Trajectory
+from stario.sequences.sequence import (
+    Barometer,
+    BoolArray,
+    FloatArray,
+    Magnetometer,
+    Satellites,
+    Trajectory,
+)
 from stario.sequences.time_order import increasing_mask
+from stario.sequences.units import (
+    HIGHEST_HPA,
+    LOWEST_HPA,
+    PRESSURE_UNITS,
+    SPEED_UNITS,
+    pressure_unit_of,
+)
 
 _log = logging.getLogger(__name__)
 
 _HELD_SHARE = 1.0 / 3.0
+_LARGEST_STEP_HPA = 0.3
+"""Median step between different neighbours of anything but pressure; of barometers it is below 0.1,
+and 0.2 in a lift at 1 Hz. Altitudes in metres taken for hPa have larger ones."""
+
+OPTIONAL = {
+    "alt": "altitude_m",
+    "acc": "radius_m",
+    "speed": "speed_m_s",
+    "bearing": "bearing_deg",
+}
+"""Optional attributes of `Satellites` by their columns in a generic CSV."""
+
+DEGREES = {"deg": 1.0, "": 1.0, "°": 1.0}
+
+_METRES = {"m": 1.0, "": 1.0, "ft": 0.3048}
+
+UNITS = {
+    "altitude_m": _METRES,
+    "radius_m": _METRES,
+    "speed_m_s": SPEED_UNITS | {"": 1.0},
+    "bearing_deg": DEGREES,
+}
+"""Factors of the units of these attributes, without a unit as well."""
+
+RADIUS_PER_SIGMA = 1.51
+"""Radius that holds 68 % of a Gaussian in the plane, in standard deviations per axis."""
+
+USUAL_RADIUS, LARGEST_RADIUS = 10.0, 30.0
+"""Radius [m] where none is stated, and the largest: more is that of positions from the network's
+cells or of rooms without reception."""
+
+_LARGEST_DEGREES = 90.0, 180.0
+"""Largest latitude and longitude."""
 
 
 def checked(path: Path, field: str, values: FloatArray) -> FloatArray:
@@ -143,3 +195,116 @@ def trajectory(
         attitude_WB=attitude_WB[keep],
         velocity_W=None if velocity_W is None else velocity_W[keep],
     )
+
+
+def barometer(
+    path: Path, title: str, time: FloatArray, values: FloatArray, unit: str = ""
+) -> Barometer | None:
+    """Return the pressure in hPa at the times that advance; None if there is none.
+
+    None too, with a warning, if the values are no pressure in any unit: a barometer is optional.
+
+    Args:
+        path: the file, for messages.
+        title: title of its column, for messages.
+        time: (N,) [s].
+        values: (N,) pressure; NaN, zero or negative where there is none.
+        unit: its unit in the tables' spelling; empty to tell it by the size.
+    """
+    kept = np.isfinite(time) & np.isfinite(values) & (values > 0.0)
+    kept[kept] = increasing_mask(time[kept])
+    if not kept.any():
+        return None
+    try:
+        return Barometer(time[kept], _in_hPa(path, title, values[kept], unit))
+    except ReadError as error:
+        _log.warning("pressure skipped: %s", error)
+        return None
+
+
+def _in_hPa(path: Path, title: str, values: FloatArray, unit: str) -> FloatArray:
+    """Return pressures (N,) in the named unit, or in the one that fits a typical value, in hPa."""
+    value = float(np.median(values))
+    if unit and unit not in PRESSURE_UNITS:
+        raise ReadError(path, title, f"{value:.6g} {unit}", *_expected())
+    likely = unit
+    if not (unit and LOWEST_HPA <= PRESSURE_UNITS[unit] * value <= HIGHEST_HPA):
+        if not (likely := pressure_unit_of(value)):
+            raise ReadError(path, title, f"{value:.6g} {unit}".rstrip(), *_expected())
+        if unit:
+            words = "%s: %s: %.6g is no pressure in %s: read as %s"
+            _log.warning(words, path, title, value, unit, likely)
+    pressure_hPa = values * PRESSURE_UNITS[likely]
+    steps = np.abs(np.diff(pressure_hPa))
+    step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
+    if not unit and step > _LARGEST_STEP_HPA:
+        found = f"steps of {step:.2g} hPa, which is {8.4 * step:.0f} m of height"
+        raise ReadError(path, title, found, *_expected())
+    return np.asarray(pressure_hPa)
+
+
+def _expected() -> tuple[str, str]:
+    expected = f"pressure of {LOWEST_HPA:g} to {HIGHEST_HPA:g} hPa, or in Pa, kPa or inHg"
+    return expected, "is it an altitude?"
+
+
+def known_places(latlon_deg: FloatArray) -> BoolArray:
+    """Return which of the latitudes and longitudes (N, 2) are a place: not NaN, nor zeros.
+
+    Some apps write zeros until there is a position.
+    """
+    return np.asarray((np.abs(latlon_deg) <= _LARGEST_DEGREES).all(axis=1) & latlon_deg.any(axis=1))
+
+
+def in_degrees(path: Path, latlon_deg: FloatArray) -> FloatArray:
+    """Return latitudes and longitudes (N, 2), exchanged if only that makes them places.
+
+    A few rows may hold anything; a single one proves nothing.
+
+    Raises:
+        ReadError: no row is in degrees.
+    """
+    present = latlon_deg[np.isfinite(latlon_deg).all(axis=1) & latlon_deg.any(axis=1)]
+    if len(present) < 2 or known_places(present).any():
+        return latlon_deg
+    if known_places(present[:, ::-1]).all():
+        _log.warning("%s: latitude and longitude are exchanged: read the other way round", path)
+        return latlon_deg[:, ::-1]
+    found, fix = f"{present[0, 0]:.10g} and {present[0, 1]:.10g}", ""
+    degrees, minutes = np.divmod(np.abs(present), 100.0)
+    if (minutes < 60.0).all() and known_places(degrees).all():
+        latitude = np.sign(present[0, 0]) * (degrees[0, 0] + minutes[0, 0] / 60.0)
+        fix = f"NMEA's degrees and minutes? That latitude is {latitude:.6f}"
+    expected = "degrees, as in 48.137 and 11.575"
+    raise ReadError(path, "latitude, longitude", found, expected, fix)
+
+
+def satellites(
+    time: FloatArray, latlon_deg: FloatArray, rest: Mapping[str, FloatArray]
+) -> Satellites | None:
+    """Return the known places whose times advance; None if there is none.
+
+    Args:
+        time: (N,) [s].
+        latlon_deg: (N, 2) latitude and longitude [deg].
+        rest: (N,) those of the attributes of `OPTIONAL` that the file has. Phones write a negative
+            accuracy, speed or bearing, or an accuracy of 0, where they know none: it becomes NaN.
+    """
+    kept = known_places(latlon_deg) & np.isfinite(time)
+    kept[kept] = increasing_mask(time[kept])
+    if not kept.any():
+        return None
+    stated = {name: values[kept] for name, values in rest.items()}
+    if "radius_m" in stated:
+        stated["radius_m"] = np.where(stated["radius_m"] > 0.0, stated["radius_m"], np.nan)
+    for name in {"speed_m_s", "bearing_deg"} & set(stated):
+        stated[name] = np.where(stated[name] >= 0.0, stated[name], np.nan)
+    told = {name: values for name, values in stated.items() if np.isfinite(values).any()}
+    return Satellites(time[kept], latlon_deg[kept], **told)
+
+
+def satellite_columns(reported: Satellites) -> tuple[list[str], FloatArray]:
+    """Return names and values (N, K) of a generic CSV's columns for what a receiver reported."""
+    known = {name: getattr(reported, attribute) for name, attribute in OPTIONAL.items()}
+    known = {name: values for name, values in known.items() if values is not None}
+    return ["lat", "lon", *known], np.column_stack([reported.latlon_deg, *known.values()])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-import math
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +11,10 @@ import numpy as np
 from stario.sequences.arrays import interpolated
 from stario.sequences.clean_samples import MAX_RATE, MIN_RATE, SHARED_TIMES
 from stario.sequences.errors import ReadError
-from stario.sequences.inspection.samples import disorder
 from stario.sequences.readers.phones.sensor_words import XSENS_CLOCK
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray
-from stario.sequences.time_order import MAX_IMU_GAP, increasing_mask
+from stario.sequences.time_order import MAX_IMU_GAP, disorder, increasing_mask
 from stario.sequences.units import FILETIME_1970, FILETIME_NS, TIME_UNITS
 
 _log = logging.getLogger(__name__)
@@ -45,13 +44,6 @@ _FEW_LOST = 0.05
 
 _FEW_ROWS = 10
 """Number of rows below which a count may be a coincidence."""
-
-_DATE_FIELDS = (
-    *((1e10, math.inf, 1970, 2100), (1e8, 100, 1, 13), (1e6, 100, 1, 32)),
-    *((1e4, 100, 0, 24), (1e2, 100, 0, 60), (1, 100, 0, 60)),
-)
-"""Year, month, day, hour, minute and second in the digits of a date: unit and number of values of
-each field, its smallest value and its limit. The year alone rules out nearly all other numbers."""
 
 
 def resample_to_gyro(
@@ -120,13 +112,9 @@ def _sorted_samples(
     order = np.argsort(stamps_ns, kind="stable")
     stamps_ns, values = stamps_ns[order], values[order]
     fresh = np.append(True, np.diff(stamps_ns) > 0)
-    _warn_of_few_times(path, name, stamps_ns[fresh], fresh | _differing(values))
+    differing = np.append(True, np.diff(values, axis=0).any(axis=1))
+    _warn_of_few_times(path, name, stamps_ns[fresh], fresh | differing)
     return stamps_ns[fresh], values[fresh]
-
-
-def _differing(values: FloatArray) -> BoolArray:
-    """Return which of the rows (N, 3) differ from the one above."""
-    return np.append(True, np.diff(values, axis=0).any(axis=1))
 
 
 def _warn_of_few_times(path: Path, name: str, stamps_ns: IntArray, samples: BoolArray) -> None:
@@ -164,17 +152,18 @@ def refuse_counts_and_dates(file: Path, title: str, time: FloatArray) -> None:
         fix = f"name a column of times `t [s]`; if these are times, name their unit: `{title} [ms]`"
         raise ReadError(file, title, found, "times", fix)
     known = time[np.isfinite(time)]
-    if _is_date(known) or _is_date(known // 1000.0):
+    if len(known) and all(_is_date(f"{one:.0f}") for one in known.tolist()):
         expected = "seconds, or dates such as 2024-05-01 12:00:59.990"
         raise ReadError(file, title, f"{time[0]:.0f}, a date without separators", expected)
 
 
-def _is_date(time: FloatArray) -> bool:
-    """Return whether the digits of all times are year, month, day, hour, minute and second."""
-    return len(time) > 0 and all(
-        bool(((time // unit % size >= least) & (time // unit % size < limit)).all())
-        for unit, size, least, limit in _DATE_FIELDS
-    )
+def _is_date(digits: str) -> bool:
+    """Return whether they are year, month, day, hour, minute and second, perhaps milliseconds."""
+    try:
+        year = datetime.strptime(digits[:14], "%Y%m%d%H%M%S").year
+    except ValueError:
+        return False
+    return len(digits) in (14, 17) and 1970 <= year < 2100
 
 
 def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.int64) -> int:

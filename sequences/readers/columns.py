@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from stario.sequences.errors import ReadError
+from stario.sequences.readers.checked import DEGREES, OPTIONAL, UNITS
+from stario.sequences.readers.lines import first_lines
 from stario.sequences.readers.phones.sensor_words import (
     axis_of,
     is_time,
@@ -22,7 +24,6 @@ from stario.sequences.units import (
     GYRO_UNITS,
     MAGNETIC_UNITS,
     PRESSURE_UNITS,
-    SPEED_UNITS,
     TIME_UNITS,
     unit_named,
 )
@@ -66,12 +67,10 @@ RARE = (PRESSURE, *SATELLITE_HEADER)
 """Quantities that some rows hold; a column of one in another unit is not read."""
 QUANTITIES = (*IMU, *MAGNETIC, *TRUTH, SIGMA, *RARE)
 
-_DEGREES, _METRES = {"deg": 1.0, "": 1.0, "°": 1.0}, {"m": 1.0, "": 1.0, "ft": 0.3048}
 RARE_UNITS: dict[str, Mapping[str, float]] = {
     PRESSURE: PRESSURE_UNITS | {"": math.nan},
-    **dict.fromkeys(("lat", "lon", "bearing"), _DEGREES),
-    **dict.fromkeys(("alt", "acc"), _METRES),
-    "speed": SPEED_UNITS | {"": 1.0},
+    **dict.fromkeys(("lat", "lon"), DEGREES),
+    **{name: UNITS[attribute] for name, attribute in OPTIONAL.items()},
 }
 """Factors of their units; that of a pressure without one is told from its size."""
 
@@ -99,6 +98,9 @@ _LIKE_TRUTH = re.compile(
 )
 _UNITS = {*ACCEL_UNITS, *GYRO_UNITS, *MAGNETIC_UNITS, *TIME_UNITS}
 _QUOTES = " \"'"
+
+_HEAD_LINES = 200
+"""Number of lines within which the header must be for a file to be recognised."""
 
 _FEWEST_UNITS = 3
 """Number of cells that make a row of units: those of one sensor."""
@@ -154,8 +156,9 @@ def _header_index(lines: list[str]) -> int | None:
     return None
 
 
-def columns_named(lines: list[str]) -> set[str]:
-    """Return the canonical names of the columns in a header, empty without one."""
+def named_columns(path: Path) -> set[str]:
+    """Return the canonical names of the columns that a file's header names, empty without one."""
+    lines = first_lines(path, _HEAD_LINES, comments=True)
     index = _header_index(lines)
     return set() if index is None else {*canonical_names(lines[index])} - {""}
 
@@ -190,20 +193,15 @@ def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
             raise ReadError(path, f"line {number}, {name}", found, "one column")
         else:
             columns[name] = Column(index, title, unit)
-    if not {"lat", "lon"} <= set(columns):
-        ignored += [columns.pop(name).title for name in SATELLITE_HEADER if name in columns]
-    missing = [name for name in ("t", *IMU) if name not in columns]
-    if not set(POSITION) & set(columns):  # attitude alone is not a track
-        ignored += [columns.pop(name).title for name in QUAT if name in columns]
-    if not set(POSITION) & set(columns) or set(QUAT) & set(columns):
-        ignored += [columns.pop(SIGMA).title] if SIGMA in columns else []
+    placed, posed = (bool(set(names) & set(columns)) for names in (POSITION, QUAT))
+    useless = [] if {"lat", "lon"} <= set(columns) else [*SATELLITE_HEADER]
+    useless += [] if placed else QUAT  # attitude alone is not a track
+    useless += [] if placed and not posed else [SIGMA]
+    ignored += [columns.pop(name).title for name in useless if name in columns]
     truth = [name for name in TRUTH if name in columns]
-    if set(QUAT) & set(columns):
-        missing += [name for name in TRUTH if name not in columns]
-    elif truth:
-        missing += [name for name in POSITION[:2] if name not in columns]
-    if set(MAGNETIC) & set(columns):
-        missing += [name for name in MAGNETIC if name not in columns]
+    needed = ["t", *IMU, *((TRUTH if posed else POSITION[:2]) if placed else ())]
+    needed += MAGNETIC if set(MAGNETIC) & set(columns) else ()
+    missing = [name for name in needed if name not in columns]
     if missing:
         fix = "or remove the truth columns" if truth and not set(missing) & {"t", *IMU} else ""
         if missing == ["t"]:

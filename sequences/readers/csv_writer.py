@@ -9,6 +9,7 @@ import numpy as np
 
 from stario.sequences.arrays import check_type
 from stario.sequences.files import atomic_write
+from stario.sequences.readers.checked import satellite_columns
 from stario.sequences.readers.columns import (
     HEADER,
     IMU,
@@ -18,7 +19,6 @@ from stario.sequences.readers.columns import (
     SIGMA_HEADER,
     TRUTH_HEADER,
 )
-from stario.sequences.readers.satellites import satellite_columns
 from stario.sequences.sequence import FloatArray, ImuSequence
 
 

@@ -37,7 +37,13 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import magnetometer
+from stario.sequences.readers.checked import (
+    OPTIONAL,
+    barometer,
+    in_degrees,
+    magnetometer,
+    satellites,
+)
 from stario.sequences.readers.clocks import (
     LATEST_S,
     assumed_unit,
@@ -57,22 +63,19 @@ from stario.sequences.readers.columns import (
     TRUTH,
     Column,
     Header,
-    columns_named,
+    named_columns,
     read_header,
     unit_factor,
 )
-from stario.sequences.readers.dates import with_seconds
-from stario.sequences.readers.devices import refuse_several_devices
 from stario.sequences.readers.lines import (
     decimal_mark,
     ends_within_a_row,
-    first_lines,
     is_row,
     read_lines,
     unquoted,
+    with_seconds,
 )
-from stario.sequences.readers.pressure import barometer
-from stario.sequences.readers.satellites import OPTIONAL, in_degrees, satellites
+from stario.sequences.readers.table_head import refuse_several_devices
 from stario.sequences.readers.text import RowFormat, Table, is_missing, read_table, seconds
 from stario.sequences.sequence import (
     Barometer,
@@ -106,9 +109,6 @@ _ALTERNATING = 0.1
 _ZERO_ROWS, _EITHER = 0.05, 0.9
 """Share of rows of zeros of each sensor, and of rows with just one sensor, from which they are
 separate rows: neither sensor at rest reads exactly 0, 0, 0."""
-
-_HEAD_LINES = 200
-"""Number of lines within which the header must be for a file to be recognised."""
 
 
 def read_generic_csv(path: Path) -> ImuSequence:
@@ -147,11 +147,6 @@ def read_generic_csv(path: Path) -> ImuSequence:
 def is_generic_csv(path: Path) -> bool:
     """Return whether a file starts with a header that names IMU columns of this format."""
     return bool(named_columns(path) & set(IMU))
-
-
-def named_columns(path: Path) -> set[str]:
-    """Return the canonical names of the columns that a file's header names."""
-    return columns_named(first_lines(path, _HEAD_LINES, comments=True))
 
 
 @dataclass(frozen=True)
@@ -304,12 +299,8 @@ def _barometer(path: Path, header: Header, rows: _Rows) -> Barometer | None:
     if PRESSURE not in rows.table:
         return None
     column = header.columns[PRESSURE]
-    unit = unit_named(column.unit)
-    try:
-        return barometer(path, column.title, rows.time, rows.table[PRESSURE], unit)
-    except ReadError as error:  # the barometer is optional
-        _log.warning("pressure skipped: %s", error)
-        return None
+    values = rows.table[PRESSURE]
+    return barometer(path, column.title, rows.time, values, unit_named(column.unit))
 
 
 def _satellites(path: Path, header: Header, rows: _Rows) -> Satellites | None:

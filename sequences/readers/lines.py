@@ -1,4 +1,4 @@
-"""Lines of text files: decoding, and a look at a file's first lines to recognise its format."""
+"""Lines of text files: decoding, dates as seconds, and a look at the first lines."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import logging
 import os
 import re
 from collections.abc import Iterable
+from datetime import UTC, datetime, timedelta
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,23 @@ _QUOTED_MARK = re.compile(
 )
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 """Byte order marks, with which spreadsheets begin a file of Unicode text."""
+
+_DAY_S = 86400
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+_TIME = re.compile(
+    r"(?<![\w:.])"
+    r"(?:(?:(?P<date>\d{4}[-/]\d\d[-/]\d\d|\d\d-[a-z]{3}-\d{4})"
+    r"|\d\d?[./]\d\d?[./]\d\d(?:\d\d)?)[t _])?"
+    r"(?P<clock>\d?\d:\d\d:\d\d)"
+    r"(?:(?::(?P<count>\d+))|(?:\.|,(?=\d+[;\t]))(?P<fraction>\d+))?"
+    r"(?: ?(?P<half>am|pm)\b)?"
+    r"(?P<zone> ?(?:z|(?:utc|gmt)?[+-]\d\d:?\d\d|utc|gmt)|[+-]\d\d)?"
+    r"(?![\w:])",
+    flags=re.IGNORECASE,
+)
+"""A time of day, with a date before it or a zone after it if there is one."""
+
+_COUNT = re.compile(r"\d:\d\d:\d\d:(\d+)")
 
 
 def read_lines(path: Path) -> list[str]:
@@ -204,3 +223,59 @@ def ends_within_a_row(path: Path, delimiter: str | None) -> bool:
     ends = [cells[-1].strip(' "') for cells in earlier]
     shortest = min((len(end) for end in ends if not end[:1].isalpha()), default=0)  # no titles
     return len(last) < len(earlier[-1]) or len(last[-1].strip(' "')) < shortest
+
+
+def with_seconds(lines: Iterable[str]) -> list[str]:
+    """Replace the dates and times of day in a file's lines by seconds.
+
+    Dates become seconds since 1970, without a zone as if it were UTC. Times of day, and those with
+    a date whose day and month may be either (`01/05/2024`), become seconds since a midnight; a step
+    of more than half a day from the line before is taken for one across midnight. After a colon,
+    milliseconds may lack zeros at the left: `12:00:00:5`, if others have more digits.
+    """
+    lines = list(lines)
+    digits = max((len(count) for line in lines for count in _COUNT.findall(line)), default=0)
+    last: dict[int, int] = {}  # the time of day that comes first in a line, second, ...
+
+    def replaced(line: str) -> str:
+        place = 0
+
+        def seconds(match: re.Match[str]) -> str:
+            nonlocal place
+            try:
+                whole = _whole_seconds(*match.group("date", "clock", "half", "zone"))
+            except ValueError:  # such as 24:60:00
+                return match[0]
+            if not match["date"]:
+                whole += _DAY_S * round((last.get(place, whole) - whole) / _DAY_S)
+                last[place] = whole
+            place += 1
+            fraction = match["fraction"] or (match["count"] or "").rjust(digits, "0")
+            return f"{whole}.{fraction}" if fraction else f"{whole}"  # its digits stay exact
+
+        return _TIME.sub(seconds, line)
+
+    return [replaced(line) if ":" in line else line for line in lines]
+
+
+@lru_cache(maxsize=4096)  # the samples within a second share it
+def _whole_seconds(date: str | None, clock: str, half: str | None, zone: str | None) -> int:
+    """Return the seconds since 1970, or without a date since a midnight.
+
+    Raises:
+        ValueError: there is no such time.
+    """
+    hour, minute, second = map(int, clock.split(":"))
+    if half:
+        hour = hour % 12 + 12 * (half.lower() == "pm")
+    if not date:
+        datetime(2000, 1, 1, hour, minute, second)  # refuses what is no time
+        # Counted from the midnight before, so that a step back across one stays positive.
+        return _DAY_S + (60 * hour + minute) * 60 + second
+    first, middle, last = re.split("[-/]", date)
+    month = int(middle) if middle.isdecimal() else _MONTHS.index(middle.lower()) + 1
+    year, day = (first, last) if len(first) == 4 else (last, first)
+    time = datetime(int(year), month, int(day), hour, minute, second, tzinfo=UTC)
+    digits = re.sub(r"\D", "", zone or "")
+    ahead = timedelta(hours=int(digits[:2] or 0), minutes=int(digits[2:] or 0))
+    return int((time + ahead if "-" in (zone or "") else time - ahead).timestamp())

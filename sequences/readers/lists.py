@@ -47,7 +47,8 @@ def list_entries(path: Path) -> Iterator[tuple[Path, AttributeFilter] | ReadErro
     entries = [(k, *_parsed(x.split("#")[0])) for k, x in numbered if is_row(x)]
     if not entries:
         raise ReadError(path, "list", "no entry", "names of recordings")
-    bases = _bases(path.parent)
+    folder = path.parent
+    bases = [folder, *(_folders(folder) or [folder.parent, *_folders(folder.parent)])]
     if len(entries) > _HEAD_LINES and not any(_located(bases, name) for _, name, _ in entries):
         found = f"{len(entries)} lines without an existing name, such as {entries[0][1]:.60}"
         raise ReadError(path, "list", found, "a recording, or a list of them")
@@ -71,10 +72,6 @@ def _parsed(text: str) -> tuple[str, AttributeFilter]:
         where.setdefault(match["key"], []).insert(0, match["value"].strip('"'))
         text = text[: match.start()]
     return text.split(",")[0].strip(), where
-
-
-def _bases(folder: Path) -> list[Path]:
-    return [folder, *(_folders(folder) or [folder.parent, *_folders(folder.parent)])]
 
 
 def _folders(folder: Path) -> list[Path]:

@@ -29,8 +29,8 @@ from stario.sequences.readers.table_head import table_heads
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.time_order import increasing_mask
-from stario.sequences.truth.accel_axes import accel_axes
 from stario.sequences.truth.alignment import BodyAlignment, align_tracked_body, clock_offset
+from stario.sequences.truth.positions import accel_axes
 
 _log = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ class PoseCandidate:
 
     Attributes:
         file: the file.
-        stamps_ns: (N,) times [ns].
+        stamps_ns: (N,) times [ns], strictly increasing.
         position: (N, 3) positions [m].
         attitude: N rotations, from an unknown body to an unknown world.
         order: how the attitude was read: "xyzw", "wxyz" or "matrix".
@@ -146,7 +146,9 @@ def pose_rows(file: Path) -> list[PoseCandidate]:
     good = (np.abs(size - 1.0) < NORM_TOLERANCE) & np.isfinite(numbers).all(axis=1)
     if not good.any():
         return []
-    stamps, position, rotation = stamps[good], position[good], rotation[good]
+    used = np.flatnonzero(good)[np.argsort(stamps[good], kind="stable")]
+    used = used[increasing_mask(seconds(stamps[used], stamps[used[0]]))]
+    stamps, position, rotation = stamps[used], position[used], rotation[used]
     if columns == 13:
         return [PoseCandidate(file, stamps, position, Rotation.from_matrix(rotation), "matrix")]
     return [
@@ -157,11 +159,10 @@ def pose_rows(file: Path) -> list[PoseCandidate]:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Fit of poses to the IMU: times on the IMU's clock, their rows, alignment and mount R_PB."""
+    """Fit of poses to the IMU: times on the IMU's clock, alignment and mount R_PB."""
 
     candidate: PoseCandidate
     time: FloatArray
-    rows: IntArray
     aligned: BodyAlignment
     mount: Rotation
 
@@ -175,11 +176,7 @@ def _fitted(
     sequence: ImuSequence, start_ns: np.int64 | int, candidate: PoseCandidate
 ) -> _Fit | None:
     time, gyro, accel = clean_samples(sequence)
-    order = np.argsort(candidate.stamps_ns, kind="stable")
-    pose_time = seconds(candidate.stamps_ns[order], start_ns)
-    kept = increasing_mask(pose_time)
-    rows, pose_time = order[kept], pose_time[kept]
-    attitude = candidate.attitude[rows]
+    pose_time, attitude = seconds(candidate.stamps_ns, start_ns), candidate.attitude
     valid = np.ones(len(pose_time), dtype=np.bool_)
     try:
         aligned = None
@@ -197,7 +194,7 @@ def _fitted(
     if aligned.correlation < _MIN_CORRELATION:
         return None
     mount = _squared(max(aligned.mounts, key=lambda piece: piece[1] - piece[0])[2])
-    return _Fit(candidate, pose_time, rows, aligned, mount)
+    return _Fit(candidate, pose_time, aligned, mount)
 
 
 def _squared(mount: Rotation) -> Rotation:
@@ -223,11 +220,9 @@ def _log_choice(sequence: ImuSequence, fits: list[_Fit], chosen: _Fit) -> None:
 
 
 def _posed(sequence: ImuSequence, fit: _Fit) -> ImuSequence:
-    candidate = fit.candidate
-    aligned = fit.aligned
-    attitude_PB = candidate.attitude[fit.rows] * fit.mount
-    time = fit.time + aligned.lag
-    truth = Trajectory(time, candidate.position[fit.rows], attitude_PB, valid=aligned.valid)
+    candidate, time = fit.candidate, fit.time + fit.aligned.lag
+    attitude_PB = candidate.attitude * fit.mount
+    truth = Trajectory(time, candidate.position, attitude_PB, valid=fit.aligned.valid)
     sequence = accel_axes(sequence, truth)
     inside = (sequence.time >= time[0]) & (sequence.time <= time[-1])
     pose = truth.at(np.unique(sequence.time[inside]))

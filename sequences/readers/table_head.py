@@ -7,17 +7,18 @@ have a decimal comma. The first row of numbers determines both.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 
 from stario.sequences.arrays import number_in
+from stario.sequences.errors import ReadError
 from stario.sequences.readers.columns import Column, with_units_below
-from stario.sequences.readers.dates import with_seconds
-from stario.sequences.readers.lines import head_lines, unquoted
-from stario.sequences.readers.phones.sensor_words import axis_of, is_time
+from stario.sequences.readers.lines import head_lines, unquoted, with_seconds
+from stario.sequences.readers.phones.sensor_words import axis_of, is_time, words_of
 from stario.sequences.readers.text import RowFormat, Table, is_missing, read_table
 from stario.sequences.sequence import FloatArray
 
@@ -34,6 +35,16 @@ _MARK_ROWS = 5
 
 _HEAD_LINES, _HEAD_ROWS = 96, 24
 """Number of lines within which the rows must begin, and of the rows that show what columns hold."""
+
+_TITLES = {
+    *map("".join, product(("device", "imu", "node"), ("", "id", "name", "number", "address"))),
+    *("i", "instance", "mac", "macaddress", "serial", "serialnumber"),
+    *("side", "limb", "placement", "bodypart", "sensorlocation", "sensorplacement"),
+}
+"""Titles, without blanks and the like, of such a column; `I` is that of ArduPilot's logs."""
+
+_MOST = 9
+"""Number of different values above which a column says something else."""
 
 
 @dataclass(frozen=True)
@@ -168,3 +179,25 @@ def _with_most_numbers(rows: list[str], first: RowFormat) -> RowFormat:
         return sum(_count_numbers(row_format.cells(line)) for line in rows)
 
     return max(first, replace(first, decimal="." if first.decimal == "," else ","), key=numbers)
+
+
+def refuse_several_devices(table: Table, titles: Sequence[str], column: int) -> None:
+    """Refuse rows of several devices, whose samples must not be mixed.
+
+    Args:
+        table: the rows.
+        titles: titles of the file's columns.
+        column: index of a column of the sensor; rows in which it is blank do not count.
+
+    Raises:
+        ReadError: there are at least two devices.
+    """
+    for index, title in enumerate(titles):
+        if "".join(words_of(title)) not in _TITLES:
+            continue
+        pairs = zip(table.cells(index), table.cells(column), strict=True)
+        devices = dict.fromkeys(device for device, cell in pairs if not is_missing(cell))
+        if 1 < len(devices) <= _MOST:
+            names = ", ".join(name or "blank" for name in devices)
+            found = f"several devices ({names})"
+            raise ReadError(table.path, title.strip(), found, "one", "keep the rows of one")

@@ -11,13 +11,17 @@ from stario.sequences.readers.lines import first_bytes, first_line, first_lines,
 from stario.sequences.readers.phones.files import (
     NO_SAMPLES,
     SUFFIXES,
-    incomplete_sensors,
-    recording_with,
-    unmatched_files,
-    unread_files,
+    groups_of,
+    is_complete,
+    phone_recordings,
+    sensors_in,
 )
-from stario.sequences.readers.phones.long_form import is_echo
+from stario.sequences.readers.phones.sensor_words import Sensor
 from stario.sequences.readers.poses import pose_files
+from stario.sequences.readers.unpacking import is_echo
+
+_GYRO: tuple[Sensor, ...] = ("gyro",)
+_FORCE: tuple[Sensor, ...] = ("accel", "linear")
 
 _EXPORT = "export as CSV, or as the zip or folder that the app writes"
 _CONTAINERS = {
@@ -41,47 +45,57 @@ def unrecognised(path: Path, inside: list[Path], known: str) -> ReadError:
     """
     if inside:
         found, fix = f"a folder of {len(inside)} recordings", f"name one, such as {inside[0]}"
-    elif has_some_sensors(path):
-        return _incomplete(path)
-    elif part_of := recording_with(path):
+        return ReadError(path, "content", found, known, fix)
+    if error := _incomplete(path):
+        return error
+    beside = phone_recordings(path.parent) if path.is_file() else []
+    if part_of := next((one for one in beside if path in one.files), None):
         found, fix = "one sensor of a recording", f"name its gyroscope: {part_of.gyro}"
         return ReadError(path, "content", found, "a recording", fix)
-    elif path.is_dir() and (files := unmatched_files(path)):
-        found = f"files of different devices or recordings ({first_of([f.name for f in files])})"
+    if path.is_dir() and (files := _of_several_devices(path)):
+        found = f"files of different devices or recordings ({first_of(files)})"
         expected, fix = "those of one", "name the files of one alike: gyro_a.csv and accel_a.csv"
         return ReadError(path, "sensors", found, expected, fix)
-    elif path.is_dir() and (poses := pose_files(path)):
+    if path.is_dir() and (poses := pose_files(path)):
         expected = "a gyroscope file and an accelerometer file"
         fix = "put the IMU files into the same folder"
         return ReadError(path, "content", f"only poses, {poses[0].name}", expected, fix)
-    elif path.is_dir() and (part := next(filter(has_some_sensors, _subfolders(path)), None)):
-        return _incomplete(part)
-    else:
-        found, fix = _folder(path) if path.is_dir() else _file(path)
+    for part in sorted(path.rglob("*")) if path.is_dir() else ():
+        if part.is_dir() and (error := _incomplete(part)):
+            return error
+    found, fix = _folder(path) if path.is_dir() else _file(path)
     return ReadError(path, "content", found, known, fix)
 
 
-def has_some_sensors(path: Path) -> bool:
-    """Return whether a folder or file holds sensors, or files named like them, but no recording."""
-    return bool(incomplete_sensors(path)) or (path.is_dir() and bool(unread_files(path)))
+def _incomplete(path: Path) -> ReadError | None:
+    """Return the error of a folder or file that lacks a gyroscope or an accelerometer.
 
-
-def _incomplete(path: Path) -> ReadError:
-    """Return the error of a folder or file that lacks a gyroscope or an accelerometer."""
-    unread = unread_files(path) if path.is_dir() else []
+    None if it has both, or neither sensors nor files that are named like them.
+    """
+    groups = groups_of(path) if path.is_dir() else []
+    unread = [file for group in groups for file in group.unread]
+    present = sensors_in(path)
+    sensors = "" if is_complete(present) else " and ".join(present)
+    if not (sensors or unread):
+        return None
     for file in unread:
         if not may_be_read(file):
             expected = "a sensor of the recording"
             return ReadError(file, "path", "no permission to read", expected, "fix its permissions")
-    sensors = " and ".join(incomplete_sensors(path))
     names = " and ".join(file.name for file in unread)
     fix = f"{names}: {NO_SAMPLES}" if unread else "log both"
     found = f"only {sensors}" if sensors else "none"
     return ReadError(path, "sensors", found, "a gyroscope and an accelerometer", fix)
 
 
-def _subfolders(path: Path) -> list[Path]:
-    return [folder for folder in sorted(path.rglob("*")) if folder.is_dir()]
+def _of_several_devices(folder: Path) -> list[str]:
+    """Return the names of gyroscope and accelerometer files, empty if a folder lacks either."""
+    tables = [group.tables for group in groups_of(folder)]
+    gyros, forces = (
+        {table.file.name for one in tables for kind in kinds for table in one.get(kind, [])}
+        for kinds in (_GYRO, _FORCE)
+    )
+    return sorted(gyros | forces) if gyros and forces else []
 
 
 def _folder(path: Path) -> tuple[str, str]:

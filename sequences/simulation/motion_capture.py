@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import first_of
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers.archive import archive_attributes, split_name
-from stario.sequences.readers.hdf5 import is_hdf5, opened_hdf5
+from stario.sequences.readers.archive import archive_attributes, is_hdf5, opened_hdf5, split_name
 from stario.sequences.sequence import FloatArray
 from stario.sequences.simulation.bvh import Skeleton, read_skeleton
 

@@ -25,11 +25,11 @@ from stario.sequences.attitude.rotations import GyroIntegral, tilt_aligning
 from stario.sequences.attitude.stacks import composed
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray
-from stario.sequences.truth.mount_heading import heading_turn
 from stario.sequences.truth.mounts import (
     MIN_FIT_S,
     disagreeing,
     fitted_mounts,
+    heading_turn,
     pieces_between_jumps,
 )
 

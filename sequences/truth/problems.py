@@ -18,7 +18,6 @@ from stario.sequences.clean_samples import usable
 from stario.sequences.errors import InputError
 from stario.sequences.findings import Finding, warn
 from stario.sequences.sequence import (
-    BoolArray,
     FloatArray,
     ImuSequence,
     Trajectory,
@@ -71,9 +70,7 @@ def examine_truth(sequence: ImuSequence, refusal: str = "") -> TruthFindings:
         return TruthFindings()
     if unusable := _unusable_times(sequence, sequence.truth):
         return TruthFindings(findings=tuple(unusable))
-    faults = tracking_faults(sequence)
-    found = tracking_findings(faults)
-    truth = without_lost(sequence.truth, faults)
+    truth, found = tracked_truth(sequence)
     if _rests(sequence, truth):  # there is no rotation to compare
         return TruthFindings(truth, findings=tuple(found))
     tracked = replace(sequence, truth=truth)
@@ -109,11 +106,11 @@ def truth_findings(sequence: ImuSequence) -> list[Finding]:
         return []
     if unusable := _unusable_times(sequence, sequence.truth):
         return unusable
-    faults = tracking_faults(sequence)
-    if not faults.lost.any():
+    truth, found = tracked_truth(sequence)
+    if truth is sequence.truth:
         positions = fit_positions(sequence, 0.0)
         if positions is not None and positions.correlation > _AGREEING:
-            return [*tracking_findings(faults), *position_fit_findings(positions)]
+            return [*found, *position_fit_findings(positions)]
     return list(examine_truth(sequence).findings)
 
 
@@ -189,24 +186,12 @@ _MOVING_RAD_S, _MOVING_M_S2 = 0.2, 0.5
 """Root mean square of the rate, and scatter of the force, above which a device moves."""
 
 
-@dataclass(frozen=True, eq=False)
-class TrackingFaults:
-    """Result of `tracking_faults`.
+def tracked_truth(sequence: ImuSequence) -> tuple[Trajectory, list[Finding]]:
+    """Return the true poses without those of lost tracking, and a finding for each kind of fault.
 
-    Attributes:
-        jumps: time [s] and length [m] of each jump of the position.
-        frozen: first and last time [s] of each stretch in which the position repeats exactly while
-            the device moves.
-        lost: (N,) bool, which of the truth's poses repeat exactly, position and attitude, there.
+    Poses are lost that repeat exactly, position and attitude, while the device moves: they would be
+    compared as rest. The truth itself is returned if there are none.
     """
-
-    jumps: tuple[tuple[float, float], ...]
-    frozen: tuple[tuple[float, float], ...]
-    lost: BoolArray
-
-
-def tracking_faults(sequence: ImuSequence) -> TrackingFaults:
-    """Find jumps and frozen stretches of a recording's true poses."""
     truth = sequence.truth
     assert truth is not None
     known = np.flatnonzero(truth.valid)
@@ -221,50 +206,47 @@ def tracking_faults(sequence: ImuSequence) -> TrackingFaults:
     lost = np.zeros(len(truth), dtype=np.bool_)
     for first, last in frozen:
         lost[known[first : last + 1]] = (quat[first : last + 1] == quat[first]).all(axis=1)
-    kept = truth.valid & ~lost  # the steps into and out of a frozen stretch are part of that fault
-    return TrackingFaults(
-        jumps=_jumps(truth.time[kept], truth.position_W[kept]),
-        frozen=tuple((float(time[first]), float(time[last])) for first, last in frozen),
-        lost=lost,
+    truth = replace(truth, valid=truth.valid & ~lost) if lost.any() else truth
+    stretches = [(float(time[first]), float(time[last])) for first, last in frozen]
+    # The steps into and out of a frozen stretch are part of that fault.
+    jumps = _jumps(truth.time[truth.valid], truth.position_W[truth.valid])
+    return truth, [*_frozen_findings(stretches), *_jump_findings(jumps)]
+
+
+def _frozen_findings(frozen: list[tuple[float, float]]) -> list[Finding]:
+    if not frozen:
+        return []
+    start, stop = max(frozen, key=lambda stretch: stretch[1] - stretch[0])
+    seconds = sum(stop - start for start, stop in frozen)
+    text = (
+        f"a position that repeats exactly for {seconds:.1f} s while the device moves, "
+        f"longest from {start:.1f} to {stop:.1f} s"
     )
+    fix = "leave the truth's cells blank where its tracking is lost"
+    return [truth_finding("frozen", text, fix, seconds=seconds, start_s=start)]
 
 
-def without_lost(truth: Trajectory, faults: TrackingFaults) -> Trajectory:
-    """Return the truth with its lost poses invalid; they would be compared as rest."""
-    return replace(truth, valid=truth.valid & ~faults.lost) if faults.lost.any() else truth
+def _jump_findings(jumps: list[tuple[float, float]]) -> list[Finding]:
+    if not jumps:
+        return []
+    at, length = max(jumps, key=lambda jump: jump[1])
+    count = len(jumps)
+    others = f", the longest of {count} jumps" if count > 1 else ""
+    text = f"a position that jumps by {length:.3g} m at {at:.2f} s{others}"
+    fix = "leave the truth's cells blank around a glitch, or split the recording there"
+    return [truth_finding("jumps", text, fix, count=count, longest_m=length)]
 
 
-def tracking_findings(faults: TrackingFaults) -> list[Finding]:
-    """Return a finding for each kind of fault."""
-    found = []
-    if faults.frozen:
-        start, stop = max(faults.frozen, key=lambda stretch: stretch[1] - stretch[0])
-        seconds = sum(stop - start for start, stop in faults.frozen)
-        text = (
-            f"a position that repeats exactly for {seconds:.1f} s while the device moves, "
-            f"longest from {start:.1f} to {stop:.1f} s"
-        )
-        fix = "leave the truth's cells blank where its tracking is lost"
-        found.append(truth_finding("frozen", text, fix, seconds=seconds, start_s=start))
-    if faults.jumps:
-        at, length = max(faults.jumps, key=lambda jump: jump[1])
-        count = len(faults.jumps)
-        others = f", the longest of {count} jumps" if count > 1 else ""
-        text = f"a position that jumps by {length:.3g} m at {at:.2f} s{others}"
-        fix = "leave the truth's cells blank around a glitch, or split the recording there"
-        found.append(truth_finding("jumps", text, fix, count=count, longest_m=length))
-    return found
-
-
-def _jumps(time: FloatArray, position: FloatArray) -> tuple[tuple[float, float], ...]:
+def _jumps(time: FloatArray, position: FloatArray) -> list[tuple[float, float]]:
+    """Return time [s] and length [m] of each jump of the positions (N, 3)."""
     if len(time) < _NEIGHBOURS:
-        return ()
+        return []
     steps, lengths = np.diff(time), np.linalg.norm(np.diff(position, axis=0), axis=1)
     speeds = lengths / steps
     usual = median_filter(speeds, _NEIGHBOURS, mode="nearest")
     jump = (lengths > _JUMP_M) & (speeds > _FASTEST_M_S) & (speeds > _FASTER * usual)
     jump &= ~is_gap(steps)
-    return tuple((float(time[k + 1]), float(lengths[k])) for k in np.flatnonzero(jump))
+    return [(float(time[k + 1]), float(lengths[k])) for k in np.flatnonzero(jump)]
 
 
 def _moves(sequence: ImuSequence, start: float, stop: float) -> bool:

@@ -12,7 +12,7 @@ from stario.fusion.config import PlaceConfig
 from stario.fusion.satellites import satellite_fixes
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.geodesy import Georeference
-from stario.sequences.readers.satellites import RADIUS_PER_SIGMA
+from stario.sequences.readers.checked import RADIUS_PER_SIGMA
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Satellites
 
 TIME = np.arange(0.0, 60.0)

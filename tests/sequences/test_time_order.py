@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences import Trajectory
 from stario.sequences.arrays import even_grid
-from stario.sequences.inspection.samples import in_order, without_times_ahead
+from stario.sequences.clean_samples import in_order
+from stario.sequences.inspection.samples import without_times_ahead
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.time_order import CONFIRMED_FAR, increasing_mask
 from stario.sequences.truth.positions import fit_positions

@@ -1,11 +1,16 @@
-"""Rare rows beside a phone's IMU: pressure and satellite positions.
+"""Rare rows beside a phone's IMU: pressure, satellite positions and reference points.
 
 They are in columns next to those of the sensors, where apps repeat the last one in every row, or in
-a file of the same folder with its own clock.
+a file of the same folder with its own clock: `Barometer.csv`, `pressure.txt`, `Location.csv`,
+`GPS.csv`. A header names latitude and longitude, and usually the accuracy: the radius that holds
+the true position with a probability of 68 % on Android, and about that on iOS. Reference points
+(`*_ref.csv`) are places that the user passed at known times.
 """
 
 from __future__ import annotations
 
+import logging
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,16 +18,61 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ReadError
+from stario.sequences.geodesy import east_north
+from stario.sequences.readers.checked import (
+    LARGEST_RADIUS,
+    RADIUS_PER_SIGMA,
+    UNITS,
+    USUAL_RADIUS,
+    barometer,
+    in_degrees,
+    known_places,
+    satellites,
+)
 from stario.sequences.readers.clocks import unit_within
 from stario.sequences.readers.columns import Column
 from stario.sequences.readers.phones.files import SUFFIXES
 from stario.sequences.readers.phones.sensor_layout import clock_of
-from stario.sequences.readers.phones.sensor_words import words_of
+from stario.sequences.readers.phones.sensor_words import is_time, sensor_of, unit_of, words_of
 from stario.sequences.readers.table_head import TableHead, table_heads
 from stario.sequences.readers.text import IntArray, Table, seconds
-from stario.sequences.sequence import BoolArray, FloatArray
+from stario.sequences.sequence import Barometer, BoolArray, FloatArray, PositionTrack, Satellites
 from stario.sequences.time_order import increasing_mask
-from stario.sequences.units import TIME_UNITS
+from stario.sequences.units import TIME_UNITS, unit_named
+
+_log = logging.getLogger(__name__)
+
+_PRESSURE_FILES = {"barometer", "barometers", "baro", "bar", "pressure", "pres"}
+_SATELLITE_FILES = {"location", "locations", "gps", "gnss"}
+_POINT_FILES = {
+    *("ref", "reference", "references", "waypoints", "waypoint", "checkpoints", "landmarks"),
+}
+"""Words of which the name of such a file has one."""
+
+_PRESSURE = ("press", "baro", "pres", "druck", "luftdruck", "presion", "presión", "pression")
+_NO_PRESSURE = {"accuracy", "temperature", "temp", "relative", "sea", "altitude", "height", "alt"}
+_ALTITUDE = {"altitude", "height", "alt", "relative"}
+_PRESSURE_UNIT = re.compile(
+    r"[\[(\s_.,-](hpa|mbars?|millibars?|kpa|pa|in_?hg|mmhg|torr|psi|atm|m)(?=[\])\s_.,-]|$)",
+    flags=re.IGNORECASE,
+)
+"""A unit in brackets or as a word of a title: `Pressure (hPa)`, `baro_pa`."""
+
+_TITLES = {
+    "latitude": {"latitude", "lat"},
+    "longitude": {"longitude", "lon", "long", "lng"},
+    "altitude_m": {"altitude", "alt", "height"},
+    "speed_m_s": {"speed", "velocity"},
+    "bearing_deg": {"bearing", "course", "direction"},
+}
+"""Words of which a column's title has one; next to a sensor's name they are directions."""
+
+_OTHERS = {"vertical", "heading", "time", "timestamp", "magnetic"}
+"""Words of columns that hold something else."""
+
+_ADVIO = "platform-locations.csv"
+_OF_ADVIO = ["time", "latitude", "longitude", "accuracy", "altitude", "vertical accuracy"]
+"""Columns of a file of ADVIO, which names none."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +93,7 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Columns:
+class _Columns:
     """Columns of a table by quantity, and its clock; `held` if rows repeat the last values."""
 
     head: TableHead
@@ -52,22 +102,15 @@ class Columns:
     held: bool
 
     def read(self) -> Table:
-        """Read the clock and the columns, in their order.
-
-        Raises:
-            ReadError: a row is malformed.
-        """
+        """Read the clock and the columns, in their order."""
         return self.head.read([self.clock.index, *(p.index for p in self.places.values())])
 
     def within(
         self, table: Table, known: BoolArray, recording: Recording
     ) -> tuple[IntArray, FloatArray]:
-        """Return the rows (N,) that hold something new within a recording, and their times [s].
+        """Return the rows (N,) of `known` ones that hold something new within a recording.
 
-        Args:
-            table: the rows, as `read` returns them.
-            known: whether each row holds anything.
-            recording: the recording.
+        Their times [s] are returned as well.
 
         Raises:
             ReadError: all of several rows are at other times.
@@ -86,9 +129,8 @@ class Columns:
         time = seconds(table.stamps_ns(self.clock.index, unit or 10**9, rows), start_ns)
         stop = float(stop_ns - start_ns) * 1e-9
         inside = (time >= 0.0) & (time <= stop)
-        if (
-            not inside.any() and len(rows) > 1
-        ):  # a single one may be the last known before the start
+        # A single one may be the last known before the start.
+        if not inside.any() and len(rows) > 1:
             found = f"times from {time[0]:.0f} to {time[-1]:.0f} s after the first sample"
             fix = "write both in one clock and time zone"
             raise ReadError(table.path, "time", found, f"times from 0 to {stop:.0f} s", fix)
@@ -96,12 +138,12 @@ class Columns:
         return rows[inside], time[inside]
 
 
-def tables_alongside(
+def _tables_alongside(
     recording: Recording,
     names: set[str],
     least: int,
     places_in: Callable[[TableHead, bool], dict[str, Column]],
-) -> Iterator[Columns]:
+) -> Iterator[_Columns]:
     """Yield the tables that hold some quantities, the sensors' own first; never raises.
 
     Args:
@@ -111,24 +153,20 @@ def tables_alongside(
         places_in: function that returns the quantities' columns in a table, given also whether it
             is the sensors'; none if it does not hold them.
     """
-    for file in (recording.sensors, *files_named(recording, names)):
+    for file in (recording.sensors, *_files_named(recording, names)):
         own = file == recording.sensors
         for head in table_heads(file, least):
             if len(head.rows) < 2 or not (places := places_in(head, own)):
                 continue
-            if clock := clock_of(head.titles, head.rows) or _first_column(head, places):
-                yield Columns(head, head.clock(clock), places, held=own)
+            clock = clock_of(head.titles, head.rows)
+            if clock is None and all(place.index for place in places.values()):
+                clock = clock_of(["time"], head.rows[:, :1])  # the first column, if it grows
+            if clock is not None:
+                yield _Columns(head, head.clock(clock), places, held=own)
                 break
 
 
-def _first_column(head: TableHead, places: dict[str, Column]) -> Column | None:
-    """Return the first column of a table whose titles name no clock, if it grows."""
-    if any(place.index == 0 for place in places.values()):
-        return None
-    return clock_of(["time"], head.rows[:, :1])
-
-
-def files_named(recording: Recording, names: set[str]) -> list[Path]:
+def _files_named(recording: Recording, names: set[str]) -> list[Path]:
     """Return the files in a recording's folder whose names have one of some words, the best first.
 
     Not those of another recording: `two_gps.csv` next to `one_gyr.csv`.
@@ -141,3 +179,150 @@ def files_named(recording: Recording, names: set[str]) -> list[Path]:
             # `LocationGps.csv` holds satellite positions only, `Location.csv` those of all sources.
             found.append((not {"gps", "gnss"} & words, len(file.stem), file))
     return [file for *_, file in sorted(found)]
+
+
+def recorded_pressure(recording: Recording) -> Barometer | None:
+    """Return the pressure next to a recording's sensors; None if there is none that can be used."""
+    for columns in _tables_alongside(recording, _PRESSURE_FILES, 2, _pressure_in):
+        place = columns.places["pressure"]
+        try:
+            table = columns.read()
+            rows, time = columns.within(table, np.isfinite(table.values[:, 1]), recording)
+        except ReadError as error:  # the barometer is optional
+            _log.warning("pressure skipped: %s", error)
+            continue
+        title = place.title or f"column {place.index + 1}"
+        found = barometer(table.path, title, time, table.values[rows, 1], place.unit)
+        if found is not None:
+            return found
+    return None
+
+
+def _pressure_in(head: TableHead, is_sensors: bool) -> dict[str, Column]:
+    """Return the column whose title names pressure or else, if the file does, its first value."""
+    for index, title in enumerate(head.titles):
+        words = set(words_of(title))
+        if any(word.startswith(_PRESSURE) for word in words) and not words & _NO_PRESSURE:
+            return {"pressure": Column(index, title, _pressure_unit(title))}
+    if is_sensors or sensor_of(words_of(head.file.stem)) is not None:  # `bar_gyr.csv`: of a bar
+        return {}
+    titles = head.titles or ["time", *[""] * (head.rows.shape[1] - 1)]
+    for index, title in enumerate(titles):
+        if not is_time(title):
+            unit = "m" if _ALTITUDE & set(words_of(title)) else _pressure_unit(title)
+            return {"pressure": Column(index, title, unit)}
+    return {}
+
+
+def _pressure_unit(title: str) -> str:
+    match = _PRESSURE_UNIT.search(title)
+    return unit_named(match[1].replace("_", "")) if match else ""
+
+
+def reported_positions(recording: Recording) -> Iterator[Satellites]:
+    """Yield the satellite positions next to a recording's sensors, the best file's first."""
+    for columns in _tables_alongside(recording, _SATELLITE_FILES, 3, _satellites_in):
+        try:
+            found = _satellites(columns, recording)
+        except ReadError as error:  # positions are optional
+            _log.warning("satellite positions skipped: %s", error)
+            continue
+        if found is not None:
+            yield found
+
+
+def _satellites_in(head: TableHead, is_sensors: bool) -> dict[str, Column]:
+    """Return the columns of a position and what is reported with it; none without a position.
+
+    Next to a sensor's columns, those belong to it whose titles begin as that of its latitude does:
+    `LOCATION Speed` to `LOCATION Latitude`.
+    """
+    named = head.titles or (_OF_ADVIO if head.file.name == _ADVIO else [])
+    titles = {index: (set(words_of(title)), title) for index, title in enumerate(named)}
+    latitudes = (words for words, _ in titles.values() if _place_of(words) == "latitude")
+    own = next(latitudes, set()) - _TITLES["latitude"] if is_sensors else set[str]()
+    places: dict[str, Column] = {}
+    for index, (words, title) in titles.items():
+        if own <= words and (place := _place_of(words)):
+            places.setdefault(place, Column(index, title, unit_of(title)))
+    if not {"latitude", "longitude"} <= set(places):
+        return {}
+    return {place: places[place] for place in (*_TITLES, "radius_m") if place in places}
+
+
+def _place_of(words: set[str]) -> str:
+    """Return the quantity of a receiver in a column with these words, empty for others."""
+    if "accuracy" in words or {"h", "acc"} <= words or "hacc" in words:
+        others = _OTHERS.union(*_TITLES.values())
+        return "" if others & words else "radius_m"
+    if sensor_of(words) is not None or words & _OTHERS:
+        return ""
+    return next((place for place, names in _TITLES.items() if names & words), "")
+
+
+def _satellites(columns: _Columns, recording: Recording) -> Satellites | None:
+    table, places = columns.read(), columns.places
+    for title in (places["latitude"].title, places["longitude"].title):
+        if unit_of(title).startswith("rad"):
+            raise ReadError(table.path, "latitude, longitude", title, "degrees")
+    values = table.values[:, 1:]
+    latlon_deg = in_degrees(table.path, values[:, :2])
+    rows, time = columns.within(table, known_places(latlon_deg), recording)
+    rest = {
+        name: UNITS[name][place.unit] * values[rows, k]
+        for k, (name, place) in enumerate(places.items())
+        if place.unit in UNITS.get(name, ())
+    }
+    return satellites(time, latlon_deg[rows], rest)
+
+
+def as_known_positions(reported: Satellites) -> PositionTrack | None:
+    """Return a receiver's positions to compare a track with, x east and y north of the first.
+
+    Repeated ones count once, those known no better than a room not at all; None if fewer than two
+    are left.
+    """
+    new = np.append(True, np.diff(reported.latlon_deg, axis=0).any(axis=1))
+    reported = reported.select(new)
+    radius = np.full(len(reported), USUAL_RADIUS)
+    if reported.radius_m is not None:
+        radius = np.where(np.isfinite(reported.radius_m), reported.radius_m, USUAL_RADIUS)
+    valid = radius <= LARGEST_RADIUS
+    if valid.sum() < 2:
+        if len(valid) > 1:
+            _log.warning(
+                "satellite positions skipped: found %d of %d positions known to %g m, expected at "
+                "least two", valid.sum(), len(valid), LARGEST_RADIUS,
+            )  # fmt: skip
+        return None
+    origin = int(np.argmax(valid))
+    degrees = np.vstack([reported.latlon_deg[origin], reported.latlon_deg])
+    return PositionTrack(
+        reported.time,
+        east_north(degrees)[1:],
+        "positions",
+        valid,
+        radius / RADIUS_PER_SIGMA,
+        latlon_deg=reported.latlon_deg,
+    )
+
+
+def reference_points(recording: Recording) -> PositionTrack | None:
+    """Return the waypoints of a file such as `*_ref.csv` (time, x, y [m]), or None without one.
+
+    Raises:
+        ReadError: a row is malformed.
+    """
+    for file in sorted(recording.sensors.parent.iterdir()):
+        words = set(words_of(file.stem))
+        if file.suffix.lower() not in (".csv", ".txt") or not _POINT_FILES & words:
+            continue
+        head = next(table_heads(file, least=3), None)
+        if head is None or not set(recording.key.split()) <= words:
+            continue
+        table = head.read(3)
+        unit = unit_within(file, table.values[:, 0], recording.start_ns, recording.stop_ns)
+        time = seconds(table.stamps_ns(0, unit), recording.start_ns)
+        kept = increasing_mask(time)
+        return PositionTrack(time[kept], table.values[kept, 1:3], "waypoints")
+    return None

@@ -26,13 +26,11 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
 from stario.sequences.geodesy import east_north
-from stario.sequences.readers.checked import finite_rows, magnetometer
+from stario.sequences.readers.checked import barometer, finite_rows, magnetometer, satellites
 from stario.sequences.readers.clocks import resample_to_gyro
 from stario.sequences.readers.lines import head_lines, read_lines
 from stario.sequences.readers.phones.attitude import agreeing_attitude, device_attitude
-from stario.sequences.readers.phones.sensor_table import Samples
-from stario.sequences.readers.pressure import barometer
-from stario.sequences.readers.satellites import satellites
+from stario.sequences.readers.phones.samples import Samples
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import (
     Barometer,
@@ -131,11 +129,7 @@ def _barometer(path: Path, sensors: dict[str, Rows], start_ns: np.int64) -> Baro
     if "pressure" not in sensors:
         return None
     stamps, values = sensors["pressure"]
-    try:
-        return barometer(path, _PRESSURE, seconds(stamps, start_ns), values[:, 0])
-    except ReadError as error:  # the barometer is optional
-        _log.warning("pressure skipped: %s", error)
-        return None
+    return barometer(path, _PRESSURE, seconds(stamps, start_ns), values[:, 0])
 
 
 def _satellites(sensors: dict[str, Rows], start_ns: np.int64) -> Satellites | None:

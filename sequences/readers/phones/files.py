@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from stario.sequences.readers.lines import head_lines
-from stario.sequences.readers.phones.sensor_table import SensorTable, sensor_table
+from stario.sequences.readers.phones.sensor_layout import SensorTable, sensor_table
 from stario.sequences.readers.phones.sensor_words import (
     Sensor,
     axis_of,
@@ -92,7 +92,7 @@ class PhoneFiles:
 
 def phone_recordings(folder: Path) -> list[PhoneFiles]:
     """Return the recordings whose gyroscope and accelerometer are in a folder; never raises."""
-    groups = _groups(folder)
+    groups = groups_of(folder)
     complete = [group for group in groups if is_complete(group.tables)]
     if complete:
         return complete
@@ -100,24 +100,19 @@ def phone_recordings(folder: Path) -> list[PhoneFiles]:
     return [merged] if is_complete(merged.tables) else []
 
 
-def recording_with(file: Path) -> PhoneFiles | None:
-    """Return the recording in a file's folder that the file is a part of; never raises."""
-    if not file.is_file():
-        return None
-    return next((one for one in phone_recordings(file.parent) if file in one.files), None)
-
-
-def unread_files(folder: Path) -> list[Path]:
-    """Return a folder's files of gyroscopes and accelerometers without samples; never raises."""
-    return [file for group in _groups(folder) for file in group.unread]
-
-
-def _groups(folder: Path) -> list[PhoneFiles]:
-    """Return a folder's files of each recording, complete or not."""
+def groups_of(folder: Path) -> list[PhoneFiles]:
+    """Return a folder's files of each recording, complete or not; never raises."""
     named = [(file, words_of(file.stem)) for file in sorted(folder.iterdir()) if may_hold(file)]
+
+    def preference(item: tuple[Path, list[str]]) -> tuple[bool, bool, bool]:
+        """Return a sort key: uncalibrated files last, total force first, then calibrated files."""
+        words = item[1]
+        return is_uncalibrated(words), "total" not in words, not {"calibrated", "mot"} & {*words}
+
     groups: dict[str, PhoneFiles] = {}
-    for file, words in sorted(named, key=lambda item: _preference(*item)):
-        sensor = _sensor_of(words)
+    for file, words in sorted(named, key=preference):
+        # iOS Logger's `Motion.txt` is an attitude.
+        sensor: Sensor | None = "attitude" if words == ["motion"] else sensor_of(words)
         table = sensor_table(file) if sensor else None
         # A file with both sensors is a recording by itself, such as the first walk, `walk_a.csv`.
         if sensor is None or (table is not None and is_complete(table.axes)):
@@ -131,29 +126,9 @@ def _groups(folder: Path) -> list[PhoneFiles]:
     return list(groups.values())
 
 
-def unmatched_files(folder: Path) -> list[Path]:
-    """Return the gyroscope and accelerometer files of a folder without a recording; never raises.
-
-    Empty if it lacks either: these are of different devices or recordings, by their names.
-    """
-    kinds: tuple[tuple[Sensor, ...], ...] = (("gyro",), ("accel", "linear"))
-    tables = [group.tables for group in _groups(folder)]
-    files = [{t.file for one in tables for s in kind for t in one.get(s, [])} for kind in kinds]
-    return sorted(set.union(*files)) if all(files) else []
-
-
 def is_complete(sensors: Collection[str | None]) -> bool:
     """Return whether sensors include a gyroscope and an accelerometer of either kind."""
     return "gyro" in sensors and bool({"accel", "linear"} & set(sensors))
-
-
-def incomplete_sensors(path: Path) -> list[Sensor]:
-    """Return the sensors of a folder or a wide file that lacks a gyroscope or an accelerometer.
-
-    Empty if it holds both, or no sensor at all.
-    """
-    sensors = _sensors(path)
-    return [] if is_complete(sensors) else sensors
 
 
 def names_both_sensors(path: Path) -> bool:
@@ -165,7 +140,8 @@ def names_both_sensors(path: Path) -> bool:
     return False
 
 
-def _sensors(path: Path) -> list[Sensor]:
+def sensors_in(path: Path) -> list[Sensor]:
+    """Return the sensors of a folder or of a wide file; never raises."""
     if not path.is_dir():
         table = sensor_table(path) if may_hold(path) else None
         order: tuple[Sensor, ...] = ("accel", "linear", "gyro", "mag")
@@ -178,17 +154,6 @@ def _sensors(path: Path) -> list[Sensor]:
 def may_hold(file: Path) -> bool:
     """Return whether a file may hold samples as text, by its name; never raises."""
     return file.suffix.lower() in SUFFIXES and file.is_file() and not file.name.startswith(".")
-
-
-def _sensor_of(words: list[str]) -> Sensor | None:
-    """Return the sensor in a file's name; iOS Logger's `Motion.txt` is an attitude."""
-    return "attitude" if words == ["motion"] else sensor_of(words)
-
-
-def _preference(file: Path, words: list[str]) -> tuple[bool, bool, bool, Path]:
-    """Return a sort key: uncalibrated files last, total force first, then calibrated files."""
-    calibrated = {"calibrated", "mot"} & set(words)
-    return is_uncalibrated(words), "total" not in words, not calibrated, file
 
 
 def _merged_groups(groups: list[PhoneFiles]) -> PhoneFiles:

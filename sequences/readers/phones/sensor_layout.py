@@ -3,25 +3,38 @@
 With a header, columns are found by their names (`sensor_words`), in any order, among any others.
 Without one, a row is time and three values, or three values and time; a second clock between them
 is skipped. The same holds if the titles name no known clock; axes are then those they name.
+
+A phone offers a sensor raw and calibrated, or its force with and without gravity: words say which
+is the better one. Any other words name a place or a number (`acc_left_x`, `imu2_gx`) and tell
+devices apart, whose sensors must not be mixed.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
 from stario.sequences.readers.columns import Column
 from stario.sequences.readers.phones.sensor_words import (
+    Sensor,
     axis_of,
     bias_axis_of,
+    is_sensor_word,
     is_time,
+    is_uncalibrated,
     quaternion_of,
+    sensor_of,
     time_unit_of,
     unit_of,
 )
-from stario.sequences.readers.phones.which_imu import Axes, choose
+from stario.sequences.readers.table_head import TableHead, table_heads
+from stario.sequences.readers.text import Table
 from stario.sequences.sequence import FloatArray
+
+Axes = tuple[Column, Column, Column]
 
 _CLOCK_FROM = 1e6
 """A second column that grows and exceeds this is another clock."""
@@ -32,12 +45,21 @@ _MOSTLY = 0.8
 _SAME_PACE = 0.02
 """Relative tolerance within which a column as fast as the time, in any unit, is another clock."""
 
+_IN_VARIANTS = {
+    *("velocity", "speed", "motion", "body", "raw", "uncomp", "cal", "ln", "wr"),
+    *("value", "values", "data", "sensor", "reading", "android", "axis"),
+}
+"""Words of variants of a sensor and words that say nothing, besides `is_sensor_word`."""
+
+_OF_UNIT: dict[str, Sensor] = {"rad/s": "gyro", "deg/s": "gyro", "m/s^2": "accel", "g": "accel"}
+
 
 @dataclass(frozen=True, kw_only=True)
-class Layout:
-    """Content of the columns.
+class SensorTable:
+    """How to read a file's rows, and what its columns hold.
 
     Attributes:
+        head: head of the file's table.
         clock: column with the sensor's time.
         axes: x, y and z of each sensor; key "" if the file names no sensor.
         quaternion: x, y, z and w of an attitude, if any.
@@ -47,6 +69,7 @@ class Layout:
         conflict: names of IMUs of which none can be chosen, empty if one can.
     """
 
+    head: TableHead
     clock: Column
     axes: dict[str, Axes]
     quaternion: tuple[Column, ...] = ()
@@ -55,16 +78,30 @@ class Layout:
     unused: tuple[str, ...] = ()
     conflict: str = ""
 
+    @property
+    def file(self) -> Path:
+        """The file."""
+        return self.head.file
 
-def by_header(titles: list[str], head: FloatArray) -> Layout | None:
-    """Return the layout that titles describe; None if they name no clock or no sensor.
+    def read(self, columns: Sequence[Column]) -> Table:
+        """Read columns; arguments and errors as for `TableHead.read`."""
+        return self.head.read([place.index for place in columns])
 
-    `head` has the first rows (N, K), NaN where a cell is not a number.
-    """
+
+def sensor_table(file: Path) -> SensorTable | None:
+    """Return how to read a file's rows, or None if that cannot be determined; never raises."""
+    for head in table_heads(file):
+        if len(head.rows) > 1 and (table := _by_header(head) or _by_rows(head)):
+            return table
+    return None
+
+
+def _by_header(head: TableHead) -> SensorTable | None:
+    """Return the layout that titles describe; None if they name no clock or no sensor."""
     groups: dict[tuple[str, ...], dict[str, Column]] = {}
     quaternion: dict[str, Column] = {}
     biases: dict[str, Column] = {}
-    for k, title in enumerate(titles):
+    for k, title in enumerate(head.titles):
         part, axis, bias = quaternion_of(title), axis_of(title), bias_axis_of(title)
         if part is not None:
             quaternion.setdefault(part, Column(k, title))
@@ -73,42 +110,108 @@ def by_header(titles: list[str], head: FloatArray) -> Layout | None:
             groups.setdefault(axis[1], {}).setdefault(axis[0], place)
         elif bias is not None:
             biases.setdefault(bias, Column(k, title))
-    choice = choose(_complete(groups))
-    axes = choice.axes
+    axes, unused, conflict = _choice(_groups(groups))
     attitude = tuple(quaternion[part] for part in "xyzw") if len(quaternion) == 4 else ()
-    clocks = _clocks(titles, head)
+    clocks = _clocks(head.titles, head.rows)
     if not clocks or not (axes or attitude):
         return None
     before = {key: _run_before(clocks, places[0].index) for key, places in axes.items()}
     raw = len(axes) == 1 and set(biases) == set("xyz")  # an uncalibrated sensor's file
-    return Layout(
-        clock=_finest(clocks, head),
+    return SensorTable(
+        head=head,
+        clock=head.clock(_finest(clocks, head.rows)),
         axes=axes,
         quaternion=attitude,
         biases=tuple(biases[axis] for axis in "xyz") if raw else (),
-        clocks={key: _finest(run, head) for key, run in before.items() if run},
-        unused=choice.unused,
-        conflict=choice.conflict,
+        clocks={key: head.clock(_finest(run, head.rows)) for key, run in before.items() if run},
+        unused=unused,
+        conflict=conflict,
     )
 
 
-def clock_of(titles: list[str], head: FloatArray) -> Column | None:
-    """Return the clock that `by_header` would choose for all sensors; None if there is none."""
-    clocks = _clocks(titles, head)
-    return _finest(clocks, head) if clocks else None
+@dataclass(frozen=True)
+class _Group:
+    """The three axes that share all other words of their titles, and the sensor they belong to."""
+
+    words: tuple[str, ...]
+    axes: Axes
+    sensor: Sensor | None
+
+    @property
+    def device(self) -> tuple[str, ...]:
+        """The words that tell devices apart; none for most files."""
+        kept = (word for word in self.words if word not in _IN_VARIANTS)
+        return tuple(word for word in kept if not is_sensor_word(word))
+
+    @property
+    def rank(self) -> tuple[bool, bool, bool, int]:
+        """Sort key: calibrated first, then total force, low noise (Shimmer), and fewer words."""
+        total = bool({"gf", "total"} & set(self.words))
+        return is_uncalibrated(self.words), not total, "wr" in self.words, len(self.words)
 
 
-def _complete(
-    columns: dict[tuple[str, ...], dict[str, Column]],
-) -> dict[tuple[str, ...], Axes]:
-    """Return the groups of columns that have all three axes."""
-    groups: dict[tuple[str, ...], Axes] = {}
+def _groups(columns: dict[tuple[str, ...], dict[str, Column]]) -> list[_Group]:
+    """Return the groups of columns, by their words and axes, that have all three axes.
+
+    A unit tells the sensor where no name does: `AsX(°/s)`.
+    """
+    named = []
     for words, by_axis in columns.items():
-        if set(by_axis) == set("xyz"):
+        if len(by_axis) == 3:
             x, y, z = (by_axis[axis] for axis in "xyz")
             x = replace(x, unit="g") if "gf" in words and not x.unit else x
-            groups[words] = x, y, z
-    return groups
+            named.append(_Group(words, (x, y, z), sensor_of(words)))
+    known = {group.sensor for group in named}
+    groups = []
+    for group in named:
+        by_unit = _OF_UNIT.get(next((place.unit for place in group.axes if place.unit), ""))
+        guessed = group.sensor is None and bool(group.words) and by_unit not in known
+        groups.append(replace(group, sensor=by_unit) if guessed else group)
+    return [group for group in groups if group.sensor != "attitude"]
+
+
+def _choice(groups: list[_Group]) -> tuple[dict[str, Axes], tuple[str, ...], str]:
+    """Return the best group of each sensor, all of the first device that has both sensors.
+
+    Titles of the first columns of other devices, which are not read, and of devices of which none
+    can be chosen follow.
+    """
+    by_column = sorted(groups, key=lambda group: min(place.index for place in group.axes))
+    gyros = [group for group in by_column if group.sensor == "gyro"]
+    forces = [group for group in by_column if group.sensor in ("accel", "linear")]
+    with_force = {group.device for group in forces}
+    whole = dict.fromkeys(group.device for group in gyros if group.device in with_force)
+    several = len({group.device for group in gyros}) > 1 or len(with_force) > 1
+    if not several:
+        return _best(groups), (), ""
+    if not whole:
+        clashing = _clashing(gyros) or _clashing([g for g in forces if g.sensor == "accel"])
+        return _best(groups), (), " and ".join(clashing)
+    device = next(iter(whole))
+    mine = {group.sensor for group in groups if group.device == device}
+    used = [group for group in groups if group.device == device or group.sensor not in mine]
+    others = [group for group in (*gyros, *forces) if group.device in set(whole) - {device}]
+    return _best(used), tuple(group.axes[0].title for group in others), ""
+
+
+def _best(groups: list[_Group]) -> dict[str, Axes]:
+    axes: dict[str, Axes] = {}
+    for group in sorted(groups, key=lambda group: group.rank):
+        axes.setdefault(group.sensor or "", group.axes)
+    return axes
+
+
+def _clashing(groups: list[_Group]) -> list[str]:
+    """Return the titles of groups of several devices none of which is better than the others."""
+    first = min((group.rank for group in groups), default=None)
+    best = [group for group in groups if group.rank == first]
+    return [group.axes[0].title for group in best] if len({g.device for g in best}) > 1 else []
+
+
+def clock_of(titles: list[str], head: FloatArray) -> Column | None:
+    """Return the clock of a table's rows (N, K) by its titles; None if there is none."""
+    clocks = _clocks(titles, head)
+    return _finest(clocks, head) if clocks else None
 
 
 def _clocks(titles: list[str], head: FloatArray) -> list[Column]:
@@ -151,32 +254,35 @@ def _order(column: FloatArray) -> float:
     return float((np.diff(column) >= 0).mean())
 
 
-def by_rows(titles: list[str], head: FloatArray) -> Layout | None:
+def _by_rows(head: TableHead) -> SensorTable | None:
     """Return the layout of rows (N, K) without titles, or whose titles name no clock.
 
     Time is first or fourth, and grows.
     """
-    width, named = head.shape[1], _named_axes(titles)
+    rows, named = head.rows, _named_axes(head.titles)
+    width = rows.shape[1]
     places = [(time, start) for time, start in ((0, 1), (3, 0)) if time < width]
-    for time, start in sorted(places, key=lambda place: -_order(head[:, place[0]])):
-        if not _grows(head[:, time]):
+    for time, start in sorted(places, key=lambda place: -_order(rows[:, place[0]])):
+        if not _grows(rows[:, time]):
             continue
-        while start and start < width and _is_clock(head[:, start], head[:, time]):
+        while start and start < width and _is_clock(rows[:, start], rows[:, time]):
             start += 1
-        if start + 3 > width or not np.isfinite(head[:, start : start + 3]).all():
+        if start + 3 > width or not np.isfinite(rows[:, start : start + 3]).all():
             continue
-        if width > 4 and named is None and _is_code(head[:, start]):  # as in ADVIO's `imu-gyro.csv`
+        code = rows[0, start]  # of a sensor, the same in every row: ADVIO's `imu-gyro.csv`
+        coded = code != 0.0 and code.is_integer() and not np.ptp(rows[:, start])
+        if width > 4 and named is None and coded:
             continue
-        axes = named or (Column(start), Column(start + 1), Column(start + 2))
         rest = width - start
-        quaternion = tuple(Column(start + k) for k in range(4)) if start and rest >= 4 else ()
-        biases: tuple[Column, ...] = ()
-        if rest == 6 and start and not np.ptp(head[:, start + 3 :], axis=0).any():
-            biases = tuple(Column(start + 3 + k) for k in range(3))
-        clock = (
-            Column(start - 1) if start > 1 and head[0, start - 1] <= _CLOCK_FROM else Column(time)
+        raw = rest == 6 and start and not np.ptp(rows[:, start + 3 :], axis=0).any()
+        clock = start - 1 if start > 1 and rows[0, start - 1] <= _CLOCK_FROM else time
+        return SensorTable(
+            head=head,
+            clock=head.clock(Column(clock)),
+            axes={"": named or (Column(start), Column(start + 1), Column(start + 2))},
+            quaternion=tuple(Column(start + k) for k in range(4)) if start and rest >= 4 else (),
+            biases=tuple(Column(start + 3 + k) for k in range(3)) if raw else (),
         )
-        return Layout(clock=clock, axes={"": axes}, quaternion=quaternion, biases=biases)
     return None
 
 
@@ -187,12 +293,6 @@ def _named_axes(titles: list[str]) -> Axes | None:
         if (axis := axis_of(title)) is not None:
             named.setdefault(axis[0], Column(k, title, unit_of(title)))
     return (named["x"], named["y"], named["z"]) if len(named) == 3 else None
-
-
-def _is_code(column: FloatArray) -> bool:
-    """Return whether a column holds the number of a sensor, the same in every row."""
-    code = float(column[0])
-    return code != 0.0 and code.is_integer() and not np.ptp(column)
 
 
 def _is_clock(column: FloatArray, time: FloatArray) -> bool:

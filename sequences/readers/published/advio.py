@@ -11,8 +11,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.phones.assembly import assemble_recording
 from stario.sequences.readers.phones.files import PhoneFiles, phone_recordings
+from stario.sequences.readers.phones.phone import assemble_recording
 from stario.sequences.sequence import ImuSequence
 
 _PHONE = "iphone"

@@ -38,7 +38,8 @@ def read_euroc(path: Path) -> ImuSequence:
     _check_titles(imu)
     table = read_table(imu, columns=7)
     stamps = table.stamps_ns(0, _unit_ns(imu))
-    truth_file = _truth_file(imu.parent.parent)
+    truth_files = (imu.parent.parent / folder / "data.csv" for folder in TRUTH_FOLDERS)
+    truth_file = next((file for file in truth_files if file.is_file()), None)
     return ImuSequence(
         name=_name(imu),
         time=seconds(stamps, stamps[0]),
@@ -84,11 +85,6 @@ def imu_file(path: Path) -> Path | None:
 def _name(imu: Path) -> str:
     folder = imu.resolve().parent.parent
     return folder.parent.name if folder.name == "mav0" else folder.name
-
-
-def _truth_file(mav: Path) -> Path | None:
-    found = (mav / folder / "data.csv" for folder in TRUTH_FOLDERS)
-    return next((path for path in found if path.is_file()), None)
 
 
 def _truth(path: Path, start_ns: np.int64) -> Trajectory:

@@ -132,7 +132,13 @@ def _truth(path: Path, phone: ImuSequence, start_ns: np.int64 | None) -> Traject
     known = np.isfinite(phone.gyro).all(axis=1) & np.isfinite(phone.accel).all(axis=1)
     imu = (phone.time[known], phone.gyro[known], phone.accel[known])
     try:
-        time, kept = _capture_time(table, phone, start_ns)
+        time, kept = phone.time, np.arange(len(table.values))
+        if start_ns is not None:
+            stamps, kept = np.unique(_stamps_ns(table), return_index=True)
+            time = seconds(stamps, start_ns)
+        elif len(kept) != len(time):
+            expected = f"{len(time)} as in the IMU's file"
+            raise ReadError(path, "rows", str(len(kept)), expected)
         # Left in as invalid, they would spoil the averages over their neighbours.
         finite = np.isfinite(table.values[kept, -7:]).all(axis=1)
         time, kept = time[finite], kept[finite]
@@ -152,20 +158,6 @@ def _truth(path: Path, phone: ImuSequence, start_ns: np.int64 | None) -> Traject
         attitude_WB=aligned.attitude_WB,
         valid=aligned.valid,
     )
-
-
-def _capture_time(
-    table: Table, phone: ImuSequence, start_ns: np.int64 | None
-) -> tuple[FloatArray, IntArray]:
-    """Return the capture's times since the phone's first sample [s], and their rows."""
-    rows = np.arange(len(table.values))
-    if start_ns is None:
-        if len(rows) != len(phone.time):
-            expected = f"{len(phone.time)} as in the IMU's file"
-            raise ReadError(table.path, "rows", str(len(rows)), expected)
-        return phone.time, rows
-    stamps, rows = np.unique(_stamps_ns(table), return_index=True)
-    return seconds(stamps, start_ns), rows
 
 
 def _position_glitches(time: FloatArray, position: FloatArray) -> BoolArray:

@@ -24,13 +24,13 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.errors import ReadError
+from stario.sequences.readers.archive import is_hdf5, opened_hdf5
 from stario.sequences.readers.checked import (
     finite_rows,
     magnetometer,
     rotations,
     trajectory,
 )
-from stario.sequences.readers.hdf5 import is_hdf5, opened_hdf5
 from stario.sequences.readers.published.by_name import JsonFields
 from stario.sequences.readers.text import IntArray
 from stario.sequences.sequence import FloatArray, ImuSequence
@@ -53,7 +53,9 @@ _TRUSTED_DEG = 20.0
 
 def read_ronin(path: Path) -> ImuSequence:
     """Read a recording from its folder or its `data.hdf5`."""
-    file = _data_file(path)
+    file = path / "data.hdf5" if path.is_dir() else path
+    if not file.is_file():
+        raise ReadError(file, "file", "no such file", "the recording's HDF5 file")
     info = JsonFields(file.with_name("info.json"))
     fields = _fields(file)
     required = np.column_stack([fields[name] for name in _FIELDS])
@@ -62,7 +64,10 @@ def read_ronin(path: Path) -> ImuSequence:
     bias, scale = info.array("imu_acce_bias", 3), info.array("imu_acce_scale", 3)
     accel = scale * (fields["synced/acce"] - bias)
     attitude_WB = _device_attitude(file, info, fields, gyro, rows)
-    start = int(np.searchsorted(rows, _start_frame(info, int(rows[-1]))))
+    frame, last = info.get("start_frame", 0), int(rows[-1])
+    if not isinstance(frame, int) or not 0 <= frame <= last:
+        raise ReadError(info.path, "start_frame", repr(frame), f"a row from 0 to {last}")
+    start = int(np.searchsorted(rows, frame))
     rows, attitude_WB = rows[start:], attitude_WB[start:]
     time = fields["synced/time"][rows]
     time = time - time[0]
@@ -79,13 +84,6 @@ def read_ronin(path: Path) -> ImuSequence:
 def is_ronin(path: Path) -> bool:
     """Return whether a path is an HDF5 file or a folder with `data.hdf5`."""
     return (path / "data.hdf5").is_file() or is_hdf5(path)
-
-
-def _data_file(path: Path) -> Path:
-    file = path / "data.hdf5" if path.is_dir() else path
-    if not file.is_file():
-        raise ReadError(file, "file", "no such file", "the recording's HDF5 file")
-    return file
 
 
 def _fields(file: Path) -> dict[str, FloatArray]:
@@ -142,10 +140,3 @@ def _source(info: JsonFields, has_ekf: bool) -> str:
     if errors.get("game_rv", 0.0) <= _TRUSTED_DEG:
         return "game_rv"
     return min(errors, key=lambda name: errors[name])
-
-
-def _start_frame(info: JsonFields, last: int) -> int:
-    start = info.get("start_frame", 0)
-    if not isinstance(start, int) or not 0 <= start <= last:
-        raise ReadError(info.path, "start_frame", repr(start), f"a row from 0 to {last}")
-    return start

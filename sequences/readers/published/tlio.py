@@ -124,24 +124,20 @@ def _places(description: Path) -> dict[str, slice]:
     fields = JsonFields(description).fields
     lists = (x for x in fields.values() if isinstance(x, list) and x)
     names = next((x for x in lists if all(isinstance(c, str) for c in x)), [])
-    places: dict[str, slice] = {}
-    start = 0
+    places, widths, start = {}, {}, 0
     for text in names:
         match = _COLUMN.match(text)
         if match is None:
             raise ReadError(description, "columns_name(width)", repr(text), "a name with its width")
+        widths[match["name"]] = int(match["width"])
         places[match["name"]] = slice(start, start := start + int(match["width"]))
-    missing = [n for n, w in _WIDTHS.items() if n not in places or _width(places[n]) != w]
-    if not any(n in places and _width(places[n]) == 4 for n in _QUATERNIONS):
+    missing = [name for name, width in _WIDTHS.items() if widths.get(name) != width]
+    if not any(widths.get(name) == 4 for name in _QUATERNIONS):
         missing.append("qxyzw_World_Device")
     if missing:
         expected = ", ".join(f"{n}({w})" for n, w in (*_WIDTHS.items(), ("qxyzw_World_Device", 4)))
         raise ReadError(description, "columns_name(width)", f"no {', '.join(missing)}", expected)
     return places
-
-
-def _width(place: slice) -> int:
-    return int(place.stop - place.start)
 
 
 def _read_raw(file: Path) -> ImuSequence:

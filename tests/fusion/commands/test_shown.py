@@ -6,7 +6,7 @@ import sys
 from itertools import count
 
 import pytest
-from phone_exports import androsensor
+from phone_exports import export
 
 from stario.fusion.commands.common import training_progress
 from stario.sequences.readers.csv_writer import write_csv
@@ -28,7 +28,7 @@ def test_run_writes_a_report_only_on_request(stario, recording, tmp_path, no_fig
 def test_a_warning_is_shown_once_however_often_a_file_is_read(
     stario, recording, tmp_path, monkeypatch
 ):
-    androsensor(tmp_path, read_generic_csv(recording))
+    export("androsensor", tmp_path, read_generic_csv(recording))
     (file,) = tmp_path.glob("*AndroSensor.csv")
     file.write_text(file.read_text()[:-9])
     monkeypatch.setattr(logging.root, "handlers", [])

@@ -21,7 +21,6 @@ from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.clean_samples import clean_samples
 from stario.sequences.inspection.magnetic import assess_magnetometer
-from stario.sequences.inspection.magnetic_findings import magnetic_findings
 from stario.sequences.inspection.samples import clock_findings
 from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
@@ -47,7 +46,7 @@ def test_correlation_lag_hard_iron_dip_and_drift_are_recovered():
     np.testing.assert_allclose(found.hard_iron_uT, IRON, atol=3.0)
     assert found.dip_rad == pytest.approx(math.radians(63.0), abs=0.1)
     assert found.gyroscope_drift_rad_s == pytest.approx(drift, rel=0.15)
-    assert "hard iron" in str(magnetic_findings(found)[0])
+    assert "hard iron" in str(found.findings()[0])
 
 
 def test_a_short_recording_gives_no_verdict_and_its_span_is_named():
@@ -66,7 +65,7 @@ def test_a_short_recording_gives_no_verdict_and_its_span_is_named():
 @pytest.mark.parametrize("lag", [-0.08, 0.2])
 def test_a_lag_outside_the_search_range_is_not_reported_as_measured(lag):
     inspected = inspect_recording(walk(MagneticField(hard_iron=IRON, lag=lag)))
-    found = inspected.magnetic
+    found = inspected.sensors["magnetometer"]
     assert found.lag_s is None
     assert found.hard_iron_uT is None
     report = "\n".join(inspected.lines())
@@ -83,7 +82,7 @@ def test_magnets_wrong_axes_apples_sign_and_wrong_units_are_detected():
     turned = Magnetometer(good.magnetometer.time, good.magnetometer.field[:, [1, 2, 0]])
     wrong = assess_magnetometer(replace(good, magnetometer=turned))
     assert wrong.verdict == "not usable"
-    assert "does not follow the gyroscope" in " ".join(map(str, magnetic_findings(wrong)))
+    assert "does not follow the gyroscope" in " ".join(map(str, wrong.findings()))
     lines = told(replace(good, truth=None, accel=-good.accel))
     assert any("points up by" in line and "--accel-sign apple" in line for line in lines)
     unit = Magnetometer(good.magnetometer.time, 1e3 * good.magnetometer.field)

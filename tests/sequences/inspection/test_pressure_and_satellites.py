@@ -8,9 +8,13 @@ from scipy.spatial.transform import Rotation
 from told import told
 
 from stario.sequences.findings import Finding
-from stario.sequences.inspection.barometer_findings import PressureFindings, assess_barometer
+from stario.sequences.inspection.outside_sensors import (
+    PressureFindings,
+    SatelliteFindings,
+    assess_barometer,
+    assess_satellites,
+)
 from stario.sequences.inspection.report import inspect_recording
-from stario.sequences.inspection.satellite_findings import SatelliteFindings, assess_satellites
 from stario.sequences.sequence import (
     Barometer,
     FloatArray,

@@ -124,8 +124,7 @@ def test_a_truncated_event_loses_only_itself(tmp_path, cut):
 
 @pytest.mark.parametrize("unit", [1.0, 1e3, 1e6, 1e9])
 def test_reference_points_take_the_time_unit_that_fits_the_recording(tmp_path, unit):
-    from stario.sequences.readers.phones.alongside import Recording
-    from stario.sequences.readers.phones.known_positions import reference_points
+    from stario.sequences.readers.phones.alongside import Recording, reference_points
 
     rows = [f"{round(t * unit)},{t},1.0" for t in (0.0, 2.0, 10.0, 28.0)]
     (tmp_path / "walk_ref.csv").write_text("\n".join(["t,x,y", *rows]) + "\n")

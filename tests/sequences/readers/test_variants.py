@@ -1,6 +1,5 @@
 """What a format leaves open: attitude sources, quaternion orders, frames, topics, clocks."""
 
-import dataclasses
 import json
 import sys
 
@@ -98,35 +97,7 @@ def test_a_processed_recording_is_preferred_to_the_raw_files_next_to_it(tmp_path
     assert find_recordings(tmp_path) == [tmp_path / "seq"]
 
 
-def same_samples(a, b) -> bool:
-    arrays = [(x.time, x.gyro, x.accel) for x in (a, b)]
-    if (a.truth is None) != (b.truth is None):
-        return False
-    if a.truth is not None:
-        arrays = [(*x, y.truth.position_W) for x, y in zip(arrays, (a, b), strict=True)]
-    return all(np.array_equal(x, y, equal_nan=True) for x, y in zip(*arrays, strict=True))
-
-
-def test_large_files_are_read_as_small_ones_are(tmp_path, walks, monkeypatch):
-    walk = walks(200.0)
-    paths = [
-        write(tmp_path / f"seq{k}", walk).path
-        for k, write in enumerate((formats.ridi, formats.rnin, formats.imunet_raw, formats.android))
-    ]
-    write_csv(tmp_path / "own.csv", walk)
-    late = dataclasses.replace(walk, time=walk.time + 1.5e9, truth=None)
-    write_csv(tmp_path / "late.csv", late)
-    sparse = walk.truth.at(walk.time[::2] + 0.001)
-    write_csv(tmp_path / "sparse.csv", dataclasses.replace(walk, truth=sparse))
-    for path in [*paths, *(tmp_path / f"{name}.csv" for name in ("own", "late", "sparse"))]:
-        careful = read_recording(path)
-        with monkeypatch.context() as small:
-            small.setattr("stario.sequences.readers.text._LARGE_BYTES", 0)
-            assert same_samples(read_recording(path), careful), path
-
-
-def test_an_error_in_a_large_file_is_named_too(tmp_path, walks, monkeypatch):
-    monkeypatch.setattr("stario.sequences.readers.text._LARGE_BYTES", 0)
+def test_an_error_within_a_row_is_named(tmp_path, walks):
     path = formats.ridi(tmp_path / "seq", walks(200.0)).path
     csv = path / "processed/data.csv"
     lines = csv.read_text().splitlines()

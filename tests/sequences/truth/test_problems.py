@@ -15,7 +15,7 @@ from stario.sequences.truth.positions import fit_positions
 from stario.sequences.truth.problems import (
     check_truth,
     examine_truth,
-    tracking_faults,
+    tracked_truth,
     truth_findings,
 )
 
@@ -149,9 +149,9 @@ def test_positions_are_not_compared_across_gaps(of):
 def test_a_shift_while_tracking_is_lost_is_not_a_jump(walk):
     assert walk.truth is not None
     lost = replace(walk.truth, position_W=jumping(walk.truth))
-    assert len(tracking_faults(replace(walk, truth=lost)).jumps) == 1
+    assert [found.code for found in truth_findings(replace(walk, truth=lost))] == ["truth_jumps"]
     blank = replace(lost, valid=np.abs(lost.time - LATE_S - 0.05) > 0.08)
-    assert tracking_faults(replace(walk, truth=blank)).jumps == ()
+    assert tracked_truth(replace(walk, truth=blank))[1] == []
 
 
 def test_a_truth_too_short_to_compare_is_no_problem(walk):
@@ -161,9 +161,10 @@ def test_a_truth_too_short_to_compare_is_no_problem(walk):
 def test_only_poses_whose_attitude_repeats_as_well_are_lost(walk):
     still = moved(walk, lambda truth: 0.0 * truth.position_W)
     assert still.truth is not None
-    assert tracking_faults(still).lost.sum() == 1  # the first, which the others repeat
+    kept, _ = tracked_truth(still)
+    assert kept.valid.sum() == len(kept) - 1  # but the first, which the others repeat
     frozen = replace(still.truth, attitude_WB=Rotation.identity(len(still.truth)))
-    assert tracking_faults(replace(still, truth=frozen)).lost.all()
+    assert not tracked_truth(replace(still, truth=frozen))[0].valid.any()
 
 
 def test_a_wrong_unit_of_the_accelerometer_is_not_blamed_on_the_positions(walk):

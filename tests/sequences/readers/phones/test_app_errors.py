@@ -4,7 +4,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from phone_exports import get_sensor_data, trace
+from phone_exports import export
 from phone_files import ns, save, zyx
 
 from stario.sequences import ReadError, read_recording
@@ -136,26 +136,31 @@ def test_a_clock_in_another_unit_than_its_title_says(walk, tmp_path):
 @pytest.mark.parametrize(
     ("write", "whole", "changed", "error"),
     [
-        (trace, "TYPE_GYROSCOPE\t", "TYPE_GYROSCOPE\tx", "TYPE_GYROSCOPE, line 1 .*'156.* x"),
+        ("trace", "TYPE_GYROSCOPE\t", "TYPE_GYROSCOPE\tx", "TYPE_GYROSCOPE, line 1 .*'156.* x"),
         (
-            trace,
+            "trace",
             "1560828400010\tTYPE_GYRO",
             "9" * 25 + "\tTYPE_GYRO",
             "TYPE_GYROSCOPE, line 2 .*'999",
         ),
-        (get_sensor_data, "\nGYRO;5.010;0.0100;", "\nGYRO;5.010\nGYRO;", "GYRO, line 2 .*cut line"),
         (
-            get_sensor_data,
+            "get_sensor_data",
+            "\nGYRO;5.010;0.0100;",
+            "\nGYRO;5.010\nGYRO;",
+            "GYRO, line 2 .*cut line",
+        ),
+        (
+            "get_sensor_data",
             "\nGYRO;5.010;",
             "\nGYRO;5.010;9;1\nGYRO;5.010;",
             "GYRO, line 2 .*cut line",
         ),
-        (get_sensor_data, "\nACCE;5.010;", "\nACCE;;", "ACCE, line 2 .*' 0.0100'"),
-        (get_sensor_data, "\nPOSI;7.000;1;", "\nPOSI\nPOSI;7;1;", "POSI, line 1 .*cut line"),
+        ("get_sensor_data", "\nACCE;5.010;", "\nACCE;;", "ACCE, line 2 .*' 0.0100'"),
+        ("get_sensor_data", "\nPOSI;7.000;1;", "\nPOSI\nPOSI;7;1;", "POSI, line 1 .*cut line"),
     ],
 )
 def test_a_damaged_event_line_is_named(walk, tmp_path, write, whole, changed, error):
-    write(tmp_path / "walk", walk)
+    export(write, tmp_path / "walk", walk)
     (file,) = (tmp_path / "walk").iterdir()
     file.write_text(file.read_text().replace(whole, changed, 1))
     with pytest.raises(ReadError, match=error):
@@ -163,10 +168,10 @@ def test_a_damaged_event_line_is_named(walk, tmp_path, write, whole, changed, er
 
 
 @pytest.mark.parametrize(
-    ("write", "cell"), [(trace, "TYPE_GYROSCOPE\t"), (get_sensor_data, "\nACCE;5.010;0.0100;")]
+    ("write", "cell"), [("trace", "TYPE_GYROSCOPE\t"), ("get_sensor_data", "\nACCE;5.010;0.0100;")]
 )
 def test_an_event_that_is_not_finite_is_dropped_with_a_warning(walk, tmp_path, caplog, write, cell):
-    write(tmp_path / "walk", walk)
+    export(write, tmp_path / "walk", walk)
     (file,) = (tmp_path / "walk").iterdir()
     before, _, after = file.read_text().rpartition(cell)
     separator = cell[-1]

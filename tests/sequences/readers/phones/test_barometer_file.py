@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from phone_exports import get_sensor_data, phyphox, prefixed, sensor_logger
+from phone_exports import export
 from phone_files import START_NS, save
 from recorded import DATA
 
@@ -47,13 +47,13 @@ def assert_pressure(found: Barometer, time: FloatArray, pressure_hPa: FloatArray
 def test_pressure_is_read_in_the_unit_of_its_title_or_else_of_its_size(
     walk, tmp_path, header, factor
 ):
-    phyphox(tmp_path / "p", walk)
+    export("phyphox", tmp_path / "p", walk)
     save(tmp_path / "p/Barometer.csv", header, TIME, factor * HPA)
     assert_pressure(pressure_of(tmp_path / "p"), TIME, HPA)
 
 
 def test_pressure_without_titles_is_read(walk, tmp_path):
-    prefixed(tmp_path / "p", walk)
+    export("prefixed", tmp_path / "p", walk)
     stamps = [f"{1606391908305 + 1e3 * t:.18e}" for t in TIME]
     rows = [f"{t} {p:.18e}" for t, p in zip(stamps, HPA, strict=True)]
     (tmp_path / "p/Eight_bar.csv").write_text("\n".join(rows) + "\n")
@@ -61,7 +61,7 @@ def test_pressure_without_titles_is_read(walk, tmp_path):
 
 
 def test_sensor_loggers_pressure_is_on_the_sensors_clock(walk, tmp_path):
-    sensor_logger(tmp_path / "s", walk)
+    export("sensor_logger", tmp_path / "s", walk)
     time = np.append(-3.0, TIME)  # delivered before the first sample of the others
     stamps = [START_NS + round(t * 1e9) for t in time]
     header = "time,seconds_elapsed,relativeAltitude,pressure"
@@ -93,7 +93,7 @@ def test_pressure_repeated_in_every_row_of_a_wide_file_is_read_once(walk, tmp_pa
 def test_an_altitude_in_place_of_pressure_is_named_in_one_line(
     walk, tmp_path, title, values, words, caplog
 ):
-    phyphox(tmp_path / "p", walk)
+    export("phyphox", tmp_path / "p", walk)
     save(tmp_path / "p/Barometer.csv", f"time,{title}", TIME, values)
     assert read_recording(tmp_path / "p").barometer is None
     [line] = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
@@ -102,7 +102,7 @@ def test_an_altitude_in_place_of_pressure_is_named_in_one_line(
 
 
 def test_pressure_of_another_clock_is_named_in_one_line(walk, tmp_path, caplog):
-    phyphox(tmp_path / "p", walk)
+    export("phyphox", tmp_path / "p", walk)
     save(tmp_path / "p/Barometer.csv", "time (s),pressure (hPa)", TIME + 7200.0, HPA)
     assert read_recording(tmp_path / "p").barometer is None
     assert "pressure skipped" in caplog.text
@@ -116,7 +116,7 @@ def test_a_walk_through_a_bar_is_no_pressure(walk, tmp_path):
 
 
 def test_lines_of_pressure_satellites_and_floors_are_read(walk, tmp_path):
-    get_sensor_data(tmp_path / "g", walk)
+    export("get_sensor_data", tmp_path / "g", walk)
     read = read_recording(tmp_path / "g/log.txt")
     assert read.barometer is not None
     assert_pressure(read.barometer, np.array([0.5, 1.5]), np.array([1013.055, 1013.065]))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from phone_exports import androsensor, phyphox, sensor_logger
+from phone_exports import export
 from phone_files import START_NS, save
 from recorded import DATA
 
@@ -38,7 +38,7 @@ def positions_of(path: Path) -> PositionTrack:
 
 @pytest.mark.parametrize("title", ["accuracy", "hAcc (m)", "h_acc", "HACC"])
 def test_the_radius_may_be_named_briefly(walk, tmp_path, title):
-    phyphox(tmp_path / "p", walk)
+    export("phyphox", tmp_path / "p", walk)
     radius = np.full(len(TIME), 4.53)
     save(tmp_path / "p/gps.csv", f"time,lat,lon,{title}", TIME, degrees(METRES), radius)
     sigma = positions_of(tmp_path / "p").sigma
@@ -47,7 +47,7 @@ def test_the_radius_may_be_named_briefly(walk, tmp_path, title):
 
 
 def test_positions_of_phyphox_are_read_with_their_accuracy(walk, tmp_path):
-    phyphox(tmp_path / "p", walk)
+    export("phyphox", tmp_path / "p", walk)
     radius = np.where(TIME == 5.0, 200.0, 4.53)  # one from the cells of the network
     header = f'{PHYPHOX},"Horizontal Accuracy (m)","Vertical Accuracy (°)"'
     save(tmp_path / "p/Location.csv", header, TIME, degrees(METRES), *[TIME] * 3, radius, TIME)
@@ -61,7 +61,7 @@ def test_positions_of_phyphox_are_read_with_their_accuracy(walk, tmp_path):
 
 
 def test_sensor_loggers_own_clock_is_used_and_satellites_are_preferred(walk, tmp_path):
-    sensor_logger(tmp_path / "s", walk)
+    export("sensor_logger", tmp_path / "s", walk)
     time = np.append(-20.0, TIME)  # the last position known before the recording
     stamps = [START_NS + round(t * 1e9) for t in time]
     place = degrees(np.vstack([[-900.0, 0.0], METRES]))
@@ -75,7 +75,7 @@ def test_sensor_loggers_own_clock_is_used_and_satellites_are_preferred(walk, tmp
 
 
 def test_positions_repeated_in_every_row_are_read_once(walk, tmp_path):
-    androsensor(tmp_path / "a", walk)
+    export("androsensor", tmp_path / "a", walk)
     [file] = (tmp_path / "a").glob("*.csv")
     header, *rows = file.read_text(encoding="utf-8").splitlines()
     sep = ";" if ";" in header else ","
@@ -104,13 +104,13 @@ def test_each_recording_of_a_folder_has_its_own_positions(walk, tmp_path):
 
 
 def test_a_latitude_that_grows_is_no_clock(walk, tmp_path):
-    phyphox(tmp_path / "p", walk)
+    export("phyphox", tmp_path / "p", walk)
     save(tmp_path / "p/gps.csv", "lat,lon,alt", np.stack([TIME, TIME, TIME], axis=1))
     assert read_recording(tmp_path / "p").satellites is None
 
 
 def test_lateral_forces_are_no_positions(walk, tmp_path):
-    phyphox(tmp_path / "p", walk)
+    export("phyphox", tmp_path / "p", walk)
     header = "time (s),acc_lat,acc_long,gps speed"
     save(tmp_path / "p/GPS.csv", header, TIME, METRES, TIME)
     assert read_recording(tmp_path / "p").positions is None
@@ -134,7 +134,7 @@ def dates(time: FloatArray, hours: int) -> list[list[str]]:
 
 
 def test_positions_known_no_better_than_a_room_are_skipped_with_a_warning(walk, tmp_path, caplog):
-    phyphox(tmp_path / "p", walk)
+    export("phyphox", tmp_path / "p", walk)
     radius = np.where(TIME == 5.0, 8.0, 120.0)
     save(tmp_path / "p/gps.csv", "time,lat,lon,accuracy", TIME, degrees(METRES), radius)
     assert read_recording(tmp_path / "p").positions is None
@@ -152,7 +152,7 @@ def test_positions_known_no_better_than_a_room_are_skipped_with_a_warning(walk, 
 def test_positions_in_another_unit_than_degrees_are_skipped_with_a_warning(
     walk, tmp_path, titles, factor, found, caplog
 ):
-    phyphox(tmp_path / "p", walk)
+    export("phyphox", tmp_path / "p", walk)
     save(tmp_path / "p/gps.csv", f"time,{titles}", TIME, factor * degrees(METRES))
     assert read_recording(tmp_path / "p").positions is None
     assert found in caplog.text
@@ -161,7 +161,7 @@ def test_positions_in_another_unit_than_degrees_are_skipped_with_a_warning(
 
 def test_degrees_and_minutes_are_named_in_one_line(walk, tmp_path, caplog):
     """NMEA's 4807.038 is 48 degrees 7.038 minutes; its hemisphere is in a column of its own."""
-    phyphox(tmp_path / "p", walk)
+    export("phyphox", tmp_path / "p", walk)
     place = np.stack([4807.038 + 0.001 * TIME, 1131.0 - 0.001 * TIME], axis=1)
     save(tmp_path / "p/gps.csv", "time,lat,lon", TIME, place)
     assert read_recording(tmp_path / "p").satellites is None
@@ -171,7 +171,7 @@ def test_degrees_and_minutes_are_named_in_one_line(walk, tmp_path, caplog):
 
 
 def test_latitude_and_longitude_that_can_only_be_exchanged_are(walk, tmp_path, caplog):
-    phyphox(tmp_path / "p", walk)
+    export("phyphox", tmp_path / "p", walk)
     place = degrees(METRES) + np.array([0.0, 120.0])
     save(tmp_path / "p/gps.csv", "time,lat,lon", TIME, place[:, ::-1])
     found = read_recording(tmp_path / "p").satellites
@@ -193,7 +193,7 @@ def test_latitude_and_longitude_that_can_only_be_exchanged_are(walk, tmp_path, c
     ],
 )
 def test_positions_that_cannot_be_used_cost_no_recording(walk, tmp_path, rows, words, caplog):
-    phyphox(tmp_path / "p", walk)
+    export("phyphox", tmp_path / "p", walk)
     (tmp_path / "p/Location.csv").write_text(f"{PHYPHOX}\n{rows}", encoding="utf-8")
     recording = read_recording(tmp_path / "p")
     assert recording.positions is None
@@ -204,7 +204,7 @@ def test_positions_that_cannot_be_used_cost_no_recording(walk, tmp_path, rows, w
 
 def test_what_a_receiver_reports_is_kept_as_measured(walk, tmp_path):
     """Repeated positions too; what it does not know is NaN, in m, m/s and degrees."""
-    phyphox(tmp_path / "p", walk)
+    export("phyphox", tmp_path / "p", walk)
     place = degrees(METRES)
     place[6:] = place[6]  # indoors
     radius = np.where(TIME == 2.0, 0.0, 9.0)

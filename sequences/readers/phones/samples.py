@@ -1,12 +1,8 @@
-"""A text file of sensor samples: how its rows are written, and reading them in known units.
-
-`table_head` determines how cells are separated, `sensor_layout` what the columns hold.
-"""
+"""Samples of a sensor, read in known units from the columns that `sensor_layout` found."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,34 +10,17 @@ import numpy as np
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.clocks import assumed_unit, refuse_counts_and_dates, time_unit
-from stario.sequences.readers.columns import Column, unit_factor
-from stario.sequences.readers.devices import refuse_several_devices
-from stario.sequences.readers.phones.sensor_layout import Layout, by_header, by_rows
+from stario.sequences.readers.columns import unit_factor
+from stario.sequences.readers.phones.sensor_layout import SensorTable
 from stario.sequences.readers.phones.sensor_words import SENSORS, Sensor
-from stario.sequences.readers.table_head import TableHead, table_heads
-from stario.sequences.readers.text import IntArray, Table
+from stario.sequences.readers.table_head import refuse_several_devices
+from stario.sequences.readers.text import IntArray
 from stario.sequences.sequence import BoolArray, FloatArray
 
 _log = logging.getLogger(__name__)
 
 _WILD = 100.0
 """Factor beyond a sensor's limit at which one sample would spoil integrals and interpolation."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SensorTable(Layout):
-    """How to read a file's rows, and what its columns hold."""
-
-    head: TableHead
-
-    @property
-    def file(self) -> Path:
-        """The file."""
-        return self.head.file
-
-    def read(self, columns: Sequence[Column]) -> Table:
-        """Read columns; arguments and errors as for `TableHead.read`."""
-        return self.head.read([place.index for place in columns])
 
 
 @dataclass(frozen=True)
@@ -59,19 +38,6 @@ class Samples:
     values: FloatArray
     unit: str = ""
     assumed_time_unit: str = ""
-
-
-def sensor_table(file: Path) -> SensorTable | None:
-    """Return how to read a file's rows, or None if that cannot be determined; never raises."""
-    for head in table_heads(file):
-        if len(head.rows) < 2:
-            continue
-        layout = by_header(head.titles, head.rows) or by_rows(head.titles, head.rows)
-        if layout is not None:
-            clocks = {axes: head.clock(clock) for axes, clock in layout.clocks.items()}
-            clock = head.clock(layout.clock)
-            return SensorTable(**vars(layout) | {"clock": clock, "clocks": clocks}, head=head)
-    return None
 
 
 def read_samples(table: SensorTable, sensor: Sensor, axes: str) -> Samples:
@@ -138,14 +104,3 @@ def _sound_samples(file: Path, sensor: Sensor, titles: str, values: FloatArray) 
     if not sound.all():
         _log.warning("%s: dropped %d wild samples of the %s", file, (~sound).sum(), sensor)
     return np.asarray(sound)
-
-
-def read_quaternion(table: SensorTable) -> tuple[IntArray, FloatArray]:
-    """Read the times (N,) [ns] and quaternions (N, 4) of an attitude, in the table's order.
-
-    Raises:
-        ReadError: a row is malformed.
-    """
-    rows = table.read([table.clock, *table.quaternion])
-    unit_ns = time_unit(table.file, rows.values[:, 0], table.clock.unit)
-    return rows.stamps_ns(table.clock.index, unit_ns), rows.values[:, 1:]
