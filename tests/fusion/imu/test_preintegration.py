@@ -235,7 +235,7 @@ def test_a_walking_force_is_as_certain_as_its_density():
     t = np.linspace(0.0, 0.1, 11)
     accel = np.outer(GRAVITY + 4.0 * np.sin(2.0 * np.pi * 2.0 * t), [0.0, 0.0, 1.0])
     variance = _standing(t, accel).pim.preintMeasCov()[8, 8]
-    assert variance == pytest.approx(0.1 * NavigatorConfig().noise.accel_noise**2, rel=0.05)
+    assert variance == pytest.approx(0.1 * NavigatorConfig().noise.accel_noise ** 2, rel=0.05)
 
 
 def _standing(time: np.ndarray, accel: np.ndarray) -> Segment:
