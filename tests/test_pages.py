@@ -113,7 +113,7 @@ def run_line(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_reader_can_follow_a_guide(page, monkeypatch, tmp_path, tmp_path_factory):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("STARIO_CACHE", str(tmp_path_factory.mktemp("cache")))
-    saved = "stario.fusion.evaluation.folders.save_figure"  # rendering is slow
+    saved = "stario.fusion.evaluation.results.save_figure"  # rendering is slow
     monkeypatch.setattr(saved, lambda figure, path: path.touch())
     names = {"__name__": page.stem}
     for language, long, text in BLOCK.findall(page.read_text()):

@@ -13,14 +13,13 @@ from typing import Annotated
 
 import typer
 
-from stario.fusion.commands import checks
+from stario.fusion.commands import checks, options
 from stario.fusion.commands.compare import compare
 from stario.fusion.commands.convert import convert
 from stario.fusion.commands.evaluate import evaluate
 from stario.fusion.commands.export import export
 from stario.fusion.commands.inspect import inspect
 from stario.fusion.commands.live import live
-from stario.fusion.commands.options import flag
 from stario.fusion.commands.run import run
 from stario.fusion.commands.simulate import simulate
 from stario.fusion.commands.table import table
@@ -46,7 +45,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _stario(
     printed: Annotated[
-        bool, flag("--version", callback=_print_version, is_eager=True, help="The version.")
+        bool, options.flag("--version", callback=_print_version, is_eager=True, help="The version.")
     ] = False,
 ) -> None:
     """Inertial navigation: fused trajectories from IMU recordings."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import typer
 
-from stario.fusion.commands.options import EstimatorOptions, ReadingOptions
+from stario.fusion.commands import options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,32 +32,45 @@ _NAMED = 3
 """Number of skipped recordings with the same reason that are listed one by one."""
 
 
+def _named_apart(reading: options.Reading) -> Callable[[Path], ImuSequence]:
+    """Return a function that reads recordings, each under a name of its own."""
+    from stario.fusion.evaluation.compare import distinct_name
+
+    names: set[str] = set()
+
+    def read(file: Path) -> ImuSequence:
+        sequence = reading.read(file)
+        return replace(sequence, name=distinct_name(sequence.name, names))
+
+    return read
+
+
+def each_used(
+    title: str, work: Callable[[Path], Result], files: Collection[Path], jobs: int = 1
+) -> tuple[list[Result], list[Skipped]]:
+    """Apply `work` to each file, with a progress bar; return the results, and what was skipped."""
+    from stario.sequences.datasets.batch import each, without_skipped
+
+    skipped: list[Skipped] = []
+    outcomes = with_bar(title, each(work, files, jobs), len(files))
+    return list(without_skipped(outcomes, skipped)), skipped
+
+
 def map_recordings(
     title: str,
-    reading: ReadingOptions,
+    reading: options.Reading,
     paths: Sequence[Path],
     work: Callable[[Path, ImuSequence], Result],
 ) -> tuple[list[Result], list[Skipped]]:
-    """Apply `work` to each path and its recording, under a name of its own.
-
-    Return results and failures.
-    """
-    from stario.fusion.evaluation.compare import distinct_name
-    from stario.sequences.datasets.batch import each, without_skipped
-
+    """Apply `work` to each path and its recording; return the results, and what was skipped."""
     files, skipped = reading.recordings(paths)
-    names: set[str] = set()
-
-    def of_named(file: Path) -> Result:
-        sequence = reading.read(file)
-        return work(file, replace(sequence, name=distinct_name(sequence.name, names)))
-
-    outcomes = each(of_named, files, jobs=1)
-    return list(without_skipped(with_bar(title, outcomes, len(files)), skipped)), skipped
+    read = _named_apart(reading)
+    found, failed = each_used(title, lambda file: work(file, read(file)), files)
+    return found, skipped + failed
 
 
 def process_each(
-    reading: ReadingOptions,
+    reading: options.Reading,
     paths: Sequence[Path],
     out: Path | None,
     work: Callable[[ImuSequence, Path], tuple[dict[str, object], str]],
@@ -69,8 +82,7 @@ def process_each(
     The folder is `out` for a single recording, else within it; None for `runs`/NAME. An option that
     allows only one recording is named by `single`.
     """
-    from stario.fusion.evaluation.compare import distinct_name
-    from stario.fusion.evaluation.folders import check_folder
+    from stario.fusion.evaluation.results import check_folder
     from stario.sequences.datasets.batch import each, without_skipped
 
     files, skipped = reading.recordings(paths)
@@ -78,12 +90,11 @@ def process_each(
         raise InputError(single, f"{len(files)} recordings", "one recording")
     if out is not None:
         check_folder(out)
-    names: set[str] = set()
+    read = _named_apart(reading)
 
     def recorded(file: Path) -> dict[str, object]:
-        sequence = reading.read(file)
-        name = distinct_name(sequence.name, names)
-        folder = out if out and len(files) == 1 else (out or Path("runs")) / name
+        sequence = read(file)
+        folder = out if out and len(files) == 1 else (out or Path("runs")) / sequence.name
         record, text = work(sequence, folder)
         if not as_json:
             typer.echo(text)
@@ -199,8 +210,8 @@ def print_result(as_json: bool, record: object, text: str = "") -> None:
 
 def origin_of(
     paths: Sequence[Path],
-    reading: ReadingOptions,
-    estimating: EstimatorOptions,
+    reading: options.Reading,
+    estimating: options.Estimator,
     network: DisplacementModel,
     fixes: Path | None = None,
 ) -> dict[str, object]:
@@ -218,7 +229,7 @@ def origin_of(
     }
 
 
-def training_command(paths: Sequence[Path], reading: ReadingOptions) -> str:
+def training_command(paths: Sequence[Path], reading: options.Reading) -> str:
     """Return the command that trains weights on these recordings, read in the same way."""
     options = [
         f"--{name.replace('_', '-')}={each}"

@@ -7,34 +7,11 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from stario.fusion.commands.common import (
-    exit_if_skipped,
-    explain,
-    names_in,
-    origin_of,
-    print_result,
-    progress_bar,
-    training_command,
-)
-from stario.fusion.commands.options import (
-    READING,
-    CompareOutOption,
-    EstimatorOptions,
-    ExplainOption,
-    FixesOption,
-    JobsOption,
-    JsonOption,
-    OptionalPathsArgument,
-    PlaceOptions,
-    ReadingOptions,
-    ReportOption,
-    expand_option_groups,
-    refuse,
-)
+from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -45,51 +22,48 @@ _SHOWN = ("track", "dead_reckoning")
 """Tracks without `--tracks`: what StarIO gives, and what one would have without it."""
 
 
-@expand_option_groups
+@options.expanded
 def compare(
     context: typer.Context,
-    reading: ReadingOptions,
-    estimating: EstimatorOptions,
-    placing: PlaceOptions,
-    paths: OptionalPathsArgument = None,
-    fixes: FixesOption = None,
-    jobs: JobsOption = 1,
-    out: CompareOutOption = None,
-    tracks: Annotated[
-        str,
-        typer.Option(
-            help="Further tracks, also as a table: filtered, network, network_true_attitude, pdr "
-            "(from steps), separated by commas, or all."
-        ),
-    ] = "",
-    report: ReportOption = False,
-    as_json: JsonOption = False,
-    explained: ExplainOption = False,
+    reading: options.Reading,
+    estimating: options.Estimator,
+    placing: options.Place,
+    paths: options.OptionalPaths = None,
+    fixes: options.Fixes = None,
+    jobs: options.Jobs = 1,
+    out: options.CompareOut = None,
+    tracks: str = typer.Option(
+        "",
+        help="Further tracks, also as a table: filtered, network, network_true_attitude, pdr "
+        "(from steps), separated by commas, or all.",
+    ),
+    report: options.Report = False,
+    as_json: options.Json = False,
+    explained: options.Explain = False,
 ) -> None:
     """Compare each recording's track with its truth and with dead reckoning by the IMU alone.
 
     Without PATH, that of a simulated walk.
     """
     from stario.fusion.evaluation.compare import TRACKS, compare_recordings, demonstration
-    from stario.fusion.evaluation.folders import check_folder
-    from stario.fusion.evaluation.results import metrics_dict, write_comparison
+    from stario.fusion.evaluation.results import check_folder, metrics_dict, write_comparison
     from stario.fusion.fix_file import read_fixes
     from stario.sequences.arrays import check_choice
     from stario.sequences.datasets.batch import without_skipped
     from stario.sequences.lazy import optional_package
 
     if not paths:
-        refuse(context, "without PATH", "use with a recording to read", *READING)
+        options.refuse(context, "without PATH", "use with a recording to read", *options.READING)
     if report:
         optional_package("plotly", "report")
-    chosen = TRACKS if tracks == "all" else [*_SHOWN, *(names_in(tracks) if tracks else [])]
+    chosen = TRACKS if tracks == "all" else [*_SHOWN, *(common.names_in(tracks) if tracks else [])]
     for name in chosen:
         check_choice("--tracks", name, TRACKS)
     settings, network = placing.settings(estimating.settings()), estimating.network()
     model = estimating.for_processes(network, jobs)
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
     files, skipped = reading.recordings(paths or [])
-    origin = origin_of(files, reading, estimating, network, fixes)
+    origin = common.origin_of(files, reading, estimating, network, fixes)
     read: Callable[[Path], ImuSequence] = reading.read
     if not paths:
         files, read = [Path("demonstration")], lambda path: demonstration()
@@ -97,11 +71,11 @@ def compare(
         raise InputError("--fixes", f"{len(files)} recordings", "one recording")
     folder = out or Path("runs") / "compare"
     check_folder(folder)
-    with progress_bar("compare", 100 * len(files)) as progress:
+    with common.progress_bar("compare", 100 * len(files)) as progress:
         outcomes = compare_recordings(
             files, model, settings, read, jobs, absolute_fixes, progress=progress, names=chosen
         )
-        train = training_command(paths, reading) if paths else ""
+        train = common.training_command(paths, reading) if paths else ""
         comparisons = [replace(c, train=train) for c in without_skipped(outcomes, skipped)]
     also = {}
     if report:
@@ -109,7 +83,7 @@ def compare(
 
         also["report.html"] = write_report
     if explained:
-        explain()
+        common.explain()
     if comparisons:
         written = write_comparison(folder, comparisons, settings, origin, also)
         lines = [line for found in comparisons for line in _lines(found, bool(tracks))]
@@ -119,8 +93,8 @@ def compare(
             command = "stario" if shutil.which("stario") else sys.argv[0]  # in no PATH: its own
             lines.append(f"next: {command} run FILE --report, with a phone's recording")
         records = {found.sequence.name: found.as_dict() for found in comparisons}
-        print_result(as_json, metrics_dict(records, comparisons[0].words), "\n".join(lines))
-    exit_if_skipped(skipped)
+        common.print_result(as_json, metrics_dict(records, comparisons[0].words), "\n".join(lines))
+    common.exit_if_skipped(skipped)
 
 
 def _lines(found: Comparison, as_table: bool) -> list[str]:

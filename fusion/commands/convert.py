@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from stario.fusion.commands.common import check_new, exit_if_skipped
-from stario.fusion.commands.options import OverwriteOption, ReadingOptions, expand_option_groups
+from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError, StarioError
 
 if TYPE_CHECKING:
@@ -17,22 +16,19 @@ if TYPE_CHECKING:
     from stario.sequences.sequence import ImuSequence
 
 
-@expand_option_groups
+@options.expanded
 def convert(
-    paths: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="IN... OUT",
-            help="Recordings, folders or list files, then the file or new folder to write. "
-            "An archive (.h5) takes any number of recordings, the other layouts one.",
-        ),
-    ],
-    reading: ReadingOptions,
-    to: Annotated[
-        str | None,
-        typer.Option(help="csv, euroc or archive. Default: by OUT's suffix: .csv, none or .h5."),
-    ] = None,
-    overwrite: OverwriteOption = False,
+    reading: options.Reading,
+    paths: list[Path] = typer.Argument(
+        ...,
+        metavar="IN... OUT",
+        help="Recordings, folders or list files, then the file or new folder to write. "
+        "An archive (.h5) takes any number of recordings, the other layouts one.",
+    ),
+    to: str | None = typer.Option(
+        None, help="csv, euroc or archive. Default: by OUT's suffix: .csv, none or .h5."
+    ),
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Convert recordings to a CSV, the EuRoC layout or an archive; warn about what they lose."""
     from stario.sequences.datasets.archive_writer import write_archive
@@ -57,13 +53,13 @@ def convert(
         names = write_archive(target, sequences)
     except InputError:
         if not read:  # then nothing was written because each of them was skipped
-            exit_if_skipped(skipped)
+            common.exit_if_skipped(skipped)
         raise
     for name, stored in zip(read, names, strict=True):
         if stored != name:
             typer.echo(f"{name} is stored as {stored}")
     typer.echo(f"written: {target}, {len(names)} recording{'s' * (len(names) != 1)}")
-    exit_if_skipped(skipped)
+    common.exit_if_skipped(skipped)
 
 
 def _check_target(target: Path, sources: list[Path], overwrite: bool) -> None:
@@ -74,7 +70,7 @@ def _check_target(target: Path, sources: list[Path], overwrite: bool) -> None:
     read = {split_name(source)[0].resolve() for source in sources}
     if target.exists() and read & {target.resolve(), *target.resolve().parents}:
         raise InputError("OUT", f"{target}, which is also an input", "another file")
-    check_new("OUT", target, overwrite)
+    common.check_new("OUT", target, overwrite)
     if target.is_dir() and any(target.iterdir()) and not overwrite:
         fix = "or pass --overwrite" if (target / EUROC_FILES[0]).is_file() else ""
         raise InputError("OUT", f"{target}, which already exists", "a new or empty folder", fix)
@@ -84,7 +80,7 @@ def _only(files: list[Path], skipped: list[Skipped]) -> Path:
     """Return the only recording found."""
     if len(skipped) == 1 and not files:
         raise StarioError(skipped[0].reason)
-    exit_if_skipped(skipped)
+    common.exit_if_skipped(skipped)
     if len(files) != 1:
         expected = "one recording, or an archive (.h5) as OUT"
         fix = f"name one, such as {files[0]}" if files else ""
@@ -93,7 +89,7 @@ def _only(files: list[Path], skipped: list[Skipped]) -> Path:
 
 
 def _read(
-    reading: ReadingOptions, files: list[Path], skipped: list[Skipped], names: list[str]
+    reading: options.Reading, files: list[Path], skipped: list[Skipped], names: list[str]
 ) -> Iterator[ImuSequence]:
     """Yield each recording and append its name; add those that cannot be used to `skipped`."""
     from stario.sequences.datasets.batch import each, without_skipped

@@ -2,37 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple, get_args
+from typing import TYPE_CHECKING, NamedTuple, get_args
 
 import typer
 
-from stario.fusion.commands.common import (
-    exit_if_skipped,
-    names_in,
-    origin_of,
-    print_result,
-    progress_bar,
-)
-from stario.fusion.commands.options import (
-    DataOption,
-    EstimatorOptions,
-    EvaluateOutOption,
-    JobsOption,
-    JsonOption,
-    OptionalPathsArgument,
-    ReadingOptions,
-    RunsOption,
-    expand_option_groups,
-    flag,
-    refuse,
-    refuse_unused_sources,
-)
+from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
+    from stario.fusion.config import NavigatorConfig
     from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
     from stario.network.model import DisplacementModel
     from stario.sequences.datasets.batch import Skipped
@@ -49,95 +30,93 @@ class _Found(NamedTuple):
     write: Callable[[Path], object]
 
 
-@expand_option_groups
+@options.expanded
 def evaluate(
     context: typer.Context,
-    reading: ReadingOptions,
-    estimating: EstimatorOptions,
-    paths: OptionalPathsArgument = None,
-    data: DataOption = None,
-    split: Annotated[
-        str,
-        typer.Option(
-            help="With --data: test, validation, training, holdout, all, open, or a list file "
-            "with lines of name, group."
-        ),
-    ] = "test",
-    by: Annotated[
-        str | None,
-        typer.Option(
-            help="Evaluate the network alone by set, group, person, device, place or carry. "
-            "Ground truth may be poses, positions or waypoints.",
-        ),
-    ] = None,
-    against: Annotated[
-        str | None,
-        typer.Option(
-            help="With --by: weights to compare with, or pdr (pedestrian dead reckoning without a "
-            "network), by paired error ratios with 95 % intervals. {group} or {set} in a weights "
-            "name stands for each recording's group, or its first word: leave-one-out."
-        ),
-    ] = None,
-    filtered: Annotated[
-        bool, flag("--filtered", help="With --by: also report the filter's mean NIS; slow.")
-    ] = False,
-    models: Annotated[
-        str | None,
-        typer.Option(
-            help="Networks to compare, separated by commas: names from `stario check models`, "
-            "default, or weights files; several weights of one network are averaged.",
-        ),
-    ] = None,
-    runs: RunsOption = Path("runs"),
-    convention: Annotated[
-        str, typer.Option(help="How --models averages position errors: rms, ronin or mean.")
-    ] = "rms",
-    jobs: JobsOption = 1,
-    out: EvaluateOutOption = None,
-    as_json: JsonOption = False,
+    reading: options.Reading,
+    estimating: options.Estimator,
+    paths: options.OptionalPaths = None,
+    data: options.Data = None,
+    split: str = typer.Option(
+        "test",
+        help="With --data: test, validation, training, holdout, all, open, or a list file "
+        "with lines of name, group.",
+    ),
+    by: str | None = typer.Option(
+        None,
+        help="Evaluate the network alone by set, group, person, device, place or carry. "
+        "Ground truth may be poses, positions or waypoints.",
+    ),
+    against: str | None = typer.Option(
+        None,
+        help="With --by: weights to compare with, or pdr (pedestrian dead reckoning without a "
+        "network), by paired error ratios with 95 % intervals. {group} or {set} in a weights "
+        "name stands for each recording's group, or its first word: leave-one-out.",
+    ),
+    filtered: bool = options.flag(
+        False, "--filtered", help="With --by: also report the filter's mean NIS; slow."
+    ),
+    models: str | None = typer.Option(
+        None,
+        help="Networks to compare, separated by commas: names from `stario check models`, "
+        "default, or weights files; several weights of one network are averaged.",
+    ),
+    runs: options.Runs = Path("runs"),
+    convention: str = typer.Option(
+        "rms", help="How --models averages position errors: rms, ronin or mean."
+    ),
+    jobs: options.Jobs = 1,
+    out: options.EvaluateOut = None,
+    as_json: options.Json = False,
 ) -> None:
     """Evaluate accuracy and consistency over recordings with ground truth: medians and means."""
-    from stario.fusion.evaluation.folders import check_folder
+    from stario.fusion.evaluation.results import check_folder
     from stario.network.training.splits import warn_of_learned
 
     if out is not None:
         check_folder(out)
-    refuse_unused_sources(context, paths, data)
+    options.refuse_unused_sources(context, paths, data)
     _refuse_unused(context, by, models)
     listed, skipped = _listed(reading, paths or [], data, split)
     files = [entry.path for entry in listed]
-    named = [estimating.model, against or ""] if models is None else names_in(models)
+    named = [estimating.model, against or ""] if models is None else common.names_in(models)
     if data is not None:
         warn_of_learned(named, files, data)
     if by is not None:
-        found, failed = _groups(listed, reading, by, estimating.model, against, filtered, jobs)
+        groups = {entry.path: entry.group for entry in listed}
+        found, failed = _groups(groups, reading, by, estimating.model, against, filtered, jobs)
     elif models is not None:
-        found, failed = _networks(named, runs, files, reading, estimating, convention, jobs)
+        settings = estimating.settings()
+        found, failed = _networks(named, runs, files, reading, settings, convention, jobs)
     else:
         found, failed = _tracks(files, reading, estimating, jobs, out)
     if found is not None:
         if out is not None:
             found.write(out)
-        print_result(as_json, found.record, found.text)
-    exit_if_skipped(skipped + failed)
+        common.print_result(as_json, found.record, found.text)
+    common.exit_if_skipped([*skipped, *failed])
 
 
 def _refuse_unused(context: typer.Context, by: str | None, models: str | None) -> None:
     """Refuse options that the chosen kind of evaluation does not use."""
     if by is None:
-        refuse(context, "without --by", "a grouping, such as --by set", "against", "filtered")
+        options.refuse(
+            context, "without --by", "a grouping, such as --by set", "against", "filtered"
+        )
     else:
-        refuse(context, "with --by", "--model and --against", "models")
+        options.refuse(context, "with --by", "--model and --against", "models")
         alone = "use without: the network alone is judged"
-        refuse(context, "with --by", alone, "config", "magnetometer", "declination")
+        options.refuse(context, "with --by", alone, "config", "magnetometer", "declination")
     if models is None:
-        refuse(context, "without --models", "networks named with --models", "convention", "runs")
+        options.refuse(
+            context, "without --models", "networks named with --models", "convention", "runs"
+        )
     else:
-        refuse(context, "with --models", "one of the two", "model")
+        options.refuse(context, "with --models", "one of the two", "model")
 
 
 def _listed(
-    reading: ReadingOptions, paths: list[Path], data: Path | None, split: str
+    reading: options.Reading, paths: list[Path], data: Path | None, split: str
 ) -> tuple[list[ListEntry], list[Skipped]]:
     """Return the named recordings, or else those of the split, and the skipped paths."""
     from stario.network.training.splits import read_packaged_list
@@ -153,23 +132,23 @@ def _listed(
 
 def _tracks(
     files: list[Path],
-    reading: ReadingOptions,
-    estimating: EstimatorOptions,
+    reading: options.Reading,
+    estimating: options.Estimator,
     jobs: int,
     out: Path | None,
 ) -> tuple[_Found | None, list[Skipped]]:
     """Return the table of recordings, whose tracks are written one by one, and those skipped."""
     from stario.fusion.evaluation.compare import compare_recordings
     from stario.fusion.evaluation.results import write_recording, write_summary
-    from stario.fusion.evaluation.summary import Scores, scores_of, summary, summary_table
+    from stario.fusion.evaluation.text import scores_of, summary, summary_table
     from stario.sequences.datasets.batch import without_skipped
 
     settings, network = estimating.settings(), estimating.network()
     model = estimating.for_processes(network, jobs)
-    origin = origin_of(files, reading, estimating, network)
+    origin = common.origin_of(files, reading, estimating, network)
     skipped: list[Skipped] = []
-    scores: list[Scores] = []
-    with progress_bar("evaluate", 100 * len(files)) as progress:
+    scores = []
+    with common.progress_bar("evaluate", 100 * len(files)) as progress:
         outcomes = compare_recordings(
             files, model, settings, reading.read, jobs, truth_needed=True, progress=progress
         )
@@ -188,34 +167,33 @@ def _networks(
     names: Sequence[str],
     runs: Path,
     files: list[Path],
-    reading: ReadingOptions,
-    estimating: EstimatorOptions,
+    reading: options.Reading,
+    settings: NavigatorConfig,
     convention: str,
     jobs: int,
 ) -> tuple[_Found | None, list[Skipped]]:
     """Return the table of networks, and the recordings that were skipped."""
     from stario.fusion.evaluation.figures import write_table
-    from stario.fusion.evaluation.networks import compare_networks, networks_text, table_dict
+    from stario.fusion.evaluation.networks import network_table, networks_on
     from stario.network.model import load_model, weights_named
     from stario.sequences.accuracy.metrics import Convention
     from stario.sequences.arrays import check_choice
 
     averaging: Convention = check_choice("convention", convention, get_args(Convention))
-    networks = [(name, load_model(weights_named(name, runs))) for name in names]
-    settings = estimating.settings()
-    with progress_bar("evaluate", 100 * len(files)) as progress:
-        table, skipped = compare_networks(
-            files, networks, settings, reading.read, averaging, jobs, progress
-        )
-    if table is None:
+    models = [(name, load_model(weights_named(name, runs))) for name in names]
+    work = partial(
+        networks_on, models=models, config=settings, read=reading.read, convention=averaging
+    )
+    found, skipped = common.each_used("evaluate", work, files, jobs)
+    if not found:
         return None, skipped
-    write = partial(write_table, table=table)
-    return _Found(table_dict(table), networks_text(table), write), skipped
+    table = network_table(found, models, averaging)
+    return _Found(table.as_dict(), table.text(), partial(write_table, table=table)), skipped
 
 
 def _groups(
-    recordings: list[ListEntry],
-    reading: ReadingOptions,
+    groups: Mapping[Path, str],
+    reading: options.Reading,
     by: str,
     ours: str,
     theirs: str | None,
@@ -223,30 +201,28 @@ def _groups(
     jobs: int,
 ) -> tuple[_Found | None, list[Skipped]]:
     """Return the table of groups, and the recordings that were skipped."""
-    from stario.fusion.evaluation.benchmark.groups import (
-        By,
-        benchmark,
-        benchmark_dict,
-        benchmark_text,
-    )
     from stario.fusion.evaluation.figures import write_benchmark
+    from stario.fusion.evaluation.groups import By, alone_on, benchmark
     from stario.sequences.arrays import check_choice
 
     grouping: By = check_choice("--by", by, get_args(By))
-    names = [ours] if theirs is None else [ours, theirs]
-    models = {name: partial(_for_group, name) for name in names}
-    for name in names:
+    weights = list(dict.fromkeys([ours, theirs or ours]))
+    for name in weights:
         if _GROUP not in name and _SET not in name:
             _for_group(name, "")  # fail on unloadable weights before preparing anything
-    groups = {entry.path: entry.group for entry in recordings}
-    with progress_bar("evaluate", len(groups)) as progress:
-        found, skipped = benchmark(groups, models, reading.read, jobs, filtered, progress)
-    if found is None:
+    work = partial(
+        alone_on,
+        groups=groups,
+        model=_for_group,
+        weights=weights,
+        read=reading.read,
+        filtered=filtered,
+    )
+    found, skipped = common.each_used("evaluate", work, groups, jobs)
+    if not found:
         return None, skipped
-    rows = found.rows(grouping, ours, theirs)
-    write = partial(write_benchmark, found=found, rows=rows, ours=ours, theirs=theirs)
-    record = benchmark_dict(found, rows, ours, theirs)
-    return _Found(record, benchmark_text(rows, ours, theirs), write), skipped
+    table = benchmark(found, grouping, ours, theirs)
+    return _Found(table.as_dict(), table.text(), partial(write_benchmark, found=table)), skipped
 
 
 @cache

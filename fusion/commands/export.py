@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
-from stario.fusion.commands.options import RunsOption
+from stario.fusion.commands import options
 from stario.sequences.errors import InputError
 
 
 def export(
-    model: Annotated[
-        str,
-        typer.Option(
-            help="Network: a name from `stario check models`, default, or weights with their card.",
-        ),
-    ] = "default",
-    runs: RunsOption = Path("runs"),
-    out: Annotated[Path | None, typer.Option(help="File to write. Default: ./NETWORK.onnx")] = None,
+    model: str = typer.Option(
+        "default",
+        help="Network: a name from `stario check models`, default, or weights with their card.",
+    ),
+    runs: options.Runs = Path("runs"),
+    out: Path | None = typer.Option(None, help="File to write. Default: ./NETWORK.onnx"),
 ) -> None:
     """Export a network with its calibration as ONNX; `--model FILE.onnx` then runs it anywhere."""
     from stario.network.model import load_model, weights_named

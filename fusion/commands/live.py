@@ -3,33 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
-from stario.fusion.commands.options import (
-    EstimatorOptions,
-    MapOptions,
-    TilesOption,
-    expand_option_groups,
-    flag,
-)
+from stario.fusion.commands import options
 
 
-@expand_option_groups
+@options.expanded
 def live(
-    estimating: EstimatorOptions,
-    placing: MapOptions,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of page and pushes.")] = 8000,
-    host: Annotated[
-        str, typer.Option(help="Address to listen on; 0.0.0.0 admits phones, with a token.")
-    ] = "127.0.0.1",
-    phyphox: Annotated[
-        list[str] | None, typer.Option(help="Address of a phone running phyphox; repeatable.")
-    ] = None,
-    tiles: TilesOption = "",
-    demo: Annotated[bool, flag("--demo", help="Let a simulated phone walk.")] = False,
-    out: Annotated[Path, typer.Option(help="Folder for the recordings.")] = Path("runs/live"),
+    estimating: options.Estimator,
+    placing: options.Map,
+    port: int = typer.Option(8000, min=0, max=65535, help="Port of page and pushes."),
+    host: str = typer.Option(
+        "127.0.0.1", help="Address to listen on; 0.0.0.0 admits phones, with a token."
+    ),
+    phyphox: list[str] | None = typer.Option(
+        None, help="Address of a phone running phyphox; repeatable."
+    ),
+    tiles: options.Tiles = "",
+    demo: bool = options.flag(False, "--demo", help="Let a simulated phone walk."),
+    out: Path = typer.Option(Path("runs/live"), help="Folder for the recordings."),
 ) -> None:
     """Show live tracks on a web page, from Sensor Logger, phyphox or any device that posts JSON."""
     from stario.sequences.errors import InputError
@@ -38,7 +31,7 @@ def live(
     for package in ("starlette", "uvicorn", "plotly", "segno"):
         optional_package(package, "live")
     from stario.fusion import demonstration
-    from stario.fusion.evaluation.folders import check_folder
+    from stario.fusion.evaluation.results import check_folder
     from stario.fusion.live.run import LiveServer
     from stario.fusion.navigator import Navigator
 

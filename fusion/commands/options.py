@@ -27,44 +27,41 @@ flag = partial(typer.Option, metavar="")
 """Option without a value; the help would show `<bool>` after it."""
 
 _PATHS = typer.Argument(metavar="PATH...", help="Recordings, folders or list files.")
-PathsArgument = Annotated[list[Path], _PATHS]
-OptionalPathsArgument = Annotated[list[Path] | None, _PATHS]
-RunsOption = Annotated[
+Paths = Annotated[list[Path], _PATHS]
+OptionalPaths = Annotated[list[Path] | None, _PATHS]
+Runs = Annotated[
     Path, typer.Option(help="Folder of training runs in which named networks are found.")
 ]
-CacheOption = Annotated[
+Cache = Annotated[
     Path | None,
     typer.Option(help="Folder for cached windows. Default: STARIO_CACHE or ~/.cache/stario."),
 ]
-DataOption = Annotated[
+Data = Annotated[
     Path | None, typer.Option(help="Folder of the development recordings, used without PATH.")
 ]
-ConfigOption = Annotated[
+Config = Annotated[
     Path | None,
     _estimation(help="TOML or JSON file with settings: gravity, tables noise, filter, graph."),
 ]
 _RESULTS = "Folder for the results; replaces those of an earlier run. Default: "
-RunOutOption = Annotated[Path | None, typer.Option(help=f"{_RESULTS}runs/NAME.")]
-CompareOutOption = Annotated[Path | None, typer.Option(help=f"{_RESULTS}runs/compare.")]
-EvaluateOutOption = Annotated[Path | None, typer.Option(help=f"{_RESULTS}none is written.")]
-FixesOption = Annotated[
+RunOut = Annotated[Path | None, typer.Option(help=f"{_RESULTS}runs/NAME.")]
+CompareOut = Annotated[Path | None, typer.Option(help=f"{_RESULTS}runs/compare.")]
+EvaluateOut = Annotated[Path | None, typer.Option(help=f"{_RESULTS}none is written.")]
+Fixes = Annotated[
     Path | None,
     typer.Option(
         help="CSV of absolute fixes with columns t, kind, x, y, z, sx, sy, sz: position \\[m], "
         "velocity \\[m/s] or yaw \\[rad] (in x), and their sigmas."
     ),
 ]
-BackendOption = Annotated[str, typer.Option(help="Estimator: ekf or graph.")]
-ByOption = Annotated[
+By = Annotated[
     str, typer.Option(help="Group by set, or by an attribute such as person, device or carry.")
 ]
-JobsOption = Annotated[
-    int, typer.Option(min=1, help="Number of processes that share the recordings.")
-]
-ReportOption = Annotated[
+Jobs = Annotated[int, typer.Option(min=1, help="Number of processes that share the recordings.")]
+Report = Annotated[
     bool, flag("--report", help="Also write report.html: map, time slider, plots, health.")
 ]
-TilesOption = Annotated[
+Tiles = Annotated[
     str,
     typer.Option(
         metavar="URL",
@@ -72,15 +69,15 @@ TilesOption = Annotated[
         "https://tile.openstreetmap.org/{z}/{x}/{y}.png; the browser asks it.",
     ),
 ]
-ExplainOption = Annotated[
+Explain = Annotated[
     bool, flag("--explain", help="Say first what the printed words and figures mean.")
 ]
-OverwriteOption = Annotated[bool, flag("--overwrite", help="Replace an existing file.")]
-JsonOption = Annotated[bool, flag("--json", help="Print the results as JSON on stdout.")]
+Overwrite = Annotated[bool, flag("--overwrite", help="Replace an existing file.")]
+Json = Annotated[bool, flag("--json", help="Print the results as JSON on stdout.")]
 
 
 @dataclass(frozen=True)
-class ReadingOptions:
+class Reading:
     """Options for reading a recording."""
 
     format: Annotated[
@@ -130,7 +127,7 @@ class ReadingOptions:
 
     def changed(self) -> dict[str, object]:
         """Return the options that differ from their defaults."""
-        default = asdict(ReadingOptions())
+        default = asdict(Reading())
         return {name: value for name, value in asdict(self).items() if value != default[name]}
 
     def as_read(self) -> dict[str, object]:
@@ -195,10 +192,10 @@ class ReadingOptions:
 
 
 @dataclass(frozen=True)
-class EstimatorOptions:
+class Estimator:
     """Options of the estimator."""
 
-    config: ConfigOption = None
+    config: Config = None
     model: Annotated[
         str,
         _estimation(help="Weights: default, open, or a safetensors or ONNX file."),
@@ -246,7 +243,7 @@ class EstimatorOptions:
 
 
 @dataclass(frozen=True)
-class MapOptions:
+class Map:
     """What is known of a place on the earth; as in `PlaceConfig`."""
 
     satellites: Annotated[
@@ -281,7 +278,7 @@ class MapOptions:
 
 
 @dataclass(frozen=True)
-class PlaceOptions(MapOptions):
+class Place(Map):
     """What is known of a recording's place, and what becomes of it."""
 
     waypoints: Annotated[
@@ -302,21 +299,16 @@ def _numbers_in(option: str, text: str) -> tuple[float, ...]:
         raise InputError(option, repr(text), expected) from None
 
 
-READING = tuple(field.name for field in fields(ReadingOptions))
+READING = tuple(field.name for field in fields(Reading))
 """Names of all options of reading, to refuse them where nothing is read."""
 
 
 def refuse(context: typer.Context, found: str, expected: str, *names: str) -> None:
     """Refuse options of the command line that would do nothing, rather than ignore them.
 
-    Args:
-        context: the command's call.
-        found: why they would do nothing, such as "without PATH".
-        expected: when they do something.
-        names: parameters of the options.
-
     Raises:
-        InputError: one was given.
+        InputError: one of the named parameters was given; `found` says why it would do nothing,
+            such as "without PATH", `expected` when it does something.
     """
     for option in context.command.params:
         source = context.get_parameter_source(str(option.name))
@@ -337,17 +329,16 @@ def refuse_unused_sources(
         refuse(context, "with --data", "use with PATH: name the archive", "where")
 
 
-def expand_option_groups(command: Callable[..., None]) -> Callable[..., None]:
-    """Expand a command's parameters of an option group into one typer option per field.
+def expanded(command: Callable[..., None]) -> Callable[..., None]:
+    """Expand a command's parameters of an option group into its options, defined only once.
 
-    Groups are `ReadingOptions`, `EstimatorOptions`, `MapOptions` and `PlaceOptions`: each option is
-    thus defined only once.
+    Groups are `Reading`, `Estimator`, `Map` and `Place`.
     """
     options: list[inspect.Parameter] = []
     groups: dict[str, tuple[type, list[str]]] = {}
     for parameter in inspect.signature(command, eval_str=True).parameters.values():
         group = parameter.annotation
-        if group in (ReadingOptions, EstimatorOptions, MapOptions, PlaceOptions):
+        if group in (Reading, Estimator, Map, Place):
             members = inspect.signature(group, eval_str=True).parameters
             groups[parameter.name] = group, list(members)
             options += members.values()

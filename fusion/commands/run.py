@@ -2,68 +2,87 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from stario.fusion.commands.common import (
-    explain,
-    origin_of,
-    process_each,
-    progress_bar,
-    training_command,
-)
-from stario.fusion.commands.options import (
-    EstimatorOptions,
-    ExplainOption,
-    FixesOption,
-    JsonOption,
-    PathsArgument,
-    PlaceOptions,
-    ReadingOptions,
-    ReportOption,
-    RunOutOption,
-    TilesOption,
-    expand_option_groups,
-    flag,
-)
+from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.compare import Comparison
-    from stario.fusion.fixes import Fix
-    from stario.fusion.navigator import Navigator
+    from stario.fusion.evaluation.results import Writers
     from stario.sequences.sequence import ImuSequence
 
 
-@expand_option_groups
+@options.expanded
 def run(
-    paths: PathsArgument,
-    reading: ReadingOptions,
-    estimating: EstimatorOptions,
-    placing: PlaceOptions,
-    fixes: FixesOption = None,
-    out: RunOutOption = None,
-    filtered: Annotated[
-        bool, flag("--filtered", help="Also write the filter's track, as a stream gives it.")
-    ] = False,
-    report: ReportOption = False,
-    tiles: TilesOption = "",
-    view: Annotated[
-        bool, flag("--view", help="Open the rerun 3-D viewer; its file is kept in --out.")
-    ] = False,
-    as_json: JsonOption = False,
-    explained: ExplainOption = False,
+    paths: options.Paths,
+    reading: options.Reading,
+    estimating: options.Estimator,
+    placing: options.Place,
+    fixes: options.Fixes = None,
+    out: options.RunOut = None,
+    filtered: bool = options.flag(
+        False, "--filtered", help="Also write the filter's track, as a stream gives it."
+    ),
+    report: options.Report = False,
+    tiles: options.Tiles = "",
+    view: bool = options.flag(
+        False, "--view", help="Open the rerun 3-D viewer; its file is kept in --out."
+    ),
+    as_json: options.Json = False,
+    explained: options.Explain = False,
 ) -> None:
     """Fuse each recording into a smooth track with attitude, velocity, biases and covariance."""
-    from stario.fusion.fix_file import read_fixes
+    from stario.fusion.evaluation.compare import measured
+    from stario.fusion.evaluation.results import write_run
+    from stario.fusion.fix_file import check_within, read_fixes
     from stario.fusion.navigator import Navigator
+
+    also = _further_files(report, tiles, view)
+    network = estimating.network()
+    navigator = Navigator(network, placing.settings(estimating.settings()))
+    given = [] if fixes is None else read_fixes(fixes)
+    if explained:
+        common.explain()
+    origin = common.origin_of(paths, reading, estimating, network, fixes)
+    train = common.training_command(paths, reading)
+
+    def fuse(sequence: ImuSequence, folder: Path) -> tuple[dict[str, object], str]:
+        """Write one recording's track; return its record and a summary."""
+        check_within(given, sequence)
+        with common.progress_bar(f"run {sequence.name}") as progress:
+            track = navigator.run(sequence, progress, given)
+        tracks = {"track": track}
+        if filtered and track.filtered is not None:
+            tracks["filtered"] = track.filtered
+        found = replace(measured(sequence, tracks, navigator.config.place), train=train)
+        written = write_run(folder, found, navigator.config, origin, also)
+        if view:
+            from stario.fusion.report.view import open_view
+
+            open_view(folder / "track.rrd")
+        record: dict[str, object] = {"recording": sequence.name, **found.metrics}
+        record |= {"verdict": [asdict(f) for f in found.verdict], "folder": str(folder)}
+        lines = [*_lines(found), f"{folder}: {', '.join(path.name for path in written)}"]
+        return record, "\n".join(lines)
+
+    common.process_each(reading, paths, out, fuse, as_json, "--fixes" if fixes else "")
+
+
+def _further_files(report: bool, tiles: str, view: bool) -> Writers:
+    """Return what writes the report and the viewer's file, if their packages are there."""
     from stario.sequences.lazy import optional_package
 
+    also: dict[str, Callable[[Path, Comparison], object]] = {}
     if report:
         optional_package("plotly", "report")
+        from stario.fusion.report.page import write_report
+
+        also["report.html"] = partial(write_report, tiles=tiles)
     if tiles:
         if not report:
             raise InputError("--tiles", "use without --report", "use with it")
@@ -72,65 +91,10 @@ def run(
         check_tiles(tiles)
     if view:
         optional_package("rerun", "view")
-    network = estimating.network()
-    navigator = Navigator(network, placing.settings(estimating.settings()))
-    absolute_fixes = [] if fixes is None else read_fixes(fixes)
-    if explained:
-        explain()
-    work = partial(
-        _run,
-        navigator=navigator,
-        fixes=absolute_fixes,
-        origin=origin_of(paths, reading, estimating, network, fixes),
-        filtered=filtered,
-        report=report,
-        tiles=tiles,
-        view=view,
-        train=training_command(paths, reading),
-    )
-    process_each(reading, paths, out, work, as_json, "--fixes" if fixes else "")
-
-
-def _run(
-    sequence: ImuSequence,
-    folder: Path,
-    navigator: Navigator,
-    fixes: Sequence[Fix],
-    origin: dict[str, object],
-    filtered: bool,
-    report: bool,
-    tiles: str,
-    view: bool,
-    train: str,
-) -> tuple[dict[str, object], str]:
-    """Write one recording's track; return its record and a summary."""
-    from stario.fusion.evaluation.compare import measured
-    from stario.fusion.evaluation.results import write_run
-    from stario.fusion.fix_file import check_within
-
-    check_within(fixes, sequence)
-    with progress_bar(f"run {sequence.name}") as progress:
-        track = navigator.run(sequence, progress, fixes)
-    tracks = {"track": track}
-    if filtered and track.filtered is not None:
-        tracks["filtered"] = track.filtered
-    found = replace(measured(sequence, tracks, navigator.config.place), train=train)
-    also: dict[str, Callable[[Path, Comparison], object]] = {}
-    if report:
-        from stario.fusion.report.page import write_report
-
-        also["report.html"] = partial(write_report, tiles=tiles)
-    if view:
-        from stario.fusion.report.view import open_view, write_view
+        from stario.fusion.report.view import write_view
 
         also["track.rrd"] = write_view
-    written = write_run(folder, found, navigator.config, origin, also)
-    if view:
-        open_view(folder / "track.rrd")
-    lines = [*_lines(found), f"{folder}: {', '.join(path.name for path in written)}"]
-    record: dict[str, object] = {"recording": sequence.name, **found.metrics}
-    record["verdict"] = [asdict(finding) for finding in found.verdict]
-    return record | {"folder": str(folder)}, "\n".join(lines)
+    return also
 
 
 def _lines(found: Comparison) -> list[str]:

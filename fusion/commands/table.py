@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import importlib.resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from stario.fusion.commands.common import exit_if_skipped, names_in
-from stario.fusion.commands.options import CacheOption, ReadingOptions, assignment, refuse
+from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,51 +17,43 @@ if TYPE_CHECKING:
 
 def table(
     context: typer.Context,
-    out: Annotated[
-        Path, typer.Option(help="Folder of the finished runs; a repetition resumes there.")
-    ],
-    data: Annotated[Path | None, typer.Option(help="Folder of the development recordings.")] = None,
-    sets: Annotated[
-        str | None,
-        typer.Option(help="Sets of --data to use. Default: oxiod,ridi,all,tyrex,kipd,ilc."),
-    ] = None,
-    published: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", help="Published data set, NAME=FOLDER, such as ronin=/data/RoNIN; repeatable."
-        ),
-    ] = None,
-    networks: Annotated[
-        str | None,
-        typer.Option(help="Networks of `stario check models`, comma-separated. Default: all."),
-    ] = None,
-    steps: Annotated[
-        int | None, typer.Option(min=1, help="Training steps per network; overrides the recipe.")
-    ] = None,
-    seeds: Annotated[
-        int,
-        typer.Option(min=1, help="Seeds for StarIO with and without MSGCU, R-ResNet and DeepILS."),
-    ] = 3,
-    split_seed: Annotated[int, typer.Option(min=0, help="Seed of the recording split.")] = 0,
-    per_group: Annotated[
-        int, typer.Option(min=1, help="Maximum test recordings per group in the set all.")
-    ] = 2,
-    config: Annotated[
-        Path | None, typer.Option(help="TOML or JSON file with the recipe. Default: the package's.")
-    ] = None,
-    cache: CacheOption = None,
-    jobs: Annotated[
-        int | None, typer.Option(help="Runs to run in parallel; -1 for as many as possible.")
-    ] = None,
-    backend: Annotated[
-        str, typer.Option(help="Where runs run: loky (this machine), dask or ray.")
-    ] = "loky",
+    out: Path = typer.Option(..., help="Folder of the finished runs; a repetition resumes there."),
+    data: Path | None = typer.Option(None, help="Folder of the development recordings."),
+    sets: str | None = typer.Option(
+        None, help="Sets of --data to use. Default: oxiod,ridi,all,tyrex,kipd,ilc."
+    ),
+    published: list[str] | None = typer.Option(
+        None,
+        "--set",
+        help="Published data set, NAME=FOLDER, such as ronin=/data/RoNIN; repeatable.",
+    ),
+    networks: str | None = typer.Option(
+        None, help="Networks of `stario check models`, comma-separated. Default: all."
+    ),
+    steps: int | None = typer.Option(
+        None, min=1, help="Training steps per network; overrides the recipe."
+    ),
+    seeds: int = typer.Option(
+        3, min=1, help="Seeds for StarIO with and without MSGCU, R-ResNet and DeepILS."
+    ),
+    split_seed: int = typer.Option(0, min=0, help="Seed of the recording split."),
+    per_group: int = typer.Option(
+        2, min=1, help="Maximum test recordings per group in the set all."
+    ),
+    config: Path | None = typer.Option(
+        None, help="TOML or JSON file with the recipe. Default: the package's."
+    ),
+    cache: options.Cache = None,
+    jobs: int | None = typer.Option(
+        None, help="Runs to run in parallel; -1 for as many as possible."
+    ),
+    backend: str = typer.Option("loky", help="Where runs run: loky (this machine), dask or ray."),
 ) -> None:
     """Train and test every network on every data set; a rerun adds only missing runs.
 
     The paper's protocol: 8:1:1 by recordings, true attitude, same recipe and steps for all.
     """
-    from stario.fusion.evaluation.folders import make_folder
+    from stario.fusion.evaluation.results import make_folder
     from stario.fusion.paper_table.runs import backend as on_backend
     from stario.fusion.paper_table.runs import complete, table_runs
     from stario.fusion.paper_table.table import known_costs, write_results
@@ -74,9 +65,9 @@ def table(
     from stario.sequences.settings import read_settings
 
     if data is None:
-        refuse(context, "without --data", "use with --data", "sets", "per_group")
+        options.refuse(context, "without --data", "use with --data", "sets", "per_group")
     datasets = _data_sets(data, sets, published or [], split_seed, per_group)
-    chosen = None if networks is None else names_in(networks)
+    chosen = None if networks is None else common.names_in(networks)
     packaged = importlib.resources.files("stario.network.weights") / "recipe-table.json"
     recipe = read_settings(config or Path(str(packaged)))
     runs = table_runs(datasets, recipe, steps, chosen, seeds)
@@ -84,8 +75,8 @@ def table(
     requested = {run.network for run in runs}
     costs = known_costs([name for name in ARCHITECTURES if name in requested], out)
     learned = {} if data is None else learned_from(data)
-    options = ReadingOptions()
-    reading = ReaderConfig(options.read, options.as_read(), cache or cache_folder())
+    usual = options.Reading()
+    reading = ReaderConfig(usual.read, usual.as_read(), cache or cache_folder())
     skipped = []
     with on_backend(backend):
         if jobs is None and backend != "loky":
@@ -98,7 +89,7 @@ def table(
             typer.echo(f"{done} of {len(runs)}: {run}: {status}", err=True)
             write_results(runs, out, costs, learned, drawn=False)
     typer.echo(write_results(runs, out, costs, learned), nl=False)
-    exit_if_skipped(skipped)
+    common.exit_if_skipped(skipped)
 
 
 def _data_sets(
@@ -110,10 +101,10 @@ def _data_sets(
         raise InputError("data", "none", "recordings", "pass --data or --set NAME=FOLDER")
     datasets: list[DataSet] = []
     if data is not None:
-        names = None if sets is None else names_in(sets)
+        names = None if sets is None else common.names_in(sets)
         datasets += development_sets(data, seed, per_group, names)
     for word in published:
-        name, folder = assignment("--set", word, "NAME=FOLDER", "such as ronin=/data/RoNIN")
+        name, folder = options.assignment("--set", word, "NAME=FOLDER", "such as ronin=/data/RoNIN")
         if name in {dataset.name for dataset in datasets}:
             raise InputError("--set", repr(name), "a name of its own", f"or drop {name} by --sets")
         datasets.append(folder_set(name, Path(folder), seed))

@@ -2,37 +2,24 @@
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from stario.fusion.commands.common import list_skipped, training_progress
-from stario.fusion.commands.options import (
-    READING,
-    CacheOption,
-    OptionalPathsArgument,
-    ReadingOptions,
-    expand_option_groups,
-    flag,
-    refuse,
-)
-from stario.fusion.commands.training_data import (
-    packaged_lists,
-    recorded_streams,
-    streams_of_files,
-    training_material,
-    validation_material,
-)
+from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.network.card import Calibration
     from stario.network.model import DisplacementModel
     from stario.network.training.config import TrainingConfig
-    from stario.network.training.data import TrainingData
+    from stario.network.training.data import RecordingStreams, TrainingData
     from stario.network.training.history import EpochReport
+    from stario.sequences.datasets.batch import Skipped
+
+    Streams = tuple[list[RecordingStreams], list[Skipped]]
 
 
 _GENERATED = 150
@@ -44,91 +31,65 @@ calibration: `first-stage` calibrated on 15 s of a person had an NIS of up to 22
 other recordings, on 80 s of up to 9, and with its own calibration of 2.8 to 5."""
 
 
-@expand_option_groups
+@options.expanded
 def train(
     context: typer.Context,
-    reading: ReadingOptions,
-    paths: OptionalPathsArgument = None,
-    model: Annotated[
-        str | None,
-        typer.Option(
-            help="Network to train, from `stario check models`. Default: that of --start-from."
-        ),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of the run, resumed if it holds a checkpoint. Default: runs/NETWORK."
-        ),
-    ] = None,
-    validation: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Recordings to select and calibrate on. Default: the last fifth of each."
-        ),
-    ] = None,
-    data: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of the development recordings: train on all that the package lists except "
-            "the test recordings; select and calibrate on those of its list `holdout`."
-        ),
-    ] = None,
-    learn_from: Annotated[
-        str,
-        typer.Option(
-            help="With --data: all, open (those whose licence allows any use) or few (the eight "
-            "recordings of the paper's comparison)."
-        ),
-    ] = "all",
-    leave_out: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="With --data: neither learn from this set or group nor select on it: tyrex, or "
-            "'ridi dan'. Repeatable."
-        ),
-    ] = None,
-    generated: Annotated[
-        int | None, typer.Option(min=0, help=f"Simulated walks of 60 s. Default: {_GENERATED}.")
-    ] = None,
-    recorded_only: Annotated[
-        bool, flag("--recorded-only", help="Train without simulated walks.")
-    ] = False,
-    body: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Motion capture (HDF5 or BVH) to learn from virtual devices on; a share of the "
-            "recipe may name the file. Repeatable."
-        ),
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option(help="TOML or JSON file with recipe settings.")
-    ] = None,
-    epochs: Annotated[int | None, typer.Option(min=1, help="Epochs; overrides --config.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed; overrides --config.")] = None,
-    start_from: Annotated[
-        str | None,
-        typer.Option(
-            help="Weights to fine-tune: default, another name, or a safetensors file. Without "
-            "--config they are changed only a little."
-        ),
-    ] = None,
-    last_stage: Annotated[
-        str | None,
-        typer.Option(
-            help="Also train on the validation recordings; sigma takes the calibration of these "
-            "weights, which were trained without them.",
-        ),
-    ] = None,
-    cache: CacheOption = None,
-    jobs: Annotated[
-        int,
-        typer.Option(
-            min=1,
-            help="Processes that read recordings into the cache; to train in several, use "
-            "torchrun.",
-        ),
-    ] = 1,
+    reading: options.Reading,
+    paths: options.OptionalPaths = None,
+    model: str | None = typer.Option(
+        None, help="Network to train, from `stario check models`. Default: that of --start-from."
+    ),
+    out: Path | None = typer.Option(
+        None, help="Folder of the run, resumed if it holds a checkpoint. Default: runs/NETWORK."
+    ),
+    validation: list[Path] | None = typer.Option(
+        None, help="Recordings to select and calibrate on. Default: the last fifth of each."
+    ),
+    data: Path | None = typer.Option(
+        None,
+        help="Folder of the development recordings: train on all that the package lists except "
+        "the test recordings; select and calibrate on those of its list `holdout`.",
+    ),
+    learn_from: str = typer.Option(
+        "all",
+        help="With --data: all, open (those whose licence allows any use) or few (the eight "
+        "recordings of the paper's comparison).",
+    ),
+    leave_out: list[str] | None = typer.Option(
+        None,
+        help="With --data: neither learn from this set or group nor select on it: tyrex, or "
+        "'ridi dan'. Repeatable.",
+    ),
+    generated: int | None = typer.Option(
+        None, min=0, help=f"Simulated walks of 60 s. Default: {_GENERATED}."
+    ),
+    recorded_only: bool = options.flag(
+        False, "--recorded-only", help="Train without simulated walks."
+    ),
+    body: list[Path] | None = typer.Option(
+        None,
+        help="Motion capture (HDF5 or BVH) to learn from virtual devices on; a share of the "
+        "recipe may name the file. Repeatable.",
+    ),
+    config: Path | None = typer.Option(None, help="TOML or JSON file with recipe settings."),
+    epochs: int | None = typer.Option(None, min=1, help="Epochs; overrides --config."),
+    seed: int | None = typer.Option(None, min=0, help="Seed; overrides --config."),
+    start_from: str | None = typer.Option(
+        None,
+        help="Weights to fine-tune: default, another name, or a safetensors file. Without "
+        "--config they are changed only a little.",
+    ),
+    last_stage: str | None = typer.Option(
+        None,
+        help="Also train on the validation recordings; sigma takes the calibration of these "
+        "weights, which were trained without them.",
+    ),
+    cache: options.Cache = None,
+    jobs: int = typer.Option(
+        1,
+        min=1,
+        help="Processes that read recordings into the cache; to train in several, use torchrun.",
+    ),
 ) -> None:
     """Train a network on recordings with ground truth and on simulated walks; a rerun resumes.
 
@@ -136,12 +97,13 @@ def train(
     default weights on your own walks. All networks share one recipe. In several processes:
     torchrun --nproc-per-node 2 --no-python stario train ...
     """
-    from stario.fusion.evaluation.folders import make_folder
+    from stario.fusion.evaluation.results import make_folder
     from stario.network.model import load_model
-    from stario.network.training.data import seconds_of, virtual_recordings
+    from stario.network.training.data import recording_streams, seconds_of, virtual_recordings
     from stario.network.training.parallel import is_leader
     from stario.network.training.splits import warn_of_learned
     from stario.sequences.datasets.cache_files import cache_folder
+    from stario.sequences.datasets.stream_cache import recorded as recorded_streams
 
     if recorded_only and generated:
         raise InputError("--generated", "use with --recorded-only", "one of the two")
@@ -152,29 +114,34 @@ def train(
     recipe = _recipe(config, first, architecture=model, epochs=epochs, seed=seed)
     _check_sources(context, paths, validation, data, generated)
     folder = cache or cache_folder()
-    streams_of = partial(streams_of_files, reading, recipe.attitude, folder, jobs)
     lists = packaged_lists(data, leave_out or [], learn_from)
     if data is not None and (judged := last_stage or start_from):
         warn_of_learned([judged], lists[1], data)
-    recorded, held_out, skipped = recorded_streams(
+
+    def streams_of(files: list[Path]) -> Streams:
+        given = reading.read, reading.as_read(), folder, jobs, recipe.attitude
+        outcomes = zip(files, recorded_streams(files, *given), strict=True)
+        return recording_streams(common.with_bar("read", outcomes, len(files)))
+
+    recorded, held_out, skipped = _recorded(
         reading, paths or [], validation or [], lists, streams_of
     )
     out = out or Path("runs") / recipe.architecture
     make_folder(out)
     virtual = virtual_recordings(body or [], recipe.seed, folder)
     learned = recorded + virtual + (held_out if last_stage is not None else [])
-    held = validation_material(held_out, required=bool(recorded))
+    held = _validation(held_out, required=bool(recorded))
     if walks and is_leader():
         typer.echo(
             f"simulating {walks} walks of a minute, or reading them from the cache", err=True
         )
-    material = training_material(learned, walks, recipe, folder)
+    material = _material(learned, walks, recipe, folder)
     calibrated_by = last_stage or (
         start_from if seconds_of(held.streams) < _CALIBRATING_S else None
     )
     calibration = load_model(calibrated_by).card.calibration if calibrated_by else None
     if is_leader():
-        list_skipped(skipped)  # before hours of training
+        common.list_skipped(skipped)  # before hours of training
         for words in material.words:
             typer.echo(words, err=True)
     path = _trained(recipe, material, held, out, folder, first, calibration)
@@ -193,14 +160,108 @@ def _check_sources(
 ) -> None:
     """Refuse options that nothing uses, and a run without anything to learn from."""
     if data is not None:
-        refuse(context, "with --data", "use with PATH: name the archive", "where")
+        options.refuse(context, "with --data", "use with PATH: name the archive", "where")
         return
     needed = "use with the development recordings"
-    refuse(context, "without --data", needed, "leave_out", "learn_from")
+    options.refuse(context, "without --data", needed, "leave_out", "learn_from")
     if not paths and not validation:
-        refuse(context, "without recordings", "use with PATH", *READING)
+        options.refuse(context, "without recordings", "use with PATH", *options.READING)
     if not paths and generated is None:
         raise InputError("PATH", "none", "recordings, --data, or --generated for walks only")
+
+
+def packaged_lists(
+    data: Path | None, left_out: list[str], name: str
+) -> tuple[list[Path], list[Path]]:
+    """Return the training and held-out recordings from the lists in the package.
+
+    Without a folder there are none. Sets or groups are left out of both; the list is all, open or
+    few.
+
+    Raises:
+        InputError: a list or group does not exist.
+    """
+    from stario.network.training.splits import read_packaged_list, without_holdout
+    from stario.sequences.arrays import check_choice
+    from stario.sequences.datasets.splits import hold_out_group
+
+    if data is None:
+        return [], []
+    check_choice("--learn-from", name, ("all", "open", "few"))
+    everything = (
+        read_packaged_list("training", data) + read_packaged_list("validation", data)
+        if name == "few"
+        else read_packaged_list(name, data)
+    )
+    for group in left_out:
+        everything, _ = hold_out_group(everything, group)
+    outside, inside = without_holdout(everything, data)
+    return [entry.path for entry in outside], [entry.path for entry in inside]
+
+
+def _recorded(
+    reading: options.Reading,
+    paths: list[Path],
+    validation: list[Path],
+    lists: tuple[list[Path], list[Path]],
+    streams_of: Callable[[list[Path]], Streams],
+) -> tuple[list[RecordingStreams], list[RecordingStreams], list[Skipped]]:
+    """Return training, held-out and skipped recordings; exit at once if too few are usable.
+
+    Without any to hold out, the last fifth of each is; `lists` names further ones of both kinds.
+    """
+    from stario.network.training.data import split_off
+
+    files, missing = reading.recordings(paths)
+    held_files, held_missing = reading.recordings(validation)
+    files, held_files = files + lists[0], held_files + lists[1]
+    known = {path.resolve() for path in held_files}
+    if both := [path for path in files if path.resolve() in known]:  # would hide overfitting
+        raise InputError(
+            "--validation", f"{both[0]}, which is also trained on", "other recordings",
+            "remove it; without --validation the last fifth of each recording is held out",
+        )  # fmt: skip
+    recordings, failed = streams_of(files)
+    held_out, held_failed = streams_of(held_files)
+    skipped = missing + failed + held_missing + held_failed
+    if skipped and not (recordings and (held_out or not validation)):
+        common.exit_if_skipped(skipped)
+    if held_files or not files:
+        return recordings, held_out, skipped
+    return *split_off(recordings), skipped
+
+
+def _material(
+    recorded: list[RecordingStreams], walks: int, recipe: TrainingConfig, folder: Path
+) -> TrainingData:
+    """Return what is learned from, if anything has full ground truth."""
+    from stario.network.training.data import cached_walks, mix_sources
+
+    simulated = cached_walks(walks, recipe.seed, folder, recipe.attitude)
+    material = mix_sources(recorded, simulated, recipe.shares, recipe.reach)
+    if not walks and material.legs and not material.streams:
+        raise InputError(
+            "simulated walks",
+            "none, and only positions or waypoints to learn from",
+            "some recordings with poses",
+            "omit --recorded-only: the poses of simulated walks will do",
+        )
+    return material
+
+
+def _validation(recorded: list[RecordingStreams], required: bool) -> TrainingData:
+    """Return what is selected and calibrated on, if there is any or none is required."""
+    from stario.network.training.data import mix_sources
+
+    held = mix_sources(recorded, [])
+    if required and not (held.streams or held.legs):
+        raise InputError(
+            "recordings",
+            "none whose last fifth has 2 s of poses, or two legs between known positions",
+            "validation data to select and calibrate on",
+            "name recordings with --validation",
+        )
+    return held
 
 
 def _trained(
@@ -219,7 +280,7 @@ def _trained(
 
     # Sigma needs windows with full ground truth; if there are none, use simulated walks.
     windows = held.streams or cached_walks(10, recipe.seed + 1, folder, recipe.attitude)
-    with training_progress(recipe.steps, shown=is_leader()) as progress:
+    with common.training_progress(recipe.steps, shown=is_leader()) as progress:
         return train_network(
             recipe,
             material.streams,

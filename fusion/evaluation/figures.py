@@ -14,17 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from stario.fusion.evaluation.benchmark.groups import RATIOS, Benchmark, benchmark_dict
 from stario.fusion.evaluation.bootstrap import Interval
-from stario.fusion.evaluation.folders import Files, figure_files, write_results
-from stario.fusion.evaluation.networks import (
-    PROTOCOLS,
-    TRUE_ATTITUDE,
-    NetworkTable,
-    Sample,
-    entries,
-    table_dict,
-)
+from stario.fusion.evaluation.groups import RATIOS, Benchmark
+from stario.fusion.evaluation.networks import PROTOCOLS, TRUE_ATTITUDE, NetworkTable, Sample
+from stario.fusion.evaluation.results import Files, figure_files, write_results
 from stario.fusion.evaluation.scores import records, values
 from stario.sequences.drawing.figures import BLUE, INK, apply_style, new_figure, split_at_gaps
 from stario.sequences.files import json_text, write_json, write_rows
@@ -45,8 +38,8 @@ _BASELINE = "R-ResNet"
 def write_table(folder: Path, table: NetworkTable) -> None:
     """Write `networks.csv`, `networks.json` and the figures; raises what `write_results` does."""
     files: Files = {
-        "networks.csv": partial(write_rows, rows=entries(table)),
-        "networks.json": partial(write_json, obj=table_dict(table)),
+        "networks.csv": partial(write_rows, rows=table.entries),
+        "networks.json": partial(write_json, obj=table.as_dict()),
         **figure_files(figures(table)),
     }
     write_results(folder, files)
@@ -60,8 +53,7 @@ def figures(table: NetworkTable) -> dict[str, Figure]:
         "pde.png": _pde_boxes(table),
     }
     if table.samples:
-        colours = {name: _colour(k) for k, name in enumerate(table.parameters)}
-        drawn["trajectories.png"] = _trajectories(table.samples, colours)
+        drawn["trajectories.png"] = _trajectories(table)
     return drawn
 
 
@@ -128,8 +120,9 @@ def _pde_boxes(table: NetworkTable) -> Figure:
     return fig
 
 
-def _trajectories(samples: list[Sample], colours: dict[str, str]) -> Figure:
+def _trajectories(table: NetworkTable) -> Figure:
     """Draw tracks of StarIO networks and R-ResNet; without it, of the first four networks."""
+    samples = table.samples
     columns = min(2, len(samples))
     rows = math.ceil(len(samples) / columns)
     fig = new_figure(
@@ -137,13 +130,13 @@ def _trajectories(samples: list[Sample], colours: dict[str, str]) -> Figure:
     )
     panels = np.ravel(fig.subplots(rows, columns, squeeze=False))
     for axes, sample in zip(panels, samples, strict=False):
-        _draw_sample(axes, sample, colours)
+        _draw_sample(axes, sample, table)
     for axes in panels[len(samples) :]:
         axes.remove()
     return fig
 
 
-def _draw_sample(axes: Axes, sample: Sample, colours: dict[str, str]) -> None:
+def _draw_sample(axes: Axes, sample: Sample, table: NetworkTable) -> None:
     truth, length = sample.truth, sample.truth.path_length()
     _, path = split_at_gaps(truth.time, truth.position_W, truth.valid)
     axes.plot(path[:, 0], path[:, 1], color="black", lw=2.0, label=f"truth, {length:.0f} m")
@@ -153,10 +146,12 @@ def _draw_sample(axes: Axes, sample: Sample, colours: dict[str, str]) -> None:
     if _BASELINE in names:
         stario = [name for name in names if name.startswith("StarIO")]
         names = [_BASELINE, *(stario or [n for n in names if n != _BASELINE])]
+    scores = table.scores
+    shown = scores[(scores["recording"] == sample.recording) & (scores["track"] == TRUE_ATTITUDE)]
+    errors = shown.groupby(["network", "metric"])["value"].first()  # of the weights that are drawn
     for name in names[:4]:
-        track, colour = sample.tracks[name].position_W, colours[name]
-        ate, rte = sample.errors[name]
-        label = f"{name}: ATE {ate:.2f} m, RTE {rte:.2f} m"
+        track, colour = sample.tracks[name], _colour(list(table.parameters).index(name))
+        label = f"{name}: ATE {errors[name, 'ate_m']:.2f} m, RTE {errors[name, 'rte_m']:.2f} m"
         axes.plot(track[:, 0], track[:, 1], color=colour, lw=1.2, label=label)
         axes.plot(*track[-1, :2], "s", color=colour, ms=6, mec="white")
     axes.plot(*known[0, :2], "o", mfc="white", mec=INK, ms=8)
@@ -171,21 +166,19 @@ def _colour(index: int) -> str:
     return _COLOURS[index % len(_COLOURS)]
 
 
-def write_benchmark(
-    folder: Path, found: Benchmark, rows: pd.DataFrame, ours: str, theirs: str | None
-) -> None:
+def write_benchmark(folder: Path, found: Benchmark) -> None:
     """Write `groups.csv`, `recordings.csv`, `groups.json` and `groups.png` into a folder.
 
     Raises what `write_results` does.
     """
-    content = benchmark_dict(found, rows, ours, theirs)
+    content = found.as_dict()
     flat = json.loads(json_text(content["groups"]))  # ratios become tables, unknown values None
     groups = pd.json_normalize(flat, sep="_").drop(columns=[*RATIOS], errors="ignore")
     files: Files = {
         "groups.csv": partial(groups.to_csv, index=False),
         "recordings.csv": partial(write_rows, rows=records(found.scores)),
         "groups.json": partial(write_json, obj=content),
-        **figure_files({"groups.png": groups_figure(rows, ours, theirs)}),
+        **figure_files({"groups.png": groups_figure(found)}),
     }
     write_results(folder, files)
 
@@ -201,17 +194,16 @@ _PANELS = (
 )
 
 
-def groups_figure(rows: pd.DataFrame, ours: str, theirs: str | None) -> Figure:
+def groups_figure(found: Benchmark) -> Figure:
     """Draw a line for each group: medians of both weights, paired ratio with its interval."""
+    rows, theirs = found.rows, found.theirs
     shown = rows[rows["role"] == "ours"]
-    groups = rows[~rows["pooled"]]
+    groups = rows[~rows["pooled"]].set_index("weights")
     fig = new_figure(12.0 if theirs else 9.0, 1.8 + 0.55 * len(shown), "")
     panels = fig.subplots(1, 3 if theirs else 2, sharey=True)
     for axes, (title, keys) in zip(panels, _PANELS, strict=False):
-        known = groups.set_index("weights")[list(keys)].bfill(axis=1).iloc[:, 0]
-        _draw_medians(
-            axes, known[[ours]].to_list(), known[[theirs or ours]].to_list(), ours, theirs
-        )
+        known = groups[list(keys)].bfill(axis=1).iloc[:, 0]
+        _draw_medians(axes, known[[found.ours]], known[[theirs]] if theirs else None)
         axes.set_title(title, loc="left", fontsize=10)
     panels[0].set_xlim(left=0.0)
     panels[1].axvline(1.0, color=INK, lw=1.0)
@@ -227,17 +219,18 @@ def groups_figure(rows: pd.DataFrame, ours: str, theirs: str | None) -> Figure:
     return fig
 
 
-def _draw_medians(
-    axes: Axes, afters: list[float], befores: list[float], ours: str, theirs: str | None
-) -> None:
-    for k, (after, before) in enumerate(zip(afters, befores, strict=True)):
-        axes.plot([before, after], [k, k], color="#CCCCCC", lw=3.0, zorder=1)
-        if theirs:
-            label = f"before: {theirs}" if k == 0 else None
-            axes.plot(before, k, "o", color=_BEFORE, ms=8, label=label)
-        label = (f"after: {ours}" if theirs else ours) if k == 0 else None
-        axes.plot(after, k, "o", color=_AFTER, ms=8, label=label)
-        axes.annotate(f"{after:.2f}", (after, k), (0, 8), textcoords="offset points",
+def _draw_medians(axes: Axes, ours: pd.Series[float], theirs: pd.Series[float] | None) -> None:
+    """Draw the medians of each group, of weights by which the series are named."""
+    label = str(ours.index[0])
+    if theirs is not None:
+        for k, ends in enumerate(zip(theirs, ours, strict=True)):
+            axes.plot(ends, [k, k], color="#CCCCCC", lw=3.0, zorder=1)
+        axes.plot(theirs, range(len(theirs)), "o", color=_BEFORE, ms=8,
+                  label=f"before: {theirs.index[0]}")  # fmt: skip
+        label = f"after: {label}"
+    axes.plot(ours, range(len(ours)), "o", color=_AFTER, ms=8, label=label)
+    for k, value in enumerate(ours):
+        axes.annotate(f"{value:.2f}", (value, k), (0, 8), textcoords="offset points",
                       ha="center", fontsize=8, color=_AFTER)  # fmt: skip
     axes.margins(x=0.12)
     apply_style(axes)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position, known_truth
+from stario.fusion.evaluation.displacement_error import fit_yaw_and_position, known_truth, planar
 from stario.fusion.imu.direction import Complex
 from stario.fusion.state import Track
 from stario.sequences.accuracy.metrics import align, pose_errors
@@ -62,6 +62,21 @@ def true_path(sequence: ImuSequence) -> float:
     return float(np.linalg.norm(np.diff(known.position_W, axis=0), axis=1).sum())
 
 
+def length_ratio(track: Track, sequence: ImuSequence) -> float:
+    """Return a track's length per true length, by lines between known positions within it.
+
+    Those of true poses count once a second. NaN for fewer than `MIN_POSITIONS`. Unlike an error it
+    does not depend on how often the way returns.
+    """
+    known = _known(sequence)
+    fitted = None if known is None else placed(track, known)
+    if fitted is None or len(fitted) < MIN_POSITIONS:
+        return float("nan")
+    truth, told = fitted.position_W, _track_at(track, fitted.time)
+    told_m, true_m = (np.linalg.norm(np.diff(p, axis=0), axis=1).sum() for p in (told, truth))
+    return float(told_m / true_m)
+
+
 def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:
     """Return the horizontal error [m] at known positions after a fit of yaw and position.
 
@@ -86,9 +101,7 @@ def placed(track: Track, known: PositionTrack) -> PositionTrack | None:
     if not len(time):
         return None
     estimated = _track_at(track, time)
-    fitted = fit_yaw_and_position(
-        truth[:, 0] + 1j * truth[:, 1], estimated[:, 0] + 1j * estimated[:, 1]
-    )
+    fitted = fit_yaw_and_position(planar(truth), planar(estimated))
     return PositionTrack(time, np.column_stack([fitted.real, fitted.imag]), known.kind)
 
 
@@ -118,8 +131,7 @@ def georeference_of(latlon_deg: FloatArray, track: FloatArray) -> Georeference |
         The frame's place; None if the places or the track are too close together to tell it.
     """
     first = Georeference(*latlon_deg[0].tolist())
-    there = first.xy(latlon_deg)
-    w, z = there[:, 0] + 1j * there[:, 1], track[:, 0] + 1j * track[:, 1]
+    w, z = planar(first.xy(latlon_deg)), planar(track)
     turn = np.vdot(z - z.mean(), w - w.mean())
     if min(np.abs(w - w.mean()).max(), np.abs(z - z.mean()).max()) < _APART_M:
         return None
@@ -169,9 +181,7 @@ def position_findings(track: Track, sequence: ImuSequence) -> list[Finding]:
     fitted = placed(track, known)
     if fitted is None or len(fitted) < _MIN_CHORDS:
         return []
-    truth, estimate = (
-        xy[:, 0] + 1j * xy[:, 1] for xy in (fitted.position_W, _track_at(track, fitted.time))
-    )
+    truth, estimate = planar(fitted.position_W), planar(_track_at(track, fitted.time))
     error = float(np.sqrt(np.mean(np.abs(truth - estimate) ** 2)))
     return [
         *_mirror_image(known.kind, truth, estimate, error),

@@ -45,12 +45,7 @@ class MapTrack:
 
 
 def on_map(track: Track, georeference: Georeference) -> MapTrack:
-    """Place a track on the map.
-
-    Args:
-        track: the track; its positions are in the frame that lies at `georeference`.
-        georeference: where that frame lies on the earth.
-    """
+    """Place a track on the map, whose frame lies at `georeference`."""
     trajectory = track.trajectory
     latlon = georeference.latlon_deg(trajectory.position_W)
     sigma = np.zeros((len(trajectory), 2))
@@ -71,11 +66,6 @@ def write_geojson(path: Path, name: str, found: MapTrack) -> Path:
 
     The line's properties hold lists, one value per point: seconds of the recording's clock, height
     above the map's zero and standard deviations [m].
-
-    Args:
-        path: the file; its folder must exist.
-        name: name of the track.
-        found: the track.
     """
     parts = found.parts
     lines = [_coordinates(part, found.altitude_m) for part in parts]
@@ -114,11 +104,6 @@ def write_gpx(path: Path, name: str, found: MapTrack) -> Path:
 
     Points have times if the recording's clock counts seconds since 1970. Their elevation is above
     the map's zero if its altitude is unknown; standard deviations [m] are in `extensions`.
-
-    Args:
-        path: the file; its folder must exist.
-        name: name of the track.
-        found: the track.
     """
     from gpxpy.gpx import GPX, GPXTrack, GPXTrackSegment
 

@@ -7,22 +7,19 @@ weights of one network, for example from different training seeds, are averaged,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import product
 from pathlib import Path
 
 import pandas as pd
-from scipy.spatial.transform import Rotation
 
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import distinct_name
-from stario.fusion.evaluation.scores import Figures, Spread, joined, records, rows_of, scored
+from stario.fusion.evaluation.scores import Spread, joined, records, scored, table
 from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude, true_poses
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
-from stario.fusion.recording import Progress, silent
 from stario.network.model import DisplacementModel
 from stario.network.runtime.cost import table_cost
 from stario.sequences.accuracy.metrics import (
@@ -33,9 +30,7 @@ from stario.sequences.accuracy.metrics import (
     evaluate_track,
     pose_errors,
 )
-from stario.sequences.datasets.batch import Skipped, each
-from stario.sequences.drawing.text_table import aligned
-from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.truth.problems import warn_of_truth
 
 TRUE_ATTITUDE, OWN_ATTITUDE, FILTERED = "network_true_attitude", "network", "filtered"
@@ -60,14 +55,12 @@ class Sample:
     Attributes:
         recording: name of the recording.
         truth: true track.
-        tracks: tracks by network.
-        errors: ATE and RTE [m] of each track.
+        tracks: horizontal track (N, 2) [m] of each network.
     """
 
     recording: str
     truth: Trajectory
-    tracks: dict[str, Trajectory]
-    errors: dict[str, tuple[float, float]]
+    tracks: dict[str, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,114 +84,84 @@ class NetworkTable:
         where = {"network": network, "track": protocol}
         return Spread(network, metric, ".3f", where=where, by="weights")
 
+    @property
+    def entries(self) -> list[dict[str, object]]:
+        """Errors of every track as plain values."""
+        return records(self.scores.drop(columns="group").rename(columns={"track": "protocol"}))
+
+    @property
+    def words(self) -> dict[str, str]:
+        """Meaning of the table's words."""
+        keys = ("ate_m", "rte_m", "pde", "alignment", "convention")
+        return {
+            **{key: CONVENTIONS[key] for key in keys},
+            "here": f"horizontal errors, alignment first, convention {self.convention}",
+            "mean": "over recordings, equally weighted; +- deviation over weights of one network",
+        }
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the table as plain values."""
+        means: dict[str, dict[str, dict[str, object]]] = {}
+        for network, protocol, metric in product(self.parameters, PROTOCOLS, METRICS):
+            mean, spread = self.column(network, protocol, metric).mean_and_spread(self.scores)
+            metrics = means.setdefault(network, {}).setdefault(protocol, {})
+            metrics[metric] = {"mean": mean, "spread": spread}
+        return {
+            "networks": self.parameters,
+            "over_recordings": means,
+            "entries": self.entries,
+            "conventions": self.words,
+        }
+
+    def text(self) -> str:
+        """Return a block for each protocol and metric, recordings by networks."""
+        rows = [*self.scores.groupby("recording", sort=False), ("mean", self.scores)]
+        lines = []
+        for protocol, words in PROTOCOLS.items():
+            for metric, title in METRICS.items():
+                columns = [self.column(name, protocol, metric) for name in self.parameters]
+                lines += [f"{words}: {title}", table(rows, columns, ("",)), ""]
+        return "\n".join([*lines, *(f"{key}: {words}." for key, words in self.words.items())])
+
 
 Models = Sequence[tuple[str, DisplacementModel]]
 """Models, each with the name by which its weights were requested."""
 
 
-def compare_networks(
-    paths: Sequence[Path],
-    models: Models,
-    config: NavigatorConfig,
-    read: Callable[[Path], ImuSequence],
-    convention: Convention = "rms",
-    jobs: int | None = None,
-    progress: Progress = silent,
-) -> tuple[NetworkTable | None, list[Skipped]]:
-    """Compute the tracks of networks, given with distinct names, on recordings with true poses.
-
-    Recordings that cannot be used are returned, too; None if all of them are. `read` must be
-    picklable; `jobs` is as for `stario.sequences.datasets.batch.each`.
-    """
-    scores: list[pd.DataFrame] = []
-    samples: list[Sample] = []
-    skipped: list[Skipped] = []
-    names: set[str] = set()
-    work = partial(_tracks, models=models, config=config, read=read, convention=convention)
-    for done, outcome in enumerate(each(work, paths, jobs), 1):
-        if isinstance(outcome, Skipped):
-            skipped.append(outcome)
-        else:
-            found, sample = outcome
-            name = distinct_name(sample.recording, names)
-            scores.append(found.assign(recording=name))
-            if len(samples) < MAX_DRAWN:
-                samples.append(replace(sample, recording=name))
-        progress(done / len(paths))
-    if not scores:
-        return None, skipped
-    parameters = {model.name: table_cost(model.name).parameters for _, model in models}
-    return NetworkTable(convention, parameters, joined(scores), samples), skipped
-
-
-def table_dict(table: NetworkTable) -> dict[str, object]:
-    """Return the table as plain values."""
-    means: dict[str, dict[str, dict[str, object]]] = {}
-    for network, protocol, metric in product(table.parameters, PROTOCOLS, METRICS):
-        mean, spread = table.column(network, protocol, metric).mean_and_spread(table.scores)
-        metrics = means.setdefault(network, {}).setdefault(protocol, {})
-        metrics[metric] = {"mean": mean, "spread": spread}
-    return {
-        "networks": table.parameters,
-        "over_recordings": means,
-        "entries": entries(table),
-        "conventions": table_words(table),
-    }
-
-
-def networks_text(table: NetworkTable) -> str:
-    """Return a block for each protocol and metric, recordings by networks."""
-    rows = [*table.scores.groupby("recording", sort=False), ("mean", table.scores)]
-    lines = []
-    for protocol, words in PROTOCOLS.items():
-        for metric, title in METRICS.items():
-            columns = [table.column(name, protocol, metric) for name in table.parameters]
-            lines += [f"{words}: {title}", *aligned(rows_of(rows, columns, "")), ""]
-    return "\n".join([*lines, *(f"{key}: {words}." for key, words in table_words(table).items())])
-
-
-def entries(table: NetworkTable) -> list[dict[str, object]]:
-    """Return the errors of every track as plain values."""
-    return records(table.scores.drop(columns="group").rename(columns={"track": "protocol"}))
-
-
-def table_words(table: NetworkTable) -> dict[str, str]:
-    """Return the meaning of the table's words."""
-    keys = ("ate_m", "rte_m", "pde", "alignment", "convention")
-    return {
-        **{key: CONVENTIONS[key] for key in keys},
-        "here": f"horizontal errors, alignment first, convention {table.convention}",
-        "mean": "over recordings, equally weighted; +- deviation over weights of one network",
-    }
-
-
-def _tracks(
+def networks_on(
     path: Path,
     models: Models,
     config: NavigatorConfig,
     read: Callable[[Path], ImuSequence],
-    convention: Convention,
+    convention: Convention = "rms",
 ) -> tuple[pd.DataFrame, Sample]:
+    """Score networks, given with distinct names, on a recording with true poses.
+
+    Returns the rows of `NetworkTable.scores`, and the tracks.
+    """
     sequence = read(path)
-    true_poses(sequence)
-    warn_of_truth(sequence)
     scores: list[pd.DataFrame] = []
-    sample: Sample | None = None
+    tracks: dict[str, FloatArray] = {}
     for weights, model in models:
         figures, errors = protocol_figures(model, sequence, config, convention)
         scores.append(scored(sequence.name, figures, network=model.name, weights=weights))
-        sample = sample or Sample(sequence.name, errors.truth, {}, {})
-        add_track(sample, model.name, errors.estimate, figures[TRUE_ATTITUDE])
-    assert sample is not None  # there are models
-    return joined(scores), sample
+        tracks.setdefault(model.name, errors.estimate.position_W[:, :2])
+    warn_of_truth(sequence)
+    return joined(scores), Sample(sequence.name, errors.truth, tracks)
 
 
-def add_track(sample: Sample, network: str, track: Trajectory, figures: Figures) -> None:
-    """Add a network's track to a sample, unless one of its other weights has been added."""
-    if network not in sample.tracks:
-        level = track.position_W * [1.0, 1.0, 0.0]
-        sample.tracks[network] = Trajectory(track.time, level, Rotation.identity(len(track)))
-        sample.errors[network] = float(figures["ate_m"] or 0.0), float(figures["rte_m"] or 0.0)
+def network_table(
+    found: Iterable[tuple[pd.DataFrame, Sample]], models: Models, convention: Convention
+) -> NetworkTable:
+    """Return the table of the recordings that `networks_on` scored, under distinct names."""
+    names: set[str] = set()
+    scores, samples = [], []
+    for rows, sample in found:
+        name = distinct_name(sample.recording, names)
+        scores.append(rows.assign(recording=name))
+        samples.append(replace(sample, recording=name))
+    parameters = {model.name: table_cost(model.name).parameters for _, model in models}
+    return NetworkTable(convention, parameters, joined(scores), samples[:MAX_DRAWN])
 
 
 def protocol_figures(

@@ -20,7 +20,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, find_peaks, hilbert, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.benchmark.pieces import UPDATES, Piece, predicted
+from stario.fusion.evaluation.displacement_error import UPDATES, Piece, planar, predicted
 from stario.fusion.imu.direction import Complex
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.state import Track
@@ -88,7 +88,7 @@ def pedestrian_track(sequence: ImuSequence) -> Track:
         raise InputError(f"{sequence.name}: samples", "no unbroken stretch", "one of 2 s")
     paths, attitudes, end, facing = [], [], 0j, 0j
     for stream in streams:
-        faces = stream.facing_N[:, 0] + 1j * stream.facing_N[:, 1]
+        faces = planar(stream.facing_N)
         # Each has its own initial yaw. The rotation during a gap is unknown and taken as zero.
         turn = float(np.angle(facing * np.conj(faces[0])))
         path = end + np.exp(1j * turn) * pedestrian_path(stream)
@@ -118,8 +118,8 @@ def steps_of(stream: LevelledStream) -> tuple[Indices, Indices, Complex]:
     regular = np.diff(peaks) <= _MAX_STEP_SECONDS * WINDOW_RATE
     begin, end = peaks[:-1][regular], peaks[1:][regular]
     spread = np.array([np.ptp(vertical[a:b]) for a, b in zip(begin, end, strict=True)])
-    heading = _unit(stream.facing_N[:, 0] + 1j * stream.facing_N[:, 1])
-    forward_H = _forward(accel_N[:, 0] + 1j * accel_N[:, 1], vertical, heading)
+    heading = _unit(planar(stream.facing_N))
+    forward_H = _forward(planar(accel_N), vertical, heading)
     direction_N = (heading * forward_H)[(begin + end) // 2]
     return begin, end, WEINBERG_CONSTANT * spread**0.25 * direction_N
 

@@ -1,21 +1,30 @@
-"""What `run` and `compare` print about a recording's tracks."""
+"""What is printed of tracks: of one recording by `run` and `compare`, of many by `evaluate`."""
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from stario.fusion.evaluation.compare import (
     FULL_COVERAGE,
     METRIC_TITLES,
     METRIC_WORDS,
+    METRICS,
     TRACK_WORDS,
+    TRACKS,
     Comparison,
     Metrics,
 )
 from stario.fusion.evaluation.known_positions import position_error_words
+from stario.fusion.evaluation.results import metrics_dict
+from stario.fusion.evaluation.scores import Column, joined, rows_of, scored, values
+from stario.sequences.arrays import check_type
 from stario.sequences.drawing.figures import distance
 from stario.sequences.drawing.text_table import aligned, figure
 
@@ -52,17 +61,13 @@ def track_words(found: Comparison) -> str:
     if recorded - tracked >= _UNTRACKED:
         duration = f"{tracked:.1f} of {recorded:.1f} s tracked"
     ends = np.linalg.norm(np.diff(track.trajectory.position_W[[0, -1], :2], axis=0))
-    words = (
-        f"{track.trajectory.path_length():.1f} m in {duration}, ending {ends:.1f} m from its start"
-    )
-    sigma = {} if track.health is None else track.health.final_sigma
-    if sigma:
-        yaw = f"yaw {math.degrees(sigma['yaw_rad']):.1f} deg"
-        if sigma["yaw_rad"] > math.pi:
-            yaw = "yaw lost"
-        words += (
-            f" (sigma there {sigma['position_m']:.1f} m, height {sigma['height_m']:.1f} m, {yaw})"
-        )
+    length = track.trajectory.path_length()
+    words = f"{length:.1f} m in {duration}, ending {ends:.1f} m from its start"
+    if sigma := track.health and track.health.final_sigma:
+        lost = sigma["yaw_rad"] > math.pi
+        yaw = "yaw lost" if lost else f"yaw {math.degrees(sigma['yaw_rad']):.1f} deg"
+        there = f"sigma there {sigma['position_m']:.1f} m, height {sigma['height_m']:.1f} m"
+        words += f" ({there}, {yaw})"
     return words
 
 
@@ -127,3 +132,119 @@ EXPLANATION = "\n".join(
     ]
 )
 """Definitions of all that `run` and `compare` print."""
+
+
+@dataclass(frozen=True)
+class _WithFit(Column):
+    """A column of ATEs, with those after a yaw fit in parentheses."""
+
+    def text(self, scores: pd.DataFrame) -> str:
+        fitted = replace(self, metric="ate_fit_m").value(scores)
+        return f"{super().text(scores)} ({figure(fitted, self.form)})"
+
+
+def _columns(over: Callable[..., Any]) -> list[Column]:
+    errors = {
+        "pdr": "steps (PDR)",
+        "network_true_attitude": "network, true attitude",
+        "network": "network, own attitude",
+        "filtered": "filtered",
+        "track": "track",
+    }
+    others = {
+        "NIS": ("filtered", "nis_mean"),
+        "filtered NEES": ("filtered", "nees_median"),
+        "track NEES": ("track", "nees_median"),
+    }
+    return [
+        *(_WithFit(title, "ate_m", over=over, where={"track": t}) for t, title in errors.items()),
+        *(Column(title, m, over=over, where={"track": t}) for title, (t, m) in others.items()),
+    ]
+
+
+_MIN_COVERAGE = 0.5
+"""Share of a track at which the truth is known below which a recording does not count in medians
+and means."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Figures of one recording, kept after a comparison's arrays are released.
+
+    Attributes:
+        name: name of the recording.
+        record: its entry in `metrics.json`.
+    """
+
+    name: str
+    record: dict[str, Any]
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """The figures as rows of recording, group, track, metric and value."""
+        return scored(self.name, self.record["tracks"])
+
+    @property
+    def coverage(self) -> float:
+        """Smallest share of a track at which the truth is known; 1 without truth."""
+        return float(min(values(self.table, "coverage"), default=1.0))
+
+
+def scores_of(comparison: Comparison) -> Scores:
+    """Return the figures of a comparison."""
+    return Scores(comparison.sequence.name, comparison.as_dict())
+
+
+def summary(recordings: Sequence[Scores]) -> dict[str, object]:
+    """Return figures of every recording, with medians and means over them, as plain values.
+
+    Medians and means leave out recordings whose truth is known for less than half of the track.
+    """
+    counted = _counted(recordings)
+    over = {
+        track: {
+            metric: {"median": float(np.median(known)), "mean": float(np.mean(known))}
+            for metric in METRICS
+            if not metric.startswith("seconds_")
+            and len(known := values(counted, metric, track=track))
+        }
+        for track in TRACKS
+    }
+    return metrics_dict({r.name: r.record for r in recordings}) | {"over_recordings": over}
+
+
+def summary_table(recordings: Sequence[Scores]) -> str:
+    """Return the summary as text: horizontal ATE of each track, consistency of the back ends.
+
+    Raises:
+        InputError: a recording's figures are of another type.
+    """
+    parts = []
+    for one in recordings:
+        check_type("recordings", one, Scores, "scores_of(comparison) returns one")
+        known = f" (truth of {one.coverage:.0%})" if one.coverage < FULL_COVERAGE else ""
+        parts.append((one.name + known, one.table))
+    rows, counted = rows_of(parts, _columns(np.mean), ""), _counted(recordings)
+    for name, over in (("median", np.median), ("mean", np.mean)):
+        rows += rows_of([(name, counted)], _columns(over), "")[1:]
+    lines = aligned(rows)
+    if any(one.coverage < _MIN_COVERAGE for one in recordings):
+        least = f"{_MIN_COVERAGE:.0%}"
+        lines.append(f"median and mean without recordings whose truth covers less than {least};")
+    words = METRIC_WORDS
+    return "\n".join(
+        [
+            *lines,
+            f"ATE in m: {words['ate_m']};",
+            f"in parentheses {words['ate_fit_m']};",
+            f"horizontal: {words['horizontal']};",
+            f"NIS: {words['nis_mean']};",
+            f"NEES: {words['nees_median']}; alignment: {words['alignment']}.",
+        ]
+    )
+
+
+def _counted(recordings: Sequence[Scores]) -> pd.DataFrame:
+    """Return the figures of the recordings that count in medians and means."""
+    counted = [one.table for one in recordings if one.coverage >= _MIN_COVERAGE]
+    return joined([scored("", {}), *counted])

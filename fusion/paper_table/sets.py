@@ -68,11 +68,8 @@ def development_sets(
 ) -> list[DataSet]:
     """Return the sets among the development recordings, the most important first.
 
-    Args:
-        data: folder of the development recordings.
-        seed: seed of the splits.
-        per_group: maximum number of test recordings per group of `ALL`.
-        chosen: names of the sets; None for all.
+    All of them, or those `chosen` by name, split with a seed; `ALL` has at most `per_group` test
+    recordings of a group.
 
     Raises:
         InputError: a name is unknown, or a recording of the packaged lists is missing.

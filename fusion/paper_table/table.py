@@ -1,10 +1,10 @@
-"""The table's files: Markdown, JSON, CSV and figures, all from the scores of completed runs."""
+"""The table: scores of completed runs, means over seeds, ranks; Markdown, JSON, CSV, figures."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,24 +12,189 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
+from stario.fusion.evaluation.bootstrap import Interval, block_rows, ranks
 from stario.fusion.evaluation.figures import write_table
 from stario.fusion.evaluation.networks import (
+    FILTERED,
     METRICS,
+    OWN_ATTITUDE,
     PROTOCOLS,
     TRUE_ATTITUDE,
     NetworkTable,
     Sample,
-    add_track,
 )
-from stario.fusion.paper_table.errors import CONVENTION
-from stario.fusion.paper_table.runs import Run
-from stario.fusion.paper_table.scores import COLUMNS, Completed, SetTable, completed_runs, set_table
-from stario.fusion.paper_table.text import WORDS, table_text
+from stario.fusion.evaluation.pedestrian import NAME as PDR
+from stario.fusion.evaluation.scores import Spread, joined, scored
+from stario.fusion.paper_table.runs import CONVENTION, Run, read_run
+from stario.fusion.paper_table.sets import DataSet, published, set_of
 from stario.network.architectures import ARCHITECTURES
 from stario.network.runtime.cost import table_cost
-from stario.network.runtime.survey import ModelRow, survey
+from stario.network.runtime.survey import BATCHES, ModelRow, survey
+from stario.network.training.config import TrainingConfig
+from stario.sequences.accuracy.metrics import CONVENTIONS
 from stario.sequences.files import atomic_write, write_json, write_rows
 from stario.sequences.sequence import Trajectory
+
+REFERENCE_NETWORK = "StarIO"
+"""Reference network that the others' errors are compared with."""
+
+Completed = Sequence[Mapping[str, Any]]
+"""Results (`read_run`) of a set's runs."""
+
+
+def _column(title: str, track: str, name: str, scale: float = 1.0) -> Spread:
+    where = {"track": track}
+    return Spread(title, name, ".3f", where=where, standard_error=True, scale=scale)
+
+
+COLUMNS = {
+    "ate": _column("ATE [m]", TRUE_ATTITUDE, "ate_m"),
+    "rte": _column("RTE [m]", TRUE_ATTITUDE, "rte_m"),
+    "pde": _column("PDE [%]", TRUE_ATTITUDE, "pde", 100.0),
+    "own_ate": _column("own attitude: ATE [m]", OWN_ATTITUDE, "ate_m"),
+    "own_rte": _column("own attitude: RTE [m]", OWN_ATTITUDE, "rte_m"),
+    "filtered_ate": _column("filtered: ATE [m]", FILTERED, "ate_m"),
+    "filtered_rte": _column("filtered: RTE [m]", FILTERED, "rte_m"),
+    "waypoints_m": _column("waypoints [m]", "waypoints", "ate_fit_m"),
+    "waypoints_percent": _column("waypoints [%]", "waypoints", "ate_fit_percent"),
+    "waypoints_length": _column("length ratio", "waypoints", "length_ratio"),
+    "positions_percent": _column("positions, 20 s [%]", "positions", "stretch_percent"),
+    "training_error": _column("training error", "trained", "training_error_m2"),
+    "validation_error": _column("validation error", "trained", "validation_error_m2"),
+}
+"""Columns of the table, in order; a column without any value on a set is omitted there."""
+
+_MEASURES = {
+    "ate": "position error under the paper's protocol",
+    "10": "displacement error over 10 s along the own attitude (waypoint residuals where there are "
+    "waypoints)",
+}
+"""Errors that networks may be ranked by, in words."""
+
+
+@dataclass(frozen=True, eq=False)
+class SetTable:
+    """A data set's part of the table.
+
+    Attributes:
+        dataset: name, recordings and split.
+        scores: errors of every run, with labels `path`, `network` and `seed`; figures of the
+            network alone are those of a track that is called by the kind of truth, errors of the
+            training those of a track "trained".
+        rows: networks, in order, with their `seeds`, the number of test recordings that given
+            weights were trained on (`learned`), mean and standard error over seeds of each of
+            `COLUMNS` ("ate", "ate_sem"; NaN if unknown), and the columns of `bootstrap.ranks`.
+        tested: number of tested recordings.
+        path_m: total length of their true paths [m].
+        measure: the error that networks are ranked by, in words.
+        skipped: reasons why recordings were skipped, each once.
+    """
+
+    dataset: DataSet
+    scores: pd.DataFrame
+    rows: pd.DataFrame
+    tested: int
+    path_m: float
+    measure: str
+    skipped: list[str]
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the set's part of `table.json`."""
+        return {
+            "split": self.dataset.words,
+            "training": len(self.dataset.training),
+            "validation": len(self.dataset.validation),
+            "tested": self.tested,
+            "path_m": self.path_m,
+            "ranks_by": self.measure,
+            "rows": self.rows.to_dict("records"),
+            "skipped": self.skipped,
+        }
+
+
+def completed_runs(runs: Iterable[Run], out: Path) -> dict[str, list[Mapping[str, Any]]]:
+    """Return the results of the completed runs, by set.
+
+    Raises:
+        ConfigError: a run was completed with another recipe, other weights or other recordings.
+    """
+    found: dict[str, list[Mapping[str, Any]]] = {}
+    for run in runs:
+        if (content := read_run(run, out)) is not None:
+            found.setdefault(run.dataset.name, []).append(content)
+    return found
+
+
+def set_table(
+    dataset: DataSet, completed: Completed, learned: Mapping[str, frozenset[Path]]
+) -> SetTable:
+    """Return a set's table, given the recordings that packaged weights have `learned`, by name."""
+    recordings = [one for content in completed for one in content["recordings"]]
+    measure = "ate" if all(one["kind"] == "poses" for one in recordings) else "10"
+    tested = completed[0]["recordings"]
+    names = [content["network"] for content in completed]
+    test = {entry.path for entry in dataset.test}
+    scores = _scores(completed)
+    rows = pd.DataFrame(
+        {"network": name, "seeds": sorted(c["seed"] for c in completed if c["network"] == name)}
+        | {"learned": len(test & learned.get(name, set()))}
+        | _means(scores[scores["network"] == name])
+        for name in sorted(set(names), key=[PDR, *ARCHITECTURES, *names].index)
+    )
+    failures = [
+        failure
+        for content in completed
+        for failure in [*content["skipped"], *content.get("trained", {}).get("skipped", [])]
+    ]
+    return SetTable(
+        dataset,
+        scores,
+        rows.merge(ranks(_blocks(completed, measure, dataset), REFERENCE_NETWORK), "left"),
+        len(tested),
+        float(sum(one["path_m"] for one in tested)),
+        _MEASURES[measure],
+        list(dict.fromkeys(f"{failure['item']}: {failure['reason']}" for failure in failures)),
+    )
+
+
+def _means(scores: pd.DataFrame) -> dict[str, float | None]:
+    found: dict[str, float | None] = {}
+    for key, column in COLUMNS.items():
+        found[key], found[f"{key}_sem"] = column.mean_and_spread(scores)
+    return found
+
+
+def _scores(completed: Completed) -> pd.DataFrame:
+    found = [scored("", {}, path="", network="", seed=0)]
+    names = [content["network"] for content in completed]
+    for content in sorted(completed, key=lambda content: names.index(content["network"])):
+        labels: dict[str, Any] = {key: content[key] for key in ("network", "seed")}
+        for one in content["recordings"]:
+            figures = {**one["tracks"], one["kind"]: one["figures"]}
+            labels["path"] = one["path"]
+            found.append(scored(one["recording"], figures, one["group"], **labels))
+        if trained := content.get("trained"):
+            errors = {key: trained[key] for key in ("training_error_m2", "validation_error_m2")}
+            found.append(scored("", {"trained": errors}, **labels | {"path": ""}))
+    return joined(found)
+
+
+def _blocks(completed: Completed, measure: str, dataset: DataSet) -> pd.DataFrame:
+    """Return the blocks of squared errors of networks that have some with every seed."""
+    units = {str(e.path): {"set": set_of(e), "group": e.group} for e in dataset.test}
+    found, without = [block_rows([], set="", group="", recording="", network="", seed=0)], set()
+    for content in completed:
+        run = {key: content[key] for key in ("network", "seed")}
+        known = {
+            one["path"]: one["blocks"][measure]
+            for one in content["recordings"]
+            if one["blocks"].get(measure)
+        }
+        if not known:
+            without.add(content["network"])
+        found += [block_rows(b, **units[path], recording=path, **run) for path, b in known.items()]
+    table = joined(found)
+    return table[~table["network"].isin(without)]
 
 
 def work_of(tables: Iterable[Completed]) -> pd.DataFrame:
@@ -39,14 +204,14 @@ def work_of(tables: Iterable[Completed]) -> pd.DataFrame:
     """
     rows = [
         {
-            "network": network,
-            "training_s": content.get("trained", {}).get("seconds", 0.0),
+            "network": content["network"],
+            "training_s": trained.get("seconds", 0.0),
             "evaluation_s": content["seconds"],
-            "windows_per_s": content.get("trained", {}).get("windows_per_s"),
+            "windows_per_s": trained.get("windows_per_s"),
         }
         for completed in tables
-        for network, seeds in completed.items()
-        for content in seeds.values()
+        for content in completed
+        for trained in [content.get("trained", {})]
     ]
     over = {"training_s": "sum", "evaluation_s": "sum", "windows_per_s": "mean"}
     return pd.DataFrame(rows, columns=["network", *over]).groupby("network").agg(over)
@@ -55,12 +220,9 @@ def work_of(tables: Iterable[Completed]) -> pd.DataFrame:
 def known_costs(names: Sequence[str], out: Path) -> list[ModelRow]:
     """Return parameters, FLOPs, memory and time, measured once per folder and network."""
     path = out / "costs.json"
-    measured = {}
-    if path.exists():
-        rows = [ModelRow(**row) for row in json.loads(path.read_text(encoding="utf-8"))]
-        measured = {row.name: row for row in rows}
-    missing = [name for name in names if name not in measured]
-    if missing:
+    rows = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
+    measured = {row["name"]: ModelRow(**row) for row in rows}
+    if missing := [name for name in names if name not in measured]:
         measured |= {row.name: row for row in survey(missing)}
         write_json(path, list(measured.values()))
     return [measured[name] for name in names]
@@ -100,8 +262,7 @@ def write_results(
     ]
     write_rows(out / "table.csv", means)
     for name, table in tables.items() if drawn else ():
-        found = _for_figures(table, completed[name])
-        if found is not None:
+        if (found := _for_figures(table, completed[name])) is not None:
             write_table(out / name / "figures", found)
     return text
 
@@ -109,32 +270,130 @@ def write_results(
 def _for_figures(table: SetTable, completed: Completed) -> NetworkTable | None:
     """Return the networks' errors on recordings with poses, for the figures; None without any."""
     scores = table.scores
-    parameters = {
-        name: table_cost(name).parameters for name in table.rows["network"] if name in ARCHITECTURES
-    }
+    names = [name for name in table.rows["network"] if name in ARCHITECTURES]
+    parameters = {name: table_cost(name).parameters for name in names}
     chosen = scores["network"].isin(parameters) & scores["track"].isin(PROTOCOLS)
     chosen &= scores["metric"].isin(METRICS)
     if not chosen.any():
         return None
     found = scores[chosen].rename(columns={"seed": "weights"})
     found["weights"] = "seed " + found["weights"].astype(str)
-    firsts = {network: completed[network].get(0, {}) for network in parameters}
-    return NetworkTable(CONVENTION, parameters, found, _samples(firsts))
-
-
-def _samples(firsts: Mapping[str, Mapping[str, Any]]) -> list[Sample]:
-    """Return tracks of some recordings, by the first seed of each network."""
     samples: dict[str, Sample] = {}
-    for network, content in firsts.items():
-        for one in content.get("recordings", ()):
-            name, drawn = one["recording"], one.get("drawn")
-            if drawn:
-                truth, track = (_level(drawn["time"], drawn[key]) for key in ("truth", "track"))
-                sample = samples.setdefault(name, Sample(name, truth, {}, {}))
-                add_track(sample, network, track, one["tracks"][TRUE_ATTITUDE])
-    return list(samples.values())
+    firsts = {c["network"]: c["recordings"] for c in completed if c["seed"] == 0}
+    for network, one in ((name, one) for name in names for one in firsts.get(name, ())):
+        if drawn := one.get("drawn"):
+            truth = np.pad(np.array(drawn["truth"]), ((0, 0), (0, 1)))
+            path = Trajectory(np.array(drawn["time"]), truth, Rotation.identity(len(truth)))
+            sample = samples.setdefault(one["recording"], Sample(one["recording"], path, {}))
+            sample.tracks[network] = np.array(drawn["track"])
+    return NetworkTable(CONVENTION, parameters, found, list(samples.values()))
 
 
-def _level(time: Sequence[float], xy: Sequence[Sequence[float]]) -> Trajectory:
-    flat = np.column_stack([xy, np.zeros(len(xy))])
-    return Trajectory(np.array(time), flat, Rotation.identity(len(xy)))
+def table_text(
+    tables: Sequence[SetTable],
+    costs: Sequence[ModelRow],
+    work: pd.DataFrame,
+    recipe: TrainingConfig,
+) -> str:
+    """Return the tables of all sets, the costs and the conventions as Markdown.
+
+    The recipe is common to all networks except for its network and seed.
+    """
+    words = (
+        f"All networks: {recipe.steps} training steps of {recipe.batch} windows, peak learning "
+        f"rate {recipe.rate:g}, {recipe.precision}, {recipe.attitude} attitude. On sets with weak "
+        f"truth, each step also learns from stretches of {recipe.waypoint_seconds} s between "
+        f"waypoints ({recipe.waypoint_stretches} per step) and of {recipe.track_seconds} s along "
+        f"positions ({recipe.track_stretches} per step)."
+    )
+    sets = [_set_text(table) for table in tables]
+    return "\n\n".join([words, *sets, _cost_text(costs, work), WORDS]) + "\n"
+
+
+def _set_text(table: SetTable) -> str:
+    dataset, known = table.dataset, table.rows[[*COLUMNS]].notna().any()
+    columns = [column for key, column in COLUMNS.items() if known[key]]
+    titles = ["network", *(column.title for column in columns), "seeds", "rank"]
+    lines = [[*titles, f"error / {REFERENCE_NETWORK}'s", "paper: ATE, RTE [m]"]]
+    for row in table.rows.to_dict("records"):
+        part = table.scores[table.scores["network"] == row["network"]]
+        rank, ratio, errors = "-", "-", "-"
+        if not np.isnan(row["rank"]):
+            rank = "{rank:.0f} [{rank_low:.0f}, {rank_high:.0f}]".format(**row)
+        if isinstance(row["ratio"], Interval):
+            ratio = f"{row['ratio']:.2f}"
+        if paper := published(dataset.name, row["network"]):
+            errors = "{:.3f}, {:.3f}".format(*paper)
+        cells = [column.text(part) for column in columns]
+        title = _title(row, table.tested)
+        lines.append([title, *cells, str(len(row["seeds"])), rank, ratio, errors])
+    return "\n".join(
+        [
+            f"### {dataset.title}",
+            "",
+            f"{len(dataset.training)} recordings for training, {len(dataset.validation)} for "
+            f"validation, {table.tested} for testing ({table.path_m:.0f} m); {dataset.words}. "
+            "Ranks and ratios are based on the geometric mean over recordings of the "
+            f"{table.measure}.",
+            "",
+            *_markdown(lines),
+            *(["", f"Skipped: {len(table.skipped)} recordings, listed in `table.json`."]
+              if table.skipped else []),
+        ]
+    )  # fmt: skip
+
+
+def _title(row: Mapping[str, Any], tested: int) -> str:
+    if row["network"] == PDR:
+        return "pedestrian dead reckoning (`pdr`)"
+    if row["network"] in ARCHITECTURES:
+        return str(row["network"])
+    note = f", trained on {row['learned']} of these {tested}" if row["learned"] else ""
+    return f"weights `{row['network']}`{note}"
+
+
+def _cost_text(costs: Sequence[ModelRow], work: pd.DataFrame) -> str:
+    times = [f"ms per window, batch {batch}" for batch in BATCHES]
+    titles = ["network", "parameters [10^6] (paper)", "FLOPs [10^6] (paper)", "memory [MB]", *times]
+    rows = [[*titles, "core hours", "training windows / s"]]
+    done = work.reindex([row.name for row in costs])
+    for row, (_, spent) in zip(costs, done.iterrows(), strict=True):
+        milliseconds = row.milliseconds["torch"] or {}
+        hours = spent[["training_s", "evaluation_s"]].sum() / 3600.0
+        speed = spent["windows_per_s"]
+        cells = [f"{milliseconds[str(batch)]:.2f}" for batch in BATCHES]
+        cells = [f"{row.peak_memory_mb:.1f}", *cells, f"{hours:.2f}"]
+        rows.append([row.name, *row.counts(), *cells, "-" if np.isnan(speed) else f"{speed:.0f}"])
+    training, testing = work[["training_s", "evaluation_s"]].sum() / 3600.0
+    return "\n".join(
+        [
+            *("### Costs", "", *_markdown(rows), ""),
+            f"Total: {training + testing:.2f} core hours, {training:.2f} for training and "
+            f"{testing:.2f} for evaluation. Time per window: on this machine, one thread per core "
+            "that PyTorch uses; memory: weights and results of one inference "
+            "(`stario check models`).",
+        ]
+    )
+
+
+def _markdown(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return a table's lines without columns that have no value; the first row holds the titles."""
+    columns = [c for c in zip(*rows, strict=True) if any(cell != "-" for cell in c[1:])]
+    head, *body = (f"| {' | '.join(cells)} |" for cells in zip(*columns, strict=True))
+    return [head, f"|{'---|' * len(columns)}", *body]
+
+
+WORDS = (
+    "ATE, RTE and PDE: horizontal, means over recordings, first poses aligned in yaw and position; "
+    f"{CONVENTIONS['ate_m']}; {CONVENTIONS['rte_m']}; {CONVENTIONS['pde']}. "
+    "Squares are also averaged over coordinates, as in RoNIN's code and the paper: multiply by "
+    "sqrt(2) for the norm. The first three columns follow the paper's protocol: windows turned "
+    "by the true attitude. Waypoints: residual after a fit in yaw and position, in m and in % "
+    "of the path, and the length of the track over that of the truth. Positions: error within "
+    "stretches of 20 s, each fitted, in % of the path. Training and validation error: mean "
+    "squared displacement error of windows [m^2] in the last epoch and in the best one, whose "
+    "weights are kept (in validation, legs count in m^2/s). +-: standard error over training "
+    "seeds, for one split. Ranks and ratios: equal weights of sets and of the groups (people, "
+    "places) in a set. Intervals (95 %): bootstrap over groups, recordings and blocks of 30 s, "
+    "with the same draws for all networks; seeds are averaged."
+)

@@ -63,13 +63,9 @@ class ReaderConfig:
 def run_recipe(
     values: dict[str, object], network: str, seed: int, steps: int | None
 ) -> TrainingConfig:
-    """Return the recipe of a run: the common one with a network, a seed and a number of steps.
+    """Return the recipe of a run: the common values with a network, a seed and a number of steps.
 
-    Args:
-        values: common settings, such as from a parsed JSON file.
-        network: name of the architecture.
-        seed: seed of initial weights and draws.
-        steps: approximate number, in epochs of equal length; None for the common recipe's.
+    It is approximate, since epochs have equal lengths; None for the common recipe's.
 
     Raises:
         ConfigError: a setting is unknown or out of range.

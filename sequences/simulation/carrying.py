@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.sequence import FloatArray
 from stario.sequences.simulation.gait import (
     HELD_SURGE,
+    SWAY,
     TRUNK_BOUNCE,
     TRUNK_SURGE,
     CarryMotion,
@@ -33,62 +34,76 @@ _ARM = (5.5, 0.3)
 """Resonance [Hz] and damping ratio of a device at the end of an arm."""
 
 
-def _held(gait: Gait, bounce: float, strike: Strike, tremor: float, wobble: float) -> CarryMotion:
+def _held(
+    gait: Gait,
+    bounce: float,
+    strike: Strike,
+    tremor: float,
+    wobble: float,
+    pitch: float,
+    surge: float = HELD_SURGE,
+) -> CarryMotion:
     """Return the motion of a device held steady: trunk, heel strikes, gait wobble, hand tremor.
 
     `tremor` [rad/s] is the angular rate of the tremor, `wobble` [rad] the rotation with the gait.
     """
     rng, n = gait.rng, len(gait)
     ring = heel_strikes(gait, strike)
-    offset = trunk(gait, bounce, HELD_SURGE) + ring.offset_H
+    offset = trunk(gait, bounce, surge) + ring.offset_H
     offset += 0.012 * drift(rng, n, gait.rate, 0.6, 3)
     turn = ring.turn_H + 0.08 * drift(rng, n, gait.rate, 0.7, 3)
     turn += 0.8 * tremor / (2.0 * np.pi * 3.0) * band_noise(rng, n, gait.rate, 1.5, 5.0, 3)
     turn += tremor / (2.0 * np.pi * 8.0) * band_noise(rng, n, gait.rate, 5.0, 11.0, 3)
-    turn += _wobble(gait, wobble)
+    turn += _wobble(gait, wobble, pitch * bounce)
     # The tremor about the wrist also displaces the device: about 0.1 m/s^2.
     offset += 0.12 / (2.0 * np.pi * 8.0) ** 2 * band_noise(rng, n, gait.rate, 5.0, 11.0, 3)
     return CarryMotion(offset, turn)
 
 
-def _wobble(gait: Gait, wobble: float) -> FloatArray:
-    """Return the turning (N, 3) [rad] of a held device with the gait, of a size [rad].
+def _wobble(gait: Gait, wobble: float, pitch: float) -> FloatArray:
+    """Return the turning (N, 3) [rad] of a held device with the gait.
 
-    With the stride, roll and yaw follow the sway from side to side; with the step, pitch does the
-    bounce (KIPD, rfbr, RIDI and tyrex by their true attitudes).
+    With the stride, roll and yaw follow the sway from side to side, by `wobble` [rad]. With the
+    step, the rate of pitch, of size `pitch` [rad/s], leads the acceleration up by a quarter, as a
+    forearm does that turns about the elbow; negative, it lags behind (by the true attitudes of
+    KIPD, rfbr, RIDI and tyrex).
     """
     rng, phi = gait.rng, gait.phase[:, None]
-    shift, size = rng.uniform(-0.7, 0.7, (2, 3)), rng.uniform(0.3, 1.0, (2, 3))
-    size *= [[0.8, 0.3, -1.6], [0.3, 1.0, 0.3]]
-    size[1, ::2] *= rng.choice([-1.0, 1.0], 2)  # to the left as often as to the right
-    stride = np.sin(phi / 2.0 + shift[0] + [0.0, 0.0, 0.6]) * size[0]
-    step = np.cos(phi + shift[1]) * size[1]
-    effort = gait.effort[:, None]
-    return np.asarray(wobble * (hardly_growing(effort) * stride + effort * step))
+    shift, size = rng.uniform(-0.7, 0.7, 4), rng.uniform(0.7, 1.3, 4)
+    stride = np.sin(phi / 2.0 + shift[:3] + [0.0, 0.0, 0.6]) * size[:3] * [0.5, 0.2, -1.0]
+    turn = wobble * hardly_growing(gait.effort)[:, None] * stride
+    nod = size[3] * pitch * gait.effort * np.cos(gait.phase + shift[3])
+    turn[:, 1] -= nod / (np.sqrt(2.0) * np.pi * gait.step_rate)
+    return np.asarray(turn)
 
 
 def _handheld(gait: Gait) -> CarryMotion:
     """Return the motion of a device held in front, not quite as lively as the trunk."""
     rng = gait.rng
-    strike, wobble = Strike(rng.uniform(0.3, 0.6), *_ARM, 1.5, 0.6), rng.uniform(0.02, 0.04)
-    motion = _held(gait, rng.uniform(1.3, 1.8), strike, rng.uniform(0.05, 0.15), wobble)
+    strike, wobble = (
+        Strike(0.5, *_ARM, (1.8, 132.0), 0.87, (0.25, 82.0), (0.41, 24.0), (0.37, 61.0), 0.4),
+        0.03,
+    )
+    motion = _held(gait, 1.5, strike, 0.1, wobble, -0.08)
     return _displaced(motion, rng.uniform(0.2, 0.45), rng.uniform(-0.2, 0.2), 0.7 * gait.height)
 
 
 def _in_front(gait: Gait) -> CarryMotion:
     """Return the motion of a device laid flat on a hand, which bounces more than the trunk."""
     rng = gait.rng
-    strike, wobble = Strike(rng.uniform(1.1, 2.1), *_ARM, 0.8, 0.6), rng.uniform(0.03, 0.07)
-    motion = _held(gait, rng.uniform(2.9, 4.3), strike, rng.uniform(0.05, 0.15), wobble)
+    strike, wobble = (
+        Strike(1.85, *_ARM, (0.34, -77.0), 0.25, (0.36, 24.0), (0.17, 59.0), (0.22, -99.0), 0.4),
+        0.05,
+    )
+    motion = _held(gait, 3.3, strike, 0.1, wobble, 0.15)
     return _displaced(motion, rng.uniform(0.2, 0.45), rng.uniform(-0.2, 0.2), 0.7 * gait.height)
 
 
 def _texting(gait: Gait) -> CarryMotion:
     """Return the motion of a device that is read: the arms keep it steadier than the trunk."""
     rng = gait.rng
-    strike = Strike(rng.uniform(0.75, 1.7), *_ARM, 0.4, 0.3)
-    wobble, tremor = rng.uniform(0.05, 0.12), rng.uniform(0.02, 0.07)
-    motion = _held(gait, rng.uniform(0.75, 1.25), strike, tremor, wobble)
+    strike = Strike(1.5, *_ARM, (0.41, -166.0), 0.39, (0.6, 49.0), (0.29, 28.0), (0.35, -67.0), 0.4)
+    motion = _held(gait, 1.15, strike, 0.04, 0.1, 0.12, 0.6)
     return _displaced(motion, rng.uniform(0.2, 0.4), rng.uniform(-0.1, 0.1), 0.72 * gait.height)
 
 
@@ -98,9 +113,8 @@ def _displaced(motion: CarryMotion, x: float, y: float, z: float) -> CarryMotion
 
 def _call(gait: Gait) -> CarryMotion:
     rng, n = gait.rng, len(gait)
-    strike = Strike(rng.uniform(0.7, 1.35), *_ARM, 0.4, 0.4)
-    wobble, tremor = rng.uniform(0.06, 0.12), rng.uniform(0.03, 0.1)
-    motion = _held(gait, rng.uniform(0.9, 1.4), strike, tremor, wobble)
+    strike = Strike(1.35, *_ARM, (0.65, 33.0), 0.49, (0.3, 50.0), (0.22, -63.0), (0.44, 169.0), 0.4)
+    motion = _held(gait, 1.05, strike, 0.06, 0.11, 0.05, 0.5)
     head = 0.4 * drift(rng, n, gait.rate, 1.0)
     arm = np.array([0.05, rng.choice([-1.0, 1.0]) * 0.1, 0.0])
     offset = motion.offset_H + np.array([0.0, 0.0, 0.93 * gait.height]) + _about(2, head, arm)
@@ -110,21 +124,22 @@ def _call(gait: Gait) -> CarryMotion:
 
 def _swinging(gait: Gait) -> CarryMotion:
     rng, n = gait.rng, len(gait)
-    amplitude = np.radians(rng.uniform(24.0, 42.0)) * np.sqrt(gait.vigor)
+    amplitude = np.radians(33.0) * np.sqrt(gait.vigor)
     forward = np.radians(rng.uniform(8.0, 24.0))
-    angle = _pendulum(gait, amplitude, forward, harmonic=0.02)
+    angle = _pendulum(gait, amplitude, forward, harmonic=0.12)
     side = rng.choice([-1.0, 1.0])
     # Elbow and shoulder give: the hand swings about a point below the shoulder.
     arm = np.array([0.0, 0.0, -0.27 * gait.height])
     pivot = np.array([0.0, side * 0.13 * gait.height, 0.7 * gait.height])
-    ring = heel_strikes(gait, Strike(rng.uniform(0.9, 1.5), 5.5, 0.4, 0.9, 0.5))
+    ring = heel_strikes(
+        gait,
+        Strike(
+            1.1, 5.5, 0.4, (0.8, -164.0), 0.59, (0.44, -103.0), (0.26, 86.0), (0.59, -168.0), 0.4
+        ),
+    )
     # Forward the hand also comes inward: the plane of the swing is turned.
     inward = Rotation.from_rotvec([0.0, 0.0, -side * rng.uniform(0.15, 0.4)])
-    offset = (
-        pivot
-        + inward.apply(_about(1, -angle, arm))
-        + trunk(gait, rng.uniform(1.7, 2.8), TRUNK_SURGE)
-    )
+    offset = pivot + inward.apply(_about(1, -angle, arm)) + trunk(gait, 3.0, TRUNK_SURGE)
     offset += ring.offset_H + 0.008 * drift(rng, n, gait.rate, 0.5, 3)
     twist = rng.uniform(0.1, 0.5) * angle + 0.08 * drift(rng, n, gait.rate, 0.7)
     roll = 0.08 * drift(rng, n, gait.rate, 0.7)
@@ -135,19 +150,23 @@ def _swinging(gait: Gait) -> CarryMotion:
 def _pocket(gait: Gait) -> CarryMotion:
     """Return the motion of a device in a front pocket: it swings and shakes with the thigh."""
     rng = gait.rng
-    amplitude = np.radians(rng.uniform(11.0, 18.0))
+    amplitude = np.radians(14.5)
     place = (0.08, -rng.uniform(0.05, 0.12) * gait.height)
-    strike = Strike(rng.uniform(2.2, 4.0), 8.5, 0.25, 0.7, 0.7, True)
-    return _on_thigh(gait, amplitude, place, rng.uniform(1.2, 2.0), TRUNK_SURGE, strike)
+    strike = Strike(
+        3.3, 8.5, 0.25, (0.67, -60.0), 0.7, (0.22, -28.0), (0.16, 58.0), (0.31, -95.0), 0.8
+    )
+    return _on_thigh(gait, amplitude, place, 1.5, TRUNK_SURGE, 1.5 * SWAY, strike, 0.0)
 
 
 def _back_pocket(gait: Gait) -> CarryMotion:
     """Return the motion of a device in a back pocket: it turns with pelvis and thigh."""
     rng = gait.rng
-    amplitude = np.radians(rng.uniform(9.0, 14.0))
-    place = (-0.1, -rng.uniform(0.0, 0.04) * gait.height)
-    strike = Strike(rng.uniform(2.3, 4.1), 7.0, 0.3, 0.7, 0.7, True)
-    return _on_thigh(gait, amplitude, place, rng.uniform(1.0, 1.6), HELD_SURGE, strike)
+    amplitude = np.radians(11.5)
+    place = (-0.1, -rng.uniform(0.02, 0.06) * gait.height)
+    strike = Strike(
+        3.6, 7.0, 0.3, (0.68, 152.0), 0.73, (0.27, 67.0), (0.15, -84.0), (0.26, 115.0), 0.8
+    )
+    return _on_thigh(gait, amplitude, place, 1.4, 1.2, 2.0 * SWAY, strike, 2.1)
 
 
 def _on_thigh(
@@ -156,20 +175,30 @@ def _on_thigh(
     place: tuple[float, float],
     bounce: float,
     surge: float,
+    sway: float,
     strike: Strike,
+    pelvis: float,
 ) -> CarryMotion:
-    """Return the motion of a device at a place (x, z) [m] from the hip that swings with a leg."""
+    """Return the motion of a device at a place (x, z) [m] from the hip that swings with a leg.
+
+    `pelvis` [rad] is the lag of its yaw behind the stride.
+    """
     rng, n = gait.rng, len(gait)
     forward = np.radians(rng.uniform(0.0, 12.0))
     angle = _pendulum(gait, amplitude * np.sqrt(gait.vigor), forward, harmonic=0.3)
-    hip = np.array([0.0, rng.choice([-1.0, 1.0]) * 0.1, 0.52 * gait.height])
+    hip = np.array([0.0, -0.1, 0.52 * gait.height])
     ring = heel_strikes(gait, strike)
-    offset = hip + _about(1, -angle, np.array([place[0], 0.0, place[1]]))
-    offset += trunk(gait, bounce, surge) + ring.offset_H
     shift = rng.uniform(-0.7, 0.7, 2)
-    yaw = 0.2 * gait.effort * np.cos(gait.phase / 2.0 + shift[0])
-    roll = 0.06 * gait.effort * np.cos(gait.phase + shift[1]) + 0.03 * drift(rng, n, gait.rate, 1.0)
-    return CarryMotion(offset, np.stack([roll, -angle, yaw], axis=1) + ring.turn_H)
+    stride = gait.phase / 2.0 + shift[0] - pelvis
+    yaw = 0.3 * gait.effort * np.cos(stride)
+    roll = 0.1 * gait.effort * np.cos(stride - 2.3 + shift[1])
+    roll += 0.03 * drift(rng, n, gait.rate, 1.0)
+    offset = _about(2, yaw, hip) + _about(1, -angle, np.array([place[0], 0.0, place[1]]))
+    offset += trunk(gait, bounce, surge, sway) + ring.offset_H
+    # All of this is for the right leg; the left one does the mirror image.
+    side = rng.choice([-1.0, 1.0])
+    turn = np.stack([roll, -angle, yaw], axis=1) + ring.turn_H
+    return CarryMotion(offset * [1.0, side, 1.0], turn * [side, 1.0, side])
 
 
 def _bag(gait: Gait) -> CarryMotion:
@@ -177,15 +206,19 @@ def _bag(gait: Gait) -> CarryMotion:
     hang, sway = rng.uniform([0.0, 0.06], [0.4, 0.16])
     shift = rng.uniform(-0.7, 0.7, 3)
     stride = np.cos(gait.phase[:, None] / 2.0 + shift)
-    turn = sway * gait.effort[:, None] * stride * np.array([1.0, 0.5, 0.8])
-    step = 0.03 * rng.choice([-1.0, 1.0], 3)
-    turn += step * gait.effort[:, None] * np.cos(gait.phase[:, None] + shift[::-1])
+    turn = sway * gait.effort[:, None] * stride * np.array([-0.9, 0.7, -1.1])
+    turn[:, 1] += 0.03 * gait.effort * np.cos(gait.phase - 1.6 + shift[0])
     turn += 0.04 * drift(rng, n, gait.rate, 1.0, 3)
     body = np.array([rng.choice([-0.15, 0.12]), rng.uniform(-0.15, 0.15), 0.75 * gait.height])
     strap = np.array([0.0, 0.0, -hang])
     # A bag knocks against the body: its ringing is damped most.
-    ring = heel_strikes(gait, Strike(rng.uniform(0.8, 1.7), 6.5, 0.5, 1.3, 1.6))
-    offset = body + np.cross(turn, strap) + strap + trunk(gait, rng.uniform(1.5, 2.4), TRUNK_SURGE)
+    ring = heel_strikes(
+        gait,
+        Strike(
+            1.25, 6.5, 0.5, (1.5, -142.0), 1.55, (0.27, 103.0), (0.33, -75.0), (0.22, 79.0), 0.7
+        ),
+    )
+    offset = body + np.cross(turn, strap) + strap + trunk(gait, 1.85, 0.75, 2.0 * SWAY)
     return CarryMotion(offset + ring.offset_H, turn + ring.turn_H)
 
 
@@ -211,8 +244,8 @@ def _trolley(gait: Gait) -> CarryMotion:
 def _rig(gait: Gait) -> CarryMotion:
     """Return a rig's motion: quick turns to random directions, arms waved by up to their length."""
     rng, n = gait.rng, len(gait)
-    strike = Strike(rng.uniform(0.2, 0.6), *_ARM, 0.8, 0.6)
-    motion = _held(gait, TRUNK_BOUNCE, strike, rng.uniform(0.03, 0.1), rng.uniform(0.01, 0.03))
+    strike = Strike(0.4, *_ARM, (0.8, 132.0), 0.6, (0.25, 82.0), (0.3, 24.0), (0.37, 61.0), 0.4)
+    motion = _held(gait, TRUNK_BOUNCE, strike, rng.uniform(0.03, 0.1), 0.02, -0.08)
     reach = np.array([0.2, 0.25, 0.2]) * rng.uniform(0.3, 1.1)
     waved = drift(rng, n, gait.rate, rng.uniform(0.25, 0.5), 3)
     lively = 0.5 * (1.0 + np.tanh(1.5 + 1.5 * drift(rng, n, gait.rate, 3.0, 1)))
@@ -257,9 +290,10 @@ def _pendulum(gait: Gait, amplitude: float, forward: float, harmonic: float) -> 
         * (1.0 + 0.1 * drift(rng, n, gait.rate, 1.0))
     )
     stride = gait.phase / 2.0 + rng.uniform(-0.4, 0.4)
-    overtone = harmonic * np.cos(2.0 * stride + rng.uniform(0.8, 1.6))
+    overtones = harmonic * np.cos(2.0 * stride + rng.uniform(0.8, 1.6))
+    overtones += 0.35 * harmonic * np.cos(3.0 * stride + rng.uniform(0.0, 2.0 * np.pi))
     restless = 0.03 * drift(rng, n, gait.rate, 0.6)
-    return np.asarray(forward + size * (np.sin(stride) + overtone) + restless)
+    return np.asarray(forward + size * (np.sin(stride) + overtones) + restless)
 
 
 def _about(axis: int, angle: FloatArray, lever: FloatArray) -> FloatArray:

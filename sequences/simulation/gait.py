@@ -19,11 +19,11 @@ import numpy as np
 
 from stario.sequences.sequence import FloatArray
 
-_STRIKE_HARMONICS = 10
+_STRIKE_HARMONICS = 20
+"""Harmonics of the stride in the ringing."""
 
-_STRIKE_LEVER = 0.1
-"""Distance [m] from the point about which a device turns as it rings: angular rates in the bands of
-the ringing are about 0.3 rad/s per m/s^2, wherever a phone is carried."""
+_STRAY = np.array([1.2, 1.2, 0.4, 1.2, 1.2, 1.2])
+"""Largest stray [rad] of a harmonic's phases along x, y, z and about them: as coherent are axes."""
 
 _STRIKE_LAG = 0.9
 """Phase [rad] between the trunk's lowest point and the blow: the other leg has taken the weight."""
@@ -74,6 +74,10 @@ class CarryMotion:
     turn_H: FloatArray
 
 
+Ratio = tuple[float, float]
+"""How large one oscillation is per another, and by how much it leads [deg]."""
+
+
 @dataclass(frozen=True)
 class Strike:
     """What a heel strike excites in a device: an oscillator.
@@ -82,18 +86,23 @@ class Strike:
         strength: root mean square of its vertical acceleration at effort 1 and vigor 1 [m/s^2].
         resonance: undamped frequency [Hz].
         damping: damping ratio.
-        forward: acceleration forward and back per acceleration up and down.
-        sideways: acceleration to the sides per acceleration up and down.
-        one_sided: whether the device is at one leg, which pushes it to one side; in the middle the
-            sides alternate from step to step.
+        forward: acceleration forward per acceleration up.
+        sideways: acceleration to the sides per acceleration up, without phase.
+        roll, yaw: angular rates about x and z of H per acceleration to the left [rad/s per m/s^2].
+        pitch: angular rate about y of H per acceleration up [rad/s per m/s^2].
+        unequal: how much of it repeats with the stride only, or, to the sides, with the step: 0 in
+            the middle of a person with equal legs, where the sides alternate; 1 at one leg.
     """
 
     strength: float
     resonance: float
     damping: float
-    forward: float
+    forward: Ratio
     sideways: float
-    one_sided: bool = False
+    roll: Ratio
+    pitch: Ratio
+    yaw: Ratio
+    unequal: float
 
 
 def hardly_growing(effort: FloatArray) -> FloatArray:
@@ -101,7 +110,7 @@ def hardly_growing(effort: FloatArray) -> FloatArray:
     return np.asarray((1.0 + _SLOW) * effort / (effort + _SLOW))
 
 
-def trunk(gait: Gait, bounce: float, surge: float) -> FloatArray:
+def trunk(gait: Gait, bounce: float, surge: float, sway: float = SWAY) -> FloatArray:
     """Return the trunk's motion (N, 3) in H [m]: bounce and surge per step, sway per stride.
 
     Its acceleration, not its height, grows with the effort: slow steps are short, not rare. Surge
@@ -111,16 +120,17 @@ def trunk(gait: Gait, bounce: float, surge: float) -> FloatArray:
         gait: the gait.
         bounce: root mean square of the vertical acceleration at effort 1 [m/s^2].
         surge: that of the acceleration forward and back [m/s^2].
+        sway: that of the acceleration to the sides [m/s^2].
     """
     rng, phi = gait.rng, gait.phase
-    rise, side, ahead, limp = rng.uniform([0.85, 0.5, 0.6, 0.0], [1.15, 1.4, 1.4, 0.25])
+    rise, side, ahead, limp = rng.uniform([0.85, 0.7, 0.75, 0.0], [1.15, 1.3, 1.25, 0.25])
     per_acceleration = np.sqrt(2.0) / (2.0 * np.pi * gait.step_rate) ** 2
     hardly = hardly_growing(gait.effort)
     shift = rng.uniform(-np.pi, np.pi, 4)
-    shift[2] = np.pi + rng.normal(0.2, 0.3)  # slowest about the highest point
+    shift[2] = np.pi + rng.normal(-0.2, 0.4)  # slowest about the highest point
     z = rise * bounce * gait.effort * (np.cos(phi) + limp * np.cos(phi / 2.0 + shift[0]))
     # Over the standing leg at mid-stance. A stride takes two steps: a quarter of the frequency^2.
-    y = 4.0 * side * SWAY * hardly * (np.cos(phi / 2.0) + 0.08 * np.sin(1.5 * phi + shift[1]))
+    y = 4.0 * side * sway * hardly * (np.cos(phi / 2.0) + 0.08 * np.sin(1.5 * phi + shift[1]))
     x = ahead * surge * hardly * (np.sin(phi + shift[2]) + 0.8 * np.sin(phi / 2.0 + shift[3]))
     return np.stack([per_acceleration * x, per_acceleration * y, per_acceleration * z], axis=1)
 
@@ -128,29 +138,40 @@ def trunk(gait: Gait, bounce: float, surge: float) -> FloatArray:
 def heel_strikes(gait: Gait, strike: Strike) -> CarryMotion:
     """Return the ringing that heel strikes excite in the device.
 
-    The oscillator is excited once per step: harmonic n of the step gets the oscillator's response
-    at n times the step rate. The device turns with it about a point nearby.
+    The oscillator is excited by every step: harmonic n of the stride gets the oscillator's response
+    at n times its frequency. The device turns with it.
     """
     rng = gait.rng
     resonance = strike.resonance * rng.uniform(0.85, 1.15)
-    share = rng.uniform(0.7, 1.3, 3) * np.array([strike.forward, strike.sideways, 1.0])
-    # A blow that comes from below and in front swings the device in a circle rather than in a line.
-    ahead = np.array([np.pi / 2.0, rng.choice([-1.0, 1.0]) * np.pi / 2.0, 0.0])
-    turn_axis = rng.standard_normal(3)
-    turn_axis /= np.linalg.norm(turn_axis)
+    forward, roll, pitch, yaw = strike.forward, strike.roll, strike.pitch, strike.yaw
+    sideways = (strike.sideways, 90.0 * rng.choice([-1.0, 1.0]))
+    size, lead = np.transpose([forward, sideways, (1.0, 0.0), roll, pitch, yaw])
+    # Roll and yaw go with the sway. An angle follows its rate, an offset opposes its acceleration.
+    size[[3, 5]], lead[[3, 5]] = size[[3, 5]] * size[1], lead[[3, 5]] + lead[1]
+    size, lead = rng.uniform(0.8, 1.2, 6) * size, np.radians(lead + np.repeat([0.0, 90.0], 3))
     typical = float(np.median(gait.step_rate))
     n = np.arange(2, _STRIKE_HARMONICS + 1)
-    n = n[n * typical < 0.4 * gait.rate]
-    ratio = n * typical / resonance
+    n = n[0.5 * n * typical < 0.4 * gait.rate]
+    ratio = 0.5 * n * typical / resonance
     response = 1.0 / (1.0 - ratio**2 + 2j * strike.damping * ratio)
-    response *= np.sqrt(2.0) * strike.strength / np.sqrt(np.sum(np.abs(response) ** 2))
+    # Both legs push alike up and forward and in turn to the sides, but for what is unequal.
+    even, odd = np.where([n % 2 == 0, n % 2 == 1], 1.0, strike.unequal)
+    even[0] = 0.0  # the trunk's bounce and surge
+    response *= np.sqrt(2.0) * strike.strength / np.sqrt(np.sum(np.abs(response * even) ** 2))
     offset, turn = np.zeros((2, len(gait), 3))
-    for k, gain in zip(n, response, strict=True):
-        amplitude = np.abs(gain) / (2.0 * np.pi * k * gait.step_rate) ** 2
-        order = np.array([k, k if strike.one_sided else k - 0.5, k, k])
-        angle = order * (gait.phase - np.pi - _STRIKE_LAG)[:, None] + np.angle(gain)
-        stray = rng.uniform(-0.4, 0.4, 4) + np.append(ahead, 0.0)
-        ring = (gait.vigor * amplitude * gait.effort)[:, None] * np.cos(angle + stray)
-        offset += ring[:, :3] * share
-        turn += ring[:, 3:] * turn_axis / _STRIKE_LEVER
+    strength = (gait.vigor * gait.effort)[:, None]
+    for k, gain, up, aside in zip(0.5 * n, response, even, odd, strict=True):
+        angle = k * (gait.phase - np.pi - _STRIKE_LAG)[:, None] + np.angle(gain)
+        angle = angle + lead + rng.uniform(-_STRAY, _STRAY)
+        omega = 2.0 * np.pi * k * gait.step_rate[:, None]
+        ring = (
+            np.abs(gain)
+            / omega
+            * strength
+            * np.cos(angle)
+            * size
+            * [up, aside, up, aside, up, aside]
+        )
+        offset += ring[:, :3] / omega
+        turn += ring[:, 3:]
     return CarryMotion(offset, turn)

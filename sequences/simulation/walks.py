@@ -96,7 +96,7 @@ class WalkStyle:
             height=float(np.clip(rng.normal(1.72, 0.1), 1.45, 2.0)),
             step_constant=float(np.clip(rng.normal(0.21, 0.02), 0.16, 0.27)),
             preferred_speed=float(np.clip(rng.normal(1.05, 0.3), 0.5, 1.8)),
-            vigor=float(rng.uniform(0.6, 1.5)),
+            vigor=float(rng.uniform(0.7, 1.3)),
             mount_rotvec=(float(x), float(y), float(z)),
         )
 

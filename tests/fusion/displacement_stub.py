@@ -6,8 +6,11 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.benchmark.displacement_error import RecordingErrors, recording_errors
-from stario.fusion.evaluation.benchmark.pieces import usable_streams
+from stario.fusion.evaluation.displacement_error import (
+    RecordingErrors,
+    recording_errors,
+    usable_streams,
+)
 from stario.fusion.evaluation.pedestrian import Model, piece_of
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.levelled_stream import LevelledStream

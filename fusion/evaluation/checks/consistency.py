@@ -68,13 +68,12 @@ def summary(scores: pd.DataFrame, seconds: float) -> dict[str, Any]:
     return {"runs": len(runs), "seconds": seconds, **means, **sizes, "nees_bounds": bounds}
 
 
-def consistency_text(scores: pd.DataFrame, seconds: float) -> str:
-    """Return the result as lines of text."""
-    found = summary(scores, seconds)
+def consistency_text(found: dict[str, Any]) -> str:
+    """Return a `summary` as lines of text."""
     low, high = found["nees_bounds"]
     error, sigma = (math.degrees(found[name]) for name in ("yaw_error", "yaw_sigma"))
     return (
-        f"{found['runs']} runs of {seconds:g} s\n"
+        f"{found['runs']} runs of {found['seconds']:g} s\n"
         f"NEES of 15 states {found['nees']:.2f}, at the end {found['nees_end']:.2f} "
         f"(expected 15; {low:.1f} to {high:.1f} in 95 of 100 trials)\n"
         f"NEES of yaw {found['yaw']:.2f} (expected 1); error at the end "
@@ -97,13 +96,8 @@ def consistency(
     (`nees_end`); NEES of `yaw` (1); `nis` of the measurements (3); at the end, the yaw's reported
     standard deviation `yaw_sigma` and its error `yaw_error` [rad].
 
-    Args:
-        config: configuration of the filter and noise of the simulated IMU.
-        yaw_sigma: standard deviation of the initial yaw [rad].
-        runs: number of walks.
-        seconds: length of each walk [s].
-        seed: seed of the first run, increased by one for each further run.
-        progress: called with the share of the work done.
+    The configuration is that of the filter and of the simulated IMU's noise; `yaw_sigma` [rad] is
+    that of the initial yaw. Walks have seeds from `seed` on, and are `seconds` long.
 
     Raises:
         InputError: there are no runs, or they are shorter than two seconds.

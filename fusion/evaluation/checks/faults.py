@@ -196,13 +196,8 @@ def run_faults(
     (`finite`). The label `reported` has the faults counted in the health report, in words, or why
     the recording is refused.
 
-    Args:
-        sequence: a recording with true poses.
-        config: configuration of the navigator.
-        model: network; None for the true displacements under white noise.
-        seed: seed of the random faults.
-        backends: back ends to run.
-        only: faults to run; None for all of them.
+    Without a network, displacements are the true ones under white noise. `seed` is that of random
+    faults; without `only`, all of them are run.
 
     Raises:
         InputError: the recording has no true poses, or is too short.
@@ -294,33 +289,39 @@ def with_true_displacements(
     window's noise depends on the seed and its time, not on earlier windows.
     """
     covariance = noise**2 / config.filter.covariance_scale * np.eye(3)
-    measurements = list(preprocessed.measurements)
-    measured = {k: each for k, each in enumerate(measurements) if each is not None}
-    stop = np.array([preprocessed.intervals[k].stop for k in measured])
-    attitudes = np.array([each.R_NB for each in measured.values()])
+    pairs = zip(preprocessed.intervals, preprocessed.measurements, strict=True)
+    measured = [(interval.stop, each.R_NB) for interval, each in pairs if each is not None]
+    stop, R_NB = (np.array(values) for values in zip(*measured, strict=True))
     ends = np.clip([stop - WINDOW_SECONDS, stop], truth.time[0], truth.time[-1])
     first, last = truth.at(ends[0]), truth.at(ends[1])
-    turn = about_z(yaw_of(Rotation.from_matrix(attitudes) * first.attitude_WB.inv()))
-    displacement_N = turn.apply(last.position_W - first.position_W)
-    times = stop - truth.time[0]
-    for k, d_N, R_NB, time in zip(measured, displacement_N, attitudes, times, strict=True):
+    turn = about_z(yaw_of(Rotation.from_matrix(R_NB) * first.attitude_WB.inv()))
+    mean_N = turn.apply(last.position_W - first.position_W)
+    for d_N, time in zip(mean_N, stop - truth.time[0], strict=True):
         rng = np.random.default_rng([seed, max(0, round(time * config.filter.output_rate))])
-        noisy_N = d_N + noise * rng.standard_normal(3)
-        measurements[k] = WindowDisplacement(noisy_N, covariance, R_NB)
-    return replace(preprocessed, measurements=measurements)
+        d_N += noise * rng.standard_normal(3)
+    return _with_displacements(preprocessed, mean_N, np.tile(covariance, (len(stop), 1, 1)))
 
 
 def _corrupted(
     preprocessed: PreprocessedRecording, modify: ModifyPredictions, rng: np.random.Generator
 ) -> PreprocessedRecording:
     """Apply a fault to all measurements at once."""
-    measurements = list(preprocessed.measurements)
-    measured = {k: each for k, each in enumerate(measurements) if each is not None}
-    mean, covariance, _ = (np.stack(values) for values in zip(*measured.values(), strict=True))
+    measured = [each for each in preprocessed.measurements if each is not None]
+    mean, covariance, _ = (np.stack(values) for values in zip(*measured, strict=True))
     modify(mean, covariance, rng)
-    for (k, each), d_N, C in zip(measured.items(), mean, covariance, strict=True):
-        measurements[k] = each._replace(d_N=d_N, covariance_N=C)
-    return replace(preprocessed, measurements=measurements)
+    return _with_displacements(preprocessed, mean, covariance)
+
+
+def _with_displacements(
+    preprocessed: PreprocessedRecording, mean_N: FloatArray, covariance_N: FloatArray
+) -> PreprocessedRecording:
+    """Replace displacements (M, 3) and covariances (M, 3, 3) of the measurements, one by one."""
+    new = zip(mean_N, covariance_N, strict=True)
+    replaced = [
+        None if each is None else WindowDisplacement(*next(new), each.R_NB)
+        for each in preprocessed.measurements
+    ]
+    return replace(preprocessed, measurements=replaced)
 
 
 def _figures(track: Track, truth: Trajectory) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""The fusion on recordings, by group: beside its network, with fixes, and with samples missing.
+"""The fusion on recordings, by group: beside its network, with fixes, samples missing, heights.
 
 - Benefit: errors of the filtered and the smoothed track relative to the network's, whose
   displacements are chained along the attitude levelled from the IMU. They are horizontal, root mean
@@ -7,12 +7,14 @@
   Only the second half of each track counts: by then several fixes have determined the direction.
 - Missing samples: a short gap at each of several instants, and samples dropped at random. Results
   must not depend on a few samples. All tracks begin in the same pose, so ends need no alignment.
+- Heights and floors, with the barometer and without, at waypoints with floors or true poses.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -20,10 +22,10 @@ import pandas as pd
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.benchmark.displacement_error import known_truth
 from stario.fusion.evaluation.checks.faults import drops, gap
 from stario.fusion.evaluation.compare import TRACK_OF, Metrics, measure
-from stario.fusion.evaluation.known_positions import MIN_POSITIONS, true_path
+from stario.fusion.evaluation.displacement_error import known_truth
+from stario.fusion.evaluation.known_positions import MIN_POSITIONS, position_error, true_path
 from stario.fusion.evaluation.scores import (
     Column,
     geometric_mean,
@@ -35,6 +37,7 @@ from stario.fusion.evaluation.scores import (
 )
 from stario.fusion.evaluation.tracks import network_track, true_poses
 from stario.fusion.fixes import Fix, position_fix
+from stario.fusion.floors import floor_at
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.lie import yaw_twist
 from stario.fusion.navigator import Navigator
@@ -43,7 +46,7 @@ from stario.sequences.accuracy.metrics import pose_errors
 from stario.sequences.accuracy.nees import nees
 from stario.sequences.arrays import even_grid
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
+from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
 
 SIGMA_BOUND = 3.0
 """Maximum yaw error of a consistent track, in standard deviations."""
@@ -57,6 +60,9 @@ GAP_SECONDS, DROPPED, INSTANTS = 0.1, 0.05, 6
 MAX_SHIFT, MAX_TURN = 0.01, 3.0
 """Maximum acceptable shift of the end: in metres per metre of the path, and in yaw [deg]."""
 
+FLOOR_METRES, WITHIN = 3.0, 0.8
+"""Distance of floors for which waypoints count, and error up to which one lies on its floor [m]."""
+
 _MIN_FIXES, _MIN_PATH = 4, 1.0
 """Minimum number of fixes, and path [m], of a track that is evaluated."""
 
@@ -65,7 +71,6 @@ def fusion_gain(
     model: Predictor,
     sequence: ImuSequence,
     config: NavigatorConfig,
-    group: str,
     backends: Sequence[BackendName] = get_args(BackendName),
 ) -> pd.DataFrame:
     """Score the network alone and the back ends: `error_m`, its `ratio` to the network's, NIS.
@@ -92,12 +97,16 @@ def fusion_gain(
         track = Navigator(model, config, backend=name).track(preprocessed)
         measured = measure(track, sequence)
         error = fitted_error(measured)
-        of_track: Metrics = {"error_m": error, "percent": 100.0 * error / path if path else None}
-        of_track |= {"ratio": error / alone, "nis": measured["nis_mean"]}
+        figures[TRACK_OF[name]] = {
+            "error_m": error,
+            "percent": 100.0 * error / path if path else None,
+            "ratio": error / alone,
+            "nis": measured["nis_mean"],
+        }
         if truth is not None:
-            of_track |= {"nees": measured["nees_median"], **_yaw_at_the_end(track, truth)}
-        figures[TRACK_OF[name]] = of_track
-    return scored(sequence.name, figures, group)
+            yaw = _yaw_at_the_end(track, truth)
+            figures[TRACK_OF[name]] |= {"nees": measured["nees_median"], **yaw}
+    return scored(sequence.name, figures)
 
 
 def fitted_error(figures: Metrics) -> float:
@@ -162,7 +171,6 @@ def track_with_fixes(
     model: Predictor,
     sequence: ImuSequence,
     config: NavigatorConfig,
-    group: str,
     every: float = 5.0,
     sigma: float = 0.3,
     backend: BackendName = "ekf",
@@ -196,7 +204,7 @@ def track_with_fixes(
         "yaw_nees": float((yaw**2 / P[:, 2, 2]).mean()),
         "yaw_covered": float((np.abs(yaw) < SIGMA_BOUND * np.sqrt(P[:, 2, 2])).mean()),
     }
-    return scored(sequence.name, {TRACK_OF[backend]: figures}, group)
+    return scored(sequence.name, {TRACK_OF[backend]: figures})
 
 
 def true_fixes(truth: Trajectory, every: float, sigma: float, seed: int) -> list[Fix]:
@@ -224,9 +232,7 @@ def fixes_table(scores: pd.DataFrame) -> str:
     return table(parts(scores), columns, notes=[note])
 
 
-def end_shifts(
-    model: Predictor, sequence: ImuSequence, config: NavigatorConfig, group: str
-) -> pd.DataFrame:
+def end_shifts(model: Predictor, sequence: ImuSequence, config: NavigatorConfig) -> pd.DataFrame:
     """Score a track without a few samples, in several ways: the shift of its end.
 
     `metres` is the horizontal distance between the ends over the length of the track, `degrees`
@@ -252,7 +258,7 @@ def end_shifts(
         degrees = abs(math.degrees(yaw_twist(turn)))
         within = float(shift <= MAX_SHIFT and degrees <= MAX_TURN)
         figures[name] = {"metres": shift, "degrees": degrees, "within": within}
-    return scored(sequence.name, figures, group)
+    return scored(sequence.name, figures)
 
 
 def end_shift_table(scores: pd.DataFrame) -> str:
@@ -268,3 +274,91 @@ def end_shift_table(scores: pd.DataFrame) -> str:
         Column("worst", "degrees", over=np.max),
     )
     return table(parts(scores), columns)
+
+
+def score_heights(model: Predictor, sequence: ImuSequence, config: NavigatorConfig) -> pd.DataFrame:
+    """Score a recording's tracks: with the barometer, filtered, and without.
+
+    Figures of each: `height_rms` and `height_max` [m], share `within` 0.8 m, median
+    `height_nees`; with the barometer the share of waypoints on the `floors` found, not counting
+    those on the way between two; horizontal error at the waypoints after a fit, `horizontal` [m].
+
+    Raises:
+        InputError: it has no barometer, or neither waypoints with floors nor true poses.
+    """
+    if sequence.barometer is None:
+        raise InputError(f"{sequence.name}: barometer", "none", "a recording with one")
+    known, positions = _known_heights(sequence), sequence.positions
+    navigator = Navigator(model, config)
+    track = navigator.run(sequence)
+    tracks = {"pressure": track, "none": navigator.run(replace(sequence, barometer=None))}
+    if track.filtered is not None:
+        tracks["filtered"] = track.filtered
+    figures = {name: _height_figures(each, *known) for name, each in tracks.items()}
+    if positions is not None:
+        for name, each in tracks.items():
+            figures[name]["horizontal"] = position_error(each, positions)[0]
+        if positions.floor is not None:
+            figures["pressure"]["floors"] = _right_floors(track, positions)
+    return scored(sequence.name, figures)
+
+
+def _known_heights(sequence: ImuSequence) -> tuple[FloatArray, FloatArray]:
+    """Return times [s] at which the height [m] is known, and these heights."""
+    if sequence.truth is not None:
+        truth = sequence.truth
+        return truth.time[truth.valid], truth.position_W[truth.valid, 2]
+    positions = sequence.positions
+    if positions is None or positions.floor is None:
+        expected = "waypoints with floors, or true poses"
+        raise InputError(f"{sequence.name}: heights", "none", expected)
+    at = positions.valid & np.isfinite(positions.floor)
+    return positions.time[at], FLOOR_METRES * positions.floor[at]
+
+
+def _height_figures(track: Track, time: FloatArray, height: FloatArray) -> dict[str, float]:
+    inside = (time >= track.time[0]) & (time <= track.time[-1])
+    time, height = time[inside], height[inside]
+    assert track.covariance is not None  # both back ends give it
+    estimated = np.interp(time, track.time, track.trajectory.position_W[:, 2])
+    variance = np.interp(time, track.time, track.covariance[:, 8, 8])
+    error = estimated - estimated[0] - height + height[0]
+    return {
+        "height_rms": math.sqrt(float(np.mean(error**2))),
+        "height_max": float(np.abs(error).max()),
+        "within": float(np.mean(np.abs(error) <= WITHIN)),
+        "height_nees": float(np.median(error[1:] ** 2 / variance[1:])),
+    }
+
+
+def _right_floors(track: Track, positions: PositionTrack) -> float:
+    """Return the share of waypoints that are on the floor that was found."""
+    assert positions.floor is not None
+    assert track.health is not None
+    known = [(t, f) for t, f in zip(positions.time, positions.floor, strict=True) if f == f]
+    found = [(floor_at(track.health.floors, t), f - known[0][1]) for t, f in known]
+    on_floors = [there == floor for there, floor in found if there is not None]
+    return float(np.mean(on_floors)) if on_floors else math.nan
+
+
+def heights_table(scores: pd.DataFrame) -> str:
+    """Return a row for each group and track: medians over recordings, shares and the largest."""
+    columns = (
+        Column("n", "height_rms", ".0f", len),
+        Column("height m", "height_rms"),
+        Column("largest", "height_max", ".2f", max),
+        Column(f"< {WITHIN:g} m", "within", ".0%", np.mean),
+        Column("NEES", "height_nees"),
+        Column("horizontal m", "horizontal"),
+        Column("floors right", "floors", ".0%", np.mean),
+    )
+    note = (
+        f"at waypoints, relative to the first, {FLOOR_METRES:g} m a floor (the truth, if there is "
+        "one); NEES: 0.45 expected (median)"
+    )
+    rows = [
+        ((group, track), part)
+        for group, found in parts(scores)
+        for track, part in parts(found, by="track", whole=None)
+    ]
+    return table(rows, columns, ("group", "track"), notes=[note])

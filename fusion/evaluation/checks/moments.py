@@ -16,9 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.backends import BackendName
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.benchmark.displacement_error import fit_yaw_and_position, known_truth
-from stario.fusion.evaluation.checks.simulation import simulated_walk
 from stario.fusion.evaluation.compare import TRACK_OF
+from stario.fusion.evaluation.displacement_error import fit_yaw_and_position, known_truth, planar
 from stario.fusion.evaluation.scores import Column, geometric_mean, joined, parts, scored, table
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.direction import Complex
@@ -29,7 +28,7 @@ from stario.sequences.arrays import interpolated
 from stario.sequences.attitude.rotations import GyroIntegral
 from stario.sequences.attitude.stacks import composed
 from stario.sequences.clean_samples import clean_samples
-from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence
+from stario.sequences.sequence import BoolArray, ImuSequence
 from stario.sequences.simulation.insertion import Inserted, insert_moment
 from stario.sequences.simulation.moments import MOMENTS
 
@@ -51,7 +50,7 @@ _FIRST_SECONDS = 1.05
 _MIN_KNOWN = 3
 """Minimum number of known positions in a part of the track for its error to count."""
 
-_CARRIES = ("handheld", "pocket", "swinging", "bag")
+CARRIES = ("handheld", "pocket", "swinging", "bag")
 """How the device is carried in the simulated walks, one each."""
 
 
@@ -67,11 +66,6 @@ _COLUMNS = (
     Column("turn [deg]", "turn", ".1f", np.max),
     Column("both small", "small", ".0%", np.mean),
 )
-
-
-def simulated_walks() -> list[ImuSequence]:
-    """Simulate a walk of each carrying mode, with a phone's sensors in a building."""
-    return [simulated_walk(carry, seed) for seed, carry in enumerate(_CARRIES)]
 
 
 def moment_costs(
@@ -138,18 +132,11 @@ def _with_truth(sequence: ImuSequence) -> ImuSequence:
 def _cost(
     sequence: ImuSequence, inserted: Inserted, without: Track, track: Track
 ) -> dict[str, float]:
-    split = inserted.start
-    errors = []
-    for each, start, stop, recording in (
-        (without, split, split, sequence),
-        (track, split, inserted.stop, inserted.sequence),
-    ):
-        time, truth, estimate = _known(recording, each)
-        rest = (time < start) | (time >= stop)
-        errors.append(_errors(truth[rest], estimate[rest], time[rest] < start))
-    step, turn = largest_correction(inserted.sequence, track)
-    usual = largest_correction(sequence, without)
-    (apart, as_one), (apart_with, as_one_with) = errors
+    apart, as_one = _errors_of_rest(sequence, without, inserted.start, inserted.start)
+    with_it = inserted.sequence
+    apart_with, as_one_with = _errors_of_rest(with_it, track, inserted.start, inserted.stop)
+    step, turn = largest_correction(with_it, track)
+    step_without, turn_without = largest_correction(sequence, without)
     return {
         "error_without": apart,
         "error_with": apart_with,
@@ -160,13 +147,15 @@ def _cost(
         "step": step,
         "turn": turn,
         "small": float(step <= MAX_STEP and turn <= MAX_TURN),
-        "step_without": usual[0],
-        "turn_without": usual[1],
+        "step_without": step_without,
+        "turn_without": turn_without,
     }
 
 
-def _known(sequence: ImuSequence, track: Track) -> tuple[FloatArray, Complex, Complex]:
-    """Return times (n,) of known positions within the track, and both horizontally as complex."""
+def _errors_of_rest(
+    sequence: ImuSequence, track: Track, start: float, stop: float
+) -> tuple[float, float]:
+    """Return `_errors` before and after a moment."""
     if sequence.truth is not None:
         inside = track.trajectory.valid & sequence.truth.covers(track.time)
         time = track.time[inside]
@@ -175,12 +164,10 @@ def _known(sequence: ImuSequence, track: Track) -> tuple[FloatArray, Complex, Co
         assert sequence.positions is not None
         inside = sequence.positions.valid & track.trajectory.covers(sequence.positions.time)
         time, position = sequence.positions.time[inside], sequence.positions.position_W[inside]
-    estimate = interpolated(time, track.time, track.trajectory.position_W)
-    return time, _horizontal(position), _horizontal(estimate)
-
-
-def _horizontal(position_W: FloatArray) -> Complex:
-    return np.asarray(position_W[:, 0] + 1j * position_W[:, 1])
+    truth = planar(position)
+    estimate = planar(interpolated(time, track.time, track.trajectory.position_W))
+    rest = (time < start) | (time >= stop)
+    return _errors(truth[rest], estimate[rest], time[rest] < start)
 
 
 def _errors(truth: Complex, estimate: Complex, before: BoolArray) -> tuple[float, float]:
@@ -193,8 +180,7 @@ def _errors(truth: Complex, estimate: Complex, before: BoolArray) -> tuple[float
     if not squares:
         return math.nan, math.nan
     joined = np.abs(fit_yaw_and_position(estimate, truth) - truth) ** 2
-    apart = np.concatenate(squares)
-    return math.sqrt(apart.mean()), math.sqrt(joined.mean())
+    return math.sqrt(np.concatenate(squares).mean()), math.sqrt(joined.mean())
 
 
 def largest_correction(sequence: ImuSequence, track: Track) -> tuple[float, float]:

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stario.fusion.commands import evaluate
-from stario.fusion.commands.options import ReadingOptions
+from stario.fusion.commands import evaluate, options
 from stario.fusion.evaluation.compare import TRACKS
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
@@ -93,7 +92,9 @@ def test_check_moments_reports_what_a_bad_moment_costs(stario, recording, monkey
         ("walk", "lift, middle", track) for track in ("filtered", "track")
     ]
     assert all(one["error_with"] > 0.0 for one in found)
-    monkeypatch.setattr(f"{checks}.simulated_walks", lambda: [read_generic_csv(recording)])
+    monkeypatch.setattr(f"{checks}.CARRIES", ("bag",))
+    simulated = "stario.fusion.evaluation.checks.simulation.simulated_walk"
+    monkeypatch.setattr(simulated, lambda carry, seed: read_generic_csv(recording))
     shown = stario("check", "moments")
     assert "lift, middle" in shown.out
     stario("check", "moments", "--axes", "y,-x,z").assert_one_line_error("--axes", "simulated")
@@ -197,7 +198,7 @@ def test_evaluate_compares_with_other_weights_by_groups(stario, recording, tmp_p
 
 
 def test_every_option_that_changes_what_is_read_is_part_of_the_key_of_a_cache():
-    usual = ReadingOptions()
+    usual = options.Reading()
     for name in (field.name for field in fields(usual)):
         other = replace(usual, **{name: ["person=dan"] if name == "where" else "other"})
         assert (other.as_read() == usual.as_read()) == (name == "where")

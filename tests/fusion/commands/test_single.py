@@ -15,9 +15,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+from stario.fusion.commands import options
 from stario.fusion.commands.cli import app
 from stario.fusion.commands.common import origin_of
-from stario.fusion.commands.options import EstimatorOptions, ReadingOptions
 from stario.fusion.config import read_config
 from stario.network.model import load_model
 from stario.sequences.conventions import with_axes
@@ -227,8 +227,8 @@ def test_run_compare_and_evaluate_state_what_produced_their_results(stario, reco
 
 
 def test_what_produced_a_run_names_fixes_and_changed_reading_options(tmp_path):
-    reading = ReadingOptions(gyro_unit="deg/s", where=["person=dan"])
-    estimating, fixes = EstimatorOptions(), tmp_path / "fixes.csv"
+    reading = options.Reading(gyro_unit="deg/s", where=["person=dan"])
+    estimating, fixes = options.Estimator(), tmp_path / "fixes.csv"
     origin = origin_of([], reading, estimating, estimating.network(), fixes)
     assert origin["reading"] == {"gyro_unit": "deg/s", "where": ["person=dan"]}
     assert origin["fixes"] == str(tmp_path / "fixes.csv")

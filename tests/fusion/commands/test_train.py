@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from stario.fusion.commands.train import _recipe
-from stario.fusion.commands.training_data import packaged_lists
+from stario.fusion.commands.train import _recipe, packaged_lists
 from stario.network import load_model
 from stario.network.training import splits
 from stario.network.training.config import FINE_TUNING, training_config

@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from stario.fusion.evaluation.benchmark.groups import POOLED, verdict
 from stario.fusion.evaluation.bootstrap import Interval, block_rows, paired_ratio, ranks
+from stario.fusion.evaluation.groups import POOLED, verdict
 from stario.fusion.evaluation.scores import joined
 
 RNG = np.random.default_rng(0)

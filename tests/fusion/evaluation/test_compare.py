@@ -19,7 +19,7 @@ from stario.fusion.evaluation.compare import (
     measure,
 )
 from stario.fusion.evaluation.results import write_comparison, write_run
-from stario.fusion.evaluation.summary import scores_of, summary, summary_table
+from stario.fusion.evaluation.text import scores_of, summary, summary_table
 from stario.fusion.fixes import position_fix
 from stario.sequences.accuracy.metrics import evaluate_track
 from stario.sequences.accuracy.nees import position_nees
@@ -192,7 +192,7 @@ def test_the_written_configuration_can_be_read_back(folder):
 @pytest.fixture
 def blank_figures(monkeypatch):
     """Draw figures, but leave their files empty: most of the time goes into rendering."""
-    saved = "stario.fusion.evaluation.folders.save_figure"
+    saved = "stario.fusion.evaluation.results.save_figure"
     monkeypatch.setattr(saved, lambda figure, path: path.touch())
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from stario.fusion.evaluation.folders import RESULTS, Files, write_results
+from stario.fusion.evaluation.results import RESULTS, Files, write_results
 from stario.sequences.errors import InputError
 from stario.sequences.files import write_json
 

@@ -14,13 +14,12 @@ from stario.fusion.evaluation.networks import (
     METRICS,
     PROTOCOLS,
     NetworkTable,
-    compare_networks,
-    networks_text,
-    table_dict,
+    network_table,
+    networks_on,
 )
 from stario.fusion.evaluation.scores import scored, values
 from stario.network.model import weights_named
-from stario.sequences.errors import WeightsError
+from stario.sequences.errors import InputError, WeightsError
 
 
 class ConstantDisplacement:
@@ -42,20 +41,34 @@ MODELS = [
 
 
 @pytest.fixture(scope="module")
-def read(make_walk):
-    def read(path):
-        walk = make_walk(seed=int(path.stem), seconds=12.0)
-        return walk.without_truth() if path.suffix == ".blind" else walk
+def compared(make_walk):
+    """Return a function that compares models on simulated walks of some seeds."""
 
-    return read
+    def compared(seeds, models=MODELS, convention="rms"):
+        found = [
+            networks_on(
+                Path("walk"),
+                models,
+                NavigatorConfig(),
+                lambda path, seed=seed: make_walk(seed=seed, seconds=12.0),
+                convention,
+            )
+            for seed in seeds
+        ]
+        return network_table(found, models, convention)
+
+    return compared
 
 
 @pytest.fixture(scope="module")
-def table(read):
-    paths = [Path("1.walk"), Path("2.walk"), Path("3.blind")]
-    table, skipped = compare_networks(paths, MODELS, NavigatorConfig(), read, jobs=1)
-    assert [s.item for s in skipped] == ["3.blind"]
-    return table
+def table(compared):
+    return compared([1, 2])
+
+
+def test_a_recording_without_true_poses_is_refused(make_walk):
+    blind = make_walk(seed=3, seconds=12.0).without_truth()
+    with pytest.raises(InputError, match="truth"):
+        networks_on(Path("blind"), MODELS, NavigatorConfig(), lambda path: blind)
 
 
 def test_every_network_has_every_track_of_every_recording(table):
@@ -66,10 +79,8 @@ def test_every_network_has_every_track_of_every_recording(table):
         assert found.shape == (count,)
 
 
-def test_recordings_with_the_same_name_are_distinguished(read):
-    twice, _ = compare_networks(
-        [Path("1.walk"), Path("1.walk")], MODELS[:1], NavigatorConfig(), read, jobs=1
-    )
+def test_recordings_with_the_same_name_are_distinguished(compared):
+    twice = compared([1, 1], MODELS[:1])
     assert set(twice.scores["recording"]) == {"walk-1", "walk-1-2"}
     assert [sample.recording for sample in twice.samples] == ["walk-1", "walk-1-2"]
 
@@ -93,24 +104,22 @@ def test_a_recording_at_rest_has_no_share_of_its_path_and_no_warning():
     figures = {"ate_m": 0.1, "rte_m": 0.1, "pde": None}
     scores = scored("rest", dict.fromkeys(PROTOCOLS, figures), network="StarIO", weights="a")
     known = NetworkTable("rms", {"StarIO": 1}, scores, [])
-    rows = {tuple(line.split()) for line in networks_text(known).splitlines()}
+    rows = {tuple(line.split()) for line in known.text().splitlines()}
     assert {("rest", "0.100"), ("rest", "-"), ("mean", "-")} < rows
 
 
-def test_the_ronin_convention_is_smaller_by_the_square_root_of_two(table, read):
-    ronin, _ = compare_networks(
-        [Path("1.walk")], MODELS[2:], NavigatorConfig(), read, "ronin", jobs=1
-    )
+def test_the_ronin_convention_is_smaller_by_the_square_root_of_two(table, compared):
+    ronin = compared([1], MODELS[2:], "ronin")
     ours, theirs = (
         values(found.scores, "ate_m", track="network", network="R-ResNet")[0]
         for found in (table, ronin)
     )
     assert theirs == pytest.approx(ours / np.sqrt(2))
-    assert "convention ronin" in networks_text(ronin)
+    assert "convention ronin" in ronin.text()
 
 
 def test_text_names_networks_recordings_convention_and_units(table):
-    text = networks_text(table)
+    text = table.text()
     for word in ("StarIO", "R-ResNet", "walk-1", "walk-2", "+-", "convention rms", "RTE [m]"):
         assert word in text
 
@@ -128,7 +137,7 @@ def test_csv_and_json_hold_the_same_figures(table, tmp_path):
     with (tmp_path / "networks.csv").open() as file:
         rows = list(csv.DictReader(file))
     content = json.loads((tmp_path / "networks.json").read_text())
-    assert content == json.loads(json.dumps(table_dict(table)))
+    assert content == json.loads(json.dumps(table.as_dict()))
     for row, entry in zip(rows, content["entries"], strict=True):
         assert row["recording"] == entry["recording"]
         for metric in METRICS:

@@ -8,7 +8,7 @@ import pytest
 from initial_ekf import Driven
 
 from stario.fusion import Navigator, NavigatorConfig, NavState, Track
-from stario.fusion.evaluation.checks.heights import heights_table, score_heights
+from stario.fusion.evaluation.checks.fusion import heights_table, score_heights
 from stario.fusion.evaluation.scores import values
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.height import with_height, yielding
@@ -155,13 +155,13 @@ def test_floors_are_those_of_the_house(house, house_track):
 
 
 def test_the_check_of_heights_tells_with_from_without(house, level_oracle):
-    scores = score_heights(level_oracle, house.sequence, CONFIG, "house")
+    scores = score_heights(level_oracle, house.sequence, CONFIG)
     assert values(scores, "height_rms", track="pressure")[0] < 0.6
     assert values(scores, "height_rms", track="none")[0] > 2.0
     assert values(scores, "floors", track="pressure")[0] == 1.0
     assert "pressure" in heights_table(scores)
     with pytest.raises(InputError, match="a recording with one"):
-        score_heights(level_oracle, replace(house.sequence, barometer=None), CONFIG, "house")
+        score_heights(level_oracle, replace(house.sequence, barometer=None), CONFIG)
 
 
 def test_the_report_draws_floors_along_the_height(house_track):

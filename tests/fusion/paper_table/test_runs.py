@@ -16,8 +16,8 @@ from stario.fusion.commands.cli import app
 from stario.fusion.paper_table import runs as runs_module
 from stario.fusion.paper_table import training
 from stario.fusion.paper_table.runs import LEADING, Run, backend, complete, complete_run, table_runs
-from stario.fusion.paper_table.scores import completed_runs, set_table
 from stario.fusion.paper_table.sets import DataSet, folder_set
+from stario.fusion.paper_table.table import completed_runs, set_table
 from stario.fusion.paper_table.training import ReaderConfig, run_recipe
 from stario.network.architectures import ARCHITECTURES
 from stario.sequences.datasets.batch import Skipped
@@ -227,7 +227,7 @@ def test_the_command_writes_tables_and_figures(dataset, tmp_path, monkeypatch):
     folder = dataset.training[0].parent
     monkeypatch.setenv("STARIO_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("stario.network.runtime.survey._RUNS", {1: 1, 64: 1})
-    saved = "stario.fusion.evaluation.folders.save_figure"  # rendering is slow
+    saved = "stario.fusion.evaluation.results.save_figure"  # rendering is slow
     monkeypatch.setattr(saved, lambda figure, path: path.touch())
     (tmp_path / "recipe.json").write_text(json.dumps(RECIPE))
     out = tmp_path / "out"

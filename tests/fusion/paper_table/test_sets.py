@@ -10,10 +10,8 @@ import pytest
 from recorded import DATA
 
 from stario.fusion.paper_table import sets, training
-from stario.fusion.paper_table.scores import COLUMNS, set_table
 from stario.fusion.paper_table.sets import ALL, FIRST, DataSet, development_sets, published
-from stario.fusion.paper_table.table import work_of
-from stario.fusion.paper_table.text import table_text
+from stario.fusion.paper_table.table import COLUMNS, set_table, table_text, work_of
 from stario.fusion.paper_table.training import ReaderConfig, run_recipe, train_run
 from stario.network.runtime.survey import ModelRow
 from stario.network.training import splits
@@ -101,7 +99,9 @@ TESTED = tuple(ListEntry(Path(f"ridi.h5:{name}"), "ridi") for name in "ab")
 DATASET = DataSet("own", (Path("ridi.h5:c"),), (Path("ridi.h5:d"),), TESTED, "")
 
 
-def content(ate_m: float, seconds: float = 0.0) -> Mapping[str, Any]:
+def content(
+    ate_m: float, network: str = "StarIO", seed: int = 0, seconds: float = 0.0
+) -> Mapping[str, Any]:
     """Results on both recordings, the second without a drift."""
     tracks = [
         {"network_true_attitude": {"ate_m": ate_m, "rte_m": 2.0, "pde": pde}}
@@ -113,17 +113,18 @@ def content(ate_m: float, seconds: float = 0.0) -> Mapping[str, Any]:
         | {"tracks": found, "blocks": {"ate": [[ate_m**2, 1.0]]}}
         for entry, found in zip(TESTED, tracks, strict=True)
     ]
-    return {"recordings": recordings, "skipped": [], "seconds": seconds}
+    run = {"network": network, "seed": seed, "seconds": seconds}
+    return {**run, "recordings": recordings, "skipped": []}
 
 
-def trained(ate_m: float) -> Mapping[str, Any]:
+def trained(ate_m: float, seed: int) -> Mapping[str, Any]:
     work = {"windows_per_s": 200.0, "seconds": 7200.0, "skipped": []}
     errors = {"training_error_m2": 0.1, "validation_error_m2": 0.2}
-    return {**content(ate_m, seconds=1800.0), "trained": work | errors}
+    return {**content(ate_m, seed=seed, seconds=1800.0), "trained": work | errors}
 
 
 def test_errors_are_means_over_recordings_in_their_units():
-    rows = set_table(DATASET, {"pdr": {0: content(1.5)}}, {}).rows
+    rows = set_table(DATASET, [content(1.5, "pdr")], {}).rows
     assert rows["ate"].item() == 1.5
     assert rows["pde"].item() == pytest.approx(3.0)  # in %, where it is known
     known = [key for key in COLUMNS if rows[key].notna().any()]
@@ -132,13 +133,14 @@ def test_errors_are_means_over_recordings_in_their_units():
 
 def test_recordings_that_weights_have_learned_are_counted_among_the_tested_ones():
     learned = {"default": frozenset({TESTED[0].path, *DATASET.training, *DATASET.validation})}
-    table = set_table(DATASET, {"default": {0: content(1.0)}, "open": {0: content(1.0)}}, learned)
+    completed = [content(1.0, "default"), content(1.0, "open")]
+    table = set_table(DATASET, completed, learned)
     rows = table.rows.to_dict("records")
     assert [(row["network"], row["learned"]) for row in rows] == [("default", 1), ("open", 0)]
 
 
 def test_work_is_told_in_core_hours_and_windows_per_second():
-    completed = {"StarIO": {0: trained(1.0), 1: trained(1.2)}}
+    completed = [trained(1.0, 0), trained(1.2, 1)]
     work = work_of([completed])
     assert work.loc["StarIO"].tolist() == [14400.0, 3600.0, 200.0]
     times = {"torch": {"1": 1.0, "64": 0.5}}

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import welch
+from scipy.signal import hilbert, welch
 
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
@@ -130,6 +130,28 @@ def _low_band(walk: Trajectory) -> float:
     return float(power[(f > 1.0) & (f < 3.0)].sum())
 
 
+_BLOW = Strike(1.0, 7.0, 0.3, (0.6, 90.0), 0.5, (0.3, 60.0), (0.2, 30.0), (0.4, -60.0), 0.0)
+
+
+def test_what_heel_strikes_excite_has_the_size_and_lead_that_were_measured():
+    time, one = np.arange(2000) / 200.0, np.ones(2000)
+    phase = 2.0 * np.pi * 1.8 * time
+    found = []
+    for seed in range(20):
+        gait = Gait(np.random.default_rng(seed), 200.0, phase, 1.8 * one, one, one, 1.75, 1.0)
+        ring = heel_strikes(gait, _BLOW)
+        rates = np.gradient(ring.turn_H, time, axis=0)
+        forces = np.gradient(np.gradient(ring.offset_H, time, axis=0), time, axis=0)
+        x, y, z, about_x, about_y, about_z = hilbert(np.hstack([forces, rates])[100:-100], axis=0).T
+        pairs = ((x, z), (about_x, y), (about_y, z), (about_z, y))
+        found.append([np.vdot(b, a) / np.vdot(b, b) for a, b in pairs])
+        assert np.std(z.real) == pytest.approx(1.0, rel=0.25)
+    mean = np.mean(found, axis=0)
+    np.testing.assert_allclose(np.degrees(np.angle(mean)), [90.0, 60.0, 30.0, -60.0], atol=15.0)
+    # Each harmonic strays, so that the coherent part is smaller than the whole.
+    assert ((np.abs(mean) > [0.35, 0.1, 0.1, 0.15]) & (np.abs(mean) < [0.6, 0.3, 0.2, 0.4])).all()
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_heel_strikes_and_surge_have_the_phases_of_people(seed):
     """The trunk is slowest where it is highest, and over the standing leg there; the device rings
@@ -143,7 +165,7 @@ def test_heel_strikes_and_surge_have_the_phases_of_people(seed):
     calm = trunk(replace(gait, rng=np.random.default_rng(seed), effort=0.3 * one), 2.0, 1.0)
     forward, side, up = calm.std(axis=0) / body.std(axis=0)
     assert up < 0.35 < 0.5 < min(forward, side) < 1.0
-    strike = heel_strikes(gait, Strike(1.0, 7.0, 0.3, 1.0, 0.5))
+    strike = heel_strikes(gait, _BLOW)
     ring = np.gradient(np.gradient(strike.offset_H[:, 2], time), time) ** 2
     after_strike = np.mod(phase - np.pi - 0.9, 2.0 * np.pi) < np.pi
     assert ring[after_strike].mean() > 2.0 * ring[~after_strike].mean()

@@ -11,30 +11,43 @@ import numpy as np
 import pytest
 from displacement_stub import Stub, horizontal_path, with_waypoints
 
-from stario.fusion.evaluation.benchmark.groups import (
+from stario.fusion.evaluation.figures import groups_figure, write_benchmark
+from stario.fusion.evaluation.groups import (
     POOLED,
     RATIOS,
     Benchmark,
+    By,
+    alone_on,
     benchmark,
-    benchmark_text,
     labels,
     verdict,
 )
-from stario.fusion.evaluation.figures import groups_figure, write_benchmark
 from stario.fusion.evaluation.scores import values
+from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 
 Makers = dict[str, Callable[[str], Any]]
+"""By the name of the weights, a function that makes the network for a group."""
 
 
 def judged(
-    recordings: Mapping[str, ImuSequence], models: Makers, groups: Mapping[str, str] | None = None
+    recordings: Mapping[str, ImuSequence],
+    models: Makers,
+    by: By = "set",
+    groups: Mapping[str, str] | None = None,
 ) -> Benchmark:
     paths = {Path(name): (groups or {}).get(name, "") for name in recordings}
-    found, skipped = benchmark(paths, models, lambda path: recordings[str(path)])
-    assert found is not None
-    assert skipped == []
-    return found
+    found = [
+        alone_on(
+            path,
+            paths,
+            lambda name, group: models[name](group),
+            models,
+            lambda path: recordings[str(path)],
+        )
+        for path in paths
+    ]
+    return benchmark(found, by, *models)
 
 
 def of_person(recording: ImuSequence, person: str) -> ImuSequence:
@@ -49,17 +62,17 @@ def pair(walk):
         "ours": lambda group: Stub(walk, scales[group]),
         "theirs": lambda group: Stub(walk, 0.8),
     }
-    return judged(recordings, models, {"one": "walks a", "two": "walks b"})
+    return judged(recordings, models, "person", {"one": "walks a", "two": "walks b"})
 
 
-def test_a_recording_that_cannot_be_used_is_skipped_and_a_wrong_truth_warned_of(stepping, caplog):
+def test_a_recording_without_truth_is_refused_and_a_wrong_truth_warned_of(stepping, caplog):
     mirrored = stepping.truth.position_W * [-1.0, 1.0, 1.0]
     wrong = replace(stepping, truth=replace(stepping.truth, position_W=mirrored))
-    recordings = {Path("wrong"): wrong, Path("blind"): stepping.without_truth()}
     models = {"ours": lambda group: Stub(stepping)}
-    _, skipped = benchmark(dict.fromkeys(recordings, ""), models, recordings.__getitem__)
-    assert [one.item for one in skipped] == ["blind"]
+    judged({"wrong": wrong}, models)
     assert "steps: truth: positions mirrored" in caplog.text
+    with pytest.raises(InputError, match="truth"):
+        judged({"blind": stepping.without_truth()}, models)
 
 
 def test_a_recording_with_two_waypoints_is_named_as_not_compared(walk, caplog):
@@ -81,13 +94,13 @@ def test_a_device_at_rest_counts_in_no_median_or_ratio(walk, caplog):
     models = {"ours": lambda group: Stub(walk), "theirs": lambda group: Stub(walk, 0.8)}
     found, walking = judged({"walk": walk, "rest": resting}, models), judged({"walk": walk}, models)
     assert "rest: not compared, because the ground truth moves by less" in caplog.text
-    both, alone = (part.rows("set", "ours", "theirs").iloc[-1] for part in (found, walking))
+    both, alone = (part.rows.iloc[-1] for part in (found, walking))
     assert str(both) == str(alone)  # some are NaN
     assert both["recordings"] == 1
 
 
 def test_rows_compare_weights_by_group_and_pooled(walk, pair):
-    rows = pair.rows("person", "ours", "theirs").set_index(["group", "weights"])
+    rows = pair.rows.set_index(["group", "weights"])
     assert list(rows.index.unique("group")) == ["a", "b", "all"]
     a, b, pooled = (rows.loc[name, "ours"] for name in ("a", "b", "all"))
     assert a["ratio_1s"].ratio == pytest.approx(0.25, rel=0.01)
@@ -107,7 +120,7 @@ def test_without_a_list_intervals_are_drawn_over_the_persons_of_an_archive(walk)
         "ours": lambda group: Stub(walk, by_group[group]),
         "theirs": lambda group: Stub(walk, 0.8),
     }
-    pooled = judged(recordings, models).rows("person", "ours", "theirs").iloc[-1]
+    pooled = judged(recordings, models, "person").rows.iloc[-1]
     # Persons have equal weights.
     assert pooled["ratio_1s"].ratio == pytest.approx(np.sqrt(0.25 * 0.5), rel=0.01)
 
@@ -119,14 +132,14 @@ def test_a_file_named_without_its_folder_belongs_to_the_set_of_that_folder(tmp_p
 
 def test_a_recording_without_errors_has_no_ratio(pair):
     """Of a device at rest, for example."""
-    perfect = replace(pair, blocks=pair.blocks.assign(squares=0.0))
-    assert perfect.rows("set", "ours", "theirs")[[*RATIOS]].isna().all(axis=None)
+    perfect = replace(pair, by="set", blocks=pair.blocks.assign(squares=0.0))
+    assert perfect.rows[[*RATIOS]].isna().all(axis=None)
 
 
 def test_a_benchmark_is_written_as_tables_and_figure(pair, tmp_path):
-    rows = pair.rows("set", "ours", "theirs")
-    assert "ratio over 10 s" in benchmark_text(rows, "ours", "theirs")
-    write_benchmark(tmp_path, pair, rows, "ours", "theirs")
+    found = replace(pair, by="set")
+    assert "ratio over 10 s" in found.text()
+    write_benchmark(tmp_path, found)
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"groups.csv", "recordings.csv", "groups.json", "groups.png"}
     with (tmp_path / "groups.csv").open() as file:
@@ -141,13 +154,11 @@ def test_a_benchmark_is_written_as_tables_and_figure(pair, tmp_path):
 def test_a_group_may_be_called_all(pair):
     named = pair.scores.assign(person=pair.scores["person"].replace("b", POOLED))
     found = replace(pair, scores=named)
-    rows = found.rows("person", "ours", "theirs")
-    ours = rows[rows["role"] == "ours"]
+    ours = found.rows[found.rows["role"] == "ours"]
     assert ours["group"].to_list() == ["a", "all", "all"]
     assert ours["pooled"].to_list() == [False, False, True]
-    assert verdict(rows).startswith("not decided, 2 groups")
-    assert len(groups_figure(rows, "ours", "theirs").axes[0].get_yticks()) == 3
+    assert verdict(found.rows).startswith("not decided, 2 groups")
+    assert len(groups_figure(found).axes[0].get_yticks()) == 3
     alone = replace(found, scores=named[named["person"] == POOLED])
-    rows = alone.rows("person", "ours", "theirs")
-    assert verdict(rows) == ""
-    assert len(groups_figure(rows, "ours", "theirs").axes[0].get_yticks()) == 1
+    assert verdict(alone.rows) == ""
+    assert len(groups_figure(alone).axes[0].get_yticks()) == 1

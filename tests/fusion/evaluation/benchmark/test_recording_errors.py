@@ -8,11 +8,11 @@ import pytest
 from displacement_stub import Stub, errors_of, horizontal_path, streams_of, with_waypoints
 from recorded import DATA
 
-from stario.fusion.evaluation.benchmark.displacement_error import (
+from stario.fusion.evaluation.displacement_error import (
     _AtTicks,
+    _Errors,
     _interpolated,
     _stretches,
-    _Sums,
     known_truth,
 )
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
@@ -150,7 +150,7 @@ def test_the_share_of_the_path_is_that_of_the_pieces_between_gaps(stepping):
 
 
 def test_stretches_at_rest_have_no_error_relative_to_their_path():
-    rng, sums = np.random.default_rng(0), _Sums()
+    rng, sums = np.random.default_rng(0), _Errors()
     track, truth = (0.01 * (rng.normal(size=100) + 1j * rng.normal(size=100)) for _ in range(2))
     breaks = np.zeros(100, dtype=np.int64)
     _stretches(_AtTicks(track, truth, breaks), sums)

@@ -63,7 +63,7 @@ def test_nees_of_a_quarter_of_an_hour_with_a_phone_is_within_its_bounds():
 
 def test_runs_are_determined_by_the_seed():
     first, again = (consistency(CONFIG, runs=2, seconds=5.0, seed=3) for _ in range(2))
-    assert "2 runs of 5 s" in consistency_text(first, 5.0)
+    assert "2 runs of 5 s" in consistency_text(summary(first, 5.0))
     assert first.equals(again)
     assert not first.equals(consistency(CONFIG, runs=2, seconds=5.0, seed=4))
 

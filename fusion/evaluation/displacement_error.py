@@ -9,24 +9,38 @@ world is unknown; how it is determined depends on the truth:
 - waypoints: the track is fitted to all waypoints in yaw and position.
 
 A displacement is compared only if the truth has neither gap nor jump between its ends.
+
+Windows overlap by half: each contributes the mean velocity over its second, and the velocity
+between two ticks of the track is the mean over the windows that cover them.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.benchmark.pieces import Piece
 from stario.fusion.imu.direction import Complex, Direction, direction, weighted_force
+from stario.fusion.imu.stateful import Predictor, StatefulInference
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.errors import InputError
+from stario.sequences.findings import warn
+from stario.sequences.inspection.checks import check_units
+from stario.sequences.inspection.constant_values import dead_axes
 from stario.sequences.legs import gaps_and_jumps
-from stario.sequences.levelled_stream import TICK_SECONDS, TICKS_PER_SECOND
+from stario.sequences.levelled_stream import (
+    TICK_SECONDS,
+    TICKS_PER_SECOND,
+    LevelledStream,
+    levelled_streams,
+)
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, PositionTrack, is_gap
+from stario.sequences.windows import WINDOW_SECONDS
 
 HORIZONS = (1, 10, 30)
 """Spans [s] over which displacements are compared."""
@@ -67,6 +81,64 @@ FIGURES = {
 
 _MIN_PATH_M = 1.0
 """Length of the true path [m] below which a recording is not compared."""
+
+
+UPDATES = round(WINDOW_SECONDS / TICK_SECONDS)
+"""Number of windows that begin within the length of one."""
+
+_BATCH = 128
+
+
+class Piece(NamedTuple):
+    """An unbroken stretch of a recording with the displacements of its M windows.
+
+    Attributes:
+        stream: IMU, levelled without the truth.
+        displacement_N: (M, 3) displacement over the second from tick m [m].
+        covariance_N: (M, 3, 3) covariance [m^2].
+    """
+
+    stream: LevelledStream
+    displacement_N: FloatArray
+    covariance_N: FloatArray
+
+    @property
+    def windows(self) -> Complex:
+        """Horizontal displacements (M,) [m]."""
+        return planar(self.displacement_N)
+
+    def track(self) -> Complex:
+        """Return the horizontal position (K,) [m] at the stream's ticks, 0 at the first."""
+        steps, cover = self.windows / UPDATES, np.ones(UPDATES)
+        total, count = np.convolve(steps, cover), np.convolve(np.ones(len(steps)), cover)
+        track = np.concatenate([[0.0], np.cumsum(total / count)])
+        return track[: len(self.stream.R_NB)]
+
+
+def usable_streams(sequence: ImuSequence) -> list[LevelledStream]:
+    """Return the unbroken stretches of a recording, levelled.
+
+    Raises:
+        InputError: there is no unbroken stretch of 2 s, or a unit is wrong.
+    """
+    check_units(sequence)
+    warn(sequence.name, dead_axes(sequence))
+    streams = levelled_streams(sequence)
+    if not streams:
+        raise InputError(f"{sequence.name}: samples", "no unbroken stretch", "one of 2 s")
+    return streams
+
+
+def predicted(model: Predictor, stream: LevelledStream) -> Piece:
+    """Return a stretch with the network's predictions, its memory cleared before."""
+    network = StatefulInference(model, UPDATES)
+    windows, heading = stream.windows(), stream.headings
+    parts = [
+        network.predict(windows[first : first + _BATCH], heading[first : first + _BATCH])
+        for first in range(0, len(windows), _BATCH)
+    ]
+    displacement, covariance = zip(*parts, strict=True)
+    return Piece(stream, np.concatenate(displacement), np.concatenate(covariance))
 
 
 class RecordingErrors(NamedTuple):
@@ -116,29 +188,24 @@ class _AtTicks(NamedTuple):
 
 
 @dataclass(eq=False)
-class _Sums:
-    """Sums over the pieces of a recording."""
+class _Errors:
+    """Squared errors by measure, and lengths [m] of truth and track, over a recording's pieces."""
 
-    squares: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    squares: dict[str, list[FloatArray]] = field(default_factory=lambda: defaultdict(list))
+    blocks: dict[str, list[FloatArray]] = field(default_factory=lambda: defaultdict(list))
     path: float = 0.0
     length: float = 0.0
-    blocks: dict[str, list[FloatArray]] = field(default_factory=dict)
 
     def add(self, measure: str, errors: FloatArray) -> None:
-        finite = errors[np.isfinite(errors)]
-        self.squares.setdefault(measure, []).append((float(np.sum(finite**2)), len(finite)))
+        self.squares[measure].append(errors[np.isfinite(errors)] ** 2)
+
+    def add_lengths(self, truth: Complex, track: Complex) -> None:
+        self.path += float(np.abs(truth).sum())
+        self.length += float(np.abs(track).sum())
 
     def rms(self, measure: str) -> float:
-        total, count = np.sum(self.squares.get(measure, [(0.0, 0.0)]), axis=0)
-        return float(np.sqrt(total / count)) if count else float("nan")
-
-    def add_blocks(self, measure: str, errors: FloatArray) -> None:
-        """Add errors (K,) by start tick, NaN where unknown."""
-        known = np.flatnonzero(np.isfinite(errors))
-        if len(known) >= _MIN_DISPLACEMENTS:
-            self.add(measure, errors)
-            sums = block_sums(np.asarray(TICK_SECONDS * known), errors[known] ** 2)
-            self.blocks.setdefault(measure, []).append(sums)
+        squares = np.concatenate([*self.squares[measure], []])
+        return float(np.sqrt(squares.mean())) if len(squares) else float("nan")
 
 
 def known_truth(sequence: ImuSequence) -> tuple[str, PositionTrack]:
@@ -164,36 +231,36 @@ def recording_errors(sequence: ImuSequence, pieces: Sequence[Piece]) -> Recordin
         InputError: as for `known_truth`.
     """
     kind, known = known_truth(sequence)
-    sums, paths, total_direction = _Sums(), [], Direction()
+    errors, paths, total_direction = _Errors(), [], Direction()
     for piece in pieces:
-        before = sums.path
+        before = errors.path
         if kind == "waypoints":
-            _waypoints(piece, known, sums)
+            _waypoints(piece, known, errors)
         else:
-            _positions(piece, known, sequence, sums)
-        paths.append(sums.path - before)
+            _positions(piece, known, sequence, errors)
+        paths.append(errors.path - before)
         weighted = weighted_force(piece.stream.windows())
         total_direction += direction(weighted, piece.displacement_N, TICKS_PER_SECOND)
-    if sums.path < _MIN_PATH_M:
+    if errors.path < _MIN_PATH_M:
         return RecordingErrors(0.0, dict.fromkeys(FIGURES, float("nan")), {})
-    fitted = sums.rms("fit")
-    usual_path = float(np.square(paths).sum()) / sums.path  # of a piece, weighted by their lengths
+    fitted = errors.rms("fit")
+    usual_path = float(np.square(paths).sum()) / errors.path  # of a piece, weighted by lengths
     figures = {
         "ate_fit_m": fitted,
         "ate_fit_percent": 100.0 * fitted / usual_path,
-        "ate_first_m": sums.rms("first"),
-        "length_ratio": sums.length / sums.path,
-        **{f"rms_{h}s_m": sums.rms(str(h)) for h in HORIZONS},
-        "stretch_percent": 100.0 * sums.rms("stretch"),
+        "ate_first_m": errors.rms("first"),
+        "length_ratio": errors.length / errors.path,
+        **{f"rms_{h}s_m": errors.rms(str(h)) for h in HORIZONS},
+        "stretch_percent": 100.0 * errors.rms("stretch"),
         "direction_deg": abs(np.degrees(total_direction.turn)),
-        "nis": sums.rms("nis") ** 2,
+        "nis": errors.rms("nis") ** 2,
         "nis_filtered": float("nan"),
     }
-    blocks = {name: np.concatenate(parts) for name, parts in sums.blocks.items()}
-    return RecordingErrors(sums.path, figures, blocks)
+    blocks = {name: np.concatenate(parts) for name, parts in errors.blocks.items()}
+    return RecordingErrors(errors.path, figures, blocks)
 
 
-def _positions(piece: Piece, known: PositionTrack, sequence: ImuSequence, sums: _Sums) -> None:
+def _positions(piece: Piece, known: PositionTrack, sequence: ImuSequence, errors: _Errors) -> None:
     """Add the errors at known positions; poses also tell the yaw at each tick."""
     track, poses = piece.track(), sequence.truth
     ticks = piece.stream.ticks[: len(track)]
@@ -210,14 +277,11 @@ def _positions(piece: Piece, known: PositionTrack, sequence: ImuSequence, sums: 
         yaw_WN = yaw_of(poses.at(ticks).attitude_WB * levelled.inv())
         turn = np.where(finite, np.exp(1j * yaw_WN), np.nan)
         turns = dict.fromkeys(HORIZONS, turn)
-        _whole_track(track[finite], at.truth[finite], turn[finite][0], sums)
-    _along_the_path(at, piece, turns, sums)
-
-
-def _whole_track(track: Complex, truth: Complex, turn: complex, sums: _Sums) -> None:
-    """Add the position errors after a fit in yaw and position, and after that of the first pose."""
-    sums.add("fit", np.abs(fit_yaw_and_position(track, truth) - truth))
-    sums.add("first", np.abs(truth[0] + turn * (track - track[0]) - truth))
+        track, truth = track[finite], at.truth[finite]
+        errors.add("fit", np.abs(fit_yaw_and_position(track, truth) - truth))
+        placed = truth[0] + turn[finite][0] * (track - track[0])
+        errors.add("first", np.abs(placed - truth))
+    _along_the_path(at, piece, turns, errors)
 
 
 def _interpolated(
@@ -233,35 +297,40 @@ def _interpolated(
     return np.where(inside, xy, complex(np.nan, np.nan)), breaks
 
 
-def _along_the_path(at: _AtTicks, piece: Piece, turns: Mapping[int, Complex], sums: _Sums) -> None:
+def _along_the_path(
+    at: _AtTicks, piece: Piece, turns: Mapping[int, Complex], errors: _Errors
+) -> None:
     """Add the errors over all horizons, given exp(i yaw) from N to W at each tick for each."""
-    _lengths(at, sums)
+    estimated, true, start = at.displacements(2)
+    legs = start % _LEG == 0
+    errors.add_lengths(true[legs], estimated[legs])
     for horizon in HORIZONS:
         estimated, true, start = at.displacements(horizon)
         turn = turns[horizon][start]
+        known = np.isfinite(turn)
         if horizon == 1:  # the windows themselves
             estimated = piece.windows[start]
-            known = np.isfinite(turn)
-            _nis(piece, start[known], np.conj(turn[known]) * true[known], sums)
-        errors = np.full(len(at.track), np.nan)
-        errors[start] = np.abs(turn * estimated - true)
-        sums.add_blocks(str(horizon), errors)
-    _stretches(at, sums)
+            _nis(piece, start[known], np.conj(turn[known]) * true[known], errors)
+        apart = np.abs(turn * estimated - true)[known]
+        if len(apart) >= _MIN_DISPLACEMENTS:
+            errors.add(str(horizon), apart)
+            seconds = np.asarray(TICK_SECONDS * start[known])
+            errors.blocks[str(horizon)].append(block_sums(seconds, apart**2))
+    _stretches(at, errors)
 
 
-def _waypoints(piece: Piece, known: PositionTrack, sums: _Sums) -> None:
+def _waypoints(piece: Piece, known: PositionTrack, errors: _Errors) -> None:
     track = piece.track()
     ticks = piece.stream.ticks[: len(track)]
     inside = (known.time >= ticks[0]) & (known.time <= ticks[-1])
-    time, truth = known.time[inside], known.position_W[inside, 0] + 1j * known.position_W[inside, 1]
+    time, truth = known.time[inside], planar(known.position_W[inside])
     if len(time) < 3:
         return
     estimated = np.interp(time, ticks, track.real) + 1j * np.interp(time, ticks, track.imag)
-    errors = np.abs(fit_yaw_and_position(estimated, truth) - truth)
-    sums.add("fit", errors)
-    sums.path += float(np.abs(np.diff(truth)).sum())
-    sums.length += float(np.abs(np.diff(estimated)).sum())
-    sums.blocks.setdefault("10", []).append(block_sums(time - ticks[0], errors**2))
+    residuals = np.abs(fit_yaw_and_position(estimated, truth) - truth)
+    errors.add("fit", residuals)
+    errors.add_lengths(np.diff(truth), np.diff(estimated))
+    errors.blocks["10"].append(block_sums(time - ticks[0], residuals**2))
 
 
 def block_sums(seconds: FloatArray, squares: FloatArray) -> FloatArray:
@@ -271,6 +340,11 @@ def block_sums(seconds: FloatArray, squares: FloatArray) -> FloatArray:
     return np.asarray(rows[rows[:, 1] > 0])
 
 
+def planar(position: NDArray[np.floating[Any]]) -> Complex:
+    """Return horizontal positions x + iy (n,) of positions (n, 2 or 3)."""
+    return np.asarray(position[:, 0] + 1j * position[:, 1])
+
+
 def fit_yaw_and_position(track: Complex, truth: Complex) -> Complex:
     """Fit a track (n,) to the truth (n,) by least squares in yaw and position."""
     centre, target = track.mean(), truth.mean()
@@ -278,14 +352,7 @@ def fit_yaw_and_position(track: Complex, truth: Complex) -> Complex:
     return np.asarray(target + np.exp(1j * np.angle(turn)) * (track - centre))
 
 
-def _lengths(at: _AtTicks, sums: _Sums) -> None:
-    estimated, true, start = at.displacements(2)
-    legs = start % _LEG == 0
-    sums.path += float(np.abs(true[legs]).sum())
-    sums.length += float(np.abs(estimated[legs]).sum())
-
-
-def _stretches(at: _AtTicks, sums: _Sums) -> None:
+def _stretches(at: _AtTicks, errors: _Errors) -> None:
     """Add position errors relative to the path [1] after fitting each half-overlapping stretch."""
     span = round(STRETCH_SECONDS / TICK_SECONDS)
     unbroken = at.unbroken(span)
@@ -293,16 +360,14 @@ def _stretches(at: _AtTicks, sums: _Sums) -> None:
         part = slice(start, start + span + 1)
         track, truth = at.track[part], at.truth[part]
         path = float(np.abs(np.diff(truth[::_LEG])).sum())
-        if path < 5.0:  # stationary: there is no path to relate errors to
-            continue
-        errors = np.abs(fit_yaw_and_position(track, truth) - truth)
-        sums.add("stretch", errors / path)
+        if path >= 5.0:  # else stationary: there is no path to relate errors to
+            errors.add("stretch", np.abs(fit_yaw_and_position(track, truth) - truth) / path)
 
 
-def _nis(piece: Piece, start: np.ndarray, true_N: Complex, sums: _Sums) -> None:
+def _nis(piece: Piece, start: np.ndarray, true_N: Complex, errors: _Errors) -> None:
     """Add the NIS of the horizontal error, scaled from two axes to three."""
     error = piece.windows[start] - true_N
     vector = np.stack([error.real, error.imag], axis=1)
     covariance = piece.covariance_N[start, :2, :2]
     nis = np.einsum("ni,ni->n", vector, np.linalg.solve(covariance, vector[..., None])[..., 0])
-    sums.add("nis", np.sqrt(1.5 * nis))
+    errors.add("nis", np.sqrt(1.5 * nis))

@@ -1,1 +1,0 @@
-"""Benchmark of networks alone, by groups of recordings."""

@@ -1,0 +1,264 @@
+"""Benchmark of networks alone by groups of recordings: sets, people, devices, places.
+
+`displacement_error` defines the errors, `stario.fusion.evaluation.bootstrap` the confidence
+intervals.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import pandas as pd
+
+from stario.fusion.evaluation import bootstrap
+from stario.fusion.evaluation.bootstrap import Interval, block_rows, paired_ratio
+from stario.fusion.evaluation.displacement_error import (
+    FIGURES,
+    HORIZONS,
+    known_truth,
+    recording_errors,
+    usable_streams,
+)
+from stario.fusion.evaluation.pedestrian import Model, PedestrianDeadReckoning, piece_of
+from stario.fusion.evaluation.scores import joined, parts, records, scored, values, wide
+from stario.fusion.navigator import Navigator
+from stario.sequences.drawing.text_table import aligned, figure
+from stario.sequences.readers.archive import split_name
+from stario.sequences.sequence import ImuSequence
+from stario.sequences.truth.problems import warn_of_truth
+
+log = logging.getLogger(__name__)
+
+By = Literal["set", "group", "person", "device", "place", "carry"]
+
+POOLED = "all"
+"""Name of the row over all sets, equally weighted; a group may have this name, too."""
+
+_UNKNOWN = "unknown"
+"""Label of a recording whose person, device, place or carry is not known."""
+
+_NOT_COMPARED = (
+    "not compared, because the ground truth moves by less than a metre, or has neither 2 s of "
+    "known positions nor three waypoints within an unbroken stretch of samples"
+)
+
+RATIOS = {f"ratio_{horizon}s": f"rms_{horizon}s_m" for horizon in HORIZONS}
+"""Ratios of errors, and the figure that each is of."""
+
+_DECISIVE = "ratio_10s"
+_MAX_GROUP_RATIO, _MIN_GROUPS = 1.1, 3
+"""Largest acceptable ratio of a group, and minimum number of groups for a verdict: intervals from
+fewer do not generalise to others."""
+
+WORDS: dict[str, str] = {
+    **FIGURES,
+    "medians": "over the recordings of a group",
+    "ratio": "root mean square errors, ours over theirs: geometric mean over groups (for all sets, "
+    f"over sets); [{bootstrap.CONFIDENCE:.0%} interval] of {bootstrap.REPLICATES} bootstrap "
+    "replicates that draw groups, recordings and blocks of 30 s; for waypoints, their residuals "
+    "replace the 10 s errors",
+}
+"""Meaning of each figure."""
+
+_TITLES = {
+    "ate_fit_m": ("fit [m]", ".2f"),
+    "ate_fit_percent": ("fit [%]", ".2f"),
+    "ate_first_m": ("first [m]", ".2f"),
+    "stretch_percent": ("20 s [%]", ".2f"),
+    "length_ratio": ("length", ".3f"),
+    "rms_1s_m": ("1 s [m]", ".3f"),
+    "rms_10s_m": ("10 s [m]", ".2f"),
+    "rms_30s_m": ("30 s [m]", ".2f"),
+    "direction_deg": ("direction [deg]", ".0f"),
+    "nis": ("NIS", ".2f"),
+    "nis_filtered": ("filtered NIS", ".2f"),
+}
+"""Titles and formats of the figures of a benchmark."""
+
+
+_NO_BLOCKS = block_rows([], set="", group="", recording="", network="", seed=0, metric="")
+
+
+@dataclass(frozen=True, eq=False)
+class Benchmark:
+    """Networks compared by groups of recordings.
+
+    Attributes:
+        scores: `path_m` and `FIGURES` of each recording, named by its path, with its set, person,
+            device, place and carry, and the kind of its `truth`; the weights are the tracks.
+        blocks: blocks of squared errors of each recording and horizon.
+        by: label that recordings are grouped by.
+        ours: the weights.
+        theirs: those that they are compared with, if any.
+    """
+
+    scores: pd.DataFrame
+    blocks: pd.DataFrame
+    by: By
+    ours: str
+    theirs: str | None
+
+    @cached_property
+    def rows(self) -> pd.DataFrame:
+        """Rows "theirs", if any, and "ours" (`role`) of each `group`; then over all groups.
+
+        The other columns are the `weights`; the medians of `FIGURES` over recordings; the number of
+        `recordings` compared, without those with fewer than three waypoints; the length `path_km`
+        of their true paths; whether the row is `pooled` over all groups, if there are several; and
+        in those of ours the `RATIOS` of errors to theirs, as `Interval`s where there are any. For
+        waypoints, the residuals replace the 10 s errors.
+        """
+        found = parts(wide(self.scores), self.by, POOLED)
+        return pd.DataFrame(
+            row
+            for k, (name, part) in enumerate(found)
+            for row in self._rows(name, part, 0 < k == len(found) - 1)
+        )
+
+    def _rows(self, name: str, part: pd.DataFrame, pooled: bool) -> list[dict[str, Any]]:
+        medians = part.groupby("track")[[*FIGURES]].median().to_dict("index")
+        blocks = self.blocks[self.blocks["recording"].isin(part["recording"])]
+        ratios = {
+            key: self.theirs
+            and paired_ratio(blocks[blocks["metric"] == metric], self.ours, self.theirs)
+            for key, metric in RATIOS.items()
+        }
+        paths = part.loc[part["track"] == self.ours, "path_m"]
+        known = {"recordings": int((paths > 0.0).sum()), "path_km": paths.sum() / 1e3}
+        return [
+            {"group": name, "pooled": pooled, "role": role, "weights": weights}
+            | known
+            | medians[weights]
+            | (ratios if role == "ours" else dict.fromkeys(RATIOS))
+            for role, weights in (("theirs", self.theirs), ("ours", self.ours))
+            if weights
+        ]
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the result as plain values, including the recordings."""
+        return {
+            "ours": self.ours,
+            "theirs": self.theirs,
+            "verdict": verdict(self.rows),
+            "groups": self.rows.to_dict("records"),
+            "recordings": records(self.scores.rename(columns={"track": "weights"})),
+            "words": WORDS,
+        }
+
+    def text(self) -> str:
+        """Return for every group rows "theirs" and "ours", the ratios, the verdict, the words."""
+        rows = self.rows.to_dict("records")
+        cells = [["", "", "n", "km", *(title for title, _ in _TITLES.values())]]
+        for row in rows:
+            known = [row["group"], row["role"], str(row["recordings"]), f"{row['path_km']:.2f}"]
+            cells.append([*known, *(figure(row[key], form) for key, (_, form) in _TITLES.items())])
+        head, *body = aligned(cells)
+        lines = [head]
+        for line, row in zip(body, rows, strict=True):
+            lines.append(line)
+            for key, metric in RATIOS.items():
+                if isinstance(row[key], Interval):
+                    title = _TITLES[metric][0].split(" [")[0]
+                    lines.append(f"{row['group']}: ratio over {title}: {row[key]:.3f}")
+        lines += [conclusion] if (conclusion := verdict(self.rows)) else []
+        lines += [f"ours: {self.ours}", *([f"theirs: {self.theirs}"] if self.theirs else [])]
+        return "\n".join([*lines, *(f"{key}: {words}." for key, words in WORDS.items())])
+
+
+def verdict(rows: pd.DataFrame) -> str:
+    """Return the verdict on replacing the weights compared with; empty without several groups.
+
+    Weights are accepted if the pooled interval is below 1 and no group is worse by over a
+    tenth.
+    """
+    compared = [r for r in rows.to_dict("records") if isinstance(r[_DECISIVE], Interval)]
+    ratios = {str(r["group"]): r[_DECISIVE] for r in compared if not r["pooled"]}
+    pooled = next((r[_DECISIVE] for r in compared if r["pooled"]), None)
+    if pooled is None:
+        return ""
+    if len(ratios) < _MIN_GROUPS:
+        return f"not decided, {len(ratios)} groups are too few: pooled {pooled:.3f} over 10 s"
+    worst = max(ratios, key=lambda name: ratios[name].ratio)
+    accepted = pooled.high < 1.0 and ratios[worst].ratio <= _MAX_GROUP_RATIO
+    words = f"pooled {pooled:.3f} over 10 s, worst {worst} {ratios[worst]:.3f}"
+    return f"{'accepted' if accepted else 'not accepted'}: {words}"
+
+
+def alone_on(
+    path: Path,
+    groups: Mapping[Path, str],
+    model: Callable[[str, str], Model],
+    weights: Collection[str],
+    read: Callable[[Path], ImuSequence],
+    filtered: bool = False,
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Score networks alone on a recording; return rows of a benchmark's scores and of its blocks.
+
+    Args:
+        path: path of the recording.
+        groups: group of each recording, by path; empty for the name of the set.
+        model: function that returns the network by the name of its weights for a group: networks
+            differ between groups if each group was held out of training in turn.
+        weights: names of the weights.
+        read: function that reads a path.
+        filtered: whether the filter is run for its mean NIS, which is slow.
+    """
+    sequence = read(path)
+    streams, (kind, _) = usable_streams(sequence), known_truth(sequence)
+    warn_of_truth(sequence)
+    named = labels(path, sequence.attributes, groups[path])
+    group, others = named["group"], {key: n for key, n in named.items() if key != "group"}
+    unit = {"set": named["set"], "group": group, "recording": str(path)}
+    figures, blocks = {}, [_NO_BLOCKS]
+    for name in weights:
+        network = model(name, group)
+        errors = recording_errors(sequence, [piece_of(network, stream) for stream in streams])
+        if filtered and not isinstance(network, PedestrianDeadReckoning):
+            nis = Navigator(network, backend="ekf").run(sequence).nis
+            errors.figures["nis_filtered"] = nis or np.nan
+        figures[name] = {"path_m": errors.path_m, **errors.figures}
+        for horizon, sums in errors.blocks.items():
+            metric = f"rms_{horizon}s_m"
+            blocks.append(block_rows(sums, **unit, network=name, seed=0, metric=metric))
+    return scored(str(path), figures, group, **others, truth=kind), joined(blocks)
+
+
+def benchmark(
+    found: Sequence[tuple[pd.DataFrame, pd.DataFrame]], by: By, ours: str, theirs: str | None = None
+) -> Benchmark:
+    """Return the benchmark of the recordings that `alone_on` scored; at least one."""
+    scores, blocks = zip(*found, strict=True)
+    _warn_of_not_compared(scores)
+    return Benchmark(joined(scores), joined(blocks), by, ours, theirs)
+
+
+def _warn_of_not_compared(scores: Sequence[pd.DataFrame]) -> None:
+    """Log one warning about all recordings in which nothing could be compared."""
+    still = [part["recording"].iloc[0] for part in scores if not values(part, "path_m").any()]
+    if len(still) > 1:
+        message = "%d of %d recordings, the first %s: %s"
+        log.warning(message, len(still), len(scores), still[0], _NOT_COMPARED)
+    elif still:
+        log.warning("%s: %s", still[0], _NOT_COMPARED)
+
+
+def labels(path: Path, attributes: Mapping[str, object], group: str = "") -> dict[str, str]:
+    """Return the labels that a recording can be grouped by, given its group in a list, if any.
+
+    Its set is the first word of its group, or else the name of its archive or folder. OxIOD names
+    folders by the form of their data: `syn` counts as `oxiod`. Without a list, a group is all of
+    one person in a set, where the person is known: intervals tell how persons differ.
+    """
+    file, member = split_name(path)
+    above = file.absolute().parent.name
+    folder = "oxiod" if above == "syn" else above
+    set_name = group.split(" ")[0] if group else file.stem if member else folder
+    known = {key: str(attributes.get(key) or _UNKNOWN) for key in get_args(By)[2:]}
+    of_person = set_name if known["person"] == _UNKNOWN else f"{set_name} {known['person']}"
+    return {"set": set_name, "group": group or of_person, **known}
