@@ -142,7 +142,7 @@ def _noise_of(interval: ImuInterval, accel_factor: float, config: NavigatorConfi
     """
     rate = rms(interval.gyro) * math.sqrt(interval.duration)
     steps = round(rate / _RATE_STEP) if config.noise.gyro_scale else 0
-    if config.filter.adaptive:
+    if config.filter.adaptive and config.noise.accel_noise:
         change = np.diff(interval.accel, axis=0) * np.diff(interval.table[:, 0])[:, None]
         assumed = 3.0 * interval.duration * (accel_factor * config.noise.accel_noise) ** 2
         accel_factor *= in_steps(math.sqrt(1.0 + float(np.vdot(change, change)) / assumed))
