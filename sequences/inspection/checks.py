@@ -61,9 +61,10 @@ _FORCE_RANGE = (6.4, 12.5)
 """Average force of a recording in g and in m/s^2. Sensors are off by a few percent; in the hand of
 a runner they saturate, and the average is as low as 7.4 m/s^2."""
 
-_SUSTAINED_RAD_S, _UNDECIDED = 3.0, 0.005
+_SUSTAINED_RAD_S, _UNDECIDED, _ABOUT_UP = 3.0, 0.005, 0.8
 """Rate that a twentieth of the samples exceed above which the unit is asked for, if the average
-force in both units differs by less than this share of it: the device turns about the vertical."""
+force in both units differs by less than this share of it and at least this share of the rate's
+square is about the force: the device turns about the vertical."""
 
 _DOWNWARD = -0.9
 """Cosine between z and the mean force below which a device lies face down, or the sign is wrong."""
@@ -218,7 +219,7 @@ def check_gyro(
         found += " that contradict the accelerometer"
     elif speed <= FAST_RAD_S:
         undecided = abs(force - in_degrees - lost) < _UNDECIDED * force
-        if speed > _SUSTAINED_RAD_S and undecided and fix != _UNIT_NAMED:
+        if speed > _SUSTAINED_RAD_S and undecided and fix != _UNIT_NAMED and _upright(gyro, accel):
             text = (
                 f"gyroscope: found rotations of {speed:.3g} rad/s, all about the vertical, of "
                 "which the accelerometer tells nothing"
@@ -231,6 +232,13 @@ def check_gyro(
     elif fix != _UNIT_NAMED and speed * GYRO_UNITS["deg/s"] > FAST_RAD_S:
         fix = "these are neither rad/s nor deg/s: convert a sensor's counts to one of the two"
     raise InputError(f"{name}: gyroscope", found, "rad/s", fix)
+
+
+def _upright(gyro: FloatArray, accel: FloatArray) -> bool:
+    """Return whether a device turns about the vertical, as which the force (N, 3) counts."""
+    up = accel / np.linalg.norm(accel, axis=1, keepdims=True)
+    about_up = np.sum(np.sum(gyro * up, axis=1) ** 2)
+    return bool(about_up > _ABOUT_UP * np.sum(gyro**2))
 
 
 def _check_swapped(

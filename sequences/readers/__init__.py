@@ -227,20 +227,18 @@ def _with_attributes(found: list[Path], where: AttributeFilter | None) -> list[P
     if not where or not found:
         return found
     chosen: list[Path] = []
-    errors: list[ReadError] = []
+    first: ReadError | None = None
     for file in dict.fromkeys(file for file, name in map(split_name, found) if name):
         try:
             matching = set(archive_members(file, where))
             chosen += [path for path in found if path in matching]
         except ReadError as error:
-            errors.append(error)
-    if errors and not chosen:
-        raise errors[0]
-    if not chosen:
-        field = f"recordings with {filter_words(where)}"
-        fix = "only recordings in archives have attributes"
-        raise ReadError(found[0], field, "none", "at least one", fix)
-    return chosen
+            first = first or error
+    if chosen:
+        return chosen
+    field = f"recordings with {filter_words(where)}"
+    fix = "only recordings in archives have attributes"
+    raise first or ReadError(found[0], field, "none", "at least one", fix)
 
 
 def _below(path: Path) -> list[Path]:

@@ -203,21 +203,14 @@ def ends_within_a_row(path: Path, delimiter: str | None) -> bool:
     """
     try:
         with opened(path) as file:
-            start = max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES)
-            file.seek(start)
-            tail = file.read()
-            if tail.endswith(b"\0"):  # a loss of power leaves any number of them
-                file.seek(0)
-                text = file.read().rstrip(b"\0")
-                start = max(0, len(text) - _TAIL_BYTES)
-                tail = text[start:]
-            tail = tail.replace(b"\0", b"")  # as in UTF-16
+            text = file.read().replace(b"\0", b"")  # of UTF-16, or left by a loss of power
     except OSError:
         return False
-    if tail.endswith((b"\n", b"\r")):
+    if text.endswith((b"\n", b"\r")):
         return False
-    rows = [row.split(delimiter) for row in tail.decode("latin-1").splitlines() if is_row(row)]
-    *earlier, last = rows[1:] if start else rows or [[]]
+    tail = text[-_TAIL_BYTES:].decode("latin-1")
+    rows = [row.split(delimiter) for row in tail.splitlines() if is_row(row)]
+    *earlier, last = rows[1:] if len(text) > _TAIL_BYTES else rows or [[]]
     if len(earlier) < 2:
         return False
     ends = [cells[-1].strip(' "') for cells in earlier]

@@ -153,7 +153,7 @@ def test_rotation_during_an_imu_gap_is_not_a_flip(gap, flips):
     aligned = align_tracked_body(
         imu.time[kept], imu.gyro[kept], imu.accel[kept], truth.time, attitude_WV, seen
     )
-    assert len(aligned.mounts) == 2 + flips
+    assert len(aligned.mounts) - flips in (1, 2)  # a gap may begin anew; a flip has to
     error = (truth.attitude_WB.inv() * aligned.attitude_WB)[seen].magnitude()
     assert np.degrees(np.median(error[truth.time[seen] > gap[1]])) < 1.5
     assert np.degrees(np.median(error[truth.time[seen] < gap[0]])) < 1.5

@@ -84,7 +84,7 @@ def test_a_gap_in_the_imu_is_not_a_jump_of_the_truth(walk):
 
 
 def test_another_recordings_truth_does_not_agree(walk):
-    other = simulate_imu(generate_walk(99, 40.0, style=WalkStyle(carry="pocket")), 200.0)
+    other = simulate_imu(generate_walk(97, 40.0, style=WalkStyle(carry="pocket")), 200.0)
     fit = fit_truth(replace(walk, truth=other.truth))
     assert fit.correlation < 0.7
     assert fit.axes() is None
