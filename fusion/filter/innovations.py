@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from stario.fusion.config import FilterConfig
 from stario.fusion.filter.kalman import UpdateResult
+from stario.fusion.imu.preintegration import in_steps
 from stario.fusion.state import changed
 
 GAIN, FIRST_GAIN = 0.05, 0.2
@@ -29,9 +30,6 @@ seconds, so consistent innovations are smaller than single errors."""
 
 MAX_FACTOR = 15.0
 """Maximum noise factor: the accelerometer then rules out little more than jumps."""
-
-_STEPS = 4
-"""Number of noise factors per doubling, so that few different noise models are created."""
 
 _SHARE_SECONDS = 20.0
 """Time over which the share of outliers is averaged [s]."""
@@ -56,7 +54,7 @@ class InnovationStatistics:
     @property
     def accel_factor(self) -> float:
         """Factor by which the accelerometer is noisier than configured, in steps."""
-        return float(2.0 ** (round(_STEPS * self.log_accel_factor / math.log(2.0)) / _STEPS))
+        return in_steps(math.exp(self.log_accel_factor))
 
     @property
     def error_level(self) -> float:

@@ -6,14 +6,14 @@ update's own chi-square test.
 
 Zero velocity is measured in the estimated axes, so it contains no information about yaw. The mean
 rate in the middle of the still second measures the gyroscope's bias; both halves of the second are
-at rest, so the onset of motion is not mistaken for bias. A turn too slow to be distinguished from
-bias makes the means of the second's parts differ; their variance is taken as that of the
-measurement, for the whole second.
+at rest, so the onset of motion is not mistaken for bias. A person who stands sways slowly, which a
+second hardly shows: what a whole rest tells about the bias is bounded by the angle of that sway.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -32,13 +32,12 @@ from stario.sequences.windows import WINDOW_SECONDS
 _HIDDEN_MOTION_NOISE = 10.0 * PHONE_NOISE.accel_noise
 """Ten times a phone's white noise: slow motion of a device that only looks still [m/s^1.5]."""
 
-_SWAY = 10.0
-"""Variance of a person's sway about its mean over a second, relative to the variance within it: who
-stands turns the device at 1 to 2 deg/s, of which a second shows a third."""
+_SWAY_SECONDS = 10.0
+"""Time for which a person's sway may go on in one direction [s]."""
 
-_SWAY_RATE = 0.02
-"""Standard deviation of a person's sway in a second that looks still [rad/s]. It falls with the
-square of the rest's duration: between two sways a second may look still, several do not."""
+_EVEN_RATE = 0.02
+"""Standard deviation of an even turn that shows no unrest in its first second [rad/s]. It falls
+with the square of the rest's duration: nobody turns evenly for long."""
 
 _H_VELOCITY = np.eye(6, 3)
 _H_BIAS = np.eye(6, 3, k=-3)
@@ -50,8 +49,8 @@ class ZeroVelocity(NamedTuple):
     b_g: FloatArray
     """(3,) mean rate [rad/s]."""
     covariance: FloatArray
-    """(6, 6) of velocity [m^2/s^2] and rate [rad^2/s^2]; widened, since every interval applies a
-    measurement of the whole last second."""
+    """(6, 6) of velocity [m^2/s^2] and rate [rad^2/s^2]. The velocity's is widened, since every
+    interval applies a measurement of the whole last second."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,10 +61,12 @@ class Stillness:
         window: for each interval of the last second (14,): number of samples, seconds, sums of gyro
             and accel, sums of their squares; None if it moves more than a still second may.
         rested: number of intervals for which it has been still without interruption.
+        rates: (2, 3) sums over them of the last second's mean rate, and of its square.
     """
 
     window: tuple[FloatArray | None, ...] = ()
     rested: int = 0
+    rates: FloatArray = field(default_factory=lambda: np.zeros((2, 3)))
 
     def after(self, interval: ImuInterval, f: FilterConfig) -> Stillness:
         """Return it after one more interval."""
@@ -75,26 +76,41 @@ class Stillness:
         sums = None if _moves(interval, intervals, f.stillness_noise) else _sums_of(interval)
         window = (*self.window, sums)[-intervals:]
         calm = [sums for sums in window if sums is not None]
-        still = len(calm) == intervals and _is_quiet(np.sum(calm, axis=0), f.stillness_noise)
-        return Stillness(window, self.rested + 1 if still else 0)
+        if len(calm) < intervals or not _is_quiet(np.sum(calm, axis=0), f.stillness_noise):
+            return Stillness(window)
+        mean = _mean_rates(calm).mean(axis=0)
+        return Stillness(window, self.rested + 1, self.rates + np.array((mean, mean**2)))
 
     def measurement(self) -> ZeroVelocity:
         """Return the measurement of a still second.
 
         The velocity's uncertainty is what white noise of a phone's accelerometer can hide over the
         second: nothing moves, so the filter's own density, which covers motion, does not apply.
+
+        Who stands sways slowly, at rates r that go on in one direction for s seconds. T seconds of
+        rest show the part 1 / (1 + 12 s^2 / T^2) of their variance, and their mean is off by up to
+        2 r s / T. Rates weighted in proportion to the time since the rest began, as by variances
+        2 r^2 s^2 / (T dt), are that precise and claim no more.
         """
-        table = np.array(self.window)
-        rates = table[:, 2:5] / table[:, :1]
-        n = len(rates)
-        hidden_variance = _HIDDEN_MOTION_NOISE**2 * WINDOW_SECONDS
-        white_variance = PHONE_NOISE.gyro_noise**2 / float(table[:, 1].mean())
-        excess = max(float(rates.var(axis=0).sum()) - 3.0 * white_variance, 0.0)
-        seconds = 1.0 + (self.rested - 1) / n
-        swaying = (_SWAY_RATE / seconds) ** 2
-        rate_variance = np.full(3, white_variance + _SWAY * excess + swaying)
-        variances = [*[n * hidden_variance] * 3, *(n * rate_variance)]
-        return ZeroVelocity(rates[n // 2], np.diag(variances))
+        rates = _mean_rates(self.window)
+        hidden_variance = len(rates) * _HIDDEN_MOTION_NOISE**2 * WINDOW_SECONDS
+        dt = WINDOW_SECONDS / len(rates)
+        rested = WINDOW_SECONDS + (self.rested - 1) * dt
+        mean, mean_square = self.rates / self.rested
+        white_variance = PHONE_NOISE.gyro_noise**2 / WINDOW_SECONDS
+        varied = max(float((mean_square - mean**2).sum()) - 3.0 * white_variance, 0.0)
+        ratio = (_SWAY_SECONDS / rested) ** 2
+        sway = 2.0 * rested * ratio * varied * (1.0 + 12.0 * ratio)
+        per_second = sway + (_EVEN_RATE / rested) ** 2
+        rate_variance = (white_variance + per_second) / dt
+        variances = [*[hidden_variance] * 3, *[rate_variance] * 3]
+        return ZeroVelocity(rates[len(rates) // 2], np.diag(variances))
+
+
+def _mean_rates(window: Sequence[FloatArray | None]) -> FloatArray:
+    """Return the mean rates (n, 3) of a still second's intervals [rad/s]."""
+    table = np.array(window)
+    return np.asarray(table[:, 2:5] / table[:, :1])
 
 
 def _moves(interval: ImuInterval, intervals: int, scale: float) -> bool:

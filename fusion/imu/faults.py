@@ -2,7 +2,8 @@
 
 Clock: single late samples are dropped, and so is a burst in the wrong order. Late samples that
 advance among themselves for seconds come from another clock, and how much time has passed between
-the two is unknown.
+the two is unknown. If they catch up with the newest sample before, the clock was set back by less:
+the motion meanwhile is unknown, a gap. What was logged twice repeats that newest sample.
 
 Stopped sensors: no real sensor repeats its numbers for long, since noise changes the last digits.
 Six numbers that repeat for a tenth of a second come from sensors that have stopped, unless the
@@ -33,6 +34,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.inspection.constant_values import shaken, tilting
 from stario.sequences.sequence import BoolArray, FloatArray
 from stario.sequences.spikes import replace_spikes
+from stario.sequences.time_order import MAX_IMU_GAP
 
 SET_BACK_SECONDS = 5.0
 """Late samples that advance for this long in a row [s] come from a clock that was set back; batches
@@ -63,8 +65,18 @@ class ClockSetBackDetector:
         self._first = self._last = 0.0
         self._running = False
 
-    def on_time(self) -> None:
-        """Note that a sample was not late."""
+    def on_time(self, time: float) -> float:
+        """Note that a sample at `time` [s] was not late.
+
+        Returns:
+            Time of the first of the late samples that it continues [s]; infinity if there are none.
+        """
+        continued = self._running and time - self._last <= MAX_IMU_GAP
+        self._running = False
+        return self._first if continued else math.inf
+
+    def logged_twice(self) -> None:
+        """Note that the late samples repeat earlier ones."""
         self._running = False
 
     def note_late(self, time: float, newest: float) -> float:

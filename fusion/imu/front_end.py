@@ -115,6 +115,8 @@ class FrontEnd:
             newest = self._unconfirmed[-1][0]
         if time == newest:
             self.counts.duplicate += 1
+            if self._samples and sample == self._samples[-1]:
+                self._clock.logged_twice()
             self._check_time_advances(time)
         elif time < newest:
             self.counts.out_of_order += 1
@@ -163,15 +165,15 @@ class FrontEnd:
 
     def _accept(self, sample: Sample) -> list[ImuInterval]:
         time = sample[0]
-        self._clock.on_time()
-        before, self.newest = self.newest, time
+        # On a clock that was set back, the sample before has the time of the first late one.
+        before, self.newest = min(self.newest, self._clock.on_time(time)), time
         self.counts.used += 1
         if self._samples and time - before > _HOLE_SECONDS:
             self._hole = before, time
             if time - before > MAX_IMU_GAP:
                 self.counts.add_gap(before, time - before)
             if time - before > BRIDGED:
-                return self._span_gap(sample)
+                return self._span_gap(before, sample)
         self._samples.append(sample)
         if time < self._next:
             return []
@@ -222,8 +224,8 @@ class FrontEnd:
             remedy = "give times in s with 64 bits"
             raise InputError("time", found, "a time that advances", remedy)
 
-    def _span_gap(self, sample: Sample) -> list[ImuInterval]:
-        """End the current interval; `_begin` spans the gap with one of its own."""
+    def _span_gap(self, start: float, sample: Sample) -> list[ImuInterval]:
+        """End the current interval; `_begin` spans the gap since `start` with one of its own."""
         before = self._samples
         self._samples = [sample]
         self._check_time_unit()
@@ -233,7 +235,7 @@ class FrontEnd:
             return []
         table = np.array(before)
         flags = self._flag_outliers(table) if len(before) > 1 else NO_FLAGS
-        self._before_gap = tuple(table[-1].tolist())
+        self._before_gap = (start, *table[-1, 1:].tolist())
         if len(before) == 1:
             return []
         self._attitude.advance(table[:, 0], table[:, 1:4], table[:, 4:])

@@ -134,14 +134,24 @@ def segment_of(
 
 
 def _noise_of(interval: ImuInterval, accel_factor: float, config: NavigatorConfig) -> ImuNoise:
-    """Return the white noise of an interval, which grows with its rate.
+    """Return the white noise of an interval, which grows with its rate and with its impacts.
 
     A rotation that is off by `gyro_scale` of what was turned over a duration t is that of white
-    noise with density gyro_scale * rate * sqrt(t).
+    noise with density gyro_scale * rate * sqrt(t). An impact is shorter than a step between
+    samples: the force's mean over a step is as uncertain as the force changes in it.
     """
     rate = rms(interval.gyro) * math.sqrt(interval.duration)
     steps = round(rate / _RATE_STEP) if config.noise.gyro_scale else 0
+    if config.filter.adaptive and config.noise.accel_noise:
+        change = np.diff(interval.accel, axis=0) * np.diff(interval.table[:, 0])[:, None]
+        assumed = 3.0 * interval.duration * (accel_factor * config.noise.accel_noise) ** 2
+        accel_factor *= in_steps(math.sqrt(1.0 + float(np.vdot(change, change)) / assumed))
     return _widened_noise(config, accel_factor, interval.flags, steps)
+
+
+def in_steps(factor: float) -> float:
+    """Round a noise factor to a quarter of a doubling, so that few noise models are created."""
+    return float(2.0 ** (round(4.0 * math.log2(factor)) / 4.0))
 
 
 @lru_cache(maxsize=256)  # successive intervals repeat it, and validating settings is slow

@@ -82,7 +82,7 @@ def _clock(health: Health) -> Iterator[Finding]:
     elif health.longest_late > _LATE_S:
         text = (
             f"Samples arrived late for {health.longest_late:.1f} s in a row: logged twice, or "
-            "from a clock that was set back; if so, that time is missing and no sigma covers it."
+            "from a clock that was set back; if so, that time is missing, and counts as a gap."
         )
         values = {"longest_s": health.longest_late}
         yield Finding("samples_late", text, level="note", values=values)

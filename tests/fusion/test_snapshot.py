@@ -126,7 +126,7 @@ def test_a_snapshot_of_another_version_is_refused(walk, still_model):
         navigator.restore(data)
 
 
-LAYOUTS = {32: "c183b965"}
+LAYOUTS = {33: "5b027c31"}
 """CRC of the classes and attributes in a snapshot, by version."""
 
 

@@ -9,6 +9,7 @@ from told import health_lines, told
 from stario.fusion import Navigator, NavigatorConfig, PriorPose
 from stario.fusion.imu.faults import ClockSetBackDetector, ClockSetBackError, OutlierDetector
 from stario.fusion.recording import cut_recording
+from stario.network import load_model
 from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.sequence import ImuSequence
 
@@ -113,11 +114,11 @@ def test_a_recordings_track_ends_there_and_its_health_states_why(make_walk, stil
 def test_late_samples_and_bursts_are_not_another_clock():
     detector = ClockSetBackDetector()
     for k in range(300):  # two sensors in turn, one half a second behind
-        detector.on_time()
+        detector.on_time(0.01 * k)
         detector.note_late(0.01 * k - 0.5, 0.01 * k)
     for k in range(490):
         detector.note_late(0.01 * k, 10.0)
-    detector.on_time()
+    detector.on_time(10.0)
     for k in range(300):  # decreasing times
         detector.note_late(9.0 - 0.01 * k, 10.0)
 
@@ -151,6 +152,23 @@ def test_impossible_values_are_reported_and_excluded_from_the_means(make_walk):
     found = inspect_recording(replace(walk, gyro=gyro))
     assert any(each.code == "values_impossible" for each in found.findings)
     assert found.gyro_norm < 10.0
+
+
+@pytest.mark.parametrize("backend", ["ekf", "graph"])
+def test_a_clock_set_back_by_a_few_seconds_is_a_gap(make_walk, backend):
+    """Else the attitude and speed of three seconds ago would be believed."""
+    walk = make_walk(3, 16.0)
+    back = set_back(walk, 3.0)
+    navigator = Navigator(load_model(), backend=backend)
+    states = [navigator.push(*row) for row in zip(back.time, back.gyro, back.accel, strict=True)]
+    after = [state for state in states if state is not None and state.time > 8.0][:30]
+    true = walk.truth.at(np.array([state.time + 3.0 for state in after]))
+    for state, up_B in zip(after, true.attitude_WB.inv().apply([0.0, 0.0, 1.0]), strict=True):
+        tilt = np.linalg.norm(np.cross(state.R_WB.T[:, 2], up_B))
+        assert tilt < 4.0 * np.sqrt(np.trace(state.covariance[:2, :2]))
+    speeds = [np.linalg.norm(state.v_W) for state in after]
+    assert max(speeds) < 2.5
+    assert navigator.health.gaps[-1] == pytest.approx((5.0, 3.0), abs=0.05)
 
 
 def test_a_clock_set_back_by_a_few_seconds_is_reported(make_walk, still_model):

@@ -5,8 +5,15 @@ import pytest
 from scipy.integrate import solve_ivp
 from se23 import exp_se23
 
+from stario.fusion import NavigatorConfig
 from stario.fusion.filter.jacobians import propagated
-from stario.fusion.imu.preintegration import corrected_increments, preintegrate
+from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.imu.preintegration import (
+    Segment,
+    corrected_increments,
+    preintegrate,
+    segment_of,
+)
 from stario.fusion.lie import log_se23
 from stario.sequences.attitude.so3 import exp_so3, log_so3, skew
 from stario.sequences.noise import ImuNoise
@@ -206,6 +213,35 @@ def test_noise_agrees_with_that_of_perturbed_samples():
     np.testing.assert_allclose(
         noise / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-3
     )
+
+
+def test_an_impact_between_samples_is_as_uncertain_as_the_force_changes():
+    """A blow of 12 ms and 3 m/s, sampled at 100 Hz, which meets its peak or its flanks."""
+    t = np.linspace(0.0, 0.1, 11)
+    errors, sigmas = [], []
+    for centre in np.linspace(0.045, 0.055, 21):
+        phase = np.clip((t - centre) / 0.012 + 0.5, 0.0, 1.0)
+        pulse = 3.0 * np.pi / 2.0 / 0.012 * np.sin(np.pi * phase)
+        accel = np.outer(GRAVITY + pulse, [0.0, 0.0, 1.0])
+        segment = _standing(t, accel)
+        velocity = segment.predict(np.eye(3), *np.zeros((4, 3)))[1][2]
+        errors.append(velocity - 3.0)
+        sigmas.append(np.sqrt(segment.pim.preintMeasCov()[8, 8]))
+    assert np.max(np.abs(errors)) > 0.5
+    assert (np.abs(errors) < 2.0 * np.array(sigmas)).all()
+
+
+def test_a_walking_force_is_as_certain_as_its_density():
+    t = np.linspace(0.0, 0.1, 11)
+    accel = np.outer(GRAVITY + 4.0 * np.sin(2.0 * np.pi * 2.0 * t), [0.0, 0.0, 1.0])
+    variance = _standing(t, accel).pim.preintMeasCov()[8, 8]
+    assert variance == pytest.approx(0.1 * NavigatorConfig().noise.accel_noise ** 2, rel=0.05)
+
+
+def _standing(time: np.ndarray, accel: np.ndarray) -> Segment:
+    table = np.column_stack([time, 0.0 * accel, accel])
+    interval = ImuInterval(table, gap=False, R_NB=np.eye(3))
+    return segment_of([interval], [1.0], np.zeros(3), np.zeros(3), NavigatorConfig())
 
 
 def test_more_white_noise_does_not_change_the_random_walk_of_the_biases():
