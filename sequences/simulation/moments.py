@@ -25,8 +25,9 @@ from stario.sequences.simulation.routes import band_noise, drift, smoothed
 FASTEST_SHAKE, SLOWEST_SHAKE = 17.0, 3.0
 """Peak rate of a shake at its strongest and its weakest [rad/s]."""
 
-_LEVER = 0.2
-"""Distance of a shaken device from the axes that it is turned about [m]."""
+_LEVER = 0.1
+"""Distance of a shaken device from the axes that it is turned about [m]: the force of IPIN's shakes
+is off gravity by 3.4 to 5.3 m/s^2 (root mean square) at their rates."""
 
 _SWAY_RATE, _SWAY_SECONDS = math.radians(1.0), 6.0
 """Rate [rad/s] at which a standing person turns the device to and fro, and its correlation time."""
