@@ -8,9 +8,10 @@ import numpy as np
 
 from stario.fusion.evaluation.displacement_error import fit_yaw_and_position, known_truth, planar
 from stario.fusion.imu.direction import Complex
+from stario.fusion.report.health import TURNED_RAD
 from stario.fusion.state import Track
 from stario.sequences.accuracy.metrics import align, pose_errors
-from stario.sequences.arrays import even_grid, interpolated
+from stario.sequences.arrays import even_grid, interpolated, rms, scatter
 from stario.sequences.findings import Finding
 from stario.sequences.geodesy import Georeference
 from stario.sequences.legs import jumps
@@ -43,10 +44,6 @@ _MIRRORED, _MIRRORED_M = 0.4, 2.0
 _APART_M = 3.0
 """Distance from their centre [m] that positions must have to tell the direction of a track."""
 
-_TURNED_RAD = math.radians(45.0)
-"""Angle between the track's direction and the true one, both as the device sees them, that
-contradicts the weights: half of a quarter turn."""
-
 _SIGMAS = 3.0
 """Error in standard deviations, both over the whole track, that contradicts the track."""
 
@@ -59,7 +56,7 @@ def true_path(sequence: ImuSequence) -> float:
     _, known = known_truth(sequence)
     if sequence.truth is not None:
         return sequence.truth.path_length()
-    return float(np.linalg.norm(np.diff(known.position_W, axis=0), axis=1).sum())
+    return _length(known.position_W)
 
 
 def length_ratio(track: Track, sequence: ImuSequence) -> float:
@@ -72,9 +69,12 @@ def length_ratio(track: Track, sequence: ImuSequence) -> float:
     fitted = None if known is None else placed(track, known)
     if fitted is None or len(fitted) < MIN_POSITIONS:
         return float("nan")
-    truth, told = fitted.position_W, _track_at(track, fitted.time)
-    told_m, true_m = (np.linalg.norm(np.diff(p, axis=0), axis=1).sum() for p in (told, truth))
-    return float(told_m / true_m)
+    return _length(_track_at(track, fitted.time)) / _length(fitted.position_W)
+
+
+def _length(position: FloatArray) -> float:
+    """Return the length [m] of the lines between positions (N, k) [m]."""
+    return float(np.linalg.norm(np.diff(position, axis=0), axis=1).sum())
 
 
 def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:
@@ -252,10 +252,11 @@ def _direction(track: Track, truth: Trajectory | None) -> list[Finding]:
     if truth is None:
         return []
     fitted = pose_errors(align(track.trajectory, truth, "yaw"), truth)
-    spread = float(np.sqrt(fitted.truth.position_W[:, :2].var(axis=0).sum()))
-    error = float(np.sqrt(np.mean(np.sum(fitted.position_W[:, :2] ** 2, axis=1))))
-    turn, sigma = -float(np.angle(np.exp(1j * fitted.yaw).mean())), error / max(spread, 1e-3)
-    if abs(turn) < max(_TURNED_RAD, _SIGMAS * sigma) or spread < _APART_M:
+    spread = scatter(fitted.truth.position_W[:, :2])
+    if spread < _APART_M:
+        return []
+    turn = -float(np.angle(np.exp(1j * fitted.yaw).mean()))
+    if abs(turn) < max(TURNED_RAD, _SIGMAS * rms(fitted.position_W[:, :2]) / spread):
         return []
     degrees = math.degrees(turn)
     text = f"Seen from the device, the track's direction is {degrees:.0f} degrees off the true one."

@@ -41,8 +41,9 @@ NIS_RATIO = 2.0
 _LATE_S, _FIELDS_DROPPED = 0.5, 50
 """Late samples in a row [s], and dropped magnetic fields, beyond which to tell of them."""
 
-_TURNED_RAD = math.radians(45.0)
-"""Turn of the network's direction, beyond three sigmas, that is reported [rad]."""
+TURNED_RAD = math.radians(45.0)
+"""Turn of the network's direction, beyond three sigmas, that is reported [rad]: half of a quarter
+turn, beyond which a track goes to another side rather than along its way."""
 
 YAW_SIGMA = math.radians(15.0)
 """Standard deviation of yaw [rad] above which the track bends."""
@@ -189,7 +190,7 @@ def _network(health: Health) -> Iterator[Finding]:
         )
         yield Finding("network_sigma", text, level="note", values={"nis_ratio": ratio})
     turn, sigma = health.network_turn, health.network_turn_sigma
-    if abs(turn) > max(_TURNED_RAD, 3.0 * sigma):
+    if abs(turn) > max(TURNED_RAD, 3.0 * sigma):
         degrees, spread = math.degrees(turn), math.degrees(sigma)
         yield Finding(
             "network_direction",

@@ -22,6 +22,9 @@ from stario.sequences.sequence import FloatArray
 _STRIKE_HARMONICS = 20
 """Harmonics of the stride in the ringing."""
 
+_PARITY = np.array([0, 1, 0, 1, 0, 1])
+"""Harmonics of the stride, even or odd, that equal legs excite along x, y, z and about them."""
+
 _STRAY = np.array([1.2, 1.2, 0.4, 1.2, 1.2, 1.2])
 """Largest stray [rad] of a harmonic's phases along x, y, z and about them: as coherent are axes."""
 
@@ -155,23 +158,16 @@ def heel_strikes(gait: Gait, strike: Strike) -> CarryMotion:
     ratio = 0.5 * n * typical / resonance
     response = 1.0 / (1.0 - ratio**2 + 2j * strike.damping * ratio)
     # Both legs push alike up and forward and in turn to the sides, but for what is unequal.
-    even, odd = np.where([n % 2 == 0, n % 2 == 1], 1.0, strike.unequal)
-    even[0] = 0.0  # the trunk's bounce and surge
-    response *= np.sqrt(2.0) * strike.strength / np.sqrt(np.sum(np.abs(response * even) ** 2))
+    share = np.where(n[:, None] % 2 == _PARITY, 1.0, strike.unequal)
+    share[0, _PARITY == 0] = 0.0  # the trunk's bounce and surge
+    response *= np.sqrt(2.0) * strike.strength / np.linalg.norm(response * share[:, 2])
     offset, turn = np.zeros((2, len(gait), 3))
     strength = (gait.vigor * gait.effort)[:, None]
-    for k, gain, up, aside in zip(0.5 * n, response, even, odd, strict=True):
+    for k, gain, each in zip(0.5 * n, response, size * share, strict=True):
         angle = k * (gait.phase - np.pi - _STRIKE_LAG)[:, None] + np.angle(gain)
         angle = angle + lead + rng.uniform(-_STRAY, _STRAY)
         omega = 2.0 * np.pi * k * gait.step_rate[:, None]
-        ring = (
-            np.abs(gain)
-            / omega
-            * strength
-            * np.cos(angle)
-            * size
-            * [up, aside, up, aside, up, aside]
-        )
+        ring = np.abs(gain) * strength * np.cos(angle) * each / omega
         offset += ring[:, :3] / omega
         turn += ring[:, 3:]
     return CarryMotion(offset, turn)

@@ -13,6 +13,7 @@ from support import CONFIG
 
 from stario.fusion import Navigator
 from stario.fusion.evaluation.known_positions import (
+    length_ratio,
     placed,
     position_error,
     position_error_words,
@@ -173,4 +174,25 @@ def test_positions_contradict_by_length_and_handedness_alone(walk_and_track, cha
 def test_a_right_truth_contradicts_nothing(walk_and_track):
     walk, track = walk_and_track
     assert position_findings(track, walk) == []
+
+
+@pytest.mark.parametrize(("degrees", "codes"), [(30.0, []), (163.0, ["network_direction"])])
+def test_a_walk_taken_backwards_is_told_by_true_attitudes(walk_and_track, degrees, codes):
+    """Its shape fits after a turn; only where the device faces says that the turn is wrong."""
+    walk, track = walk_and_track
+    turned = Rotation.from_euler("z", degrees, degrees=True) * walk.truth.attitude_WB
+    found = position_findings(track, replace(walk, truth=replace(walk.truth, attitude_WB=turned)))
+    assert [finding.code for finding in found] == codes
+    assert [finding.values["turn_deg"] for finding in found] == pytest.approx(
+        [degrees] * len(codes), abs=5.0
+    )
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_the_length_of_a_track_is_compared_along_its_way(walk_and_track, scale):
+    walk, track = walk_and_track
+    truth = replace(walk.truth, position_W=scale * walk.truth.position_W)
+    ratio = length_ratio(track, replace(walk, truth=truth))
+    assert ratio == pytest.approx(1.0 / scale, rel=0.05)
+    assert np.isnan(length_ratio(track, walk.without_truth()))
     assert position_findings(track, walk.without_truth()) == []

@@ -9,7 +9,7 @@ from told import UP, refusal, told
 
 from stario.sequences.conventions import SAME_AXES, with_axes, with_conventions
 from stario.sequences.errors import InputError
-from stario.sequences.inspection.checks import check_units
+from stario.sequences.inspection.checks import check_units, unit_findings
 from stario.sequences.readers import find_recordings, read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
@@ -46,6 +46,14 @@ def test_a_hard_shaken_device_passes_but_not_without_gravity():
     assert np.median(np.linalg.norm(shaken.accel, axis=1)) > 14.0
     check_units(shaken)
     assert "--gravity removed" in refusal(without_gravity(shaken))
+
+
+def test_the_unit_is_not_asked_of_a_phone_that_swings_in_a_pocket():
+    """Its average force is as large in either unit, but not since it turned about the vertical."""
+    style = WalkStyle(carry="pocket", preferred_speed=1.4, vigor=1.3)
+    swung = simulate_imu(generate_walk(0, 30.0, style=style), 100.0, PHONE_IMU).without_truth()
+    assert np.percentile(np.linalg.norm(swung.gyro, axis=1), 95) > 3.0
+    assert unit_findings(swung) == []
 
 
 def test_a_device_at_rest_passes_but_not_with_its_bias_in_degrees():
