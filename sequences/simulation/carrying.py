@@ -30,8 +30,35 @@ from stario.sequences.simulation.gait import (
 )
 from stario.sequences.simulation.routes import band_noise, drift, smoothed
 
-_ARM = (5.5, 0.3)
-"""Resonance [Hz] and damping ratio of a device at the end of an arm."""
+_STRIKES = {
+    "handheld": Strike(
+        0.5, 5.5, 0.3, (1.8, 132.0), 0.87, (0.25, 82.0), (0.41, 24.0), (0.37, 61.0), 0.4
+    ),
+    "in-front": Strike(
+        1.85, 5.5, 0.3, (0.34, -77.0), 0.25, (0.36, 24.0), (0.17, 59.0), (0.22, -99.0), 0.4
+    ),
+    "texting": Strike(
+        1.5, 5.5, 0.3, (0.41, -166.0), 0.39, (0.6, 49.0), (0.29, 28.0), (0.35, -67.0), 0.4
+    ),
+    "call": Strike(
+        1.35, 5.5, 0.3, (0.65, 33.0), 0.49, (0.3, 50.0), (0.22, -63.0), (0.44, 169.0), 0.4
+    ),
+    "swinging": Strike(
+        1.1, 5.5, 0.4, (0.8, -164.0), 0.59, (0.44, -103.0), (0.26, 86.0), (0.59, -168.0), 0.4
+    ),
+    "pocket": Strike(
+        3.3, 8.5, 0.25, (0.67, -60.0), 0.7, (0.22, -28.0), (0.16, 58.0), (0.31, -95.0), 0.8
+    ),
+    "back-pocket": Strike(
+        3.6, 7.0, 0.3, (0.68, 152.0), 0.73, (0.27, 67.0), (0.15, -84.0), (0.26, 115.0), 0.8
+    ),
+    "bag": Strike(
+        1.25, 6.5, 0.5, (1.5, -142.0), 1.55, (0.27, 103.0), (0.33, -75.0), (0.22, 79.0), 0.7
+    ),
+    "rig": Strike(0.4, 5.5, 0.3, (0.8, 132.0), 0.6, (0.25, 82.0), (0.3, 24.0), (0.37, 61.0), 0.4),
+}
+"""What heel strikes excite in each way of carrying: strength, resonance and damping, then forward,
+sideways, roll, pitch and yaw as `check simulation` and true attitudes show them from 3 to 10 Hz."""
 
 
 def _held(
@@ -45,7 +72,8 @@ def _held(
 ) -> CarryMotion:
     """Return the motion of a device held steady: trunk, heel strikes, gait wobble, hand tremor.
 
-    `tremor` [rad/s] is the angular rate of the tremor, `wobble` [rad] the rotation with the gait.
+    `tremor` [rad/s] is the angular rate of the tremor, `wobble` [rad] the rotation with the stride,
+    `pitch` the rate of pitch with the step per bounce [rad/s per m/s^2], `surge` the trunk's.
     """
     rng, n = gait.rng, len(gait)
     ring = heel_strikes(gait, strike)
@@ -80,30 +108,21 @@ def _wobble(gait: Gait, wobble: float, pitch: float) -> FloatArray:
 def _handheld(gait: Gait) -> CarryMotion:
     """Return the motion of a device held in front, not quite as lively as the trunk."""
     rng = gait.rng
-    strike, wobble = (
-        Strike(0.5, *_ARM, (1.8, 132.0), 0.87, (0.25, 82.0), (0.41, 24.0), (0.37, 61.0), 0.4),
-        0.03,
-    )
-    motion = _held(gait, 1.5, strike, 0.1, wobble, -0.08)
+    motion = _held(gait, 1.5, _STRIKES["handheld"], 0.1, 0.03, -0.08)
     return _displaced(motion, rng.uniform(0.2, 0.45), rng.uniform(-0.2, 0.2), 0.7 * gait.height)
 
 
 def _in_front(gait: Gait) -> CarryMotion:
     """Return the motion of a device laid flat on a hand, which bounces more than the trunk."""
     rng = gait.rng
-    strike, wobble = (
-        Strike(1.85, *_ARM, (0.34, -77.0), 0.25, (0.36, 24.0), (0.17, 59.0), (0.22, -99.0), 0.4),
-        0.05,
-    )
-    motion = _held(gait, 3.3, strike, 0.1, wobble, 0.15)
+    motion = _held(gait, 3.3, _STRIKES["in-front"], 0.1, 0.05, 0.15)
     return _displaced(motion, rng.uniform(0.2, 0.45), rng.uniform(-0.2, 0.2), 0.7 * gait.height)
 
 
 def _texting(gait: Gait) -> CarryMotion:
     """Return the motion of a device that is read: the arms keep it steadier than the trunk."""
     rng = gait.rng
-    strike = Strike(1.5, *_ARM, (0.41, -166.0), 0.39, (0.6, 49.0), (0.29, 28.0), (0.35, -67.0), 0.4)
-    motion = _held(gait, 1.15, strike, 0.04, 0.1, 0.12, 0.6)
+    motion = _held(gait, 1.15, _STRIKES["texting"], 0.04, 0.1, 0.12, 0.6)
     return _displaced(motion, rng.uniform(0.2, 0.4), rng.uniform(-0.1, 0.1), 0.72 * gait.height)
 
 
@@ -113,8 +132,7 @@ def _displaced(motion: CarryMotion, x: float, y: float, z: float) -> CarryMotion
 
 def _call(gait: Gait) -> CarryMotion:
     rng, n = gait.rng, len(gait)
-    strike = Strike(1.35, *_ARM, (0.65, 33.0), 0.49, (0.3, 50.0), (0.22, -63.0), (0.44, 169.0), 0.4)
-    motion = _held(gait, 1.05, strike, 0.06, 0.11, 0.05, 0.5)
+    motion = _held(gait, 1.05, _STRIKES["call"], 0.06, 0.11, 0.05, 0.5)
     head = 0.4 * drift(rng, n, gait.rate, 1.0)
     arm = np.array([0.05, rng.choice([-1.0, 1.0]) * 0.1, 0.0])
     offset = motion.offset_H + np.array([0.0, 0.0, 0.93 * gait.height]) + _about(2, head, arm)
@@ -131,12 +149,7 @@ def _swinging(gait: Gait) -> CarryMotion:
     # Elbow and shoulder give: the hand swings about a point below the shoulder.
     arm = np.array([0.0, 0.0, -0.27 * gait.height])
     pivot = np.array([0.0, side * 0.13 * gait.height, 0.7 * gait.height])
-    ring = heel_strikes(
-        gait,
-        Strike(
-            1.1, 5.5, 0.4, (0.8, -164.0), 0.59, (0.44, -103.0), (0.26, 86.0), (0.59, -168.0), 0.4
-        ),
-    )
+    ring = heel_strikes(gait, _STRIKES["swinging"])
     # Forward the hand also comes inward: the plane of the swing is turned.
     inward = Rotation.from_rotvec([0.0, 0.0, -side * rng.uniform(0.15, 0.4)])
     offset = pivot + inward.apply(_about(1, -angle, arm)) + trunk(gait, 3.0, TRUNK_SURGE)
@@ -152,10 +165,7 @@ def _pocket(gait: Gait) -> CarryMotion:
     rng = gait.rng
     amplitude = np.radians(14.5)
     place = (0.08, -rng.uniform(0.05, 0.12) * gait.height)
-    strike = Strike(
-        3.3, 8.5, 0.25, (0.67, -60.0), 0.7, (0.22, -28.0), (0.16, 58.0), (0.31, -95.0), 0.8
-    )
-    return _on_thigh(gait, amplitude, place, 1.5, TRUNK_SURGE, 1.5 * SWAY, strike, 0.0)
+    return _on_thigh(gait, amplitude, place, 1.5, TRUNK_SURGE, 1.5 * SWAY, _STRIKES["pocket"], 0.0)
 
 
 def _back_pocket(gait: Gait) -> CarryMotion:
@@ -163,10 +173,7 @@ def _back_pocket(gait: Gait) -> CarryMotion:
     rng = gait.rng
     amplitude = np.radians(11.5)
     place = (-0.1, -rng.uniform(0.02, 0.06) * gait.height)
-    strike = Strike(
-        3.6, 7.0, 0.3, (0.68, 152.0), 0.73, (0.27, 67.0), (0.15, -84.0), (0.26, 115.0), 0.8
-    )
-    return _on_thigh(gait, amplitude, place, 1.4, 1.2, 2.0 * SWAY, strike, 2.1)
+    return _on_thigh(gait, amplitude, place, 1.4, 1.2, 2.0 * SWAY, _STRIKES["back-pocket"], 2.1)
 
 
 def _on_thigh(
@@ -212,12 +219,7 @@ def _bag(gait: Gait) -> CarryMotion:
     body = np.array([rng.choice([-0.15, 0.12]), rng.uniform(-0.15, 0.15), 0.75 * gait.height])
     strap = np.array([0.0, 0.0, -hang])
     # A bag knocks against the body: its ringing is damped most.
-    ring = heel_strikes(
-        gait,
-        Strike(
-            1.25, 6.5, 0.5, (1.5, -142.0), 1.55, (0.27, 103.0), (0.33, -75.0), (0.22, 79.0), 0.7
-        ),
-    )
+    ring = heel_strikes(gait, _STRIKES["bag"])
     offset = body + np.cross(turn, strap) + strap + trunk(gait, 1.85, 0.75, 2.0 * SWAY)
     return CarryMotion(offset + ring.offset_H, turn + ring.turn_H)
 
@@ -244,8 +246,7 @@ def _trolley(gait: Gait) -> CarryMotion:
 def _rig(gait: Gait) -> CarryMotion:
     """Return a rig's motion: quick turns to random directions, arms waved by up to their length."""
     rng, n = gait.rng, len(gait)
-    strike = Strike(0.4, *_ARM, (0.8, 132.0), 0.6, (0.25, 82.0), (0.3, 24.0), (0.37, 61.0), 0.4)
-    motion = _held(gait, TRUNK_BOUNCE, strike, rng.uniform(0.03, 0.1), 0.02, -0.08)
+    motion = _held(gait, TRUNK_BOUNCE, _STRIKES["rig"], rng.uniform(0.03, 0.1), 0.02, -0.08)
     reach = np.array([0.2, 0.25, 0.2]) * rng.uniform(0.3, 1.1)
     waved = drift(rng, n, gait.rate, rng.uniform(0.25, 0.5), 3)
     lively = 0.5 * (1.0 + np.tanh(1.5 + 1.5 * drift(rng, n, gait.rate, 3.0, 1)))
