@@ -24,6 +24,7 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Any
 
 from stario.sequences.errors import InputError
@@ -40,6 +41,13 @@ MAX_SPAN = 600 * 10**9
 _MIN_STEP, _FEW_SAMPLES = 100_000, 5
 """Minimum average step [ns] between that many samples of a sensor: none has 10 kHz, but times in
 microseconds or a coarser unit seem to be so dense."""
+
+BACKWARD = 5 * 10**9
+"""A batch whose middle is this [ns] before the newest sample comes from a clock set back."""
+
+_STRAY_SHARE = 0.1
+"""Maximum share of a batch's readings whose times, `BACKWARD` or more from the batch's middle, are
+taken to be wrong; more are a backlog."""
 
 MAX_READING = 1e4
 """Maximum reading of any sensor in rad/s, m/s^2 or uT."""
@@ -100,6 +108,17 @@ class Batch:
     number: int = -1
     places: list[Reading] = field(default_factory=list)
 
+    @property
+    def middle_ns(self) -> int:
+        """Median time of a batch that is not empty [ns]."""
+        return sorted(reading.time_ns for reading in self.readings)[len(self.readings) // 2]
+
+    def credible(self) -> list[Reading]:
+        """Return the readings without single ones far from the rest, which would seem newest."""
+        middle, count = self.middle_ns, len(self.readings)
+        near = [reading for reading in self.readings if abs(reading.time_ns - middle) < BACKWARD]
+        return near if count - len(near) <= _STRAY_SHARE * count else self.readings
+
 
 def parse_push(body: bytes) -> Batch:
     """Parse a push of Sensor Logger.
@@ -153,19 +172,32 @@ def _check_unit(readings: list[Reading]) -> None:
             raise InputError("payload.time", found, "times in nanoseconds", fix)
 
 
-def parse_line(line: bytes, sender: str) -> Batch:
-    """Parse a line of JSON.
+def parse_lines(body: bytes, sender: str) -> list[Batch]:
+    """Parse lines of JSON into a batch for each stretch of lines of one device and recording.
 
     Args:
-        line: JSON object.
-        sender: name of the device if the line gives none.
+        body: JSON objects, one a line.
+        sender: name of the device of a line that gives none.
 
     Raises:
-        InputError: the line does not have this form; the error names the field.
+        InputError: a line does not have this form; the error names the line and the field.
     """
+    lines = []
+    for number, line in enumerate(body.splitlines(), 1):
+        try:
+            lines += [_line(line, sender)] if line.strip() else []
+        except InputError as error:
+            field = f"line {number}, {error.field}"
+            raise InputError(field, error.found, error.expected, error.fix) from None
+    return [
+        Batch(device, recording, [reading for _, readings in stretch for reading in readings])
+        for (device, recording), stretch in groupby(lines, key=lambda line: line[0])
+    ]
+
+
+def _line(line: bytes, sender: str) -> tuple[tuple[str, str], list[Reading]]:
+    """Parse a line of JSON into device and recording, and readings."""
     message = object_from("line", line)
-    if "payload" in message:
-        return parse_push(line)
     if "t_ns" in message:
         time_ns = _nanoseconds("t_ns", message["t_ns"])
     else:
@@ -178,20 +210,7 @@ def parse_line(line: bytes, sender: str) -> Batch:
     if not readings:
         raise InputError("line", "none of gyro, accel and mag", "at least one of them")
     device = _name("device", message.get("device", sender))
-    return Batch(device, _name("recording", message.get("recording", ""), needed=False), readings)
-
-
-def joined(batches: Iterable[Batch]) -> list[Batch]:
-    """Merge consecutive batches without numbers of the same device and recording."""
-    merged: list[Batch] = []
-    for batch in batches:
-        key = (batch.device, batch.recording, -1)
-        if merged and (merged[-1].device, merged[-1].recording, batch.number) == key:
-            merged[-1].readings.extend(batch.readings)
-            merged[-1].places.extend(batch.places)
-        else:
-            merged.append(batch)
-    return merged
+    return (device, _name("recording", message.get("recording", ""), needed=False)), readings
 
 
 def object_from(where: str, text: bytes) -> Mapping[str, Any]:

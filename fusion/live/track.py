@@ -17,7 +17,6 @@ from stario.fusion.live.merging import MAX_WAIT, Merger, Sample
 from stario.fusion.live.payload import BAROMETER, LOCATION, MAG, Batch, Reading, Vector
 from stario.fusion.live.places import Earth, Places
 from stario.fusion.live.storage import LiveFile
-from stario.fusion.live.times import with_credible_time
 from stario.fusion.navigator import Navigator
 from stario.fusion.report.health import health_findings
 from stario.fusion.state import NavState
@@ -106,12 +105,12 @@ class LiveTrack:
             received: time of receipt [s since 1970].
             accel_factor: factor from its accelerometer's unit to specific force in m/s^2.
         """
-        readings = with_credible_time(batch)
+        readings = batch.credible()
         self._stray += len(batch.readings) - len(readings)
         self._factor = accel_factor
         samples: list[Sample] = [
-            (time, gyro, (accel_factor * a[0], accel_factor * a[1], accel_factor * a[2]))
-            for time, gyro, a in self._merger.add(readings)
+            (time, gyro, tuple(accel_factor * a for a in accel))
+            for time, gyro, accel in self._merger.add(readings)
         ]
         # Samples wait until they are on disk: when a failed push is repeated, they count as late.
         samples = [*self._unwritten[0], *samples]
@@ -166,7 +165,7 @@ class LiveTrack:
         """Return what keeps the track from being right, in words; empty if nothing does."""
         if self._write_error:
             return self._write_error
-        alone = self._merger.dropped.get("without acceleration", 0)
+        alone = self._merger.dropped["without acceleration"]
         if alone > max(_MANY_ALONE, self.samples):
             return (
                 f"{alone} readings of the gyroscope have none of the acceleration within "
@@ -191,8 +190,8 @@ class LiveTrack:
     def dropped(self) -> dict[str, int]:
         """Return the number of samples dropped, by reason."""
         dropped = self._merger.dropped
-        late = dropped.get("late", 0) + self.delayed
-        counts = dropped | {"late": late, "wrong time": self._stray, "not written": self._lost}
+        late = dropped["late"] + self.delayed
+        counts = {**dropped, "late": late, "wrong time": self._stray, "not written": self._lost}
         return {reason: count for reason, count in counts.items() if count}
 
     def _write(self, samples: list[Sample], received: float, aside: list[Reading]) -> None:
