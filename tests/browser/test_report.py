@@ -10,7 +10,6 @@ from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import Comparison, compare, demonstration
 from stario.fusion.report.page import write_report
-from stario.fusion.report.series import ellipse
 from stario.fusion.state import Innovations, Track
 from stario.network import load_model
 from stario.sequences.attitude.rotations import about_z
@@ -157,14 +156,6 @@ def test_report_of_a_run_without_truth_has_no_table(tmp_path):
     track = Navigator(load_model()).run(sequence)
     path = write_report(tmp_path / "r.html", Comparison(sequence, {"track": track}, {"track": {}}))
     assert "Accuracy against ground truth" not in path.read_text()
-
-
-def test_ellipse_is_where_the_mahalanobis_distance_is_three():
-    covariance = np.array([[4.0, 1.5, 0.3], [1.5, 1.0, 0.1], [0.3, 0.1, 9.0]])
-    outline = ellipse(covariance)
-    weight = np.linalg.inv(covariance[:2, :2])
-    distance = np.sqrt(np.einsum("ni,ij,nj->n", outline, weight, outline))
-    np.testing.assert_allclose(distance, 3.0)
 
 
 def test_a_map_server_is_asked_on_request_and_points_have_their_place(
