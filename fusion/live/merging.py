@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict, deque
 from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,8 +29,14 @@ from stario.fusion.live.payload import (
 from stario.sequences.sequence import FloatArray
 from stario.sequences.time_order import MAX_IMU_GAP
 
-Sample = tuple[int, Vector, Vector]
-"""Time [ns], angular rate [rad/s], specific force [m/s^2]."""
+
+class Sample(NamedTuple):
+    """Time [ns], angular rate [rad/s], specific force [m/s^2]."""
+
+    time_ns: int
+    gyro: Vector
+    accel: Vector
+
 
 CHOOSING = 5 * 10**8
 """Time [ns] allowed for every sensor of a device to appear before choosing among them."""
@@ -114,7 +121,8 @@ class Merger:
             forces = [_at(stream, rate.time_ns) for stream in accel]
             known = [force for force in forces if force is not None]
             if len(known) == len(accel):
-                yield rate.time_ns, rate.value, tuple(map(sum, zip(*known, strict=True)))
+                force = tuple(map(sum, zip(*known, strict=True)))
+                yield Sample(rate.time_ns, rate.value, force)
             else:
                 self.dropped["without acceleration"] += 1
         for sensor, stream in self._streams.items():

@@ -121,8 +121,8 @@ def innovation_panels(innovations: Innovations, start: float) -> list[Panel]:
     panels = []
     for k, axis in enumerate("xyz"):
         residual, sigma = innovations.residual_W[rows, k], innovations.sigma[rows, k]
-        ticks, edge = split_at_gaps(time, 3.0 * sigma[:, None], max_gap=_MAX_PAUSE)
-        traces = [_band(INNOVATION, ticks, -edge[:, 0], edge[:, 0], FAINT)]
+        ticks, edge = split_at_gaps(time, 3.0 * sigma, max_gap=_MAX_PAUSE)
+        traces = [_band(INNOVATION, ticks, -edge, edge, FAINT)]
         traces += _dots(time, residual, gated, "m")
         panel = _fitted(f"Innovation {axis} [m], band: 3 sigma", traces)
         panels.append(panel._replace(height=LOW_HEIGHT))

@@ -75,9 +75,7 @@ def test_yaws_on_both_sides_of_half_a_turn_are_drawn_next_to_each_other() -> Non
         name: trajectory_series(along_y(np.radians(yaw)).trajectory, 0.0)
         for name, yaw in (("track", 179.0), ("filtered", -179.0))
     }
-    yaw = {
-        trace.name: trace.y for trace in motion_panels(shown, None)[2].traces if trace.name
-    }
+    yaw = {trace.name: trace.y for trace in motion_panels(shown, None)[2].traces if trace.name}
     np.testing.assert_allclose(
         np.subtract(yaw["filter, as in a stream"], yaw["StarIO"]), 2.0, atol=1e-3
     )
