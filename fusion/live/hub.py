@@ -153,18 +153,16 @@ class Hub:
         surplus = len(self.sessions) + len(new) - MAX_DEVICES
         if surplus <= 0:
             return
-        silent = [
-            session
-            for name, session in self.sessions.items()
-            if not (name in devices or session.pending)
-            and time.time() - session.received > SILENT_SECONDS
-        ]
-        if len(silent) < surplus:
+        silent = sorted(
+            (each for name, each in self.sessions.items() if not (name in devices or each.pending)),
+            key=lambda session: session.received,
+        )[:surplus]
+        if len(silent) < surplus or time.time() - silent[-1].received <= SILENT_SECONDS:
             found = f"{len(new)} new: {', '.join(sorted(new))[:80]}"
             expected = f"at most {MAX_DEVICES} devices at once"
             fix = f"one that sends nothing for {SILENT_SECONDS:g} s makes room"
             raise InputError("device", found, expected, fix)
-        for session in sorted(silent, key=lambda session: session.received)[:surplus]:
+        for session in silent:
             self._close(session)
             del self.sessions[session.device]
 

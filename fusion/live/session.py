@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-import itertools
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -184,7 +183,7 @@ class PushOrder:
 
     def __init__(self) -> None:
         self._recording, self._next = "", 0
-        self._recordings, self._arrivals = 0, itertools.count()
+        self._recordings, self._arrivals = 0, 0
         self._waiting: list[tuple[int, int, int, float, Batch]] = []
 
     def add(self, batch: Batch, received: float) -> None:
@@ -192,7 +191,8 @@ class PushOrder:
         if batch.recording != self._recording:
             self._recording, self._next = batch.recording, batch.number
             self._recordings += 1
-        entry = (self._recordings, batch.number, next(self._arrivals), received, batch)
+        self._arrivals += 1
+        entry = (self._recordings, batch.number, self._arrivals, received, batch)
         heapq.heappush(self._waiting, entry)
 
     def is_due(self, now: float) -> bool:
