@@ -15,7 +15,6 @@ from recorded import DATA
 
 from stario.fusion.live.merging import MAX_WAIT, Merger
 from stario.fusion.live.payload import GYRO, TOTAL, Reading, parse_push
-from stario.fusion.live.session import Session
 from stario.sequences import read_recording
 
 SECOND = 10**9
@@ -159,13 +158,6 @@ def test_specific_force_points_up_in_the_reported_attitude_of_a_real_phone():
     merger = Merger()
     merger.add(parse_push(json.dumps({"deviceId": "d", "payload": payload}).encode()).readings)
     assert merger.upward > 0.9
-
-
-@pytest.fixture
-def session(tmp_path, new_navigator):
-    session = Session("phone", tmp_path, new_navigator)
-    yield session
-    session.close()
 
 
 def take(session, bodies, began=0.0):
