@@ -33,12 +33,13 @@ from urllib.parse import urlsplit
 
 import numpy as np
 from starlette.applications import Starlette
+from starlette.authentication import AuthenticationBackend, AuthenticationError
 from starlette.middleware import Middleware
+from starlette.middleware.authentication import AuthenticationMiddleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
-from starlette.types import ASGIApp, Receive, Scope, Send
 
 from stario.fusion.live.hub import Hub, Viewer
 from stario.fusion.live.payload import number_from, object_from, parse_lines, parse_push
@@ -91,7 +92,7 @@ def live_app(
         beside: context of what runs as long as the server.
     """
     guard = (
-        Middleware(TokenMiddleware, token=token)
+        Middleware(AuthenticationMiddleware, backend=TokenCheck(token), on_error=_unauthorised)
         if token
         else Middleware(TrustedHostMiddleware, allowed_hosts=LOOPBACK)
     )
@@ -116,32 +117,29 @@ def live_app(
     return app
 
 
-class TokenMiddleware:
-    """Middleware that rejects requests without the token.
+class TokenCheck(AuthenticationBackend):
+    """Check that a request has the token.
 
     Args:
-        app: application that handles accepted requests.
         token: required token, not empty.
     """
 
-    def __init__(self, app: ASGIApp, token: str) -> None:
-        self._app, self._token = app, token
+    def __init__(self, token: str) -> None:
+        self._token = token
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Reject a request, or pass it on."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-        request = Request(scope)
-        bearer = request.headers.get("authorization", "").removeprefix("Bearer ")
-        shown = (request.query_params.get("token", ""), bearer, request.cookies.get(_COOKIE, ""))
-        if any(tokens_match(each, self._token) for each in shown):
-            await self._app(scope, receive, send)
-            return
-        reason = "token: missing or wrong; add ?token=..., as the server printed when it started"
-        # Without a token nobody keeps a connection.
-        refusal = JSONResponse({"error": reason}, 401, {"connection": "close"})
-        await refusal(scope, receive, send)
+    async def authenticate(self, conn: HTTPConnection) -> None:
+        """Raise an error if a request has no token."""
+        bearer = conn.headers.get("authorization", "").removeprefix("Bearer ")
+        shown = (conn.query_params.get("token", ""), bearer, conn.cookies.get(_COOKIE, ""))
+        if not any(tokens_match(each, self._token) for each in shown):
+            raise AuthenticationError(
+                "token: missing or wrong; add ?token=..., as the server printed when it started"
+            )
+
+
+def _unauthorised(conn: HTTPConnection, error: Exception) -> Response:
+    # Without a token nobody keeps a connection.
+    return JSONResponse({"error": str(error)}, 401, {"connection": "close"})
 
 
 def tokens_match(shown: str, token: str) -> bool:
