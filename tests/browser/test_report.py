@@ -56,6 +56,8 @@ def test_slider_moves_the_cursor_on_the_map_and_every_panel(show, report, compar
     cursor += (
         " x: document.getElementById('map').layout.shapes.find(s => s.name === 'filtered').xanchor,"
     )
+    cursor += " ellipses: document.getElementById('map').layout.shapes"
+    cursor += ".filter(s => s.type === 'path').length,"
     cursor += " lines: document.getElementById('time').layout.shapes.map(s => s.x0)})"
     seen = []
     times = [0.0, 0.25 * comparison.tracks["track"].time[-1], comparison.tracks["track"].time[-1]]
@@ -67,6 +69,7 @@ def test_slider_moves_the_cursor_on_the_map_and_every_panel(show, report, compar
     for one in seen:
         assert one["lines"] == [pytest.approx(one["at"], abs=1e-3)] * len(one["lines"])
         assert len(one["lines"]) == 14
+        assert one["ellipses"] == 2  # of the track, and of the filter's
     end = comparison.aligned()["filtered"].position_W[-1, 0]
     assert seen[-1]["x"] == pytest.approx(end, abs=0.05)
     assert shown.problems == []
