@@ -102,7 +102,7 @@ class Hub:
     async def release(self) -> None:
         """Process the pushes that have waited long enough for one before them."""
         now = time.time()
-        due = [session for session in self.sessions.values() if session.is_due(now)]
+        due = [session for session in self.sessions.values() if session.order.is_due(now)]
         tasks = (self._in_thread(session, session.release, now) for session in due)
         for result in await asyncio.gather(*tasks, return_exceptions=True):
             if isinstance(result, Exception):

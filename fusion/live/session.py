@@ -34,6 +34,7 @@ class Session:
         track: current track.
         thread: the thread in which the hub uses it.
         pending: number of the hub's calls that are not done.
+        order: its pushes that wait for one before them.
     """
 
     def __init__(
@@ -47,14 +48,14 @@ class Session:
         self._folder, self._new_navigator = folder, new_navigator
         self.received, self._factor = 0.0, 1.0
         self.thread, self.pending = ThreadPoolExecutor(1), 0
-        self._order = PushOrder()
+        self.order = PushOrder()
         self._previous, self._opened_ns = "", 0  # recording before this, start of this
         self._begin()
 
     def start(self) -> None:
         """Start a new track and a new recording."""
         self.close()
-        self._order = PushOrder()  # pushes that came after `stop` are not missing
+        self.order = PushOrder()  # pushes that came after `stop` are not missing
         self._begin()
 
     def _begin(self, recording: str = "") -> None:
@@ -84,7 +85,7 @@ class Session:
         if self._is_of_previous(batch):
             self.track.delayed += len(batch.readings)
             return 0
-        self._order.add(batch, received)
+        self.order.add(batch, received)
         return self.release(received)
 
     def check(self, batch: Batch) -> None:
@@ -98,13 +99,9 @@ class Session:
             fix = "give each phone a name of its own"
             raise InputError("device", found, "one at a time", fix)
 
-    def is_due(self, now: float) -> bool:
-        """Return whether a push has waited long enough for one before it, at a time [s]."""
-        return self._order.is_due(now)
-
     def release(self, now: float) -> int:
         """Process the pushes whose turn it is at a time [s]; return their number of samples."""
-        return sum(self._process(*each) for each in self._order.ready(now))
+        return sum(self._process(*each) for each in self.order.ready(now))
 
     def _process(self, batch: Batch, received: float) -> int:
         if not batch.readings:
@@ -129,24 +126,9 @@ class Session:
             self.track.close()
 
     def status(self) -> dict[str, Any]:
-        """Return what the page shows next to the track."""
-        track = self.track
-        return {
-            "id": self.device,
-            "running": self.running,
-            "samples": track.samples,
-            "rate": round(track.rate, 1),
-            "received": self.received,
-            "origin": track.drawn.origin.round(4).tolist(),
-            "fixes": track.fixes,
-            "dropped": track.dropped(),
-            "file": None if track.path is None else track.path.name,
-            "problem": track.problem(),
-            "health": track.words,
-            "floor": track.floor,
-            "satellites": track.places.words(),
-            "georeferenced": track.georeferenced,
-        }
+        """Return what the page shows of the device."""
+        known = {"id": self.device, "running": self.running, "received": self.received}
+        return known | self.track.status()
 
     def _is_new(self, batch: Batch) -> bool:
         """Return whether a batch belongs to a different recording than those before."""

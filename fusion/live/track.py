@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -59,12 +60,7 @@ class LiveTrack:
     Attributes:
         drawn: displayed track.
         places: places by satellites.
-        georeferenced: whether the track lies on the earth: the origin or satellites placed it.
-        words: what stands out in the navigator's health, in words.
-        floor: the floor above that of the start, in words; empty without a barometer.
         samples: number of samples processed.
-        rate: their rate [Hz], smoothed over some batches.
-        fixes: number of fixes applied.
         delayed: number of readings that came after a later recording had begun.
     """
 
@@ -80,12 +76,12 @@ class LiveTrack:
         self._stray = self._lost = 0
         self.drawn = DisplayedTrack()
         self.places = Places(navigator.config.place.satellites, self._earth)
-        self.georeferenced = navigator.config.place.origin is not None
+        self._georeferenced = navigator.config.place.origin is not None
         self._earth.begin(navigator.config.place.georeference)
-        self.words: list[dict[str, str]] = []
-        self.floor = ""
-        self.samples = self.fixes = self.delayed = 0
-        self.rate = 0.0
+        self._words: list[dict[str, str]] = []
+        self._floor = ""
+        self.samples = self.delayed = self._fixes = 0
+        self._rate = 0.0
 
     @property
     def path(self) -> Path | None:
@@ -133,7 +129,7 @@ class LiveTrack:
         Raises:
             InputError: there is no position yet, or the track lies on the earth.
         """
-        if self.georeferenced:
+        if self._georeferenced:
             raise InputError("zero", "a track that lies on the earth", "one that does not")
         self.drawn.origin = self._state().p_W.copy()
 
@@ -155,12 +151,28 @@ class LiveTrack:
         if self._earth.georeference is None:
             self.places.compare()
         after = self._applied(fix)
-        self.fixes += 1
+        self._fixes += 1
         self._draw(after)
         self._health_time = -math.inf
         self._update_health(after.time)
 
-    def problem(self) -> str:
+    def status(self) -> dict[str, Any]:
+        """Return what the page shows next to the track."""
+        return {
+            "samples": self.samples,
+            "rate": round(self._rate, 1),
+            "origin": self.drawn.origin.round(4).tolist(),
+            "fixes": self._fixes,
+            "dropped": self._dropped(),
+            "file": None if self.path is None else self.path.name,
+            "problem": self._problem(),
+            "health": self._words,
+            "floor": self._floor,
+            "satellites": self.places.words(),
+            "georeferenced": self._georeferenced,
+        }
+
+    def _problem(self) -> str:
         """Return what keeps the track from being right, in words; empty if nothing does."""
         if self._write_error:
             return self._write_error
@@ -186,7 +198,7 @@ class LiveTrack:
             )
         return ""
 
-    def dropped(self) -> dict[str, int]:
+    def _dropped(self) -> dict[str, int]:
         """Return the number of samples dropped, by reason."""
         dropped = self._merger.dropped
         late = dropped["late"] + self.delayed
@@ -254,7 +266,7 @@ class LiveTrack:
         if fix.kind == "velocity":
             navigator.update_velocity(*arguments)
         elif navigator.update_position(*arguments) != "refused" and self._earth.georeference:
-            self.georeferenced, self.drawn.origin = True, np.zeros(3)
+            self._georeferenced, self.drawn.origin = True, np.zeros(3)
         after = self._state()
         if after.map_frame != before.map_frame:
             self.drawn.move(before, after)
@@ -272,16 +284,16 @@ class LiveTrack:
         if time - self._health_time < _HEALTH_SECONDS:
             return
         self._health_time = time
-        health, late = self._navigator.health, self.dropped().get("late", 0)
+        health, late = self._navigator.health, self._dropped().get("late", 0)
         # The navigator never sees them; if the clock was set back a little, it sees no gap either.
         health = replace(health, samples=health.samples | {"late": late})
         floor = ""  # as well when the stream began again and has no pressure yet
         if health.pressures:
             health.floors = self.drawn.floor_changes()
             floor = _floor_words(floor_at(health.floors, time - _FLOOR_SECONDS))
-        self.floor = floor
+        self._floor = floor
         self.places.draw(self.drawn.points)
-        self.words = [asdict(finding) for finding in verdict(health_findings(health))]
+        self._words = [asdict(finding) for finding in verdict(health_findings(health))]
 
     def _count(self, samples: Sequence[Sample]) -> None:
         """Update the number of samples and their rate, smoothed over some batches."""
@@ -291,8 +303,8 @@ class LiveTrack:
         self.samples += len(samples)
         if last > since:
             rate = 1e9 * len(samples) / (last - since)
-            weight = min(1.0, (last - since) / 2e9) if self.rate else 1.0
-            self.rate += weight * (rate - self.rate)
+            weight = min(1.0, (last - since) / 2e9) if self._rate else 1.0
+            self._rate += weight * (rate - self._rate)
 
     def _state(self) -> NavState:
         state = self._navigator.state

@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from stario.fusion.live import connections
+from stario.fusion.live import run
 from stario.fusion.live.run import LiveServer, is_loopback
 from stario.sequences import read_recording
 
@@ -71,7 +71,7 @@ def test_four_hundred_silent_and_slow_connections_keep_no_push_out(serve, pushes
 
 
 def test_a_connection_without_a_whole_request_is_closed_in_time(serve, monkeypatch):
-    monkeypatch.setattr(connections, "REQUEST_SECONDS", 0.5)
+    monkeypatch.setattr(run, "REQUEST_SECONDS", 0.5)
     server = serve()
     for sent in (b"", HEAD[:20], HEAD + b"{"):
         with socket.create_connection(("127.0.0.1", server.port), timeout=10.0) as client:

@@ -115,7 +115,7 @@ def test_tapped_fixes_move_and_rotate_the_whole_drawn_track(client, hub, pushes,
     np.testing.assert_allclose(start - [50.0, -20.0], [-before[1], before[0]], atol=0.6)
     send(client, bodies[90:])
     np.testing.assert_allclose(ends(session), end_of_rerun(session, new_navigator()), atol=1e-3)
-    assert session.track.fixes == 2
+    assert session.status()["fixes"] == 2
 
 
 def scaled(bodies, factor):
