@@ -175,6 +175,13 @@ def test_shuffled_pushes_give_the_recording_of_ordered_ones(session, pushes, wal
     assert session.status()["dropped"] == {}
 
 
+def test_nothing_waits_for_a_push_that_is_missing_in_the_recording_before(session, pushes):
+    first, second = (pushes(session=name, offset_ns=k * 10**18) for k, name in ((1, "1"), (2, "2")))
+    for body in [first[0], first[2], *second[:4]]:
+        session.take(parse_push(body), 0.0)
+    assert session.track.samples == 80
+
+
 def test_a_push_that_comes_much_too_late_does_not_begin_a_new_track(session, pushes, walk):
     bodies = pushes()
     delayed = bodies.pop(20)

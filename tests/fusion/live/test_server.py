@@ -25,16 +25,6 @@ def test_drawn_track_ends_as_that_of_the_recording(client, hub, pushes, new_navi
     np.testing.assert_allclose(recording.time, walk.time - walk.time[0], atol=1e-9)
 
 
-def test_a_push_of_another_recording_begins_a_new_track_and_file(client, hub, pushes):
-    send(client, pushes(seconds=3.0))
-    first = hub.sessions["phone"].track.path
-    send(client, pushes(session="two", seconds=3.0))
-    session = hub.sessions["phone"]
-    assert session.track.path != first
-    assert session.track.samples == 300
-    assert len(read_recording(first)) == len(read_recording(session.track.path)) == 300
-
-
 def test_two_phones_of_one_name_are_told_apart_and_the_earlier_is_refused(client, hub, pushes):
     one, two = pushes(seconds=3.0), pushes(session="two", offset_ns=10**18 + 10**6, seconds=3.0)
     answers = send(client, [body for pair in zip(one, two, strict=True) for body in pair])

@@ -111,9 +111,11 @@ class NearlyFull:
 def test_a_partial_write_on_a_full_disk_is_undone(tmp_path):
     file = LiveFile(tmp_path, "phone")
     file.append(SAMPLES[:10], 1.7e9)
+    size = file.path.stat().st_size
     file._file = NearlyFull(file._file)
     with pytest.raises(OSError, match="space"):
         file.append(SAMPLES[10:], 1.7e9)
+    assert file.path.stat().st_size == size
     file._file.full = False
     file.append(SAMPLES[10:], 1.7e9)
     recording = read_recording(file.path)
