@@ -83,7 +83,7 @@ def after_a_still_start(walk: ImuSequence) -> ImuSequence:
     )
 
 
-@pytest.mark.parametrize("carry", ["handheld", "pocket", "swinging"])
+@pytest.mark.parametrize("carry", ["handheld", "swinging"])
 def test_a_stream_in_degrees_is_refused_once_the_device_turns(make_walk, still_model, carry):
     right = after_a_still_start(make_walk(3, 26.0, carry=carry))
     navigator = Navigator(still_model)
@@ -98,13 +98,13 @@ def test_a_stream_in_degrees_is_refused_once_the_device_turns(make_walk, still_m
 
 @pytest.mark.parametrize("sensor", ["gyro", "accel"])
 def test_a_stream_with_a_sensor_dead_from_the_beginning_is_refused(make_walk, still_model, sensor):
-    right = after_a_still_start(make_walk(3, 26.0))
+    right = after_a_still_start(make_walk(3, 26.0)).slice(0.0, 20.0)
     dead = replace(right, **{sensor: np.tile(getattr(right, sensor)[0], (len(right), 1))})
     navigator = Navigator(still_model)
     with pytest.raises(InputError, match=f"{sensor}: found values that never change"):
         stream(navigator, dead)
     assert navigator.state is None
-    assert stream(navigator, right)
+    assert stream(navigator, right.slice(0.0, 3.0))
 
 
 def test_a_briefly_tumbling_device_is_not_mistaken_for_a_stream_in_degrees(make_walk, still_model):

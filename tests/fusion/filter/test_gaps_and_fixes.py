@@ -35,7 +35,7 @@ def position_nees(track: Track, walk: ImuSequence, row: int) -> float:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize(("seed", "gap"), [(1, 15.0), (3, 15.0), (4, 3.0)])
+@pytest.mark.parametrize(("seed", "gap"), [(1, 15.0), (4, 3.0)])
 def test_a_position_before_a_gap_does_not_turn_the_track_after_it(
     make_walk, make_oracle, without, backend, seed, gap
 ):
@@ -60,7 +60,7 @@ def test_a_position_before_a_gap_does_not_turn_the_track_after_it(
 def test_fixes_find_the_direction_again_after_a_gap_with_fixes_in_it(
     make_walk, make_oracle, without, backend, seed, gap, turn
 ):
-    walk = turned(make_walk(seed, 60.0), 20.0 + 0.5 * gap, turn)
+    walk = turned(make_walk(seed, 50.0), 20.0 + 0.5 * gap, turn)
     holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
     oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     fixes = true_fixes(walk.truth, 3.0, 0.3, 0)
@@ -91,7 +91,7 @@ def test_states_before_the_first_position_are_as_uncertain_as_the_motion_until_i
     assert (np.abs(off[early, 2]) < 3.0 * np.sqrt(track.covariance[early, 8, 8])).all()
 
 
-@pytest.mark.parametrize("seed", [3, 7])
+@pytest.mark.parametrize("seed", [3])
 def test_a_first_yaw_that_was_off_is_off_about_the_position_that_places_the_track(
     make_walk, make_oracle, seed
 ):
@@ -106,7 +106,7 @@ def test_a_first_yaw_that_was_off_is_off_about_the_position_that_places_the_trac
     assert max(position_nees(track, walk, row) for row in early) < 12.0
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1])
 def test_short_gaps_after_a_long_one_do_not_lose_the_position(
     make_walk, make_oracle, without, seed
 ):
@@ -142,7 +142,7 @@ def test_a_track_not_yet_placed_stays_in_one_piece_across_a_gap(make_walk, make_
     assert error[:2] @ np.linalg.solve(P, error[:2]) < 12.0
 
 
-@pytest.mark.parametrize("seed", [1, 2, 4])
+@pytest.mark.parametrize("seed", [1])
 def test_fixes_after_a_gap_do_not_determine_the_yaw_before_it(
     make_walk, make_oracle, without, seed
 ):
@@ -164,10 +164,10 @@ def test_fixes_after_a_gap_do_not_determine_the_yaw_before_it(
 def test_the_graph_is_no_more_certain_of_the_turn_in_a_gap_than_the_filter(
     make_walk, make_oracle, without, gap
 ):
-    walk = make_walk(1, 30.0)
-    holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
+    walk = make_walk(1, 20.0)
+    holed = without(walk, (walk.time > 10.0) & (walk.time < 10.0 + gap))
     oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
-    after = 20.0 + gap + 0.2
+    after = 10.0 + gap + 0.2
 
     def sigma(track):
         return float(np.sqrt(track.covariance[np.searchsorted(track.time, after), 2, 2]))
@@ -175,7 +175,7 @@ def test_the_graph_is_no_more_certain_of_the_turn_in_a_gap_than_the_filter(
     expected = sigma(Navigator(oracle, CONFIG, backend="ekf").run(holed))
     assert expected > 0.45 * min(gap, 3.0)
     assert sigma(Navigator(oracle, CONFIG, backend="graph").run(holed)) > 0.85 * expected
-    states = stream(Navigator(oracle, CONFIG, backend="graph"), holed)
+    states = stream(Navigator(oracle, CONFIG, backend="graph"), holed.slice(0.0, after + 1.5))
     streamed = next(s for s in states if s.time > after)
     assert np.sqrt(streamed.covariance[2, 2]) > 0.85 * expected
 
@@ -186,7 +186,7 @@ def test_a_fix_within_a_gap_gives_little_information_about_the_track_before_it(
 ):
     nees = []
     for seed in range(4):
-        walk = make_walk(seed, 30.0)
+        walk = make_walk(seed, 18.0)
         holed = without(walk, (walk.time > 15.0) & (walk.time < 15.9))
         oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
         truth = walk.truth.at(np.array([15.85]))
@@ -219,14 +219,14 @@ def test_a_yaw_within_a_short_gap_of_a_turning_device_is_that_of_its_time(
 )
 def test_a_streams_graph_follows_the_fixes_where_the_filter_does(make_walk, make_oracle, jump):
     """A lift, or a positioning system whose origin has moved."""
-    walk = make_walk(2, 42.0)
+    walk = make_walk(2, 26.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     navigator = Navigator(oracle, CONFIG, true_start(walk), "graph")
     for fix in true_fixes(walk.truth, 2.0, 0.3, 0):
-        value = fix.value + (np.array(jump) if fix.time > 30.0 else 0.0)
+        value = fix.value + (np.array(jump) if fix.time > 14.0 else 0.0)
         navigator.update_position(fix.time, value, fix.covariance)
     for state in stream(navigator, walk):
-        if state.time > 36.5:
+        if state.time > 20.5:
             truth = walk.truth.at(np.array([state.time])).position_W[0] + jump
             assert np.linalg.norm(state.p_W - truth) < 1.5
 

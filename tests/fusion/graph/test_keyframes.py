@@ -12,8 +12,6 @@ from told import health_lines
 
 from stario.fusion import Navigator, backends
 from stario.fusion.config import NavigatorConfig
-from stario.fusion.evaluation.checks.backends import score_walk, summary
-from stario.fusion.evaluation.scores import joined
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.fixes import position_fix, velocity_fix, yaw_fix
 from stario.fusion.graph import keyframes
@@ -36,15 +34,6 @@ def graph(model: Any, config: NavigatorConfig = CONFIG, **more: Any) -> Navigato
 
 
 # --- accuracy --------------------------------------------------------------------------------
-
-
-def test_the_graph_is_more_accurate_than_the_filter():
-    scores = joined(score_walk(seed, 30.0) for seed in range(1, 4))
-    figures = summary(scores)
-    assert figures["median_ate_to_filtered"]["track"] < 0.95
-    assert 0.8 < figures["median_ate_to_filtered"]["fixed_lag"] < 1.2
-    # The errors are as stated, so the covariances are right (2.4 expected; three walks scatter).
-    assert all(1.8 < nees < 5.0 for nees in figures["median_nees"].values())
 
 
 def test_states_are_at_the_filters_times_with_a_smaller_covariance(walk, make_oracle):
@@ -91,7 +80,7 @@ def test_the_track_does_not_depend_on_a_heading_that_the_filter_lost(
     make_walk, make_oracle, monkeypatch, full_steps
 ):
     """With full steps, and with small turns where these do not converge."""
-    walk = make_walk(3, 60.0)
+    walk = make_walk(3, 40.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     expected = graph(oracle).run(walk)
     monkeypatch.setattr(backends, "smooth", smooth_turned)
