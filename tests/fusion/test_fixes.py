@@ -179,13 +179,13 @@ def test_two_positions_determine_the_position_and_direction_of_a_track(walk, mod
 def test_the_covariance_in_the_map_frame_is_consistent(make_walk, make_oracle):
     position, yaw = [], []
     for seed in range(12):
-        walk = make_walk(seed, 30.0, 50.0, ERRORS)
+        walk = make_walk(seed, 22.0, 50.0, ERRORS)
         rng = np.random.default_rng(seed)
         oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.05, sigma=0.05, seed=seed)
         turn = about_z(rng.uniform(-np.pi, np.pi))
         fixes = [
             position_fix(t, turn.apply(truth_at(walk, t)[0]) + rng.normal(0.0, 0.2, 3), 0.04 * EYE)
-            for t in (3.0, 25.0)
+            for t in (3.0, 18.0)
         ]
         track = Navigator(oracle, CONFIG, backend="ekf").run(walk, fixes=fixes)
         if track.health.fixes != {"applied": 2}:
@@ -285,10 +285,7 @@ def test_states_of_a_stream_carry_the_number_of_their_map_frame(walk, model):
         (position_fix(5.0, [0, 0, 0], np.nan * EYE), "value that is not finite"),
         (position_fix(5.0, [0, 0, 0], -EYE), "covariance not positive definite"),
         (position_fix(5.0, [0, 0, 0], np.ones((3, 3))), "covariance not positive definite"),
-        (
-            position_fix(5.0, [0, 0, 0], np.triu(np.ones((3, 3)))),
-            "covariance not positive definite",
-        ),
+        (position_fix(5.0, [0, 0, 0], np.tri(3)), "covariance not positive definite"),
         (position_fix(5.0, [0, 0, 0], ROOT @ ROOT.T), "covariance not positive definite"),
         (position_fix(5.0, [0, 0, 0], np.diag([1.0, 1.0, 1e300])), "value too large"),
         (position_fix(5.0, [1e20, 0, 0], EYE), "value too large"),
