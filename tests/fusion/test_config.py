@@ -38,15 +38,12 @@ def test_json_and_toml_give_the_same_configuration(tmp_path):
     (tmp_path / "a.json").write_text(json.dumps(values))
     (tmp_path / "a.toml").write_text("gravity = 9.8\n[filter]\ngate = 0.99\n")
     assert read_config(tmp_path / "a.json") == read_config(tmp_path / "a.toml")
+    (tmp_path / "empty.toml").write_text("")
+    assert read_config(tmp_path / "empty.toml") == NavigatorConfig()
     for name in ("a.json", "a.toml"):
         marked = tmp_path / f"MARKED{name[1:].upper()}"
         marked.write_text((tmp_path / name).read_text(), encoding="utf-8-sig")
         assert read_config(marked) == read_config(tmp_path / name)
-
-
-def test_an_empty_file_gives_the_defaults(tmp_path):
-    (tmp_path / "empty.toml").write_text("")
-    assert read_config(tmp_path / "empty.toml") == NavigatorConfig()
 
 
 def test_a_saved_configuration_reads_back_equal(tmp_path):
@@ -102,6 +99,9 @@ def test_a_malformed_file_is_named_in_one_line(tmp_path, name, content):
     with pytest.raises(ConfigError, match=name) as caught:
         read_config(tmp_path / name)
     assert "\n" not in str(caught.value)
+    for path in (tmp_path / "none.toml", tmp_path):
+        with pytest.raises(StarioError):
+            read_config(path)
 
 
 def test_an_invalid_setting_in_a_file_is_named_with_the_file(tmp_path):
@@ -110,12 +110,6 @@ def test_an_invalid_setting_in_a_file_is_named_with_the_file(tmp_path):
     with pytest.raises(ConfigError, match="an unknown key") as caught:
         read_config(path)
     assert caught.value.field == f"{path}: noise.gyro"
-
-
-def test_a_missing_file_or_a_folder_raises_a_stario_error(tmp_path):
-    for path in (tmp_path / "none.toml", tmp_path):
-        with pytest.raises(StarioError):
-            read_config(path)
 
 
 @pytest.mark.parametrize("rate", UPDATE_RATES)

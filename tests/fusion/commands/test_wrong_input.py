@@ -52,13 +52,6 @@ def test_a_broken_file_is_named_in_one_line(stario, tmp_path, content, words):
     assert list(tmp_path.iterdir()) == [tmp_path / "broken.csv"]
 
 
-def test_a_line_that_is_cut_short_is_named(stario, recording, tmp_path):
-    content = recording.read_bytes()
-    cut, end = content.index(b",", content.index(b"\n", 50_000)), content.index(b"\n", 60_000)
-    (tmp_path / "cut.csv").write_bytes(content[:cut] + content[end:])
-    stario("run", "cut.csv").assert_one_line_error("cut.csv", "line ")
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -239,16 +239,6 @@ def test_a_comparison_leaves_nothing_of_an_earlier_one_but_other_recordings(
     assert {*files, *kept} == {path for path in tmp_path.rglob("*") if path.is_file()}
 
 
-def test_truth_that_ends_early_is_compared_up_to_its_end(walk, model, compared):
-    half = replace(walk, truth=walk.truth.slice(0.0, 10.0))
-    result = compare(model, half, CONFIG)
-    assert result.metrics["track"]["ate_m"] is not None
-    np.testing.assert_array_equal(
-        result.tracks["track"].trajectory.position_W,
-        compared.tracks["track"].trajectory.position_W,
-    )
-
-
 def test_truth_shorter_than_a_window_loses_only_the_true_attitude_track(walk, model, caplog):
     short_truth = replace(walk, truth=walk.truth.slice(3.0, 3.8))
     result = compare(model, short_truth, CONFIG)

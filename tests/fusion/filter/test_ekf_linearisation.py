@@ -136,44 +136,20 @@ def injected(dx: np.ndarray) -> Driven:
 
 def test_retraction_agrees_with_its_first_order_expansion():
     before, step = injected(np.zeros(21)), 1e-5
-    for k in range(21):
-        d = step * np.eye(21)[k]
-        plus, minus = injected(d), injected(-d)
-        clone = [ekf.state.clone_pose(0) for ekf in (plus, minus, before)]
-        e = np.eye(21)[k]
-        for theta, rotations, rho, positions, position in (
-            (
-                e[0:3],
-                (plus.state.R_WB, minus.state.R_WB),
-                e[6:9],
-                (plus.state.p_W, minus.state.p_W),
-                before.state.p_W,
-            ),
-            (
-                e[0:3],
-                (plus.state.R_WB, minus.state.R_WB),
-                e[3:6],
-                (plus.state.v_W, minus.state.v_W),
-                before.state.v_W,
-            ),
-            (
-                e[15:18],
-                (clone[0][0], clone[1][0]),
-                e[18:21],
-                (clone[0][1], clone[1][1]),
-                clone[2][1],
-            ),
-        ):
-            rotation = log_so3(rotations[0] @ rotations[1].T) / (2 * step)
-            np.testing.assert_allclose(rotation, theta, atol=1e-6)
-            shift = (positions[0] - positions[1]) / (2 * step)
-            np.testing.assert_allclose(shift, rho - skew(position) @ theta, atol=1e-6)
-        np.testing.assert_allclose(
-            (plus.state.b_g - minus.state.b_g) / (2 * step), e[9:12], atol=1e-6
-        )
-        np.testing.assert_allclose(
-            (plus.state.b_a - minus.state.b_a) / (2 * step), e[12:15], atol=1e-6
-        )
+    for e in np.eye(21):
+        plus, minus = (injected(sign * step * e).state for sign in (1.0, -1.0))
+        poses = [ekf.clone_pose(0) for ekf in (plus, minus, before.state)]
+        now = [(ekf.R_WB, ekf.p_W) for ekf in (plus, minus, before.state)]
+        moving = [(ekf.R_WB, ekf.v_W) for ekf in (plus, minus, before.state)]
+        for theta, rho, ends in ((0, 6, now), (0, 3, moving), (15, 18, poses)):
+            (R_plus, x_plus), (R_minus, x_minus), (_, x) = ends
+            rotation = log_so3(R_plus @ R_minus.T) / (2 * step)
+            np.testing.assert_allclose(rotation, e[theta : theta + 3], atol=1e-6)
+            expected = e[rho : rho + 3] - skew(x) @ e[theta : theta + 3]
+            np.testing.assert_allclose((x_plus - x_minus) / (2 * step), expected, atol=1e-6)
+        for bias, row in (("b_g", 9), ("b_a", 12)):
+            change = (getattr(plus, bias) - getattr(minus, bias)) / (2 * step)
+            np.testing.assert_allclose(change, e[row : row + 3], atol=1e-6)
 
 
 def test_large_corrections_follow_the_exponential_map():

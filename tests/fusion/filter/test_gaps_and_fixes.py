@@ -246,13 +246,6 @@ def test_the_moments_of_a_large_turn_agree_with_sampled_turns():
     assert np.linalg.eigvalsh(found).min() > -1e-9
 
 
-def test_a_yaw_that_is_not_an_angle_is_refused_and_counted(make_walk, make_oracle):
-    walk = make_walk(3, 12.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG)
-    track = Navigator(oracle, CONFIG, backend="ekf").run(walk, fixes=[yaw_fix(6.0, 1.7e9, 0.1)])
-    assert track.health.fixes == {"yaw not in radians": 1}
-
-
 def test_a_rotation_rounded_to_four_digits_is_accepted(still_model, make_walk):
     walk, zero = make_walk(3, 5.0), np.zeros(3)
     R_WB = np.round(about_z(0.7).as_matrix(), 4)

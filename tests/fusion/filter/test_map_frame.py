@@ -207,19 +207,6 @@ def test_more_accurate_positions_move_a_stationary_track(still_model):
     assert ((sigma > 0.5) & (sigma < 1.5)).all()
 
 
-def test_a_yaw_too_coarse_to_be_informative_is_refused(make_walk, make_oracle):
-    walk = make_walk(3, 40.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
-    fixes = fixes_of(walk, np.arange(2.0, 38.0, 3.0), np.zeros(3))
-    wrong = yaw_fix(3.0, 0.0, 2.0)
-    with_it, without = (
-        Navigator(oracle, CONFIG, backend="ekf").run(walk, fixes=f)
-        for f in ([*fixes, wrong], fixes)
-    )
-    assert with_it.health.fixes == without.health.fixes | {"too coarse": 1}
-    np.testing.assert_array_equal(with_it.trajectory.position_W, without.trajectory.position_W)
-
-
 def test_the_track_is_turned_about_its_prior_position(make_walk, make_oracle):
     walk = make_walk(3, 40.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
