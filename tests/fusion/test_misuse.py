@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from simulated import measured
 from support import GRAPH
 
 from stario.fusion import (
@@ -113,9 +114,8 @@ def test_fixes_of_a_clock_that_is_ahead_do_not_block_correct_ones(still_model):
     assert navigator.health.fixes == {"too many waiting": 2, "waiting": 10_000}
 
 
-def test_the_graph_accepts_biases_without_random_walk(make_walk, make_oracle):
-    walk = make_walk(3, 15.0)
-    oracle = make_oracle(walk, walk.truth, GRAPH, noise=0.03, sigma=0.03)
+def test_the_graph_accepts_biases_without_random_walk():
+    walk, _, oracle = measured(3, 15.0, GRAPH)
     steady = replace(GRAPH, noise=ImuNoise(2e-3, 0.1, 0.0, 0.0))
     track = Navigator(oracle, steady, backend="graph").run(walk)
     assert not any("fell back" in note for note in track.health.notes)

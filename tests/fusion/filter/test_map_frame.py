@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from simulated import measured
 from support import GRAPH as CONFIG
 from support import stream
 
@@ -38,11 +39,8 @@ def stream_with_fixes(navigator: Navigator, walk: ImuSequence, fixes: list[Fix])
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_fixes_far_from_the_maps_origin_are_as_accurate_as_near_ones(
-    make_walk, make_oracle, backend
-):
-    walk = make_walk(3, 16.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+def test_fixes_far_from_the_maps_origin_are_as_accurate_as_near_ones(backend):
+    walk, _, oracle = measured(3, 16.0, CONFIG)
     found = []
     for shift in (np.zeros(3), MAP):
         fixes = fixes_of(walk, np.arange(5.0, 15.0, 3.0), shift)
@@ -72,13 +70,9 @@ def test_a_fix_at_the_first_sample_places_the_first_state_too(make_walk, make_or
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("gap", [4.0, 15.0])
-def test_fixes_recover_the_yaw_after_a_gap_that_lost_it(
-    make_walk, make_oracle, without, backend, gap
-):
+def test_fixes_recover_the_yaw_after_a_gap_that_lost_it(backend, gap):
     """The pedestrian turns in the gap; the track before it stays where the fixes placed it."""
-    walk = make_walk(6, 50.0)
-    holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
-    oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    walk, holed, oracle = measured(6, 50.0, CONFIG, gap=(20.0, 20.0 + gap))
     times = [*np.arange(3.0, 19.0, 3.0), *np.arange(22.0 + gap, 49.0, 3.0)]
     fixes = fixes_of(walk, times, np.zeros(3))
     track = Navigator(oracle, CONFIG, backend=backend).run(holed, fixes=fixes)
@@ -161,9 +155,8 @@ def yaw_error(walk: ImuSequence, states: list[NavState]) -> tuple[np.ndarray, np
 @pytest.mark.parametrize(
     "off", [[200.0, 0.0, 0.0], pytest.param([0.0, -60.0, 0.0], marks=pytest.mark.slow)]
 )
-def test_a_wrong_first_position_does_not_turn_the_track(make_walk, make_oracle, backend, off):
-    walk = make_walk(3, 40.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+def test_a_wrong_first_position_does_not_turn_the_track(backend, off):
+    walk, _, oracle = measured(3, 40.0, CONFIG)
     fixes = fixes_of(walk, np.arange(2.0, 38.0, 3.0), np.zeros(3))
     bad = position_fix(fixes[0].time, fixes[0].value + off, fixes[0].covariance)
     states = stream_with_fixes(Navigator(oracle, CONFIG, backend=backend), walk, [bad, *fixes[1:]])
@@ -176,9 +169,8 @@ def test_a_wrong_first_position_does_not_turn_the_track(make_walk, make_oracle, 
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_positions_undo_a_yaw_that_pointed_backwards(make_walk, make_oracle, backend):
-    walk = make_walk(3, 60.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+def test_positions_undo_a_yaw_that_pointed_backwards(backend):
+    walk, _, oracle = measured(3, 60.0, CONFIG)
     wrong = yaw_of(walk.truth.at(np.array([4.0])).attitude_WB)[0] + np.pi
     right = [position_fix(t, true_at(walk, t), 0.09 * np.eye(3)) for t in np.arange(5.0, 58.0, 1.0)]
     track = Navigator(oracle, CONFIG, backend=backend).run(
@@ -207,9 +199,8 @@ def test_more_accurate_positions_move_a_stationary_track(still_model):
     assert ((sigma > 0.5) & (sigma < 1.5)).all()
 
 
-def test_the_track_is_turned_about_its_prior_position(make_walk, make_oracle):
-    walk = make_walk(3, 40.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+def test_the_track_is_turned_about_its_prior_position():
+    walk, _, oracle = measured(3, 40.0, CONFIG)
     far, turn = np.array([100.0, 50.0, 0.0]), about_z(2.0)
     fixes = fixes_of(walk, np.arange(3.0, 38.0, 3.0), far)
     first = walk.truth.attitude_WB[0].as_matrix()
@@ -243,9 +234,8 @@ def test_uninformative_fixes_in_a_gap_leave_its_turn_as_uncertain(make_walk, wit
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_false_position_does_not_block_a_yaw(make_walk, make_oracle, backend):
-    walk = make_walk(3, 20.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+def test_a_false_position_does_not_block_a_yaw(backend):
+    walk, _, oracle = measured(3, 20.0, CONFIG)
     first, off = fixes_of(walk, [2.0, 4.0], np.zeros(3))
     off = position_fix(off.time, off.value + np.array([60.0, 0.0, 0.0]), off.covariance)
     yaw = float(yaw_of(walk.truth.at(np.array([5.0])).attitude_WB)[0]) + 2.0
@@ -256,9 +246,8 @@ def test_a_false_position_does_not_block_a_yaw(make_walk, make_oracle, backend):
     assert sigma[-1] < 0.2
 
 
-def test_a_horizontal_position_is_kept_over_a_coarser_one_with_height(make_walk, make_oracle):
-    walk = make_walk(3, 20.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+def test_a_horizontal_position_is_kept_over_a_coarser_one_with_height():
+    walk, _, oracle = measured(3, 20.0, CONFIG)
     start = true_at(walk, 1.5)
     plane = position_fix(1.5, [start[0], start[1], 0.0], np.diag([0.09, 0.09, 1e6]))
     coarse = position_fix(2.5, true_at(walk, 2.5) + np.array([6.0, 6.0, 0.0]), 64.0 * np.eye(3))

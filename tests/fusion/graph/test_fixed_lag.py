@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from simulated import measured
 from support import GRAPH as CONFIG
 from support import stream
 
@@ -43,10 +44,9 @@ def assert_valid(state: NavState) -> None:
     np.testing.assert_allclose(state.R_WB @ state.R_WB.T, np.eye(3), atol=1e-9)
 
 
-def test_a_stream_is_about_as_accurate_as_the_filter(make_walk, make_oracle):
+def test_a_stream_is_about_as_accurate_as_the_filter():
     """Same times, similar errors and sigmas; above all yaw's, which only fixes determine."""
-    walk = make_walk(5, 25.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    walk, _, oracle = measured(5, 25.0, CONFIG)
     ours, theirs = (
         stream(Navigator(oracle, CONFIG, true_start(walk), backend), walk)
         for backend in ("graph", "ekf")
@@ -115,10 +115,9 @@ def test_a_stream_gates_displacements_itself_if_the_filter_uses_more_of_them(wal
     assert np.linalg.norm(corrupted - clean, axis=1).max() < 0.35
 
 
-def test_a_heading_far_from_the_estimate_turns_a_stream_like_its_filter(make_walk, make_oracle):
+def test_a_heading_far_from_the_estimate_turns_a_stream_like_its_filter():
     """Used as inflated by the filter; to a robust loss of the graph's own it is 60 sigma off."""
-    walk = make_walk(5, 16.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    walk, _, oracle = measured(5, 16.0, CONFIG)
     start = true_start(walk)
     turn = about_z(0.6).as_matrix()
     turned = replace(start, R_WB=turn @ start.R_WB, v_W=turn @ start.v_W, yaw_sigma=0.5)
@@ -131,10 +130,9 @@ def test_a_heading_far_from_the_estimate_turns_a_stream_like_its_filter(make_wal
     assert ends[0] < 1.2 * ends[1] + 0.1
 
 
-def test_a_late_fix_that_changes_the_gating_brings_a_stream_to_its_filter(make_walk, make_oracle):
+def test_a_late_fix_that_changes_the_gating_brings_a_stream_to_its_filter():
     """A start 4 m/s off makes correct displacements look false until a fix gives the velocity."""
-    walk = make_walk(5, 6.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    walk, _, oracle = measured(5, 6.0, CONFIG)
     start = true_start(walk)
     fast = replace(start, v_W=start.v_W + np.array([4.0, 0.0, 0.0]), velocity_sigma=0.5)
     v_W = walk.truth.at(np.array([0.3])).velocity_W[0]
@@ -226,7 +224,7 @@ def test_late_fixes_correct_the_newest_state_too(walk, make_oracle):
     assert_valid(navigator.state)
 
 
-def test_rest_stops_the_drift(make_oracle, still_model, make_walk):
+def test_rest_stops_the_drift(still_model):
     """A device on a table with an uninformative network."""
     rng = np.random.default_rng(0)
     n = 1500

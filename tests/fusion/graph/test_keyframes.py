@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from simulated import measured
 from support import GRAPH as CONFIG
 from support import stream
 from told import health_lines
@@ -76,12 +77,9 @@ def smooth_turned(filtered, *others):
 
 
 @pytest.mark.parametrize("full_steps", [50, 1])
-def test_the_track_does_not_depend_on_a_heading_that_the_filter_lost(
-    make_walk, make_oracle, monkeypatch, full_steps
-):
+def test_the_track_does_not_depend_on_a_heading_that_the_filter_lost(monkeypatch, full_steps):
     """With full steps, and with small turns where these do not converge."""
-    walk = make_walk(3, 40.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    walk, _, oracle = measured(3, 40.0, CONFIG)
     expected = graph(oracle).run(walk)
     monkeypatch.setattr(backends, "smooth", smooth_turned)
     monkeypatch.setattr(keyframes, "_FULL_STEPS", full_steps)
@@ -233,12 +231,9 @@ def test_the_track_meets_heading_and_velocity_fixes(walk, make_oracle):
     assert track.covariance[k, 3, 3] < 2e-4
 
 
-def test_a_heading_at_a_tilted_device_is_measured_at_the_tilt_that_the_graph_finds(
-    make_walk, make_oracle
-):
+def test_a_heading_at_a_tilted_device_is_measured_at_the_tilt_that_the_graph_finds():
     """At 126 degrees, the start's error of the tilt enters a yaw fix twice as large."""
-    walk = make_walk(1, 15.0, mount_rotvec=(2.2, 0.0, 0.0))
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
+    walk, _, oracle = measured(1, 15.0, CONFIG, noise=0.1, mount_rotvec=(2.2, 0.0, 0.0))
     first = Rotation.from_rotvec([0.1, -0.1, 0.0]) * walk.truth.attitude_WB[0]
     start = first.as_matrix(), walk.truth.velocity_W[0], walk.truth.position_W[0]
     times = np.arange(0.51, 14.0, 0.1)
