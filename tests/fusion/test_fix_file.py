@@ -51,7 +51,6 @@ def test_a_spreadsheets_blank_cells_and_encoding_are_read(tmp_path, encoding):
         (HEADER + "1,position,1,2,,1,,0.5\n", "line 2, z"),
         (HEADER + "1,yaw,170,,,5,,\n", r"yaw.*radians.*\[deg\]"),
         (HEADER + "1,position [deg],1,2,3,1,,\n", "line 2, kind"),
-        ("t,kind,x,x,sx\n", "line 1.*header"),
         ("t,kind,x [cm],y [cm],sx\n", r"line 1.*\[cm\]"),
         ("t [ms],kind,x [m],y,sx\n", r"line 1.*\[ms\]"),
         (HEADER + "1,position,1,2,3,,,\n", "line 2, sx"),

@@ -259,20 +259,6 @@ def test_one_position_leaves_the_direction_in_the_map_unknown(walk, model, backe
     assert streamed.health.final_sigma["yaw_rad"] > 1.5
 
 
-def test_states_of_a_stream_carry_the_number_of_their_map_frame(walk, model):
-    navigator, map_frames = Navigator(model, CONFIG), []
-    for fix in fixes_of(walk):
-        apply_fix(navigator, fix)
-    for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
-        state = navigator.push(*row)
-        if state is not None:
-            map_frames.append((state.time, state.map_frame))
-    changed = [
-        t for (t, w), (_, before) in zip(map_frames[1:], map_frames, strict=False) if w > before
-    ]
-    assert changed == pytest.approx([5.1, 12.0], abs=1e-6)
-
-
 # --- bad fixes -------------------------------------------------------------------------------
 
 
@@ -280,7 +266,6 @@ def test_states_of_a_stream_carry_the_number_of_their_map_frame(walk, model):
     ("fix", "reason"),
     [
         (position_fix(5.0, [np.nan, 0, 0], EYE), "value that is not finite"),
-        (position_fix(5.0, [0, np.inf, 0], EYE), "value that is not finite"),
         (position_fix(np.nan, [0, 0, 0], EYE), "value that is not finite"),
         (position_fix(5.0, [0, 0, 0], np.nan * EYE), "value that is not finite"),
         (position_fix(5.0, [0, 0, 0], -EYE), "covariance not positive definite"),
@@ -290,8 +275,6 @@ def test_states_of_a_stream_carry_the_number_of_their_map_frame(walk, model):
         (position_fix(5.0, [0, 0, 0], np.diag([1.0, 1.0, 1e300])), "value too large"),
         (position_fix(5.0, [1e20, 0, 0], EYE), "value too large"),
         (yaw_fix(5.0, 0.0, -0.1), "covariance not positive definite"),
-        (yaw_fix(5.0, 0.0, 0.0), "covariance not positive definite"),
-        (yaw_fix(5.0, 0.0, np.inf), "value that is not finite"),
         (yaw_fix(5.0, 0.0, 1e200), "value that is not finite"),
         (yaw_fix(5.0, np.inf, 0.1), "value that is not finite"),
         (yaw_fix(5.0, 90.0, 0.1), "yaw not in radians"),

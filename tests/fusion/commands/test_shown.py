@@ -88,10 +88,6 @@ def test_live_refuses_a_port_in_use(stario):
         stario("live", "--port", port).assert_one_line_error("port", "--port")
 
 
-def test_live_refuses_an_invalid_address_of_a_phone(stario):
-    stario("live", "--port", 0, "--phyphox", "file:///etc/passwd").assert_one_line_error("phyphox")
-
-
 def test_training_without_a_terminal_tells_its_progress_and_the_time_left(monkeypatch, capsys):
     """Steps of four seconds: a line every third of them, none of seconds that had no step."""
     clock = count(0.0, 4.0)

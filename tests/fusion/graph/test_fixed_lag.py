@@ -163,17 +163,6 @@ def test_a_late_fix_from_before_the_graph_began_brings_a_stream_to_its_filter(wa
     np.testing.assert_allclose(*late, atol=1e-6)
 
 
-def test_a_stream_equals_the_batch_within_the_lag(walk, make_oracle):
-    """Until something leaves the lag, both use everything, with one or two windows a second."""
-    short = walk.slice(0.0, 4.0)
-    oracle = make_oracle(short, walk.truth, CONFIG, noise=0.03, sigma=0.03)
-    track, states = lagged(oracle).run(short), stream(lagged(oracle), short)
-    at = int(np.argmin(np.abs(track.time - 3.0)))
-    newest = next(s for s in states if abs(s.time - 3.0) < 1e-6)
-    # The batch uses one more second.
-    assert np.linalg.norm(newest.p_W - track.trajectory.position_W[at]) < 0.1
-
-
 def test_a_lag_longer_than_the_walk_changes_little(walk, make_oracle):
     """Marginalised information is kept."""
     walk = walk.slice(0.0, 12.0)

@@ -25,7 +25,7 @@ from stario.fusion.state import Track
 from stario.network.model import load_model
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.moments import MOMENTS
 
 BY_NAME = {moment.name: moment for moment in MOMENTS}
@@ -92,12 +92,6 @@ def test_a_phone_laid_down_and_taken_up_costs_the_rest_little(walk, monkeypatch)
 def test_a_recording_without_known_positions_is_refused(walk):
     with pytest.raises(InputError, match="truth"):
         moment_costs(object(), walk.without_truth(), NavigatorConfig())
-
-
-def test_a_recording_begins_at_its_first_known_position_and_is_cut(walk):
-    late = replace(walk, truth=walk.truth.slice(5.0, 20.0))
-    assert moments._with_truth(late).time[0] == pytest.approx(5.0)
-    assert isinstance(late.truth, Trajectory)
 
 
 MEASURED = {
