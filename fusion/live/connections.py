@@ -16,10 +16,6 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 REQUEST_SECONDS = 20.0
 """Maximum time from a connection or a request's first byte to its last [s]."""
 
-MAX_OF_ADDRESS, CROWDED_SECONDS = 40, 1.0
-"""Number of waiting connections of one address, beyond which those without an answer so far must
-send their request in this time [s]."""
-
 MAX_WAITING = 500
 """Maximum number of waiting connections; for one more the address with the most loses its oldest.
 They are accepted hundreds at a time, so that a lower number could hit one that has just come."""
@@ -69,11 +65,8 @@ class Connection(H11Protocol):
 
 def close_overdue(connections: Iterable[object], now: float) -> None:
     """Close the connections that have waited too long at a time of the event loop [s]."""
-    waiting = _waiting(connections)
-    number = Counter(each.address for each in waiting)
-    for each in waiting:
-        crowded = number[each.address] > MAX_OF_ADDRESS and not each.answered
-        if now - each.since > (CROWDED_SECONDS if crowded else REQUEST_SECONDS):
+    for each in _waiting(connections):
+        if now - each.since > REQUEST_SECONDS:
             each.transport.abort()
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stario.sequences.arrays import interpolated
-from stario.sequences.drawing.figures import INK, clock, distance, split_at_gaps, split_at_nan
+from stario.sequences.drawing.figures import INK, clock, distance, split_at_gaps
 from stario.sequences.sequence import FloatArray, Trajectory
 
 if TYPE_CHECKING:
@@ -28,9 +27,9 @@ _STRIDE = 1.0
 _MIN_STRIDE = 0.3
 """Distance within these [m] below which there is no arrow: the device rests."""
 
-_WIDE, _NARROW, _PIECES = 3.2, 1.4, 200
-"""Line widths at start and end, and number of pieces of one colour and width each: where the way
-back covers the way out, both show."""
+_WIDE, _NARROW, _COLOURS = 3.2, 1.4, 200
+"""Line widths at start and end, and number of colours: where the way back covers the way out, both
+show."""
 
 
 def draw_timed_path(
@@ -54,26 +53,16 @@ def draw_timed_path(
 
     duration = max(float(track.time[-1] - track.time[0]), 1e-3)
     # Without the brightest colours, which white paper swallows; uniform also for colour-blind eyes.
-    colours = ListedColormap(colormaps["plasma"](np.linspace(0.0, 0.85, _PIECES)))
+    colours = ListedColormap(colormaps["plasma"](np.linspace(0.0, 0.85, _COLOURS)))
     elapsed = track.time - track.time[0]
     scale = ScalarMappable(Normalize(0.0, duration), colours)
     rows = np.column_stack(split_at_gaps(elapsed, track.position_W[:, :2], track.valid))
-    parts = []
-    for stretch in split_at_nan(rows):
-        cuts = np.interp(
-            np.unique(np.clip(np.linspace(0.0, elapsed[-1], _PIECES), *stretch[[0, -1], 0])),
-            stretch[:, 0],
-            np.arange(len(stretch)),
-        ).astype(int)
-        parts += [stretch[a : b + 1] for a, b in pairwise(cuts) if b > a]
-    middle = np.array([part[len(part) // 2, 0] for part in parts])
+    steps = np.stack([rows[:-1], rows[1:]], axis=1)
+    steps = steps[np.isfinite(steps).all(axis=(1, 2))]
+    middle = steps[:, :, 0].mean(axis=1)
     widths = fine * (_WIDE + (_NARROW - _WIDE) * middle / duration)
-    axes.add_collection(
-        LineCollection(
-            [part[:, 1:] for part in parts], colors=scale.to_rgba(middle), linewidths=widths,
-            capstyle="round", zorder=3.5,
-        )
-    )  # fmt: skip
+    look = {"colors": scale.to_rgba(middle), "linewidths": widths, "capstyle": "round"}
+    axes.add_collection(LineCollection([*steps[:, :, 1:]], **look, zorder=3.5))
     in_legend = _at(scale, 0.5 * duration)
     axes.plot([], [], color=in_legend, lw=2.0 * fine, label=label)
     _draw_arrows(axes, track, scale)
