@@ -164,6 +164,9 @@ EXPORTS: dict[str, Export] = {
         f, *alike("{}.csv", "timeMillis,timeNanos,@", 1_539_940_408_606 + w.ms, w.ns,
                   Accelerometer=w.a, Gyroscope=w.w, MagneticField=w.m),
     ),
+    "time_behind_the_values": lambda f, w: write(
+        f, ("accel.csv", ",", w.a, w.t), ("gyro.csv", ",", w.w, w.t)
+    ),
     # Milliseconds in scientific notation, no header.
     "prefixed": lambda f, w: write(
         f, *alike("Eight_{}.csv", " ", [f"{x:.18e}" for x in 1.606391908305e12 + 1e3 * w.t],

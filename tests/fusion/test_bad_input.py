@@ -3,12 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
-from support import CONFIG, FILTER, NOISE, Broken, ate, stream, stream_deviation
+from support import CONFIG, GRAPH, Broken, ate, stream, stream_deviation
 
 from stario.fusion import Navigator
-from stario.fusion.config import NavigatorConfig
 from stario.sequences.accuracy.metrics import align
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
@@ -48,9 +48,7 @@ def test_health_counts_bad_samples_gaps_and_updates(walk, make_oracle):
     assert all("\n" not in line for line in health.lines())
 
 
-@pytest.mark.parametrize(
-    ("factor", "start"), [(1e3, 0.0), (1e3, 1.7e12), (1e6, 0.0), (1e9, 1.7e18), (100.0, 0.0)]
-)
+@pytest.mark.parametrize(("factor", "start"), [(1e3, 0.0), (1e9, 1.7e18), (100.0, 0.0)])
 def test_a_stream_whose_times_are_not_in_seconds_is_refused(walk, still_model, factor, start):
     navigator = Navigator(still_model, CONFIG)
     mistimed = replace(walk, time=start + factor * walk.time)
@@ -81,13 +79,24 @@ def test_invalid_predictions_are_refused_and_counted(walk, make_oracle, mean, va
     assert ate(track, walk) < 0.3
 
 
-def test_outliers_are_gated_and_do_little_harm(walk, make_oracle):
-    model = Broken(make_oracle(walk, walk.truth, CONFIG), 5.0, 0.02**2)
-    track = Navigator(model, CONFIG, backend="ekf").run(walk)
-    assert 0.5 * track.health.updates / 3 < track.health.gated
-    open_gate = NavigatorConfig(NOISE, replace(FILTER, gate=1.0 - 1e-16))
-    model = Broken(make_oracle(walk, walk.truth, open_gate), 5.0, 0.02**2)
-    assert ate(track, walk) < 0.5 * ate(Navigator(model, open_gate, backend="ekf").run(walk), walk)
+@pytest.mark.parametrize(
+    ("backend", "config", "metres", "sigma"),
+    [("ekf", CONFIG, 5.0, 0.02), ("graph", GRAPH, 2.0, 0.05)],
+)
+def test_outliers_do_less_harm_than_without_a_gate(
+    walk, make_oracle, backend, config, metres, sigma
+):
+    open_gate = replace(config, filter=replace(config.filter, gate=1.0 - 1e-16))
+    gated, taken = (
+        Navigator(
+            Broken(make_oracle(walk, walk.truth, each, sigma=sigma), metres, sigma**2),
+            each,
+            backend=backend,
+        ).run(walk)
+        for each in (config, open_gate)
+    )
+    assert 0.5 * gated.health.updates / 3 < gated.health.gated
+    assert ate(gated, walk) < (0.5 if backend == "ekf" else 0.6) * ate(taken, walk)
 
 
 @pytest.mark.parametrize("length", [0.5, 3.0])
@@ -95,7 +104,7 @@ def test_after_a_gap_speed_recovers_and_sigma_covers_the_error(
     make_walk, make_oracle, without, length
 ):
     covered, speed_errors = [], []
-    for seed in range(4):
+    for seed in range(2):
         walk = make_walk(seed, 20.0)
         holed = without(walk, (walk.time > 8.0) & (walk.time < 8.0 + length))
         track = Navigator(make_oracle(holed, walk.truth, CONFIG), CONFIG, backend="ekf").run(holed)
@@ -121,7 +130,7 @@ def test_after_a_gap_speed_recovers_and_sigma_covers_the_error(
     assert np.max(speed_errors) < 0.25
 
 
-@pytest.mark.parametrize("seconds", [0.0, 0.02, 0.9, 1.4])
+@pytest.mark.parametrize("seconds", [0.0, 0.9, 1.4])
 def test_a_recording_that_is_too_short_raises_a_clear_error(walk, still_model, seconds):
     with pytest.raises(InputError, match="at least") as caught:
         Navigator(still_model, backend="ekf").run(walk.slice(0.0, seconds))
@@ -137,25 +146,19 @@ def test_a_recording_of_pieces_shorter_than_a_window_raises_a_clear_error(
 
 
 @pytest.mark.parametrize(
-    "vector", [(1.0, 2.0), 3.0, "abc", (1, 2, None), None, np.ones((3, 1)), np.ones((1, 3))]
+    "vector",
+    [3.0, "abc", (1, 2, None), pd.DataFrame([[0.0, 0.0, 9.8]])],
 )
 def test_a_sample_that_is_not_a_vector_is_refused_by_name(still_model, vector):
     navigator = Navigator(still_model)
-    with pytest.raises(InputError, match=r"^gyro: found .*$"):
+    with pytest.raises(InputError, match=r"^gyro: found "):
         navigator.push(0.0, vector, (0.0, 0.0, 9.8))
-    with pytest.raises(InputError, match=r"^accel: found .*$"):
+    with pytest.raises(InputError, match=r"^accel: found "):
         navigator.push(0.0, (0.0, 0.0, 0.0), vector)
+    navigator.push(0.0, (0.0, 0.0, 0.0), pd.Series([0.0, 0.0, 9.8]))
 
 
-def test_a_table_is_no_vector_though_its_columns_are_numbers(still_model):
-    pandas = pytest.importorskip("pandas")
-    row = pandas.DataFrame([[0.0, 0.0, 9.8]])
-    with pytest.raises(InputError, match="accel"):
-        Navigator(still_model).push(0.0, (0.0, 0.0, 0.0), row)
-    Navigator(still_model).push(0.0, (0.0, 0.0, 0.0), row.iloc[0])
-
-
-@pytest.mark.parametrize("time", ["x", None, (1.0, 2.0)])
+@pytest.mark.parametrize("time", ["0.0", None, (1.0, 2.0), 10**400])
 def test_a_time_that_is_not_a_number_is_refused_by_name(still_model, time):
     with pytest.raises(InputError, match=r"time: found .*, expected a number"):
         Navigator(still_model).push(time, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))
@@ -220,6 +223,7 @@ def turned_over(walk: ImuSequence, late: np.ndarray) -> ImuSequence:
 @pytest.mark.parametrize("seconds", [60.0, 1e6])
 def test_after_a_long_gap_the_navigator_restarts_where_it_was(walk, make_oracle, seconds):
     """The device is turned over in the gap: the first second after it determines the tilt again."""
+    walk = walk.slice(0.0, 17.0)
     late = walk.time > 10.0
     turned, time = turned_over(walk, late), walk.time + seconds * late
     truth = replace(turned.truth, time=time)
@@ -244,7 +248,7 @@ def test_after_a_long_gap_the_navigator_restarts_where_it_was(walk, make_oracle,
 
 
 @both_backends
-@pytest.mark.parametrize("seconds", [0.3, 1.0, 5.0])
+@pytest.mark.parametrize("seconds", [0.3, 5.0])
 def test_a_device_turned_over_in_a_gap_does_not_run_away(walk, make_oracle, backend, seconds):
     """As in a swinging hand: with its old tilt, gravity would be taken for motion."""
     gap = (walk.time > 10.0) & (walk.time < 10.0 + seconds)
@@ -269,6 +273,7 @@ def test_a_device_turned_over_in_a_gap_does_not_run_away(walk, make_oracle, back
 
 @both_backends
 def test_spikes_are_replaced_and_counted(walk, make_oracle, backend):
+    walk = walk.slice(0.0, 13.0)
     gyro, accel = walk.gyro.copy(), walk.accel.copy()
     gyro[405, 0] += 300.0
     gyro[800, 2] -= 50.0  # at an interval's end
@@ -288,6 +293,7 @@ def test_spikes_are_replaced_and_counted(walk, make_oracle, backend):
 
 @both_backends
 def test_a_clipped_sensor_is_flagged_and_trusted_less(walk, make_oracle, backend):
+    walk = walk.slice(0.0, 10.0)
     limit = float(np.quantile(np.abs(walk.accel).max(axis=1), 0.9))
     clipped = replace(walk, accel=np.clip(walk.accel, -limit, limit))
     oracle = make_oracle(clipped, walk.truth, CONFIG)

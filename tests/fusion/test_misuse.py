@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from simulated import measured
 from support import GRAPH
 
 from stario.fusion import (
@@ -45,9 +46,6 @@ LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
             lambda model: Navigator(model).update_yaw(np.datetime64("2024"), 0.0, 0.1),
             r"time: found values of type datetime64\[Y\], expected a number",
         ),
-        (lambda model: Navigator(model).push(0.0, "123", [0, 0, 9.8]), "gyro.*three numbers"),
-        (lambda model: Navigator(model).push("0.0", [0, 0, 0], [0, 0, 9.8]), "time: .*seconds"),
-        (lambda model: Navigator(model).push(10**400, [0, 0, 0], [0, 0, 9.8]), "time: .*seconds"),
         (lambda model: Navigator(model).restore(b"xx" + Navigator(model).snapshot()), "else"),
         (lambda model: compare("walk.csv", model, NavigatorConfig()), "sequence.*read_recording"),
         (lambda model: network_track("walk.csv"), "preprocessed.*observe"),
@@ -55,7 +53,6 @@ LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
         (lambda model: summary_table(["walk"]), "recordings.*scores_of"),
         (lambda model: next(compare_recordings("walk.csv", model)), "paths.*find_recordings"),
         (lambda model: FilterConfig(gate="0.9"), "gate"),
-        (lambda model: FilterConfig(gate=1.0), "gate"),
         (lambda model: FilterConfig(magnetometer="no"), "magnetometer"),
         (lambda model: FilterConfig(update_rate=np.ones(3)), "update_rate"),
         (lambda model: NavigatorConfig(filter={"update_rate": 2}), "filter"),
@@ -64,7 +61,6 @@ LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
         (lambda model: PriorPose(*LEVEL, tilt_sigma="a"), "tilt_sigma"),
         (lambda model: PriorPose(*LEVEL, position_sigma=1e9), "position_sigma"),
         (lambda model: PriorPose(2.0 * np.eye(3), *LEVEL[1:]), "R_WB"),
-        (lambda model: PriorPose(np.diag([1.0, 1.0, -1.0]), *LEVEL[1:]), "R_WB"),
         (lambda model: PriorPose(LEVEL[0], [0.0, 0.0], LEVEL[2]), "v_W"),
     ],
 )
@@ -116,9 +112,8 @@ def test_fixes_of_a_clock_that_is_ahead_do_not_block_correct_ones(still_model):
     assert navigator.health.fixes == {"too many waiting": 2, "waiting": 10_000}
 
 
-def test_the_graph_accepts_biases_without_random_walk(make_walk, make_oracle):
-    walk = make_walk(3, 15.0)
-    oracle = make_oracle(walk, walk.truth, GRAPH, noise=0.03, sigma=0.03)
+def test_the_graph_accepts_biases_without_random_walk():
+    walk, _, oracle = measured(3, 15.0, GRAPH)
     steady = replace(GRAPH, noise=ImuNoise(2e-3, 0.1, 0.0, 0.0))
     track = Navigator(oracle, steady, backend="graph").run(walk)
     assert not any("fell back" in note for note in track.health.notes)

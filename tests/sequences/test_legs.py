@@ -57,17 +57,11 @@ def test_the_time_of_a_tap_is_uncertain_wherever_the_waypoint_is(recording):
     assert (by_eye.sigma > surveyed.sigma).all()
 
 
-def test_positions_seconds_apart_make_no_legs(recording):
-    """Between them a pedestrian may have turned, however regular they are."""
-    time = TIME[::4]
-    known = PositionTrack(time, recording.truth.at(time).position_W, "positions")
-    assert leg_streams(replace(recording, truth=None, positions=known)) == []
-
-
-def test_a_single_leg_is_not_enough(recording):
-    """With its yaw unknown, a leg by itself says no more than its length."""
-    time = np.array([5.0, 15.0])
-    known = PositionTrack(time, recording.truth.at(time).position_W, "waypoints")
+@pytest.mark.parametrize(("time", "kind"), [(TIME[::4], "positions"), ([5.0, 15.0], "waypoints")])
+def test_positions_seconds_apart_and_a_single_leg_are_not_used(recording, time, kind):
+    """Between positions a pedestrian may have turned, and one leg is no more than its length."""
+    position = recording.truth.at(np.array(time)).position_W
+    known = PositionTrack(np.array(time), position, kind)
     assert leg_streams(replace(recording, truth=None, positions=known)) == []
 
 

@@ -35,12 +35,6 @@ def test_increasing_times_are_all_kept_whatever_the_gaps():
     assert increasing_mask(np.empty(0)).tolist() == []
 
 
-def test_repeated_and_late_times_are_dropped():
-    time = TIME.copy()
-    time[20], time[30] = time[19], time[11]
-    assert dropped_rows(time) == [20, 30]
-
-
 @pytest.mark.parametrize("by", [0.3, 5.0, 100.0, 1e9])
 @pytest.mark.parametrize("row", [0, 1, 200, 398])
 def test_one_outlying_time_drops_only_its_own_sample(row, by):

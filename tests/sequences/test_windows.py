@@ -96,19 +96,6 @@ def test_the_target_is_the_displacement_over_the_window(walk):
         assert np.abs(windows[k, :3].T - rate).max() < 1e-5
 
 
-def test_a_window_contains_the_motion_of_its_target(walk):
-    """Force integrated twice from the true initial velocity gives the target: no time shift."""
-    (stream,) = world_streams(walk, attitude="true")
-    velocity = walk.truth.velocity_W
-    windows, targets = windows_of(stream, stride=100)
-    for k, (window, target) in enumerate(zip(windows, targets, strict=True)):
-        accel = window[3:].T.astype(np.float64) - [0.0, 0.0, 9.80665]
-        remaining = 1.0 - np.arange(200) / 200.0
-        remaining[0] = 0.5  # the trapezoidal rule
-        moved = velocity[100 * k] + (accel * remaining[:, None]).sum(axis=0) / 200.0
-        assert np.abs(moved - target).max() < 0.004
-
-
 def test_no_window_spans_a_gap_in_the_truth(walk):
     truth = walk.truth
     valid = np.ones(len(truth), dtype=np.bool_)
@@ -121,37 +108,19 @@ def test_no_window_spans_a_gap_in_the_truth(walk):
     assert np.allclose(windows_of(streams[1], 200)[1][0], ends[1] - ends[0], atol=0.01)
 
 
-def test_no_window_spans_a_gap_in_the_imu(walk):
-    kept = (walk.time < 8.0) | (walk.time > 8.3)
+@pytest.mark.parametrize(("gap", "seconds"), [(0.05, [20.0]), (0.3, [8.0, 11.7])])
+def test_no_window_spans_a_long_gap_in_the_imu(walk, gap, seconds):
+    kept = (walk.time < 8.0) | (walk.time > 8.0 + gap)
     gappy = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept], walk.truth)
-    first, second = world_streams(gappy)
-    assert len(first) / 200.0 == pytest.approx(8.0, abs=0.011)
-    assert len(second) / 200.0 == pytest.approx(11.7, abs=0.011)
+    lengths = [len(stream) / 200.0 for stream in world_streams(gappy)]
+    assert lengths == pytest.approx(seconds, abs=0.011)
 
 
-def test_short_gaps_are_bridged_and_short_stretches_dropped(walk):
-    kept = (walk.time < 8.0) | (walk.time > 8.05)
-    gappy = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept], walk.truth)
-    assert len(world_streams(gappy)) == 1
+def test_short_stretches_of_truth_are_dropped(walk):
     truth = walk.truth
     valid = np.ones(len(truth), dtype=np.bool_)
     valid[1000:1100] = valid[1300:1400] = False
     assert len(world_streams(replace(walk, truth=replace(truth, valid=valid)))) == 2
-
-
-def test_rotating_the_world_rotates_window_and_target_equally(walk):
-    truth, turn = walk.truth, about_z(2.1)
-    turned = replace(
-        walk,
-        truth=Trajectory(truth.time, turn.apply(truth.position_W), turn * truth.attitude_WB),
-    )
-    (stream,), (other,) = world_streams(walk), world_streams(turned)
-    windows, targets = windows_of(stream, 100)
-    turned_windows, turned_targets = windows_of(other, 100)
-    assert np.abs(turn.apply(targets) - turned_targets).max() < 1e-5
-    for k in (slice(0, 3), slice(3, 6)):
-        rows = turn.apply(windows[:, k].transpose(0, 2, 1).reshape(-1, 3))
-        assert np.abs(rows - turned_windows[:, k].transpose(0, 2, 1).reshape(-1, 3)).max() < 1e-4
 
 
 def test_a_misaligned_truth_does_not_affect_levelled_windows():

@@ -108,11 +108,6 @@ def test_a_recording_cannot_both_train_and_validate(stario, recording, tmp_path)
     assert not (tmp_path / "runs").exists()
 
 
-def test_nothing_is_trained_if_nothing_could_be_read(stario, tmp_path):
-    stario("train", "missing.csv").assert_one_line_error("missing.csv", "no such file")
-    assert not (tmp_path / "runs").exists()
-
-
 def test_recordings_too_short_to_hold_out_a_part_require_validation_recordings(
     stario, recording, tmp_path
 ):

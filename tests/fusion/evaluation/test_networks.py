@@ -79,12 +79,6 @@ def test_every_network_has_every_track_of_every_recording(table):
         assert found.shape == (count,)
 
 
-def test_recordings_with_the_same_name_are_distinguished(compared):
-    twice = compared([1, 1], MODELS[:1])
-    assert set(twice.scores["recording"]) == {"walk-1", "walk-1-2"}
-    assert [sample.recording for sample in twice.samples] == ["walk-1", "walk-1-2"]
-
-
 def test_mean_and_spread_are_taken_over_weights_of_recording_means(table):
     a, b = (
         values(table.scores, "ate_m", track="network", weights=weights).mean() for weights in "ab"

@@ -9,7 +9,6 @@ from stario.fusion.filter.correlated_errors import displacement_errors
 from stario.fusion.filter.ekf import clone
 from stario.fusion.filter.ekf import initialised as filter_state
 from stario.fusion.filter.estimates import plain_covariances
-from stario.fusion.filter.jacobians import displacement_jacobian
 from stario.fusion.imu.preintegration import Segment, preintegrate
 from stario.fusion.state import NavState
 from stario.sequences.attitude.so3 import exp_so3
@@ -64,16 +63,6 @@ def driven():
     ekf = initialised(6)
     drive(ekf, 20)
     return ekf
-
-
-def test_measurements_do_not_observe_yaw(driven):
-    yaw = np.zeros(len(driven.P))
-    yaw[2] = 1.0
-    yaw[15 + 2 :: 6] = 1.0
-    p_i, p_j = driven.state.clone_pose(0)[1], driven.state.p_W
-    blocks = displacement_jacobian(p_i, p_j, 0)
-    turned = sum(H @ yaw[first : first + H.shape[1]] for first, H in blocks)
-    np.testing.assert_allclose(turned, 0.0, atol=1e-10)
 
 
 # --- algebra -------------------------------------------------------------------------------------
@@ -249,19 +238,6 @@ def test_the_plain_covariance_is_returned_as_it_was_set():
     np.testing.assert_allclose(ekf.state.nav_state().covariance, covariance, rtol=1e-9, atol=1e-9)
 
 
-def test_a_precise_displacement_sets_the_vector_between_the_poses():
-    ekf = initialised(1)
-    slot = ekf.clone()
-    for segment in segments(20):
-        ekf.propagate(segment)
-    p_before = ekf.state.p_W
-    displacement = p_before - ekf.state.clone_pose(slot)[1] + np.array([0.0, 0.0, 1.0])
-    ekf.update_displacement(slot, displacement, 1e-6 * np.eye(3))
-    np.testing.assert_allclose(
-        ekf.state.p_W - ekf.state.clone_pose(slot)[1], displacement, atol=0.05
-    )
-
-
 # --- gate and refusals ---------------------------------------------------------------------------
 
 
@@ -274,34 +250,22 @@ def test_outliers_are_inflated_by_their_nis(driven):
 
 
 def test_outliers_can_be_rejected(driven):
-    P, p = driven.P.copy(), driven.state.p_W
-    result = driven.update_displacement(
-        0, np.array([50.0, 0, 0]), 0.01 * np.eye(3), gate=7.8, inflation=None
-    )
-    assert not result.accepted
-    assert result.reason == "gated"
-    assert result.nis > 7.8
-    np.testing.assert_array_equal(driven.P, P)
-    np.testing.assert_array_equal(driven.state.p_W, p)
-
-
-def test_a_rejected_displacement_with_lasting_errors_leaves_the_state_unchanged(driven):
     before, d_W, covariance = driven.state, np.array([50.0, 0.0, 0.0]), 0.01 * np.eye(3)
-    errors = displacement_errors(d_W, covariance, 1.0, FilterConfig())
-    result = driven.update_displacement(0, d_W, covariance, 7.8, inflation=None, errors=errors)
-    assert not result.accepted
-    assert driven.state is before
+    lasting = displacement_errors(d_W, covariance, 1.0, FilterConfig())
+    for errors in (None, lasting):
+        result = driven.update_displacement(0, d_W, covariance, 7.8, inflation=None, errors=errors)
+        assert not result.accepted
+        assert result.reason == "gated"
+        assert result.nis > 7.8
+        assert driven.state is before
 
 
 @pytest.mark.parametrize(
     ("d", "covariance", "reason"),
     [
         ([np.nan, 0, 0], np.eye(3), "finite"),
-        ([np.inf, 0, 0], np.eye(3), "finite"),
         ([0, 0, 0], np.full((3, 3), np.nan), "finite"),
         ([0, 0, 0], np.diag([1.0, -1.0, 1.0]), "positive definite"),
-        ([0, 0, 0], np.zeros((3, 3)), "positive definite"),
-        ([0, 0, 0], np.ones((3, 3)), "positive definite"),
     ],
 )
 def test_invalid_measurements_are_refused(driven, d, covariance, reason):

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from simulated import measured
 from support import GRAPH as CONFIG
 from support import stream, swivelled
 
@@ -35,14 +36,10 @@ def position_nees(track: Track, walk: ImuSequence, row: int) -> float:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize(("seed", "gap"), [(1, 15.0), (3, 15.0), (4, 3.0)])
-def test_a_position_before_a_gap_does_not_turn_the_track_after_it(
-    make_walk, make_oracle, without, backend, seed, gap
-):
+@pytest.mark.parametrize(("seed", "gap"), [(1, 15.0), (4, 3.0)])
+def test_a_position_before_a_gap_does_not_turn_the_track_after_it(backend, seed, gap):
     """Its direction was never determined, so that position gives none to the track after it."""
-    walk = make_walk(seed, 60.0)
-    holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
-    oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    walk, holed, oracle = measured(seed, 60.0, CONFIG, gap=(20.0, 20.0 + gap))
     fixes = [f for f in true_fixes(walk.truth, 3.0, 0.3, 0) if not 1.0 < f.time < 20.0 + gap]
     track = Navigator(oracle, CONFIG, backend=backend).run(holed, fixes=fixes)
     late = track.time > 50.0
@@ -60,7 +57,7 @@ def test_a_position_before_a_gap_does_not_turn_the_track_after_it(
 def test_fixes_find_the_direction_again_after_a_gap_with_fixes_in_it(
     make_walk, make_oracle, without, backend, seed, gap, turn
 ):
-    walk = turned(make_walk(seed, 60.0), 20.0 + 0.5 * gap, turn)
+    walk = turned(make_walk(seed, 50.0), 20.0 + 0.5 * gap, turn)
     holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
     oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     fixes = true_fixes(walk.truth, 3.0, 0.3, 0)
@@ -76,11 +73,9 @@ def test_fixes_find_the_direction_again_after_a_gap_with_fixes_in_it(
     ("seed", "gap", "yaw_first"), [(2, 7.3, False), (2, 7.3, True), (7, 0.9, True)]
 )
 def test_states_before_the_first_position_are_as_uncertain_as_the_motion_until_it(
-    make_walk, make_oracle, without, seed, gap, yaw_first
+    seed, gap, yaw_first
 ):
-    walk = make_walk(seed, 45.0)
-    holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
-    oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    walk, holed, oracle = measured(seed, 45.0, CONFIG, gap=(20.0, 20.0 + gap))
     fixes = [f for f in true_fixes(walk.truth, 2.0, 0.2, 0) if f.time > 32.0]
     if yaw_first:
         fixes.insert(0, yaw_fix(31.0, yaw_of(walk.truth.at(np.array([31.0])).attitude_WB)[0], 0.1))
@@ -91,12 +86,8 @@ def test_states_before_the_first_position_are_as_uncertain_as_the_motion_until_i
     assert (np.abs(off[early, 2]) < 3.0 * np.sqrt(track.covariance[early, 8, 8])).all()
 
 
-@pytest.mark.parametrize("seed", [3, 7])
-def test_a_first_yaw_that_was_off_is_off_about_the_position_that_places_the_track(
-    make_walk, make_oracle, seed
-):
-    walk = make_walk(seed, 45.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+def test_a_first_yaw_that_was_off_is_off_about_the_position_that_places_the_track():
+    walk, _, oracle = measured(3, 45.0, CONFIG)
     yaw = yaw_of(walk.truth.at(np.array([5.0])).attitude_WB)[0] + 0.3
     fixes = [f for f in true_fixes(walk.truth, 2.0, 0.2, 0) if f.time > 30.0]
     track = Navigator(oracle, CONFIG, backend="ekf").run(
@@ -106,12 +97,9 @@ def test_a_first_yaw_that_was_off_is_off_about_the_position_that_places_the_trac
     assert max(position_nees(track, walk, row) for row in early) < 12.0
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_short_gaps_after_a_long_one_do_not_lose_the_position(
-    make_walk, make_oracle, without, seed
-):
+def test_short_gaps_after_a_long_one_do_not_lose_the_position(make_walk, make_oracle, without):
     """A yaw that was lost once is not lost again because of a turn of a tenth of a radian."""
-    walk = make_walk(seed, 60.0)
+    walk = make_walk(1, 60.0)
     gone = (walk.time > 12.0) & (walk.time < 16.0)
     gone |= (walk.time > 18.0) & (walk.time % 4.0 < 0.3)
     holed = without(walk, gone)
@@ -125,10 +113,8 @@ def test_short_gaps_after_a_long_one_do_not_lose_the_position(
     assert np.abs(yaw_error(track, walk, late)).max() < 0.5  # each short gap adds 0.15 rad
 
 
-def test_a_track_not_yet_placed_stays_in_one_piece_across_a_gap(make_walk, make_oracle, without):
-    walk = make_walk(4, 60.0)
-    holed = without(walk, (walk.time > 20.0) & (walk.time < 23.0))
-    oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+def test_a_track_not_yet_placed_stays_in_one_piece_across_a_gap():
+    walk, holed, oracle = measured(4, 60.0, CONFIG, gap=(20.0, 23.0))
     shift = np.array([100.0, 50.0, 0.0])
     fixes = [yaw_fix(5.0, yaw_of(walk.truth.at(np.array([5.0])).attitude_WB)[0], 0.02)]
     for fix in true_fixes(walk.truth, 3.0, 0.3, 0):
@@ -142,13 +128,8 @@ def test_a_track_not_yet_placed_stays_in_one_piece_across_a_gap(make_walk, make_
     assert error[:2] @ np.linalg.solve(P, error[:2]) < 12.0
 
 
-@pytest.mark.parametrize("seed", [1, 2, 4])
-def test_fixes_after_a_gap_do_not_determine_the_yaw_before_it(
-    make_walk, make_oracle, without, seed
-):
-    walk = make_walk(seed, 60.0)
-    holed = without(walk, (walk.time > 20.0) & (walk.time < 35.0))
-    oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+def test_fixes_after_a_gap_do_not_determine_the_yaw_before_it():
+    walk, holed, oracle = measured(1, 60.0, CONFIG, gap=(20.0, 35.0))
     fixes = [f for f in true_fixes(walk.truth, 3.0, 0.3, 0) if f.time > 35.0]
     track = Navigator(oracle, CONFIG, backend="ekf").run(holed, fixes=fixes)
     before = int(np.searchsorted(track.time, 15.0))
@@ -161,13 +142,9 @@ def test_fixes_after_a_gap_do_not_determine_the_yaw_before_it(
     "gap",
     [pytest.param(1.5, marks=pytest.mark.slow), 3.0, pytest.param(7.0, marks=pytest.mark.slow)],
 )
-def test_the_graph_is_no_more_certain_of_the_turn_in_a_gap_than_the_filter(
-    make_walk, make_oracle, without, gap
-):
-    walk = make_walk(1, 30.0)
-    holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
-    oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
-    after = 20.0 + gap + 0.2
+def test_the_graph_is_no_more_certain_of_the_turn_in_a_gap_than_the_filter(gap):
+    _, holed, oracle = measured(1, 20.0, CONFIG, gap=(10.0, 10.0 + gap))
+    after = 10.0 + gap + 0.2
 
     def sigma(track):
         return float(np.sqrt(track.covariance[np.searchsorted(track.time, after), 2, 2]))
@@ -175,20 +152,16 @@ def test_the_graph_is_no_more_certain_of_the_turn_in_a_gap_than_the_filter(
     expected = sigma(Navigator(oracle, CONFIG, backend="ekf").run(holed))
     assert expected > 0.45 * min(gap, 3.0)
     assert sigma(Navigator(oracle, CONFIG, backend="graph").run(holed)) > 0.85 * expected
-    states = stream(Navigator(oracle, CONFIG, backend="graph"), holed)
+    states = stream(Navigator(oracle, CONFIG, backend="graph"), holed.slice(0.0, after + 1.5))
     streamed = next(s for s in states if s.time > after)
     assert np.sqrt(streamed.covariance[2, 2]) > 0.85 * expected
 
 
 @pytest.mark.parametrize("kind", ["yaw", "position"])
-def test_a_fix_within_a_gap_gives_little_information_about_the_track_before_it(
-    make_walk, make_oracle, without, kind
-):
+def test_a_fix_within_a_gap_gives_little_information_about_the_track_before_it(kind):
     nees = []
     for seed in range(4):
-        walk = make_walk(seed, 30.0)
-        holed = without(walk, (walk.time > 15.0) & (walk.time < 15.9))
-        oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+        walk, holed, oracle = measured(seed, 18.0, CONFIG, gap=(15.0, 15.9))
         truth = walk.truth.at(np.array([15.85]))
         fix = (
             yaw_fix(15.85, yaw_of(truth.attitude_WB)[0], 0.02)
@@ -217,16 +190,15 @@ def test_a_yaw_within_a_short_gap_of_a_turning_device_is_that_of_its_time(
 @pytest.mark.parametrize(
     "jump", [(0.0, 0.0, 8.0), pytest.param((20.0, 0.0, 0.0), marks=pytest.mark.slow)]
 )
-def test_a_streams_graph_follows_the_fixes_where_the_filter_does(make_walk, make_oracle, jump):
+def test_a_streams_graph_follows_the_fixes_where_the_filter_does(jump):
     """A lift, or a positioning system whose origin has moved."""
-    walk = make_walk(2, 42.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    walk, _, oracle = measured(2, 26.0, CONFIG)
     navigator = Navigator(oracle, CONFIG, true_start(walk), "graph")
     for fix in true_fixes(walk.truth, 2.0, 0.3, 0):
-        value = fix.value + (np.array(jump) if fix.time > 30.0 else 0.0)
+        value = fix.value + (np.array(jump) if fix.time > 14.0 else 0.0)
         navigator.update_position(fix.time, value, fix.covariance)
     for state in stream(navigator, walk):
-        if state.time > 36.5:
+        if state.time > 20.5:
             truth = walk.truth.at(np.array([state.time])).position_W[0] + jump
             assert np.linalg.norm(state.p_W - truth) < 1.5
 
@@ -244,13 +216,6 @@ def test_the_moments_of_a_large_turn_agree_with_sampled_turns():
     found = turn.state(state).covariance[np.ix_(rows, rows)]
     np.testing.assert_allclose(found, expected, atol=0.02 * expected.max())
     assert np.linalg.eigvalsh(found).min() > -1e-9
-
-
-def test_a_yaw_that_is_not_an_angle_is_refused_and_counted(make_walk, make_oracle):
-    walk = make_walk(3, 12.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG)
-    track = Navigator(oracle, CONFIG, backend="ekf").run(walk, fixes=[yaw_fix(6.0, 1.7e9, 0.1)])
-    assert track.health.fixes == {"yaw not in radians": 1}
 
 
 def test_a_rotation_rounded_to_four_digits_is_accepted(still_model, make_walk):

@@ -171,11 +171,6 @@ def test_the_report_draws_floors_along_the_height(house_track):
     assert labels == ["floor 0", "1", "4"]
 
 
-def test_without_a_barometer_they_go_unnoticed(house, level_oracle):
-    blind = replace(house.sequence, barometer=None)
-    assert climb_error(Navigator(level_oracle, CONFIG).run(blind), blind) > 10.0
-
-
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
 def test_a_stream_has_the_heights_of_the_recording(house, level_oracle, house_track, backend):
     sequence = house.sequence.slice(0.0, 60.0)

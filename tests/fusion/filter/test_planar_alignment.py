@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from simulated import measured
 from support import GRAPH as CONFIG
 
 from stario.fusion import Navigator
@@ -10,9 +11,8 @@ from stario.fusion.filter.planar_alignment import PlanarAlignment
 from stario.sequences.accuracy.metrics import pose_errors
 
 
-def test_positions_too_close_to_give_a_direction_alone_give_it_together(make_walk, make_oracle):
-    walk = make_walk(8, 60.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.02, sigma=0.02)
+def test_positions_too_close_to_give_a_direction_alone_give_it_together():
+    walk, _, oracle = measured(8, 60.0, CONFIG, noise=0.02)
     farthest = np.linalg.norm(walk.truth.position_W[:, :2] - walk.truth.position_W[0, :2], axis=1)
     sigma = 0.4 * float(farthest.max())
     fixes = true_fixes(walk.truth, 1.0, sigma, seed=3)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from simulated import measured
 from support import GRAPH as CONFIG
 from support import stream
 
@@ -43,10 +44,9 @@ def assert_valid(state: NavState) -> None:
     np.testing.assert_allclose(state.R_WB @ state.R_WB.T, np.eye(3), atol=1e-9)
 
 
-def test_a_stream_is_about_as_accurate_as_the_filter(make_walk, make_oracle):
+def test_a_stream_is_about_as_accurate_as_the_filter():
     """Same times, similar errors and sigmas; above all yaw's, which only fixes determine."""
-    walk = make_walk(5, 40.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    walk, _, oracle = measured(5, 25.0, CONFIG)
     ours, theirs = (
         stream(Navigator(oracle, CONFIG, true_start(walk), backend), walk)
         for backend in ("graph", "ekf")
@@ -58,10 +58,10 @@ def test_a_stream_is_about_as_accurate_as_the_filter(make_walk, make_oracle):
     assert 0.95 < sigma[2] / expected[2] < 1.05
 
 
-@pytest.mark.parametrize("tilt", [0.1, 0.2, 0.3])
+@pytest.mark.parametrize("tilt", [0.1, 0.3])
 def test_a_tilted_start_misleads_a_stream_no_more_than_the_filter(tilt, make_walk, make_oracle):
     """Starts in motion are up to 0.2 rad off level; correct displacements then look false."""
-    walk = make_walk(5, 20.0)
+    walk = make_walk(5, 12.0)
     config = replace(CONFIG, filter=replace(CONFIG.filter, update_rate=1))
     oracle = make_oracle(walk, walk.truth, config, noise=0.03, sigma=0.03)
     start = true_start(walk)
@@ -108,17 +108,16 @@ def test_a_stream_gates_displacements_itself_if_the_filter_uses_more_of_them(wal
     at = next(
         k
         for k, interval in enumerate(preprocessed.intervals)
-        if interval.stop > walk.time[0] + 9.99
+        if interval.stop > walk.time[0] + 4.99
     )
     clean, _ = track_with_outliers(preprocessed, config, 0.0, range(at, at + 1))
     corrupted, _ = track_with_outliers(preprocessed, config, 1.2, range(at, at + 1))
     assert np.linalg.norm(corrupted - clean, axis=1).max() < 0.35
 
 
-def test_a_heading_far_from_the_estimate_turns_a_stream_like_its_filter(make_walk, make_oracle):
+def test_a_heading_far_from_the_estimate_turns_a_stream_like_its_filter():
     """Used as inflated by the filter; to a robust loss of the graph's own it is 60 sigma off."""
-    walk = make_walk(5, 16.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    walk, _, oracle = measured(5, 16.0, CONFIG)
     start = true_start(walk)
     turn = about_z(0.6).as_matrix()
     turned = replace(start, R_WB=turn @ start.R_WB, v_W=turn @ start.v_W, yaw_sigma=0.5)
@@ -131,10 +130,9 @@ def test_a_heading_far_from_the_estimate_turns_a_stream_like_its_filter(make_wal
     assert ends[0] < 1.2 * ends[1] + 0.1
 
 
-def test_a_late_fix_that_changes_the_gating_brings_a_stream_to_its_filter(make_walk, make_oracle):
+def test_a_late_fix_that_changes_the_gating_brings_a_stream_to_its_filter():
     """A start 4 m/s off makes correct displacements look false until a fix gives the velocity."""
-    walk = make_walk(5, 6.0)
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
+    walk, _, oracle = measured(5, 6.0, CONFIG)
     start = true_start(walk)
     fast = replace(start, v_W=start.v_W + np.array([4.0, 0.0, 0.0]), velocity_sigma=0.5)
     v_W = walk.truth.at(np.array([0.3])).velocity_W[0]
@@ -165,19 +163,9 @@ def test_a_late_fix_from_before_the_graph_began_brings_a_stream_to_its_filter(wa
     np.testing.assert_allclose(*late, atol=1e-6)
 
 
-def test_a_stream_equals_the_batch_within_the_lag(walk, make_oracle):
-    """Until something leaves the lag, both use everything, with one or two windows a second."""
-    short = walk.slice(0.0, 4.0)
-    oracle = make_oracle(short, walk.truth, CONFIG, noise=0.03, sigma=0.03)
-    track, states = lagged(oracle).run(short), stream(lagged(oracle), short)
-    at = int(np.argmin(np.abs(track.time - 3.0)))
-    newest = next(s for s in states if abs(s.time - 3.0) < 1e-6)
-    # The batch uses one more second.
-    assert np.linalg.norm(newest.p_W - track.trajectory.position_W[at]) < 0.1
-
-
 def test_a_lag_longer_than_the_walk_changes_little(walk, make_oracle):
     """Marginalised information is kept."""
+    walk = walk.slice(0.0, 12.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     ends = [
         stream(lagged(oracle, replace(CONFIG, graph=replace(CONFIG.graph, lag=lag))), walk)[-1]
@@ -225,25 +213,10 @@ def test_late_fixes_correct_the_newest_state_too(walk, make_oracle):
     assert_valid(navigator.state)
 
 
-def test_two_positions_turn_a_stream_that_started_without_a_pose(make_walk, make_oracle):
-    walk = make_walk(2, 30.0)
-    R, shift = about_z(-2.1), np.array([500.0, 200.0, 10.0])
-    navigator = lagged(make_oracle(walk, walk.truth, CONFIG))
-    for time in (5.0, 25.0):
-        measured = R.apply(walk.truth.at(np.array([time])).position_W[0]) + shift
-        navigator.update_position(time, measured, 0.01 * np.eye(3))
-    states = stream(navigator, walk)
-    last = states[-1]
-    truth = R.apply(walk.truth.at(np.array([last.time])).position_W[0]) + shift
-    assert np.linalg.norm(last.p_W - truth) < 1.0
-    assert last.map_frame == 2
-    assert_valid(last)
-
-
-def test_rest_stops_the_drift(make_oracle, still_model, make_walk):
+def test_rest_stops_the_drift(still_model):
     """A device on a table with an uninformative network."""
     rng = np.random.default_rng(0)
-    n = 3000
+    n = 1500
     time = np.arange(n) / 100.0
     gyro = 2e-3 + 2e-3 * rng.normal(size=(n, 3))
     accel = np.array([0.0, 0.0, 9.80665]) + 0.02 * rng.normal(size=(n, 3))
@@ -264,6 +237,7 @@ def test_if_the_graph_fails_the_stream_continues_from_the_filter(walk, make_orac
             raise IndeterminateError("velocity at 8.0 s is undetermined")
         return solve(self, max_rounds)
 
+    walk = walk.slice(0.0, 12.0)
     oracle = make_oracle(walk, walk.truth, CONFIG)
     filtered = stream(Navigator(oracle, CONFIG), walk)
     monkeypatch.setattr(KeyframeGraph, "solve", fails_once)
@@ -271,7 +245,7 @@ def test_if_the_graph_fails_the_stream_continues_from_the_filter(walk, make_orac
     states = stream(navigator, walk)
     at = next(k for k, s in enumerate(states) if abs(s.time - 8.0) < 1e-6)
     np.testing.assert_allclose(states[at].p_W, filtered[at].p_W, atol=1e-9)
-    assert len(calls) > 30
+    assert len(calls) > 20
     assert errors(states[-1:], walk)[0] < errors(filtered[-1:], walk)[0] + 0.3
     assert (
         "fell back to the filter 1 times, last because velocity at 8.0 s is undetermined"

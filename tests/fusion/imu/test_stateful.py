@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.fusion.evaluation.tracks import network_track_true_attitude
 from stario.fusion.imu.direction import Direction, direction, weighted_force
 from stario.fusion.imu.stateful import StatefulInference
 from stario.fusion.navigator import Navigator
@@ -88,14 +87,6 @@ def test_a_stream_equals_the_batch_also_after_a_restore(walk, without):
     np.testing.assert_allclose([s.p_W for s in states], track.position_W[at], atol=1e-6)
 
 
-def test_the_track_with_true_attitude_uses_memory_too(walk):
-    config = NavigatorConfig(filter=FilterConfig(update_rate=1))
-    track = network_track_true_attitude(Counting(), walk, config)
-    speed = track.trajectory.velocity_W[:, 2]
-    assert (np.diff(speed) >= 0.0).all()
-    assert speed[-1] == pytest.approx(len(track.trajectory.time) - 2)
-
-
 def test_a_model_without_memory_is_called_directly(still_model):
     network = StatefulInference(still_model, 10)
     assert not network.is_recurrent
@@ -171,10 +162,6 @@ def test_the_rotation_of_rotated_displacements_is_found(stream_and_truth, degree
     rotated = displacement @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
     rotated_back = np.exp(1j * (compared(stream, rotated).turn + np.radians(degrees)))
     assert np.angle(rotated_back) == pytest.approx(compared(*stream_and_truth).turn, abs=1e-9)
-
-
-def test_changes_of_velocity_over_three_seconds_count_once_in_that_time(stream_and_truth):
-    assert compared(*stream_and_truth).count == pytest.approx(90.0 / 3.0, abs=1.5)
 
 
 def test_the_direction_of_noise_has_a_large_sigma(stream_and_truth):

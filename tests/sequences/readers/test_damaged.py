@@ -5,7 +5,6 @@ import zipfile
 from contextlib import suppress
 from dataclasses import replace
 
-import h5py
 import numpy as np
 import pytest
 
@@ -41,19 +40,6 @@ def test_flipped_bytes_in_an_archive_raise_input_errors_only(archive, tmp_path):
             for path in find_recordings(damaged):
                 with suppress(InputError):
                     read_recording(path)
-
-
-def test_arrays_of_wrong_shapes_are_a_read_error(archive):
-    with h5py.File(archive, "r+") as file:
-        del file["walk/truth/p"]
-        file["walk/truth/p"] = np.zeros((3, 3))
-        del file["other/imu/gyro"]
-        file["other/imu/gyro"] = 1.0
-        file["other"].attrs["tags"] = ["a", "b"]
-    assert len(find_recordings(archive, where={"name": ["*"]})) == 2
-    for name in ("walk", "other"):
-        with pytest.raises(ReadError, match="two"):
-            read_recording(f"{archive}:{name}")
 
 
 def test_an_archive_with_an_upper_case_suffix_is_read(archive, tmp_path):

@@ -26,8 +26,7 @@ def written(path: Path, header: str, form: str, start: datetime, count: int = 20
     return write_lines(path, header, *rows)
 
 
-@pytest.mark.parametrize("header", [GENERIC, WIDE])
-@pytest.mark.parametrize("start", [NOON, LATE])
+@pytest.mark.parametrize(("header", "start"), [(GENERIC, LATE), (WIDE, NOON)])
 @pytest.mark.parametrize(
     "form",
     [

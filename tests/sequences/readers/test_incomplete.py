@@ -55,13 +55,6 @@ def test_a_column_of_a_code_is_no_axis_of_a_sensor(walk, tmp_path):
     assert "no rows with a time that grows" in str(error.value)
 
 
-def test_files_whose_rows_are_all_out_of_order_are_named(walk, tmp_path):
-    for name, values in (("Gyroscope", walk.gyro), ("Accelerometer", walk.accel)):
-        save(tmp_path / f"{name}.csv", "", walk.time[::-1], values)
-    with pytest.raises(ReadError, match=r"found none, .*Gyroscope\.csv: no rows with"):
-        read_recording(tmp_path)
-
-
 def test_a_sensor_file_without_permission_is_named(walk, tmp_path, monkeypatch):
     save(tmp_path / "Accelerometer.csv", "", walk.time, walk.accel)
     gyro = tmp_path / "Gyroscope.csv"
@@ -92,17 +85,6 @@ def test_poses_out_of_order_are_counted(walk, tmp_path, caplog):
     assert f"dropped 50 of {len(poses)} poses: their times do not increase" in caplog.text
 
 
-def test_poses_of_imunet_that_go_back_in_time_are_counted(walk, tmp_path, caplog):
-    path = formats.imunet_raw(tmp_path / "seq", walk).path
-    header, *poses = (path / "pose.txt").read_text().splitlines()
-    early = poses[3].split()[0]
-    poses[20:22] = [f"{early} {pose.split(maxsplit=1)[1]}" for pose in poses[20:22]]
-    (path / "pose.txt").write_text("\n".join([header, *poses]))
-    found = read_recording(path).truth
-    assert found is not None
-    assert f"pose.txt: dropped 2 of {len(poses)} poses: their times do not" in caplog.text
-
-
 def test_an_euroc_file_whose_titles_are_in_another_order_is_not_read_by_position(tmp_path, walk):
     imu, *_ = write_euroc(tmp_path / "V1", walk)
     header, *rows = imu.read_text().splitlines()
@@ -114,21 +96,3 @@ def test_an_euroc_file_whose_titles_are_in_another_order_is_not_read_by_position
     with pytest.raises(ReadError, match=r"header: found .*, expected time, gyroscope xyz and acc"):
         read_recording(tmp_path / "V1")
     np.testing.assert_allclose(read_recording(imu, format="csv").gyro, walk.gyro)
-
-
-@pytest.mark.parametrize(
-    ("gyro", "accel"), [("Gyroscope", "WatchAccelerometer"), ("left_gyro_1", "right_accel_2")]
-)
-def test_sensors_of_different_devices_are_not_mixed(walk, tmp_path, gyro, accel):
-    save(tmp_path / "w" / f"{gyro}.csv", "time,x,y,z", walk.time, walk.gyro)
-    save(tmp_path / "w" / f"{accel}.csv", "time,x,y,z", walk.time, walk.accel)
-    message = rf"w: sensors: found files of different devices .*\({gyro}\.csv, {accel}\.csv\)"
-    for read in (read_recording, find_recordings):
-        with pytest.raises(ReadError, match=message):
-            read(tmp_path / "w")
-
-
-def test_sensors_whose_files_differ_in_a_number_are_of_one_recording(walk, tmp_path):
-    save(tmp_path / "w/left_gyro_1.csv", "time,x,y,z", walk.time, walk.gyro)
-    save(tmp_path / "w/left_accel_2.csv", "time,x,y,z", walk.time, walk.accel)
-    assert len(read_recording(tmp_path / "w")) == len(walk)

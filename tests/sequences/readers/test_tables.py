@@ -1,7 +1,5 @@
 """Tables of text: their heads, ragged rows, rows of one sensor alone, zeros and clocks."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from csv_lines import write_lines
@@ -11,55 +9,34 @@ from hypothesis import strategies as st
 from stario.sequences.errors import ReadError
 from stario.sequences.readers import read_recording
 from stario.sequences.readers.columns import HEADER
-from stario.sequences.readers.table_head import TableHead, first_row, table_heads
-from stario.sequences.readers.text import RowFormat
+from stario.sequences.readers.table_head import table_heads
 from stario.sequences.sequence import FloatArray
 
-
-def head_of(folder: Path, *lines: str) -> TableHead:
-    file = folder / "table.csv"
-    file.write_text("\n".join(lines))
-    *_, last = table_heads(file)
-    return last
-
-
-def test_a_first_row_of_integers_has_the_decimal_mark_of_the_rows_below():
-    rows = ["Zeit;x;y;z", "0;0;0;0", "0,01;0,5;-0,25;9,8", "0,02;0,5;-0,25;9,8"]
-    assert first_row(rows) == RowFormat(1, ";", ",")
-    points = [row.replace(",", ".") for row in rows]
-    assert first_row(points) == RowFormat(1, ";", ".")
-
-
-def test_words_above_rows_with_blanks_are_no_titles(tmp_path):
-    assert head_of(tmp_path, "made by a logger on a phone", "0 1 2 3", "1 1 2 3").titles == []
-    assert head_of(tmp_path, "t x y z", "0 1 2 3", "1 1 2 3").titles == ["t", "x", "y", "z"]
-
-
-def test_titles_may_be_separated_in_another_way_than_the_rows(tmp_path):
-    """As NumPy's `savetxt` does: without its titles, columns z, y, x would be read as x, y, z."""
-    assert head_of(tmp_path, "# time,z,y,x", "0 1 2 3", "1 1 2 3").titles == ["time", "z", "y", "x"]
+ZYX = ["time", "z", "y", "x"]
+"""Titles without which these columns would be read as x, y, z."""
 
 
 @pytest.mark.parametrize(
-    "between",
+    ("lines", "titles"),
     [
-        ("0,,,", "1,,,"),
-        ("0,NaN,NaN,NaN",),
-        ("0,null,,1",),
-        ("Started 12:00",),
-        ("# walk",),
-        ("int64,float,float,float",),
+        ("made by a logger on a phone|0 1 2 3|1 1 2 3", []),
+        ("t x y z|0 1 2 3|1 1 2 3", ["t", "x", "y", "z"]),
+        ("# time,z,y,x|0 1 2 3|1 1 2 3", ZYX),  # as by NumPy's `savetxt`
+        ("by a logger|time,z,y,x|0,,,|1,,,|2,1,2,3|3,1,2,3", ZYX),
+        ("by a logger|time,z,y,x|0,NaN,NaN,NaN|2,1,2,3|3,1,2,3", ZYX),
+        ("by a logger|time,z,y,x|0,null,,1|2,1,2,3|3,1,2,3", ZYX),
+        ("|time,z,y,x|Started 12:00|2,1,2,3|3,1,2,3", ZYX),
+        ("# a||# b|time,z,y,x|# walk|2,1,2,3|3,1,2,3", ZYX),
+        ("time,z,y,x|int64,float,float,float|2,1,2,3|3,1,2,3", ZYX),
+        ("0,,,|2,1,2,3|3,1,2,3", []),
+        ("Zeit;x;y;z|0;0;0;0|0,01;0,5;-0,25;9,8|0,02;0,5;-0,25;9,8", ["Zeit", "x", "y", "z"]),
     ],
 )
-def test_incomplete_rows_and_remarks_may_follow_the_titles(tmp_path, between):
-    """Without its titles, columns z, y, x would be read as x, y, z."""
-    head = head_of(tmp_path, "by a logger", "time,z,y,x", *between, "2,1,2,3", "3,1,2,3")
-    assert head.titles == ["time", "z", "y", "x"]
-    assert head.row_format.skip == 2 + len(between)
-
-
-def test_incomplete_rows_without_titles_are_none(tmp_path):
-    assert head_of(tmp_path, "0,,,", "2,1,2,3", "3,1,2,3").titles == []
+def test_titles_are_found_among_remarks_and_incomplete_rows(tmp_path, lines, titles):
+    (tmp_path / "table.csv").write_text(lines.replace("|", "\n"))
+    *_, head = table_heads(tmp_path / "table.csv")
+    assert head.titles == titles
+    assert head.row_format.decimal == ("," if "0,01" in lines else ".")
 
 
 TITLES = ["gx [rad/s]", "gy [rad/s]", "gz [rad/s]", "ax [m/s^2]", "ay [m/s^2]", "az [m/s^2]"]
@@ -147,15 +124,6 @@ def test_blank_cells_of_the_other_sensor_are_interpolated(tmp_path, header):
     gyro, accel = expected(read.time, 0.01)
     np.testing.assert_allclose(read.gyro, gyro, atol=1e-9)
     np.testing.assert_allclose(read.accel, accel, atol=1e-9)
-
-
-def test_a_slower_accelerometer_is_interpolated(tmp_path):
-    cells = [text(force(t)) if k % 3 == 0 else ",," for k, t in enumerate(GYRO_TIMES.tolist())]
-    rows = [f"{t},{text(rate(t))},{cells[k]}" for k, t in enumerate(GYRO_TIMES.tolist())]
-    path = write_lines(tmp_path / "own.csv", HEADER, *rows)
-    read = read_recording(path)
-    assert len(read) == 298
-    np.testing.assert_allclose(read.accel, expected(read.time, 0.0)[1], atol=1e-9)
 
 
 def test_an_accelerometer_that_fails_halfway_leaves_its_rows_to_be_counted(tmp_path):

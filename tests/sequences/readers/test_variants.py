@@ -9,8 +9,8 @@ import pytest
 from alike import max_angle
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers import find_recordings, read_recording, write_csv
+from stario.sequences.errors import InputError
+from stario.sequences.readers import find_recordings, read_recording
 
 
 def relative_to_first(attitude: Rotation) -> Rotation:
@@ -95,23 +95,6 @@ def test_a_processed_recording_is_preferred_to_the_raw_files_next_to_it(tmp_path
     assert len(read_recording(tmp_path / "seq")) == len(walk)
     assert len(read_recording(tmp_path / "seq", format="imunet")) == len(walk)
     assert find_recordings(tmp_path) == [tmp_path / "seq"]
-
-
-def test_an_error_within_a_row_is_named(tmp_path, walks):
-    path = formats.ridi(tmp_path / "seq", walks(200.0)).path
-    csv = path / "processed/data.csv"
-    lines = csv.read_text().splitlines()
-    csv.write_text("\n".join([*lines[:99], lines[99].rsplit(",", 3)[0]]))
-    with pytest.raises(ReadError, match="line 100: found 25 values, expected 28"):
-        read_recording(path)
-    csv.write_text("\n".join([*lines[:99], lines[99].replace(".", "x", 1)]))
-    with pytest.raises(ReadError, match="line 100, column "):
-        read_recording(path)
-    write_csv(tmp_path / "own.csv", walks(200.0).without_truth())
-    text = (tmp_path / "own.csv").read_text().rstrip().rsplit(",", 1)[0]
-    (tmp_path / "own.csv").write_text(f"{text},-1.#IND\n")
-    with pytest.raises(ReadError, match=r"az.*: found '-1\.#IND', expected a number"):
-        read_recording(tmp_path / "own.csv")
 
 
 def test_a_missing_package_is_named_with_what_installs_it(tmp_path, walks, monkeypatch):

@@ -202,8 +202,7 @@ def turning():
     return simulate_imu(generate_walk(5, 90.0, style=style), 100.0, PERFECT_IMU, 1)
 
 
-@pytest.mark.parametrize("scale", [0.0, 0.023, -0.015])
-@pytest.mark.parametrize("bias", [0.0, 0.004])
+@pytest.mark.parametrize(("scale", "bias"), [(0.0, 0.004), (0.023, 0.0), (-0.015, 0.004)])
 def test_scale_and_bias_are_recovered(turning, scale, bias):
     truth = turning.truth
     up_B = truth.at(turning.time).attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)

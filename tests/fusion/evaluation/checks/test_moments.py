@@ -25,7 +25,7 @@ from stario.fusion.state import Track
 from stario.network.model import load_model
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import ImuSequence, Trajectory
+from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.moments import MOMENTS
 
 BY_NAME = {moment.name: moment for moment in MOMENTS}
@@ -94,12 +94,6 @@ def test_a_recording_without_known_positions_is_refused(walk):
         moment_costs(object(), walk.without_truth(), NavigatorConfig())
 
 
-def test_a_recording_begins_at_its_first_known_position_and_is_cut(walk):
-    late = replace(walk, truth=walk.truth.slice(5.0, 20.0))
-    assert moments._with_truth(late).time[0] == pytest.approx(5.0)
-    assert isinstance(late.truth, Trajectory)
-
-
 MEASURED = {
     "pocket": (1.04, 0.69, 0.99, 0.60, 1.4),
     "back-pocket": (0.81, 1.00, 1.04, 0.48, 1.3),
@@ -115,7 +109,7 @@ MEASURED = {
 
 @pytest.mark.parametrize("carry", SPEEDS)
 def test_simulated_walks_move_within_a_third_of_recorded_ones(carry):
-    found = [motion(simulated_walk(carry, seed, 60.0)) for seed in range(12)]
+    found = [motion(simulated_walk(carry, seed, 60.0)) for seed in range(6)]
     keys = [*(f"force_{low:g}" for low, _ in BANDS), "rate"]
     medians = [float(np.median([each[key] for each in found])) for key in keys]
     ratio = np.array(medians) / MEASURED[carry]

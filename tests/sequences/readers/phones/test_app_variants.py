@@ -5,7 +5,7 @@ import pytest
 from alike import assert_same_samples
 from csv_lines import write_lines
 from phone_exports import export
-from phone_files import ZYX, ns, save
+from phone_files import ns, save
 
 from stario.sequences import (
     InputError,
@@ -41,18 +41,6 @@ def test_the_summary_names_the_unit_that_times_were_taken_for(walk, tmp_path):
     ):
         save(tmp_path / "a.csv", titles, times, walk.gyro, walk.accel)
         assert words in read_recording(tmp_path / "a.csv").summary()
-
-
-def test_sensors_of_different_rates_are_read_at_the_gyroscopes_rate(walk, tmp_path):
-    save(tmp_path / "s/Gyroscope.csv", ZYX, ns(walk), walk.time, walk.gyro[:, ::-1])
-    rows = slice(None, None, 2)
-    force = walk.accel[rows, ::-1]
-    save(tmp_path / "s/TotalAcceleration.csv", ZYX, ns(walk)[rows], walk.time[rows], force)
-    read = read_recording(tmp_path / "s")
-    assert read.rate == pytest.approx(100.0)
-    np.testing.assert_array_equal(read.accel[rows], walk.accel[rows])
-    halfway = 0.5 * (walk.accel[:-2:2] + walk.accel[2::2])
-    np.testing.assert_allclose(read.accel[1::2], halfway, atol=1e-6)
 
 
 def test_an_undetermined_accelerometer_sign_is_reported(walk, tmp_path, caplog):
