@@ -74,8 +74,10 @@ class TrainingRun:
         self._moving, self._counts = _pairs(self.averaged, self.network)
         self._initial: dict[str, Tensor] | None = None
         self._keep(self.averaged)
+        # Recording is untried with cuDNN's recurrent layers and with several processes.
+        is_recurrent = any(isinstance(part, nn.RNNBase) for part in self.network.modules())
+        self._is_captured = self.device.type == "cuda" and workers.count == 1 and not is_recurrent
         # A recorded step reads its rate from the GPU.
-        self._is_captured = self.device.type == "cuda" and workers.count == 1
         rate = torch.tensor(config.rate, device=self.device) if self._is_captured else config.rate
         self.optimiser = torch.optim.AdamW(
             self.network.parameters(),
