@@ -69,8 +69,8 @@ def train(
     ),
     body: list[Path] | None = typer.Option(
         None,
-        help="Motion capture (HDF5 or BVH) to learn from virtual devices on; a share of the "
-        "recipe may name the file. Repeatable.",
+        help="Motion capture (HDF5, also FILE:CLIP or FILE:'walk*', or BVH) to learn from virtual "
+        "devices on; a share of the recipe may name the file. Repeatable.",
     ),
     config: Path | None = typer.Option(None, help="TOML or JSON file with recipe settings."),
     epochs: int | None = typer.Option(None, min=1, help="Epochs; overrides --config."),

@@ -7,6 +7,7 @@ xyzw, joint to world, and attributes `rate` [Hz] and `joints` (their names, one 
 
 from __future__ import annotations
 
+import fnmatch
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -62,13 +63,20 @@ class BodyMotion:
 def body_clips(path: Path) -> list[Path]:
     """Return the clips of a motion capture file: `file.h5:clip` each, or a BVH file itself.
 
+    Args:
+        path: the file; `file.h5:clip`, where the clip's name may be a pattern such as `hdm05_*`.
+
     Raises:
-        ReadError: the file cannot be read.
+        ReadError: the file cannot be read, or no clip has such a name.
     """
-    if split_name(path)[1] is not None or not is_hdf5(path):
+    file, clip = split_name(path)
+    if not is_hdf5(file):
         return [path]
-    with opened_hdf5(path, _EXPECTED) as file:
-        return [Path(f"{path}:{name}") for name in file]
+    with opened_hdf5(file, _EXPECTED) as content:
+        names = fnmatch.filter(content, clip or "*")
+        if not names:
+            raise _no_such_clip(file, clip, list(content))
+    return [Path(f"{file}:{name}") for name in names]
 
 
 def read_body(path: Path) -> BodyMotion:
@@ -92,11 +100,14 @@ def read_body(path: Path) -> BodyMotion:
     return _from_hdf5(file, clip)
 
 
+def _no_such_clip(path: Path, clip: str | None, names: list[str]) -> ReadError:
+    return ReadError(path, "clip", repr(clip), f"a name in it, such as {first_of(names, 3)}")
+
+
 def _from_hdf5(path: Path, clip: str) -> BodyMotion:
     with opened_hdf5(path, _EXPECTED) as file:
         if clip not in file:
-            expected = f"a name in it, such as {first_of(list(file), 3)}"
-            raise ReadError(path, "clip", repr(clip), expected)
+            raise _no_such_clip(path, clip, list(file))
         group = file[clip]
         rate = float(group.attrs["rate"])
         names = [str(name) for name in group.attrs["joints"]]

@@ -133,6 +133,14 @@ def test_hdf5_clip_is_read(tmp_path):
         read_body(tmp_path / "body.h5:runner")
 
 
+def test_clips_are_named_by_a_pattern(tmp_path):
+    file = tmp_path / "body.h5"
+    write_hdf5(file, walker())
+    assert body_clips(Path(f"{file}:walk*")) == body_clips(file)
+    with pytest.raises(ReadError, match="walker"):
+        body_clips(Path(f"{file}:run*"))
+
+
 BVH = """HIERARCHY
 ROOT Hips
 {{
