@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from stario.network.training.data import RecordingStreams, TrainingData
     from stario.network.training.history import EpochReport
     from stario.sequences.datasets.batch import Skipped
+    from stario.sequences.windows import WorldStream
 
     Streams = tuple[list[RecordingStreams], list[Skipped]]
 
@@ -99,7 +100,9 @@ def train(
     """
     from stario.fusion.evaluation.results import make_folder
     from stario.network.model import load_model
+    from stario.network.training.config import INSERTED
     from stario.network.training.data import recording_streams, seconds_of, virtual_recordings
+    from stario.network.training.moments import moment_streams
     from stario.network.training.parallel import is_leader
     from stario.network.training.splits import warn_of_learned
     from stario.sequences.datasets.cache_files import cache_folder
@@ -135,7 +138,11 @@ def train(
         typer.echo(
             f"simulating {walks} walks of a minute, or reading them from the cache", err=True
         )
-    material = _material(learned, walks, recipe, folder)
+    moments = []
+    if recipe.shares.get(INSERTED):
+        real = [recording.path for recording in learned if recording.has_poses]
+        moments = moment_streams(real, reading.read, reading.as_read(), recipe.seed, folder)
+    material = _material(learned, walks, moments, recipe, folder)
     calibrated_by = last_stage or (
         start_from if seconds_of(held.streams) < _CALIBRATING_S else None
     )
@@ -232,13 +239,17 @@ def _recorded(
 
 
 def _material(
-    recorded: list[RecordingStreams], walks: int, recipe: TrainingConfig, folder: Path
+    recorded: list[RecordingStreams],
+    walks: int,
+    moments: list[WorldStream],
+    recipe: TrainingConfig,
+    folder: Path,
 ) -> TrainingData:
     """Return what is learned from, if anything has full ground truth."""
     from stario.network.training.data import cached_walks, mix_sources
 
     simulated = cached_walks(walks, recipe.seed, folder, recipe.attitude)
-    material = mix_sources(recorded, simulated, recipe.shares, recipe.reach)
+    material = mix_sources(recorded, simulated, recipe.shares, recipe.reach, moments)
     if not walks and material.legs and not material.streams:
         raise InputError(
             "simulated walks",

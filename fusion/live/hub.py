@@ -7,9 +7,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Set
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -58,8 +56,6 @@ class Hub:
         self.earth = Earth()
         self.refused: Counter[str] = Counter()
         self.viewers, self.ending = 0, False
-        self._threads: dict[str, ThreadPoolExecutor] = {}
-        self._tasks: Counter[str] = Counter()
         self._news = asyncio.Event()
 
     async def take(self, *batches: Batch, accel_factor: float = 1.0) -> int:
@@ -76,13 +72,15 @@ class Hub:
             if batch.device in self.sessions:
                 self.sessions[batch.device].check(batch)
         self._make_room({batch.device for batch in known})
-        for batch in known:
-            self._session(batch.device).received = received
-        count = 0
-        for batch in known:
-            session = self.sessions[batch.device]
-            count += await self._in_thread(session, session.take, batch, received, accel_factor)
-        return count
+        sessions = [self._session(batch.device) for batch in known]
+        for session in sessions:
+            session.received = received
+        return sum(
+            [
+                await self._in_thread(session, session.take, batch, received, accel_factor)
+                for session, batch in zip(sessions, known, strict=True)
+            ]
+        )
 
     async def command(self, device: str, name: str, **values: float) -> None:
         """Run a command on a device's session: start, stop, zero or fix.
@@ -94,12 +92,17 @@ class Hub:
             devices = ", ".join(self.sessions) or "none yet"
             raise InputError("device", repr(device), f"a device that has sent data: {devices}")
         session = self.sessions[device]
-        await self._in_thread(session, partial(getattr(session, name), **values))
+
+        def run() -> None:
+            of_track = name in ("zero", "fix")
+            getattr(session.track if of_track else session, name)(**values)
+
+        await self._in_thread(session, run)
 
     async def release(self) -> None:
         """Process the pushes that have waited long enough for one before them."""
         now = time.time()
-        due = [session for session in self.sessions.values() if session.is_due(now)]
+        due = [session for session in self.sessions.values() if session.order.is_due(now)]
         tasks = (self._in_thread(session, session.release, now) for session in due)
         for result in await asyncio.gather(*tasks, return_exceptions=True):
             if isinstance(result, Exception):
@@ -129,17 +132,16 @@ class Hub:
         if device not in self.sessions:
             session = Session(device, self._folder, self._new_navigator, self.earth)
             self.sessions[device] = session
-            self._threads[device] = ThreadPoolExecutor(1)
         return self.sessions[device]
 
     async def _in_thread(self, session: Session, action: Callable[..., T], *arguments: Any) -> T:
         """Run an action of a session after those before it, and tell the viewers."""
-        self._tasks[session.device] += 1
+        session.pending += 1
         try:
-            thread = self._threads[session.device]
-            return await asyncio.get_running_loop().run_in_executor(thread, action, *arguments)
+            loop = asyncio.get_running_loop()
+            return await loop.run_in_executor(session.thread, action, *arguments)
         finally:
-            self._tasks[session.device] -= 1
+            session.pending -= 1
             self.announce()
 
     def _make_room(self, devices: Set[str]) -> None:
@@ -151,29 +153,26 @@ class Hub:
         surplus = len(self.sessions) + len(new) - MAX_DEVICES
         if surplus <= 0:
             return
-        silent = [
-            session
-            for name, session in self.sessions.items()
-            if not (name in devices or self._tasks[name])
-            and time.time() - session.received > SILENT_SECONDS
-        ]
-        if len(silent) < surplus:
+        silent = sorted(
+            (each for name, each in self.sessions.items() if not (name in devices or each.pending)),
+            key=lambda session: session.received,
+        )[:surplus]
+        if len(silent) < surplus or time.time() - silent[-1].received <= SILENT_SECONDS:
             found = f"{len(new)} new: {', '.join(sorted(new))[:80]}"
             expected = f"at most {MAX_DEVICES} devices at once"
             fix = f"one that sends nothing for {SILENT_SECONDS:g} s makes room"
             raise InputError("device", found, expected, fix)
-        for session in sorted(silent, key=lambda session: session.received)[:surplus]:
+        for session in silent:
             self._close(session)
-            del self.sessions[session.device], self._tasks[session.device]
+            del self.sessions[session.device]
 
     def _close(self, session: Session) -> None:
         """Close a recording after all that was to be processed before."""
-        thread = self._threads.pop(session.device)
         try:
-            thread.submit(session.close).result()
+            session.thread.submit(session.close).result()
         except (OSError, InputError) as error:  # of pushes that still waited
             _log.error("%s: the end of its recording is lost: %s", session.device, error)
-        thread.shutdown()
+        session.thread.shutdown()
 
 
 class Viewer:

@@ -23,7 +23,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Any
 
 from stario.sequences.errors import InputError
@@ -41,6 +43,13 @@ _MIN_STEP, _FEW_SAMPLES = 100_000, 5
 """Minimum average step [ns] between that many samples of a sensor: none has 10 kHz, but times in
 microseconds or a coarser unit seem to be so dense."""
 
+BACKWARD = 5 * 10**9
+"""A batch whose middle is this [ns] before the newest sample comes from a clock set back."""
+
+_STRAY_SHARE = 0.1
+"""Maximum share of a batch's readings whose times, `BACKWARD` or more from the batch's middle, are
+taken to be wrong; more are a backlog."""
+
 MAX_READING = 1e4
 """Maximum reading of any sensor in rad/s, m/s^2 or uT."""
 
@@ -54,15 +63,11 @@ ACCEL_RAW = "accelerometeruncalibrated"
 MAG = "magnetometer"
 BAROMETER = "barometer"
 _AXES = frozenset({GYRO, GYRO_RAW, TOTAL, LINEAR, GRAVITY, ACCEL_RAW, MAG})
-SENSORS = _AXES | {BAROMETER}
 ORIENTATION = "orientation"
 """The phone's own attitude, of which only the vertical is used."""
 
 LOCATION = "location"
 """Places by the phone's satellite receiver."""
-
-_LOCATION_REST = ("altitude", "horizontalAccuracy", "speed", "bearing")
-"""Values of a place that may be unknown."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,7 @@ class Reading:
     """One sample of one sensor.
 
     Attributes:
-        sensor: one of `SENSORS`, `ORIENTATION` or `LOCATION`.
+        sensor: one of the names above.
         time_ns: time on the device's clock [ns].
         value: reading in rad/s, m/s^2 or uT; for an attitude, the upward unit vector in B; for the
             barometer, one number in hPa; for a place, latitude and longitude [deg], altitude [m],
@@ -99,6 +104,17 @@ class Batch:
     readings: list[Reading]
     number: int = -1
     places: list[Reading] = field(default_factory=list)
+
+    @property
+    def middle_ns(self) -> int:
+        """Median time of a batch that is not empty [ns]."""
+        return sorted(reading.time_ns for reading in self.readings)[len(self.readings) // 2]
+
+    def credible(self) -> list[Reading]:
+        """Return the readings without single ones far from the rest, which would seem newest."""
+        middle, count = self.middle_ns, len(self.readings)
+        near = [reading for reading in self.readings if abs(reading.time_ns - middle) < BACKWARD]
+        return near if count - len(near) <= _STRAY_SHARE * count else self.readings
 
 
 def parse_push(body: bytes) -> Batch:
@@ -142,56 +158,53 @@ def _check_unit(readings: list[Reading]) -> None:
     Raises:
         InputError: no sensor has so high a rate.
     """
-    times: dict[str, list[int]] = {}
-    for reading in readings:
-        times.setdefault(reading.sensor, []).append(reading.time_ns)
-    for sensor, at in times.items():
-        steps = len(at) - 1
-        if steps >= _FEW_SAMPLES - 1 and max(at) - min(at) < steps * _MIN_STEP:
+    for sensor in {reading.sensor for reading in readings}:
+        at = [reading.time_ns for reading in readings if reading.sensor == sensor]
+        if len(at) >= _FEW_SAMPLES and max(at) - min(at) < (len(at) - 1) * _MIN_STEP:
             found = f"samples of {sensor} less than {_MIN_STEP / 1e6:g} ms apart"
             fix = "send integers: times in s, ms or us seem to stand still"
             raise InputError("payload.time", found, "times in nanoseconds", fix)
 
 
-def parse_line(line: bytes, sender: str) -> Batch:
-    """Parse a line of JSON.
+def parse_lines(body: bytes, sender: str) -> list[Batch]:
+    """Parse lines of JSON into a batch for each stretch of lines of one device and recording.
 
     Args:
-        line: JSON object.
-        sender: name of the device if the line gives none.
+        body: JSON objects, one a line.
+        sender: name of the device of a line that gives none.
 
     Raises:
-        InputError: the line does not have this form; the error names the field.
+        InputError: a line does not have this form; the error names the line and the field.
     """
+    lines = []
+    for number, line in enumerate(body.splitlines(), 1):
+        try:
+            lines += [_line(line, sender)] if line.strip() else []
+        except InputError as error:
+            field = f"line {number}, {error.field}"
+            raise InputError(field, error.found, error.expected, error.fix) from None
+    return [
+        Batch(device, recording, [reading for _, readings in stretch for reading in readings])
+        for (device, recording), stretch in groupby(lines, key=lambda line: line[0])
+    ]
+
+
+def _line(line: bytes, sender: str) -> tuple[tuple[str, str], list[Reading]]:
+    """Parse a line of JSON into device and recording, and readings."""
     message = object_from("line", line)
-    if "payload" in message:
-        return parse_push(line)
     if "t_ns" in message:
         time_ns = _nanoseconds("t_ns", message["t_ns"])
     else:
         time_ns = _nanoseconds("t", 1e9 * number_from("t", message.get("t")))
     readings = [
-        Reading(sensor, time_ns, _three(key, message[key]))
+        Reading(sensor, time_ns, _vector(_three(key, message[key])))
         for key, sensor in (("gyro", GYRO), ("accel", TOTAL), ("mag", MAG))
         if key in message
     ]
     if not readings:
         raise InputError("line", "none of gyro, accel and mag", "at least one of them")
     device = _name("device", message.get("device", sender))
-    return Batch(device, _name("recording", message.get("recording", ""), needed=False), readings)
-
-
-def joined(batches: Iterable[Batch]) -> list[Batch]:
-    """Merge consecutive batches without numbers of the same device and recording."""
-    merged: list[Batch] = []
-    for batch in batches:
-        key = (batch.device, batch.recording, -1)
-        if merged and (merged[-1].device, merged[-1].recording, batch.number) == key:
-            merged[-1].readings.extend(batch.readings)
-            merged[-1].places.extend(batch.places)
-        else:
-            merged.append(batch)
-    return merged
+    return (device, _name("recording", message.get("recording", ""), needed=False)), readings
 
 
 def object_from(where: str, text: bytes) -> Mapping[str, Any]:
@@ -210,32 +223,21 @@ def object_from(where: str, text: bytes) -> Mapping[str, Any]:
 
 
 def _pushed(where: str, entry: Mapping[str, Any]) -> Reading | None:
-    """Parse one sample of a push; None for a sensor that is not used."""
+    """Parse one sample of a push; None if its sensor, or the value of one not needed, is unused."""
     name = entry.get("name")
     if not isinstance(name, str):
         raise InputError(f"{where}.name", _describe(name), "a sensor name")
-    sensor = name.lower()
-    values = entry.get("values", entry)
-    if sensor in _OPTIONAL:
-        return _optional(sensor, entry.get("time"), values)
-    if sensor not in _AXES:
-        return None
-    time_ns = _nanoseconds(f"{where}.time", entry.get("time"))
-    axes = _object(f"{where}.values", values)
-    return Reading(
-        sensor,
-        time_ns,
-        _vector((f"{where}.values.{axis}", axes.get(axis)) for axis in "xyz"),
-    )
-
-
-def _optional(sensor: str, time: Any, values: Any) -> Reading | None:
-    """Parse a sensor that no track needs; None if its values are invalid."""
-    try:
-        value = _OPTIONAL[sensor](_object("values", values))
-        return Reading(sensor, _nanoseconds("time", time), value)
-    except InputError:
-        return None
+    sensor, time, values = name.lower(), entry.get("time"), entry.get("values", entry)
+    if sensor in _AXES:
+        time_ns = _nanoseconds(f"{where}.time", time)
+        axes = _object(f"{where}.values", values)
+        value = _vector((f"{where}.values.{axis}", axes.get(axis)) for axis in "xyz")
+        return Reading(sensor, time_ns, value)
+    with suppress(InputError):
+        if sensor in _OPTIONAL:
+            value = _OPTIONAL[sensor](_object("values", values))
+            return Reading(sensor, _nanoseconds("time", time), value)
+    return None
 
 
 def _vertical(values: Mapping[str, Any]) -> Vector:
@@ -251,8 +253,9 @@ def _pressure(values: Mapping[str, Any]) -> Vector:
 
 
 def _place(values: Mapping[str, Any]) -> Vector:
-    latlon_deg = (number_from(name, values.get(name)) for name in ("latitude", "longitude"))
-    return *latlon_deg, *(_number_or_nan(values.get(name)) for name in _LOCATION_REST)
+    known = (number_from(name, values.get(name)) for name in ("latitude", "longitude"))
+    rest = (values.get(name) for name in ("altitude", "horizontalAccuracy", "speed", "bearing"))
+    return *known, *(math.nan if value is None else number_from("", value) for value in rest)
 
 
 _OPTIONAL: dict[str, Callable[[Mapping[str, Any]], Vector]] = {
@@ -291,22 +294,20 @@ def _nanoseconds(where: str, value: Any) -> int:
     return value
 
 
-def _three(where: str, values: Any) -> Vector:
+def _three(where: str, values: Any) -> list[tuple[str, Any]]:
     if not isinstance(values, list) or len(values) != 3:
         raise InputError(where, _describe(values), "a list of three numbers")
-    return _vector((f"{where}[{k}]", value) for k, value in enumerate(values))
+    return [(f"{where}[{k}]", value) for k, value in enumerate(values)]
 
 
 def _vector(values: Iterable[tuple[str, Any]]) -> Vector:
     """Return three readings, each given with its place in the message."""
-    numbers = []
-    for where, value in values:
-        numbers.append(number_from(where, value))
-        if abs(numbers[-1]) > MAX_READING:
-            found = f"{numbers[-1]:.3g}"
-            raise InputError(where, found, f"at most {MAX_READING:g} rad/s, m/s^2 or uT")
-    x, y, z = numbers
-    return x, y, z
+    numbers = {where: number_from(where, value) for where, value in values}
+    for where, number in numbers.items():
+        if abs(number) > MAX_READING:
+            expected = f"at most {MAX_READING:g} rad/s, m/s^2 or uT"
+            raise InputError(where, f"{number:.3g}", expected)
+    return tuple(numbers.values())
 
 
 def number_from(where: str, value: Any) -> float:
@@ -324,13 +325,6 @@ def number_from(where: str, value: Any) -> float:
     if not math.isfinite(number):
         raise InputError(where, "no finite number", "a finite number")
     return number
-
-
-def _number_or_nan(value: Any) -> float:
-    try:
-        return number_from("value", value)
-    except InputError:
-        return math.nan
 
 
 def _describe(value: Any) -> str:

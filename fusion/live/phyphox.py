@@ -8,6 +8,7 @@ experiment must record the gyroscope and the acceleration with g: "Add experimen
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
 import math
 import urllib.request
@@ -97,9 +98,9 @@ class Phyphox:
                 return Batch(self.device, session, [])
         if self._is_forced(buffers):
             self._restart()
-        known = [r for sensor in self._buffers for r in self._readings(sensor, buffers)]
-        readings = [r for r in known if r.sensor != LOCATION]
-        places = [r for r in known if r.sensor == LOCATION]
+        known = {sensor: self._readings(sensor, buffers) for sensor in self._buffers}
+        places = known.pop(LOCATION, [])
+        readings = [*itertools.chain(*known.values())]
         measuring = status.get("measuring") is not False
         if measuring and not self._measuring:
             self._restarts += 1  # phyphox's time does not count a pause: the track cannot continue
@@ -175,13 +176,9 @@ def buffers_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
         if all(isinstance(name, str) for name in names):
             found[sensor] = tuple(map(str, names))
     if GYRO not in found or not (TOTAL in found or {LINEAR, GRAVITY} <= set(found)):
-        present = ", ".join(found) or "neither"
-        raise InputError(
-            "phyphox",
-            present,
-            "gyroscope and acceleration with g in one experiment",
-            "add a simple experiment with both",
-        )
+        expected = "gyroscope and acceleration with g in one experiment"
+        fix = "add a simple experiment with both"
+        raise InputError("phyphox", ", ".join(found) or "neither", expected, fix)
     return found
 
 
@@ -209,10 +206,8 @@ def _column(buffers: Mapping[str, Any], name: str, unknown: bool = False) -> lis
     numbers: list[float] = []
     for value in values if isinstance(values, list) else []:
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if not number or not abs(value) < _LARGEST:  # or NaN
-            if unknown:
-                numbers.append(math.nan)
-                continue
+        valid = number and abs(value) < _LARGEST  # not NaN
+        if not (valid or unknown):
             break
-        numbers.append(float(value))
+        numbers.append(float(value) if valid else math.nan)
     return numbers

@@ -80,8 +80,7 @@ class Places:
         if self.use == "ignore" or (self._recent and time <= self._recent[-1][0]):
             return
         row = (time, *value)
-        self._recent = [earlier for earlier in self._recent if time - earlier[0] <= _RECENT_S]
-        self._recent.append(row)
+        self._recent = [row for row in self._recent if time - row[0] <= _RECENT_S] + [row]
         self._shown.append(row)
         if len(self._shown) > MAX_PLACES:
             self._shown = self._shown[::2]
@@ -101,9 +100,8 @@ class Places:
             return ""
         become, place = "compared with the track", self._earth.georeference
         if self.use == "use":
-            become = "used"
-            if place is not None:
-                become += f", origin {place.latitude_deg:.6f},{place.longitude_deg:.6f}"
+            at = place and f", origin {place.latitude_deg:.6f},{place.longitude_deg:.6f}"
+            become = f"used{at or ''}"
         return f"{self.count} satellite position{'s' * (self.count > 1)} {become}"
 
     def due(self, time: float) -> list[Fix]:
@@ -120,28 +118,20 @@ class Places:
         if not (self._changed and self._shown and points):
             return
         self._changed = False
-        good = _good(self._shown, points[0][0], points[-1][0])
-        if good is None:
+        known = _reported(self._shown)
+        known = known and known.slice(points[0][0], points[-1][0])
+        if known is None or not (good := reliable(known)).any():
             return
-        place = self._earth.georeference
+        known, place = known.select(good), self._earth.georeference
         if self.use == "compare":
             time, x, y = np.array([[p[0], p[10], p[11]] for p in points]).T
-            track = np.column_stack([np.interp(good.time, time, axis) for axis in (x, y)])
-            place = georeference_of(good.latlon_deg, track)
+            track = np.column_stack([np.interp(known.time, time, axis) for axis in (x, y)])
+            place = georeference_of(known.latlon_deg, track)
         if place is None:
             return
-        radius = np.zeros(len(good)) if good.radius_m is None else np.nan_to_num(good.radius_m)
-        rows = np.column_stack([good.time, place.xy(good.latlon_deg), radius])
+        radius = np.zeros(len(known)) if known.radius_m is None else np.nan_to_num(known.radius_m)
+        rows = np.column_stack([known.time, place.xy(known.latlon_deg), radius])
         self.drawn = rows.round(2).tolist()
-
-
-def _good(rows: Sequence[Vector], start: float, stop: float) -> Satellites | None:
-    """Return the reliable places of times from start to stop [s]; None if there is none."""
-    reported = _reported(rows)
-    known = None if reported is None else reported.slice(start, stop)
-    if known is None or not (good := reliable(known)).any():
-        return None
-    return known.select(good)
 
 
 def _reported(rows: Sequence[Vector]) -> Satellites | None:

@@ -1,4 +1,9 @@
-"""The complete live server: page, pushes and polled phones in one event loop."""
+"""The complete live server: page, pushes and polled phones in one event loop.
+
+A connection waits if the server needs more from its client before it can answer: a header, a body,
+or another request. Such connections cost a client nothing, with or without a token, and would keep
+others out if there were no end to them. A phone sends its push at once and is not affected.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +12,16 @@ import ipaddress
 import secrets
 import signal
 import socket
-import threading
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, nullcontext
+from collections import Counter
+from collections.abc import AsyncIterator, Callable, Iterable
+from contextlib import asynccontextmanager
 from pathlib import Path
 from types import FrameType
 
 import uvicorn
-from uvicorn.server import HANDLED_SIGNALS
+from starlette.applications import Starlette
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from stario.fusion.live.connections import Connection, close_overdue
 from stario.fusion.live.demo import walk
 from stario.fusion.live.hub import Hub
 from stario.fusion.live.phyphox import Phyphox, follow
@@ -26,10 +31,17 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 
 _POLL_SECONDS = 0.1
-"""Interval between checks for a signal to stop, and for what has waited too long [s]."""
+"""Interval between checks for the server's end, and for what has waited too long [s]."""
 
 _MAX_CONNECTIONS = 800
-"""Maximum number of connections; those that wait for their clients are fewer (`connections`)."""
+"""Maximum number of connections; those that wait for their clients are fewer."""
+
+REQUEST_SECONDS = 20.0
+"""Maximum time from a connection or a request's first byte to its last [s]."""
+
+MAX_WAITING = 500
+"""Maximum number of waiting connections; for one more the address with the most loses its oldest.
+They are accepted hundreds at a time, so that a lower number could hit one that has just come."""
 
 
 class LiveServer:
@@ -72,21 +84,25 @@ class LiveServer:
         self.port = int(self._socket.getsockname()[1])
         own = host if host not in ("0.0.0.0", "::") else _own_address()
         self._netloc = f"[{own}]:{self.port}" if ":" in own else f"{own}:{self.port}"
+        known_as = self._netloc if self.token else ""
         config = uvicorn.Config(
-            live_app(self.hub, self.token, self._netloc if self.token else "", tiles),
+            live_app(self.hub, self.token, known_as, tiles, self._beside),
             http=Connection,
             log_config=None,
             log_level="warning",
-            lifespan="off",
             timeout_graceful_shutdown=1,
             limit_concurrency=_MAX_CONNECTIONS,
         )
         self._server = _Server(config)
+        self._started: Callable[[], None] = lambda: None
 
     def run(self, started: Callable[[], None] = lambda: None) -> None:
         """Serve until stopped by a signal or `stop`; `started` is called once it is listening."""
-        with self._stopped_by_signals():
-            asyncio.run(self._run(started))
+        self._started = started
+        try:
+            asyncio.run(self._server.serve(sockets=[self._socket]))
+        finally:
+            self._socket.close()
 
     def stop(self) -> None:
         """End `run`; may be called from another thread."""
@@ -104,63 +120,90 @@ class LiveServer:
             lines.append("only this computer can connect; use --host 0.0.0.0 for phones")
         return lines
 
-    async def _run(self, started: Callable[[], None]) -> None:
-        tasks = [asyncio.create_task(follow(self.hub, phone)) for phone in self._phones]
-        tasks.append(asyncio.create_task(self._watch()))
-        try:
-            web = asyncio.create_task(self._server.serve(sockets=[self._socket]))
-            while not self._server.started and not web.done():
-                await asyncio.sleep(0.01)
-            started()
-            if self._demo is not None:
-                tasks.append(asyncio.create_task(walk(self.hub, self._demo)))
-            while not self._server.should_exit:
-                await asyncio.sleep(_POLL_SECONDS)
-            self.hub.end()
-            await web
-        finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-            self._socket.close()
-            self.hub.close()
+    @asynccontextmanager
+    async def _beside(self, app: Starlette) -> AsyncIterator[None]:
+        """Poll phones, let the simulated one walk and watch the clock; at last close recordings."""
+        work = [follow(self.hub, phone) for phone in self._phones]
+        work += (
+            [self._watch()] if self._demo is None else [self._watch(), walk(self.hub, self._demo)]
+        )
+        tasks = [asyncio.create_task(each) for each in work]
+        self._started()
+        yield
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        self.hub.close()
 
     async def _watch(self) -> None:
-        """Close connections, and process pushes, that have waited long enough."""
+        """End what has waited long enough, and the viewers' connections if the server stops."""
         while True:
             await asyncio.sleep(_POLL_SECONDS)
             now = asyncio.get_running_loop().time()
-            close_overdue(self._server.server_state.connections, now)
+            _close_overdue(self._server.server_state.connections, now)
             await self.hub.release()
-
-    @contextmanager
-    def _stopped_by_signals(self) -> Iterator[None]:
-        """Let the first signal stop the server, and the next one end the program as usual."""
-        if threading.current_thread() is not threading.main_thread():
-            yield  # signals go to the main thread only
-            return
-        usual = {number: signal.getsignal(number) for number in HANDLED_SIGNALS}
-
-        def restore() -> None:
-            for number, handler in usual.items():
-                signal.signal(number, handler)
-
-        def stop(number: int, frame: FrameType | None) -> None:
-            restore()
-            self.stop()
-
-        for number in HANDLED_SIGNALS:
-            signal.signal(number, stop)
-        try:
-            yield
-        finally:
-            restore()
+            if self._server.should_exit:
+                self.hub.end()
 
 
 class _Server(uvicorn.Server):
-    def capture_signals(self) -> nullcontext[None]:  # type: ignore[override]
-        """Leave the signals to `LiveServer`: uvicorn raises them before recordings are closed."""
-        return nullcontext()
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """Stop at a signal, which uvicorn would raise again; the next one ends the program."""
+        self.should_exit = True
+        signal.signal(sig, signal.SIG_DFL if sig != signal.SIGINT else signal.default_int_handler)
+
+
+class Connection(H11Protocol):
+    """HTTP connection that knows for how long the server has waited for its client.
+
+    Attributes:
+        since: time of the event loop at which a connection, or its present request, began [s].
+        answered: whether a request was answered.
+    """
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin to wait, in the place of another if too many do."""
+        super().connection_made(transport)
+        self.since, self.answered, self._idle = self.loop.time(), False, False
+        waiting = _waiting(self.connections)
+        if len(waiting) > MAX_WAITING:
+            [(crowded, _)] = Counter(each.address for each in waiting).most_common(1)
+            crowd = (each for each in waiting if each.address == crowded)
+            min(crowd, key=lambda each: (each.answered, each.since)).transport.abort()
+
+    def data_received(self, data: bytes) -> None:
+        """Process data, which may begin a request."""
+        if self._idle:
+            self.since, self._idle = self.loop.time(), False
+        super().data_received(data)
+
+    def on_response_complete(self) -> None:
+        """Wait for another request; uvicorn closes a connection that sends none for seconds."""
+        self.since, self.answered, self._idle = self.loop.time(), True, True
+        super().on_response_complete()
+
+    @property
+    def waits(self) -> bool:
+        """Whether the server needs more from the client before it can answer."""
+        if self.transport.is_closing():
+            return False
+        return self.cycle is None or self.cycle.response_complete or self.cycle.more_body
+
+    @property
+    def address(self) -> str:
+        """The client's address."""
+        return self.client[0] if self.client else ""
+
+
+def _close_overdue(connections: Iterable[object], now: float) -> None:
+    """Close the connections that have waited too long at a time of the event loop [s]."""
+    for each in _waiting(connections):
+        if now - each.since > REQUEST_SECONDS:
+            each.transport.abort()
+
+
+def _waiting(connections: Iterable[object]) -> list[Connection]:
+    return [each for each in connections if isinstance(each, Connection) and each.waits]
 
 
 def is_loopback(host: str) -> bool:

@@ -24,7 +24,8 @@ import importlib.resources
 import io
 import json
 import logging
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import AbstractAsyncContextManager, suppress
 from functools import cache
 from html import escape
 from typing import Any
@@ -32,22 +33,16 @@ from urllib.parse import urlsplit
 
 import numpy as np
 from starlette.applications import Starlette
+from starlette.authentication import AuthenticationBackend, AuthenticationError
 from starlette.middleware import Middleware
+from starlette.middleware.authentication import AuthenticationMiddleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
-from starlette.types import ASGIApp, Receive, Scope, Send
 
 from stario.fusion.live.hub import Hub, Viewer
-from stario.fusion.live.payload import (
-    Batch,
-    joined,
-    number_from,
-    object_from,
-    parse_line,
-    parse_push,
-)
+from stario.fusion.live.payload import number_from, object_from, parse_lines, parse_push
 from stario.sequences.arrays import check_choice
 from stario.sequences.errors import InputError, StarioError
 from stario.sequences.units import ACCEL_UNITS, known_unit
@@ -80,7 +75,13 @@ _HEADERS = {
 _log = logging.getLogger(__name__)
 
 
-def live_app(hub: Hub, token: str = "", host: str = "", tiles: str = "") -> Starlette:
+def live_app(
+    hub: Hub,
+    token: str = "",
+    host: str = "",
+    tiles: str = "",
+    beside: Callable[[Starlette], AbstractAsyncContextManager[None]] | None = None,
+) -> Starlette:
     """Return the web application.
 
     Args:
@@ -88,9 +89,10 @@ def live_app(hub: Hub, token: str = "", host: str = "", tiles: str = "") -> Star
         token: token that every request must carry; empty for a server on loopback only.
         host: this computer's name or address and port in its network; empty on loopback.
         tiles: address of a map server's tiles; empty for none.
+        beside: context of what runs as long as the server.
     """
     guard = (
-        Middleware(TokenMiddleware, token=token)
+        Middleware(AuthenticationMiddleware, backend=TokenCheck(token), on_error=_unauthorised)
         if token
         else Middleware(TrustedHostMiddleware, allowed_hosts=LOOPBACK)
     )
@@ -108,48 +110,36 @@ def live_app(hub: Hub, token: str = "", host: str = "", tiles: str = "") -> Star
         ],
         middleware=[guard],
         exception_handlers={StarioError: _bad_request, OSError: _storage_error},
+        lifespan=beside,
     )
     app.state.hub, app.state.token, app.state.host = hub, token, host
     app.state.tiles = tiles
     return app
 
 
-class TokenMiddleware:
-    """Middleware that rejects requests without the token.
+class TokenCheck(AuthenticationBackend):
+    """Check that a request has the token.
 
     Args:
-        app: application that handles accepted requests.
         token: required token, not empty.
     """
 
-    def __init__(self, app: ASGIApp, token: str) -> None:
-        self._app, self._token = app, token
+    def __init__(self, token: str) -> None:
+        self._token = token
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Reject a request, or pass it on."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-        request = Request(scope)
-        query_token = request.query_params.get("token", "")
-        bearer = request.headers.get("authorization", "").removeprefix("Bearer ")
-        candidates = (query_token, bearer, request.cookies.get(_COOKIE, ""))
-        if not any(tokens_match(candidate, self._token) for candidate in candidates):
-            reason = (
+    async def authenticate(self, conn: HTTPConnection) -> None:
+        """Raise an error if a request has no token."""
+        bearer = conn.headers.get("authorization", "").removeprefix("Bearer ")
+        shown = (conn.query_params.get("token", ""), bearer, conn.cookies.get(_COOKIE, ""))
+        if not any(tokens_match(each, self._token) for each in shown):
+            raise AuthenticationError(
                 "token: missing or wrong; add ?token=..., as the server printed when it started"
             )
-            # Without a token nobody keeps a connection.
-            refusal = JSONResponse({"error": reason}, 401, {"connection": "close"})
-            await refusal(scope, receive, send)
-            return
 
-        async def with_cookie(message: Any) -> None:
-            if message["type"] == "http.response.start" and tokens_match(query_token, self._token):
-                cookie = f"{_COOKIE}={self._token}; HttpOnly; SameSite=Strict; Path=/"
-                message["headers"] = [*message["headers"], (b"set-cookie", cookie.encode())]
-            await send(message)
 
-        await self._app(scope, receive, with_cookie)
+def _unauthorised(conn: HTTPConnection, error: Exception) -> Response:
+    # Without a token nobody keeps a connection.
+    return JSONResponse({"error": str(error)}, 401, {"connection": "close"})
 
 
 def tokens_match(shown: str, token: str) -> bool:
@@ -167,31 +157,17 @@ async def _data(request: Request) -> Response:
         if coding != "identity":
             raise InputError("content-encoding", coding, "identity", "send it uncompressed")
         body = await _body(request)
-        lines = request.headers.get("content-type", "").lower().startswith(_LINES)
-        sender = f"http {request.client.host if request.client else ''}"
         # In a thread, so that a large body does not block other requests.
-        batches = await asyncio.to_thread(_parsed, body, sender if lines else "")
+        if request.headers.get("content-type", "").lower().startswith(_LINES):
+            sender = f"http {request.client.host if request.client else ''}"
+            batches = await asyncio.to_thread(parse_lines, body, sender)
+        else:
+            batches = [await asyncio.to_thread(parse_push, body)]
     except InputError as error:
         hub.refused["http"] += 1
         _log.warning("a message is refused: %s", error)  # few apps show the response
         raise
     return JSONResponse({"samples": await hub.take(*batches, accel_factor=ACCEL_UNITS[name])})
-
-
-def _parsed(body: bytes, sender_of_lines: str) -> list[Batch]:
-    """Return the batches of a body; an invalid line refuses all of them."""
-    if not sender_of_lines:
-        return [parse_push(body)]
-    lines = [(k, line) for k, line in enumerate(body.splitlines(), 1) if line.strip()]
-    return joined(_parsed_line(k, line, sender_of_lines) for k, line in lines)
-
-
-def _parsed_line(number: int, line: bytes, sender: str) -> Batch:
-    try:
-        return parse_line(line, sender)
-    except InputError as error:
-        field = f"line {number}, {error.field}"
-        raise InputError(field, error.found, error.expected, error.fix) from None
 
 
 def _check_origin(request: Request) -> None:
@@ -226,18 +202,19 @@ async def _command(request: Request) -> Response:
 
 
 def _fix_values(message: Mapping[str, Any]) -> dict[str, float]:
-    values = {name: number_from(name, message.get(name)) for name in ("x", "y", "sigma")}
-    for name in ("x", "y"):
-        _check_coordinate(name, values[name])
-    low, high = _SIGMA_RANGE
-    if not low <= values["sigma"] <= high:
-        raise InputError("sigma", f"{values['sigma']:g}", f"{low:g} to {high:g} m")
-    return values
+    x, y = (_metres(name, message.get(name)) for name in ("x", "y"))
+    sigma, (low, high) = number_from("sigma", message.get("sigma")), _SIGMA_RANGE
+    if not low <= sigma <= high:
+        raise InputError("sigma", f"{sigma:g}", f"{low:g} to {high:g} m")
+    return {"x": x, "y": y, "sigma": sigma}
 
 
-def _check_coordinate(name: str, value: float) -> None:
-    if abs(value) > _MAX_COORDINATE:
-        raise InputError(name, f"{value:g}", f"up to {_MAX_COORDINATE:g} m")
+def _metres(name: str, value: Any) -> float:
+    """Return a coordinate of the map in a request [m]."""
+    metres = number_from(name, value)
+    if abs(metres) > _MAX_COORDINATE:
+        raise InputError(name, f"{metres:g}", f"up to {_MAX_COORDINATE:g} m")
+    return metres
 
 
 async def _events(request: Request) -> Response:
@@ -270,29 +247,29 @@ async def _page(request: Request) -> Response:
     if tiles.hostname:
         source = f"img-src {tiles.scheme}://{tiles.netloc} "
         headers[_POLICY] = headers[_POLICY].replace("img-src ", source)
-    return Response(text, media_type="text/html", headers=headers)
+    page = Response(text, media_type="text/html", headers=headers)
+    if token := request.app.state.token:
+        page.set_cookie(_COOKIE, token, httponly=True, samesite="strict")
+    return page
 
 
 async def _background(request: Request) -> Response:
     """Return the map's tiles between limits of its axes; none before a track is on the earth."""
     from stario.fusion.report.background import tile_images
 
-    limits = np.array([[_metres(request, side) for side in axis] for axis in _SIDES])
+    limits = np.array([[_limit(request, side) for side in axis] for axis in _SIDES])
     if not (limits[:, 0] < limits[:, 1]).all():
         raise InputError("left, bottom", "not below right, top", "limits of the map's axes")
     place, tiles = request.app.state.hub.earth.georeference, request.app.state.tiles
     return JSONResponse([*tile_images(place, limits, tiles)] if place and tiles else [])
 
 
-def _metres(request: Request, name: str) -> float:
+def _limit(request: Request, side: str) -> float:
     """Return a limit of the map's axes in a request [m]."""
-    text = request.query_params.get(name, "")
-    try:
-        value = number_from(name, float(text))
-    except ValueError:
-        raise InputError(name, repr(text[:40]), "metres") from None
-    _check_coordinate(name, value)
-    return value
+    value: Any = request.query_params.get(side, "")
+    with suppress(ValueError):  # a text is refused as such
+        value = float(value)
+    return _metres(side, value)
 
 
 async def _page_code(request: Request) -> Response:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import heapq
-import itertools
 import math
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from stario.fusion.live.payload import Batch
+from stario.fusion.live.payload import BACKWARD, Batch
 from stario.fusion.live.places import Earth
-from stario.fusion.live.times import BACKWARD, middle_time, with_credible_time
 from stario.fusion.live.track import LiveTrack
 from stario.fusion.navigator import Navigator
 from stario.sequences.errors import InputError
@@ -21,7 +20,7 @@ FORWARD = 60 * 10**9
 
 
 class Session:
-    """Stream of one device. Not thread-safe: the caller must hold the hub's lock for the device.
+    """Stream of one device. Not thread-safe: after its first batch use it in its thread only.
 
     Args:
         device: name of the device.
@@ -33,6 +32,9 @@ class Session:
         received: time of the last receipt [s since 1970].
         running: whether data are processed.
         track: current track.
+        thread: the thread in which the hub uses it.
+        pending: number of the hub's calls that are not done.
+        order: its pushes that wait for one before them.
     """
 
     def __init__(
@@ -45,14 +47,15 @@ class Session:
         self.device, self._earth = device, earth or Earth()
         self._folder, self._new_navigator = folder, new_navigator
         self.received, self._factor = 0.0, 1.0
-        self._order = PushOrder()
+        self.thread, self.pending = ThreadPoolExecutor(1), 0
+        self.order = PushOrder()
         self._previous, self._opened_ns = "", 0  # recording before this, start of this
         self._begin()
 
     def start(self) -> None:
         """Start a new track and a new recording."""
         self.close()
-        self._order = PushOrder()  # pushes that came after `stop` are not missing
+        self.order = PushOrder()  # pushes that came after `stop` are not missing
         self._begin()
 
     def _begin(self, recording: str = "") -> None:
@@ -82,7 +85,7 @@ class Session:
         if self._is_of_previous(batch):
             self.track.delayed += len(batch.readings)
             return 0
-        self._order.add(batch, received)
+        self.order.add(batch, received)
         return self.release(received)
 
     def check(self, batch: Batch) -> None:
@@ -96,20 +99,16 @@ class Session:
             fix = "give each phone a name of its own"
             raise InputError("device", found, "one at a time", fix)
 
-    def is_due(self, now: float) -> bool:
-        """Return whether a push has waited long enough for one before it, at a time [s]."""
-        return self._order.is_due(now)
-
     def release(self, now: float) -> int:
         """Process the pushes whose turn it is at a time [s]; return their number of samples."""
-        return sum(self._process(*each) for each in self._order.ready(now))
+        return sum(self._process(*each) for each in self.order.ready(now))
 
     def _process(self, batch: Batch, received: float) -> int:
         if not batch.readings:
             return 0
         if self._is_new(batch):
             self.track.close()
-            self._previous, self._opened_ns = self._recording, middle_time(batch)
+            self._previous, self._opened_ns = self._recording, batch.middle_ns
             self._begin(batch.recording)
         self._recording, self._number = batch.recording, max(self._number, batch.number)
         return self.track.process(batch, received, self._factor)
@@ -119,14 +118,6 @@ class Session:
         self.release(math.inf)
         self.running = False
 
-    def zero(self) -> None:
-        """See `LiveTrack.zero`."""
-        self.track.zero()
-
-    def fix(self, x: float, y: float, sigma: float) -> None:
-        """See `LiveTrack.fix`."""
-        self.track.fix(x, y, sigma)
-
     def close(self) -> None:
         """Process what still waits, and close the recording."""
         try:
@@ -135,24 +126,9 @@ class Session:
             self.track.close()
 
     def status(self) -> dict[str, Any]:
-        """Return what the page shows next to the track."""
-        track = self.track
-        return {
-            "id": self.device,
-            "running": self.running,
-            "samples": track.samples,
-            "rate": round(track.rate, 1),
-            "received": self.received,
-            "origin": track.drawn.origin.round(4).tolist(),
-            "fixes": track.fixes,
-            "dropped": track.dropped(),
-            "file": None if track.path is None else track.path.name,
-            "problem": track.problem(),
-            "health": track.words,
-            "floor": track.floor,
-            "satellites": track.places.words(),
-            "georeferenced": track.georeferenced,
-        }
+        """Return what the page shows of the device."""
+        known = {"id": self.device, "running": self.running, "received": self.received}
+        return known | self.track.status()
 
     def _is_new(self, batch: Batch) -> bool:
         """Return whether a batch belongs to a different recording than those before."""
@@ -161,9 +137,9 @@ class Session:
             return False
         if self._recording and batch.recording and self._recording != batch.recording:
             return True
-        first = min(reading.time_ns for reading in with_credible_time(batch))
+        first = min(reading.time_ns for reading in batch.credible())
         delayed = 0 <= batch.number < self._number  # rather than after the clock was set back
-        set_back = middle_time(batch) - newest <= -BACKWARD and not delayed
+        set_back = batch.middle_ns - newest <= -BACKWARD and not delayed
         return first - newest >= FORWARD or set_back
 
     def _is_of_previous(self, batch: Batch) -> bool:
@@ -172,7 +148,7 @@ class Session:
         return bool(named and batch.readings)
 
     def _is_late(self, batch: Batch) -> bool:
-        return batch.number >= 0 and middle_time(batch) < self._opened_ns
+        return batch.number >= 0 and batch.middle_ns < self._opened_ns
 
 
 MAX_DELAY = 0.8
@@ -189,7 +165,7 @@ class PushOrder:
 
     def __init__(self) -> None:
         self._recording, self._next = "", 0
-        self._recordings, self._arrivals = 0, itertools.count()
+        self._recordings, self._arrivals = 0, 0
         self._waiting: list[tuple[int, int, int, float, Batch]] = []
 
     def add(self, batch: Batch, received: float) -> None:
@@ -197,7 +173,8 @@ class PushOrder:
         if batch.recording != self._recording:
             self._recording, self._next = batch.recording, batch.number
             self._recordings += 1
-        entry = (self._recordings, batch.number, next(self._arrivals), received, batch)
+        self._arrivals += 1
+        entry = (self._recordings, batch.number, self._arrivals, received, batch)
         heapq.heappush(self._waiting, entry)
 
     def is_due(self, now: float) -> bool:

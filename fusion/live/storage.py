@@ -7,11 +7,15 @@ receipt, does not come from the device: a truncated line lacks it and can thus b
 
 from __future__ import annotations
 
+import csv
 import errno
+import io
+import itertools
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO
@@ -29,16 +33,10 @@ _ASIDE = {
 }
 """Columns of sensors that may start later; their readings have rows of their own."""
 
-HEADER = (
-    "t [ns],gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2],"
-    f"{','.join(title for titles in _ASIDE.values() for title in titles)},received [unix s]\n"
-)
-"""Header of a recording."""
+_IMU = ["gx [rad/s]", "gy [rad/s]", "gz [rad/s]", "ax [m/s^2]", "ay [m/s^2]", "az [m/s^2]"]
 
-_NO_IMU = "," * 6
-_NO_ASIDE = "," * (sum(map(len, _ASIDE.values())) - 1)
-
-FIXES_HEADER = "t,kind,x,y,z,sx,sy,sz\n"
+_HEADER = ["t [ns]", *_IMU, *itertools.chain(*_ASIDE.values()), "received [unix s]"]
+_FIXES_HEADER = ("t", "kind", *"xyz", "sx", "sy", "sz")
 
 
 class LiveFile:
@@ -73,40 +71,39 @@ class LiveFile:
         Raises:
             OSError: they could not all be written; the file is then unchanged.
         """
-        end = f"{received:.3f}\n"
-        rows = [f"{reading.time_ns}{_NO_IMU},{_cells(reading)},{end}" for reading in aside]
-        rows += [
-            f"{time},{g[0]!r},{g[1]!r},{g[2]!r},{a[0]!r},{a[1]!r},{a[2]!r},{_NO_ASIDE},{end}"
-            for time, g, a in samples
-        ]
-        _write_whole(self._file, "".join(rows).encode())
+        end = f"{received:.3f}"
+        rows = [(each.time_ns, *[""] * len(_IMU), *_cells(each), end) for each in aside]
+        blank = [""] * (len(_HEADER) - 2 - len(_IMU))
+        rows += [(time, *gyro, *accel, *blank, end) for time, gyro, accel in samples]
+        _write_whole(self._file, rows)
 
     def append_fix(self, fix: Fix) -> None:
         """Append a position fix for `stario run --fixes`; its time counts from the first sample."""
-        (x, y, z), sigma = fix.value.tolist(), fix.covariance.diagonal() ** 0.5
-        sx, sy, sz = sigma.tolist()
-        line = f"{fix.time!r},position,{x!r},{y!r},{z!r},{sx!r},{sy!r},{sz!r}\n"
+        sigma = fix.covariance.diagonal() ** 0.5
+        row = (fix.time, "position", *fix.value.tolist(), *sigma.tolist())
         with self.fixes_path.open("ab", buffering=0) as file:
             # An attempt on a full disk may have left an empty file.
-            _write_whole(file, (line if file.tell() else FIXES_HEADER + line).encode())
+            _write_whole(file, [row] if file.tell() else [_FIXES_HEADER, row])
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
 
-def _cells(reading: Reading) -> str:
+def _cells(reading: Reading) -> list[object]:
     """Return a reading in the columns of `_ASIDE`, blank where it is unknown."""
-    cells: list[str] = []
+    cells: list[object] = []
     for sensor, titles in _ASIDE.items():
         values = reading.value if sensor == reading.sensor else [math.nan] * len(titles)
-        cells += ["" if math.isnan(value) else repr(value) for value in values]
-    return ",".join(cells)
+        cells += ["" if math.isnan(value) else value for value in values]
+    return cells
 
 
-def _write_whole(file: BinaryIO, data: bytes) -> None:
-    """Append all data or nothing, as a nearly full disk may take only a part."""
-    before = file.tell()
+def _write_whole(file: BinaryIO, rows: Iterable[Sequence[object]]) -> None:
+    """Append all rows or nothing, as a nearly full disk may take only a part."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    before, data = file.tell(), text.getvalue().encode()
     try:
         if file.write(data) < len(data):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -120,17 +117,15 @@ def _new_file(folder: Path, device: str) -> tuple[Path, BinaryIO]:
     """Create a new file with the header, named by time and device."""
     slug = re.sub(r"[^A-Za-z0-9]+", "-", device).strip("-")[:32] or "device"
     stem = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{slug}"
-    for number in range(1, 1000):
+    for number in itertools.count(1):
         path = folder / (f"{stem}.csv" if number == 1 else f"{stem}-{number}.csv")
-        try:
+        with suppress(FileExistsError):
             file = path.open("xb", buffering=0)
-        except FileExistsError:
-            continue
-        try:
-            _write_whole(file, HEADER.encode())
-        except OSError:  # on a full disk; each attempt would leave another empty file
-            file.close()
-            path.unlink()
-            raise
-        return path, file
-    raise InputError("out", f"999 files named {stem}", "an unused name", "choose another folder")
+            break
+    try:
+        _write_whole(file, [_HEADER])
+    except OSError:  # on a full disk; each attempt would leave another empty file
+        file.close()
+        path.unlink()
+        raise
+    return path, file

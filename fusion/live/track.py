@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import heapq
 import math
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
+from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,10 +16,9 @@ from stario.fusion.fixes import Fix, position_fix
 from stario.fusion.floors import floor_at
 from stario.fusion.live.drawn import DisplayedTrack
 from stario.fusion.live.merging import MAX_WAIT, Merger, Sample
-from stario.fusion.live.payload import BAROMETER, LOCATION, MAG, Batch, Reading, Vector
+from stario.fusion.live.payload import LOCATION, MAG, Batch, Reading
 from stario.fusion.live.places import Earth, Places
 from stario.fusion.live.storage import LiveFile
-from stario.fusion.live.times import with_credible_time
 from stario.fusion.navigator import Navigator
 from stario.fusion.report.health import health_findings
 from stario.fusion.state import NavState
@@ -59,12 +60,7 @@ class LiveTrack:
     Attributes:
         drawn: displayed track.
         places: places by satellites.
-        georeferenced: whether the track lies on the earth: the origin or satellites placed it.
-        words: what stands out in the navigator's health, in words.
-        floor: the floor above that of the start, in words; empty without a barometer.
         samples: number of samples processed.
-        rate: their rate [Hz], smoothed over some batches.
-        fixes: number of fixes applied.
         delayed: number of readings that came after a later recording had begun.
     """
 
@@ -80,12 +76,12 @@ class LiveTrack:
         self._stray = self._lost = 0
         self.drawn = DisplayedTrack()
         self.places = Places(navigator.config.place.satellites, self._earth)
-        self.georeferenced = navigator.config.place.origin is not None
+        self._georeferenced = navigator.config.place.origin is not None
         self._earth.begin(navigator.config.place.georeference)
-        self.words: list[dict[str, str]] = []
-        self.floor = ""
-        self.samples = self.fixes = self.delayed = 0
-        self.rate = 0.0
+        self._words: list[dict[str, str]] = []
+        self._floor = ""
+        self.samples = self.delayed = self._fixes = 0
+        self._rate = 0.0
 
     @property
     def path(self) -> Path | None:
@@ -96,7 +92,7 @@ class LiveTrack:
     def newest_ns(self) -> int:
         """Time of the newest sample on the device's clock [ns]; -1 before the first."""
         waiting = self._unwritten[0]
-        return waiting[-1][0] if waiting and self._newest_ns >= 0 else self._newest_ns
+        return waiting[-1].time_ns if waiting and self._newest_ns >= 0 else self._newest_ns
 
     def process(self, batch: Batch, received: float, accel_factor: float) -> int:
         """Write a batch to disk, then pass it to the navigator; return its number of samples.
@@ -106,22 +102,20 @@ class LiveTrack:
             received: time of receipt [s since 1970].
             accel_factor: factor from its accelerometer's unit to specific force in m/s^2.
         """
-        readings = with_credible_time(batch)
+        readings = batch.credible()
         self._stray += len(batch.readings) - len(readings)
         self._factor = accel_factor
-        samples: list[Sample] = [
-            (time, gyro, (accel_factor * a[0], accel_factor * a[1], accel_factor * a[2]))
-            for time, gyro, a in self._merger.add(readings)
-        ]
         # Samples wait until they are on disk: when a failed push is repeated, they count as late.
-        samples = [*self._unwritten[0], *samples]
+        samples = [*self._unwritten[0]]
+        for sample in self._merger.add(readings):
+            samples.append(sample._replace(accel=tuple(accel_factor * a for a in sample.accel)))
         self._merger.add_places(batch.places)
         if not samples:
             return 0
         aside = [*self._unwritten[1], *self._merger.aside()]
         self._write(samples, received, aside)
         self._navigate(samples, aside)
-        self._count(samples[0][0], samples[-1][0], len(samples))
+        self._count(samples)
         return len(samples)
 
     def close(self) -> None:
@@ -135,7 +129,7 @@ class LiveTrack:
         Raises:
             InputError: there is no position yet, or the track lies on the earth.
         """
-        if self.georeferenced:
+        if self._georeferenced:
             raise InputError("zero", "a track that lies on the earth", "one that does not")
         self.drawn.origin = self._state().p_W.copy()
 
@@ -157,16 +151,32 @@ class LiveTrack:
         if self._earth.georeference is None:
             self.places.compare()
         after = self._applied(fix)
-        self.fixes += 1
+        self._fixes += 1
         self._draw(after)
         self._health_time = -math.inf
         self._update_health(after.time)
 
-    def problem(self) -> str:
+    def status(self) -> dict[str, Any]:
+        """Return what the page shows next to the track."""
+        return {
+            "samples": self.samples,
+            "rate": round(self._rate, 1),
+            "origin": self.drawn.origin.round(4).tolist(),
+            "fixes": self._fixes,
+            "dropped": self._dropped(),
+            "file": None if self.path is None else self.path.name,
+            "problem": self._problem(),
+            "health": self._words,
+            "floor": self._floor,
+            "satellites": self.places.words(),
+            "georeferenced": self._georeferenced,
+        }
+
+    def _problem(self) -> str:
         """Return what keeps the track from being right, in words; empty if nothing does."""
         if self._write_error:
             return self._write_error
-        alone = self._merger.dropped.get("without acceleration", 0)
+        alone = self._merger.dropped["without acceleration"]
         if alone > max(_MANY_ALONE, self.samples):
             return (
                 f"{alone} readings of the gyroscope have none of the acceleration within "
@@ -188,11 +198,11 @@ class LiveTrack:
             )
         return ""
 
-    def dropped(self) -> dict[str, int]:
+    def _dropped(self) -> dict[str, int]:
         """Return the number of samples dropped, by reason."""
         dropped = self._merger.dropped
-        late = dropped.get("late", 0) + self.delayed
-        counts = dropped | {"late": late, "wrong time": self._stray, "not written": self._lost}
+        late = dropped["late"] + self.delayed
+        counts = {**dropped, "late": late, "wrong time": self._stray, "not written": self._lost}
         return {reason: count for reason, count in counts.items() if count}
 
     def _write(self, samples: list[Sample], received: float, aside: list[Reading]) -> None:
@@ -211,33 +221,35 @@ class LiveTrack:
     def _navigate(self, samples: list[Sample], aside: Sequence[Reading]) -> None:
         """Pass samples, fields and pressures to the navigator in the order of their times."""
         if self._first_ns < 0:
-            self._first_ns = samples[0][0]
-        pending = deque(aside)
-        for time_ns, gyro, accel in samples:
-            while pending and pending[0].time_ns <= time_ns:
-                self._push_aside(pending.popleft())
-            self._push(time_ns, gyro, accel)
-        for reading in pending:  # ahead of the samples, which wait for the accelerometer
-            self._push_aside(reading)
-        self._update_health(self._seconds(samples[-1][0]))  # with or without a position
+            self._first_ns = samples[0].time_ns
+        # Some of the others may lie ahead of the samples, which wait for the accelerometer.
+        events: Iterable[Sample | Reading] = heapq.merge(aside, samples, key=attrgetter("time_ns"))
+        for each in events:
+            if isinstance(each, Sample):
+                self._push(each)
+            else:
+                self._push_aside(each)
+        self._update_health(self._seconds(samples[-1].time_ns))  # with or without a position
 
     def _push_aside(self, reading: Reading) -> None:
         time = self._seconds(reading.time_ns)
-        if reading.sensor == MAG:
-            self._navigator.push_magnetometer(time, reading.value)
         if reading.sensor == LOCATION:
             self.places.add(time, reading.value)
-        if reading.sensor == BAROMETER:
-            try:
-                self._navigator.push_pressure(time, *reading.value)
-            except InputError as error:  # in another unit
-                self._push_error, self._error_time = str(error), time
-
-    def _push(self, time_ns: int, gyro: Vector, accel: Vector) -> None:
+            return
         try:
-            state = self._navigator.push(self._seconds(time_ns), gyro, accel)
+            if reading.sensor == MAG:
+                self._navigator.push_magnetometer(time, reading.value)
+            else:
+                self._navigator.push_pressure(time, *reading.value)
+        except InputError as error:  # in another unit
+            self._push_error, self._error_time = str(error), time
+
+    def _push(self, sample: Sample) -> None:
+        time = self._seconds(sample.time_ns)
+        try:
+            state = self._navigator.push(time, sample.gyro, sample.accel)
         except InputError as error:
-            self._push_error, self._error_time = str(error), self._seconds(time_ns)
+            self._push_error, self._error_time = str(error), time
             return
         if state is None:
             return
@@ -254,7 +266,7 @@ class LiveTrack:
         if fix.kind == "velocity":
             navigator.update_velocity(*arguments)
         elif navigator.update_position(*arguments) != "refused" and self._earth.georeference:
-            self.georeferenced, self.drawn.origin = True, np.zeros(3)
+            self._georeferenced, self.drawn.origin = True, np.zeros(3)
         after = self._state()
         if after.map_frame != before.map_frame:
             self.drawn.move(before, after)
@@ -272,26 +284,27 @@ class LiveTrack:
         if time - self._health_time < _HEALTH_SECONDS:
             return
         self._health_time = time
-        health, late = self._navigator.health, self.dropped().get("late", 0)
+        health, late = self._navigator.health, self._dropped().get("late", 0)
         # The navigator never sees them; if the clock was set back a little, it sees no gap either.
         health = replace(health, samples=health.samples | {"late": late})
         floor = ""  # as well when the stream began again and has no pressure yet
         if health.pressures:
             health.floors = self.drawn.floor_changes()
             floor = _floor_words(floor_at(health.floors, time - _FLOOR_SECONDS))
-        self.floor = floor
+        self._floor = floor
         self.places.draw(self.drawn.points)
-        self.words = [asdict(finding) for finding in verdict(health_findings(health))]
+        self._words = [asdict(finding) for finding in verdict(health_findings(health))]
 
-    def _count(self, first_ns: int, last_ns: int, count: int) -> None:
+    def _count(self, samples: Sequence[Sample]) -> None:
         """Update the number of samples and their rate, smoothed over some batches."""
-        since = self._newest_ns if self._newest_ns >= 0 else first_ns
-        self._newest_ns = max(self._newest_ns, last_ns)
-        self.samples += count
-        if last_ns > since:
-            rate = 1e9 * count / (last_ns - since)
-            weight = min(1.0, (last_ns - since) / 2e9) if self.rate else 1.0
-            self.rate += weight * (rate - self.rate)
+        first, last = samples[0].time_ns, samples[-1].time_ns
+        since = self._newest_ns if self._newest_ns >= 0 else first
+        self._newest_ns = max(self._newest_ns, last)
+        self.samples += len(samples)
+        if last > since:
+            rate = 1e9 * len(samples) / (last - since)
+            weight = min(1.0, (last - since) / 2e9) if self._rate else 1.0
+            self._rate += weight * (rate - self._rate)
 
     def _state(self) -> NavState:
         state = self._navigator.state

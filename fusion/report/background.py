@@ -42,21 +42,8 @@ def check_tiles(url: str) -> str:
 
 def add_north(figure: go.Figure) -> None:
     """Draw an arrow to the north, which is upwards."""
-    figure.add_annotation(
-        text="N",
-        xref="paper",
-        yref="paper",
-        x=0.98,
-        y=0.9,
-        ax=0,
-        ay=-34,
-        showarrow=True,
-        arrowside="start",
-        arrowwidth=2,
-        arrowcolor=INK,
-        bgcolor="white",
-        font={"size": 13, "color": INK},
-    )
+    arrow = {"ax": 0, "ay": -34, "arrowside": "start", "arrowwidth": 2, "arrowcolor": INK}
+    figure.add_annotation(text="N", x=0.98, y=0.9, bgcolor="white", **arrow, **_note(13))
 
 
 def add_tiles(figure: go.Figure, place: Georeference, url: str) -> None:
@@ -70,18 +57,13 @@ def add_tiles(figure: go.Figure, place: Georeference, url: str) -> None:
         url: address of a tile, with {z}, {x} and {y}.
     """
     limits = np.array([figure.layout.xaxis.range, figure.layout.yaxis.range], dtype=np.float64)
-    for image in tile_images(place, limits, url):
-        figure.add_layout_image(image)
-    figure.add_annotation(
-        text=f"map: {urlsplit(url).hostname}",
-        xref="paper",
-        yref="paper",
-        x=1.0,
-        y=0.0,
-        showarrow=False,
-        bgcolor="rgba(255,255,255,0.8)",
-        font={"size": 11, "color": INK},
-    )
+    figure.update_layout(images=[*tile_images(place, limits, url)])
+    text, white = f"map: {urlsplit(url).hostname}", "rgba(255,255,255,0.8)"
+    figure.add_annotation(text=text, x=1.0, y=0.0, showarrow=False, bgcolor=white, **_note(11))
+
+
+def _note(size: int) -> dict[str, Any]:
+    return {"xref": "paper", "yref": "paper", "font": {"size": size, "color": INK}}
 
 
 def tile_images(place: Georeference, limits: FloatArray, url: str) -> Iterator[dict[str, Any]]:

@@ -6,15 +6,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import plotly.graph_objects as go
 
 from stario.fusion.floors import FloorChange
-from stario.fusion.report.series import Series
 from stario.fusion.state import Innovations
 from stario.sequences.arrays import evenly_spaced, interpolated
 from stario.sequences.drawing.figures import (
+    BLUE,
     BROWN,
     DASHES,
+    RED,
     TRACK_STYLES,
     split_at_gaps,
     split_at_nan,
@@ -22,8 +24,11 @@ from stario.sequences.drawing.figures import (
 from stario.sequences.sequence import BoolArray, FloatArray
 
 INK, GRID, FAINT = "#222222", "#E3E6EA", "#767676"
-TRUTH = "truth"
-_MAX_INNOVATIONS = 600
+MAIN, TRUTH = "track", "truth"
+"""Names of the track that has bands and ellipses, and of the ground truth."""
+
+INNOVATION = "innovation"
+_SILENT = {"mode": "lines", "hoverinfo": "skip"}
 _MAX_POINTS = 600
 """Maximum number of points of a curve: a panel is as many pixels wide, and the file stays small."""
 
@@ -52,9 +57,8 @@ def style(name: str) -> tuple[str, str, str]:
 
 
 def motion_panels(
-    tracks: Mapping[str, Series],
-    truth: Series | None,
-    main: str,
+    tracks: Mapping[str, pd.DataFrame],
+    truth: pd.DataFrame | None,
     floors: Sequence[FloorChange] = (),
 ) -> list[Panel]:
     """Return panels of height, speed and yaw, and of position error if there is ground truth.
@@ -62,20 +66,19 @@ def motion_panels(
     The main track has bands; more of them on one another would show none.
 
     Args:
-        tracks: by name.
+        tracks: tables of `series`, by name.
         truth: ground truth.
-        main: name of the main track.
-        floors: its changes of floor, in the time of the series.
+        floors: the main track's changes of floor, in the time of the series.
     """
     shown = dict(tracks) if truth is None else {TRUTH: truth, **tracks}
     first = next(iter(shown.values()))
     height, speed, yaw = [], [], []
     for name, s in shown.items():
-        sigmas = (s.height_sigma, s.speed_sigma, s.yaw_sigma) if name == main else (None,) * 3
-        height += _curve(name, s.time, s.position[:, 2], "m", sigmas[0])
-        speed += _curve(name, s.time, s.speed, "m/s", sigmas[1], lowest=0.0)
-        yaw += _curve(name, s.time, s.yaw + _whole_turns(s, first), "deg", sigmas[2])
-    height += _floor_lines(tracks[main], floors)
+        sigma = s if name == MAIN else {}
+        height += _curve(name, s.z, "m", sigma.get("sigma z"))
+        speed += _curve(name, s.speed, "m/s", sigma.get("sigma speed"), lowest=0.0)
+        yaw += _curve(name, s.yaw + _whole_turns(s, first), "deg", sigma.get("sigma yaw"))
+    height += _floor_lines(tracks[MAIN].z, floors)
     return [
         *([] if truth is None else [_error_panel(tracks, truth)]),
         _fitted("Height [m], band: 3 sigma", height),
@@ -84,20 +87,23 @@ def motion_panels(
     ]
 
 
-def bias_panels(name: str, series: Series) -> list[Panel]:
-    """Return a panel for each axis of both biases of a track; those of one bias share limits."""
+def bias_panels(series: pd.DataFrame) -> list[Panel]:
+    """Return a panel per axis of the main track's biases; those of one bias share limits."""
     panels = []
-    for title, unit, bias in (
-        ("Gyroscope bias", "deg/s", series.gyro_bias),
-        ("Accelerometer bias", "m/s^2", series.accel_bias),
+    for title, name, unit in (
+        ("Gyroscope bias", "gyro", "deg/s"),
+        ("Accelerometer bias", "accel", "m/s^2"),
     ):
-        if bias is None:
+        if f"{name} x" not in series:
             continue
-        axes = [_curve(name, series.time, bias[0][:, k], unit, bias[1][:, k]) for k in range(3)]
-        limits = _fitted("", [trace for traces in axes for trace in traces]).layout
+        axes = {
+            axis: _curve(MAIN, series[f"{name} {axis}"], unit, series[f"sigma {name} {axis}"])
+            for axis in "xyz"
+        }
+        all_axes = _fitted("", [trace for traces in axes.values() for trace in traces])
         panels += [
-            Panel(f"{title} {axis} [{unit}], band: 3 sigma", traces, limits, LOW_HEIGHT)
-            for axis, traces in zip("xyz", axes, strict=True)
+            Panel(f"{title} {axis} [{unit}], band: 3 sigma", traces, all_axes.layout, LOW_HEIGHT)
+            for axis, traces in axes.items()
         ]
     return panels
 
@@ -109,88 +115,94 @@ def innovation_panels(innovations: Innovations, start: float) -> list[Panel]:
         innovations: innovations of an estimator's updates.
         start: time of the recording's first sample [s].
     """
-    rows = evenly_spaced(len(innovations.time), _MAX_INNOVATIONS)
+    rows = evenly_spaced(len(innovations.time), _MAX_POINTS)
     rows = np.union1d(rows, np.flatnonzero(innovations.gated))  # draw all of these
     time, gated = innovations.time[rows] - start, innovations.gated[rows]
     panels = []
     for k, axis in enumerate("xyz"):
         residual, sigma = innovations.residual_W[rows, k], innovations.sigma[rows, k]
-        ticks, edge = split_at_gaps(time, sigma[:, None], max_gap=_MAX_PAUSE)
-        band = _band("innovation", ticks, -3.0 * edge[:, 0], 3.0 * edge[:, 0], FAINT)
-        traces = [band, *_dots(time, residual, gated, "m")]
+        ticks, edge = split_at_gaps(time, 3.0 * sigma, max_gap=_MAX_PAUSE)
+        traces = [_band(INNOVATION, ticks, -edge, edge, FAINT)]
+        traces += _dots(time, residual, gated, "m")
         panel = _fitted(f"Innovation {axis} [m], band: 3 sigma", traces)
         panels.append(panel._replace(height=LOW_HEIGHT))
     nis = np.maximum(innovations.nis[rows], 1e-2)
-    traces = [*_dots(time, nis, gated, ""), _expected_nis(time[[0, -1]])]
+    dotted = {"color": INK, "dash": "dot", "width": 1.2}
+    expected = scatter(INNOVATION, time[[0, -1]], np.full(2, 3.0), name="expected 3", line=dotted)
+    traces = [*_dots(time, nis, gated, ""), expected]
     panels.append(Panel("NIS [1], dotted: expected 3", traces, {"type": "log", "dtick": 1}))
     return panels
 
 
+def scatter(
+    group: str, x: FloatArray, y: FloatArray, *, digits: int = 4, **settings: Any
+) -> go.Scatter:
+    """Return a trace of a track's group: a line without hover text, but for other settings.
+
+    Its x are rounded to two digits, its y as asked: as text short numbers need little room.
+    """
+    usual = {"mode": "lines"} if "hovertemplate" in settings else _SILENT
+    xy = {"x": numbers(x, 2), "y": numbers(y, digits)}
+    return go.Scatter(legendgroup=group, **xy, **usual | settings)
+
+
 def _curve(
     name: str,
-    time: FloatArray,
-    value: FloatArray,
+    values: pd.Series,
     unit: str,
-    sigma: FloatArray | None = None,
+    sigma: pd.Series | None = None,
     lowest: float = -np.inf,
 ) -> list[go.Scatter]:
     """Return a line with hover text, and its 3-sigma band above `lowest` if there is a sigma."""
     label, colour, dash = style(name)
-    rows = np.union1d(evenly_spaced(len(time), _MAX_POINTS), np.flatnonzero(np.isnan(value)))
-    time, value = time[rows], value[rows]
-    line = go.Scatter(
-        x=numbers(time, 2),
-        y=numbers(value),
-        name=label,
-        legendgroup=name,
-        mode="lines",
-        line={"color": colour, "dash": dash, "width": 1.6},
-        hovertemplate=f"{label} %{{y:.3g}} {unit}<extra></extra>",
-    )
+    rows = np.union1d(evenly_spaced(len(values), _MAX_POINTS), np.flatnonzero(values.isna()))
+    time, value = values.index.to_numpy()[rows], values.to_numpy()[rows]
+    stroke = {"color": colour, "dash": dash, "width": 1.6}
+    hover = f"{label} %{{y:.3g}} {unit}"
     if sigma is None:
-        return [line]
-    line.customdata = numbers(sigma[rows])
-    line.hovertemplate = (
-        f"{label} %{{y:.3g}} {unit}, sigma %{{customdata:.2g}} {unit}<extra></extra>"
+        hover = f"{hover}<extra></extra>"
+        return [scatter(name, time, value, name=label, line=stroke, hovertemplate=hover)]
+    three = 3.0 * sigma.to_numpy()[rows]
+    hover = f"{hover}, sigma %{{customdata:.2g}} {unit}<extra></extra>"
+    line = scatter(
+        name,
+        time,
+        value,
+        name=label,
+        line=stroke,
+        hovertemplate=hover,
+        customdata=numbers(three / 3),
     )
-    low = np.maximum(value - 3.0 * sigma[rows], lowest)
-    return [_band(name, time, low, value + 3.0 * sigma[rows], colour), line]
+    return [_band(name, time, np.maximum(value - three, lowest), value + three, colour), line]
 
 
-def _floor_lines(series: Series, floors: Sequence[FloorChange]) -> list[go.Scatter]:
+def _floor_lines(height: pd.Series, floors: Sequence[FloorChange]) -> list[go.Scatter]:
     """Return a dotted line along each stay on a floor, with its number; the first says of what."""
     if not floors:
         return []
-    starts = [float(series.time[0]), *(change.stop for change in floors)]
-    stops = [*(change.start for change in floors), float(series.time[-1])]
+    starts = [height.index[0], *(change.stop for change in floors)]
+    stops = [*(change.start for change in floors), height.index[-1]]
     lines: list[go.Scatter] = []
     for start, stop, floor in zip(starts, stops, [0, *(c.after for c in floors)], strict=True):
-        inside = (series.time >= start) & (series.time <= stop)
-        if not inside.any():
+        inside = height[(height.index >= start) & (height.index <= stop)]
+        if inside.empty:
             continue
-        level = float(np.nanmedian(series.position[inside, 2]))
-        lines.append(
-            go.Scatter(
-                x=[start, stop],
-                y=[level, level],
-                mode="lines+text",
-                text=[str(floor) if lines else f"floor {floor}"],
-                textposition="top right",
-                line={"color": FAINT, "dash": "dot", "width": 1},
-                hoverinfo="skip",
-            )
-        )
+        text = [str(floor) if lines else f"floor {floor}"]
+        words: dict[str, Any] = {"mode": "lines+text", "text": text, "textposition": "top right"}
+        dotted = {"color": FAINT, "dash": "dot", "width": 1}
+        level = np.full(2, inside.median())
+        lines.append(scatter(MAIN, np.array([start, stop]), level, line=dotted, **words))
     return lines
 
 
-def _error_panel(tracks: Mapping[str, Series], truth: Series) -> Panel:
+def _error_panel(tracks: Mapping[str, pd.DataFrame], truth: pd.DataFrame) -> Panel:
     traces = []
     for name, series in tracks.items():
         # Not a number in the truth's gaps, and beyond its ends.
-        true_position = interpolated(series.time, truth.time, truth.position[:, :2])
-        error = np.linalg.norm(series.position[:, :2] - true_position, axis=1)
-        inside = (series.time >= truth.time[0]) & (series.time <= truth.time[-1])
-        traces += _curve(name, series.time, np.where(inside, error, np.nan), "m")
+        true_xy = interpolated(series.index, truth.index, truth[["x", "y"]].to_numpy())
+        error = np.hypot(*(series[["x", "y"]] - true_xy).to_numpy().T)
+        inside = (series.index >= truth.index[0]) & (series.index <= truth.index[-1])
+        traces += _curve(name, pd.Series(error, series.index).where(inside), "m")
     return Panel("Horizontal position error [m]", traces, {"rangemode": "tozero"})
 
 
@@ -202,46 +214,25 @@ def _band(
     edges = [part[evenly_spaced(len(part), _MAX_POINTS // 2)] for part in edges]
     outlines = [np.vstack([part[:, [0, 1]], part[::-1, [0, 2]], [[np.nan] * 2]]) for part in edges]
     x, y = np.vstack([np.empty((0, 2)), *outlines]).T
-    return go.Scatter(
-        x=numbers(x, 2),
-        y=numbers(y),
-        mode="lines",
-        line={"width": 0},
-        hoverinfo="skip",
-        legendgroup=group,
-        fill="toself",  # each stretch between gaps on its own; "tonexty" would fill the gaps
-        fillcolor=f"rgba({red},{green},{blue},0.16)",
-    )
+    # Each stretch between gaps is filled on its own; "tonexty" would fill the gaps.
+    filling: dict[str, Any] = {"fill": "toself", "fillcolor": f"rgba({red},{green},{blue},0.16)"}
+    return scatter(group, x, y, line={"width": 0}, **filling)
 
 
 def _dots(time: FloatArray, value: FloatArray, gated: BoolArray, unit: str) -> list[go.Scatter]:
-    marker_styles: Sequence[tuple[Any, str, dict[str, Any]]] = (
-        (~gated, "used", {"color": "#0072B2", "size": 3}),
-        (gated, "gated", {"color": "#D55E00", "size": 7, "symbol": "x-thin-open"}),
-    )
-    return [
-        go.Scatter(
-            x=numbers(time[rows], 2),
-            y=numbers(value[rows]),
-            name=name,
-            mode="markers",
-            marker=marker,
-            hovertemplate=f"{name} %{{y:.3g}} {unit}<extra></extra>",
-        )
-        for rows, name, marker in marker_styles
-        if rows.any()
-    ]
-
-
-def _expected_nis(ends: FloatArray) -> go.Scatter:
-    return go.Scatter(
-        x=numbers(ends, 2),
-        y=[3.0, 3.0],
-        name="expected 3",
-        mode="lines",
-        line={"color": INK, "dash": "dot", "width": 1.2},
-        hoverinfo="skip",
-    )
+    used, weakened = {"color": BLUE, "size": 3}, {"color": RED, "size": 7, "symbol": "x-thin-open"}
+    traces = []
+    for rows, name, marker in ((~gated, "used", used), (gated, "gated", weakened)):
+        if rows.any():
+            hover = f"{name} %{{y:.3g}} {unit}<extra></extra>"
+            shown: dict[str, Any] = {
+                "name": name,
+                "mode": "markers",
+                "marker": marker,
+                "hovertemplate": hover,
+            }
+            traces.append(scatter(INNOVATION, time[rows], value[rows], **shown))
+    return traces
 
 
 def _fitted(title: str, traces: list[go.Scatter]) -> Panel:
@@ -249,20 +240,18 @@ def _fitted(title: str, traces: list[go.Scatter]) -> Panel:
     drawn = [(t.hoverinfo == "skip", np.asarray(t.y, dtype=float)) for t in traces]
     curves = np.concatenate([y for is_band, y in drawn if not is_band])
     bands = np.concatenate([[np.nan], *(y for is_band, y in drawn if is_band)])
-    low, high = np.nanmin(curves), np.nanmax(curves)
+    ends = [float(np.nanmin(curves)), float(np.nanmax(curves))]
     if np.isfinite(bands).any():
-        inner = np.nanpercentile(bands, [2.5, 97.5])
-        low, high = min(low, inner[0]), max(high, inner[1])
-    margin = 0.06 * max(float(high - low), 1e-3)
-    return Panel(title, traces, {"range": [float(low - margin), float(high + margin)]})
+        ends += np.nanpercentile(bands, [2.5, 97.5]).tolist()
+    margin = 0.06 * max(max(ends) - min(ends), 1e-3)
+    return Panel(title, traces, {"range": [min(ends) - margin, max(ends) + margin]})
 
 
-def _whole_turns(series: Series, reference: Series) -> float:
+def _whole_turns(series: pd.DataFrame, reference: pd.DataFrame) -> float:
     """Return the whole turns [deg] that bring a yaw nearest to a reference at common times."""
-    expected = np.interp(series.time, reference.time, reference.yaw, np.nan, np.nan)
-    off = series.yaw - expected
-    known = off[np.isfinite(off)]
-    return -360.0 * float(np.round(np.median(known) / 360.0)) if len(known) else 0.0
+    expected = np.interp(series.index, reference.index, reference.yaw, np.nan, np.nan)
+    off = (series.yaw - expected).median()
+    return 0.0 if np.isnan(off) else -360.0 * float(np.round(off / 360.0))
 
 
 def numbers(values: FloatArray, digits: int = 4) -> list[float | None]:

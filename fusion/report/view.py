@@ -54,11 +54,11 @@ def write_view(path: Path, run: Comparison) -> Path:
     if sequence.truth is not None:
         _log_path(stream, "world/truth", sequence.truth, _BLACK)
     _log_device(stream, aligned, start)
-    for entity, time, values, labels in _quantities(sequence, track):
-        name, index = rr.new_entity_path(entity), _times(time - start)
-        stream.send_columns(name, index, rr.Scalars.columns(scalars=values))
-        colours = [list(colour) for colour in _AXIS_COLOURS[: values.shape[1]]]
-        stream.log(name, rr.SeriesLines(colors=colours, names=labels), static=True)
+    for entity, time, values in _quantities(sequence, track):
+        path_of, what = rr.new_entity_path(entity), entity[1].partition(" [")[0].split()[-1]
+        stream.send_columns(path_of, _times(time - start), rr.Scalars.columns(scalars=values))
+        names, colours = ("xyz", _AXIS_COLOURS) if values.shape[1] == 3 else ([what], [_BLUE])
+        stream.log(path_of, rr.SeriesLines(colors=colours, names=[*names]), static=True)
     stream.disconnect()
     return path
 
@@ -69,11 +69,9 @@ def open_view(path: Path) -> None:
     Raises:
         InputError: the viewer cannot be started.
     """
-    command = [sys.executable, "-m", "rerun", str(path)]
+    command, quiet = [sys.executable, "-m", "rerun", str(path)], subprocess.DEVNULL
     try:
-        subprocess.Popen(
-            command, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
+        subprocess.Popen(command, start_new_session=True, stdout=quiet, stderr=quiet)
     except OSError as error:
         raise InputError("view", str(error), "the rerun viewer") from error
 
@@ -83,59 +81,52 @@ def _log_path(
 ) -> None:
     """Log a whole path at once, broken in gaps and where poses are not valid."""
     _, path = split_at_gaps(trajectory.time, trajectory.position_W, trajectory.valid)
-    stream.log(
-        entity, rr.LineStrips3D(split_at_nan(path), colors=[colour], radii=[0.02]), static=True
-    )
+    lines = rr.LineStrips3D(split_at_nan(path), colors=[colour], radii=[0.02])
+    stream.log(entity, lines, static=True)
 
 
 def _log_device(stream: Any, trajectory: Trajectory, start: float) -> None:
     """Log the device's axes at its position, with the 3-sigma ellipsoid of the position."""
-    index = _times(trajectory.time[trajectory.valid] - start)
-    position = trajectory.position_W[trajectory.valid]
-    columns = rr.Transform3D.columns(
-        translation=position, quaternion=trajectory.quat_xyzw[trajectory.valid]
-    )
+    valid = trajectory.valid
+    index, position = _times(trajectory.time[valid] - start), trajectory.position_W[valid]
+    turned = trajectory.quat_xyzw[valid]
+    columns = rr.Transform3D.columns(translation=position, quaternion=turned)
     stream.send_columns("world/device", index, columns)
     axes = rr.Arrows3D(vectors=_AXIS_LENGTH * np.eye(3), colors=_AXIS_COLOURS)
     stream.log("world/device", axes, static=True)
     covariance = trajectory.position_covariance_W
     if covariance is None:
         return
-    values, vectors = np.linalg.eigh(covariance[trajectory.valid])
+    values, vectors = np.linalg.eigh(covariance[valid])
     vectors[np.linalg.det(vectors) < 0.0, :, 0] *= -1.0  # a rotation, not a reflection
-    count = np.ones(len(position), dtype=int)
     columns = rr.Ellipsoids3D.columns(
         centers=position,
         half_sizes=_SIGMAS * np.sqrt(np.maximum(values, 0.0)),
         quaternions=Rotation.from_matrix(vectors).as_quat(),
-    )
-    stream.send_columns(rr.new_entity_path(["world", "3 sigma"]), index, columns.partition(count))
+    ).partition(np.ones(len(position), dtype=int))
+    stream.send_columns(rr.new_entity_path(["world", "3 sigma"]), index, columns)
 
 
 def _quantities(
     sequence: ImuSequence, track: Track
-) -> Iterator[tuple[list[str], FloatArray, FloatArray, list[str]]]:
-    """Yield path, times (N,), values (N, k) and labels of each quantity over time."""
-    finite, axes = np.isfinite(sequence.time), list("xyz")
-    time = sequence.time[finite]
-    yield ["sensors", "gyroscope [rad/s]"], time, sequence.gyro[finite], axes
-    yield ["sensors", "specific force [m/s^2]"], time, sequence.accel[finite], axes
-    for name, bias in (
-        ("gyroscope bias [rad/s]", track.b_g),
-        ("accelerometer bias [m/s^2]", track.b_a),
-    ):
-        if bias is not None:
-            yield ["estimate", name], track.time, bias, axes
-    if track.trajectory.velocity_W is not None:
-        speed = np.linalg.norm(track.trajectory.velocity_W, axis=1)[:, None]
-        yield ["estimate", "speed [m/s]"], track.time, speed, ["speed"]
+) -> Iterator[tuple[tuple[str, str], FloatArray, FloatArray]]:
+    """Yield path, times (N,) and values (N, 1) or (N, 3), by axis, of each quantity over time."""
+    finite = np.isfinite(sequence.time)
+    sensors = {"gyroscope [rad/s]": sequence.gyro, "specific force [m/s^2]": sequence.accel}
+    for name, values in sensors.items():
+        yield ("sensors", name), sequence.time[finite], values[finite]
+    estimates = {"gyroscope bias [rad/s]": track.b_g, "accelerometer bias [m/s^2]": track.b_a}
+    if (velocity := track.trajectory.velocity_W) is not None:
+        estimates["speed [m/s]"] = np.linalg.norm(velocity, axis=1)[:, None]
     if track.covariance is not None:
         sigma = np.sqrt(track.covariance[:, range(15), range(15)])
-        yield ["estimate", "sigma of position [m]"], track.time, sigma[:, 6:9], axes
-        yield ["estimate", "sigma of yaw [rad]"], track.time, sigma[:, 2:3], ["yaw"]
+        estimates |= {"sigma of position [m]": sigma[:, 6:9], "sigma of yaw [rad]": sigma[:, 2:3]}
+    for name, known in estimates.items():
+        if known is not None:
+            yield ("estimate", name), track.time, known
     innovations = track.innovations
     if innovations is not None and len(innovations.time):
-        yield ["estimate", "NIS [1]"], innovations.time, innovations.nis[:, None], ["NIS"]
+        yield ("estimate", "NIS [1]"), innovations.time, innovations.nis[:, None]
 
 
 def _times(seconds: FloatArray) -> list[Any]:

@@ -34,6 +34,12 @@ NETWORK_SETTINGS: dict[str, dict[str, object]] = {
 SIMULATED = "simulated"
 """Name of the simulated walks in a recipe's shares."""
 
+INSERTED = "moments"
+"""Name of the bad moments inserted into recordings in a recipe's shares."""
+
+MADE = (SIMULATED, INSERTED)
+"""Sources that are no recordings; their shares are among all windows."""
+
 FINE_TUNING: dict[str, object] = {
     "epochs": 2,
     "epoch_windows": 40_000,
@@ -121,8 +127,8 @@ class TrainingConfig:
         shares: share of the windows for each source, named by a folder, archive or file in its
             recordings' paths ("ridi.h5" or "ridi" for `archives/ridi.h5:name`); recordings of no
             named source are drawn by their length and liveliness. The share of a source that is
-            absent goes to the other recordings. "simulated" is the share of simulated walks among
-            all windows.
+            absent goes to the other recordings. "simulated" and "moments" are the shares of
+            simulated walks and of bad moments inserted into recordings among all windows.
         compiled: compile the network for training (torch.compile; on CPUs, it needs a C++
             compiler and saves a third of the time).
         augmentation: how windows are varied.
@@ -168,7 +174,7 @@ class TrainingConfig:
             is_number = isinstance(share, int | float) and not isinstance(share, bool)
             if not (is_number and 0.0 <= share <= 1.0):
                 raise ConfigError(f"shares, {name}", repr(share), "a share from 0 to 1")
-        recorded = sum(share for name, share in self.shares.items() if name != SIMULATED)
+        recorded = sum(share for name, share in self.shares.items() if name not in MADE)
         if recorded > 1.0 + 1e-9:
             raise ConfigError("shares", f"a sum of {recorded:g} over recorded sources", "1 or less")
         for name, choices in _CHOICES.items():

@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from stario.network.training.config import SIMULATED
+from stario.network.training.config import INSERTED, MADE, SIMULATED
 from stario.sequences.arrays import rms
 from stario.sequences.datasets.batch import Skipped
 from stario.sequences.datasets.cache_files import recording_stamps
@@ -56,6 +56,11 @@ class RecordingStreams:
     streams: Sequence[Stream]
     licence: str = ""
     is_virtual: bool = False
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether a real device recorded it, with poses as ground truth."""
+        return not self.is_virtual and isinstance(self.streams[0], WorldStream)
 
 
 def recording_streams(
@@ -109,6 +114,7 @@ def mix_sources(
     generated: Sequence[WorldStream],
     shares: Mapping[str, float] = MappingProxyType({}),
     reach: int = 1,
+    moments: Sequence[WorldStream] = (),
 ) -> TrainingData:
     """Mix recordings and simulated walks so that each source makes up its share of the windows.
 
@@ -117,9 +123,10 @@ def mix_sources(
         generated: simulated walks.
         shares: share of each source among the recordings' windows, by a folder, archive or file in
             their paths, with or without its suffix; other recordings make up the rest of 1. The
-            share of a source that is absent goes to the others. `SIMULATED` is the share of
-            simulated walks among all windows.
+            share of a source that is absent goes to the others. `SIMULATED` and `INSERTED` are the
+            shares of simulated walks and of `moments` among all windows.
         reach: minimum number of samples of a stream to draw from (`TrainingConfig.reach`).
+        moments: streams of recordings with bad moments inserted.
 
     Raises:
         ConfigError: the named shares leave nothing for other recordings, or all shares are 0.
@@ -127,11 +134,13 @@ def mix_sources(
     streams: list[WorldStream] = []
     weights: list[float] = []
     simulated = shares.get(SIMULATED, _SIMULATED_SHARE)
+    inserted = shares.get(INSERTED, 0.0) if moments else 0.0
     named = _sources(recorded, shares)
     present = sum(share for _, share, members in named if any(len(s) >= reach for s in members))
-    sources = [(f"recorded, {name}", (1.0 - simulated) * share / (present or 1.0), members)
-               for name, share, members in named]  # fmt: skip
+    rest = (1.0 - simulated - inserted) / (present or 1.0)
+    sources = [(f"recorded, {name}", rest * share, members) for name, share, members in named]
     sources.append(("simulated walks", simulated, list(generated)))
+    sources.append(("recordings with bad moments", inserted, list(moments)))
     # Errors are large where motion is wild; of motion capture, that is not worth learning most.
     real = {id(s) for recording in recorded if not recording.is_virtual for s in recording.streams}
     words = []
@@ -170,7 +179,7 @@ def _sources(
     recorded: Sequence[RecordingStreams], shares: Mapping[str, float]
 ) -> list[tuple[str, float, list[WorldStream]]]:
     """Return name, share and streams of each source of recordings with full truth."""
-    shares = {name: share for name, share in shares.items() if name != SIMULATED}
+    shares = {name: share for name, share in shares.items() if name not in MADE}
     members: dict[str, list[WorldStream]] = {name: [] for name in [*shares, ""]}
     for recording in recorded:
         source = next((name for name in shares if _is_in(recording.path, name)), "")

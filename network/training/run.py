@@ -9,7 +9,7 @@ import copy
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -22,6 +22,7 @@ from stario.network.architectures import architecture, build_network
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import DisplacementModel
 from stario.network.training.augment import WindowSampler
+from stario.network.training.captured import CapturedStep
 from stario.network.training.checkpoint import damaged, read_checkpoint, write_checkpoint
 from stario.network.training.config import TrainingConfig, learning_rate, loss_with_sigma
 from stario.network.training.history import EpochReport, History
@@ -70,11 +71,19 @@ class TrainingRun:
                     module.p = config.dropout
         self.averaged = DisplacementNetwork(build_network(config.architecture)).to(self.device)
         self.averaged.load_state_dict(self.network.state_dict())
+        self._moving, self._counts = _pairs(self.averaged, self.network)
         self._initial: dict[str, Tensor] | None = None
         self._keep(self.averaged)
+        # A recorded step reads its rate from the GPU.
+        self._is_captured = self.device.type == "cuda" and workers.count == 1
+        rate = torch.tensor(config.rate, device=self.device) if self._is_captured else config.rate
         self.optimiser = torch.optim.AdamW(
-            self.network.parameters(), config.rate, weight_decay=config.weight_decay
+            self.network.parameters(),
+            rate,
+            weight_decay=config.weight_decay,
+            capturable=self._is_captured,
         )
+        self._captured = CapturedStep(self._update)
         idle = architecture(config.architecture).heads > 1
         shared = workers.wrapped(self.network, idle=idle)
         self._shared: Any = torch.compile(shared) if config.compiled else shared
@@ -124,28 +133,55 @@ class TrainingRun:
         return self.workers.mean(float(np.mean(errors)))
 
     def _one_step(self) -> float:
-        for group in self.optimiser.param_groups:
-            group["lr"] = learning_rate(self.config, self.step)
+        self._set_rate(learning_rate(self.config, self.step))
         begin = perf_counter()
         drawn = self.sampler.batch(self.config.batch // self.config.successive)
         windows, target = (self.workers.share(part).to(self.device) for part in drawn)
         legs = [s.batch(n).shared(self.workers).to(self.device) for s, n in self.legs]
         ready = perf_counter()
-        loss, error = self._loss(windows, target, legs)
-        self.optimiser.zero_grad()
-        torch.autograd.backward(loss)
-        norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
-        self._check_finite(float(loss.detach()), float(norm))
-        self.optimiser.step()
+        inputs = [windows, target, *(value for part in legs for value in vars(part).values())]
+        if self._is_captured:
+            result = self._captured(inputs, self._learns_sigma)
+        else:
+            result = self._update(inputs)
+        loss, error, norm = result.tolist()
+        self._check_finite(loss, norm)
         self.step += 1
         self._average()
         self._drawing_s += ready - begin
         self._learning_s += perf_counter() - ready
         parts = [windows, *(part.windows for part in legs)]
         self._windows += sum(part[..., 0, 0].numel() for part in parts)
-        return error
+        return float(error)
 
-    def _loss(self, windows: Tensor, target: Tensor, legs: list[LegBatch]) -> tuple[Tensor, float]:
+    def _set_rate(self, rate: float) -> None:
+        for group in self.optimiser.param_groups:
+            if isinstance(group["lr"], Tensor):
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
+
+    @property
+    def _learns_sigma(self) -> bool:
+        return self.step >= self.config.likelihood_from * self.config.steps
+
+    def _update(self, inputs: list[Tensor]) -> Tensor:
+        """Change the weights once; return loss, mean squared error and norm of the gradient (3,).
+
+        Args:
+            inputs: windows, their displacements, and the values of each `LegBatch`.
+        """
+        windows, target, *values = inputs
+        count = len(fields(LegBatch))
+        legs = [LegBatch(*values[i : i + count]) for i in range(0, len(values), count)]
+        loss, error = self._loss(windows, target, legs)
+        self.optimiser.zero_grad()
+        torch.autograd.backward(loss)
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip)
+        self.optimiser.step()
+        return torch.stack([loss.detach(), error, norm])
+
+    def _loss(self, windows: Tensor, target: Tensor, legs: list[LegBatch]) -> tuple[Tensor, Tensor]:
         """Return the loss of windows and legs, and the windows' mean squared error [m^2].
 
         All pass through the network in one batch, so that its normalisation covers them all.
@@ -160,12 +196,12 @@ class TrainingRun:
         mean, log_sigma = self._predict(torch.cat(parts))
         means, log_sigmas = torch.split(mean, sizes), torch.split(log_sigma, sizes)
         squared = (means[0] - target.flatten(0, -2)) ** 2
-        with_sigma = self.step >= self.config.likelihood_from * self.config.steps
-        loss = loss_with_sigma(squared, log_sigmas[0]) if with_sigma else squared.sum(1).mean()
+        learns_sigma = self._learns_sigma
+        loss = loss_with_sigma(squared, log_sigmas[0]) if learns_sigma else squared.sum(1).mean()
         for part, predicted, sigma in zip(legs, means[1:], log_sigmas[1:], strict=True):
             shape = (len(part.known), -1, 3)
             loss = loss + leg_loss(predicted.view(shape), sigma.view(shape), part)[0]
-        return loss, float(squared.detach().sum(1).mean())
+        return loss, squared.detach().sum(1).mean()
 
     def _predict(self, windows: Tensor) -> tuple[Tensor, Tensor]:
         """Return displacements and log sigmas (B, 3) of windows (B, 6, 200).
@@ -181,7 +217,7 @@ class TrainingRun:
         return mean.view(-1, 3), log_sigma.view(-1, 3)
 
     def _check_finite(self, loss: float, norm: float) -> None:
-        """Stop before a step that would corrupt every weight.
+        """Stop after a step that has corrupted every weight, before any of it is kept.
 
         The gradient's norm is checked as well: it is infinite one step before the loss is, and all
         processes have the same norm, so that all of them stop.
@@ -198,14 +234,9 @@ class TrainingRun:
     @torch.no_grad()
     def _average(self) -> None:
         decay = min(self.config.average, (1 + self.step) / (10 + self.step))
-        current = self.network.state_dict()
-        averaged = self.averaged.state_dict()
-        moving = [name for name, value in averaged.items() if value.is_floating_point()]
-        torch._foreach_lerp_(  # one kernel instead of one for each tensor
-            [averaged[name] for name in moving], [current[name] for name in moving], 1.0 - decay
-        )
-        for name in averaged.keys() - moving:
-            averaged[name].copy_(current[name])
+        # One kernel instead of one for each tensor.
+        torch._foreach_lerp_(self._moving[0], self._moving[1], 1.0 - decay)
+        torch._foreach_copy_(self._counts[0], self._counts[1])
 
     def validate(self, training_error: float, held_out: ValidationSet) -> EpochReport:
         """Validate an epoch in the leading process, which shares the error with the others.
@@ -292,3 +323,12 @@ class TrainingRun:
         """Return the network with the best weights so far."""
         self.averaged.load_state_dict(self.best)
         return self.averaged
+
+
+def _pairs(*networks: nn.Module) -> list[tuple[list[Tensor], ...]]:
+    """Return the tensors of networks of one kind, real numbers and counts apart."""
+    states = [list(network.state_dict().values()) for network in networks]
+    return [
+        tuple([v for v in state if v.is_floating_point() == real] for state in states)
+        for real in (True, False)
+    ]

@@ -102,7 +102,7 @@ def split_at_gaps(
     valid: BoolArray | None = None,
     max_gap: float = MAX_TRUTH_GAP,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the valid rows of time (N,) and values (N, k), with a row of NaN in each gap.
+    """Return the valid rows of time (N,) and values (N,) or (N, k), with a row of NaN in each gap.
 
     Gaps are those of `indices_after_gaps`.
     """
@@ -148,12 +148,12 @@ def draw_samples(axes: Axes, time: FloatArray, value: FloatArray, label: str, co
     """Draw a curve through samples; if they are many, through block means within the extremes."""
     block = 1 if len(time) <= _MAX_SAMPLES else -(-len(time) // _BLOCKS)
     starts = np.arange(0, len(time), block)
-    mean = np.add.reduceat(value, starts) / np.diff(np.append(starts, len(time)))
-    extremes = [ufunc.reduceat(value, starts) for ufunc in (np.minimum, np.maximum)]
-    ticks, curves = split_at_gaps(time[starts], np.column_stack([mean, *extremes]))
+    total, low, high = (each.reduceat(value, starts) for each in (np.add, np.minimum, np.maximum))
+    mean = total / np.diff(np.append(starts, len(time)))
+    ticks, curves = split_at_gaps(time[starts], np.column_stack([mean, low, high]))
     axes.plot(ticks, curves[:, 0], color=colour, lw=0.8, label=label)
     if block > 1:
-        axes.fill_between(ticks, curves[:, 1], curves[:, 2], color=colour, alpha=0.3, lw=0.4)
+        axes.fill_between(ticks, *curves[:, 1:].T, color=colour, alpha=0.3, lw=0.4)
 
 
 def reach_of(*values: FloatArray) -> float:

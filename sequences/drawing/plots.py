@@ -84,8 +84,7 @@ def error_over_time(
         line = line_of(name, k)
         if name not in good:
             line["label"] += f" (leaves the figure, up to {distance(largest[name])})"
-        time, norm = split_at_gaps(errors[name].estimate.time, norms[name][:, None])
-        panels[0].plot(time, norm[:, 0], **line, lw=1.3)
+        panels[0].plot(*split_at_gaps(errors[name].estimate.time, norms[name]), **line, lw=1.3)
     panels[0].set_ylim(0, 1.08 * max(largest[name] for name in good) or 1.0)
     panels[0].set_ylabel("horizontal error [m]")
     with_covariance = [n for n in tracks if errors[n].estimate.position_covariance_W is not None]
@@ -124,21 +123,15 @@ def draw_error(
             if P is not None:
                 sigma = np.sqrt(P[:, 0, 0] + P[:, 1, 1])
                 reach = max(reach, float(sigma.max()))
-                axes.plot(*_unbroken(elapsed, sigma), "--", color=INK, lw=1.2, label="its sigma")
-        own = (
-            {"color": colour, "lw": 2.0} if k == 0 else {**line_of(name, k), "label": "", "lw": 1.2}
-        )
-        axes.plot(*_unbroken(elapsed, norm), **own)
+                axes.plot(
+                    *split_at_gaps(elapsed, sigma), "--", color=INK, lw=1.2, label="its sigma"
+                )
+        own = {"color": colour, "lw": 2.0} if k == 0 else {**line_of(name, k), "lw": 1.2}
+        axes.plot(*split_at_gaps(elapsed, norm), **{**own, "label": ""})
     axes.set(xlabel="time [s]", ylabel="distance from the truth [m]")
     axes.set_ylim(0.0, 1.3 * reach or 1.0)
     if axes.get_legend_handles_labels()[0]:
         axes.legend(**ABOVE_LEFT)
-
-
-def _unbroken(time: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return times and values (N,), NaN in gaps."""
-    ticks, values = split_at_gaps(time, value[:, None])
-    return ticks, values[:, 0]
 
 
 def innovations(
@@ -256,12 +249,12 @@ def _draw_axis_errors(panels: list[Axes], errors: PoseErrors, line: dict[str, An
     time, colour = errors.estimate.time, line["color"]
     edge = {**line, "label": "", "lw": 0.7}
     for k, (axes, axis) in enumerate(zip(panels, "xyz", strict=True)):
-        axes.plot(*_unbroken(time, errors.position_W[:, k]), **line, lw=1.2)
+        axes.plot(*split_at_gaps(time, errors.position_W[:, k]), **line, lw=1.2)
         if errors.estimate.position_covariance_W is not None:
             sigma = np.sqrt(errors.estimate.position_covariance_W[:, k, k])
             _draw_band(axes, time, sigma, color=colour, label=f"{line['label']}, 3 sigma")
             for bound in (-3.0 * sigma, 3.0 * sigma):
-                axes.plot(*_unbroken(time, bound), **edge)
+                axes.plot(*split_at_gaps(time, bound), **edge)
         axes.set_ylabel(f"error in {axis} [m]")
 
 
@@ -274,8 +267,8 @@ def _draw_band(
     axes: Axes, time: FloatArray, sigma: FloatArray, max_gap: float = MAX_TRUTH_GAP, **style: Any
 ) -> None:
     """Shade three standard deviations (N,) on both sides of zero."""
-    time, band = split_at_gaps(time, 3 * sigma[:, None], max_gap=max_gap)
-    axes.fill_between(time, -band[:, 0], band[:, 0], alpha=0.15, lw=0, **style)
+    time, band = split_at_gaps(time, 3 * sigma, max_gap=max_gap)
+    axes.fill_between(time, -band, band, alpha=0.15, lw=0, **style)
 
 
 def _draw_dots(axes: Axes, time: FloatArray, value: FloatArray, gated: BoolArray) -> None:

@@ -10,7 +10,6 @@ from stario.fusion import Navigator
 from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import Comparison, compare, demonstration
 from stario.fusion.report.page import write_report
-from stario.fusion.report.series import ellipse
 from stario.fusion.state import Innovations, Track
 from stario.network import load_model
 from stario.sequences.attitude.rotations import about_z
@@ -57,6 +56,8 @@ def test_slider_moves_the_cursor_on_the_map_and_every_panel(show, report, compar
     cursor += (
         " x: document.getElementById('map').layout.shapes.find(s => s.name === 'filtered').xanchor,"
     )
+    cursor += " ellipses: document.getElementById('map').layout.shapes"
+    cursor += ".filter(s => s.type === 'path').length,"
     cursor += " lines: document.getElementById('time').layout.shapes.map(s => s.x0)})"
     seen = []
     times = [0.0, 0.25 * comparison.tracks["track"].time[-1], comparison.tracks["track"].time[-1]]
@@ -68,6 +69,7 @@ def test_slider_moves_the_cursor_on_the_map_and_every_panel(show, report, compar
     for one in seen:
         assert one["lines"] == [pytest.approx(one["at"], abs=1e-3)] * len(one["lines"])
         assert len(one["lines"]) == 14
+        assert one["ellipses"] == 2  # of the track, and of the filter's
     end = comparison.aligned()["filtered"].position_W[-1, 0]
     assert seen[-1]["x"] == pytest.approx(end, abs=0.05)
     assert shown.problems == []
@@ -157,14 +159,6 @@ def test_report_of_a_run_without_truth_has_no_table(tmp_path):
     track = Navigator(load_model()).run(sequence)
     path = write_report(tmp_path / "r.html", Comparison(sequence, {"track": track}, {"track": {}}))
     assert "Accuracy against ground truth" not in path.read_text()
-
-
-def test_ellipse_is_where_the_mahalanobis_distance_is_three():
-    covariance = np.array([[4.0, 1.5, 0.3], [1.5, 1.0, 0.1], [0.3, 0.1, 9.0]])
-    outline = ellipse(covariance)
-    weight = np.linalg.inv(covariance[:2, :2])
-    distance = np.sqrt(np.einsum("ni,ij,nj->n", outline, weight, outline))
-    np.testing.assert_allclose(distance, 3.0)
 
 
 def test_a_map_server_is_asked_on_request_and_points_have_their_place(

@@ -166,7 +166,7 @@ def test_the_check_of_heights_tells_with_from_without(house, level_oracle):
 
 def test_the_report_draws_floors_along_the_height(house_track):
     series = trajectory_series(house_track.trajectory, 0.0)
-    panels = motion_panels({"track": series}, None, "track", house_track.health.floors)
+    panels = motion_panels({"track": series}, None, house_track.health.floors)
     labels = [trace.text[0] for trace in panels[0].traces if trace.text]
     assert labels == ["floor 0", "1", "4"]
 

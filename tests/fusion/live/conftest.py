@@ -1,5 +1,6 @@
-"""Pushes of a recording as a phone sends them, and a navigator with a cheap network."""
+"""Pushes of a recording as a phone sends them, a navigator with a cheap network, and requests."""
 
+import errno
 import json
 import subprocess
 import sys
@@ -9,10 +10,12 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from stario.fusion import Navigator
+from stario.fusion import Navigator, read_fixes
 from stario.fusion.live.hub import Hub
 from stario.fusion.live.run import LiveServer
 from stario.fusion.live.server import live_app
+from stario.fusion.live.session import Session
+from stario.sequences import read_recording
 
 
 class SteadyWalk:
@@ -21,6 +24,45 @@ class SteadyWalk:
     def predict(self, windows):
         mean = np.asarray(windows, dtype=float)[:, 3:, :].mean(axis=2) * [0.3, 0.3, 0.0]
         return mean + np.array([0.8, 0.1, 0.0]), np.tile(0.01 * np.eye(3), (len(mean), 1, 1))
+
+
+def send(client, bodies, query=""):
+    """Post pushes; return the answers."""
+    return [client.post(f"/data{query}", content=body) for body in bodies]
+
+
+def command(client, name, device="phone", **content):
+    """Post a command of the page; return the answer."""
+    return client.post("/command", json={"device": device, "command": name, **content})
+
+
+def added(bodies, name, values, every=1):
+    """Pushes with another sensor's entry in every so many, of the time since the first [s]."""
+    for number, body in enumerate(bodies):
+        message = json.loads(body)
+        time = message["payload"][0]["time"]
+        if number % every == 0:
+            entry = {"name": name, "time": time, "values": values(0.2 * number)}
+            message["payload"].append(entry)
+        yield json.dumps(message).encode()
+
+
+def ends(session):
+    """Where the drawn track of a session ends: x, y, z [m]."""
+    return session.track.drawn.points[-1][1:4]
+
+
+def end_of_rerun(session, navigator):
+    """Where the navigator's track of the recording and fixes of a session ends [m]."""
+    fixes = session.track.path.with_name(f"{session.track.path.stem}-fixes.csv")
+    known = read_fixes(fixes) if fixes.exists() else ()
+    track = navigator.run(read_recording(session.track.path), fixes=known).filtered
+    return track.trajectory.position_W[-1]
+
+
+def full_disk(*arguments, **more):
+    """Fail as a write on a full disk."""
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 @pytest.fixture
@@ -99,3 +141,10 @@ def process(tmp_path):
 def client(hub):
     with TestClient(live_app(hub), base_url="http://localhost") as client:
         yield client
+
+
+@pytest.fixture
+def session(tmp_path, new_navigator):
+    session = Session("phone", tmp_path, new_navigator)
+    yield session
+    session.close()

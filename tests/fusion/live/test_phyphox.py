@@ -9,8 +9,7 @@ from urllib.parse import parse_qsl, urlsplit
 import numpy as np
 import pytest
 
-from stario.fusion.live.phyphox import Phyphox, buffers_of
-from stario.fusion.live.session import Session
+from stario.fusion.live.phyphox import Phyphox
 from stario.sequences import InputError, read_recording
 
 CONFIG = {
@@ -33,7 +32,7 @@ class FakePhone:
 
     def __init__(self, walk):
         self.walk, self.count, self.measuring, self.cleared = walk, 0, True, False
-        self.config = CONFIG
+        self.config, self.wrong = CONFIG, {}
 
     def clear(self):
         """Empty the buffers; the next answer is whole, so that this is noticed."""
@@ -54,6 +53,8 @@ class FakePhone:
             else:
                 mode = "partial"
                 values = columns[name][columns[by or name] > float(since)].tolist()
+            if name in self.wrong:
+                values[-1] = self.wrong[name]
             buffers[name] = {"updateMode": mode, "buffer": values}
         self.cleared = False
         return {"buffer": buffers, "status": {"session": "abc", "measuring": self.measuring}}
@@ -76,21 +77,11 @@ class FakePhone:
 
 @pytest.fixture
 def fake(walk):
-    return FakePhone(walk)
+    """The fake phone, which answers at `address`."""
+    fake = FakePhone(walk)
 
-
-@pytest.fixture
-def phone(fake, monkeypatch):
-    """A client of the fake phone, without a network."""
-    phone = Phyphox("phone:8080")
-    monkeypatch.setattr(phone, "_get", fake.answer)
-    return phone
-
-
-def test_a_phone_is_polled_until_all_samples_are_recorded(serve, fake):
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):
-            fake.count += 20  # each request finds 0.2 s more of the walk
             self.send_response(200)
             self.end_headers()
             self.wfile.write(json.dumps(fake.answer(self.path)).encode())
@@ -100,16 +91,26 @@ def test_a_phone_is_polled_until_all_samples_are_recorded(serve, fake):
 
     with HTTPServer(("127.0.0.1", 0), Handler) as listener:
         threading.Thread(target=listener.serve_forever, daemon=True).start()
-        address = f"127.0.0.1:{listener.server_port}"
-        server = serve(phones=[address])
-        stop = time.monotonic() + 20.0
-        sessions, device = server.hub.sessions, f"phyphox {address}"
-        while device not in sessions or sessions[device].track.samples < 200:
-            assert time.monotonic() < stop
-            time.sleep(0.02)
-        recording = read_recording(sessions[device].track.path)
-        np.testing.assert_array_equal(recording.accel, fake.walk.accel[: len(recording)])
+        fake.address = f"127.0.0.1:{listener.server_port}"
+        yield fake
         listener.shutdown()
+
+
+@pytest.fixture
+def phone(fake):
+    return Phyphox(fake.address)
+
+
+def test_a_phone_is_polled_until_all_samples_are_recorded(serve, fake):
+    server = serve(phones=[fake.address])
+    stop = time.monotonic() + 20.0
+    sessions, device = server.hub.sessions, f"phyphox {fake.address}"
+    while device not in sessions or sessions[device].track.samples < 200:
+        assert time.monotonic() < stop
+        time.sleep(0.02)
+        fake.count += 2
+    recording = read_recording(sessions[device].track.path)
+    np.testing.assert_array_equal(recording.accel, fake.walk.accel[: len(recording)])
 
 
 def recorded(phone, fake, session, sensor):
@@ -121,21 +122,17 @@ def recorded(phone, fake, session, sensor):
     return session
 
 
-def test_the_pressure_of_an_experiment_that_has_it_is_recorded(
-    phone, fake, tmp_path, new_navigator
-):
-    session = recorded(phone, fake, Session(phone.device, tmp_path, new_navigator), PRESSURE)
+def test_the_pressure_of_an_experiment_that_has_it_is_recorded(phone, fake, session):
+    recorded(phone, fake, session, PRESSURE)
     known = read_recording(session.track.path).barometer
     np.testing.assert_allclose(known.time, 0.1 * np.arange(50), atol=1e-6)
     np.testing.assert_allclose(known.pressure_hPa, 1000.0 - 0.001 * np.arange(50))
     assert session.status()["floor"] == "floor 0"
 
 
-def test_the_places_of_an_experiment_that_has_them_are_recorded(
-    phone, fake, tmp_path, new_navigator
-):
+def test_the_places_of_an_experiment_that_has_them_are_recorded(phone, fake, session):
     """An altitude that the phone does not know ends no buffer."""
-    session = recorded(phone, fake, Session(phone.device, tmp_path, new_navigator), LOCATION)
+    recorded(phone, fake, session, LOCATION)
     known = read_recording(session.track.path).satellites
     np.testing.assert_allclose(known.time, np.arange(5), atol=1e-6)
     np.testing.assert_allclose(known.latlon_deg[:, 0], 48.1 + 1e-5 * np.arange(5))
@@ -145,9 +142,10 @@ def test_the_places_of_an_experiment_that_has_them_are_recorded(
     assert session.status()["satellites"] == "5 satellite positions compared with the track"
 
 
-def test_an_experiment_without_both_sensors_is_refused():
+def test_an_experiment_without_both_sensors_is_refused(phone, fake):
+    fake.config = {"inputs": CONFIG["inputs"][1:]}
     with pytest.raises(InputError, match="gyroscope and acceleration with g"):
-        buffers_of({"inputs": CONFIG["inputs"][1:]})
+        phone.fetch()
 
 
 @pytest.mark.parametrize("lost", [False, True], ids=["noticed", "the answer after it is lost"])
@@ -177,17 +175,13 @@ def test_an_experiment_cleared_while_the_phone_was_away_begins_another_recording
     assert after.recording != before.recording
 
 
-@pytest.mark.parametrize("time", [float("inf"), 10**400, 1e300])
-def test_an_endless_time_neither_fails_nor_ends_the_stream(time):
-    phone = Phyphox("phone:8080")
-    phone._buffers = {"gyro": ("t", "x", "y", "z")}
-
-    def answer(times):
-        buffers = {name: {"buffer": [0.5] * len(times)} for name in ("x", "y", "z")}
-        return buffers | {"t": {"buffer": times}}
-
-    assert len(phone._readings("gyro", answer([1.0, time]))) == 1
-    assert len(phone._readings("gyro", answer([2.0, 3.0]))) == 2
+@pytest.mark.parametrize("wrong", [float("inf"), 10**400, 1e300])
+def test_an_endless_time_neither_fails_nor_ends_the_stream(phone, fake, wrong):
+    fake.count = 10
+    fake.wrong = {"gt": wrong}
+    assert len(phone.fetch().readings) == 19
+    fake.count, fake.wrong = 20, {}
+    assert len(phone.fetch().readings) == 21
 
 
 def test_a_paused_experiment_continues_as_another_recording(phone, fake):

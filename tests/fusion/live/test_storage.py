@@ -9,6 +9,7 @@ import signal
 import threading
 import time
 import urllib.request
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +23,8 @@ from stario.fusion.live.payload import GYRO, parse_push
 from stario.fusion.live.session import Session
 from stario.fusion.live.storage import LiveFile
 from stario.sequences import InputError, read_recording
+
+from .conftest import full_disk
 
 SAMPLES = [
     (10**18 + k * 10**7, (0.1 * k, 1 / 3, -2e-5), (1 / 7, 0.01 * k, 9.80665)) for k in range(40)
@@ -93,7 +96,7 @@ def _push_on(url, bodies):
 
 
 class NearlyFull:
-    """A file on a full disk, which writes only a part until `full` is cleared."""
+    """A file on a disk that becomes full: it writes only a part until `full` is cleared."""
 
     def __init__(self, file):
         self.file, self.full = file, True
@@ -108,9 +111,11 @@ class NearlyFull:
 def test_a_partial_write_on_a_full_disk_is_undone(tmp_path):
     file = LiveFile(tmp_path, "phone")
     file.append(SAMPLES[:10], 1.7e9)
+    size = file.path.stat().st_size
     file._file = NearlyFull(file._file)
     with pytest.raises(OSError, match="space"):
         file.append(SAMPLES[10:], 1.7e9)
+    assert file.path.stat().st_size == size
     file._file.full = False
     file.append(SAMPLES[10:], 1.7e9)
     recording = read_recording(file.path)
@@ -118,14 +123,15 @@ def test_a_partial_write_on_a_full_disk_is_undone(tmp_path):
     file.close()
 
 
-def test_a_fix_after_one_that_failed_on_a_full_disk_has_its_header(tmp_path, monkeypatch):
-    file, write = LiveFile(tmp_path, "phone"), storage._write_whole
-
-    def full(file, data):
-        raise OSError("No space left on device")
-
-    fix = position_fix(1.0, np.zeros(3), np.eye(3))
-    monkeypatch.setattr(storage, "_write_whole", full)
+def test_nothing_is_left_of_a_header_that_a_full_disk_refused(tmp_path, monkeypatch):
+    fix, write = position_fix(1.0, np.zeros(3), np.eye(3)), storage._write_whole
+    monkeypatch.setattr(storage, "_write_whole", full_disk)
+    with pytest.raises(InputError, match="No space left"):
+        LiveFile(tmp_path, "phone")
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.setattr(storage, "_write_whole", write)
+    file = LiveFile(tmp_path, "phone")
+    monkeypatch.setattr(storage, "_write_whole", full_disk)
     with pytest.raises(OSError, match="space"):
         file.append_fix(fix)
     monkeypatch.setattr(storage, "_write_whole", write)
@@ -133,33 +139,6 @@ def test_a_fix_after_one_that_failed_on_a_full_disk_has_its_header(tmp_path, mon
     file.append_fix(fix)
     assert len(read_fixes(file.fixes_path)) == 2
     file.close()
-
-
-def test_a_push_that_was_not_written_can_be_repeated(tmp_path, new_navigator, pushes, monkeypatch):
-    session = Session("phone", tmp_path, new_navigator)
-    *before, second = [parse_push(body) for body in pushes(seconds=2.0)]
-    for batch in before:
-        session.take(batch, 1.7e9)
-    append, failed = LiveFile.append, []
-
-    def full(self, samples, received, fields=()):
-        failed.append(len(samples))
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(LiveFile, "append", full)
-    with pytest.raises(OSError, match="space"):
-        session.take(second, 1.7e9)
-    monkeypatch.setattr(LiveFile, "append", append)
-    assert session.take(second, 1.7e9) == failed[0] > 0
-    assert len(read_recording(session.track.path)) == session.track.samples
-    session.close()
-
-
-@pytest.fixture
-def session(tmp_path, new_navigator):
-    session = Session("phone", tmp_path, new_navigator)
-    yield session
-    session.close()
 
 
 @pytest.fixture
@@ -191,28 +170,33 @@ def test_a_gyroscope_in_another_unit_is_shown_though_the_track_begins_again(sess
     assert all(shown[first:])
 
 
-def test_a_full_disk_is_shown_until_it_has_space_and_what_is_lost_is_counted(
+def test_a_full_disk_is_shown_until_it_has_space_and_a_push_may_be_repeated(
     session, batches, monkeypatch
 ):
-    append, attempts = LiveFile.append, []
+    for batch in batches[:10]:
+        session.take(batch, 1.7e9)
+    append = LiveFile.append
+    monkeypatch.setattr(LiveFile, "append", full_disk)
+    with pytest.raises(OSError, match="space"):
+        session.take(batches[10], 1.7e9)
+    assert "No space left" in session.status()["problem"]
+    monkeypatch.setattr(LiveFile, "append", append)
+    assert session.take(batches[10], 1.7e9) == 20
+    assert session.status()["problem"] == ""
+    assert len(read_recording(session.track.path)) == session.track.samples == 220
 
-    def full(self, samples, received, fields=()):
-        attempts.append(len(samples))
-        raise OSError("No space left on device")
 
+def test_what_a_full_disk_loses_is_counted(session, batches, monkeypatch):
     monkeypatch.setattr(track_module, "_MAX_UNWRITTEN", 100)
-    monkeypatch.setattr(LiveFile, "append", full)
+    append = LiveFile.append
+    monkeypatch.setattr(LiveFile, "append", full_disk)
     for batch in batches[:-1]:
-        try:
+        with suppress(OSError):
             session.take(batch, 1.7e9)
-        except OSError:
-            assert "No space left" in session.status()["problem"]
-    assert max(attempts) < 150
     monkeypatch.setattr(LiveFile, "append", append)
     session.take(batches[-1], 1.7e9)
-    assert session.status()["problem"] == ""
     written = len(read_recording(session.track.path))
-    assert 100 < written == session.track.samples
+    assert 100 < written == session.track.samples < 150
     assert session.status()["dropped"] == {"not written": 900 - written}
 
 
@@ -244,13 +228,3 @@ def test_an_unwritable_folder_is_shown(tmp_path, new_navigator, batches):
     with pytest.raises(InputError, match="a writable folder"):
         session.take(longer, 1.7e9)
     assert "a writable folder" in session.status()["problem"]
-
-
-def test_a_file_without_space_for_its_header_is_removed(tmp_path, monkeypatch):
-    def full(file, data):
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(storage, "_write_whole", full)
-    with pytest.raises(InputError, match="No space left"):
-        LiveFile(tmp_path, "phone")
-    assert list(tmp_path.iterdir()) == []

@@ -33,16 +33,16 @@ def test_map_and_panels_break_where_poses_are_missing(rate):
     time = np.arange(0.0, 60.0, 1.0 / rate)
     track = along_x(time[(time < 20.0) | (time > 27.0)])
     series = trajectory_series(track, 0.0)
-    assert len(series.time) <= MAX_POINTS + 1
-    inside = (series.time > 20.0) & (series.time < 27.0)
-    assert np.isnan(series.position[inside]).all()
-    assert inside.any()
-    figure = map_figure({"track": series}, None, None, "track")
+    assert len(series) <= MAX_POINTS + 1
+    inside = series[(series.index > 20.0) & (series.index < 27.0)]
+    assert inside.isna().all(axis=None)
+    assert len(inside)
+    figure = map_figure({"track": series}, None, None)
     path = next(
         trace for trace in figure.data if trace.mode == "lines" and trace.customdata is not None
     )
     assert stretches(path.x) == 2
-    height = motion_panels({"track": series}, None, "track")[0]
+    height = motion_panels({"track": series}, None)[0]
     assert [stretches(trace.y) for trace in height.traces] == [2, 2]  # band and line
 
 
@@ -50,7 +50,7 @@ def test_an_error_is_drawn_only_where_the_truth_is_known():
     time = np.arange(0.0, 60.0, 0.1)
     truth = along_x(time[(time < 20.0) | (time > 27.0)])
     series, true = (trajectory_series(track, 0.0) for track in (along_x(time), truth))
-    error = motion_panels({"track": series}, true, "track")[0].traces[0]
+    error = motion_panels({"track": series}, true)[0].traces[0]
     x, y = np.asarray(error.x), np.asarray(error.y, dtype=float)
     assert np.isnan(y[(x > 20.05) & (x < 26.95)]).all()
     assert np.isfinite(y[(x < 19.85) | (x > 27.15)]).all()
@@ -59,14 +59,14 @@ def test_an_error_is_drawn_only_where_the_truth_is_known():
 def test_a_device_at_rest_does_not_fill_the_map():
     track = along_x(np.arange(0.0, 60.0, 0.1), speed=5e-5)  # 3 mm
     series = trajectory_series(replace(track, position_covariance_W=None), 0.0)
-    low, high = map_figure({"track": series}, None, None, "track").layout.xaxis.range
+    low, high = map_figure({"track": series}, None, None).layout.xaxis.range
     assert high - low >= 1.0
 
 
 def test_known_positions_are_within_the_map():
     series = trajectory_series(along_x(np.arange(0.0, 10.0, 0.1)), 0.0)
     taps = PositionTrack(np.array([1.0, 9.0]), np.array([[0.0, -40.0], [9.0, 0.0]]), "waypoints")
-    low, high = map_figure({"track": series}, None, taps, "track").layout.yaxis.range
+    low, high = map_figure({"track": series}, None, taps).layout.yaxis.range
     assert low < -40.0
     assert high > 0.0
 
@@ -75,15 +75,15 @@ def test_no_ellipse_is_cut_by_the_axes_and_the_speed_band_ends_at_rest():
     track = along_x(np.arange(0.0, 60.0, 0.1))
     wide = np.linspace(0.0, 25.0, len(track.time))[:, None, None] * np.eye(3)  # up to 5 m, 1 sigma
     series = trajectory_series(replace(track, position_covariance_W=wide), 0.0)
-    series = replace(series, speed_sigma=np.full(len(series.time), 0.8))
-    figure = map_figure({"track": series}, None, None, "track")
+    series["sigma speed"] = 0.8
+    figure = map_figure({"track": series}, None, None)
     outline = next(trace for trace in figure.data if trace.name == "3 sigma")
     y = np.asarray(outline.y, dtype=float)
     low, high = figure.layout.yaxis.range
     assert np.nanmax(y) > 10.0
     assert low < np.nanmin(y)
     assert np.nanmax(y) < high
-    band, _ = motion_panels({"track": series}, None, "track")[1].traces
+    band, _ = motion_panels({"track": series}, None)[1].traces
     assert np.nanmin(np.asarray(band.y, dtype=float)) == 0.0
 
 
@@ -91,7 +91,7 @@ def test_arrows_point_where_the_device_goes_and_there_are_none_at_rest():
     time = np.arange(0.0, 200.0, 0.1)
     position = np.clip(time, 0.0, 100.0)[:, None] * [0.6, -0.8, 0.0]  # then at rest
     track = replace(along_x(time), position_W=position)
-    figure = map_figure({"track": trajectory_series(track, 0.0)}, None, None, "track")
+    figure = map_figure({"track": trajectory_series(track, 0.0)}, None, None)
     arrows = next(trace for trace in figure.data if trace.marker.symbol == "arrow")
     assert len(arrows.x) == 3
     # Clockwise from up, which is y.
@@ -101,7 +101,7 @@ def test_arrows_point_where_the_device_goes_and_there_are_none_at_rest():
 def test_a_correction_is_drawn_where_the_device_was_with_its_size_and_cause():
     series = trajectory_series(along_x(np.arange(0.0, 60.0, 0.1)), 0.0)
     found = [(20.0, 2.5, np.radians(4.0), "network")]
-    figure = map_figure({"track": series}, None, None, "track", found)
+    figure = map_figure({"track": series}, None, None, found)
     mark = next(trace for trace in figure.data if trace.name == "corrected")
     assert mark.x == pytest.approx((20.0,))
     assert mark.text == ("20.0 s: corrected by 2.5 m, 4 deg<br>network",)
@@ -113,7 +113,7 @@ def test_many_known_positions_are_drawn_smaller_than_few_and_below_the_track():
     def drawn(count: int):
         at = np.linspace(1.0, 59.0, count)
         known = PositionTrack(at, np.outer(at, [1.0, 0.0]), "positions")
-        return map_figure({"track": series}, None, known, "track").data[0]
+        return map_figure({"track": series}, None, known).data[0]
 
     assert drawn(10).name == drawn(150).name == "positions"
     assert drawn(150).marker.size < drawn(10).marker.size

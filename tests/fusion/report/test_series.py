@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("plotly", reason="pip install '.[report]'")
 
-from stario.fusion.report.page import _cursors
 from stario.fusion.report.panels import motion_panels
-from stario.fusion.report.series import Series, ellipse, track_series, trajectory_series
+from stario.fusion.report.series import ellipse, track_series, trajectory_series
 from stario.fusion.state import Track
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.sequence import Trajectory
@@ -37,26 +37,25 @@ def along_y(yaw: float = 0.0) -> Track:
     return Track(trajectory, b_g=b_g, b_a=b_a, covariance=covariance)
 
 
-def series_of(track: Track) -> Series:
+def series_of(track: Track) -> pd.DataFrame:
     return track_series(track, track.trajectory, 0.0)
 
 
 def test_columns_are_in_their_units_with_their_own_sigmas() -> None:
     series = series_of(along_y(yaw=0.5))
-    assert series.gyro_bias is not None
-    assert series.accel_bias is not None
-    for found, expected in (
-        (series.yaw, np.degrees(0.5)),
-        (series.yaw_sigma, np.degrees(0.03)),
-        (series.speed, 1.5),
-        (series.speed_sigma, 0.2),  # that of the velocity along the path
-        (series.height_sigma, 0.6),
-        (series.gyro_bias[0], np.degrees(0.01)),
-        (series.gyro_bias[1], np.degrees(SIGMA[9:12])),
-        (series.accel_bias[0], 0.2),
-        (series.accel_bias[1], SIGMA[12:]),
-    ):
-        np.testing.assert_allclose(found, np.broadcast_to(expected, np.shape(found)))
+    for column, expected in {
+        "yaw": np.degrees(0.5),
+        "sigma yaw": np.degrees(0.03),
+        "speed": 1.5,
+        "sigma speed": 0.2,  # that of the velocity along the path
+        "sigma z": 0.6,
+        "xy": 0.05,
+        "gyro x": np.degrees(0.01),
+        "sigma gyro y": np.degrees(2e-3),
+        "accel z": 0.2,
+        "sigma accel z": 0.09,
+    }.items():
+        np.testing.assert_allclose(series[column], expected)
 
 
 def test_speed_of_positions_alone_is_their_rate() -> None:
@@ -64,10 +63,10 @@ def test_speed_of_positions_alone_is_their_rate() -> None:
     np.testing.assert_allclose(trajectory_series(positions, 0.0).speed, 1.5)
 
 
-def test_an_ellipse_reaches_three_sigma_along_its_axes() -> None:
-    R = about_z(0.4).as_matrix()[:2, :2]
-    outline = ellipse(R @ np.diag([4.0, 0.25]) @ R.T) @ R  # in the ellipse's own axes
-    np.testing.assert_allclose(np.abs(outline).max(axis=0), [6.0, 1.5], rtol=0.01)
+def test_an_ellipse_is_where_the_mahalanobis_distance_is_three() -> None:
+    outline = ellipse(4.0, 1.5, 1.0)
+    weight = np.linalg.inv([[4.0, 1.5], [1.5, 1.0]])
+    np.testing.assert_allclose(np.einsum("ni,ij,nj->n", outline, weight, outline), 9.0)
     np.testing.assert_allclose(outline[0], outline[-1], atol=1e-10)
 
 
@@ -76,16 +75,14 @@ def test_yaws_on_both_sides_of_half_a_turn_are_drawn_next_to_each_other() -> Non
         name: trajectory_series(along_y(np.radians(yaw)).trajectory, 0.0)
         for name, yaw in (("track", 179.0), ("filtered", -179.0))
     }
-    yaw = {
-        trace.name: trace.y for trace in motion_panels(shown, None, "track")[2].traces if trace.name
-    }
+    yaw = {trace.name: trace.y for trace in motion_panels(shown, None)[2].traces if trace.name}
     np.testing.assert_allclose(
         np.subtract(yaw["filter, as in a stream"], yaw["StarIO"]), 2.0, atol=1e-3
     )
 
 
 def test_the_band_of_a_line_is_three_sigma_wide() -> None:
-    height = motion_panels({"track": series_of(along_y())}, None, "track")[0]
+    height = motion_panels({"track": series_of(along_y())}, None)[0]
     band, line = height.traces
     edge = np.asarray(band.y, dtype=float)
     assert np.nanmax(edge) == pytest.approx(3.0 * 0.6)
@@ -93,19 +90,10 @@ def test_the_band_of_a_line_is_three_sigma_wide() -> None:
     assert not any(line.y)
 
 
-def test_the_slider_moves_ellipses_of_the_horizontal_covariance() -> None:
-    series = series_of(along_y())
-    other, main = _cursors({"filtered": series, "track": series}, "track")[::-1]
-    assert (main["name"], other["name"]) == ("track", "filtered")
-    assert [main[key][5] for key in ("xx", "xy", "yy")] == [0.16, 0.05, 0.25]
-    assert main["y"][10] == pytest.approx(1.5 * TIME[10])
-
-
-def turning(stop: float, offset: float) -> Series:
+def turning(stop: float, offset: float) -> pd.DataFrame:
     """A device that turns by six degrees a second until `stop` [s], its yaw off by `offset` deg."""
     time = np.arange(0.0, stop, 0.1)
-    zeros = np.zeros(len(time))
-    return Series(time, np.zeros((len(time), 3)), zeros, 6.0 * time + offset)
+    return pd.DataFrame({"yaw": 6.0 * time + offset}, time).assign(x=0.0, y=0.0, z=0.0, speed=0.0)
 
 
 @pytest.mark.parametrize("stop", [10.0, 120.0])
@@ -114,6 +102,6 @@ def test_yaws_are_drawn_within_half_a_turn_of_the_truth_where_both_exist(
     stop: float, turns: int
 ) -> None:
     track = turning(stop, 5.0 + 360.0 * turns)
-    panel = motion_panels({"track": track}, turning(120.0, 0.0), "track")[-1]
+    panel = motion_panels({"track": track}, turning(120.0, 0.0))[-1]
     drawn = next(trace for trace in panel.traces if trace.legendgroup == "track")
     np.testing.assert_allclose(drawn.y, 6.0 * np.array(drawn.x) + 5.0, atol=1e-3)

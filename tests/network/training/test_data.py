@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from stario.network.training.config import SIMULATED, TrainingConfig
+from stario.network.training.config import INSERTED, SIMULATED, TrainingConfig
 from stario.network.training.data import (
     RecordingStreams,
     TrainingData,
@@ -50,6 +50,13 @@ def test_recorded_and_generated_streams_get_their_shares():
     drawn = np.array([len(s) for s in material.streams]) * material.weights
     assert drawn[2:].sum() / drawn.sum() == pytest.approx(0.05)
     assert material.words[0].startswith("recorded")
+
+
+def test_bad_moments_get_their_share_of_all_windows():
+    recorded = recordings_of([stream("a", 3000)])
+    shares = {SIMULATED: 0.2, INSERTED: 0.1, "r": 0.3}
+    material = mix_sources(recorded, [stream("c", 700)], shares, moments=[stream("m", 900)])
+    assert drawn_shares(material) == pytest.approx({"a": 0.7, "c": 0.2, "m": 0.1}, abs=1e-3)
 
 
 def drawn_shares(material: TrainingData, reach: int = 1) -> dict[str, float]:

@@ -17,6 +17,7 @@ from stario.network.architectures import build_network
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import load_model
 from stario.network.training.augment import Augmentation
+from stario.network.training.captured import CapturedStep
 from stario.network.training.config import TrainingConfig, training_config
 from stario.network.training.history import EpochReport, History
 from stario.network.training.result import calibrate
@@ -289,3 +290,15 @@ def test_a_sigma_that_is_wrong_way_round_is_ignored():
     np.testing.assert_allclose(found.exponent, 0.0, atol=1e-3)
     rms = np.sqrt(np.mean(np.minimum(error**2, 25.0 * np.square(found.scale)), axis=0))
     np.testing.assert_allclose(found.scale, rms, rtol=0.05)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_recorded_step_learns_what_a_launched_one_does(tmp_path, monkeypatch):
+    config = replace(TINY, device="cuda", dropout=0.0)
+    recorded: list[EpochReport] = []
+    launched: list[EpochReport] = []
+    run(tmp_path / "recorded", config, on_epoch=recorded.append)
+    monkeypatch.setattr(CapturedStep, "__call__", lambda self, inputs, stage: self._step(inputs))
+    run(tmp_path / "launched", config, on_epoch=launched.append)
+    for one, other in zip(recorded, launched, strict=True):
+        assert one.training_error == pytest.approx(other.training_error, rel=0.01)
