@@ -92,7 +92,7 @@ def shorter(line: str) -> str:
     """Return the command for a walk of fewer samples, which take most of these tests' time."""
     if "--floors" in line:  # a house takes two minutes
         return f"{line} --rate 50"
-    return re.sub(r"--seconds \d+", "--seconds 12", line)
+    return re.sub(r"--seconds \d+", "--seconds 15", line)
 
 
 def run_line(line: str, monkeypatch: pytest.MonkeyPatch) -> None:

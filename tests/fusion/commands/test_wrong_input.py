@@ -154,7 +154,7 @@ def test_an_option_that_would_do_nothing_is_refused(stario, recording, tmp_path,
 @pytest.mark.parametrize(
     ("command", "content", "named"),
     [
-        ("run", '{"filter": {"speed": 1}}', "filter.speed"),
+        ("compare", '{"filter": {"speed": 1}}', "filter.speed"),
         ("evaluate", '{"gravity": 1.62}', "gravity"),
         ("run", "{", "settings.json"),
         ("train", '{"speed": 1}', "speed"),

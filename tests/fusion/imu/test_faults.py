@@ -173,7 +173,9 @@ def test_a_clock_set_back_by_a_few_seconds_is_a_gap(make_walk, backend):
 
 def test_a_clock_set_back_by_a_few_seconds_is_reported(make_walk, still_model):
     walk = make_walk(3, 16.0)
-    track = Navigator(still_model, backend="ekf").run(set_back(walk, 3.0))
-    assert any("late for 3.0 s in a row" in line for line in health_lines(track.health))
+    back = set_back(walk, 3.0)
+    track = Navigator(still_model, backend="ekf").run(back)
+    for lines in (health_lines(track.health), told(back)):
+        assert any("late for 3.0 s in a row" in line for line in lines)
     usual = Navigator(still_model, backend="ekf").run(walk).health
     assert not any("late" in line for line in health_lines(usual))
