@@ -16,7 +16,7 @@ class DisplacementNetwork(nn.Module):
     """A network with centred input: gravity is subtracted from the vertical specific force.
 
     Args:
-        network: maps (B, 6, 200) to (B, 6); a recurrent one also has `first_state` and `step`, and
+        network: maps (B, 6, 200) to (B, 6); a recurrent one also has `state_size` and `step`, and
             maps (B, K, 6, 200) to (B, K, 6).
     """
 
@@ -29,31 +29,23 @@ class DisplacementNetwork(nn.Module):
         self.register_buffer("gravity", gravity, persistent=False)
 
     @property
+    def state_size(self) -> int:
+        """Size H of the state (2, B, H) that a recurrent network carries along; 0 of others."""
+        return getattr(self.network, "state_size", 0)
+
+    @property
     def is_recurrent(self) -> bool:
         """Whether the network is recurrent: it carries a state from window to window."""
-        return hasattr(self.network, "step")
+        return self.state_size > 0
 
-    def forward(self, windows: Tensor) -> tuple[Tensor, Tensor]:
-        """Map windows (B, 6, 200) to displacement (B, 3) [m] and log sigma (B, 3)."""
-        return _split_output(self.network(windows - self.gravity))
+    def forward(self, windows: Tensor, state: Tensor | None = None) -> tuple[Tensor, ...]:
+        """Map windows (B, 6, 200) to displacement (B, 3) [m] and log sigma (B, 3).
 
-    def step(self, windows: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Run a recurrent network as in `forward`, starting from its state (2, B, H).
-
-        Returns:
-            Displacement, log sigma, and the state after these windows.
+        A recurrent network starts from a state (2, B, H), or from zero, and also returns the state
+        after these windows.
         """
         network: Any = self.network
-        output, after = network.step(windows - self.gravity, state)
-        return *_split_output(output), after
-
-    def first_state(self, batch: int) -> Tensor:
-        """Return the state (2, B, H) of a recurrent network before the first window."""
-        network: Any = self.network
-        state: Tensor = network.first_state(self.gravity.new_zeros(batch, 0))
-        return state
-
-
-def _split_output(output: Tensor) -> tuple[Tensor, Tensor]:
-    output = output.float()
-    return output[..., :3], output[..., 3:].clamp(*LOG_SIGMA_RANGE)
+        centred = windows - self.gravity
+        output, *after = network.step(centred, state) if self.is_recurrent else (network(centred),)
+        output = output.float()
+        return output[..., :3], output[..., 3:].clamp(*LOG_SIGMA_RANGE), *after

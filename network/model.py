@@ -69,7 +69,7 @@ class DisplacementModel:
         Returns:
             The model itself, or a `StatefulModel` if the network is recurrent.
         """
-        return StatefulModel(self, self.engine, updates) if self.engine.is_recurrent else self
+        return StatefulModel(self, updates) if self.engine.state_size else self
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Predict the displacement over each window, from its start to one second later.
@@ -109,7 +109,6 @@ class StatefulModel:
 
     Args:
         model: model with a recurrent network.
-        engine: engine that runs it.
         updates: number of windows that begin within the length of one; each such series of
             windows, one second apart, has its own state, as in training.
 
@@ -117,8 +116,8 @@ class StatefulModel:
         memory: number of windows so far and the state of each series; may be restored.
     """
 
-    def __init__(self, model: DisplacementModel, engine: Engine, updates: int) -> None:
-        self._model, self._engine = model, engine
+    def __init__(self, model: DisplacementModel, updates: int) -> None:
+        self._model = model
         self.memory: Memory = (0, (None,) * updates)
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -128,10 +127,8 @@ class StatefulModel:
         first, (*states,) = self.memory
         for k in range(len(batch)):
             series = (first + k) % len(states)
-            before = states[series]
-            mean[k], log_sigma[k], states[series] = self._engine.run(
-                batch[k : k + 1], self._engine.first_state() if before is None else before
-            )
+            answer = self._model.engine.run(batch[k : k + 1], states[series])
+            mean[k], log_sigma[k], states[series] = answer
         self.memory = first + len(batch), tuple(states)
         return self._model.calibrated(mean, log_sigma)
 

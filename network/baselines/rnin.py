@@ -18,50 +18,44 @@ from stario.network.baselines.parts import (
 )
 
 _HIDDEN = 256
+_FEATURES = 64 * 13
 
 
 class Rnin(nn.Module):
     """RNIN, whose LSTM state comes from the preceding windows.
 
-    A call with (B, 6, 200) treats each window as the first of a chain; `step` continues from the
-    state after an earlier call; a call with (B, K, 6, 200) runs through K windows in a row, as in
+    Windows (B, 6, 200) are the next of B chains; (B, K, 6, 200) are the next K of each, as in
     training.
     """
+
+    state_size = _HIDDEN
 
     def __init__(self, outputs: int = 6) -> None:
         super().__init__()
         self.trunk = nn.Sequential(
             resnet_stem(pool=False), residual_groups(BasicBlock), ConvNorm(512, 64), nn.Flatten()
         )
-        self.lstm = nn.LSTM(64 * 13, _HIDDEN, batch_first=True)
+        self.lstm = nn.LSTM(_FEATURES, _HIDDEN, batch_first=True)
         widths = _HIDDEN, 256, 256, outputs // 2
         self.mean = nn.Sequential(*linear_layers(*widths, dropout=0.2))
         self.log_sigma = nn.Sequential(*linear_layers(*widths, dropout=0.2))
 
     def forward(self, windows: Tensor) -> Tensor:
-        """Map (B, 6, 200) to (B, outputs), or (B, K, 6, 200) to (B, K, outputs)."""
-        if windows.dim() == 3:
-            return self.step(windows, self.first_state(windows))[0]
-        features = self.trunk(windows.flatten(0, 1)).unflatten(0, windows.shape[:2])
-        return self._heads(self.lstm(features)[0])
+        """Map the first windows of chains, (..., 6, 200), to (..., outputs)."""
+        return self.step(windows)[0]
 
-    def first_state(self, windows: Tensor) -> Tensor:
-        """Return the zero state (2, B, 256) before the first window."""
-        return windows.new_zeros(2, len(windows), _HIDDEN)
-
-    def step(self, windows: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Process one window of each of B chains.
+    def step(self, windows: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Process windows of B chains.
 
         Args:
-            windows: (B, 6, 200).
-            state: (2, B, 256) hidden and cell state after each chain's last window.
+            windows: (B, 6, 200) or (B, K, 6, 200).
+            state: (2, B, 256) hidden and cell state after each chain's last window; None for zero.
 
         Returns:
-            Outputs (B, outputs) and the state after these windows.
+            Outputs (B, outputs) or (B, K, outputs), and the state after these windows.
         """
-        features = self.trunk(windows).unsqueeze(1)
-        recalled, (hidden, cell) = self.lstm(features, (state[:1], state[1:]))
-        return self._heads(recalled.squeeze(1)), torch.cat([hidden, cell])
-
-    def _heads(self, features: Tensor) -> Tensor:
-        return torch.cat([self.mean(features), self.log_sigma(features)], dim=-1)
+        features = self.trunk(windows.flatten(0, -3)).view(windows.shape[0], -1, _FEATURES)
+        recalled, after = self.lstm(features, None if state is None else (state[:1], state[1:]))
+        recalled = recalled.view(*windows.shape[:-2], _HIDDEN)
+        outputs = torch.cat([self.mean(recalled), self.log_sigma(recalled)], dim=-1)
+        return outputs, torch.cat(after)

@@ -1,12 +1,9 @@
-"""What runs a network: `TorchEngine` or `OnnxEngine`.
-
-Engines map windows to displacement and log sigma. A recurrent network (RNIN) also takes the state
-after the previous window and returns the state for the next one.
-"""
+"""What runs a network: `TorchEngine` or `OnnxEngine`."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,34 +13,41 @@ if TYPE_CHECKING:  # PyTorch is imported only by what needs it
 
 Float32Array = NDArray[np.float32]
 
-Answer = tuple[Float32Array, Float32Array, Float32Array | None]
-"""Displacement (B, 3) [m], log sigma (B, 3), and the state after these windows."""
+Answer = tuple[Float32Array, Float32Array, Float32Array]
+"""Displacement (B, 3) [m], log sigma (B, 3), and the state (2, B, H) after these windows."""
 
 BATCH = 64
 """Number of windows that an engine computes at once."""
 
 
-class Engine(Protocol):
-    """A network that is ready to run."""
+class Engine(ABC):
+    """A network that is ready to run.
+
+    Attributes:
+        state_size: size H of the state (2, B, H) that a recurrent network (RNIN) carries from
+            window to window; 0 of others.
+    """
+
+    state_size: int
 
     @property
-    def is_recurrent(self) -> bool:
-        """Whether the network is recurrent: it carries a state from window to window."""
-        ...
-
-    @property
+    @abstractmethod
     def training_form(self) -> DisplacementNetwork:
         """Trainable form of the network in PyTorch, in evaluation mode.
 
         Raises:
-            InputError: the engine has none.
+            InputError: an exported graph does not contain it.
         """
-        ...
-
-    def first_state(self) -> Float32Array:
-        """Return the state (2, 1, H) of a recurrent network before the first window."""
-        ...
 
     def run(self, windows: Float32Array, state: Float32Array | None = None) -> Answer:
         """Run windows (B, 6, 200), each from its own state, or from zero if `state` is None."""
-        ...
+        if state is None:
+            state = np.zeros((2, len(windows), self.state_size), np.float32)
+        starts = range(0, len(windows), BATCH)
+        answers = [self._run(windows[k : k + BATCH], state[:, k : k + BATCH]) for k in starts]
+        mean, log_sigma, after = zip(*answers, strict=True)
+        return np.concatenate(mean), np.concatenate(log_sigma), np.concatenate(after, axis=1)
+
+    @abstractmethod
+    def _run(self, windows: Float32Array, state: Float32Array) -> Answer:
+        """Run up to `BATCH` windows."""

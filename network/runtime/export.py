@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor, nn
 
 from stario.network.card import dump_card
 from stario.network.displacement import DisplacementNetwork
@@ -66,34 +65,23 @@ def export_onnx(model: DisplacementModel, path: Path) -> None:
 
 def _traced(network: DisplacementNetwork) -> Any:
     optional_package("onnxscript", "onnx")
-    recurrent, batch = network.is_recurrent, torch.export.Dim("batch")
+    batch = torch.export.Dim("batch")
     inputs = {"windows": torch.zeros(2, 6, WINDOW_SAMPLES)}
-    if recurrent:
-        inputs["state"] = network.first_state(2)
+    if network.is_recurrent:
+        inputs["state"] = torch.zeros(2, 2, network.state_size)
     with _quiet():
         program = torch.onnx.export(
-            _Step(network) if recurrent else network,
+            network,
             tuple(inputs.values()),
             dynamo=True,
             external_data=False,
             verbose=False,
             input_names=list(inputs),
-            output_names=["displacement", "log_sigma", "next_state"][: 2 + recurrent],
+            output_names=["displacement", "log_sigma", "next_state"][: 1 + len(inputs)],
             dynamic_shapes=({0: batch}, {1: batch})[: len(inputs)],
         )
     assert program is not None
     return program.model_proto
-
-
-class _Step(nn.Module):
-    """A recurrent network with its state as input and output."""
-
-    def __init__(self, network: DisplacementNetwork) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, windows: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return self.network.step(windows, state)
 
 
 @contextmanager

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stario.network.card import Card, parse_card
-from stario.network.runtime.engines import BATCH, Answer, Float32Array
+from stario.network.runtime.engines import Answer, Engine, Float32Array
 from stario.sequences.errors import InputError, WeightsError
 from stario.sequences.windows import WINDOW_SAMPLES
 
@@ -29,7 +29,7 @@ GRAPHS = {"StarIO": "stario.onnx"}
 """Files in this folder with the graphs of networks, without weights."""
 
 
-class OnnxEngine:
+class OnnxEngine(Engine):
     """ONNX Runtime on the CPU.
 
     Args:
@@ -68,28 +68,15 @@ class OnnxEngine:
             graph, options, providers=["CPUExecutionProvider"]
         )
         shapes = {node.name: node.shape for node in self._session.get_inputs()}
-        self._state_size = int(shapes["state"][2]) if "state" in shapes else 0
+        self.state_size = int(shapes["state"][2]) if "state" in shapes else 0
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Send graph and weights to another process, which makes its own session."""
         return OnnxEngine, (self._graph, self._tensors, self._architecture)
 
-    @property
-    def is_recurrent(self) -> bool:
-        """Whether the network is recurrent: it carries a state from window to window."""
-        return self._state_size > 0
-
-    def first_state(self) -> Float32Array:
-        """Return the state (2, 1, H) of a recurrent network before the first window."""
-        return np.zeros((2, 1, self._state_size), np.float32)
-
     @cached_property
     def training_form(self) -> DisplacementNetwork:
-        """Network with trainable weights, made in PyTorch when it is first needed.
-
-        Raises:
-            InputError: an exported graph does not contain it.
-        """
+        """As described in `Engine`; made when it is first needed."""
         if not self._architecture:
             raise InputError("model", "an exported graph", "a safetensors file of weights")
         import torch
@@ -99,20 +86,10 @@ class OnnxEngine:
         state = {name: torch.tensor(tensor) for name, tensor in self._tensors.items()}
         return trainable(self._architecture, state)
 
-    def run(self, windows: Float32Array, state: Float32Array | None = None) -> Answer:
-        """Run windows (B, 6, 200), each from its own state, or from zero if `state` is None."""
-        if state is not None:
-            mean, log_sigma, after = self._session.run(None, {"windows": windows, "state": state})
-            return mean, log_sigma, after
-        parts = []
-        for begin in range(0, len(windows), BATCH):
-            feed = {"windows": windows[begin : begin + BATCH]}
-            if self.is_recurrent:
-                shape = (2, len(feed["windows"]), self._state_size)
-                feed["state"] = np.zeros(shape, np.float32)
-            parts.append(self._session.run(["displacement", "log_sigma"], feed))
-        mean, log_sigma = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return mean, log_sigma, None
+    def _run(self, windows: Float32Array, state: Float32Array) -> Answer:
+        feed = {"windows": windows, "state": state} if self.state_size else {"windows": windows}
+        mean, log_sigma, *after = self._session.run(None, feed)
+        return mean, log_sigma, *(after or [state])
 
     def described(self, path: Path) -> Card:
         """Return the card in an exported graph, after checking the graph.

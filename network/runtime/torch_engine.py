@@ -13,43 +13,31 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from stario.network.architectures import build_network
 from stario.network.baselines.parts import ConvNorm
 from stario.network.displacement import DisplacementNetwork
-from stario.network.runtime.engines import BATCH, Answer, Float32Array
+from stario.network.runtime.engines import Answer, Engine, Float32Array
 
 
-class TorchEngine:
+class TorchEngine(Engine):
     """PyTorch on the CPU; batch norms are folded into the convolutions before them.
 
     Args:
         network: network with its weights; it is left in evaluation mode. Later changes of the
             weights do not affect the engine.
-
-    Attributes:
-        training_form: that network, whose weights are trainable.
     """
 
     def __init__(self, network: DisplacementNetwork) -> None:
-        self.training_form = network.eval()
-        self._network = _folded(network)
+        self._trainable, self._network = network.eval(), _folded(network)
+        self.state_size = network.state_size
 
     @property
-    def is_recurrent(self) -> bool:
-        """Whether the network is recurrent: it carries a state from window to window."""
-        return self._network.is_recurrent
+    def training_form(self) -> DisplacementNetwork:
+        """The network itself."""
+        return self._trainable
 
-    def first_state(self) -> Float32Array:
-        """Return the state (2, 1, H) of a recurrent network before the first window."""
-        return self._network.first_state(1).numpy()
-
-    def run(self, windows: Float32Array, state: Float32Array | None = None) -> Answer:
-        """Run windows (B, 6, 200), each from its own state, or from zero if `state` is None."""
-        tensor = torch.from_numpy(windows)
+    def _run(self, windows: Float32Array, state: Float32Array) -> Answer:
+        given = (windows, state) if self.state_size else (windows,)
         with torch.inference_mode():
-            if state is not None:
-                mean, log_sigma, after = self._network.step(tensor, torch.from_numpy(state))
-                return mean.numpy(), log_sigma.numpy(), after.numpy()
-            parts = [self._network(part) for part in torch.split(tensor, BATCH)]
-        mean = torch.cat([m for m, _ in parts])
-        return mean.numpy(), torch.cat([s for _, s in parts]).numpy(), None
+            mean, log_sigma, *after = self._network(*map(torch.from_numpy, given))
+        return mean.numpy(), log_sigma.numpy(), after[0].numpy() if after else state
 
 
 def trainable(architecture: str, state: Mapping[str, Tensor]) -> DisplacementNetwork:

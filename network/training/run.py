@@ -215,7 +215,7 @@ class TrainingRun:
             windows = windows.view(-1, successive, *windows.shape[1:])
         mixed = self.config.precision == "bfloat16"
         with torch.autocast(self.device.type, torch.bfloat16, enabled=mixed):
-            mean, log_sigma = self._shared(windows)
+            mean, log_sigma, *_ = self._shared(windows)
         return mean.view(-1, 3), log_sigma.view(-1, 3)
 
     def _check_finite(self, loss: float, norm: float) -> None:

@@ -94,14 +94,11 @@ class ValidationSet:
         # Windows that begin within the same second belong to separate series, as at inference.
         batch = WINDOW_SAMPLES // self.stride if network.is_recurrent else _BATCH
         for stream in self.streams:
-            state = network.first_state(batch) if network.is_recurrent else None
+            after: list[torch.Tensor] = []
             for cut, target in self._cut(stream, batch):
                 windows = torch.from_numpy(cut).to(self.device)
-                if state is None:
-                    mean, log_sigma = network(windows)
-                else:
-                    before = state[:, : len(windows)].contiguous()
-                    mean, log_sigma, state = network.step(windows, before)
+                before = (state[:, : len(windows)].contiguous() for state in after)
+                mean, log_sigma, *after = network(windows, *before)
                 errors.append(mean.cpu() - torch.from_numpy(target))
                 log_sigmas.append(log_sigma.cpu())
         return torch.cat(errors).double().numpy(), torch.cat(log_sigmas).double().numpy()
@@ -160,7 +157,7 @@ class ValidationSet:
     def _leg_error(self, network: DisplacementNetwork, batch: LegBatch) -> float:
         batch = batch.to(self.device)
         windows = batch.windows if network.is_recurrent else batch.windows.flatten(0, 1)
-        mean, log_sigma = network(windows)
+        mean, log_sigma, *_ = network(windows)
         shape = batch.windows.shape[:2]
         return float(leg_loss(mean.view(*shape, 3), log_sigma.view(*shape, 3), batch)[1])
 

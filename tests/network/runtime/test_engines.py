@@ -69,7 +69,7 @@ def engine(network):
 def assert_same(engine: Engine, network: DisplacementNetwork, windows: Float32Array) -> None:
     with torch.inference_mode():
         expected = network(torch.from_numpy(windows))
-    for a, b in zip(engine.run(windows)[:2], expected, strict=True):
+    for a, b in zip(engine.run(windows), expected, strict=False):
         np.testing.assert_allclose(a, b.numpy(), rtol=0.0, atol=1e-5)
 
 
