@@ -37,6 +37,9 @@ class OnnxEngine(Engine):
         tensors: tensors of the weights, if the graph does not contain them, by name.
         architecture: name of the network that they belong to.
 
+    Attributes:
+        session: session of ONNX Runtime.
+
     Raises:
         Exception: ONNX Runtime's own, which have no common base: graph or tensors do not fit.
     """
@@ -64,10 +67,10 @@ class OnnxEngine(Engine):
             if tensor.dtype == np.float32
         }
         options.add_external_initializers(list(self._given), list(self._given.values()))
-        self._session = onnxruntime.InferenceSession(
+        self.session = onnxruntime.InferenceSession(
             graph, options, providers=["CPUExecutionProvider"]
         )
-        shapes = {node.name: node.shape for node in self._session.get_inputs()}
+        shapes = {node.name: node.shape for node in self.session.get_inputs()}
         self.state_size = int(shapes["state"][2]) if "state" in shapes else 0
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -88,23 +91,8 @@ class OnnxEngine(Engine):
 
     def _run(self, windows: Float32Array, state: Float32Array) -> Answer:
         feed = {"windows": windows, "state": state} if self.state_size else {"windows": windows}
-        mean, log_sigma, *after = self._session.run(None, feed)
+        mean, log_sigma, *after = self.session.run(None, feed)
         return mean, log_sigma, *(after or [state])
-
-    def described(self, path: Path) -> Card:
-        """Return the card in an exported graph, after checking the graph.
-
-        Args:
-            path: file that the graph is from, for the error.
-
-        Raises:
-            WeightsError: the graph was not written by `export_onnx`, or was changed since.
-        """
-        metadata = self._session.get_modelmeta().custom_metadata_map
-        if CARD_KEY not in metadata:
-            raise WeightsError(path, CARD_KEY, "no such metadata", "a file from `stario export`")
-        _check_graph(self._session, path)
-        return parse_card(metadata[CARD_KEY], path)
 
 
 def load_onnx(path: Path) -> tuple[OnnxEngine, Card]:
@@ -128,7 +116,11 @@ def load_onnx(path: Path) -> tuple[OnnxEngine, Card]:
         found = str(error).splitlines()[0]
         expected = f"a complete ONNX file that ONNX Runtime {onnxruntime.__version__} can read"
         raise WeightsError(path, "graph", found, expected) from error
-    return engine, engine.described(path)
+    metadata = engine.session.get_modelmeta().custom_metadata_map
+    if CARD_KEY not in metadata:
+        raise WeightsError(path, CARD_KEY, "no such metadata", "a file from `stario export`")
+    _check_graph(engine.session, path)
+    return engine, parse_card(metadata[CARD_KEY], path)
 
 
 def weights_engine(architecture: str, content: bytes) -> OnnxEngine | None:

@@ -91,9 +91,7 @@ def train(
             config, sampler, leg_samplers(config, legs, sampler), material, folder, processes
         )
         recurrent = run.network.is_recurrent
-        held_out = ValidationSet(
-            validation, run.device, config, validation_legs, chosen_by_legs, recurrent
-        )
+        held_out = ValidationSet(validation, config, validation_legs, chosen_by_legs, recurrent)
         before: dict[str, float] = {}
         if start_from is not None:
             run.start_from(start_from)

@@ -52,7 +52,6 @@ class ValidationSet:
 
     Args:
         streams: held-out streams with full truth.
-        device: device of the evaluated networks.
         config: recipe that determines how stretches of weak truth are drawn.
         legs: held-out streams with weak truth.
         chosen_by_legs: whether legs alone select the weights, if there are any.
@@ -65,13 +64,12 @@ class ValidationSet:
     def __init__(
         self,
         streams: Sequence[WorldStream],
-        device: torch.device,
         config: TrainingConfig,
         legs: Sequence[LegStream] = (),
         chosen_by_legs: bool = False,
         is_recurrent: bool = False,
     ) -> None:
-        self.device, self._chosen_by_legs = device, chosen_by_legs
+        self._chosen_by_legs = chosen_by_legs
         self.legs = _drawn_once(legs, config)
         # Hours of data are cut sparsely: the variety of motion matters, not the number of windows.
         length = sum(len(stream) for stream in streams)
@@ -96,7 +94,7 @@ class ValidationSet:
         for stream in self.streams:
             after: list[torch.Tensor] = []
             for cut, target in self._cut(stream, batch):
-                windows = torch.from_numpy(cut).to(self.device)
+                windows = torch.from_numpy(cut).to(network.gravity.device)
                 before = (state[:, : len(windows)].contiguous() for state in after)
                 mean, log_sigma, *after = network(windows, *before)
                 errors.append(mean.cpu() - torch.from_numpy(target))
@@ -155,7 +153,7 @@ class ValidationSet:
 
     @torch.inference_mode()
     def _leg_error(self, network: DisplacementNetwork, batch: LegBatch) -> float:
-        batch = batch.to(self.device)
+        batch = batch.to(network.gravity.device)
         windows = batch.windows if network.is_recurrent else batch.windows.flatten(0, 1)
         mean, log_sigma, *_ = network(windows)
         shape = batch.windows.shape[:2]

@@ -27,7 +27,7 @@ from stario.sequences.errors import ConfigError
 def test_training_that_spoils_its_initial_weights_gives_a_warning(model, tmp_path, caplog):
     run(tmp_path / "spoilt", replace(TINY, epochs=1, rate=0.1), start_from=load_model(model))
     assert "times those of the initial weights" in caplog.text
-    held_out = ValidationSet(VALIDATION, torch.device("cpu"), TINY)
+    held_out = ValidationSet(VALIDATION, TINY)
     assert not held_out.worse({"c": 1.0, "d": 1.0}, {"c": 0.5, "d": 1.5})
     words = held_out.worse({"c": 1.0, "d": 1.0}, {"c": 0.5, "d": 4.0})
     assert "1.41 times those of the initial weights (d: 4 instead of 1)" in words

@@ -237,13 +237,12 @@ def test_long_validation_data_are_thinned_by_minutes_for_recurrent_networks(
     """Of seven minutes in two recordings, the first of each and every n-th after it are used."""
     monkeypatch.setattr("stario.network.training.validation._DENSE_SAMPLES", 200 * dense)
     streams = [swaying("a", 0.3, 300.0), swaying("b", 0.3, 120.0)]
-    cpu = torch.device("cpu")
-    held_out = ValidationSet(streams, cpu, TINY, is_recurrent=True)
+    held_out = ValidationSet(streams, TINY, is_recurrent=True)
     assert held_out.stride == stride
     seconds = sum(len(stream) for stream in held_out.streams) / 200
     assert seconds == 60 * minutes
     assert list(dict.fromkeys(held_out.names)) == ["a", "b"]
-    others = ValidationSet(streams, cpu, TINY)
+    others = ValidationSet(streams, TINY)
     assert others.streams is streams
     assert others.stride == 20 * max(1, 420 // dense)
 

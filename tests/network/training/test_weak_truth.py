@@ -220,7 +220,7 @@ def test_a_recurrent_network_is_trained_on_stretches_in_rows(tmp_path, monkeypat
     monkeypatch.setattr(
         DisplacementNetwork,
         "forward",
-        lambda self, windows: shapes.append(tuple(windows.shape)) or original(self, windows),
+        lambda self, *given: shapes.append(tuple(given[0].shape)) or original(self, *given),
     )
     run(tmp_path / "rows")
     assert shapes[0] == (3, 10, 6, 200)  # two rows with full truth, one stretch of a track
@@ -242,13 +242,11 @@ def test_invalid_positions_and_those_of_another_clock_make_no_legs():
 def test_legs_of_short_walks_can_select_the_weights_alone():
     [legs] = leg_streams(with_positions("positions", 0.1))
     part = replace(legs, imu_N=legs.imu_N[: 8 * 200], facing_N=legs.facing_N[: 8 * 200])
-    held_out = ValidationSet(
-        world_streams(WALK), torch.device("cpu"), TrainingConfig(), [part], chosen_by_legs=True
-    )
+    held_out = ValidationSet(world_streams(WALK), TrainingConfig(), [part], chosen_by_legs=True)
     assert list(held_out.legs) == ["positions"]  # of eight seconds, though training uses twelve
     errors = {"walk": 5.0, "positions": 0.25}
     assert held_out.selection_error(errors) == 0.25
-    combined = ValidationSet(world_streams(WALK), torch.device("cpu"), TrainingConfig(), [part])
+    combined = ValidationSet(world_streams(WALK), TrainingConfig(), [part])
     assert combined.selection_error(errors) == 2.625
 
 
@@ -288,7 +286,7 @@ def test_a_recording_shorter_than_two_legs_is_not_told_to_change_the_recipe():
 def test_validation_skips_legs_without_information(caplog):
     """Their error would be 0, the best possible."""
     held_out = ValidationSet(
-        world_streams(WALK), torch.device("cpu"), TrainingConfig(),
+        world_streams(WALK), TrainingConfig(),
         leg_streams(with_positions("waypoints", 25.0)), chosen_by_legs=True,
     )  # fmt: skip
     assert held_out.legs == {}
