@@ -213,6 +213,10 @@ def peak_bytes(work: Callable[[], object]) -> int:
     return counter.peak
 
 
+def _storages(tree: Any) -> list[torch.UntypedStorage]:
+    return [t.untyped_storage() for t in tree_leaves(tree) if isinstance(t, torch.Tensor)]
+
+
 class _Counter(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Counter of the bytes of all new tensors' storages that have not been freed."""
 
@@ -226,9 +230,10 @@ class _Counter(TorchDispatchMode):  # type: ignore[no-untyped-call]
         self, function: Any, types: Any, args: Any = (), kwargs: Any = None
     ) -> Any:
         result = function(*args, **(kwargs or {}))
-        for value in tree_leaves(result):
-            if isinstance(value, torch.Tensor):
-                self._add(value.untyped_storage())
+        existing = [storage._cdata for storage in _storages((args, kwargs))]  # seen by views
+        for storage in _storages(result):
+            if storage._cdata not in existing:
+                self._add(storage)
         return result
 
     def _add(self, storage: torch.UntypedStorage) -> None:

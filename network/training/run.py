@@ -238,7 +238,8 @@ class TrainingRun:
         decay = min(self.config.average, (1 + self.step) / (10 + self.step))
         # One kernel instead of one for each tensor.
         torch._foreach_lerp_(self._moving[0], self._moving[1], 1.0 - decay)
-        torch._foreach_copy_(self._counts[0], self._counts[1])
+        if self._counts[0]:  # those of batch norms
+            torch._foreach_copy_(self._counts[0], self._counts[1])
 
     def validate(self, training_error: float, held_out: ValidationSet) -> EpochReport:
         """Validate an epoch in the leading process, which shares the error with the others.

@@ -62,6 +62,8 @@ def test_peak_memory_is_the_most_that_is_allocated_at_once():
 
     assert peak_bytes(work) == 3 * 4000
     assert peak_bytes(lambda: None) == 0
+    layer, row = nn.Linear(1000, 100), torch.zeros(1, 1000)  # multiplied by a view of its weights
+    assert peak_bytes(lambda: layer(row)) == 400
 
 
 def test_rows_hold_counts_times_and_memory(tmp_path, monkeypatch):

@@ -135,14 +135,6 @@ def test_later_training_does_not_affect_an_engine():
     assert np.array_equal(engine.run(windows)[0], before)
 
 
-def test_results_do_not_depend_on_the_size_of_batches(engine):
-    windows = random_windows(7)
-    whole = engine.run(windows)[0]
-    for sizes in ([1, 1, 1, 4], [2, 5], [1, 6]):
-        parts = [engine.run(part)[0] for part in np.split(windows, np.cumsum(sizes)[:-1])]
-        np.testing.assert_allclose(np.concatenate(parts), whole, rtol=0.0, atol=1e-5)
-
-
 def test_threads_do_not_affect_each_other(engine):
     batches = [random_windows(2) * np.float32(scale) for scale in (0.5, 1.0, 2.0, 3.0)]
     alone = [engine.run(batch)[0] for batch in batches]

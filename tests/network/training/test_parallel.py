@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import safetensors.torch
 import torch
+import training_runs
 
 from stario.network.training.parallel import is_leader, workers
 from stario.sequences.errors import ConfigError
@@ -16,21 +17,12 @@ from stario.sequences.errors import ConfigError
 SCRIPT = """
 import copy, sys
 from pathlib import Path
-import numpy as np
 import torch
 from stario.network.training.augment import Augmentation
 from stario.network.training.config import TrainingConfig
 from stario.network.training import run
 from stario.network.training.train import train
-from stario.sequences.windows import WorldStream
-
-def swaying(name, phase, seconds):
-    t = np.arange(round(200 * seconds)) / 200.0
-    way = np.stack([np.sin(np.pi * t + phase), 0.5 * np.sin(np.pi * t), 0.0 * t], axis=1)
-    imu_W = np.zeros((len(t), 6), np.float32)
-    imu_W[:, 3:] = -(np.pi**2) * way + [0.0, 0.0, 9.80665]
-    facing_W = np.tile(np.float32([1.0, 0.0]), (len(t), 1))
-    return WorldStream(name, imu_W, way.astype(np.float32), facing_W)
+from training_runs import swaying
 
 if sys.argv[2] == "plain":  # no batch norm: what two processes compute is the same number
     torch.manual_seed(0)
@@ -48,10 +40,13 @@ train(config, [swaying("a", 0.3, 20.0)], [1.0], [swaying("b", 0.8, 6.0)], Path(s
 """
 
 
+TESTS = str(Path(training_runs.__file__).parent)
+
+
 def launched(script: Path, folder: Path, processes: int, network: str, stop: int = 0) -> int:
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
     command += ["--nproc-per-node", str(processes), str(script), str(folder), network, str(stop)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": TESTS}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300)
     assert stop or done.returncode == 0, done.stderr
     return done.returncode
