@@ -1,11 +1,6 @@
 """Public names of `stario.fusion`, which are imported on first use."""
 
 from stario.fusion.backends import BackendName as BackendName
-from stario.fusion.config import FilterConfig as FilterConfig
-from stario.fusion.config import GraphConfig as GraphConfig
-from stario.fusion.config import NavigatorConfig as NavigatorConfig
-from stario.fusion.config import PlaceConfig as PlaceConfig
-from stario.fusion.config import read_config as read_config
 from stario.fusion.evaluation.compare import Comparison as Comparison
 from stario.fusion.evaluation.compare import compare as compare
 from stario.fusion.evaluation.compare import compare_recordings as compare_recordings
@@ -17,13 +12,6 @@ from stario.fusion.evaluation.tracks import inertial_track as inertial_track
 from stario.fusion.evaluation.tracks import network_track as network_track
 from stario.fusion.filter.initial import PriorPose as PriorPose
 from stario.fusion.filter.kalman import UpdateResult as UpdateResult
-from stario.fusion.fix_file import read_fixes as read_fixes
-from stario.fusion.fixes import Fix as Fix
-from stario.fusion.fixes import FixOutcome as FixOutcome
-from stario.fusion.fixes import position_fix as position_fix
-from stario.fusion.fixes import velocity_fix as velocity_fix
-from stario.fusion.fixes import yaw_fix as yaw_fix
-from stario.fusion.health import Health as Health
 from stario.fusion.imu.preintegration import Segment as Segment
 from stario.fusion.imu.preintegration import preintegrate as preintegrate
 from stario.fusion.imu.stateful import Predictor as Predictor
@@ -31,8 +19,20 @@ from stario.fusion.imu.stateful import WindowDisplacement as WindowDisplacement
 from stario.fusion.live.run import LiveServer as LiveServer
 from stario.fusion.navigator import Navigator as Navigator
 from stario.fusion.recording import PreprocessedRecording as PreprocessedRecording
-from stario.fusion.state import ContinuousPose as ContinuousPose
-from stario.fusion.state import Innovations as Innovations
-from stario.fusion.state import NavState as NavState
-from stario.fusion.state import SmoothedPose as SmoothedPose
-from stario.fusion.state import Track as Track
+from stario.fusion.values.config import FilterConfig as FilterConfig
+from stario.fusion.values.config import GraphConfig as GraphConfig
+from stario.fusion.values.config import NavigatorConfig as NavigatorConfig
+from stario.fusion.values.config import PlaceConfig as PlaceConfig
+from stario.fusion.values.config import read_config as read_config
+from stario.fusion.values.fix_file import read_fixes as read_fixes
+from stario.fusion.values.fixes import Fix as Fix
+from stario.fusion.values.fixes import FixOutcome as FixOutcome
+from stario.fusion.values.fixes import position_fix as position_fix
+from stario.fusion.values.fixes import velocity_fix as velocity_fix
+from stario.fusion.values.fixes import yaw_fix as yaw_fix
+from stario.fusion.values.health import Health as Health
+from stario.fusion.values.state import ContinuousPose as ContinuousPose
+from stario.fusion.values.state import Innovations as Innovations
+from stario.fusion.values.state import NavState as NavState
+from stario.fusion.values.state import SmoothedPose as SmoothedPose
+from stario.fusion.values.state import Track as Track

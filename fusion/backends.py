@@ -15,7 +15,6 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
-from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.filter import estimator
 from stario.fusion.filter.estimates import Estimate, nav_states
 from stario.fusion.filter.estimator_state import EstimatorState
@@ -24,18 +23,19 @@ from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import ASSUMED, GYRO_BIAS
 from stario.fusion.filter.map_frame import YAW_UNKNOWN
 from stario.fusion.filter.record import Record, innovations_of
-from stario.fusion.fixes import Accepted, Fix, FixQueue, fix_list
-from stario.fusion.floors import FloorChange, floor_changes
 from stario.fusion.graph import fixed_lag
 from stario.fusion.graph.batch import smooth
 from stario.fusion.graph.covariances import with_actual_covariances
 from stario.fusion.graph.whitening import IndeterminateError
-from stario.fusion.health import Health, SampleCounts
 from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.place import known_fixes
 from stario.fusion.recording import PreprocessedRecording, Progress
-from stario.fusion.state import NavState, SmoothedPose, Track, track_from_states
+from stario.fusion.values.config import FilterConfig, NavigatorConfig
+from stario.fusion.values.fixes import Accepted, Fix, FixQueue, fix_list
+from stario.fusion.values.floors import FloorChange, floor_changes
+from stario.fusion.values.health import Health, SampleCounts
+from stario.fusion.values.state import NavState, SmoothedPose, Track, track_from_states
 from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 

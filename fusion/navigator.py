@@ -17,16 +17,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stario.fusion.backends import BACKENDS, BackendName, track_recording
-from stario.fusion.checked import Vector, hectopascals, seconds, three
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.initial import PriorPose
-from stario.fusion.fixes import Fix, FixOutcome, position_fix, velocity_fix, yaw_fix
-from stario.fusion.health import Health
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.recording import PreprocessedRecording, Progress, preprocess, silent
 from stario.fusion.snapshot import check_same, pack, unpack
-from stario.fusion.state import ContinuousPose, NavState, SmoothedPose, Track, copied
 from stario.fusion.stream import Stream
+from stario.fusion.values.checked import Vector, hectopascals, seconds, three
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.fixes import Fix, FixOutcome, position_fix, velocity_fix, yaw_fix
+from stario.fusion.values.health import Health
+from stario.fusion.values.state import ContinuousPose, NavState, SmoothedPose, Track, copied
 from stario.sequences.arrays import check_choice, check_type
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence

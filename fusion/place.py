@@ -6,10 +6,10 @@ import logging
 
 import numpy as np
 
-from stario.fusion.config import PlaceConfig
-from stario.fusion.fixes import UNKNOWN_HEIGHT, Fix, position_fix
 from stario.fusion.recording import PreprocessedRecording
-from stario.fusion.satellites import satellite_fixes
+from stario.fusion.values.config import PlaceConfig
+from stario.fusion.values.fixes import UNKNOWN_HEIGHT, Fix, position_fix
+from stario.fusion.values.satellites import satellite_fixes
 from stario.sequences.errors import InputError
 from stario.sequences.geodesy import Georeference
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack

@@ -10,8 +10,6 @@ from time import perf_counter
 
 import numpy as np
 
-from stario.fusion.config import NavigatorConfig
-from stario.fusion.health import SampleCounts
 from stario.fusion.imu.direction import Complex, Direction, direction, weighted_force
 from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
@@ -22,6 +20,8 @@ from stario.fusion.imu.stateful import (
     WindowDisplacement,
     displacements_of,
 )
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.health import SampleCounts
 from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 from stario.sequences.findings import warn

@@ -26,7 +26,8 @@ FORMAT, VERSION = "stario snapshot", 33
 
 _PACKAGES = ("fusion.filter", "fusion.graph", "fusion.imu")
 _MODULES = """
-fusion.config fusion.fixes fusion.health fusion.state sequences.attitude.levelling sequences.noise
+fusion.values.config fusion.values.fixes fusion.values.health fusion.values.state
+sequences.attitude.levelling sequences.noise
 """
 """Packages and modules whose classes a snapshot may hold: plain data, rebuilt from attributes."""
 

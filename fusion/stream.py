@@ -9,16 +9,16 @@ from __future__ import annotations
 from typing import Any
 
 from stario.fusion.backends import BACKENDS, BackendName, StreamState
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.initial import PriorPose
-from stario.fusion.fixes import Fix, FixOutcome, FixQueue
-from stario.fusion.health import Health
 from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
 from stario.fusion.imu.intervals import ImuInterval, Sample
 from stario.fusion.imu.stateful import Predictor, StatefulInference, displacements_of
 from stario.fusion.imu.units import check_start
-from stario.fusion.state import ContinuousPose, NavState, advanced, copied
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.fixes import Fix, FixOutcome, FixQueue
+from stario.fusion.values.health import Health
+from stario.fusion.values.state import ContinuousPose, NavState, advanced, copied
 from stario.sequences.errors import InputError
 
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stario.fusion.health import Health
 from stario.fusion.report.health import health_findings
+from stario.fusion.values.health import Health
 from stario.sequences.errors import InputError
 from stario.sequences.findings import Finding, verdict
 from stario.sequences.inspection.checks import check_units

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from stario.fusion.backends import BackendName
-    from stario.fusion.config import NavigatorConfig
     from stario.fusion.imu.stateful import Predictor
+    from stario.fusion.values.config import NavigatorConfig
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
 

@@ -47,7 +47,7 @@ def compare(
     """
     from stario.fusion.evaluation.compare import TRACKS, compare_recordings, demonstration
     from stario.fusion.evaluation.results import check_folder, metrics_dict, write_comparison
-    from stario.fusion.fix_file import read_fixes
+    from stario.fusion.values.fix_file import read_fixes
     from stario.sequences.arrays import check_choice
     from stario.sequences.datasets.batch import without_skipped
     from stario.sequences.lazy import optional_package

@@ -13,8 +13,8 @@ from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
-    from stario.fusion.config import NavigatorConfig
     from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
+    from stario.fusion.values.config import NavigatorConfig
     from stario.network.model import DisplacementModel
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.splits import ListEntry

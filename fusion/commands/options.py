@@ -15,7 +15,7 @@ import typer
 from stario.sequences.errors import InputError, StarioError
 
 if TYPE_CHECKING:
-    from stario.fusion.config import NavigatorConfig
+    from stario.fusion.values.config import NavigatorConfig
     from stario.network.model import DisplacementModel
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
@@ -218,7 +218,7 @@ class Estimator:
         Raises:
             InputError: there is a declination, but the magnetometer is not used.
         """
-        from stario.fusion.config import NavigatorConfig, read_config
+        from stario.fusion.values.config import NavigatorConfig, read_config
 
         config = NavigatorConfig() if self.config is None else read_config(self.config)
         chosen = config.filter

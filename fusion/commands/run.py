@@ -39,8 +39,8 @@ def run(
     """Fuse each recording into a smooth track with attitude, velocity, biases and covariance."""
     from stario.fusion.evaluation.compare import measured
     from stario.fusion.evaluation.results import write_run
-    from stario.fusion.fix_file import check_within, read_fixes
     from stario.fusion.navigator import Navigator
+    from stario.fusion.values.fix_file import check_within, read_fixes
 
     also = _further_files(report, tiles, view)
     network = estimating.network()

@@ -9,7 +9,6 @@ from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from stario.fusion.config import NavigatorConfig, PlaceConfig
 from stario.fusion.evaluation.known_positions import (
     MIN_POSITIONS,
     fitted_georeference,
@@ -23,14 +22,15 @@ from stario.fusion.evaluation.tracks import (
     true_poses,
 )
 from stario.fusion.evaluation.verdict import recording_verdict
-from stario.fusion.fix_file import check_within
-from stario.fusion.fixes import Fix, fix_list
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.place import compared_with, used_words
 from stario.fusion.recording import Progress, silent
 from stario.fusion.report.health import LOST_YAW_SIGMA
-from stario.fusion.state import Track
+from stario.fusion.values.config import NavigatorConfig, PlaceConfig
+from stario.fusion.values.fix_file import check_within
+from stario.fusion.values.fixes import Fix, fix_list
+from stario.fusion.values.state import Track
 from stario.sequences.accuracy.metrics import CONVENTIONS, Alignment, align, evaluate_track
 from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.arrays import check_choice, check_type, shown

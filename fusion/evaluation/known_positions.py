@@ -9,7 +9,7 @@ import numpy as np
 from stario.fusion.evaluation.displacement_error import fit_yaw_and_position, known_truth, planar
 from stario.fusion.imu.direction import Complex
 from stario.fusion.report.health import TURNED_RAD
-from stario.fusion.state import Track
+from stario.fusion.values.state import Track
 from stario.sequences.accuracy.metrics import align, pose_errors
 from stario.sequences.arrays import even_grid, interpolated, rms, scatter
 from stario.sequences.findings import Finding

@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from stario.fusion.state import Track
+from stario.fusion.values.state import Track
 from stario.sequences.drawing.figures import split_at_gaps, split_at_nan
 from stario.sequences.files import atomic_write
 from stario.sequences.geodesy import Georeference

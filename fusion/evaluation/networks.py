@@ -14,12 +14,12 @@ from pathlib import Path
 
 import pandas as pd
 
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import distinct_name
 from stario.fusion.evaluation.scores import Spread, joined, records, scored, table
 from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude, true_poses
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
+from stario.fusion.values.config import NavigatorConfig
 from stario.network.model import DisplacementModel
 from stario.network.runtime.cost import table_cost
 from stario.sequences.accuracy.metrics import (

@@ -13,10 +13,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import METRIC_WORDS, RECORDING_WORDS, TRACKS, Comparison
 from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.evaluation.map_files import on_map, write_geojson, write_gpx
+from stario.fusion.values.config import NavigatorConfig
 from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.plan import plan_view
 from stario.sequences.drawing.plots import error_over_time, innovations

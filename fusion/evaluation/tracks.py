@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.imu.stateful import Predictor, StatefulInference
 from stario.fusion.recording import PreprocessedRecording
-from stario.fusion.state import Track
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.state import Track
 from stario.sequences.arrays import check_type, integral, interpolated, runs, trapezoids
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.clean_samples import clean_samples

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from stario.fusion.evaluation.known_positions import position_findings
 from stario.fusion.report.health import health_findings
-from stario.fusion.state import Track
+from stario.fusion.values.state import Track
 from stario.sequences.findings import Finding, verdict
 from stario.sequences.inspection.report import Inspection, inspect_recording
 from stario.sequences.sequence import ImuSequence

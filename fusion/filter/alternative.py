@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.state import changed
+from stario.fusion.values.state import changed
 from stario.sequences.sequence import FloatArray
 
 _FITS_TO_DROP = 4

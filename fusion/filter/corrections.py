@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.lie import twist
+from stario.fusion.values.lie import twist
 
 MIN_METRES, MIN_TURN = 1.0, math.radians(10.0)
 """Distance [m] or turn about the vertical [rad] from which a correction is recorded."""

@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stario.fusion.config import FilterConfig
 from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS, EkfState
 from stario.fusion.filter.kalman import gauss_markov
 from stario.fusion.imu.stateful import slope_variance
-from stario.fusion.state import changed
+from stario.fusion.values.config import FilterConfig
+from stario.fusion.values.state import changed
 from stario.sequences.sequence import FloatArray
 
 WHITE, DRIFTING, LASTING = 0.35, 0.25, 0.15

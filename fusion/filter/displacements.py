@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stario.fusion.config import FilterConfig
 from stario.fusion.filter.alternative import AlternativeHypothesis, Hypotheses
 from stario.fusion.filter.correlated_errors import displacement_errors
 from stario.fusion.filter.ekf import Updated, update_displacement
@@ -17,8 +16,9 @@ from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.innovations import InnovationStatistics
 from stario.fusion.filter.kalman import UpdateResult
 from stario.fusion.imu.stateful import WindowDisplacement
-from stario.fusion.lie import yaw_rotation
-from stario.fusion.state import changed
+from stario.fusion.values.config import FilterConfig
+from stario.fusion.values.lie import yaw_rotation
+from stario.fusion.values.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 

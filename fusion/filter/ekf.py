@@ -11,8 +11,6 @@ import math
 
 import numpy as np
 
-from stario.fusion.checked import check_covariance, checked, checked_rotation
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.correlated_errors import DisplacementErrors, with_considered_propagated
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import (
@@ -32,8 +30,10 @@ from stario.fusion.filter.kalman import Linear, UpdateResult, predict, update
 from stario.fusion.imu.gap import gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.lie import yaw_twist
-from stario.fusion.state import NavState, changed
+from stario.fusion.values.checked import check_covariance, checked, checked_rotation
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.lie import yaw_twist
+from stario.fusion.values.state import NavState, changed
 from stario.sequences.attitude.rotations import tilt_aligning
 from stario.sequences.attitude.so3 import log_so3
 from stario.sequences.errors import InputError

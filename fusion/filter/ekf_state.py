@@ -21,8 +21,8 @@ from stario.fusion.filter.jacobians import (
     plain_covariance,
     symmetric,
 )
-from stario.fusion.lie import exp_times
-from stario.fusion.state import NavState, changed
+from stario.fusion.values.lie import exp_times
+from stario.fusion.values.state import NavState, changed
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.fusion.filter.jacobians import ACTUAL, CLONED, plain_covariance
-from stario.fusion.state import NavState, SmoothedPose
+from stario.fusion.values.state import NavState, SmoothedPose
 from stario.sequences.sequence import FloatArray
 
 _CHUNK = 2000

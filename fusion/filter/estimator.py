@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter import displacements, ekf, height, magnetic, map_frame
 from stario.fusion.filter.correlated_errors import ACCEL_SHARE
 from stario.fusion.filter.ekf_state import EkfState
@@ -20,12 +19,13 @@ from stario.fusion.filter.kalman import UpdateResult
 from stario.fusion.filter.map_frame import Mapped
 from stario.fusion.filter.record import Record
 from stario.fusion.filter.zero_velocity import ZeroVelocity, update_zero_velocity
-from stario.fusion.fixes import Accepted, Fix, by_time
 from stario.fusion.imu.gap import INTERPOLATED
 from stario.fusion.imu.intervals import ImuInterval, Start, split_at_fixes
 from stario.fusion.imu.preintegration import Segment, segment_of
 from stario.fusion.imu.stateful import WindowDisplacement
-from stario.fusion.state import changed
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.fixes import Accepted, Fix, by_time
+from stario.fusion.values.state import changed
 
 
 def begin(

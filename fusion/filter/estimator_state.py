@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stario.fusion.config import FilterConfig
 from stario.fusion.filter.alternative import AlternativeHypothesis, Hypotheses
 from stario.fusion.filter.corrections import correction
 from stario.fusion.filter.ekf_state import EkfState
@@ -22,11 +21,12 @@ from stario.fusion.filter.innovations import InnovationStatistics
 from stario.fusion.filter.magnetic import MagneticReference
 from stario.fusion.filter.record import UpdateCounts
 from stario.fusion.filter.zero_velocity import Stillness
-from stario.fusion.fixes import Fix
-from stario.fusion.health import Health, SampleCounts
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
 from stario.fusion.imu.stateful import WindowDisplacement
-from stario.fusion.state import NavState, SmoothedPose, changed
+from stario.fusion.values.config import FilterConfig
+from stario.fusion.values.fixes import Fix
+from stario.fusion.values.health import Health, SampleCounts
+from stario.fusion.values.state import NavState, SmoothedPose, changed
 from stario.sequences.windows import WINDOW_SECONDS
 
 

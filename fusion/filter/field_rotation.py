@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.state import changed
+from stario.fusion.values.state import changed
 from stario.sequences.sequence import FloatArray
 
 _MIN_ROTATION, _MAX_STEP = 0.2, 1.1

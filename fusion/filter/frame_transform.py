@@ -17,9 +17,9 @@ import numpy as np
 
 from stario.fusion.filter.jacobians import CORE, POSITION
 from stario.fusion.filter.planar_alignment import PlanarAlignment, without_yaw
-from stario.fusion.fixes import Fix
-from stario.fusion.lie import UNKNOWN_YAW, e3_cross
-from stario.fusion.state import NavState, changed
+from stario.fusion.values.fixes import Fix
+from stario.fusion.values.lie import UNKNOWN_YAW, e3_cross
+from stario.fusion.values.state import NavState, changed
 from stario.sequences.sequence import FloatArray
 
 _HORIZONTAL = np.diag([1.0, 1.0, 0.0])

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.config import MIN_PRIOR_SIGMA, FilterConfig
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, GYRO_BIAS
 from stario.fusion.filter.kalman import corrected
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
-from stario.fusion.state import changed
+from stario.fusion.values.config import MIN_PRIOR_SIGMA, FilterConfig
+from stario.fusion.values.state import changed
 from stario.sequences.sequence import FloatArray
 
 _DEGREES_OF_FREEDOM = 3.0

@@ -23,7 +23,7 @@ from stario.fusion.filter.kalman import Linear, UpdateResult, update
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.imu.barometer import HeightSample
 from stario.fusion.imu.stateful import WindowDisplacement
-from stario.fusion.state import changed
+from stario.fusion.values.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS

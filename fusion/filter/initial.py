@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.checked import checked, checked_rotation
-from stario.fusion.config import MIN_PRIOR_SIGMA, NavigatorConfig
 from stario.fusion.filter.ekf import initialised
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.imu.intervals import ImuInterval, Start
-from stario.fusion.lie import UNKNOWN_YAW, yaw_rotation
-from stario.fusion.state import NavState
+from stario.fusion.values.checked import checked, checked_rotation
+from stario.fusion.values.config import MIN_PRIOR_SIGMA, NavigatorConfig
+from stario.fusion.values.lie import UNKNOWN_YAW, yaw_rotation
+from stario.fusion.values.state import NavState
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 from stario.sequences.settings import check_number

@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from stario.fusion.config import FilterConfig
 from stario.fusion.filter.kalman import UpdateResult
 from stario.fusion.imu.preintegration import in_steps
-from stario.fusion.state import changed
+from stario.fusion.values.config import FilterConfig
+from stario.fusion.values.state import changed
 
 GAIN, FIRST_GAIN = 0.05, 0.2
 """Step per displacement of a logarithm that is estimated from innovations: in the long run, and for

@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.gap import gap_covariance
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.lie import twist
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.lie import twist
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.sequence import FloatArray
 

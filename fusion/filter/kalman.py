@@ -19,7 +19,7 @@ from scipy.linalg.lapack import dposv, dpotrf
 
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CORE, Block, symmetric
-from stario.fusion.state import changed
+from stario.fusion.values.state import changed
 from stario.sequences.sequence import FloatArray
 
 

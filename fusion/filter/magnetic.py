@@ -24,10 +24,10 @@ from stario.fusion.filter import ekf
 from stario.fusion.filter.ekf_state import EkfState, FieldState
 from stario.fusion.filter.field_rotation import FieldRotation
 from stario.fusion.filter.kalman import UpdateResult, gauss_markov
-from stario.fusion.fixes import Fix, yaw_fix
 from stario.fusion.imu.intervals import SAME_TIME
-from stario.fusion.lie import yaw_twist
-from stario.fusion.state import changed
+from stario.fusion.values.fixes import Fix, yaw_fix
+from stario.fusion.values.lie import yaw_twist
+from stario.fusion.values.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.linalg import norm
 
-from stario.fusion.config import FilterConfig
 from stario.fusion.filter import ekf
 from stario.fusion.filter.ekf import Updated
 from stario.fusion.filter.ekf_state import EkfState
@@ -29,9 +28,10 @@ from stario.fusion.filter.planar_alignment import (
     turn_from_fix,
     without_yaw,
 )
-from stario.fusion.fixes import Fix
-from stario.fusion.lie import UNKNOWN_YAW, about_vertical
-from stario.fusion.state import changed
+from stario.fusion.values.config import FilterConfig
+from stario.fusion.values.fixes import Fix
+from stario.fusion.values.lie import UNKNOWN_YAW, about_vertical
+from stario.fusion.values.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stario.fusion.fixes import Fix
-from stario.fusion.lie import yaw_twist
-from stario.fusion.state import NavState
+from stario.fusion.values.fixes import Fix
+from stario.fusion.values.lie import yaw_twist
+from stario.fusion.values.state import NavState
 from stario.sequences.sequence import FloatArray
 
 

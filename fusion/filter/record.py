@@ -15,12 +15,12 @@ from stario.fusion.filter.gained import Gained
 from stario.fusion.filter.height import resting_in_lift, yielding
 from stario.fusion.filter.kalman import UpdateResult
 from stario.fusion.filter.zero_velocity import ZeroVelocity
-from stario.fusion.fixes import Accepted, Fix
-from stario.fusion.health import Health, SampleCounts
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.imu.stateful import WindowDisplacement
-from stario.fusion.state import Innovations, NavState, changed
+from stario.fusion.values.fixes import Accepted, Fix
+from stario.fusion.values.health import Health, SampleCounts
+from stario.fusion.values.state import Innovations, NavState, changed
 
 
 class Record(NamedTuple):

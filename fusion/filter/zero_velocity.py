@@ -18,11 +18,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stario.fusion.config import FilterConfig
 from stario.fusion.filter.ekf import Updated
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.kalman import Linear, update
 from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.values.config import FilterConfig
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.inspection.stillness import looks_still, scatter_bound
 from stario.sequences.noise import PHONE_NOISE

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.frame_transform import FrameTransform, MapFrameState, frame_rotation
 from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.filter.record import Record
@@ -16,8 +15,9 @@ from stario.fusion.graph.factors import GyroBias, SamePlace
 from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.imu.barometer import CLIMB_DELAY
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.lie import UNKNOWN_YAW
-from stario.fusion.state import NavState
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.lie import UNKNOWN_YAW
+from stario.fusion.values.state import NavState
 from stario.sequences.attitude.so3 import exp_so3, log_so3
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS

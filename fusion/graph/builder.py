@@ -7,12 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.height import WEATHER_WALK
 from stario.fusion.filter.initial import tilt_sigma
 from stario.fusion.filter.record import Record
 from stario.fusion.filter.zero_velocity import ZeroVelocity
-from stario.fusion.fixes import Fix
 from stario.fusion.graph.factors import (
     Displacement,
     GyroBias,
@@ -30,7 +28,9 @@ from stario.fusion.imu.gap import gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval, split_at
 from stario.fusion.imu.preintegration import Segment, segment_of
 from stario.fusion.imu.stateful import WindowDisplacement
-from stario.fusion.state import NavState
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.fixes import Fix
+from stario.fusion.values.state import NavState
 from stario.sequences.attitude.so3 import exp_so3, log_so3
 from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import WINDOW_SECONDS

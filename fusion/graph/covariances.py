@@ -8,7 +8,7 @@ import numpy as np
 
 from stario.fusion.filter.estimates import Estimate, plain_covariances
 from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, symmetric
-from stario.fusion.state import NavState, changed
+from stario.fusion.values.state import NavState, changed
 from stario.sequences.sequence import FloatArray
 
 _MIN_VARIANCE, _MIN_EIGENVALUE = 1e-16, 1e-12

@@ -22,8 +22,8 @@ from gtsam.symbol_shorthand import B, O, V, X
 from stario.fusion.filter.jacobians import plain_covariance, yaw_jacobian
 from stario.fusion.graph.covariances import root_information
 from stario.fusion.graph.keyframe_state import KeyframeState
-from stario.fusion.lie import e3_cross, twist, yaw_rotation
-from stario.fusion.state import NavState
+from stario.fusion.values.lie import e3_cross, twist, yaw_rotation
+from stario.fusion.values.state import NavState
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.sequence import FloatArray
 

@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.filter import estimator
 from stario.fusion.filter.ekf import initialised, propagate
 from stario.fusion.filter.ekf_state import EkfState
@@ -26,16 +25,17 @@ from stario.fusion.filter.gained import Gained
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import ASSUMED
 from stario.fusion.filter.record import Record
-from stario.fusion.fixes import Accepted, Fix
 from stario.fusion.graph.bearing import Bearing
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.covariances import with_actual_covariances
 from stario.fusion.graph.factors import GyroBias
 from stario.fusion.graph.whitening import IndeterminateError
-from stario.fusion.health import Health, SampleCounts
 from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.imu.stateful import WindowDisplacement
-from stario.fusion.state import NavState, changed
+from stario.fusion.values.config import FilterConfig, NavigatorConfig
+from stario.fusion.values.fixes import Accepted, Fix
+from stario.fusion.values.health import Health, SampleCounts
+from stario.fusion.values.state import NavState, changed
 from stario.sequences.sequence import FloatArray
 
 _WIDER, _NARROWER = 1.2, 0.99

@@ -10,8 +10,8 @@ from gtsam.symbol_shorthand import B, O, V, X
 from scipy.linalg import block_diag
 
 from stario.fusion.filter.jacobians import invariant_from_local
-from stario.fusion.lie import log_se23
-from stario.fusion.state import NavState
+from stario.fusion.values.lie import log_se23
+from stario.fusion.values.state import NavState
 from stario.sequences.sequence import FloatArray
 
 

@@ -21,8 +21,6 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from scipy.linalg import block_diag
 
-from stario.fusion.checked import check_covariance
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.graph.factors import Prior, Term
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.marginals import LinearSolution
@@ -31,7 +29,9 @@ from stario.fusion.graph.whitening import IndeterminateError, Whitened, linear_f
 from stario.fusion.imu.gap import gap_covariance, gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.state import NavState
+from stario.fusion.values.checked import check_covariance
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.state import NavState
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray

@@ -12,7 +12,7 @@ from gtsam.symbol_shorthand import B, V, X
 from stario.fusion.filter.jacobians import yaw_jacobian
 from stario.fusion.graph.factors import Between, Linearised
 from stario.fusion.graph.keyframe_state import KeyframeState
-from stario.fusion.lie import about_vertical, twist
+from stario.fusion.values.lie import about_vertical, twist
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.sequence import FloatArray
 

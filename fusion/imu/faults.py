@@ -27,8 +27,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from stario.fusion.health import Stopped
 from stario.fusion.imu.intervals import NO_FLAGS, Flags, Sample
+from stario.fusion.values.health import Stopped
 from stario.sequences.clean_samples import MIN_RATE
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.constant_values import shaken, tilting

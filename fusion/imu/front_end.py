@@ -20,8 +20,6 @@ import statistics
 
 import numpy as np
 
-from stario.fusion.config import NavigatorConfig
-from stario.fusion.health import SampleCounts
 from stario.fusion.imu.barometer import HEIGHT_SECONDS, HeightBuffer
 from stario.fusion.imu.buffers import FieldBuffer
 from stario.fusion.imu.faults import (
@@ -40,6 +38,8 @@ from stario.fusion.imu.intervals import (
 )
 from stario.fusion.imu.stateful import WindowBuffer
 from stario.fusion.imu.units import SensorCheck, warn_of_field
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.health import SampleCounts
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray

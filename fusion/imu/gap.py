@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from stario.fusion.config import MIN_WALK, NavigatorConfig
 from stario.fusion.imu.intervals import ImuInterval
-from stario.fusion.lie import UNKNOWN_YAW, e3_cross
+from stario.fusion.values.config import MIN_WALK, NavigatorConfig
+from stario.fusion.values.lie import UNKNOWN_YAW, e3_cross
 from stario.sequences.attitude.levelling import integrate
 from stario.sequences.sequence import FloatArray
 

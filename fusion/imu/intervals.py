@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stario.fusion.fixes import Fix
 from stario.fusion.imu.barometer import HeightSample
-from stario.fusion.state import changed
+from stario.fusion.values.fixes import Fix
+from stario.fusion.values.state import changed
 from stario.sequences.attitude.levelling import GravityStart
 from stario.sequences.sequence import FloatArray
 

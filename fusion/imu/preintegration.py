@@ -23,8 +23,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from stario.fusion.config import MIN_WALK, NavigatorConfig
 from stario.fusion.imu.intervals import Flags, ImuInterval
+from stario.fusion.values.config import MIN_WALK, NavigatorConfig
 from stario.sequences.arrays import rms
 from stario.sequences.attitude.so3 import skew
 from stario.sequences.noise import ImuNoise

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.filter.map_frame import MAX_PRIOR_YAW_SIGMA
-from stario.fusion.floors import FloorChange, floor_changes
-from stario.fusion.state import NavState
+from stario.fusion.values.floors import FloorChange, floor_changes
+from stario.fusion.values.state import NavState
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.sequence import FloatArray
 

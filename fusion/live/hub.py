@@ -75,12 +75,10 @@ class Hub:
         sessions = [self._session(batch.device) for batch in known]
         for session in sessions:
             session.received = received
-        return sum(
-            [
-                await self._in_thread(session, session.take, batch, received, accel_factor)
-                for session, batch in zip(sessions, known, strict=True)
-            ]
-        )
+        count = 0
+        for session, batch in zip(sessions, known, strict=True):
+            count += await self._in_thread(session, session.take, batch, received, accel_factor)
+        return count
 
     async def command(self, device: str, name: str, **values: float) -> None:
         """Run a command on a device's session: start, stop, zero or fix.

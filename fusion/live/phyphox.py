@@ -85,7 +85,7 @@ class Phyphox:
             OSError: the phone does not respond.
         """
         if not self._buffers:
-            self._buffers = buffers_of(self._get("/config"))
+            self._buffers = _buffers_of(self._get("/config"))
         response = self._get(f"/get?{'&'.join(self._query())}")
         status, buffers = response.get("status"), response.get("buffer")
         if not isinstance(status, dict) or not isinstance(buffers, dict):
@@ -158,7 +158,7 @@ class Phyphox:
             return object_from("phyphox", response.read(_MAX_RESPONSE_BYTES))
 
 
-def buffers_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
+def _buffers_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
     """Return the names of the buffers of time and values by sensor from phyphox's `/config`.
 
     Raises:

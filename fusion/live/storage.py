@@ -20,9 +20,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO
 
-from stario.fusion.fixes import Fix
 from stario.fusion.live.merging import Sample
 from stario.fusion.live.payload import BAROMETER, LOCATION, MAG, Reading
+from stario.fusion.values.fixes import Fix
 from stario.sequences.errors import InputError
 from stario.sequences.readers.columns import MAGNETIC_HEADER, PRESSURE_HEADER, SATELLITE_HEADER
 

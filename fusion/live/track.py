@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from stario.fusion.fixes import Fix, position_fix
-from stario.fusion.floors import floor_at
 from stario.fusion.live.drawn import DisplayedTrack
 from stario.fusion.live.merging import MAX_WAIT, Merger, Sample
 from stario.fusion.live.payload import LOCATION, MAG, Batch, Reading
@@ -21,7 +19,9 @@ from stario.fusion.live.places import Earth, Places
 from stario.fusion.live.storage import LiveFile
 from stario.fusion.navigator import Navigator
 from stario.fusion.report.health import health_findings
-from stario.fusion.state import NavState
+from stario.fusion.values.fixes import Fix, position_fix
+from stario.fusion.values.floors import floor_at
+from stario.fusion.values.state import NavState
 from stario.sequences.errors import InputError
 from stario.sequences.findings import verdict
 from stario.sequences.time_order import MAX_IMU_GAP

@@ -18,7 +18,6 @@ from itertools import product
 from pathlib import Path
 from time import process_time
 
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.displacement_error import (
     block_sums,
     known_truth,
@@ -38,6 +37,7 @@ from stario.fusion.paper_table.training import (
     run_recipe,
     train_run,
 )
+from stario.fusion.values.config import NavigatorConfig
 from stario.network.architectures import ARCHITECTURES, architecture
 from stario.network.model import DisplacementModel, load_model
 from stario.network.training.config import TrainingConfig

@@ -10,9 +10,9 @@ import math
 from collections.abc import Iterator
 from itertools import pairwise
 
-from stario.fusion.health import Health
 from stario.fusion.imu.front_end import BRIDGED
 from stario.fusion.imu.gap import INTERPOLATED
+from stario.fusion.values.health import Health
 from stario.sequences.attitude.levelling import START_SECONDS
 from stario.sequences.findings import TOO_EARLY, Finding
 

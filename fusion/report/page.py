@@ -31,7 +31,7 @@ from stario.fusion.report.panels import (
     style,
 )
 from stario.fusion.report.series import track_series, trajectory_series
-from stario.fusion.state import Track
+from stario.fusion.values.state import Track
 from stario.sequences.accuracy.metrics import moved
 from stario.sequences.drawing.figures import clock
 from stario.sequences.drawing.text_table import figure

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
 
-from stario.fusion.floors import FloorChange
-from stario.fusion.state import Innovations
+from stario.fusion.values.floors import FloorChange
+from stario.fusion.values.state import Innovations
 from stario.sequences.arrays import evenly_spaced, interpolated
 from stario.sequences.drawing.figures import (
     BLUE,

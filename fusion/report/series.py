@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from stario.fusion.state import Track
+from stario.fusion.values.state import Track
 from stario.sequences.arrays import evenly_spaced, interpolated
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.drawing.figures import indices_after_gaps

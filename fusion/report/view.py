@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.compare import Comparison
-from stario.fusion.state import Track
+from stario.fusion.values.state import Track
 from stario.sequences.drawing.figures import split_at_gaps, split_at_nan
 from stario.sequences.errors import InputError
 from stario.sequences.lazy import optional_package

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from stario.fusion import Navigator
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import Comparison, compare, demonstration
 from stario.fusion.report.page import write_report
-from stario.fusion.state import Innovations, Track
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.state import Innovations, Track
 from stario.network import load_model
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.geodesy import Georeference

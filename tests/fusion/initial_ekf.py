@@ -9,7 +9,7 @@ import numpy as np
 
 from stario.fusion.filter import ekf, kalman
 from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.state import NavState, changed
+from stario.fusion.values.state import NavState, changed
 from stario.sequences.attitude.so3 import exp_so3
 
 ZERO = np.zeros(3)

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.recording import cut_recording
+from stario.fusion.values.config import NavigatorConfig
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.sequence import BoolArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from stario.fusion import Navigator, NavState, Track
-from stario.fusion.config import FilterConfig, NavigatorConfig
+from stario.fusion.values.config import FilterConfig, NavigatorConfig
 from stario.sequences.accuracy.metrics import Alignment, evaluate_track
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.noise import ImuNoise

@@ -6,7 +6,7 @@ import numpy as np
 from support import CONFIG
 
 from stario.fusion import Navigator, NavState
-from stario.fusion.state import MAX_STEP, advanced
+from stario.fusion.values.state import MAX_STEP, advanced
 
 
 def state_at(time: float, x: float, map_frame: int = 0) -> NavState:

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from support import CONFIG, GRAPH, ate, stream, stream_deviation, swivelled
 
 from stario.fusion import Navigator, NavState, PriorPose, Track
-from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.tracks import inertial_track
+from stario.fusion.values.config import FilterConfig, NavigatorConfig
 from stario.sequences.accuracy.metrics import align, pose_errors
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import InputError

@@ -6,8 +6,8 @@ from recorded import DATA
 from support import stream
 
 from stario.fusion import Navigator
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import compare, measure
+from stario.fusion.values.config import NavigatorConfig
 from stario.network import load_model
 from stario.sequences import ImuSequence, read_recording
 

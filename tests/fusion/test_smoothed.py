@@ -8,7 +8,7 @@ from support import WHITE_ERRORS as ERRORS
 from support import stream
 
 from stario.fusion import Navigator, SmoothedPose
-from stario.fusion.fixes import position_fix
+from stario.fusion.values.fixes import position_fix
 from stario.sequences.accuracy.metrics import align, pose_errors
 from stario.sequences.sequence import ImuSequence, Trajectory
 

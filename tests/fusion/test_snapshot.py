@@ -8,9 +8,9 @@ import pytest
 from support import stream
 
 from stario.fusion import Navigator, NavigatorConfig, NavState, PriorPose
-from stario.fusion.config import FilterConfig
 from stario.fusion.filter.alternative import AlternativeHypothesis
 from stario.fusion.snapshot import VERSION, plain, unpack
+from stario.fusion.values.config import FilterConfig
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
 

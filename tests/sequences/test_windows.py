@@ -5,8 +5,8 @@ import pytest
 from cut_windows import windows_of
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.recording import cut_recording
+from stario.fusion.values.config import NavigatorConfig
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.clean_samples import clean_samples
 from stario.sequences.errors import InputError

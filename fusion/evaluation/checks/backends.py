@@ -13,7 +13,6 @@ import numpy as np
 import pandas as pd
 
 from stario.fusion.backends import BackendName
-from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.checks.faults import (
     DummyPredictor,
     matched_config,
@@ -27,7 +26,8 @@ from stario.fusion.graph import fixed_lag
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.recording import PreprocessedRecording
-from stario.fusion.state import Track, track_from_states
+from stario.fusion.values.config import FilterConfig, NavigatorConfig
+from stario.fusion.values.state import Track, track_from_states
 from stario.network.model import DisplacementModel
 from stario.network.runtime.survey import BATCHES, median_milliseconds
 from stario.network.runtime.torch_engine import TorchEngine

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.scores import joined, scored, wide
 from stario.fusion.filter import estimator
 from stario.fusion.filter.correlated_errors import ACCEL_SHARE, displacement_errors
@@ -27,8 +26,9 @@ from stario.fusion.filter.jacobians import ACTUAL, CORE
 from stario.fusion.filter.record import innovations_of
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.stateful import WindowDisplacement, slope_variance
-from stario.fusion.lie import log_se23, yaw_rotation
 from stario.fusion.recording import Progress, cut_recording, silent
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.lie import log_se23, yaw_rotation
 from stario.sequences.accuracy.nees import nees_bounds
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError

@@ -19,15 +19,15 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.backends import BackendName
-from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.compare import TRACK_OF
 from stario.fusion.evaluation.scores import Column, joined, rows_of, scored
 from stario.fusion.evaluation.tracks import true_poses
-from stario.fusion.health import Health
 from stario.fusion.imu.stateful import Predictor, WindowDisplacement
 from stario.fusion.navigator import Navigator
 from stario.fusion.recording import PreprocessedRecording
-from stario.fusion.state import Track
+from stario.fusion.values.config import FilterConfig, NavigatorConfig
+from stario.fusion.values.health import Health
+from stario.fusion.values.state import Track
 from stario.sequences.accuracy.metrics import align, evaluate_track
 from stario.sequences.arrays import even_grid, interpolated
 from stario.sequences.attitude.rotations import about_z, yaw_of

@@ -21,7 +21,6 @@ import numpy as np
 import pandas as pd
 
 from stario.fusion.backends import BackendName
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks.faults import drops, gap
 from stario.fusion.evaluation.compare import TRACK_OF, Metrics, measure
 from stario.fusion.evaluation.displacement_error import known_truth
@@ -36,12 +35,13 @@ from stario.fusion.evaluation.scores import (
     table,
 )
 from stario.fusion.evaluation.tracks import network_track, true_poses
-from stario.fusion.fixes import Fix, position_fix
-from stario.fusion.floors import floor_at
 from stario.fusion.imu.stateful import Predictor
-from stario.fusion.lie import yaw_twist
 from stario.fusion.navigator import Navigator
-from stario.fusion.state import Track
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.fixes import Fix, position_fix
+from stario.fusion.values.floors import floor_at
+from stario.fusion.values.lie import yaw_twist
+from stario.fusion.values.state import Track
 from stario.sequences.accuracy.metrics import pose_errors
 from stario.sequences.accuracy.nees import nees
 from stario.sequences.arrays import even_grid

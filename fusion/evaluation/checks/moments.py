@@ -15,7 +15,6 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.backends import BackendName
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.compare import TRACK_OF
 from stario.fusion.evaluation.displacement_error import fit_yaw_and_position, known_truth, planar
 from stario.fusion.evaluation.scores import Column, geometric_mean, joined, parts, scored, table
@@ -23,7 +22,8 @@ from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.direction import Complex
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
-from stario.fusion.state import Track
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.state import Track
 from stario.sequences.arrays import interpolated
 from stario.sequences.attitude.rotations import GyroIntegral
 from stario.sequences.attitude.stacks import composed

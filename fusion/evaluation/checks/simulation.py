@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 from scipy.signal import butter, sosfiltfilt, welch
 
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks.fusion import fitted_error
 from stario.fusion.evaluation.compare import Metrics, measure
 from stario.fusion.evaluation.known_positions import length_ratio, true_path
@@ -20,6 +19,7 @@ from stario.fusion.evaluation.scores import Column, scored, table
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
+from stario.fusion.values.config import NavigatorConfig
 from stario.sequences.arrays import even_grid, generator, interpolated, rms
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, ImuSequence

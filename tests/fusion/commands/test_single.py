@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from stario.fusion.commands import options
 from stario.fusion.commands.cli import app
 from stario.fusion.commands.common import origin_of
-from stario.fusion.config import read_config
+from stario.fusion.values.config import read_config
 from stario.network.model import load_model
 from stario.sequences.conventions import with_axes
 from stario.sequences.readers import FORMATS

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation import compare as compare_module
 from stario.fusion.evaluation.compare import (
     TRACKS,
@@ -20,7 +19,8 @@ from stario.fusion.evaluation.compare import (
 )
 from stario.fusion.evaluation.results import write_comparison, write_run
 from stario.fusion.evaluation.text import scores_of, summary, summary_table
-from stario.fusion.fixes import position_fix
+from stario.fusion.values.config import FilterConfig, NavigatorConfig
+from stario.fusion.values.fixes import position_fix
 from stario.sequences.accuracy.metrics import evaluate_track
 from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.readers.tum import read_tum

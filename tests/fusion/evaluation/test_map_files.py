@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.known_positions import fitted_georeference
 from stario.fusion.evaluation.map_files import on_map, write_geojson, write_gpx
-from stario.fusion.state import Track
+from stario.fusion.values.state import Track
 from stario.sequences.geodesy import Georeference
 from stario.sequences.sequence import PositionTrack, Trajectory
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.figures import figures, write_table
 from stario.fusion.evaluation.networks import (
     METRICS,
@@ -18,6 +17,7 @@ from stario.fusion.evaluation.networks import (
     networks_on,
 )
 from stario.fusion.evaluation.scores import scored, values
+from stario.fusion.values.config import NavigatorConfig
 from stario.network.model import weights_named
 from stario.sequences.errors import InputError, WeightsError
 

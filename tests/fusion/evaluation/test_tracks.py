@@ -9,7 +9,6 @@ import pytest
 from recorded import DATA
 from scipy.interpolate import make_interp_spline
 
-from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.pedestrian import (
     WEINBERG_CONSTANT,
     pedestrian_path,
@@ -23,6 +22,7 @@ from stario.fusion.evaluation.tracks import (
     true_poses,
 )
 from stario.fusion.navigator import Navigator
+from stario.fusion.values.config import FilterConfig, NavigatorConfig
 from stario.sequences.accuracy.metrics import align, evaluate_track, pose_errors
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.clean_samples import clean_samples

@@ -9,14 +9,14 @@ from initial_ekf import Driven
 from support import stream
 
 from stario.fusion import Navigator
-from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.checks.faults import faults, matched_walk, run_faults
 from stario.fusion.evaluation.scores import wide
 from stario.fusion.filter.alternative import AlternativeHypothesis, Hypotheses
 from stario.fusion.filter.displacements import update_with
 from stario.fusion.filter.innovations import InnovationStatistics
 from stario.fusion.imu.stateful import WindowDisplacement
-from stario.fusion.state import NavState
+from stario.fusion.values.config import FilterConfig, NavigatorConfig
+from stario.fusion.values.state import NavState
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu

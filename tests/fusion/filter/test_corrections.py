@@ -7,8 +7,8 @@ from told import health_verdict
 
 from stario.fusion import Navigator, NavigatorConfig
 from stario.fusion.filter.corrections import correction
-from stario.fusion.health import Health
-from stario.fusion.lie import about_vertical
+from stario.fusion.values.health import Health
+from stario.fusion.values.lie import about_vertical
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import pytest
 from initial_ekf import Driven
 
 from stario.fusion import Navigator, NavigatorConfig
-from stario.fusion.config import FilterConfig
 from stario.fusion.filter import estimator, map_frame
 from stario.fusion.filter.correlated_errors import (
     DRIFTING,
@@ -22,11 +21,12 @@ from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.innovations import MAX_LEVEL, MIN_LEVEL, InnovationStatistics
 from stario.fusion.filter.kalman import UpdateResult
 from stario.fusion.filter.map_frame import Mapped
-from stario.fusion.fixes import position_fix
 from stario.fusion.graph.covariances import with_actual_covariances
 from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.recording import cut_recording
-from stario.fusion.state import NavState
+from stario.fusion.values.config import FilterConfig
+from stario.fusion.values.fixes import position_fix
+from stario.fusion.values.state import NavState
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence

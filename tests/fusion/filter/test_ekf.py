@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from initial_ekf import Driven, initialised
 
-from stario.fusion.config import FilterConfig
 from stario.fusion.filter.correlated_errors import displacement_errors
 from stario.fusion.filter.ekf import clone
 from stario.fusion.filter.ekf import initialised as filter_state
 from stario.fusion.filter.estimates import plain_covariances
 from stario.fusion.imu.preintegration import Segment, preintegrate
-from stario.fusion.state import NavState
+from stario.fusion.values.config import FilterConfig
+from stario.fusion.values.state import NavState
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise

@@ -6,7 +6,6 @@ from initial_ekf import Driven, initialised
 from scipy.spatial.transform import Rotation
 from se23 import exp_se23
 
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.jacobians import (
     displacement_jacobian,
     plain_covariance,
@@ -15,7 +14,8 @@ from stario.fusion.filter.jacobians import (
     velocity_jacobian,
     yaw_jacobian,
 )
-from stario.fusion.lie import yaw_twist
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.lie import yaw_twist
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.attitude.so3 import exp_so3
 

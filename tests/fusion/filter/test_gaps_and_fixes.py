@@ -13,8 +13,8 @@ from support import stream, swivelled
 from stario.fusion import Navigator, PriorPose, Track
 from stario.fusion.evaluation.checks.fusion import true_fixes
 from stario.fusion.filter.frame_transform import FrameTransform
-from stario.fusion.fixes import position_fix, yaw_fix
-from stario.fusion.state import NavState
+from stario.fusion.values.fixes import position_fix, yaw_fix
+from stario.fusion.values.state import NavState
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence
 

@@ -5,7 +5,7 @@ import pytest
 from initial_ekf import Driven
 
 from stario.fusion.filter.gyro_bias import GyroBiasPrior, with_prior_replaced
-from stario.fusion.state import NavState
+from stario.fusion.values.state import NavState
 
 
 def ekf_with_measured_bias(sigma: float) -> Driven:

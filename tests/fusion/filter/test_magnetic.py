@@ -11,7 +11,6 @@ from support import stream_deviation
 from told import health_lines
 
 from stario.fusion import Navigator, NavState, PriorPose
-from stario.fusion.config import FilterConfig
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import bearing_jacobian
 from stario.fusion.filter.magnetic import (
@@ -22,8 +21,9 @@ from stario.fusion.filter.magnetic import (
     update_bearing,
     with_field,
 )
-from stario.fusion.fixes import position_fix
 from stario.fusion.navigator import Navigator as Stream
+from stario.fusion.values.config import FilterConfig
+from stario.fusion.values.fixes import position_fix
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import ConfigError

@@ -9,8 +9,8 @@ from support import GRAPH as CONFIG
 from support import stream
 
 from stario.fusion import Navigator, NavState, PriorPose
-from stario.fusion.fixes import Fix, position_fix, yaw_fix
-from stario.fusion.lie import yaw_twist
+from stario.fusion.values.fixes import Fix, position_fix, yaw_fix
+from stario.fusion.values.lie import yaw_twist
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence
 

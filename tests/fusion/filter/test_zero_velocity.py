@@ -8,10 +8,10 @@ import pytest
 from recorded import DATA
 
 from stario.fusion import Navigator, PriorPose, Track
-from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.filter.zero_velocity import Stillness
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.recording import cut_recording
+from stario.fusion.values.config import FilterConfig, NavigatorConfig
 from stario.network import load_model
 from stario.sequences import read_recording
 from stario.sequences.attitude.so3 import exp_so3

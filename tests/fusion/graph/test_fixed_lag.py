@@ -10,13 +10,13 @@ from support import GRAPH as CONFIG
 from support import stream
 
 from stario.fusion import Navigator, NavState
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.graph import fixed_lag
 from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.graph.whitening import IndeterminateError
-from stario.fusion.lie import yaw_twist
 from stario.fusion.recording import PreprocessedRecording
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.lie import yaw_twist
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.sequence import ImuSequence

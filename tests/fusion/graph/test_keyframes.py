@@ -12,17 +12,17 @@ from support import stream
 from told import health_lines
 
 from stario.fusion import Navigator, backends
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.filter.initial import PriorPose
-from stario.fusion.fixes import position_fix, velocity_fix, yaw_fix
 from stario.fusion.graph import keyframes
 from stario.fusion.graph.batch import smooth
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.graph.whitening import IndeterminateError
 from stario.fusion.imu.preintegration import preintegrate
-from stario.fusion.lie import yaw_twist
-from stario.fusion.state import NavState
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.fixes import position_fix, velocity_fix, yaw_fix
+from stario.fusion.values.lie import yaw_twist
+from stario.fusion.values.state import NavState
 from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import ConfigError, InputError

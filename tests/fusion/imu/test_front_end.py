@@ -8,11 +8,11 @@ import pytest
 from cut_windows import windows_of
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.config import FilterConfig, NavigatorConfig
-from stario.fusion.health import SampleCounts
 from stario.fusion.imu.front_end import FrontEnd
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.recording import cut_recording
+from stario.fusion.values.config import FilterConfig, NavigatorConfig
+from stario.fusion.values.health import SampleCounts
 from stario.sequences.attitude.levelling import LevelledAttitude
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 from support import GRAPH, swivelled
 
 from stario.fusion import Navigator
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.imu.buffers import FieldBuffer
 from stario.fusion.imu.gap import INTERPOLATED, gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.recording import cut_recording
+from stario.fusion.values.config import NavigatorConfig
 from stario.sequences import PHONE_IMU, generate_walk, simulate_imu
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.sequence import ImuSequence, Magnetometer

@@ -14,7 +14,7 @@ from stario.fusion.imu.preintegration import (
     preintegrate,
     segment_of,
 )
-from stario.fusion.lie import log_se23
+from stario.fusion.values.lie import log_se23
 from stario.sequences.attitude.so3 import exp_so3, log_so3, skew
 from stario.sequences.noise import ImuNoise
 

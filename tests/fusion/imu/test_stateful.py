@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.imu.direction import Direction, direction, weighted_force
 from stario.fusion.imu.stateful import StatefulInference
 from stario.fusion.navigator import Navigator
 from stario.fusion.recording import cut_recording
+from stario.fusion.values.config import FilterConfig, NavigatorConfig
 from stario.sequences import PHONE_IMU, generate_walk, simulate_imu
 from stario.sequences.errors import InputError
 from stario.sequences.levelled_stream import TICK_SAMPLES, TICKS_PER_SECOND, levelled_streams

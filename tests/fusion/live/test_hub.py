@@ -10,7 +10,7 @@ import pytest
 from stario.fusion.live import hub as hub_module
 from stario.fusion.live.drawn import DisplayedTrack
 from stario.fusion.live.hub import MAX_DEVICES, SILENT_SECONDS, Viewer
-from stario.fusion.state import NavState
+from stario.fusion.values.state import NavState
 from stario.sequences import read_recording
 from stario.sequences.attitude.rotations import about_z
 

@@ -145,19 +145,25 @@ def test_malformed_pushes_between_others_are_refused_and_change_nothing(client, 
     assert one.track.drawn.points == other.track.drawn.points
 
 
-def test_a_full_disk_is_reported_and_a_fix_that_cannot_be_written_moves_nothing(
-    client, hub, pushes, monkeypatch
-):
-    bodies = pushes(seconds=4.0)
-    send(client, bodies[:-1])
+def test_a_full_disk_is_reported_and_affects_no_other(client, hub, pushes, monkeypatch):
+    append = LiveFile.append
+
+    def only_one_is_full(file, *arguments):
+        (full_disk if "full" in file.path.name else append)(file, *arguments)
+
+    monkeypatch.setattr(LiveFile, "append", only_one_is_full)
+    full, phone = (send(client, pushes(device, seconds=1.0)) for device in ("full", "phone"))
+    assert (full[-1].status_code, "No space" in full[-1].json()["error"]) == (507, True)
+    assert all(answer.is_success for answer in phone)
+
+
+def test_a_fix_that_cannot_be_written_moves_nothing(client, hub, pushes, monkeypatch):
+    send(client, pushes(seconds=4.0))
     track = hub.sessions["phone"].track
     points = list(track.drawn.points)
     monkeypatch.setattr(LiveFile, "append_fix", full_disk)
     assert command(client, "fix", x=50.0, y=-20.0, sigma=0.1).status_code == 507
     assert track.drawn.points == points
-    monkeypatch.setattr(LiveFile, "append", full_disk)
-    (answer,) = send(client, bodies[-1:])
-    assert (answer.status_code, "No space" in answer.json()["error"]) == (507, True)
 
 
 def test_fixes_after_a_gap_leave_the_track_before_it_unchanged(client, hub, pushes):

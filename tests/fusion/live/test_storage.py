@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 
 from stario.fusion import read_fixes
-from stario.fusion.fixes import position_fix
 from stario.fusion.live import storage
 from stario.fusion.live import track as track_module
 from stario.fusion.live.payload import GYRO, parse_push
 from stario.fusion.live.session import Session
 from stario.fusion.live.storage import LiveFile
+from stario.fusion.values.fixes import position_fix
 from stario.sequences import InputError, read_recording
 
 from .conftest import full_disk

@@ -7,8 +7,8 @@ from recorded import DATA
 from told import health_verdict as findings
 
 from stario.fusion import Health, Navigator
-from stario.fusion.health import SampleCounts
 from stario.fusion.imu.gap import INTERPOLATED
+from stario.fusion.values.health import SampleCounts
 from stario.network import load_model
 from stario.sequences import read_recording
 from stario.sequences.findings import Finding

@@ -11,7 +11,7 @@ pytest.importorskip("plotly", reason="pip install '.[report]'")
 
 from stario.fusion.report.panels import motion_panels
 from stario.fusion.report.series import ellipse, track_series, trajectory_series
-from stario.fusion.state import Track
+from stario.fusion.values.state import Track
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.sequence import Trajectory
 

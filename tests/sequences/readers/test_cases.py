@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from recorded import CASES
 
-from stario.fusion.config import read_config
-from stario.fusion.fix_file import read_fixes
+from stario.fusion.values.config import read_config
+from stario.fusion.values.fix_file import read_fixes
 from stario.sequences.errors import StarioError
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.inspection.report import inspect_recording

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from stario.fusion.config import FilterConfig, NavigatorConfig
 from stario.fusion.evaluation.checks.consistency import consistency, consistency_text, summary
+from stario.fusion.values.config import FilterConfig, NavigatorConfig
 from stario.sequences.accuracy.nees import nees_bounds
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise

@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from stario.fusion import Navigator, NavigatorConfig, NavState
-from stario.fusion.config import FilterConfig
+from stario.fusion.values.config import FilterConfig
 from stario.sequences.errors import InputError
 
 CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=5))

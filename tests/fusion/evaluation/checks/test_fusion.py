@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 from support import CONFIG
 
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks.fusion import (
     end_shift_table,
     end_shifts,
@@ -18,9 +17,10 @@ from stario.fusion.evaluation.checks.fusion import (
     true_fixes,
 )
 from stario.fusion.evaluation.scores import joined, scored, values, wide
-from stario.fusion.health import Health
 from stario.fusion.navigator import Navigator
-from stario.fusion.state import Track
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.health import Health
+from stario.fusion.values.state import Track
 from stario.network.model import load_model
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError

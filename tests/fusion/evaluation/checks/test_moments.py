@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from stario.fusion.config import NavigatorConfig
 from stario.fusion.evaluation.checks import moments
 from stario.fusion.evaluation.checks.moments import largest_correction, moment_costs, moment_table
 from stario.fusion.evaluation.checks.simulation import (
@@ -21,7 +20,8 @@ from stario.fusion.evaluation.checks.simulation import (
     simulated_walk,
 )
 from stario.fusion.evaluation.scores import joined, scored, values, wide
-from stario.fusion.state import Track
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.state import Track
 from stario.network.model import load_model
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError

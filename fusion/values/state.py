@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.health import Health
+from stario.fusion.values.health import Health
 from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 from stario.sequences.geodesy import Georeference

@@ -8,8 +8,8 @@ import pytest
 import support
 
 from stario.fusion import Navigator, Track, position_fix
-from stario.fusion.config import PlaceConfig
-from stario.fusion.satellites import satellite_fixes
+from stario.fusion.values.config import PlaceConfig
+from stario.fusion.values.satellites import satellite_fixes
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.geodesy import Georeference
 from stario.sequences.readers.checked import RADIUS_PER_SIGMA

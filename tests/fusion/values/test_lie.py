@@ -4,7 +4,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from se23 import exp_se23
 
-from stario.fusion import lie
+from stario.fusion.values import lie
 from stario.sequences.attitude import so3
 from stario.sequences.attitude.rotations import yaw_of
 

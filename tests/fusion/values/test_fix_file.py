@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from stario.fusion.fix_file import check_within, read_fixes
-from stario.fusion.fixes import position_fix
+from stario.fusion.values.fix_file import check_within, read_fixes
+from stario.fusion.values.fixes import position_fix
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.sequence import ImuSequence
 

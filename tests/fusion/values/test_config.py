@@ -5,7 +5,7 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from stario.fusion.config import UPDATE_RATES, FilterConfig, NavigatorConfig, read_config
+from stario.fusion.values.config import UPDATE_RATES, FilterConfig, NavigatorConfig, read_config
 from stario.sequences.errors import ConfigError, StarioError
 from stario.sequences.files import write_json
 from stario.sequences.noise import ImuNoise

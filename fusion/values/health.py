@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from stario.fusion.floors import FloorChange
+from stario.fusion.values.floors import FloorChange
 
 Stopped = Literal["both", "gyroscope", "accelerometer"]
 """What has stopped: both sensors, or one alone."""

@@ -7,10 +7,10 @@ from support import WHITE as CONFIG
 from support import WHITE_ERRORS as ERRORS
 
 from stario.fusion import Navigator, NavState, PriorPose, Track
-from stario.fusion.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_fix
 from stario.fusion.imu.intervals import split_at
-from stario.fusion.lie import UNKNOWN_YAW
 from stario.fusion.recording import cut_recording
+from stario.fusion.values.fixes import Fix, FixQueue, position_fix, velocity_fix, yaw_fix
+from stario.fusion.values.lie import UNKNOWN_YAW
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stario.fusion.floors import FloorChange, floor_at, floor_changes
+from stario.fusion.values.floors import FloorChange, floor_at, floor_changes
 
 DRIFT = 0.3
 """Drift of the height over each track [m]."""

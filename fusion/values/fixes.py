@@ -16,8 +16,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from stario.fusion.checked import floored, shaped
-from stario.fusion.health import Health
+from stario.fusion.values.checked import floored, shaped
+from stario.fusion.values.health import Health
 from stario.sequences.arrays import check_type, shown
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray

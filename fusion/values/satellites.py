@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stario.fusion.fixes import UNKNOWN_HEIGHT, Fix, position_fix, velocity_fix
+from stario.fusion.values.fixes import UNKNOWN_HEIGHT, Fix, position_fix, velocity_fix
 from stario.sequences.geodesy import Georeference
 from stario.sequences.readers.checked import LARGEST_RADIUS, RADIUS_PER_SIGMA, USUAL_RADIUS
 from stario.sequences.sequence import BoolArray, FloatArray, Satellites

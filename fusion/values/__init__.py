@@ -1,0 +1,1 @@
+"""Values of the estimator: states and tracks, settings, fixes, floors, health, rotations."""
