@@ -154,8 +154,8 @@ def _trunk(graph: _Graph, windows: str, trunk: nn.Sequential) -> tuple[str, int,
     for index, layer in enumerate(trunk):
         name = f"trunk.{index}"
         if isinstance(layer, nn.Conv1d):
-            convolved = _stem if x == windows else _strided
-            x = convolved(graph, x, index, length, channels, layer)
+            stem = index == 0
+            x = _stem(graph, x, layer) if stem else _strided(graph, x, index, length, channels)
             padded = length + 2 * int(layer.padding[0])
             length, channels = (padded - 3) // layer.stride[0] + 1, layer.out_channels
         elif isinstance(layer, Block):
@@ -165,18 +165,16 @@ def _trunk(graph: _Graph, windows: str, trunk: nn.Sequential) -> tuple[str, int,
     return x, length, channels
 
 
-def _stem(graph: _Graph, x: str, index: int, length: int, channels: int, layer: nn.Conv1d) -> str:
+def _stem(graph: _Graph, x: str, layer: nn.Conv1d) -> str:
     """Return rows (B L, C) of the normalised convolution of windows (B, 6, 200)."""
-    scale, offset = graph.norm(f"trunk.{index + 1}")
-    weight = graph.weight(f"trunk.{index}.weight")
+    scale, offset = graph.norm("trunk.1")
+    weight = graph.weight("trunk.0.weight")
     weight = graph.op("Mul", weight, graph.reshape(scale, -1, 1, 1))
     x = graph.op("Conv", x, weight, offset, strides=layer.stride, pads=[1, 1])
     return graph.reshape(graph.op("Transpose", x, perm=[0, 2, 1]), -1, layer.out_channels)
 
 
-def _strided(
-    graph: _Graph, x: str, index: int, length: int, channels: int, layer: nn.Conv1d
-) -> str:
+def _strided(graph: _Graph, x: str, index: int, length: int, channels: int) -> str:
     """Return rows of the normalised convolution, of width and stride 3, of rows (B L, C)."""
     if length % 3:
         x = graph.reshape(x, -1, length, channels)
