@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, get_args
 
@@ -225,18 +225,12 @@ def _groups(
     return _Found(table.as_dict(), table.text(), partial(write_benchmark, found=table)), skipped
 
 
-@cache
-def _loaded(name: str) -> DisplacementModel | PedestrianDeadReckoning:
-    from stario.fusion.evaluation.pedestrian import NAME, PedestrianDeadReckoning
-    from stario.network.model import load_model
-
-    return PedestrianDeadReckoning() if name == NAME else load_model(name)
-
-
 def _for_group(name: str, group: str) -> DisplacementModel | PedestrianDeadReckoning:
     """Load weights by name; `{group}` in it stands for the group, with underscores for blanks.
 
     `{set}` stands for the group's first word.
     """
+    from stario.fusion.evaluation.pedestrian import model_named
+
     name = name.replace(_SET, group.partition(" ")[0])
-    return _loaded(name.replace(_GROUP, group.replace(" ", "_")))
+    return model_named(name.replace(_GROUP, group.replace(" ", "_")))

@@ -60,6 +60,15 @@ TRACK_WORDS = {
 
 TRACKS = tuple(TRACK_WORDS)
 
+TRACK_TITLES = {
+    "pdr": "steps (PDR)",
+    "network_true_attitude": "network, true attitude",
+    "network": "network, own attitude",
+    "filtered": "filtered",
+    "track": "track",
+}
+"""Titles of the columns of tracks."""
+
 TRACK_OF = {"ekf": "filtered", "graph": "track"}
 """Name of the track that a back end makes of a recording."""
 

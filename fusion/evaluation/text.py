@@ -16,6 +16,7 @@ from stario.fusion.evaluation.compare import (
     METRIC_TITLES,
     METRIC_WORDS,
     METRICS,
+    TRACK_TITLES,
     TRACK_WORDS,
     TRACKS,
     Comparison,
@@ -144,20 +145,16 @@ class _WithFit(Column):
 
 
 def _columns(over: Callable[..., Any]) -> list[Column]:
-    errors = {
-        "pdr": "steps (PDR)",
-        "network_true_attitude": "network, true attitude",
-        "network": "network, own attitude",
-        "filtered": "filtered",
-        "track": "track",
-    }
     others = {
         "NIS": ("filtered", "nis_mean"),
         "filtered NEES": ("filtered", "nees_median"),
         "track NEES": ("track", "nees_median"),
     }
     return [
-        *(_WithFit(title, "ate_m", over=over, where={"track": t}) for t, title in errors.items()),
+        *(
+            _WithFit(title, "ate_m", over=over, where={"track": t})
+            for t, title in TRACK_TITLES.items()
+        ),
         *(Column(title, m, over=over, where={"track": t}) for title, (t, m) in others.items()),
     ]
 
