@@ -182,6 +182,7 @@ def _read_rows(path: Path, lines: list[str], header: Header) -> _Rows:
     names = ["t", *(name for name in QUANTITIES if name in columns)]
     table = _table(path, header, names, row_format)
     names = names[: table.values.shape[1]]
+    _warn_of_wide_rows(table, header)
     refuse_several_devices(table, header.titles, columns["gx"].index)
     is_imu = _imu_rows(table, [names.index(name) for name in IMU])
     if not is_imu.any():
@@ -219,6 +220,19 @@ def _first_cells(path: Path, lines: list[str], header: Header, decimal: str) -> 
         fix = "name every column, and write decimal points"
         raise ReadError(path, f"line {number}", found, expected, fix)
     return cells.split(header.separator)
+
+
+def _warn_of_wide_rows(table: Table, header: Header) -> None:
+    """Say that rows hold more values than there are titles: two lines became one, for example."""
+    mark = header.separator
+    most = len(header.titles) - 1
+    wide = [number for number, line in table.rows if line.rstrip(f"{mark} ").count(mark) > most]
+    if wide:
+        more = f" and {len(wide) - 1} others" if len(wide) > 1 else ""
+        _log.warning(
+            "%s: line %d%s: more values than the header has titles; the first %d were read",
+            table.path, wide[0], more, most + 1,
+        )  # fmt: skip
 
 
 def _imu_rows(table: Table, imu: list[int]) -> BoolArray:
