@@ -174,7 +174,7 @@ class Comparison:
         """Meaning of the metrics."""
         return METRIC_WORDS | ({"alignment": _FITTED} if self.alignment == "yaw" else {})
 
-    @property
+    @cached_property
     def path_m(self) -> float | None:
         """Length of the true path [m] that the track is compared with; None without truth.
 

@@ -109,7 +109,7 @@ def error_words(found: Comparison, name: str = "track") -> str:
         f"{metrics['ate_m']:.2f} m rms from the truth ({share:.1f} % of its {path:.1f} m), "
         f"{metrics['ate_fit_m']:.2f} m ({fitted:.1f} %) after the best shift and turn"
     )
-    covariance = found.aligned()[name].position_covariance_W
+    covariance = found.tracks[name].trajectory.position_covariance_W
     if covariance is not None:
         sigma = math.sqrt(float(np.mean(covariance[:, 0, 0] + covariance[:, 1, 1])))
         words += f"; its sigma says {sigma:.2f} m"
