@@ -13,9 +13,8 @@ from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
-    from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
+    from stario.fusion.evaluation.pedestrian import Model
     from stario.fusion.values.config import NavigatorConfig
-    from stario.network.model import DisplacementModel
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.splits import ListEntry
 
@@ -225,7 +224,7 @@ def _groups(
     return _Found(table.as_dict(), table.text(), partial(write_benchmark, found=table)), skipped
 
 
-def _for_group(name: str, group: str) -> DisplacementModel | PedestrianDeadReckoning:
+def _for_group(name: str, group: str) -> Model:
     """Load weights by name; `{group}` in it stands for the group, with underscores for blanks.
 
     `{set}` stands for the group's first word.

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from functools import cache
 from time import perf_counter
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -31,9 +30,6 @@ from stario.sequences.errors import InputError
 from stario.sequences.levelled_stream import TICK_SAMPLES, LevelledStream, levelled_streams
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.windows import WINDOW_RATE
-
-if TYPE_CHECKING:
-    from stario.network.model import DisplacementModel
 
 WEINBERG_CONSTANT = 0.373
 """K [m / (m/s^2)^(1/4)], fitted to the paths of 107 training recordings; 0.25 to 0.65 by person."""
@@ -75,7 +71,7 @@ Model = Predictor | PedestrianDeadReckoning
 
 
 @cache
-def model_named(name: str) -> DisplacementModel | PedestrianDeadReckoning:
+def model_named(name: str) -> Model:
     """Return the network with these weights, loaded once, or pedestrian dead reckoning."""
     from stario.network.model import load_model
 
