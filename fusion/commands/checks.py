@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import importlib.resources
 import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
 from stario.fusion.commands import common, options
+from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from stario.fusion.backends import BackendName
     from stario.fusion.imu.stateful import Predictor
+    from stario.fusion.paper_table.sets import DataSet
     from stario.fusion.values.config import NavigatorConfig
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
@@ -25,6 +29,56 @@ if TYPE_CHECKING:
     Found = tuple[Sequence[pd.DataFrame], Sequence[Skipped]]
 
 _Graph = Annotated[bool, options.flag("--graph", help="Also run the graph (slower).")]
+
+
+@dataclass(frozen=True)
+class _Scoring:
+    """Options of a check that scores recordings or simulated walks, and prints the scores."""
+
+    reading: options.Reading
+    estimating: options.Estimator
+    as_json: options.Json = False
+
+    def of_recordings(self, paths: Sequence[Path], score: Score, by: str = "") -> Found:
+        """Score each recording, as one of its group if they are grouped by a label."""
+        from stario.fusion.evaluation.groups import By, labels
+        from stario.sequences.arrays import check_choice
+
+        if by:
+            check_choice("--by", by, get_args(By))
+        model, settings = self.estimating.network(), self.estimating.settings()
+
+        def of_named(path: Path, sequence: ImuSequence) -> pd.DataFrame:
+            scores = score(model, sequence, settings)
+            return scores.assign(group=labels(path, sequence.attributes)[by]) if by else scores
+
+        return common.map_recordings("check", self.reading, paths, of_named)
+
+    def of_walks(
+        self, context: typer.Context, walks: Iterable[ImuSequence], count: int, score: Score
+    ) -> Found:
+        """Score simulated walks, for which nothing is read."""
+        options.refuse(context, "with simulated walks", "use with PATH", *options.READING)
+        model, settings = self.estimating.network(), self.estimating.settings()
+        walks = common.with_bar("check", walks, count)
+        return [score(model, walk, settings) for walk in walks], []
+
+    def print(
+        self,
+        found: Found,
+        table: Callable[[pd.DataFrame], str],
+        record: Callable[[pd.DataFrame], object] | None = None,
+    ) -> None:
+        """Print scores as a table or JSON, and exit with 1 if any recording was skipped."""
+        from stario.fusion.evaluation.scores import joined, records
+
+        tables, skipped = found
+        if tables:
+            scores = joined(tables)
+            common.print_result(self.as_json, (record or records)(scores), table(scores))
+        elif self.as_json:
+            common.print_result(True, [])
+        common.exit_if_skipped(skipped)
 
 
 def models(
@@ -43,17 +97,112 @@ def models(
     common.print_result(as_json, rows, survey_table(rows))
 
 
+def table(
+    context: typer.Context,
+    out: Path = typer.Option(..., help="Folder of the finished runs; a repetition resumes there."),
+    data: Path | None = typer.Option(None, help="Folder of the development recordings."),
+    sets: str | None = typer.Option(
+        None, help="Sets of --data to use. Default: oxiod,ridi,all,tyrex,kipd,ilc."
+    ),
+    published: list[str] | None = typer.Option(
+        None,
+        "--set",
+        help="Published data set, NAME=FOLDER, such as ronin=/data/RoNIN; repeatable.",
+    ),
+    networks: str | None = typer.Option(
+        None, help="Networks of `stario check models`, comma-separated. Default: all."
+    ),
+    steps: int | None = typer.Option(
+        None, min=1, help="Training steps per network; overrides the recipe."
+    ),
+    seeds: int = typer.Option(
+        3, min=1, help="Seeds for StarIO with and without MSGCU, R-ResNet and DeepILS."
+    ),
+    split_seed: int = typer.Option(0, min=0, help="Seed of the recording split."),
+    per_group: int = typer.Option(
+        2, min=1, help="Maximum test recordings per group in the set all."
+    ),
+    config: Path | None = typer.Option(
+        None, help="TOML or JSON file with the recipe. Default: the package's."
+    ),
+    cache: options.Cache = None,
+    jobs: int | None = typer.Option(
+        None, help="Runs to run in parallel; -1 for as many as possible."
+    ),
+    backend: str = typer.Option("loky", help="Where runs run: loky (this machine), dask or ray."),
+) -> None:
+    """Train and test every network on every data set; a rerun adds only missing runs.
+
+    The paper's protocol: 8:1:1 by recordings, true attitude, same recipe and steps for all.
+    """
+    from stario.fusion.evaluation.results import make_folder
+    from stario.fusion.paper_table.runs import backend as on_backend
+    from stario.fusion.paper_table.runs import complete, table_runs
+    from stario.fusion.paper_table.table import known_costs, write_results
+    from stario.fusion.paper_table.training import ReaderConfig
+    from stario.network.architectures import ARCHITECTURES
+    from stario.network.training.splits import learned_from
+    from stario.sequences.datasets.batch import Skipped
+    from stario.sequences.datasets.cache_files import cache_folder
+    from stario.sequences.settings import read_settings
+
+    if data is None:
+        options.refuse(context, "without --data", "use with --data", "sets", "per_group")
+    datasets = _data_sets(data, sets, published or [], split_seed, per_group)
+    chosen = None if networks is None else common.names_in(networks)
+    packaged = importlib.resources.files("stario.network.weights") / "recipe-table.json"
+    recipe = read_settings(config or Path(str(packaged)))
+    runs = table_runs(datasets, recipe, steps, chosen, seeds)
+    make_folder(out)
+    requested = {run.network for run in runs}
+    costs = known_costs([name for name in ARCHITECTURES if name in requested], out)
+    learned = {} if data is None else learned_from(data)
+    usual = options.Reading()
+    reading = ReaderConfig(usual.read, usual.as_read(), cache or cache_folder())
+    skipped = []
+    with on_backend(backend):
+        if jobs is None and backend != "loky":
+            jobs = -1
+        for done, outcome in enumerate(complete(runs, out, reading, jobs), 1):
+            run, status = str(outcome), "done"
+            if isinstance(outcome, Skipped):
+                skipped.append(outcome)
+                run, status = outcome.item, "not done"
+            typer.echo(f"{done} of {len(runs)}: {run}: {status}", err=True)
+            write_results(runs, out, costs, learned, drawn=False)
+    typer.echo(write_results(runs, out, costs, learned), nl=False)
+    common.exit_if_skipped(skipped)
+
+
+def _data_sets(
+    data: Path | None, sets: str | None, published: list[str], seed: int, per_group: int
+) -> list[DataSet]:
+    from stario.fusion.paper_table.sets import development_sets, folder_set
+
+    if data is None and not published:
+        raise InputError("data", "none", "recordings", "pass --data or --set NAME=FOLDER")
+    datasets: list[DataSet] = []
+    if data is not None:
+        names = None if sets is None else common.names_in(sets)
+        datasets += development_sets(data, seed, per_group, names)
+    for word in published:
+        name, folder = options.assignment("--set", word, "NAME=FOLDER", "such as ronin=/data/RoNIN")
+        if name in {dataset.name for dataset in datasets}:
+            raise InputError("--set", repr(name), "a name of its own", f"or drop {name} by --sets")
+        datasets.append(folder_set(name, Path(folder), seed))
+    return datasets
+
+
 @options.expanded
 def backends(
     context: typer.Context,
-    reading: options.Reading,
-    estimating: options.Estimator,
     paths: options.OptionalPaths = None,
     walks: int = typer.Option(20, min=1, help="Number of simulated walks."),
     seconds: float = typer.Option(120.0, min=5.0, help="Duration of each walk in s."),
     data: options.Data = None,
     split: str = typer.Option("validation", help="With --data: split to use."),
-    as_json: options.Json = False,
+    *,
+    scoring: _Scoring,
 ) -> None:
     """Compare filter, graph and fixed-lag graph: accuracy, consistency, speed, slowest update.
 
@@ -71,20 +220,18 @@ def backends(
     if paths or data is not None:
         options.refuse(context, "with recordings", "use with simulated walks", "walks", "seconds")
         files = paths or [entry.path for entry in read_packaged_list(split, data or Path())]
-        found = _of_recordings(reading, estimating, files, check.score_recording)
+        found = scoring.of_recordings(files, check.score_recording)
     else:
         unused = (*options.READING, "config", "model", "magnetometer", "declination")
         options.refuse(context, "with simulated walks", "use with PATH or --data", *unused)
         seeds = common.with_bar("backends", range(walks), walks)
         found = [check.score_walk(seed, seconds) for seed in seeds], []
-    _print_scores(found, check.score_table, as_json, record)
+    scoring.print(found, check.score_table, record)
 
 
 @options.expanded
 def faults(
     context: typer.Context,
-    reading: options.Reading,
-    estimating: options.Estimator,
     path: Path | None = typer.Argument(
         None, help="Recording with true poses. Default: a simulated walk."
     ),
@@ -96,7 +243,8 @@ def faults(
     seed: int = typer.Option(
         0, min=0, help="Seed of the faults and of the simulated walk, if any."
     ),
-    as_json: options.Json = False,
+    *,
+    scoring: _Scoring,
 ) -> None:
     """Inject faults into a recording one at a time; print the resulting error and the report."""
     from stario.fusion.evaluation.checks.faults import fault_table, matched_walk, run_faults
@@ -104,10 +252,11 @@ def faults(
 
     if not network:
         options.refuse(context, "without --network", "use with --network", "model")
+    estimating = scoring.estimating
     settings = estimating.settings()
     if path is not None:
         options.refuse(context, "with one recording", "no filter", "where")
-        sequence = reading.read(path)
+        sequence = scoring.reading.read(path)
     else:
         unused = (*options.READING, "magnetometer", "declination")
         options.refuse(context, "with the simulated walk", "use with PATH", *unused)
@@ -116,7 +265,7 @@ def faults(
     scores = run_faults(sequence, settings, estimating.network() if network else None, seed)
     named = scores.rename(columns={"group": "fault", "track": "backend"})
     title = f"{sequence.name}: {sequence.duration:.1f} s"
-    common.print_result(as_json, records(named), f"{title}\n{fault_table(scores)}")
+    common.print_result(scoring.as_json, records(named), f"{title}\n{fault_table(scores)}")
 
 
 def consistency(
@@ -149,30 +298,27 @@ def benchmark(as_json: options.Json = False) -> None:
 @options.expanded
 def fusion(
     paths: options.Paths,
-    reading: options.Reading,
-    estimating: options.Estimator,
     by: options.By = "set",
     graph: _Graph = False,
-    as_json: options.Json = False,
+    *,
+    scoring: _Scoring,
 ) -> None:
     """Compare the filter's error with the network's by group, with NIS and consistency of yaw."""
     from stario.fusion.evaluation.checks.fusion import fusion_gain, fusion_gain_table
 
     score = partial(fusion_gain, backends=_backends(graph))
-    found = _of_recordings(reading, estimating, paths, score, by)
-    _print_scores(found, fusion_gain_table, as_json)
+    scoring.print(scoring.of_recordings(paths, score, by), fusion_gain_table)
 
 
 @options.expanded
 def fixes(
     paths: options.Paths,
-    reading: options.Reading,
-    estimating: options.Estimator,
     every: float = typer.Option(5.0, min=0.1, help="Interval between fixes in s."),
     sigma: float = typer.Option(0.3, min=0.001, help="Fix sigma per axis \\[m]."),
     backend: str = typer.Option("ekf", help="Estimator: ekf or graph."),
     by: options.By = "set",
-    as_json: options.Json = False,
+    *,
+    scoring: _Scoring,
 ) -> None:
     """Supply periodic true positions; check that position and yaw errors match their sigmas."""
     from stario.fusion.backends import BackendName
@@ -181,18 +327,17 @@ def fixes(
 
     chosen: BackendName = check_choice("--backend", backend, get_args(BackendName))
     score = partial(track_with_fixes, every=every, sigma=sigma, backend=chosen)
-    _print_scores(_of_recordings(reading, estimating, paths, score, by), fixes_table, as_json)
+    scoring.print(scoring.of_recordings(paths, score, by), fixes_table)
 
 
 @options.expanded
 def heights(
     context: typer.Context,
-    reading: options.Reading,
-    estimating: options.Estimator,
     paths: options.OptionalPaths = None,
     walks: int = typer.Option(40, min=1, help="Number of simulated walks."),
     by: options.By = "set",
-    as_json: options.Json = False,
+    *,
+    scoring: _Scoring,
 ) -> None:
     """Compare heights and floors with known ones, by the barometer and without it.
 
@@ -202,41 +347,35 @@ def heights(
     from stario.sequences.simulation.house import simulate_house
 
     if paths:
-        found = _of_recordings(reading, estimating, paths, score_heights, by)
+        found = scoring.of_recordings(paths, score_heights, by)
     else:
         houses = (simulate_house(k, name=f"house-{k}").sequence for k in range(walks))
-
-        def of_house(*given: Any) -> pd.DataFrame:
-            return score_heights(*given).assign(group="simulated")
-
-        found = _of_walks(context, estimating, houses, walks, of_house)
-    _print_scores(found, heights_table, as_json)
+        tables, _ = scoring.of_walks(context, houses, walks, score_heights)
+        found = [scores.assign(group="simulated") for scores in tables], []
+    scoring.print(found, heights_table)
 
 
 @options.expanded
 def gaps(
     paths: options.Paths,
-    reading: options.Reading,
-    estimating: options.Estimator,
     by: options.By = "set",
-    as_json: options.Json = False,
+    *,
+    scoring: _Scoring,
 ) -> None:
     """Remove 0.1 s at one of six instants or 5 % of the samples; report how far the end moves."""
     from stario.fusion.evaluation.checks.fusion import end_shift_table, end_shifts
 
-    found = _of_recordings(reading, estimating, paths, end_shifts, by)
-    _print_scores(found, end_shift_table, as_json)
+    scoring.print(scoring.of_recordings(paths, end_shifts, by), end_shift_table)
 
 
 @options.expanded
 def moments(
     context: typer.Context,
-    reading: options.Reading,
-    estimating: options.Estimator,
     paths: options.OptionalPaths = None,
     graph: _Graph = False,
     seed: int = typer.Option(0, min=0, help="Seed of the moments."),
-    as_json: options.Json = False,
+    *,
+    scoring: _Scoring,
 ) -> None:
     """Insert bad moments (shake, drop, table, standing, lift); report what the rest of tracks pays.
 
@@ -247,22 +386,21 @@ def moments(
 
     score = partial(moment_costs, backends=_backends(graph), seed=seed)
     if paths:
-        found = _of_recordings(reading, estimating, paths, score)
+        found = scoring.of_recordings(paths, score)
     else:
         walks = (simulated_walk(carry, k) for k, carry in enumerate(CARRIES))
-        found = _of_walks(context, estimating, walks, len(CARRIES), score)
-    _print_scores(found, moment_table, as_json)
+        found = scoring.of_walks(context, walks, len(CARRIES), score)
+    scoring.print(found, moment_table)
 
 
 @options.expanded
 def simulation(
     context: typer.Context,
-    reading: options.Reading,
-    estimating: options.Estimator,
     paths: options.OptionalPaths = None,
     walks: int = typer.Option(10, min=1, help="Simulated walks of each way."),
     seconds: float = typer.Option(120.0, min=10.0, help="Duration of each walk in s."),
-    as_json: options.Json = False,
+    *,
+    scoring: _Scoring,
 ) -> None:
     """Compare simulated walks with recordings by way of carrying: motion by band, steps, errors.
 
@@ -272,7 +410,8 @@ def simulation(
 
     if not paths:
         options.refuse(context, "with simulated walks", "use with PATH", *options.READING)
-    score = partial(check.motion_scores, estimating.network(), config=estimating.settings())
+    model, settings = scoring.estimating.network(), scoring.estimating.settings()
+    score = partial(check.motion_scores, model, config=settings)
     wanted = [(carry, seed) for carry in check.SPEEDS for seed in range(walks)]
     found = [
         score(check.simulated_walk(carry, seed, seconds), carry=carry, kind=check.SIMULATED)
@@ -282,62 +421,16 @@ def simulation(
     def recorded(path: Path, sequence: ImuSequence) -> pd.DataFrame:
         return score(sequence, carry=check.carry_of(sequence), kind=check.RECORDED)
 
-    more, skipped = common.map_recordings("simulation", reading, paths or [], recorded)
-    _print_scores((found + more, skipped), check.motion_table, as_json)
+    more, skipped = common.map_recordings("simulation", scoring.reading, paths or [], recorded)
+    scoring.print((found + more, skipped), check.motion_table)
 
 
 def _backends(graph: bool) -> tuple[BackendName, ...]:
     return ("ekf", "graph") if graph else ("ekf",)
 
 
-def _of_recordings(
-    reading: options.Reading,
-    estimating: options.Estimator,
-    paths: Sequence[Path],
-    score: Score,
-    by: str = "",
-) -> Found:
-    """Score each recording, as one of its group if they are grouped by a label."""
-    from stario.fusion.evaluation.groups import By, labels
-    from stario.sequences.arrays import check_choice
-
-    if by:
-        check_choice("--by", by, get_args(By))
-    model, settings = estimating.network(), estimating.settings()
-
-    def of_named(path: Path, sequence: ImuSequence) -> pd.DataFrame:
-        scores = score(model, sequence, settings)
-        return scores.assign(group=labels(path, sequence.attributes)[by]) if by else scores
-
-    return common.map_recordings("check", reading, paths, of_named)
-
-
-def _of_walks(
-    context: typer.Context,
-    estimating: options.Estimator,
-    walks: Iterable[ImuSequence],
-    count: int,
-    score: Score,
-) -> Found:
-    """Score simulated walks, for which nothing is read."""
-    options.refuse(context, "with simulated walks", "use with PATH", *options.READING)
-    model, settings = estimating.network(), estimating.settings()
-    return [score(model, walk, settings) for walk in common.with_bar("check", walks, count)], []
-
-
-def _print_scores(
-    of: Found,
-    table: Callable[[pd.DataFrame], str],
-    as_json: bool,
-    record: Callable[[pd.DataFrame], object] | None = None,
-) -> None:
-    """Print scores as a table or JSON, and exit with 1 if any recording was skipped."""
-    from stario.fusion.evaluation.scores import joined, records
-
-    found, skipped = of
-    if found:
-        scores = joined(found)
-        common.print_result(as_json, (record or records)(scores), table(scores))
-    elif as_json:
-        common.print_result(as_json, [])
-    common.exit_if_skipped(skipped)
+COMMANDS = (
+    *(models, table, fusion, backends, faults, gaps),
+    *(moments, heights, simulation, fixes, consistency, benchmark),
+)
+"""The checks, in the order of the help."""

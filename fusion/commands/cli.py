@@ -22,7 +22,6 @@ from stario.fusion.commands.inspect import inspect
 from stario.fusion.commands.live import live
 from stario.fusion.commands.run import run
 from stario.fusion.commands.simulate import simulate
-from stario.fusion.commands.table import table
 from stario.fusion.commands.train import train
 from stario.sequences.errors import StarioError
 from stario.sequences.findings import FINDINGS
@@ -55,11 +54,7 @@ for command in (run, live, compare, evaluate, inspect, convert, train, simulate,
     app.command()(command)
 
 check = typer.Typer(no_args_is_help=True, help="Check estimators and networks on this machine.")
-for command in (checks.models, table, checks.fusion, checks.backends, checks.faults, checks.gaps):
-    check.command()(command)
-for command in (checks.moments, checks.heights, checks.simulation, checks.fixes):
-    check.command()(command)
-for command in (checks.consistency, checks.benchmark):
+for command in checks.COMMANDS:
     check.command()(command)
 app.add_typer(check, name="check")
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import TYPE_CHECKING, TypeVar
@@ -18,6 +19,8 @@ from stario.fusion.commands import options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
+    from stario.fusion.evaluation.compare import Comparison
+    from stario.fusion.evaluation.results import Writers
     from stario.fusion.recording import Progress
     from stario.network.model import DisplacementModel
     from stario.sequences.datasets.batch import Skipped
@@ -104,6 +107,30 @@ def process_each(
     if as_json and records:
         print_result(True, records[0] if len(files) == 1 else records)
     exit_if_skipped(skipped)
+
+
+def further_files(report: bool, tiles: str = "", view: bool = False) -> Writers:
+    """Return what writes the report and the viewer's file, if their packages are there."""
+    from stario.sequences.lazy import optional_package
+
+    also: dict[str, Callable[[Path, Comparison], object]] = {}
+    if report:
+        optional_package("plotly", "report")
+        from stario.fusion.report.page import write_report
+
+        also["report.html"] = partial(write_report, tiles=tiles)
+    if tiles:
+        if not report:
+            raise InputError("--tiles", "use without --report", "use with it")
+        from stario.fusion.report.background import check_tiles
+
+        check_tiles(tiles)
+    if view:
+        optional_package("rerun", "view")
+        from stario.fusion.report.view import write_view
+
+        also["track.rrd"] = write_view
+    return also
 
 
 def explain() -> None:

@@ -50,12 +50,10 @@ def compare(
     from stario.fusion.values.fix_file import read_fixes
     from stario.sequences.arrays import check_choice
     from stario.sequences.datasets.batch import without_skipped
-    from stario.sequences.lazy import optional_package
 
     if not paths:
         options.refuse(context, "without PATH", "use with a recording to read", *options.READING)
-    if report:
-        optional_package("plotly", "report")
+    also = common.further_files(report)
     chosen = TRACKS if tracks == "all" else [*_SHOWN, *(common.names_in(tracks) if tracks else [])]
     for name in chosen:
         check_choice("--tracks", name, TRACKS)
@@ -77,11 +75,6 @@ def compare(
         )
         train = common.training_command(paths, reading) if paths else ""
         comparisons = [replace(c, train=train) for c in without_skipped(outcomes, skipped)]
-    also = {}
-    if report:
-        from stario.fusion.report.page import write_report
-
-        also["report.html"] = write_report
     if explained:
         common.explain()
     if comparisons:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, get_args
 
@@ -13,9 +13,8 @@ from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
-    from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
+    from stario.fusion.evaluation.pedestrian import Model
     from stario.fusion.values.config import NavigatorConfig
-    from stario.network.model import DisplacementModel
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.splits import ListEntry
 
@@ -225,18 +224,12 @@ def _groups(
     return _Found(table.as_dict(), table.text(), partial(write_benchmark, found=table)), skipped
 
 
-@cache
-def _loaded(name: str) -> DisplacementModel | PedestrianDeadReckoning:
-    from stario.fusion.evaluation.pedestrian import NAME, PedestrianDeadReckoning
-    from stario.network.model import load_model
-
-    return PedestrianDeadReckoning() if name == NAME else load_model(name)
-
-
-def _for_group(name: str, group: str) -> DisplacementModel | PedestrianDeadReckoning:
+def _for_group(name: str, group: str) -> Model:
     """Load weights by name; `{group}` in it stands for the group, with underscores for blanks.
 
     `{set}` stands for the group's first word.
     """
+    from stario.fusion.evaluation.pedestrian import model_named
+
     name = name.replace(_SET, group.partition(" ")[0])
-    return _loaded(name.replace(_GROUP, group.replace(" ", "_")))
+    return model_named(name.replace(_GROUP, group.replace(" ", "_")))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -332,31 +332,40 @@ def refuse_unused_sources(
 def expanded(command: Callable[..., None]) -> Callable[..., None]:
     """Expand a command's parameters of an option group into its options, defined only once.
 
-    Groups are `Reading`, `Estimator`, `Map` and `Place`.
+    Groups are data classes, such as `Reading`; their fields may be groups, too.
     """
-    options: list[inspect.Parameter] = []
-    groups: dict[str, tuple[type, list[str]]] = {}
-    for parameter in inspect.signature(command, eval_str=True).parameters.values():
-        group = parameter.annotation
-        if group in (Reading, Estimator, Map, Place):
-            members = inspect.signature(group, eval_str=True).parameters
-            groups[parameter.name] = group, list(members)
-            options += members.values()
-        else:
-            options.append(parameter)
-    options = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
+    options = [o.replace(kind=inspect.Parameter.KEYWORD_ONLY) for o in _options_of(command)]
 
     @wraps(command)
     def flat(**values: Any) -> None:
-        grouped = {
-            name: group(**{key: values.pop(key) for key in keys})
-            for name, (group, keys) in groups.items()
-        }
-        command(**values, **grouped)
+        command(**_grouped(command, values))
 
     flat.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     flat.__annotations__ = {option.name: option.annotation for option in options}
     return flat
+
+
+def _options_of(what: Callable[..., Any]) -> list[inspect.Parameter]:
+    """Return the parameters of a command or group, with the options of groups in their place."""
+    return [
+        option
+        for parameter, group in _parameters(what)
+        for option in (_options_of(group) if group else [parameter])
+    ]
+
+
+def _grouped(what: Callable[..., Any], values: Mapping[str, object]) -> dict[str, Any]:
+    """Return the arguments of a command or group from the values of its options."""
+    return {
+        parameter.name: group(**_grouped(group, values)) if group else values[parameter.name]
+        for parameter, group in _parameters(what)
+    }
+
+
+def _parameters(what: Callable[..., Any]) -> list[tuple[inspect.Parameter, Any]]:
+    """Return the parameters of a command or group, each with its group if it is one."""
+    parameters = inspect.signature(what, eval_str=True).parameters.values()
+    return [(p, p.annotation if is_dataclass(p.annotation) else None) for p in parameters]
 
 
 def _attributes(words: Iterable[str]) -> dict[str, list[str]]:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stario.fusion.commands import common, options
-from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.compare import Comparison
-    from stario.fusion.evaluation.results import Writers
     from stario.sequences.sequence import ImuSequence
 
 
@@ -42,7 +38,7 @@ def run(
     from stario.fusion.navigator import Navigator
     from stario.fusion.values.fix_file import check_within, read_fixes
 
-    also = _further_files(report, tiles, view)
+    also = common.further_files(report, tiles, view)
     network = estimating.network()
     navigator = Navigator(network, placing.settings(estimating.settings()))
     given = [] if fixes is None else read_fixes(fixes)
@@ -71,30 +67,6 @@ def run(
         return record, "\n".join(lines)
 
     common.process_each(reading, paths, out, fuse, as_json, "--fixes" if fixes else "")
-
-
-def _further_files(report: bool, tiles: str, view: bool) -> Writers:
-    """Return what writes the report and the viewer's file, if their packages are there."""
-    from stario.sequences.lazy import optional_package
-
-    also: dict[str, Callable[[Path, Comparison], object]] = {}
-    if report:
-        optional_package("plotly", "report")
-        from stario.fusion.report.page import write_report
-
-        also["report.html"] = partial(write_report, tiles=tiles)
-    if tiles:
-        if not report:
-            raise InputError("--tiles", "use without --report", "use with it")
-        from stario.fusion.report.background import check_tiles
-
-        check_tiles(tiles)
-    if view:
-        optional_package("rerun", "view")
-        from stario.fusion.report.view import write_view
-
-        also["track.rrd"] = write_view
-    return also
 
 
 def _lines(found: Comparison) -> list[str]:

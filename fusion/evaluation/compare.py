@@ -60,6 +60,15 @@ TRACK_WORDS = {
 
 TRACKS = tuple(TRACK_WORDS)
 
+TRACK_TITLES = {
+    "pdr": "steps (PDR)",
+    "network_true_attitude": "network, true attitude",
+    "network": "network, own attitude",
+    "filtered": "filtered",
+    "track": "track",
+}
+"""Titles of the columns of tracks."""
+
 TRACK_OF = {"ekf": "filtered", "graph": "track"}
 """Name of the track that a back end makes of a recording."""
 
@@ -165,7 +174,7 @@ class Comparison:
         """Meaning of the metrics."""
         return METRIC_WORDS | ({"alignment": _FITTED} if self.alignment == "yaw" else {})
 
-    @property
+    @cached_property
     def path_m(self) -> float | None:
         """Length of the true path [m] that the track is compared with; None without truth.
 

@@ -66,8 +66,8 @@ def length_ratio(track: Track, sequence: ImuSequence) -> float:
     does not depend on how often the way returns.
     """
     known = _known(sequence)
-    fitted = None if known is None else placed(track, known)
-    if fitted is None or len(fitted) < MIN_POSITIONS:
+    fitted = None if known is None else placed(track, known, MIN_POSITIONS)
+    if fitted is None:
         return float("nan")
     return _length(_track_at(track, fitted.time)) / _length(fitted.position_W)
 
@@ -87,18 +87,18 @@ def position_error(track: Track, known: PositionTrack) -> tuple[float, int]:
     if fitted is None or len(fitted) < MIN_POSITIONS:
         return float("nan"), 0 if fitted is None else len(fitted)
     error = fitted.position_W - _track_at(track, fitted.time)
-    return float(np.sqrt(np.mean(np.sum(error**2, axis=1)))), len(fitted)
+    return rms(error), len(fitted)
 
 
-def placed(track: Track, known: PositionTrack) -> PositionTrack | None:
+def placed(track: Track, known: PositionTrack, least: int = 1) -> PositionTrack | None:
     """Return the known positions (n, 2) [m] that lie within a track and in none of its gaps.
 
     They are rotated about the vertical and shifted to fit the track best, in its frame; a single
-    one lies exactly on it. None if there is none within its time.
+    one lies exactly on it. None if there are fewer than `least`.
     """
     inside = known.valid & _within(track, known.time)
     time, truth = known.time[inside], known.position_W[inside]
-    if not len(time):
+    if len(time) < least:
         return None
     estimated = _track_at(track, time)
     fitted = fit_yaw_and_position(planar(truth), planar(estimated))
@@ -178,8 +178,8 @@ def position_findings(track: Track, sequence: ImuSequence) -> list[Finding]:
     known = _known(sequence)
     if known is None:
         return []
-    fitted = placed(track, known)
-    if fitted is None or len(fitted) < _MIN_CHORDS:
+    fitted = placed(track, known, _MIN_CHORDS)
+    if fitted is None:
         return []
     truth, estimate = planar(fitted.position_W), planar(_track_at(track, fitted.time))
     error = float(np.sqrt(np.mean(np.abs(truth - estimate) ** 2)))

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from stario.fusion.evaluation.compare import distinct_name
+from stario.fusion.evaluation.compare import TRACK_TITLES, distinct_name
 from stario.fusion.evaluation.scores import Spread, joined, records, scored, table
 from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude, true_poses
 from stario.fusion.imu.stateful import Predictor
@@ -35,11 +35,7 @@ from stario.sequences.truth.problems import warn_of_truth
 
 TRUE_ATTITUDE, OWN_ATTITUDE, FILTERED = "network_true_attitude", "network", "filtered"
 
-PROTOCOLS = {
-    TRUE_ATTITUDE: "network, true attitude",
-    OWN_ATTITUDE: "network, own attitude",
-    FILTERED: "filtered",
-}
+PROTOCOLS = {name: TRACK_TITLES[name] for name in (TRUE_ATTITUDE, OWN_ATTITUDE, FILTERED)}
 """Tracks of the table and their titles."""
 
 METRICS = {"ate_m": "ATE [m]", "rte_m": "RTE [m]", "pde": "PDE [1]"}

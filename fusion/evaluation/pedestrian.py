@@ -13,6 +13,7 @@ A classical baseline that shows whether a network is worth using on a recording:
 
 from __future__ import annotations
 
+from functools import cache
 from time import perf_counter
 
 import numpy as np
@@ -67,6 +68,14 @@ class PedestrianDeadReckoning:
 
 
 Model = Predictor | PedestrianDeadReckoning
+
+
+@cache
+def model_named(name: str) -> Model:
+    """Return the network with these weights, loaded once, or pedestrian dead reckoning."""
+    from stario.network.model import load_model
+
+    return PedestrianDeadReckoning() if name == NAME else load_model(name)
 
 
 def piece_of(model: Model, stream: LevelledStream) -> Piece:

@@ -16,6 +16,7 @@ from stario.fusion.evaluation.compare import (
     METRIC_TITLES,
     METRIC_WORDS,
     METRICS,
+    TRACK_TITLES,
     TRACK_WORDS,
     TRACKS,
     Comparison,
@@ -108,7 +109,7 @@ def error_words(found: Comparison, name: str = "track") -> str:
         f"{metrics['ate_m']:.2f} m rms from the truth ({share:.1f} % of its {path:.1f} m), "
         f"{metrics['ate_fit_m']:.2f} m ({fitted:.1f} %) after the best shift and turn"
     )
-    covariance = found.aligned()[name].position_covariance_W
+    covariance = found.tracks[name].trajectory.position_covariance_W
     if covariance is not None:
         sigma = math.sqrt(float(np.mean(covariance[:, 0, 0] + covariance[:, 1, 1])))
         words += f"; its sigma says {sigma:.2f} m"
@@ -144,20 +145,16 @@ class _WithFit(Column):
 
 
 def _columns(over: Callable[..., Any]) -> list[Column]:
-    errors = {
-        "pdr": "steps (PDR)",
-        "network_true_attitude": "network, true attitude",
-        "network": "network, own attitude",
-        "filtered": "filtered",
-        "track": "track",
-    }
     others = {
         "NIS": ("filtered", "nis_mean"),
         "filtered NEES": ("filtered", "nees_median"),
         "track NEES": ("track", "nees_median"),
     }
     return [
-        *(_WithFit(title, "ate_m", over=over, where={"track": t}) for t, title in errors.items()),
+        *(
+            _WithFit(title, "ate_m", over=over, where={"track": t})
+            for t, title in TRACK_TITLES.items()
+        ),
         *(Column(title, m, over=over, where={"track": t}) for title, (t, m) in others.items()),
     ]
 

@@ -26,7 +26,13 @@ from stario.fusion.evaluation.displacement_error import (
 )
 from stario.fusion.evaluation.networks import MAX_DRAWN, OWN_ATTITUDE, metrics_of, protocol_figures
 from stario.fusion.evaluation.pedestrian import NAME as PDR
-from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning, pedestrian_track, piece_of
+from stario.fusion.evaluation.pedestrian import (
+    Model,
+    PedestrianDeadReckoning,
+    model_named,
+    pedestrian_track,
+    piece_of,
+)
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.paper_table.sets import ALL, FIRST, DataSet
 from stario.fusion.paper_table.training import (
@@ -39,7 +45,7 @@ from stario.fusion.paper_table.training import (
 )
 from stario.fusion.values.config import NavigatorConfig
 from stario.network.architectures import ARCHITECTURES, architecture
-from stario.network.model import DisplacementModel, load_model
+from stario.network.model import load_model
 from stario.network.training.config import TrainingConfig
 from stario.sequences.accuracy.metrics import Convention
 from stario.sequences.arrays import check_choice
@@ -56,8 +62,6 @@ LEADING = ("StarIO", "R-ResNet", "DeepILS", "StarIO without MSGCU")
 
 CONVENTION: Convention = "ronin"
 """How errors are averaged: as in the paper."""
-
-Model = DisplacementModel | PedestrianDeadReckoning
 
 
 @dataclass(frozen=True)
@@ -212,11 +216,9 @@ def _recording(
 
 
 def _model(run: Run, folder: Path) -> Model:
-    if run.network == PDR:
-        return PedestrianDeadReckoning()
     if run.network in ARCHITECTURES:
         return load_model(folder / "model.safetensors")
-    return load_model(run.network)
+    return model_named(run.network)
 
 
 def _read_if_done(run: Run, path: Path) -> dict[str, object] | None:

@@ -32,6 +32,7 @@ from stario.network.runtime.cost import table_cost
 from stario.network.runtime.survey import BATCHES, ModelRow, survey
 from stario.network.training.config import TrainingConfig
 from stario.sequences.accuracy.metrics import CONVENTIONS
+from stario.sequences.drawing.text_table import figure, markdown
 from stario.sequences.files import atomic_write, write_json, write_rows
 from stario.sequences.sequence import Trajectory
 
@@ -336,7 +337,7 @@ def _set_text(table: SetTable) -> str:
             "Ranks and ratios are based on the geometric mean over recordings of the "
             f"{table.measure}.",
             "",
-            *_markdown(lines),
+            *markdown(lines),
             *(["", f"Skipped: {len(table.skipped)} recordings, listed in `table.json`."]
               if table.skipped else []),
         ]
@@ -362,25 +363,18 @@ def _cost_text(costs: Sequence[ModelRow], work: pd.DataFrame) -> str:
         hours = spent[["training_s", "evaluation_s"]].sum() / 3600.0
         speed = spent["windows_per_s"]
         cells = [f"{milliseconds[str(batch)]:.2f}" for batch in BATCHES]
-        cells = [f"{row.peak_memory_mb:.1f}", *cells, f"{hours:.2f}"]
-        rows.append([row.name, *row.counts(), *cells, "-" if np.isnan(speed) else f"{speed:.0f}"])
+        cells = [f"{row.peak_memory_mb:.1f}", *cells, f"{hours:.2f}", figure(speed, ".0f")]
+        rows.append([row.name, *row.counts(), *cells])
     training, testing = work[["training_s", "evaluation_s"]].sum() / 3600.0
     return "\n".join(
         [
-            *("### Costs", "", *_markdown(rows), ""),
+            *("### Costs", "", *markdown(rows), ""),
             f"Total: {training + testing:.2f} core hours, {training:.2f} for training and "
             f"{testing:.2f} for evaluation. Time per window: on this machine, one thread per core "
             "that PyTorch uses; memory: weights and results of one inference "
             "(`stario check models`).",
         ]
     )
-
-
-def _markdown(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return a table's lines without columns that have no value; the first row holds the titles."""
-    columns = [c for c in zip(*rows, strict=True) if any(cell != "-" for cell in c[1:])]
-    head, *body = (f"| {' | '.join(cells)} |" for cells in zip(*columns, strict=True))
-    return [head, f"|{'---|' * len(columns)}", *body]
 
 
 WORDS = (

@@ -1,4 +1,4 @@
-"""Plain-text tables of numbers."""
+"""Tables of numbers as plain text and Markdown."""
 
 from __future__ import annotations
 
@@ -16,6 +16,13 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
         + "".join(f"{cell:>{_GAP + width}}" for cell, width in zip(cells, others, strict=True))
         for name, *cells in rows
     ]
+
+
+def markdown(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a Markdown table without columns of no value; first come the titles."""
+    columns = [c for c in zip(*rows, strict=True) if any(cell != "-" for cell in c[1:])]
+    head, *body = (f"| {' | '.join(cells)} |" for cells in zip(*columns, strict=True))
+    return [head, f"|{'---|' * len(columns)}", *body]
 
 
 def figure(value: float | None, form: str = ".3f") -> str:

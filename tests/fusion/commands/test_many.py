@@ -222,7 +222,7 @@ def test_backends_compares_filter_and_graph(stario):
 
 def test_set_in_the_name_of_weights_is_the_first_word_of_a_group(monkeypatch):
     loaded = []
-    monkeypatch.setattr(evaluate, "_loaded", loaded.append)
+    monkeypatch.setattr("stario.fusion.evaluation.pedestrian.model_named", loaded.append)
 
     evaluate._for_group("runs/{set}/{group}.safetensors", "ridi dan")
 
