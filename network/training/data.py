@@ -60,7 +60,7 @@ class RecordingStreams:
     @property
     def has_poses(self) -> bool:
         """Whether a real device recorded it, with poses as ground truth."""
-        return not self.is_virtual and isinstance(self.streams[0], WorldStream)
+        return not self.is_virtual and any(isinstance(s, WorldStream) for s in self.streams)
 
 
 def recording_streams(
@@ -129,12 +129,16 @@ def mix_sources(
         moments: streams of recordings with bad moments inserted.
 
     Raises:
-        ConfigError: the named shares leave nothing for other recordings, or all shares are 0.
+        ConfigError: the named shares leave nothing for other recordings, those of walks and moments
+            exceed 1, or all shares are 0.
     """
     streams: list[WorldStream] = []
     weights: list[float] = []
     simulated = shares.get(SIMULATED, _SIMULATED_SHARE)
     inserted = shares.get(INSERTED, 0.0) if moments else 0.0
+    if simulated + inserted > 1.0 + 1e-9:
+        found = f"{simulated + inserted:g} for simulated walks and moments"
+        raise ConfigError("shares", found, "a sum of 1 or less")
     named = _sources(recorded, shares)
     present = sum(share for _, share, members in named if any(len(s) >= reach for s in members))
     rest = (1.0 - simulated - inserted) / (present or 1.0)

@@ -24,7 +24,7 @@ from stario.sequences.windows import WorldStream, world_streams
 log = logging.getLogger(__name__)
 
 _DRAWN = ("shake 10 s", "shake 10 s", "shake 10 s", "drop", "table", "standing")
-"""Moments in their proportions; in a lift only the gyroscope and the feet tell nothing."""
+"""Moments in their proportions, without the lift: no second within it tells how fast it moves."""
 
 _AROUND = 8.0
 """Time of the recording on either side of a moment [s]."""
