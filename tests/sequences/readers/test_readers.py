@@ -9,7 +9,7 @@ from recorded import DATA
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers import FORMATS, find_recordings, read_recording, write_csv
+from stario.sequences.readers import find_recordings, read_recording, write_csv
 from stario.sequences.readers.published.euroc import read_euroc
 from stario.sequences.readers.published.oxiod import read_oxiod
 from stario.sequences.sequence import BoolArray, ImuSequence
