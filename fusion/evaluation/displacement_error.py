@@ -86,8 +86,6 @@ _MIN_PATH_M = 1.0
 UPDATES = round(WINDOW_SECONDS / TICK_SECONDS)
 """Number of windows that begin within the length of one."""
 
-_BATCH = 128
-
 
 class Piece(NamedTuple):
     """An unbroken stretch of a recording with the displacements of its M windows.
@@ -132,13 +130,7 @@ def usable_streams(sequence: ImuSequence) -> list[LevelledStream]:
 def predicted(model: Predictor, stream: LevelledStream) -> Piece:
     """Return a stretch with the network's predictions, its memory cleared before."""
     network = StatefulInference(model, UPDATES)
-    windows, heading = stream.windows(), stream.headings
-    parts = [
-        network.predict(windows[first : first + _BATCH], heading[first : first + _BATCH])
-        for first in range(0, len(windows), _BATCH)
-    ]
-    displacement, covariance = zip(*parts, strict=True)
-    return Piece(stream, np.concatenate(displacement), np.concatenate(covariance))
+    return Piece(stream, *network.predict(stream.windows(), stream.headings))
 
 
 class RecordingErrors(NamedTuple):

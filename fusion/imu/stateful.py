@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -17,7 +18,7 @@ from stario.fusion.imu.intervals import Flags, Window
 from stario.fusion.values.checked import floored
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import FloatArray
+from stario.sequences.sequence import BoolArray, FloatArray
 from stario.sequences.windows import (
     WINDOW_RATE,
     WINDOW_SECONDS,
@@ -124,6 +125,10 @@ class WindowBuffer:
         )
 
 
+_BATCH = 512
+"""Number of windows given to a model at once."""
+
+
 class Predictor(Protocol):
     """Interface that a navigator requires of a model; `DisplacementModel` implements it.
 
@@ -166,13 +171,14 @@ class StatefulInference:
         self._stretch: Any = self._model if begin is None else begin(self.updates)
 
     def predict(
-        self, windows_N: NDArray[np.float32], heading: FloatArray
+        self, windows_N: NDArray[np.float32], heading: FloatArray, begins: BoolArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Predict the stretch's next windows, given to the model in the device's heading frame H.
+        """Predict the track's next windows, given to the model in the device's heading frame H.
 
         Args:
-            windows_N: (B, 6, 200) in a gravity-aligned frame N.
+            windows_N: (B, 6, 200), one or more, in a gravity-aligned frame N.
             heading: (B,) heading of the device in N [rad].
+            begins: (B,) whether each is the first window after a gap; None for none of them.
 
         Returns:
             displacement (B, 3) [m] and covariance (B, 3, 3) [m^2] in N.
@@ -181,8 +187,16 @@ class StatefulInference:
             InputError: the model's predictions are not arrays of these shapes, or a covariance is
                 asymmetric.
         """
-        answer = self._stretch.predict(rotated_windows(windows_N, -heading))
-        mean_H, covariance_H = _checked(answer, len(heading))
+        remembers = begins is not None and self.is_recurrent
+        restarts = np.flatnonzero(begins).tolist() if remembers else []
+        edges = sorted({*range(0, len(heading), _BATCH), *restarts, len(heading)})
+        answers = []
+        for first, stop in pairwise(edges):
+            if first in restarts:
+                self.restart()
+            windows_H = rotated_windows(windows_N[first:stop], -heading[first:stop])
+            answers.append(_checked(self._stretch.predict(windows_H), stop - first))
+        mean_H, covariance_H = map(np.concatenate, zip(*answers, strict=True))
         R_NH = about_z(heading).as_matrix()
         with np.errstate(invalid="ignore"):  # the estimator refuses values that are not finite
             mean_N: FloatArray = (R_NH @ mean_H[:, :, None])[:, :, 0]
@@ -227,12 +241,15 @@ def _checked(answer: Any, count: int) -> tuple[FloatArray, FloatArray]:
 
 
 def displacements_of(
-    network: StatefulInference, windows: Sequence[Window]
+    network: StatefulInference, windows: Sequence[Window], begins: BoolArray | None = None
 ) -> list[WindowDisplacement]:
-    """Predict the displacements of windows, with inflated and floored covariances."""
+    """Predict the displacements of windows, with inflated and floored covariances.
+
+    `begins` is as for `StatefulInference.predict`.
+    """
     windows_N = np.stack([window.imu_N for window in windows])
     heading = np.array([window.heading for window in windows])
-    mean_N, covariance_N = network.predict(windows_N, heading)
+    mean_N, covariance_N = network.predict(windows_N, heading, begins)
     flagged = np.array([window.flagged for window in windows])
     covariance_N = np.where(flagged[:, None, None], FLAGGED_SCALE, 1.0) * covariance_N
     with np.errstate(invalid="ignore", over="ignore"):  # the estimator refuses such values

@@ -25,8 +25,9 @@ from stario.network.training.augment import WindowSampler
 from stario.network.training.captured import CapturedStep
 from stario.network.training.checkpoint import damaged, read_checkpoint, write_checkpoint
 from stario.network.training.config import TrainingConfig, learning_rate, loss_with_sigma
+from stario.network.training.data import TrainingData
 from stario.network.training.history import EpochReport, History
-from stario.network.training.legs import LegBatch, LegSampler
+from stario.network.training.legs import LegBatch, leg_samplers
 from stario.network.training.parallel import Workers
 from stario.network.training.validation import ValidationSet
 from stario.network.training.weak_truth import leg_loss
@@ -41,8 +42,7 @@ class TrainingRun:
 
     Args:
         config: the recipe.
-        sampler: sampler of windows with full truth.
-        legs: samplers of weak truth, each with the number of stretches per step.
+        data: what is learned from.
         material: digest of the recordings and initial weights, for the checkpoint.
         folder: existing folder for checkpoint, model and log.
         workers: the processes that share the run.
@@ -54,15 +54,23 @@ class TrainingRun:
     def __init__(
         self,
         config: TrainingConfig,
-        sampler: WindowSampler,
-        legs: list[tuple[LegSampler, int]],
+        data: TrainingData,
         material: str,
         folder: Path,
         workers: Workers,
     ) -> None:
         torch.manual_seed(config.seed)
-        self.config, self.sampler, self.legs = config, sampler, legs
-        self.workers, self.device, self._material = workers, workers.device, material
+        self.config, self._material = config, material
+        self.workers, self.device = workers, workers.device
+        self.sampler = WindowSampler(
+            data.streams,
+            data.weights,
+            config.augmentation,
+            config.seed,
+            config.successive,
+            self.device,
+        )
+        self.legs = leg_samplers(config, data.legs, self.sampler.generator)
         self.network = DisplacementNetwork(build_network(config.architecture)).to(self.device)
         self._checkpoint, self._log = folder / "checkpoint.safetensors", folder / "log.json"
         if config.dropout is not None:

@@ -120,6 +120,21 @@ def test_slopes_and_missing_samples_make_displacements_less_certain(walk, withou
         np.testing.assert_allclose(covariance, expected, atol=1e-10)
 
 
+@pytest.mark.parametrize("rate", [2, 10])
+def test_a_recording_tells_a_network_that_walks_backwards(make_walk, make_oracle, rate):
+    sequence, config = make_walk(seconds=60.0), NavigatorConfig(filter=FilterConfig(rate))
+    oracle = make_oracle(sequence, sequence.truth, config)
+
+    class Backwards:
+        def predict(self, windows):
+            displacement, covariance = oracle.predict(windows)
+            return -displacement, covariance
+
+    counts = Navigator(Backwards(), config).observe(sequence).front_end.counts
+    assert abs(counts.network_turn) > np.radians(135.0)
+    assert counts.network_turn_sigma < np.radians(20.0)
+
+
 def compared(stream, displacement) -> Direction:
     return direction(weighted_force(stream.windows()), displacement, TICKS_PER_SECOND)
 
