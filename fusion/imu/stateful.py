@@ -132,8 +132,8 @@ _BATCH = 512
 class Predictor(Protocol):
     """Interface that a navigator requires of a model; `DisplacementModel` implements it.
 
-    A model whose network remembers earlier windows also has `stateful_inference(updates)`, which
-    returns a predictor for the windows of one unbroken stretch.
+    That of a recurrent network also has `is_recurrent`, true, and `predict_next`, as
+    `DisplacementModel`: its predictions depend on the track's earlier windows.
     """
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -154,21 +154,19 @@ class StatefulInference:
 
     Attributes:
         updates: that number.
+        is_recurrent: whether predictions depend on earlier windows, and so on gaps.
+        memory: what a recurrent network remembers, as arrays and numbers; None at the start, after
+            a gap, and of other networks.
     """
 
     def __init__(self, model: Predictor, updates: int) -> None:
-        self._model, self.updates = model, updates
-        self.restart()
-
-    @property
-    def is_recurrent(self) -> bool:
-        """Whether predictions depend on earlier windows, and so on gaps."""
-        return self._stretch is not self._model
+        self._model: Any = model
+        self.updates, self.memory = updates, None
+        self.is_recurrent = bool(getattr(model, "is_recurrent", False))
 
     def restart(self) -> None:
         """Clear the memory of windows before a gap."""
-        begin = getattr(self._model, "stateful_inference", None)
-        self._stretch: Any = self._model if begin is None else begin(self.updates)
+        self.memory = None
 
     def predict(
         self, windows_N: NDArray[np.float32], heading: FloatArray, begins: BoolArray | None = None
@@ -195,31 +193,19 @@ class StatefulInference:
             if first in restarts:
                 self.restart()
             windows_H = rotated_windows(windows_N[first:stop], -heading[first:stop])
-            answers.append(_checked(self._stretch.predict(windows_H), stop - first))
+            answers.append(self._predicted(windows_H))
         mean_H, covariance_H = map(np.concatenate, zip(*answers, strict=True))
         R_NH = about_z(heading).as_matrix()
         with np.errstate(invalid="ignore"):  # the estimator refuses values that are not finite
             mean_N: FloatArray = (R_NH @ mean_H[:, :, None])[:, :, 0]
             return mean_N, R_NH @ covariance_H @ R_NH.transpose(0, 2, 1)
 
-    @property
-    def memory(self) -> Any:
-        """State that the network remembers, as arrays and numbers; None without memory.
-
-        Raises:
-            InputError: a memory is assigned to a network that has none, or the reverse.
-        """
-        return self._stretch.memory if self.is_recurrent else None
-
-    @memory.setter
-    def memory(self, memory: Any) -> None:
-        self.restart()
-        if (memory is not None) != self.is_recurrent:
-            raise InputError(
-                "snapshot: network", "a different kind of memory", "that of the same network"
-            )
+    def _predicted(self, windows_H: NDArray[np.float32]) -> tuple[FloatArray, FloatArray]:
         if self.is_recurrent:
-            self._stretch.memory = memory
+            *answer, self.memory = self._model.predict_next(windows_H, self.updates, self.memory)
+        else:
+            answer = self._model.predict(windows_H)
+        return _checked(answer, len(windows_H))
 
 
 def _checked(answer: Any, count: int) -> tuple[FloatArray, FloatArray]:

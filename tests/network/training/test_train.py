@@ -212,7 +212,7 @@ def test_a_recurrent_network_is_trained_on_successive_windows(tmp_path, monkeypa
     assert config.successive == 10
     # A step changes the weights that act only on a nonzero state.
     path = run(tmp_path / "row", config)
-    assert load_model(path).stateful_inference(2) is not None
+    assert load_model(path).is_recurrent
     first = DisplacementNetwork(build_network_of(config)).state_dict()
     last = safetensors.torch.load_file(path)
     change = last["lstm.weight_hh_l0"] - first["network.lstm.weight_hh_l0"]
