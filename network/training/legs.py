@@ -14,10 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from stario.network.training.augment import Augmentation, augmented, heading_of
+from stario.network.training.augment import Augmentation, Stretches, augmented, heading_of
 from stario.network.training.config import TrainingConfig
 from stario.network.training.parallel import Workers
-from stario.network.training.stretches import Stretches
 from stario.sequences.arrays import runs
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.legs import LegStream

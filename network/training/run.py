@@ -9,7 +9,7 @@ import copy
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import asdict, fields
+from dataclasses import fields
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -268,10 +268,9 @@ class TrainingRun:
         if self.history.epochs_since_best() == 0 and math.isfinite(report.validation_error):
             self._keep(candidate)
         if self.workers.is_leader:
-            history = [asdict(r) for r in self.history.reports]
-            path, config = self._checkpoint, self.config
-            write_checkpoint(path, config, self._material, self.step, history, self._tensors())
-            write_json(self._log, history)
+            given = self.history, self._material, self.step, self._tensors()
+            write_checkpoint(self._checkpoint, *given)
+            write_json(self._log, self.history.reports)
         return report
 
     def _tensors(self) -> dict[str, Tensor]:
@@ -299,14 +298,14 @@ class TrainingRun:
         """
         if not self._checkpoint.exists():
             return
-        self.step, history, tensors = read_checkpoint(self._checkpoint, self.config, self._material)
+        found = read_checkpoint(self._checkpoint, self.config, self._material)
+        self.step, self.history.reports, tensors = found
         try:
-            self.history.reports = [EpochReport(**report) for report in history]
             self._restore(tensors)
         except (RuntimeError, KeyError, TypeError, ValueError) as error:
             raise damaged(self._checkpoint, error) from error
         if self.workers.is_leader:
-            write_json(self._log, history)  # which may have been lost
+            write_json(self._log, self.history.reports)  # which may have been lost
         log.info("resumed %s at step %d", self._checkpoint, self.step)
 
     def _restore(self, tensors: dict[str, Tensor]) -> None:
