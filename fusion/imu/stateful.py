@@ -185,8 +185,9 @@ class StatefulInference:
             InputError: the model's predictions are not arrays of these shapes, or a covariance is
                 asymmetric.
         """
-        remembers = begins is not None and self.is_recurrent
-        restarts = np.flatnonzero(begins).tolist() if remembers else []
+        restarts: list[int] = []
+        if begins is not None and self.is_recurrent:
+            restarts = np.flatnonzero(begins).tolist()
         edges = sorted({*range(0, len(heading), _BATCH), *restarts, len(heading)})
         answers = []
         for first, stop in pairwise(edges):
