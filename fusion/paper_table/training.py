@@ -30,7 +30,7 @@ from stario.sequences.datasets.cache_files import recording_stamps
 from stario.sequences.datasets.stream_cache import recorded
 from stario.sequences.files import write_json
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.windows import WINDOW_SAMPLES, Attitude, WorldStream
+from stario.sequences.windows import WINDOW_SAMPLES, Attitude
 
 _EPOCH_STEPS = 250
 """Maximum steps between two checkpoints: what an interrupted run loses."""
@@ -95,8 +95,7 @@ def train_run(
     streams, skipped = _streams(dataset.training, recipe.attitude, reading)
     held_out, missing = _streams(dataset.validation, recipe.attitude, reading)
     simulated = partial(cached_walks, folder=reading.cache, attitude=recipe.attitude)
-    poses = any(isinstance(s, WorldStream) for recording in streams for s in recording.streams)
-    walks = [] if poses else simulated(_WALKS, 0)
+    walks = [] if any(recording.has_poses for recording in streams) else simulated(_WALKS, 0)
     data = mix_sources(streams, walks, recipe.shares, recipe.reach)
     validation = validation_data(held_out, partial(simulated, _VALIDATION_WALKS, 1))
     began, clock = process_time(), folder / TEMPORARY_FILES[1]

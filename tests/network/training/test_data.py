@@ -42,6 +42,8 @@ def test_parts_too_short_for_windows_are_dropped():
     first, last = split_off(recordings_of([stream("a", 1500)]))
     assert [len(s) for s in first[0].streams] == [1200]
     assert not last[0].streams
+    assert first[0].has_poses
+    assert not last[0].has_poses
 
 
 def test_recorded_and_generated_streams_get_their_shares():
@@ -59,12 +61,6 @@ def test_bad_moments_get_their_share_of_all_windows():
     assert drawn_shares(material) == pytest.approx({"a": 0.7, "c": 0.2, "m": 0.1}, abs=1e-3)
     with pytest.raises(ConfigError, match=r"1\.1 for simulated walks and moments"):
         mix_sources(recorded, [], {SIMULATED: 0.4, INSERTED: 0.7}, moments=[stream("m", 900)])
-
-
-def test_a_recording_too_short_to_be_split_has_no_poses_left():
-    _, last = split_off(recordings_of([stream("a", 1500)]))
-    assert not last[0].has_poses
-    assert recordings_of([stream("a", 1500)])[0].has_poses
 
 
 def drawn_shares(material: TrainingData, reach: int = 1) -> dict[str, float]:
