@@ -104,6 +104,9 @@ class TrainingData:
         words: description of the sources, for the card.
         simulated: whether all `streams` are simulated: legs, if there are any, then select the
             weights alone.
+
+    Raises:
+        InputError: the number of weights is not that of streams.
     """
 
     streams: Sequence[WorldStream]
@@ -113,7 +116,11 @@ class TrainingData:
     simulated: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "weights", self.weights or [1.0] * len(self.streams))
+        if not len(self.weights):
+            object.__setattr__(self, "weights", [1.0] * len(self.streams))
+        if len(self.weights) != len(self.streams):
+            expected = f"{len(self.streams)}, one for each stream"
+            raise InputError("weights", str(len(self.weights)), expected)
 
 
 def mix_sources(

@@ -17,7 +17,7 @@ from stario.network.training.data import (
 )
 from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.datasets.batch import Skipped
-from stario.sequences.errors import ConfigError
+from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
@@ -61,6 +61,14 @@ def test_bad_moments_get_their_share_of_all_windows():
     assert drawn_shares(material) == pytest.approx({"a": 0.7, "c": 0.2, "m": 0.1}, abs=1e-3)
     with pytest.raises(ConfigError, match=r"1\.1 for simulated walks and moments"):
         mix_sources(recorded, [], {SIMULATED: 0.4, INSERTED: 0.7}, moments=[stream("m", 900)])
+
+
+def test_streams_are_drawn_alike_unless_each_has_a_weight():
+    streams = [stream("a", 3000), stream("b", 1000)]
+    assert drawn_shares(TrainingData(streams)) == pytest.approx({"a": 0.75, "b": 0.25})
+    assert drawn_shares(TrainingData(streams, np.array([1.0, 3.0])))["a"] == pytest.approx(0.5)
+    with pytest.raises(InputError, match="weights: found 1, expected 2"):
+        TrainingData(streams, [1.0])
 
 
 def drawn_shares(material: TrainingData, reach: int = 1) -> dict[str, float]:
