@@ -388,7 +388,7 @@ def _loaded(name: str) -> Predictor:
 def demonstration() -> ImuSequence:
     """Return the bundled demonstration: a simulated walk of two and a half minutes in a building.
 
-    A phone with a magnetometer is held flat in front along the corridors, as who follows a map does.
+    A phone with a magnetometer is held flat in front along the corridors, as one follows a map.
     """
     style = WalkStyle(carry="in-front", mount_rotvec=(0.3, -0.2, 0.9))
     walk = generate_walk(DEMONSTRATION_SEED, duration=150.0, style=style, corridors=True)

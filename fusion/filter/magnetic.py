@@ -41,7 +41,8 @@ it decorrelates [s]: phones calibrate their magnetometer anew as they are carrie
 once (IPIN 2023, Trial01_1), so that what it was a minute ago tells little."""
 
 BEARING_SIGMA = 0.3
-"""White noise of one bearing [rad]: steel within a step's length, late samples while it turns."""
+"""White noise of one bearing [rad] where the wander's sigma is at its largest, elsewhere in
+proportion: steel within a step's length, late samples while it turns."""
 
 _FIRST_AZIMUTH_SIGMA = math.pi
 """Initial standard deviation of c [rad]."""
@@ -68,19 +69,22 @@ _PERIOD = 0.5
 _NEW_PLACE, _NEW_TURN = 0.3, 0.2
 """Distance [m] or rotation [rad] since the last bearing from which on the next one is used."""
 
-WANDER_SIGMA = 0.4
-"""Sigma of the wander, the azimuth about its mean [rad]: buildings turn it by 5 to 30 degrees. One
-that follows how size and dip vary along the path changed no error on OxIOD, RIDI, KIPD and tyrex by
-more than 1 %."""
+WANDER_SIGMA, _MIN_WANDER_SIGMA = 0.4, 0.1
+"""Sigma of the wander, the azimuth about its mean, at most and at least [rad]: buildings turn it by
+5 to 30 degrees."""
 
-_SIGMAS = np.array([WANDER_SIGMA, *[HARD_IRON_SIGMA] * 3])
-"""Stationary sigmas of the wander [rad] and of the hard iron [uT]."""
+_WANDER_PER_SPREAD = 2.0
+"""Sigma of the wander per unit of `MagneticReference.spread` [rad]: 1 to 2 by the true attitude of
+OxIOD, RIDI, KIPD and tyrex."""
+
+_FIRST_SPREAD, _FIRST_COUNT = 0.2, 20
+"""Spread as in a building, and the number of bearings that it counts as."""
 
 _SIZE_TOLERANCE, _DIP_TOLERANCE = 0.05, 0.05
 """Deviations from the place's usual size (fraction) and dip [rad] that double the variance."""
 
 _AVERAGING_COUNT = 120
-"""Number of bearings that determine the place's usual size and dip: those of a minute."""
+"""Number of bearings that determine the place's usual size, dip and spread: those of a minute."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +96,8 @@ class MagneticReference:
         count: number of bearings so far.
         size: usual size of the field [uT].
         dip: usual angle below the horizontal [rad].
+        spread: mean deviation of size (fraction) and dip [rad] from these along the path.
+        places: number of bearings averaged in it.
         rotation: how the field has changed while the device rotated.
         pose: attitude R_WB (3, 3) and position p_W (3,) [m] at the last bearing.
     """
@@ -100,8 +106,15 @@ class MagneticReference:
     count: int = 0
     size: float = 0.0
     dip: float = 0.0
+    spread: float = _FIRST_SPREAD
+    places: int = _FIRST_COUNT
     rotation: FieldRotation = field(default_factory=FieldRotation)
     pose: tuple[FloatArray, FloatArray] | None = None
+
+    @property
+    def wander_sigma(self) -> float:
+        """Sigma of the azimuth about its mean [rad]: it varies as size and dip do."""
+        return min(max(_WANDER_PER_SPREAD * self.spread, _MIN_WANDER_SIGMA), WANDER_SIGMA)
 
     def unusual(self, size: float, dip: float) -> float:
         """Return how far a field's size [uT] and dip [rad] are from usual; 1 doubles a variance."""
@@ -119,18 +132,24 @@ class MagneticReference:
             return False
         if self.pose is None:
             return True
-        R_WB, p_W = self.pose
-        x, y, _ = s.p_W - p_W
-        turned = s.R_WB @ R_WB.T
-        return math.hypot(x, y) > _NEW_PLACE or np.trace(turned) < 1.0 + 2.0 * math.cos(_NEW_TURN)
+        turned = s.R_WB @ self.pose[0].T
+        return self.travelled(s) or np.trace(turned) < 1.0 + 2.0 * math.cos(_NEW_TURN)
 
-    def updated(self, time: float, size: float, dip: float) -> MagneticReference:
+    def travelled(self, s: EkfState) -> bool:
+        """Return whether a state is at another place than the last bearing."""
+        if self.pose is None:
+            return False
+        x, y, _ = s.p_W - self.pose[1]
+        return math.hypot(x, y) > _NEW_PLACE
+
+    def updated(self, time: float, size: float, dip: float, travelled: bool) -> MagneticReference:
         """Return the reference after one more bearing: clipped means, as robust as medians.
 
         Args:
             time: time of the bearing [s].
             size: size of the field [uT].
             dip: angle below the horizontal [rad].
+            travelled: whether at another place than the one before: one alone shows no spread.
         """
         count = self.count + 1
         if count == 1:
@@ -140,7 +159,13 @@ class MagneticReference:
         size_change = min(max(size - self.size, -clip), clip)
         dip_change = min(max(dip - self.dip, -2.0 * _DIP_TOLERANCE), 2.0 * _DIP_TOLERANCE)
         usual = self.size + gain * size_change, self.dip + gain * dip_change
-        return changed(self, time=time, count=count, size=usual[0], dip=usual[1])
+        means = changed(self, time=time, count=count, size=usual[0], dip=usual[1])
+        if not travelled:
+            return means
+        deviation = min(math.hypot(size / usual[0] - 1.0, dip - usual[1]), 1.0)
+        places = self.places + 1
+        spread = self.spread + (deviation - self.spread) / min(places, _AVERAGING_COUNT)
+        return changed(means, spread=spread, places=places)
 
 
 def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> Fix | None:
@@ -166,22 +191,26 @@ def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> 
 def with_field(s: EkfState, m_B: FloatArray) -> EkfState:
     """Return the state with an unknown azimuth, initialised by the first field (3,) [uT]."""
     x, y, _ = s.R_WB @ m_B
-    variances = [_FIRST_AZIMUTH_SIGMA**2, *_SIGMAS**2]
+    variances = [_FIRST_AZIMUTH_SIGMA**2, WANDER_SIGMA**2, *[HARD_IRON_SIGMA**2] * 3]
     n = s.field_row
     P = np.zeros((2, n + len(variances), n + len(variances)))
     P[:, :n, :n], P[:, n:, n:] = s.covariances, np.diag(variances)
     return changed(s, covariances=P, field=FieldState(math.atan2(y, x), 0.0, np.zeros(3)))
 
 
-def propagated_field(s: EkfState, seconds: float) -> EkfState:
-    """Return the state with its azimuth and hard iron propagated for a time [s]."""
+def propagated_field(s: EkfState, seconds: float, sigma: float) -> EkfState:
+    """Return the state with its azimuth and hard iron propagated for a time [s].
+
+    `sigma` is the standard deviation of the azimuth about its mean [rad].
+    """
     assert s.field is not None  # set by `with_field`
     metres = seconds * math.hypot(s.v_W[0], s.v_W[1])
     row = s.field_row + 1
     wander = math.exp(-metres / WANDER_METRES - seconds / WANDER_SECONDS)
     iron = math.exp(-seconds / HARD_IRON_SECONDS)
     kept = np.array([wander, iron, iron, iron])
-    P = gauss_markov(s.covariances, slice(row, row + 4), kept, _SIGMAS)
+    sigmas = np.array([sigma, *[HARD_IRON_SIGMA] * 3])
+    P = gauss_markov(s.covariances, slice(row, row + 4), kept, sigmas)
     wander_iron = kept * np.array([s.field.wander, *s.field.hard_iron_B])
     field = changed(s.field, wander=float(wander_iron[0]), hard_iron_B=wander_iron[1:])
     return changed(s, covariances=P, field=field)
@@ -197,7 +226,7 @@ def update_bearing(
     if s.field is None:
         s = with_field(s, m_B)
     elif math.isfinite(reference.time):
-        s = propagated_field(s, now - reference.time)
+        s = propagated_field(s, now - reference.time, reference.wander_sigma)
     assert s.field is not None
     m_W = s.R_WB @ (m_B - s.field.hard_iron_B)
     horizontal = math.hypot(m_W[0], m_W[1])
@@ -209,6 +238,7 @@ def update_bearing(
     reference = changed(reference, rotation=rotation)
     if rotation.contradicts_gyro:
         return s, UpdateResult("contradicts the gyroscope"), changed(reference, time=now)
-    reference = reference.updated(now, size, dip)
-    variance = BEARING_SIGMA**2 * (1.0 + reference.unusual(size, dip) ** 2)
+    reference = reference.updated(now, size, dip, reference.travelled(s))
+    sigma = BEARING_SIGMA * reference.wander_sigma / WANDER_SIGMA
+    variance = sigma**2 * (1.0 + reference.unusual(size, dip) ** 2)
     return *ekf.update_bearing(s, m_B, variance, chi2_quantile(_GATE, 1)), reference

@@ -16,6 +16,7 @@ from stario.fusion.filter.jacobians import bearing_jacobian
 from stario.fusion.filter.magnetic import (
     HARD_IRON_SECONDS,
     HARD_IRON_SIGMA,
+    WANDER_SIGMA,
     MagneticReference,
     propagated_field,
     update_bearing,
@@ -73,6 +74,23 @@ def state() -> EkfState:
     return with_field(ekf.state, R_WB.T @ FIELD_W)
 
 
+def test_a_field_that_varies_along_the_path_has_a_wandering_azimuth() -> None:
+    rng = np.random.default_rng(1)
+    wander = {}
+    for place, spread, travelled in (
+        ("quiet", 0.01, True),
+        ("steel", 0.4, True),
+        ("table", 0.01, False),
+    ):
+        reference = MagneticReference()
+        for k in range(120):
+            size, dip = 45.0 * (1.0 + spread * rng.normal()), 1.0 + spread * rng.normal()
+            reference = reference.updated(0.5 * k, size, dip, travelled)
+        wander[place] = reference.wander_sigma
+    assert wander["quiet"] < 0.15
+    assert wander["steel"] == wander["table"] == WANDER_SIGMA  # one spot tells nothing of others
+
+
 def with_iron(s: EkfState, iron_B: np.ndarray, sigma: float):
     """The state with a known hard iron [uT]."""
     P, rows = s.covariances.copy(), slice(s.field_row + 2, s.field_row + 5)
@@ -119,7 +137,7 @@ def test_bearings_of_a_device_at_rest_leave_its_yaw_unknown():
 def test_a_field_of_unusual_size_has_less_weight():
     reference = MagneticReference()
     for k in range(20):
-        reference = reference.updated(0.5 * k, 45.0, 1.0)
+        reference = reference.updated(0.5 * k, 45.0, 1.0, travelled=True)
     gains = []
     for scale in (1.0, 1.5):
         ekf = Driven(2)
@@ -178,7 +196,7 @@ def test_bearings_determine_the_gyroscope_bias(biased_walk, oracle, biased_track
 
 def test_what_a_magnetometers_calibration_was_is_forgotten_within_minutes():
     known = with_iron(state(), np.array([20.0, -25.0, 10.0]), sigma=1.0)
-    later = propagated_field(known, 3.0 * HARD_IRON_SECONDS)
+    later = propagated_field(known, 3.0 * HARD_IRON_SECONDS, WANDER_SIGMA)
     row = later.field_row + 2
     assert np.abs(later.field.hard_iron_B).max() < 2.0
     assert math.sqrt(later.P[row, row]) == pytest.approx(HARD_IRON_SIGMA, rel=0.01)
