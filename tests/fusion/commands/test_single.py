@@ -105,7 +105,9 @@ def test_a_bug_is_not_reported_as_an_error_of_the_user(stario, monkeypatch, reco
 # --- run -------------------------------------------------------------------------------------
 
 
-def test_run_writes_a_track_and_prints_a_summary(stario, recording, tmp_path):
+def test_run_writes_a_track_and_prints_a_summary(stario, recording, tmp_path, monkeypatch):
+    saved = "stario.fusion.evaluation.results.save_figure"  # rendering is slow
+    monkeypatch.setattr(saved, lambda figure, path: path.touch())
     done = stario("run", recording, "--out", "out")
     assert done.code == 0
     assert done.err == ""
