@@ -31,9 +31,8 @@ def error_added(
 ) -> float:
     """Return what a fault adds to the error of the position [m]."""
     only = [each for each in faults(SECONDS) if each.name == fault]
-    short = sequence.slice(0.0, 0.75 * SECONDS)  # half a minute after the fault
     [result] = wide(
-        run_faults(short, config, seed=seed, backends=(backend,), only=only)
+        run_faults(sequence, config, seed=seed, backends=(backend,), only=only)
     ).itertuples()
     return float(result.error_with - result.error_without)
 
