@@ -101,9 +101,9 @@ def test_the_graph_uses_no_fix_that_the_filter_refused(make_walk, make_oracle):
 
 
 def test_a_heading_alone_does_not_make_the_position_uncertain(make_walk, make_oracle):
-    walk = make_walk(4, 20.0)
+    walk = make_walk(4, 8.0)
     oracle = make_oracle(walk, walk.truth, CONFIG)
-    fixes = [yaw_fix(10.0, 1.0, 0.05)]
+    fixes = [yaw_fix(5.0, 1.0, 0.05)]
     track = Navigator(oracle, CONFIG, backend="graph").run(walk, fixes=fixes)
     assert track.health.fixes == {"applied": 1}
     assert np.linalg.norm(track.trajectory.position_W[0]) < 0.01
@@ -200,9 +200,9 @@ def test_more_accurate_positions_move_a_stationary_track(still_model):
 
 
 def test_the_track_is_turned_about_its_prior_position():
-    walk, _, oracle = measured(3, 40.0, CONFIG)
+    walk, _, oracle = measured(3, 28.0, CONFIG)
     far, turn = np.array([100.0, 50.0, 0.0]), about_z(2.0)
-    fixes = fixes_of(walk, np.arange(3.0, 38.0, 3.0), far)
+    fixes = fixes_of(walk, np.arange(3.0, 27.0, 3.0), far)
     first = walk.truth.attitude_WB[0].as_matrix()
     p_W = turn.apply(walk.truth.position_W[0]) + far
     prior = PriorPose(first, np.zeros(3), p_W, yaw_sigma=3.0, position_sigma=1.0)
@@ -235,7 +235,7 @@ def test_uninformative_fixes_in_a_gap_leave_its_turn_as_uncertain(make_walk, wit
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_false_position_does_not_block_a_yaw(backend):
-    walk, _, oracle = measured(3, 20.0, CONFIG)
+    walk, _, oracle = measured(3, 12.0, CONFIG)
     first, off = fixes_of(walk, [2.0, 4.0], np.zeros(3))
     off = position_fix(off.time, off.value + np.array([60.0, 0.0, 0.0]), off.covariance)
     yaw = float(yaw_of(walk.truth.at(np.array([5.0])).attitude_WB)[0]) + 2.0
@@ -247,7 +247,7 @@ def test_a_false_position_does_not_block_a_yaw(backend):
 
 
 def test_a_horizontal_position_is_kept_over_a_coarser_one_with_height():
-    walk, _, oracle = measured(3, 20.0, CONFIG)
+    walk, _, oracle = measured(3, 8.0, CONFIG)
     start = true_at(walk, 1.5)
     plane = position_fix(1.5, [start[0], start[1], 0.0], np.diag([0.09, 0.09, 1e6]))
     coarse = position_fix(2.5, true_at(walk, 2.5) + np.array([6.0, 6.0, 0.0]), 64.0 * np.eye(3))

@@ -119,7 +119,7 @@ def test_a_stream_gates_displacements_itself_if_the_filter_uses_more_of_them(wal
 
 def test_a_heading_far_from_the_estimate_turns_a_stream_like_its_filter():
     """Used as inflated by the filter; to a robust loss of the graph's own it is 60 sigma off."""
-    walk, _, oracle = measured(5, 16.0, CONFIG)
+    walk, _, oracle = measured(5, 13.0, CONFIG)
     start = true_start(walk)
     turn = about_z(0.6).as_matrix()
     turned = replace(start, R_WB=turn @ start.R_WB, v_W=turn @ start.v_W, yaw_sigma=0.5)
