@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stario.network import DisplacementModel, TrainingConfig, load_model, train
+from stario.network import DisplacementModel, TrainingConfig, TrainingData, load_model, train
 from stario.sequences import (
     ImuSequence,
     PositionTrack,
@@ -45,8 +45,8 @@ def main(folder: Path, epochs: int = 1) -> DisplacementModel:
     )  # fmt: skip
     before = load_model("default")
     weights = train(
-        config, full[0], [1.0] * len(full[0]), full[1], folder,
-        start_from=before, calibration=before.card.calibration, legs=legs,
+        config, TrainingData(full[0], legs=legs), TrainingData(full[1]), folder,
+        start_from=before, calibration=before.card.calibration,
     )  # fmt: skip
     return load_model(weights)
 

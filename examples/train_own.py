@@ -11,7 +11,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from stario.network import DisplacementModel, TrainingConfig, load_model, train
+from stario.network import DisplacementModel, TrainingConfig, TrainingData, load_model, train
 from stario.sequences import generate_walk, simulate_imu, world_streams
 
 
@@ -20,7 +20,7 @@ def main(folder: Path, epochs: int = 2) -> DisplacementModel:
     recordings = [simulate_imu(generate_walk(seed, 30.0), 200.0, seed=seed) for seed in range(6)]
     streams = [stream for recording in recordings for stream in world_streams(recording)]
     config = TrainingConfig(epochs=epochs, epoch_windows=256, batch=64, seed=0)
-    weights = train(config, streams[:-1], [1.0] * len(streams[:-1]), streams[-1:], folder)
+    weights = train(config, TrainingData(streams[:-1]), TrainingData(streams[-1:]), folder)
     return load_model(weights)
 
 

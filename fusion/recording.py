@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
 
-from stario.fusion.imu.direction import Complex, Direction, direction, weighted_force
+from stario.fusion.imu.direction import Direction, direction, weighted_force
 from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
 from stario.fusion.imu.intervals import ImuInterval, Start
@@ -162,43 +162,24 @@ def _displacements(
     counts: SampleCounts,
     progress: Progress,
 ) -> list[WindowDisplacement | None]:
+    """Predict the displacement of the window that ends with each interval; None without one."""
+    ends = [k for k, interval in enumerate(intervals) if interval.window is not None]
+    gaps = np.cumsum([interval.gap for interval in intervals])[ends]
+    begins = np.diff(gaps, prepend=gaps[0]) > 0
     measurements: list[WindowDisplacement | None] = [None] * len(intervals)
-    weighted = [np.empty((0, 2), dtype=np.complex128)]
-    for batch in _batches(intervals, unbroken=network.is_recurrent):
-        if network.is_recurrent and intervals[batch[0]].gap:
-            network.restart()
-        windows = {k: window for k in batch if (window := intervals[k].window) is not None}
-        if windows:
-            displacements = displacements_of(network, list(windows.values()))
-            weighted.append(weighted_force(np.stack([w.imu_N for w in windows.values()])))
-            for k, displacement in zip(windows, displacements, strict=True):
-                measurements[k] = displacement
+    weighted = []
+    for first in range(0, len(ends), _BATCH):
+        batch = ends[first : first + _BATCH]
+        windows = [window for k in batch if (window := intervals[k].window) is not None]
+        displacements = displacements_of(network, windows, begins[first : first + _BATCH])
+        weighted.append(weighted_force(np.stack([window.imu_N for window in windows])))
+        for k, displacement in zip(batch, displacements, strict=True):
+            measurements[k] = displacement
         progress(0.1 + 0.5 * (batch[-1] + 1) / len(intervals))
-    found = _direction(measurements, np.concatenate(weighted), network.updates)
+    moved = np.array([m.d_N for m in measurements if m is not None])
+    cuts = np.flatnonzero(begins)
+    parts = zip(np.split(np.concatenate(weighted), cuts), np.split(moved, cuts), strict=True)
+    found = sum((direction(w, d, network.updates) for w, d in parts), Direction())
     if found.sigma < math.pi:
         counts.network_turn, counts.network_turn_sigma = found.turn, found.sigma
     return measurements
-
-
-def _direction(
-    measurements: list[WindowDisplacement | None], weighted: Complex, updates: int
-) -> Direction:
-    """Compare displacements with the accelerometer over each unbroken run of windows."""
-    ends = np.flatnonzero([m is not None for m in measurements])
-    if not len(ends):
-        return Direction()
-    moved = np.array([m.d_N for m in measurements if m is not None])
-    cuts = np.flatnonzero(np.diff(ends) > 1) + 1
-    parts = zip(np.split(weighted, cuts), np.split(moved, cuts), strict=True)
-    return sum((direction(w, d, updates) for w, d in parts), Direction())
-
-
-def _batches(intervals: Sequence[ImuInterval], unbroken: bool) -> Iterator[range]:
-    """Yield ranges of intervals that form a batch; with `unbroken`, batches end at gaps."""
-    begin = windows = 0
-    for k, interval in enumerate(intervals):
-        if windows == _BATCH or (unbroken and interval.gap and k > begin):
-            yield range(begin, k)
-            begin, windows = k, 0
-        windows += interval.window is not None
-    yield range(begin, len(intervals))

@@ -147,4 +147,8 @@ class Stream:
         """Continue a new stream from the parts of another."""
         self.prior, self._fixes = parts["prior"], parts["fixes"]
         self.front_end, self.continuous = parts["front end"], parts["continuous"]
+        if parts["network"] is not None and not self._network.is_recurrent:
+            raise InputError(
+                "snapshot: network", "a different kind of memory", "that of the same network"
+            )
         self._network.memory, self.state = parts["network"], parts["estimator"]

@@ -2,7 +2,7 @@
 
 Use: `load_model`, `DisplacementModel`.
 
-Train: `train`, `TrainingConfig`, `Augmentation`, `EpochReport`.
+Train: `train`, `TrainingConfig`, `TrainingData`, `Augmentation`, `EpochReport`.
 
 What weights are: `Card`, `Calibration`.
 """

@@ -27,6 +27,10 @@ if TYPE_CHECKING:  # PyTorch is imported only by what needs it
     from stario.network.displacement import DisplacementNetwork
 
 
+Memory = tuple[int, tuple[Float32Array | None, ...]]
+"""State along a track: number of windows so far, and the network's state for each series."""
+
+
 class DisplacementModel:
     """Model that predicts displacements with calibrated covariance from windows of IMU data.
 
@@ -59,17 +63,10 @@ class DisplacementModel:
         """
         return self.engine.training_form
 
-    def stateful_inference(self, updates: int = 1) -> DisplacementModel | StatefulModel:
-        """Return a model that predicts the windows of one unbroken track, in order of time.
-
-        Args:
-            updates: number of windows that begin within the length of one: the state of a window
-                comes from the window that many places before it.
-
-        Returns:
-            The model itself, or a `StatefulModel` if the network is recurrent.
-        """
-        return StatefulModel(self, updates) if self.engine.state_size else self
+    @property
+    def is_recurrent(self) -> bool:
+        """Whether predictions depend on earlier windows (`predict_next`)."""
+        return self.engine.state_size > 0
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Predict the displacement over each window, from its start to one second later.
@@ -90,47 +87,40 @@ class DisplacementModel:
         if len(batch) == 0:
             return np.zeros((0, 3)), np.zeros((0, 3, 3))
         mean, log_sigma, _ = self.engine.run(batch)
-        return self.calibrated(mean, log_sigma)
+        return self._calibrated(mean, log_sigma)
 
-    def calibrated(
-        self, mean: Float32Array, log_sigma: Float32Array
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return displacements and covariances, as `predict`, from the network's own outputs."""
-        variance = self.card.calibration.variance(log_sigma.astype(np.float64))
-        return mean.astype(np.float64), variance[:, :, None] * np.eye(3)
+    def predict_next(
+        self, windows: ArrayLike, updates: int, memory: Memory | None = None
+    ) -> tuple[FloatArray, FloatArray, Memory]:
+        """Predict the next windows of an unbroken track with a recurrent network.
 
+        Args:
+            windows: (B, 6, 200) as for `predict`, in order of time.
+            updates: number of windows that begin within the length of one; each such series of
+                windows, one second apart, has its own state, as in training.
+            memory: what was returned with the windows before; None at the start of a track.
 
-Memory = tuple[int, tuple[Float32Array | None, ...]]
-"""State along a track: number of windows so far, and the network's state for each series."""
+        Returns:
+            Displacement and covariance as from `predict`, and the memory of these windows.
 
-
-class StatefulModel:
-    """A model with a recurrent network, along one track.
-
-    Args:
-        model: model with a recurrent network.
-        updates: number of windows that begin within the length of one; each such series of
-            windows, one second apart, has its own state, as in training.
-
-    Attributes:
-        memory: number of windows so far and the state of each series; may be restored.
-    """
-
-    def __init__(self, model: DisplacementModel, updates: int) -> None:
-        self._model = model
-        self.memory: Memory = (0, (None,) * updates)
-
-    def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Predict the track's next windows, with the interface of `DisplacementModel.predict`."""
+        Raises:
+            InputError: as for `predict`.
+        """
         batch = _checked_windows(windows)
         mean, log_sigma = np.zeros((2, len(batch), 3), np.float32)
-        first, (*states,) = self.memory
+        first, (*states,) = memory or (0, (None,) * updates)
         for k in range(len(batch)):
-            series = (first + k) % len(states)
-            answer = self._model.engine.run(batch[k : k + 1], states[series])
+            series = (first + k) % updates
+            answer = self.engine.run(batch[k : k + 1], states[series])
             mean[k], log_sigma[k], states[series] = answer
-        self.memory = first + len(batch), tuple(states)
-        return self._model.calibrated(mean, log_sigma)
+        return *self._calibrated(mean, log_sigma), (first + len(batch), tuple(states))
+
+    def _calibrated(
+        self, mean: Float32Array, log_sigma: Float32Array
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return displacements and covariances from the network's own outputs."""
+        variance = self.card.calibration.variance(log_sigma.astype(np.float64))
+        return mean.astype(np.float64), variance[:, :, None] * np.eye(3)
 
 
 def save_model(path: Path, network: DisplacementNetwork, card: Card) -> Card:

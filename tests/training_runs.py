@@ -1,5 +1,6 @@
 """A tiny training run, on a device on a swing, and networks that are trained quickly."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 from stario.network.stario import WIDTHS
 from stario.network.training.augment import Augmentation
 from stario.network.training.config import TrainingConfig
+from stario.network.training.data import TrainingData
 from stario.network.training.train import train
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.windows import WorldStream
@@ -39,6 +41,7 @@ def swaying(name: str, phase: float, seconds: float = 20.0) -> WorldStream:
 
 STREAMS = [swaying("a", 0.3), swaying("b", 1.2)]
 VALIDATION = [swaying("c", 0.8, 6.0), swaying("d", 2.0, 6.0)]
+HELD_OUT = TrainingData(VALIDATION)
 
 
 def narrow(patch: pytest.MonkeyPatch) -> None:
@@ -53,5 +56,7 @@ def shallow(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(one_block, lambda block: block(64, 512, 8))
 
 
-def run(folder: Path, config: TrainingConfig = TINY, **options: Any) -> Path:
-    return train(config, STREAMS, [1.0, 1.0], VALIDATION, folder, **options)
+def run(
+    folder: Path, config: TrainingConfig = TINY, words: Sequence[str] = (), **options: Any
+) -> Path:
+    return train(config, TrainingData(STREAMS, words=words), HELD_OUT, folder, **options)

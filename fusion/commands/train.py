@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,6 @@ from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
-    from stario.network.card import Calibration
     from stario.network.model import DisplacementModel
     from stario.network.training.config import TrainingConfig
     from stario.network.training.data import RecordingStreams, TrainingData
@@ -105,6 +105,7 @@ def train(
     from stario.network.training.moments import moment_streams
     from stario.network.training.parallel import is_leader
     from stario.network.training.splits import warn_of_learned
+    from stario.network.training.train import train as train_network
     from stario.sequences.datasets.cache_files import cache_folder
     from stario.sequences.datasets.stream_cache import recorded as recorded_streams
 
@@ -133,7 +134,7 @@ def train(
     make_folder(out)
     virtual = virtual_recordings(body or [], recipe.seed, folder)
     learned = recorded + virtual + (held_out if last_stage is not None else [])
-    held = _validation(held_out, required=bool(recorded))
+    held = _validation(held_out, bool(recorded), recipe, folder)
     if walks and is_leader():
         typer.echo(
             f"simulating {walks} walks of a minute, or reading them from the cache", err=True
@@ -143,15 +144,17 @@ def train(
         real = [recording.path for recording in learned if recording.has_poses]
         moments = moment_streams(real, reading.read, reading.as_read(), recipe.seed, folder)
     material = _material(learned, walks, moments, recipe, folder)
-    calibrated_by = last_stage or (
-        start_from if seconds_of(held.streams) < _CALIBRATING_S else None
-    )
+    calibrates = not held.simulated and seconds_of(held.streams) >= _CALIBRATING_S
+    calibrated_by = last_stage or (None if calibrates else start_from)
     calibration = load_model(calibrated_by).card.calibration if calibrated_by else None
     if is_leader():
         common.list_skipped(skipped)  # before hours of training
         for words in material.words:
             typer.echo(words, err=True)
-    path = _trained(recipe, material, held, out, folder, first, calibration)
+    with common.training_progress(recipe.steps, shown=is_leader()) as progress:
+        path = train_network(
+            recipe, material, held, out, progress, _print_epoch, first, calibration
+        )
     if is_leader():
         typer.echo(str(path))
         if skipped:
@@ -260,53 +263,21 @@ def _material(
     return material
 
 
-def _validation(recorded: list[RecordingStreams], required: bool) -> TrainingData:
+def _validation(
+    recorded: list[RecordingStreams], required: bool, recipe: TrainingConfig, folder: Path
+) -> TrainingData:
     """Return what is selected and calibrated on, if there is any or none is required."""
-    from stario.network.training.data import mix_sources
+    from stario.network.training.data import cached_walks, validation_data
 
-    held = mix_sources(recorded, [])
-    if required and not (held.streams or held.legs):
+    if required and not any(recording.streams for recording in recorded):
         raise InputError(
             "recordings",
             "none whose last fifth has 2 s of poses, or two legs between known positions",
             "validation data to select and calibrate on",
             "name recordings with --validation",
         )
-    return held
-
-
-def _trained(
-    recipe: TrainingConfig,
-    material: TrainingData,
-    held: TrainingData,
-    out: Path,
-    folder: Path,
-    first: DisplacementModel | None,
-    calibration: Calibration | None,
-) -> Path:
-    """Train with a progress bar and a line per epoch; return the path of the weights."""
-    from stario.network.training.data import cached_walks
-    from stario.network.training.parallel import is_leader
-    from stario.network.training.train import train as train_network
-
-    # Sigma needs windows with full ground truth; if there are none, use simulated walks.
-    windows = held.streams or cached_walks(10, recipe.seed + 1, folder, recipe.attitude)
-    with common.training_progress(recipe.steps, shown=is_leader()) as progress:
-        return train_network(
-            recipe,
-            material.streams,
-            material.weights,
-            windows,
-            out,
-            on_step=progress,
-            on_epoch=_print_epoch,
-            trained_on=material.words,
-            start_from=first,
-            calibration=calibration,
-            legs=material.legs,
-            validation_legs=held.legs,
-            chosen_by_legs=not held.streams,
-        )
+    walks = partial(cached_walks, 10, recipe.seed + 1, folder, recipe.attitude)
+    return validation_data(recorded, walks)
 
 
 def _print_epoch(report: EpochReport) -> None:

@@ -388,9 +388,9 @@ def _loaded(name: str) -> Predictor:
 def demonstration() -> ImuSequence:
     """Return the bundled demonstration: a simulated walk of two and a half minutes in a building.
 
-    A phone with a magnetometer is carried in the hand along the corridors.
+    A phone with a magnetometer is held flat in front along the corridors, as who follows a map does.
     """
-    style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.2, 0.9))
+    style = WalkStyle(carry="in-front", mount_rotvec=(0.3, -0.2, 0.9))
     walk = generate_walk(DEMONSTRATION_SEED, duration=150.0, style=style, corridors=True)
     name = "demonstration"
     seed, field = DEMONSTRATION_SEED, INDOOR_FIELD

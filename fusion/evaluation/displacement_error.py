@@ -40,7 +40,6 @@ from stario.sequences.levelled_stream import (
     levelled_streams,
 )
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, PositionTrack, is_gap
-from stario.sequences.windows import WINDOW_SECONDS
 
 HORIZONS = (1, 10, 30)
 """Spans [s] over which displacements are compared."""
@@ -83,12 +82,6 @@ _MIN_PATH_M = 1.0
 """Length of the true path [m] below which a recording is not compared."""
 
 
-UPDATES = round(WINDOW_SECONDS / TICK_SECONDS)
-"""Number of windows that begin within the length of one."""
-
-_BATCH = 128
-
-
 class Piece(NamedTuple):
     """An unbroken stretch of a recording with the displacements of its M windows.
 
@@ -109,7 +102,7 @@ class Piece(NamedTuple):
 
     def track(self) -> Complex:
         """Return the horizontal position (K,) [m] at the stream's ticks, 0 at the first."""
-        steps, cover = self.windows / UPDATES, np.ones(UPDATES)
+        steps, cover = self.windows / TICKS_PER_SECOND, np.ones(TICKS_PER_SECOND)
         total, count = np.convolve(steps, cover), np.convolve(np.ones(len(steps)), cover)
         track = np.concatenate([[0.0], np.cumsum(total / count)])
         return track[: len(self.stream.R_NB)]
@@ -131,14 +124,8 @@ def usable_streams(sequence: ImuSequence) -> list[LevelledStream]:
 
 def predicted(model: Predictor, stream: LevelledStream) -> Piece:
     """Return a stretch with the network's predictions, its memory cleared before."""
-    network = StatefulInference(model, UPDATES)
-    windows, heading = stream.windows(), stream.headings
-    parts = [
-        network.predict(windows[first : first + _BATCH], heading[first : first + _BATCH])
-        for first in range(0, len(windows), _BATCH)
-    ]
-    displacement, covariance = zip(*parts, strict=True)
-    return Piece(stream, np.concatenate(displacement), np.concatenate(covariance))
+    network = StatefulInference(model, TICKS_PER_SECOND)
+    return Piece(stream, *network.predict(stream.windows(), stream.headings))
 
 
 class RecordingErrors(NamedTuple):

@@ -21,13 +21,18 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, find_peaks, hilbert, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.displacement_error import UPDATES, Piece, planar, predicted
+from stario.fusion.evaluation.displacement_error import Piece, planar, predicted
 from stario.fusion.imu.direction import Complex
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.values.state import Track
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
-from stario.sequences.levelled_stream import TICK_SAMPLES, LevelledStream, levelled_streams
+from stario.sequences.levelled_stream import (
+    TICK_SAMPLES,
+    TICKS_PER_SECOND,
+    LevelledStream,
+    levelled_streams,
+)
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.windows import WINDOW_RATE
 
@@ -62,7 +67,7 @@ class PedestrianDeadReckoning:
         track, count = pedestrian_path(stream), stream.window_count
         # The window that begins at the last tick ends one sample after the stretch.
         at_tick = np.append(track, track[-1])[::TICK_SAMPLES]
-        moved = at_tick[UPDATES : UPDATES + count] - at_tick[:count]
+        moved = at_tick[TICKS_PER_SECOND : TICKS_PER_SECOND + count] - at_tick[:count]
         displacement = np.stack([moved.real, moved.imag, np.zeros(count)], axis=1)
         return Piece(stream, displacement, np.tile(_SIGMA**2 * np.eye(3), (count, 1, 1)))
 

@@ -122,9 +122,9 @@ def network_track_true_attitude(
     truth = _propagated_through_gaps(sequence, true_poses(sequence))
     time, windows, heading = _true_windows(sequence, truth, 1.0 / config.filter.update_rate)
     prepared = perf_counter()
-    displacement = _predicted_displacements(
-        model, time, windows, heading, config.filter.window_updates
-    )
+    network = StatefulInference(model, config.filter.window_updates)
+    begins = np.diff(time, prepend=time[0]) * network.updates > 1.5
+    displacement, _ = network.predict(windows, heading, begins)
     done = perf_counter()
     middle = time + 0.5 * WINDOW_SECONDS
     ticks = np.append(middle - 0.5 * WINDOW_SECONDS, middle[-1] + 0.5 * WINDOW_SECONDS)
@@ -135,25 +135,6 @@ def network_track_true_attitude(
         seconds_network=done - prepared,
         seconds_filter=prepared - began + perf_counter() - done,
     )
-
-
-def _predicted_displacements(
-    model: Predictor,
-    time: FloatArray,
-    windows: NDArray[np.float32],
-    heading: FloatArray,
-    updates: int,
-) -> FloatArray:
-    """Predict displacements (M, 3) of windows from `time` (M,) on; memory is reset at each gap."""
-    network = StatefulInference(model, updates)
-    if not network.is_recurrent:
-        return network.predict(windows, heading)[0]
-    displacements = []
-    gaps = np.flatnonzero(np.diff(time) * updates > 1.5) + 1
-    for part, headings in zip(np.split(windows, gaps), np.split(heading, gaps), strict=True):
-        displacements.append(network.predict(part, headings)[0])
-        network.restart()
-    return np.concatenate(displacements)
 
 
 def _propagated_through_gaps(sequence: ImuSequence, truth: Trajectory) -> Trajectory:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -17,7 +18,7 @@ from stario.fusion.imu.intervals import Flags, Window
 from stario.fusion.values.checked import floored
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import FloatArray
+from stario.sequences.sequence import BoolArray, FloatArray
 from stario.sequences.windows import (
     WINDOW_RATE,
     WINDOW_SECONDS,
@@ -124,11 +125,15 @@ class WindowBuffer:
         )
 
 
+_BATCH = 512
+"""Number of windows given to a model at once."""
+
+
 class Predictor(Protocol):
     """Interface that a navigator requires of a model; `DisplacementModel` implements it.
 
-    A model whose network remembers earlier windows also has `stateful_inference(updates)`, which
-    returns a predictor for the windows of one unbroken stretch.
+    That of a recurrent network also has `is_recurrent`, true, and `predict_next`, as
+    `DisplacementModel`: its predictions depend on the track's earlier windows.
     """
 
     def predict(self, windows: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -149,30 +154,29 @@ class StatefulInference:
 
     Attributes:
         updates: that number.
+        is_recurrent: whether predictions depend on earlier windows, and so on gaps.
+        memory: what a recurrent network remembers, as arrays and numbers; None at the start, after
+            a gap, and of other networks.
     """
 
     def __init__(self, model: Predictor, updates: int) -> None:
-        self._model, self.updates = model, updates
-        self.restart()
-
-    @property
-    def is_recurrent(self) -> bool:
-        """Whether predictions depend on earlier windows, and so on gaps."""
-        return self._stretch is not self._model
+        self._model: Any = model
+        self.updates, self.memory = updates, None
+        self.is_recurrent = bool(getattr(model, "is_recurrent", False))
 
     def restart(self) -> None:
         """Clear the memory of windows before a gap."""
-        begin = getattr(self._model, "stateful_inference", None)
-        self._stretch: Any = self._model if begin is None else begin(self.updates)
+        self.memory = None
 
     def predict(
-        self, windows_N: NDArray[np.float32], heading: FloatArray
+        self, windows_N: NDArray[np.float32], heading: FloatArray, begins: BoolArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Predict the stretch's next windows, given to the model in the device's heading frame H.
+        """Predict the track's next windows, given to the model in the device's heading frame H.
 
         Args:
-            windows_N: (B, 6, 200) in a gravity-aligned frame N.
+            windows_N: (B, 6, 200), one or more, in a gravity-aligned frame N.
             heading: (B,) heading of the device in N [rad].
+            begins: (B,) whether each is the first window after a gap; None for none of them.
 
         Returns:
             displacement (B, 3) [m] and covariance (B, 3, 3) [m^2] in N.
@@ -181,31 +185,28 @@ class StatefulInference:
             InputError: the model's predictions are not arrays of these shapes, or a covariance is
                 asymmetric.
         """
-        answer = self._stretch.predict(rotated_windows(windows_N, -heading))
-        mean_H, covariance_H = _checked(answer, len(heading))
+        restarts: list[int] = []
+        if begins is not None and self.is_recurrent:
+            restarts = np.flatnonzero(begins).tolist()
+        edges = sorted({*range(0, len(heading), _BATCH), *restarts, len(heading)})
+        answers = []
+        for first, stop in pairwise(edges):
+            if first in restarts:
+                self.restart()
+            windows_H = rotated_windows(windows_N[first:stop], -heading[first:stop])
+            answers.append(self._predicted(windows_H))
+        mean_H, covariance_H = map(np.concatenate, zip(*answers, strict=True))
         R_NH = about_z(heading).as_matrix()
         with np.errstate(invalid="ignore"):  # the estimator refuses values that are not finite
             mean_N: FloatArray = (R_NH @ mean_H[:, :, None])[:, :, 0]
             return mean_N, R_NH @ covariance_H @ R_NH.transpose(0, 2, 1)
 
-    @property
-    def memory(self) -> Any:
-        """State that the network remembers, as arrays and numbers; None without memory.
-
-        Raises:
-            InputError: a memory is assigned to a network that has none, or the reverse.
-        """
-        return self._stretch.memory if self.is_recurrent else None
-
-    @memory.setter
-    def memory(self, memory: Any) -> None:
-        self.restart()
-        if (memory is not None) != self.is_recurrent:
-            raise InputError(
-                "snapshot: network", "a different kind of memory", "that of the same network"
-            )
+    def _predicted(self, windows_H: NDArray[np.float32]) -> tuple[FloatArray, FloatArray]:
         if self.is_recurrent:
-            self._stretch.memory = memory
+            *answer, self.memory = self._model.predict_next(windows_H, self.updates, self.memory)
+        else:
+            answer = self._model.predict(windows_H)
+        return _checked(answer, len(windows_H))
 
 
 def _checked(answer: Any, count: int) -> tuple[FloatArray, FloatArray]:
@@ -227,12 +228,15 @@ def _checked(answer: Any, count: int) -> tuple[FloatArray, FloatArray]:
 
 
 def displacements_of(
-    network: StatefulInference, windows: Sequence[Window]
+    network: StatefulInference, windows: Sequence[Window], begins: BoolArray | None = None
 ) -> list[WindowDisplacement]:
-    """Predict the displacements of windows, with inflated and floored covariances."""
+    """Predict the displacements of windows, with inflated and floored covariances.
+
+    `begins` is as for `StatefulInference.predict`.
+    """
     windows_N = np.stack([window.imu_N for window in windows])
     heading = np.array([window.heading for window in windows])
-    mean_N, covariance_N = network.predict(windows_N, heading)
+    mean_N, covariance_N = network.predict(windows_N, heading, begins)
     flagged = np.array([window.flagged for window in windows])
     covariance_N = np.where(flagged[:, None, None], FLAGGED_SCALE, 1.0) * covariance_N
     with np.errstate(invalid="ignore", over="ignore"):  # the estimator refuses such values

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from time import process_time
@@ -21,6 +21,7 @@ from stario.network.training.data import (
     cached_walks,
     mix_sources,
     recording_streams,
+    validation_data,
 )
 from stario.network.training.history import EpochReport, History
 from stario.network.training.train import train
@@ -29,7 +30,7 @@ from stario.sequences.datasets.cache_files import recording_stamps
 from stario.sequences.datasets.stream_cache import recorded
 from stario.sequences.files import write_json
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.windows import WINDOW_SAMPLES, Attitude, WorldStream
+from stario.sequences.windows import WINDOW_SAMPLES, Attitude
 
 _EPOCH_STEPS = 250
 """Maximum steps between two checkpoints: what an interrupted run loses."""
@@ -94,24 +95,17 @@ def train_run(
     streams, skipped = _streams(dataset.training, recipe.attitude, reading)
     held_out, missing = _streams(dataset.validation, recipe.attitude, reading)
     simulated = partial(cached_walks, folder=reading.cache, attitude=recipe.attitude)
-    poses = any(isinstance(s, WorldStream) for recording in streams for s in recording.streams)
-    walks = [] if poses else simulated(_WALKS, 0)
-    material = mix_sources(streams, walks, recipe.shares, recipe.reach)
-    validation_data = mix_sources(held_out, [])
+    walks = [] if any(recording.has_poses for recording in streams) else simulated(_WALKS, 0)
+    data = mix_sources(streams, walks, recipe.shares, recipe.reach)
+    validation = validation_data(held_out, partial(simulated, _VALIDATION_WALKS, 1))
     began, clock = process_time(), folder / TEMPORARY_FILES[1]
     before = float(json.loads(clock.read_text())) if clock.exists() else 0.0  # of killed processes
     train(
         recipe,
-        material.streams,
-        material.weights,
-        [s.part(0, _VALIDATION_SAMPLES) for s in validation_data.streams]
-        or simulated(_VALIDATION_WALKS, 1),
+        data,
+        replace(validation, streams=[s.part(0, _VALIDATION_SAMPLES) for s in validation.streams]),
         folder,
         on_epoch=lambda report: write_json(clock, before + process_time() - began),
-        trained_on=material.words,
-        legs=material.legs,
-        validation_legs=validation_data.legs,
-        chosen_by_legs=not validation_data.streams,
     )
     reports = _reports(folder / "log.json")
     return {

@@ -13,11 +13,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from stario.network.training.lever_arm import Swing, apply_swing, sample_swing
-from stario.network.training.stretches import Stretches
+from stario.network.training.lever_arm import Swing, apply_swing, sample_swing, uniform
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.settings import check_number
@@ -90,6 +91,39 @@ def reach_of(augmentation: Augmentation, successive: int = 1) -> int:
     return math.ceil(successive * WINDOW_SAMPLES * max(1.0, augmentation.speeds[1])) + 1
 
 
+class Stretches:
+    """One array of every stream, from which stretches of one length are gathered.
+
+    On a CPU, streams may be memory-mapped: a batch reads what it is cut from and nothing is kept.
+    On a GPU all streams together (50 hours take 1.5 GB) are copied once, and a batch never leaves
+    the device: drawing on the CPU would take several times as long as the network.
+
+    Args:
+        arrays: (N_i, K) float32, one of each stream.
+        device: device of what is gathered.
+    """
+
+    def __init__(self, arrays: Sequence[NDArray[np.float32]], device: torch.device) -> None:
+        self._arrays, self._whole = list(arrays), torch.empty(0)
+        self._is_resident = device.type == "cuda"
+        if self._is_resident:
+            lengths = [len(array) for array in self._arrays]
+            self._first = torch.tensor(np.cumsum([0, *lengths[:-1]]), device=device)
+            self._whole = torch.from_numpy(np.concatenate(self._arrays)).to(device)
+
+    def gathered(self, stream: Tensor, start: Tensor, length: int) -> Tensor:
+        """Return samples [start, start + length) of the numbered streams, (B, length, K)."""
+        if self._is_resident:
+            rows = (self._first[stream] + start)[:, None] + torch.arange(
+                length, device=start.device
+            )
+            return self._whole[rows]
+        found = np.empty((len(stream), length, self._arrays[0].shape[1]), dtype=np.float32)
+        for row, (index, first) in enumerate(zip(stream.tolist(), start.tolist(), strict=True)):
+            found[row] = self._arrays[index][first : first + length]
+        return torch.from_numpy(found)
+
+
 class WindowSampler:
     """Sampler of augmented training batches from weighted streams.
 
@@ -140,14 +174,14 @@ class WindowSampler:
 
         K > 1 successive windows have shapes (size, K, 6, 200) and (size, K, 3).
         """
-        device = self.generator.device
-        uniform = torch.rand(size, generator=self.generator, dtype=torch.float64, device=device)
-        stream = torch.searchsorted(self._cumulative, uniform).clamp(max=len(self._starts) - 1)
+        drawn, device = self.generator, self.generator.device
+        share = torch.rand(size, generator=drawn, dtype=torch.float64, device=device)
+        stream = torch.searchsorted(self._cumulative, share).clamp(max=len(self._starts) - 1)
         # Whole samples: at speed 1, interpolation would smooth data that is not smoothed otherwise.
-        offset = (self._uniform(size).double() * self._starts[stream]).floor()
+        offset = (uniform(drawn, size).double() * self._starts[stream]).floor()
         low, high = self.augmentation.speeds
-        speed = low + (high - low) * self._uniform(size)
-        speed = torch.where(self._uniform(size) < self.augmentation.replayed, speed, 1.0)
+        speed = low + (high - low) * uniform(drawn, size)
+        speed = torch.where(uniform(drawn, size) < self.augmentation.replayed, speed, 1.0)
         count = self._successive * WINDOW_SAMPLES + 1
         steps = torch.arange(count, dtype=torch.float64, device=device)
         at = offset.double()[:, None] + steps * speed[:, None].double()
@@ -180,9 +214,6 @@ class WindowSampler:
         imu, R_WH = augmented(imu, heading.flatten(), a, self.generator, seconds)
         displacement = displacement.reshape(-1, 1, 3) @ R_WH
         return imu.view(size, -1, 6), displacement.view(size, seconds, 3)
-
-    def _uniform(self, *shape: int) -> Tensor:
-        return torch.rand(*shape, generator=self.generator, device=self.generator.device)
 
 
 def _replayed(imu: Tensor, speed: Tensor) -> Tensor:
@@ -218,20 +249,17 @@ def augmented(
     """
     a, groups, device = augmentation, len(imu) // together, generator.device
 
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator, device=device)
-
     def symmetric(*shape: int) -> Tensor:
-        return 2.0 * uniform(*shape) - 1.0
+        return 2.0 * uniform(generator, *shape) - 1.0
 
     def of_each(values: Tensor) -> Tensor:
         return values.repeat_interleave(together, dim=0)
 
     # Drawn for every window: the yaw fit of a stretch of weak truth removes a common error.
     error = a.yaw * torch.randn(len(imu), generator=generator, device=device)
-    anywhere = uniform(len(imu)) < a.any_yaw
+    anywhere = uniform(generator, len(imu)) < a.any_yaw
     R_HW = _about_z(torch.where(anywhere, symmetric(len(imu)) * torch.pi, error) - heading)
-    sign = torch.where(uniform(groups) < a.mirrored, -1.0, 1.0)
+    sign = torch.where(uniform(generator, groups) < a.mirrored, -1.0, 1.0)
     one = torch.ones_like(sign)
     mirror = of_each(torch.stack([one, sign, sign, sign, one, one], dim=1))
     R_tilt = of_each(_small_tilt(symmetric(groups, 2) * a.tilt / 2**0.5))
@@ -241,7 +269,7 @@ def augmented(
     deviations = imu.new_tensor([a.gyro_noise] * 3 + [a.accel_noise] * 3)
     imu = tilted.reshape(imu.shape) + of_each(symmetric(groups, 6) * limits).unsqueeze(1)
     white = torch.randn(imu.shape, generator=generator, device=device)
-    imu = imu + white * of_each(uniform(groups)[:, None, None] ** 2 * deviations)
+    imu = imu + white * of_each(uniform(generator, groups)[:, None, None] ** 2 * deviations)
     return imu, R_HW.mT * mirror[:, None, 3:]
 
 

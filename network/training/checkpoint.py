@@ -19,33 +19,28 @@ from torch import Tensor
 
 from stario.network.model import first_mismatch
 from stario.network.training.config import TrainingConfig
+from stario.network.training.history import EpochReport, History
 from stario.sequences.errors import ConfigError, InputError, ReadError
 from stario.sequences.files import atomic_write, remove_abandoned
 
 
 def write_checkpoint(
-    path: Path,
-    config: TrainingConfig,
-    material: str,
-    step: int,
-    history: list[dict[str, Any]],
-    tensors: Mapping[str, Tensor],
+    path: Path, history: History, material: str, step: int, tensors: Mapping[str, Tensor]
 ) -> None:
     """Write everything that a run needs to resume.
 
     Args:
         path: path of the file.
-        config: the run's recipe.
+        history: the run's recipe and the reports of its epochs so far.
         material: identifier of the run's recordings and initial weights.
         step: number of steps done.
-        history: reports of the epochs so far, as plain values.
         tensors: tensors by name.
     """
     metadata = {
-        "config": json.dumps(asdict(config)),
+        "config": json.dumps(asdict(history.config)),
         "material": material,
         "step": str(step),
-        "history": json.dumps(history),
+        "history": json.dumps([asdict(report) for report in history.reports]),
     }
     whole = {k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()}
     with atomic_write(path, "wb") as file:
@@ -54,8 +49,8 @@ def write_checkpoint(
 
 def read_checkpoint(
     path: Path, config: TrainingConfig, material: str
-) -> tuple[int, list[dict[str, Any]], dict[str, Tensor]]:
-    """Return the number of steps, the history and the tensors of a run.
+) -> tuple[int, list[EpochReport], dict[str, Tensor]]:
+    """Return the number of steps, the reports of the epochs and the tensors of a run.
 
     Raises:
         ConfigError: the file belongs to another recipe or to other material.
@@ -70,8 +65,8 @@ def read_checkpoint(
     if "config" not in metadata:
         raise ReadError(path, "checkpoint", "no recipe in it", "a checkpoint of a training run")
     try:
-        recipe, history = dict(json.loads(metadata["config"])), json.loads(metadata["history"])
-        step = int(metadata["step"])
+        recipe, step = dict(json.loads(metadata["config"])), int(metadata["step"])
+        reports = [EpochReport(**report) for report in json.loads(metadata["history"])]
     except (KeyError, TypeError, ValueError) as error:
         raise damaged(path, error) from error
     _check_same(path, recipe, config)
@@ -82,7 +77,7 @@ def read_checkpoint(
             "those of this run",
             "resume with the same ones or train into another folder (--out)",
         )
-    return step, history, tensors
+    return step, reports, tensors
 
 
 def damaged(path: Path, error: Exception) -> ReadError:

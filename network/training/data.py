@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -94,19 +94,33 @@ def _distinct(streams: Sequence[Stream], taken: set[str]) -> Sequence[Stream]:
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Streams to learn from and how often each is drawn.
+    """Streams to learn from, or to select weights and calibrate on.
 
     Attributes:
         streams: stretches with full ground truth.
-        weights: relative frequency of each stream, per second of its length.
-        legs: stretches of weak truth.
+        weights: how often each is drawn, relative to others, per second of its length; by default
+            all alike.
+        legs: stretches of weak truth, positions or waypoints.
         words: description of the sources, for the card.
+        simulated: whether all `streams` are simulated: legs, if there are any, then select the
+            weights alone.
+
+    Raises:
+        InputError: the number of weights is not that of streams.
     """
 
-    streams: list[WorldStream]
-    weights: list[float]
-    legs: list[LegStream]
-    words: list[str]
+    streams: Sequence[WorldStream]
+    weights: Sequence[float] = ()
+    legs: Sequence[LegStream] = ()
+    words: Sequence[str] = ()
+    simulated: bool = False
+
+    def __post_init__(self) -> None:
+        if not len(self.weights):
+            object.__setattr__(self, "weights", [1.0] * len(self.streams))
+        if len(self.weights) != len(self.streams):
+            expected = f"{len(self.streams)}, one for each stream"
+            raise InputError("weights", str(len(self.weights)), expected)
 
 
 def mix_sources(
@@ -162,7 +176,19 @@ def mix_sources(
     legs = [s for recording in recorded for s in recording.streams if isinstance(s, LegStream)]
     for kind in dict.fromkeys(stream.kind for stream in legs):
         words.append(f"{kind}: {_length([s for s in legs if s.kind == kind])}")
-    return TrainingData(streams, weights, legs, words + _licences(recorded))
+    simulated = not any(len(members) for _, _, members in named)
+    return TrainingData(streams, weights, legs, words + _licences(recorded), simulated)
+
+
+def validation_data(
+    recorded: Sequence[RecordingStreams], walks: Callable[[], list[WorldStream]]
+) -> TrainingData:
+    """Return the streams of held-out recordings, with simulated walks if none of them has poses.
+
+    Sigma needs windows with full ground truth.
+    """
+    held = mix_sources(recorded, [])
+    return held if held.streams else mix_sources(recorded, walks())
 
 
 def _licences(recorded: Sequence[RecordingStreams]) -> list[str]:

@@ -14,10 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from stario.network.training.augment import Augmentation, WindowSampler, augmented, heading_of
+from stario.network.training.augment import Augmentation, Stretches, augmented, heading_of
 from stario.network.training.config import TrainingConfig
 from stario.network.training.parallel import Workers
-from stario.network.training.stretches import Stretches
 from stario.sequences.arrays import runs
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.legs import LegStream
@@ -199,7 +198,7 @@ def _padded(drawn: Sequence[LegStream], seconds: int) -> list[Tensor]:
 
 
 def leg_samplers(
-    config: TrainingConfig, streams: Sequence[LegStream], beside: WindowSampler
+    config: TrainingConfig, streams: Sequence[LegStream], generator: torch.Generator
 ) -> list[tuple[LegSampler, int]]:
     """Return a sampler and the number of stretches per step for each kind of weak truth present.
 
@@ -213,7 +212,7 @@ def leg_samplers(
             expected = f"a multiple of successive={config.successive}"
             raise ConfigError(f"seconds in a stretch with {kind}", str(seconds), expected)
     return [
-        (LegSampler(members, seconds, config.augmentation, beside.generator), stretches)
+        (LegSampler(members, seconds, config.augmentation, generator), stretches)
         for _, members, seconds, stretches in kinds
     ]
 

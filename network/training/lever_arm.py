@@ -50,6 +50,11 @@ class Swing:
         return sine.sum(-2), (a * w * argument.cos()).sum(-2), -(w**2 * sine).sum(-2)
 
 
+def uniform(generator: torch.Generator, *shape: int) -> Tensor:
+    """Draw numbers from 0 to 1 on the generator's device."""
+    return torch.rand(*shape, generator=generator, device=generator.device)
+
+
 def sample_swing(
     size: int, share: float, rate: float, lever: float, generator: torch.Generator
 ) -> Swing:
@@ -63,21 +68,17 @@ def sample_swing(
         generator: generator of the draws.
     """
     device = generator.device
-
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=generator, device=device)
-
     spread = torch.randn(size, 3, generator=generator, device=device)
     spread = spread * spread.new_tensor([0.5, 0.5, 0.0])
     axis = torch.nn.functional.normalize(spread + spread.new_tensor([0.0, 0.0, 1.0]), dim=1)
     arm = torch.randn(size, 3, generator=generator, device=device)
     arm = torch.nn.functional.normalize(arm, dim=1)
-    swings = (uniform(size) < share).float()
+    swings = (uniform(generator, size) < share).float()
     low, high = (2.0 * math.pi * f for f in _FREQUENCIES)
-    frequency = low + (high - low) * uniform(size, _SINES)
-    amplitude = swings[:, None] * rate / _SINES * uniform(size, _SINES) / frequency
-    phase = 2.0 * math.pi * uniform(size, _SINES)
-    lever_W = arm * (swings * lever * uniform(size))[:, None]
+    frequency = low + (high - low) * uniform(generator, size, _SINES)
+    amplitude = swings[:, None] * rate / _SINES * uniform(generator, size, _SINES) / frequency
+    phase = 2.0 * math.pi * uniform(generator, size, _SINES)
+    lever_W = arm * (swings * lever * uniform(generator, size))[:, None]
     return Swing(axis, lever_W, amplitude, frequency, phase)
 
 

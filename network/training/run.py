@@ -9,7 +9,7 @@ import copy
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import asdict, fields
+from dataclasses import fields
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -25,8 +25,9 @@ from stario.network.training.augment import WindowSampler
 from stario.network.training.captured import CapturedStep
 from stario.network.training.checkpoint import damaged, read_checkpoint, write_checkpoint
 from stario.network.training.config import TrainingConfig, learning_rate, loss_with_sigma
+from stario.network.training.data import TrainingData
 from stario.network.training.history import EpochReport, History
-from stario.network.training.legs import LegBatch, LegSampler
+from stario.network.training.legs import LegBatch, leg_samplers
 from stario.network.training.parallel import Workers
 from stario.network.training.validation import ValidationSet
 from stario.network.training.weak_truth import leg_loss
@@ -41,8 +42,7 @@ class TrainingRun:
 
     Args:
         config: the recipe.
-        sampler: sampler of windows with full truth.
-        legs: samplers of weak truth, each with the number of stretches per step.
+        data: what is learned from.
         material: digest of the recordings and initial weights, for the checkpoint.
         folder: existing folder for checkpoint, model and log.
         workers: the processes that share the run.
@@ -54,15 +54,23 @@ class TrainingRun:
     def __init__(
         self,
         config: TrainingConfig,
-        sampler: WindowSampler,
-        legs: list[tuple[LegSampler, int]],
+        data: TrainingData,
         material: str,
         folder: Path,
         workers: Workers,
     ) -> None:
         torch.manual_seed(config.seed)
-        self.config, self.sampler, self.legs = config, sampler, legs
-        self.workers, self.device, self._material = workers, workers.device, material
+        self.config, self._material = config, material
+        self.workers, self.device = workers, workers.device
+        self.sampler = WindowSampler(
+            data.streams,
+            data.weights,
+            config.augmentation,
+            config.seed,
+            config.successive,
+            self.device,
+        )
+        self.legs = leg_samplers(config, data.legs, self.sampler.generator)
         self.network = DisplacementNetwork(build_network(config.architecture)).to(self.device)
         self._checkpoint, self._log = folder / "checkpoint.safetensors", folder / "log.json"
         if config.dropout is not None:
@@ -260,10 +268,9 @@ class TrainingRun:
         if self.history.epochs_since_best() == 0 and math.isfinite(report.validation_error):
             self._keep(candidate)
         if self.workers.is_leader:
-            history = [asdict(r) for r in self.history.reports]
-            path, config = self._checkpoint, self.config
-            write_checkpoint(path, config, self._material, self.step, history, self._tensors())
-            write_json(self._log, history)
+            given = self.history, self._material, self.step, self._tensors()
+            write_checkpoint(self._checkpoint, *given)
+            write_json(self._log, self.history.reports)
         return report
 
     def _tensors(self) -> dict[str, Tensor]:
@@ -291,14 +298,14 @@ class TrainingRun:
         """
         if not self._checkpoint.exists():
             return
-        self.step, history, tensors = read_checkpoint(self._checkpoint, self.config, self._material)
+        found = read_checkpoint(self._checkpoint, self.config, self._material)
+        self.step, self.history.reports, tensors = found
         try:
-            self.history.reports = [EpochReport(**report) for report in history]
             self._restore(tensors)
         except (RuntimeError, KeyError, TypeError, ValueError) as error:
             raise damaged(self._checkpoint, error) from error
         if self.workers.is_leader:
-            write_json(self._log, history)  # which may have been lost
+            write_json(self._log, self.history.reports)  # which may have been lost
         log.info("resumed %s at step %d", self._checkpoint, self.step)
 
     def _restore(self, tensors: dict[str, Tensor]) -> None:

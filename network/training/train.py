@@ -6,7 +6,7 @@ import hashlib
 import json
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -14,57 +14,44 @@ import numpy as np
 
 from stario.network.card import Calibration
 from stario.network.model import DisplacementModel
-from stario.network.training.augment import WindowSampler
 from stario.network.training.checkpoint import exclusive
 from stario.network.training.config import TrainingConfig
+from stario.network.training.data import TrainingData
 from stario.network.training.history import EpochReport
-from stario.network.training.legs import leg_samplers
 from stario.network.training.parallel import workers
 from stario.network.training.result import write_result
 from stario.network.training.run import TrainingRun
 from stario.network.training.validation import ValidationSet
+from stario.sequences.datasets.stream_cache import Stream
 from stario.sequences.errors import InputError
-from stario.sequences.legs import LegStream
-from stario.sequences.windows import WorldStream
 
 log = logging.getLogger(__name__)
 
 
 def train(
     config: TrainingConfig,
-    streams: Sequence[WorldStream],
-    weights: Sequence[float],
-    validation: Sequence[WorldStream],
+    data: TrainingData,
+    validation: TrainingData,
     folder: Path,
     on_step: Callable[[int, float], None] = lambda step, loss: None,
     on_epoch: Callable[[EpochReport], None] = lambda report: None,
-    trained_on: Sequence[str] = (),
     start_from: DisplacementModel | None = None,
     calibration: Calibration | None = None,
-    legs: Sequence[LegStream] = (),
-    validation_legs: Sequence[LegStream] = (),
-    chosen_by_legs: bool = False,
 ) -> Path:
     """Train a network, continuing from the folder's checkpoint where there is one.
 
     Args:
         config: the recipe; a checkpoint made with another one is rejected.
-        streams: training stretches with full truth.
-        weights: relative frequency of each stretch, per second of its length.
-        validation: stretches that select the weights and calibrate the covariance.
+        data: what is learned from. Its description is written on the card, with that of the initial
+            weights.
+        validation: what selects the weights and calibrates the covariance.
         folder: folder for `checkpoint.safetensors`, `model.safetensors`, its card and `log.json`.
         on_step: called after each step with the step and its mean squared error [m^2], for a
             progress bar.
         on_epoch: called after each validation; for initial weights before the first epoch, too.
-        trained_on: description of the training data, for the card; that of the initial weights is
-            added to it.
         start_from: model that provides the initial weights.
         calibration: calibration of other weights, used if the errors on `validation` are
             meaningless: a last stage also trains on it, and weak truth alone has no such windows.
-        legs: additional stretches of weak truth, positions or waypoints.
-        validation_legs: additional stretches of weak truth that select the weights.
-        chosen_by_legs: whether `validation_legs` alone select the weights, for example if
-            `validation` is only simulated.
 
     Returns:
         Path of the model's weights.
@@ -76,22 +63,16 @@ def train(
             cannot be divided evenly among the processes that the launcher started, or another run
             is training in the folder.
     """
-    if not streams or not validation:
-        fix = "positions and waypoints can only be learned alongside them" if legs else ""
+    if not data.streams or not validation.streams:
+        fix = "positions and waypoints can only be learned alongside them" if data.legs else ""
         raise InputError("streams", "none", "stretches of at least 2 s with poses", fix)
     with (
         workers(config.device, config.batch // config.successive) as processes,
         exclusive(folder) if processes.is_leader else nullcontext(),
     ):
-        sampler = WindowSampler(
-            streams, weights, config.augmentation, config.seed, config.successive, processes.device
-        )
-        material = _material([streams, validation, legs, validation_legs], weights, start_from)
-        run = TrainingRun(
-            config, sampler, leg_samplers(config, legs, sampler), material, folder, processes
-        )
-        recurrent = run.network.is_recurrent
-        held_out = ValidationSet(validation, config, validation_legs, chosen_by_legs, recurrent)
+        material = _material(data, validation, start_from)
+        run = TrainingRun(config, data, material, folder, processes)
+        held_out = ValidationSet(validation, config, run.network.is_recurrent)
         before: dict[str, float] = {}
         if start_from is not None:
             run.start_from(start_from)
@@ -109,9 +90,9 @@ def train(
             log.warning("%s: %s", folder, words)
         path = folder / "model.safetensors"
         if processes.is_leader:
-            sources = [*trained_on, *_inherited(start_from)]
-            validating = {id(stream) for stream in (*validation, *validation_legs)}
-            learned = any(id(stream) in validating for stream in (*streams, *legs))
+            sources = [*data.words, *_inherited(start_from)]
+            validating = {id(stream) for stream in (*validation.streams, *validation.legs)}
+            learned = any(id(stream) in validating for stream in (*data.streams, *data.legs))
             write_result(path, run.best_network(), config, held_out, sources, calibration, learned)
         return path
 
@@ -124,20 +105,19 @@ def _inherited(start_from: DisplacementModel | None) -> list[str]:
 
 
 def _material(
-    streams: Sequence[Sequence[WorldStream | LegStream]],
-    weights: Sequence[float],
-    start_from: DisplacementModel | None,
+    data: TrainingData, validation: TrainingData, start_from: DisplacementModel | None
 ) -> str:
     """Return the digest of training data, validation data and initial weights."""
+    parts = data.streams, validation.streams, data.legs, validation.legs
     content = [
-        [[(stream.name, len(stream), _moments(stream)) for stream in part] for part in streams],
-        [f"{weight:.6g}" for weight in weights],
+        [[(stream.name, len(stream), _moments(stream)) for stream in part] for part in parts],
+        [f"{weight:.6g}" for weight in data.weights],
         start_from.card.sha256 if start_from else "",
     ]
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 
-def _moments(stream: WorldStream | LegStream) -> list[str]:
+def _moments(stream: Stream) -> list[str]:
     """Return the sums over time of t x, for every column x of a stream: they tell corrected data.
 
     Unlike a digest of the bytes, they are the same on processors that round differently.

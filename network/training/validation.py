@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from stario.network.displacement import DisplacementNetwork
 from stario.network.training.augment import UNVARIED
 from stario.network.training.config import LEAST_SECONDS, TrainingConfig
+from stario.network.training.data import TrainingData
 from stario.network.training.legs import LegBatch, LegSampler, by_kind
 from stario.network.training.weak_truth import leg_loss
 from stario.sequences.attitude.rotations import about_z
@@ -51,10 +52,8 @@ class ValidationSet:
     """Held-out windows, cut again for each evaluation because all of them would fill the memory.
 
     Args:
-        streams: held-out streams with full truth.
+        data: held-out streams.
         config: recipe that determines how stretches of weak truth are drawn.
-        legs: held-out streams with weak truth.
-        chosen_by_legs: whether legs alone select the weights, if there are any.
         is_recurrent: whether the evaluated networks are recurrent.
 
     Raises:
@@ -62,15 +61,10 @@ class ValidationSet:
     """
 
     def __init__(
-        self,
-        streams: Sequence[WorldStream],
-        config: TrainingConfig,
-        legs: Sequence[LegStream] = (),
-        chosen_by_legs: bool = False,
-        is_recurrent: bool = False,
+        self, data: TrainingData, config: TrainingConfig, is_recurrent: bool = False
     ) -> None:
-        self._chosen_by_legs = chosen_by_legs
-        self.legs = _drawn_once(legs, config)
+        streams, self._simulated = data.streams, data.simulated
+        self.legs = _drawn_once(data.legs, config)
         # Hours of data are cut sparsely: the variety of motion matters, not the number of windows.
         length = sum(len(stream) for stream in streams)
         self.stride = max(_STRIDE, _STRIDE * (length // _DENSE_SAMPLES))
@@ -133,7 +127,7 @@ class ValidationSet:
 
     def _selecting(self, errors: Mapping[str, float]) -> Mapping[str, float]:
         by_legs = {kind: errors[kind] for kind in self.legs if kind in errors}
-        return by_legs if self._chosen_by_legs and by_legs else errors
+        return by_legs if self._simulated and by_legs else errors
 
     def worse(self, before: Mapping[str, float], after: Mapping[str, float]) -> str:
         """Return in words that the errors that select the weights grew; empty if they did not.

@@ -35,7 +35,12 @@ from stario.sequences.windows import Attitude, WorldStream, world_streams
 Stream = WorldStream | LegStream
 """Training data of a network: with poses, or with legs between known positions."""
 
+log = logging.getLogger(__name__)
+
 _POSES = "poses"
+
+_ABANDONED_S = 3600.0
+
 _OPEN_FILES = 10_240
 """Number of open files to ask for where a system states no limit; macOS allows no more."""
 
@@ -132,55 +137,26 @@ def _streams(sequence: ImuSequence, attitude: Attitude) -> list[Stream]:
     return streams
 
 
-def _parts(streams: Sequence[Stream]) -> list[Part]:
-    return [
-        (
-            {"name": stream.name, "kind": getattr(stream, "kind", _POSES)},
-            {name: value for name, value in vars(stream).items() if isinstance(value, np.ndarray)},
-        )
-        for stream in streams
-    ]
-
-
-def _opened(file: Path) -> list[Stream] | None:
-    """Return memory-mapped streams, or None if the file is missing or incomplete."""
-    parts = _read_parts(file)
-    return None if parts is None else [_stream(*part) for part in parts]
-
-
-def _stream(values: dict[str, Any], arrays: dict[str, Any]) -> Stream:
-    if values["kind"] == _POSES:
-        return WorldStream(values["name"], **arrays)
-    return LegStream(**values, **arrays)
-
-
-log = logging.getLogger(__name__)
-
-Part = tuple[dict[str, Any], dict[str, NDArray[Any]]]
-"""Plain values, and arrays by name; all parts of a file have arrays of the same names."""
-
-_ABANDONED_S = 3600.0
-
-
 def _kept(file: Path, build: Callable[[], Sequence[Stream]]) -> Sequence[Stream] | None:
     """Build what a file lacks and write it there; return it if it could not be, None if it was."""
-    if _read_parts(file) is not None:
+    if _opened(file) is not None:
         return None
     built = build()
-    return None if _write_parts(file, _parts(built)) else built
+    return None if _written(file, built) else built
 
 
-def _write_parts(file: Path, parts: Sequence[Part]) -> bool:
-    """Write parts to the cache; return False, with a warning, if they cannot be written."""
-    if not parts:
+def _written(file: Path, streams: Sequence[Stream]) -> bool:
+    """Write streams to the cache; return False, with a warning, if they cannot be written."""
+    if not streams:
         return False
-    tables = [arrays for _, arrays in parts]
-    rows = [{name: len(array) for name, array in table.items()} for table in tables]
-    metadata = [{**values, "rows": counts} for (values, _), counts in zip(parts, rows, strict=True)]
-    content = safetensors.numpy.save(
-        {name: np.concatenate([table[name] for table in tables]) for name in tables[0]},
-        metadata={"parts": json.dumps(metadata)},
-    )
+    kinds = [{"name": stream.name, "kind": getattr(stream, "kind", _POSES)} for stream in streams]
+    arrays = {
+        f"{k} {name}": np.ascontiguousarray(value)  # a slice would be written wrongly
+        for k, stream in enumerate(streams)
+        for name, value in vars(stream).items()
+        if isinstance(value, np.ndarray)
+    }
+    content = safetensors.numpy.save(arrays, metadata={"streams": json.dumps(kinds)})
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         remove_abandoned(file.parent, _ABANDONED_S, file.name)
@@ -193,33 +169,34 @@ def _write_parts(file: Path, parts: Sequence[Part]) -> bool:
     return True
 
 
-def _read_parts(file: Path) -> list[Part] | None:
-    """Return the parts, memory-mapped, or None if the file is missing or incomplete."""
+def _opened(file: Path) -> list[Stream] | None:
+    """Return memory-mapped streams, or None if the file is missing or incomplete."""
     try:
         mapped = np.memmap(file, dtype=np.uint8, mode="r")  # once: each map keeps a file open
         begin = 8 + int.from_bytes(mapped[:8].tobytes(), "little")
         header = json.loads(mapped[8:begin].tobytes())
-        metadata = json.loads(header.pop("__metadata__")["parts"])
+        kinds = json.loads(header.pop("__metadata__")["streams"])
         if len(mapped) != begin + max(tensor["data_offsets"][1] for tensor in header.values()):
             raise ValueError(f"{len(mapped)} bytes")
-        whole = {name: _array(mapped[begin:], tensor) for name, tensor in header.items()}
+        arrays: list[dict[str, NDArray[Any]]] = [{} for _ in kinds]
+        for label, tensor in header.items():
+            k, name = label.split()
+            arrays[int(k)][name] = _array(mapped[begin:], tensor)
+        return [_stream(*both) for both in zip(kinds, arrays, strict=True)]
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError) as error:
         log.warning("%s: incomplete, will be rebuilt: %s", file, error)
         return None
-    first = dict.fromkeys(whole, 0)
-    parts: list[Part] = []
-    for values in metadata:
-        arrays = {}
-        for name, rows in values.pop("rows").items():
-            arrays[name] = whole[name][first[name] : first[name] + rows]
-            first[name] += rows
-        parts.append((values, arrays))
-    return parts
 
 
 def _array(content: NDArray[np.uint8], tensor: Mapping[str, Any]) -> NDArray[Any]:
     begin, stop = tensor["data_offsets"]
     dtype = {"F32": "<f4", "F64": "<f8", "I64": "<i8"}[tensor["dtype"]]
     return np.asarray(content[begin:stop].view(dtype).reshape(tensor["shape"]))
+
+
+def _stream(known: dict[str, Any], arrays: dict[str, Any]) -> Stream:
+    if known["kind"] == _POSES:
+        return WorldStream(known["name"], **arrays)
+    return LegStream(**known, **arrays)

@@ -124,7 +124,7 @@ FORMATS: dict[str, Format] = {
 """Known formats by name, tried in this order, more specific ones first; `euroc` also covers TUM-VI,
 `ridi` also IMUNet's processed recordings. Files are found below a folder by `_SUFFIXES`."""
 
-_KNOWN = f"one of the formats {', '.join(FORMATS)}"
+_KNOWN = "a recording in a known format (`stario inspect --help` lists them)"
 
 _SUFFIXES = (
     *(".csv", ".txt", ".tsv", ".log", ".json", ".zip"),

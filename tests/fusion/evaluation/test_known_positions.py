@@ -119,8 +119,8 @@ def test_positions_that_say_the_way_is_longer_are_told_with_the_factor():
 
 def test_positions_that_fit_the_mirror_image_name_the_accelerometers_sign():
     found = case("sign_flipped_with_positions/walk.csv")["mirror_image"]
-    assert found.values["error_m"] == pytest.approx(8.3, abs=0.5)
     assert found.values["mirrored_m"] < 1.2
+    assert found.values["error_m"] > 5.0 * found.values["mirrored_m"]
     assert "--accel-sign apple" in found.advice
 
 

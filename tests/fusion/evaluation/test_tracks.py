@@ -129,17 +129,13 @@ def test_gaps_in_the_truth_are_bridged_by_the_gyroscope(make_walk):
 class Counting:
     """A recurrent network that predicts how many windows of a stretch it has seen [m]."""
 
-    def __init__(self, seen: int = 0) -> None:
-        self.seen = seen
+    is_recurrent = True
 
-    def stateful_inference(self, updates: int):
-        return Counting()
-
-    def predict(self, windows: Any) -> Any:
-        seen, self.seen = self.seen, self.seen + len(windows)
-        mean = np.zeros((len(windows), 3))
-        mean[:, 2] = seen + np.arange(len(windows))
-        return mean, np.tile(np.eye(3), (len(windows), 1, 1))
+    def predict_next(self, windows: Any, updates: int, seen: int | None) -> Any:
+        first, n = seen or 0, len(windows)
+        mean = np.zeros((n, 3))
+        mean[:, 2] = first + np.arange(n)
+        return mean, np.tile(np.eye(3), (n, 1, 1)), first + n
 
 
 def test_the_memory_of_a_network_ends_at_a_gap(walk, without):

@@ -20,32 +20,16 @@ from stario.sequences.windows import WINDOW_SAMPLES
 class Counting:
     """Predicts one metre upwards per window in its memory, separately for each series."""
 
-    def predict(self, windows):
-        raise AssertionError("a network with memory must be called through `stateful_inference`")
-
-    def stateful_inference(self, updates):
-        return _Series(updates)
-
-
-class _Series:
-    def __init__(self, updates):
-        self.counts, self.index = [0] * updates, 0
+    is_recurrent = True
 
     def predict(self, windows):
-        mean = np.zeros((len(windows), 3))
-        for k in range(len(windows)):
-            mean[k, 2] = self.counts[self.index % len(self.counts)]
-            self.counts[self.index % len(self.counts)] += 1
-            self.index += 1
-        return mean, np.tile(np.eye(3), (len(windows), 1, 1))
+        raise AssertionError("a network with memory must be called through `predict_next`")
 
-    @property
-    def memory(self):
-        return self.index, tuple(self.counts)
-
-    @memory.setter
-    def memory(self, memory):
-        self.index, self.counts = memory[0], list(memory[1])
+    def predict_next(self, windows, updates, memory):
+        first, n = memory or 0, len(windows)
+        mean = np.zeros((n, 3))
+        mean[:, 2] = (first + np.arange(n)) // updates
+        return mean, np.tile(np.eye(3), (n, 1, 1)), first + n
 
 
 def with_gap(walk, without):
@@ -87,12 +71,13 @@ def test_a_stream_equals_the_batch_also_after_a_restore(walk, without):
     np.testing.assert_allclose([s.p_W for s in states], track.position_W[at], atol=1e-6)
 
 
-def test_a_model_without_memory_is_called_directly(still_model):
-    network = StatefulInference(still_model, 10)
-    assert not network.is_recurrent
-    assert network.memory is None
+def test_a_model_without_memory_refuses_that_of_another(walk, still_model):
+    assert not StatefulInference(still_model, 10).is_recurrent
+    navigator = Navigator(Counting())
+    for sample in zip(walk.time[:300], walk.gyro, walk.accel, strict=False):
+        navigator.push(*sample)
     with pytest.raises(InputError, match="memory"):
-        network.memory = (1, (1,))
+        Navigator(still_model).restore(navigator.snapshot())
 
 
 class Walking:
@@ -118,6 +103,21 @@ def test_slopes_and_missing_samples_make_displacements_less_certain(walk, withou
         own = 4e-4 if flagged else 1e-4
         expected = np.diag([own, own, own + (0.03 * 1.5) ** 2])
         np.testing.assert_allclose(covariance, expected, atol=1e-10)
+
+
+@pytest.mark.parametrize("rate", [2, 10])
+def test_a_recording_tells_a_network_that_walks_backwards(make_walk, make_oracle, rate):
+    sequence, config = make_walk(seconds=60.0), NavigatorConfig(filter=FilterConfig(rate))
+    oracle = make_oracle(sequence, sequence.truth, config)
+
+    class Backwards:
+        def predict(self, windows):
+            displacement, covariance = oracle.predict(windows)
+            return -displacement, covariance
+
+    counts = Navigator(Backwards(), config).observe(sequence).front_end.counts
+    assert abs(counts.network_turn) > np.radians(135.0)
+    assert counts.network_turn_sigma < np.radians(20.0)
 
 
 def compared(stream, displacement) -> Direction:

@@ -71,8 +71,8 @@ def test_without_recorded_poses_the_legs_alone_select_the_weights(
 ):
     chosen = []
 
-    def trained(*arguments, chosen_by_legs=False, **rest):
-        chosen.append(chosen_by_legs)
+    def trained(recipe, data, validation, *rest, **options):
+        chosen.append(validation.simulated)
         raise InputError("stop", "enough", "no training")
 
     def waypoints(path):

@@ -170,8 +170,9 @@ def weights(monkeypatch):
     """Replace training by a log with three epochs; holds the weight of each stream."""
     found = {}
 
-    def trained(recipe, streams, weights, held_out, folder, **rest):
-        found.update((s.name, w * len(s)) for s, w in zip(streams, weights, strict=True))
+    def trained(recipe, data, validation, folder, **rest):
+        pairs = zip(data.streams, data.weights, strict=True)
+        found.update((stream.name, weight * len(stream)) for stream, weight in pairs)
         errors = (0.5, 0.1), (0.4, float("nan")), (0.3, 0.2)
         write_json(
             folder / "log.json",

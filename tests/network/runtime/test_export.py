@@ -67,8 +67,8 @@ def test_an_exported_network_gives_the_same_predictions(name, tmp_path):
 def test_a_recurrent_network_keeps_its_state_in_both_engines(exported):
     windows, model = random_windows(6), shallow_rnin()
     for found, expected in zip(
-        load_model(exported).stateful_inference(2).predict(windows),
-        model.stateful_inference(2).predict(windows),
+        load_model(exported).predict_next(windows, 2)[:2],
+        model.predict_next(windows, 2)[:2],
         strict=True,
     ):
         assert_close(found, expected)
@@ -119,16 +119,13 @@ def test_a_recurrent_model_depends_on_the_order_of_windows(tmp_path):
     save_model(tmp_path / "rnin.safetensors", model.training_form, model.card)
     loaded = load_model(tmp_path / "rnin.safetensors")
     windows = random_windows(6)
-    at_once = loaded.stateful_inference(3).predict(windows)[0]
-    stateful = loaded.stateful_inference(3)
-    one_by_one = np.concatenate([stateful.predict(windows[k : k + 1])[0] for k in range(6)])
+    at_once = loaded.predict_next(windows, 3)[0]
+    memory, one_by_one = None, []
+    for k in range(6):
+        moved, _, memory = loaded.predict_next(windows[k : k + 1], 3, memory)
+        one_by_one.append(moved[0])
     np.testing.assert_allclose(at_once, one_by_one, atol=1e-6)
     # The first window of each series has no predecessor, the others do.
     alone = loaded.predict(windows)[0]
     np.testing.assert_allclose(at_once[:3], alone[:3], atol=1e-5)
     assert (np.abs(at_once[3:] - alone[3:]).max(axis=1) > 1e-5).all()
-
-
-def test_a_model_without_memory_is_its_own_stateful_inference():
-    model = untrained("I-MobileNet")
-    assert model.stateful_inference(10) is model

@@ -20,7 +20,7 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("finished")
     with pytest.MonkeyPatch.context() as patch:
         narrow(patch)
-        return run(folder, on_epoch=reports.append, trained_on=["swings"]), reports
+        return run(folder, on_epoch=reports.append, words=["swings"]), reports
 
 
 @pytest.fixture

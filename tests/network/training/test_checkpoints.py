@@ -9,10 +9,11 @@ import pytest
 import safetensors
 import safetensors.torch
 import torch
-from training_runs import STREAMS, TINY, VALIDATION, run, swaying
+from training_runs import HELD_OUT, STREAMS, TINY, run, swaying
 
 from stario.network.model import load_model
 from stario.network.training.checkpoint import exclusive
+from stario.network.training.data import TrainingData
 from stario.network.training.train import train
 from stario.sequences.errors import ConfigError, InputError, ReadError
 
@@ -38,7 +39,7 @@ def test_a_finished_run_is_not_trained_further(finished, tmp_path, caplog):
     checkpoint = tmp_path / "checkpoint.safetensors"
     checkpoint.write_bytes((finished[0].parent / checkpoint.name).read_bytes())
     steps = []
-    path = run(tmp_path, on_step=lambda step, loss: steps.append(step), trained_on=["swings"])
+    path = run(tmp_path, on_step=lambda step, loss: steps.append(step), words=["swings"])
     assert steps == []
     assert path.read_bytes() == finished[0].read_bytes()
     assert "all 4 epochs are done" in caplog.text
@@ -50,9 +51,9 @@ def test_a_checkpoint_of_other_recordings_is_refused(finished):
     folder = finished[0].parent
     more = [*STREAMS, swaying("e", 0.1)]
     with pytest.raises(ConfigError, match="other recordings"):
-        train(TINY, more, [1.0, 1.0, 1.0], VALIDATION, folder)
+        train(TINY, TrainingData(more), HELD_OUT, folder)
     with pytest.raises(ConfigError, match="other recordings"):
-        train(TINY, STREAMS, [1.0, 2.0], VALIDATION, folder)
+        train(TINY, TrainingData(STREAMS, [1.0, 2.0]), HELD_OUT, folder)
     with pytest.raises(ConfigError, match="initial weights"):
         run(folder, start_from=load_model(finished[0]))
 
@@ -64,7 +65,7 @@ def test_a_checkpoint_of_recordings_that_were_corrected_since_is_refused(finishe
     other_sign = replace(STREAMS[0], imu_W=STREAMS[0].imu_W * np.float32([1, 1, 1, -1, 1, 1]))
     for corrected in (swapped, replace(STREAMS[0], position_W=1.01 * position_W), other_sign):
         with pytest.raises(ConfigError, match="other recordings"):
-            train(TINY, [corrected, STREAMS[1]], [1.0, 1.0], VALIDATION, folder)
+            train(TINY, TrainingData([corrected, STREAMS[1]]), HELD_OUT, folder)
 
 
 def test_a_checkpoint_of_another_recipe_is_refused(finished):

@@ -17,7 +17,7 @@ from stario.network.training.data import (
 )
 from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.datasets.batch import Skipped
-from stario.sequences.errors import ConfigError
+from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
@@ -42,6 +42,8 @@ def test_parts_too_short_for_windows_are_dropped():
     first, last = split_off(recordings_of([stream("a", 1500)]))
     assert [len(s) for s in first[0].streams] == [1200]
     assert not last[0].streams
+    assert first[0].has_poses
+    assert not last[0].has_poses
 
 
 def test_recorded_and_generated_streams_get_their_shares():
@@ -61,10 +63,12 @@ def test_bad_moments_get_their_share_of_all_windows():
         mix_sources(recorded, [], {SIMULATED: 0.4, INSERTED: 0.7}, moments=[stream("m", 900)])
 
 
-def test_a_recording_too_short_to_be_split_has_no_poses_left():
-    _, last = split_off(recordings_of([stream("a", 1500)]))
-    assert not last[0].has_poses
-    assert recordings_of([stream("a", 1500)])[0].has_poses
+def test_streams_are_drawn_alike_unless_each_has_a_weight():
+    streams = [stream("a", 3000), stream("b", 1000)]
+    assert drawn_shares(TrainingData(streams)) == pytest.approx({"a": 0.75, "b": 0.25})
+    assert drawn_shares(TrainingData(streams, np.array([1.0, 3.0])))["a"] == pytest.approx(0.5)
+    with pytest.raises(InputError, match="weights: found 1, expected 2"):
+        TrainingData(streams, [1.0])
 
 
 def drawn_shares(material: TrainingData, reach: int = 1) -> dict[str, float]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from recorded import DATA
-from training_runs import STREAMS, TINY, VALIDATION, run
+from training_runs import HELD_OUT, STREAMS, TINY, VALIDATION, run
 
 from stario.network.card import Calibration
 from stario.network.model import load_model
@@ -18,6 +18,7 @@ from stario.network.training.config import (
     loss_with_sigma,
     training_config,
 )
+from stario.network.training.data import TrainingData
 from stario.network.training.splits import read_packaged_list, warn_of_learned
 from stario.network.training.train import train
 from stario.network.training.validation import ValidationSet
@@ -27,7 +28,7 @@ from stario.sequences.errors import ConfigError
 def test_training_that_spoils_its_initial_weights_gives_a_warning(model, tmp_path, caplog):
     run(tmp_path / "spoilt", replace(TINY, epochs=1, rate=0.1), start_from=load_model(model))
     assert "times those of the initial weights" in caplog.text
-    held_out = ValidationSet(VALIDATION, TINY)
+    held_out = ValidationSet(HELD_OUT, TINY)
     assert not held_out.worse({"c": 1.0, "d": 1.0}, {"c": 0.5, "d": 1.5})
     words = held_out.worse({"c": 1.0, "d": 1.0}, {"c": 0.5, "d": 4.0})
     assert "1.41 times those of the initial weights (d: 4 instead of 1)" in words
@@ -57,23 +58,23 @@ def test_a_last_stage_starts_from_weights_and_adopts_a_calibration(model, tmp_pa
     first = load_model(model)
     slow = replace(TINY, rate=1e-8, epochs=1, epoch_windows=16)
     other = Calibration((1.5, 1.5, 2.0), (0.9, 0.9, 1.1), (0.02, 0.02, 0.03))
-    options = {"calibration": other, "trained_on": ["walks"]}
+    options = {"calibration": other, "words": ["walks"]}
     last = load_model(run(tmp_path / "last", slow, start_from=first, **options))
     assert last.card.calibration == other
     assert last.card.trained_on == ["walks", "initial weights, swings"]
     before = dict(first.training_form.named_parameters())
     for name, value in last.training_form.named_parameters():
         torch.testing.assert_close(value, before[name], atol=1e-4, rtol=0.0)
-    again = load_model(run(tmp_path / "again", slow, start_from=last, trained_on=["swings"]))
+    again = load_model(run(tmp_path / "again", slow, start_from=last, words=["swings"]))
     inherited = ["initial weights, walks", "initial weights, swings"]
     assert again.card.trained_on == ["swings", *inherited]
 
 
 def test_errors_on_recordings_that_were_learned_are_named_so(tmp_path):
     """A last stage trains on the validation recordings, too."""
-    everything = [*STREAMS, *VALIDATION]
+    everything = TrainingData([*STREAMS, *VALIDATION])
     once = replace(TINY, epochs=1, epoch_windows=16)
-    path = train(once, everything, [1.0] * 4, VALIDATION, tmp_path)
+    path = train(once, everything, HELD_OUT, tmp_path)
     assert list(load_model(path).card.figures) == ["validation_mse_m2_after_it_was_learned"]
 
 

@@ -13,6 +13,7 @@ from stario.network.architectures import build_network
 from stario.network.displacement import DisplacementNetwork
 from stario.network.training.augment import Augmentation
 from stario.network.training.config import SIGMA_WEIGHT, TrainingConfig
+from stario.network.training.data import TrainingData
 from stario.network.training.legs import VARIANCE_RATE, LegBatch, LegSampler
 from stario.network.training.validation import ValidationSet
 from stario.network.training.weak_truth import VELOCITY_SIGMA, direction_loss, leg_loss
@@ -181,7 +182,7 @@ def test_errors_do_not_depend_on_the_yaw_of_the_world():
     torch.manual_seed(0)
     network = DisplacementNetwork(build_network("DeepILS"))
     before, after = (
-        ValidationSet([each], TrainingConfig()).residuals(network)
+        ValidationSet(TrainingData([each]), TrainingConfig()).residuals(network)
         for each in (stream, rotated(stream, 2.0))
     )
     for found, expected in zip(after, before, strict=True):
@@ -200,7 +201,7 @@ def test_errors_are_those_of_a_network_that_always_predicts_the_same():
             return torch.tensor([[1.0, 0.0, 0.0, -1.0, -2.0, -3.0]]).expand(len(windows), 6)
 
     stream = WorldStream("north", still, position_W, facing_W)
-    held_out = ValidationSet([stream], TrainingConfig())
+    held_out = ValidationSet(TrainingData([stream]), TrainingConfig())
     error, log_sigma = held_out.residuals(DisplacementNetwork(Constant()))
     np.testing.assert_allclose(error, np.tile([-0.2, 0.0, -0.1], (len(error), 1)), atol=1e-5)
     np.testing.assert_allclose(log_sigma, np.tile([-1.0, -2.0, -3.0], (len(error), 1)))

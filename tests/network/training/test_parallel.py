@@ -20,6 +20,7 @@ from pathlib import Path
 import torch
 from stario.network.training.augment import Augmentation
 from stario.network.training.config import TrainingConfig
+from stario.network.training.data import TrainingData
 from stario.network.training import run
 from stario.network.training.train import train
 from training_runs import swaying
@@ -36,7 +37,10 @@ stop = int(sys.argv[3])
 def kill(step, loss):
     if step == stop:
         raise KeyboardInterrupt
-train(config, [swaying("a", 0.3, 20.0)], [1.0], [swaying("b", 0.8, 6.0)], Path(sys.argv[1]), kill)
+learned, held_out = (
+    TrainingData([swaying(*given)]) for given in (("a", 0.3, 20.0), ("b", 0.8, 6.0))
+)
+train(config, learned, held_out, Path(sys.argv[1]), kill)
 """
 
 

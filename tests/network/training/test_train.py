@@ -11,7 +11,7 @@ import pytest
 import safetensors.torch
 import torch
 from cut_windows import windows_of
-from training_runs import STREAMS, TINY, VALIDATION, run, shallow, swaying
+from training_runs import HELD_OUT, STREAMS, TINY, VALIDATION, run, shallow, swaying
 
 from stario.network.architectures import build_network
 from stario.network.displacement import DisplacementNetwork
@@ -19,6 +19,7 @@ from stario.network.model import load_model
 from stario.network.training.augment import Augmentation
 from stario.network.training.captured import CapturedStep
 from stario.network.training.config import TrainingConfig, training_config
+from stario.network.training.data import TrainingData
 from stario.network.training.history import EpochReport, History
 from stario.network.training.result import calibrate
 from stario.network.training.run import TrainingRun
@@ -67,7 +68,7 @@ def test_sigma_matches_the_errors_in_validation(tmp_path):
     streams = [swaying("a", 0.3, 40.0), swaying("b", 1.2, 40.0)]
     other = swaying("c", 0.8, 30.0)
     other.imu_W[:, :3] = np.random.default_rng(0).standard_normal((6000, 3))
-    path = train(replace(TINY, epochs=2), streams, [1.0, 1.0], [other], tmp_path)
+    path = train(replace(TINY, epochs=2), TrainingData(streams), TrainingData([other]), tmp_path)
     windows, truth = windows_of(other, 20)
     mean, covariance = load_model(path).predict(windows)
     variance = np.diagonal(covariance, axis1=1, axis2=2)
@@ -162,7 +163,7 @@ def test_a_loss_that_is_not_finite_stops_before_it_corrupts_anything(tmp_path):
 
     short = replace(TINY, epochs=2, epoch_windows=32)
     with pytest.raises(InputError, match=r"loss: found nan .* in step 3.*`rate` below 0\.001"):
-        train(short, corrupted, [1.0, 1.0], VALIDATION, tmp_path, on_epoch=corrupt)
+        train(short, TrainingData(corrupted), HELD_OUT, tmp_path, on_epoch=corrupt)
     state = safetensors.torch.load_file(tmp_path / "checkpoint.safetensors")
     assert all(value.isfinite().all() for value in state.values() if value.is_floating_point())
     assert not (tmp_path / "model.safetensors").exists()
@@ -187,16 +188,16 @@ def test_the_log_holds_every_epoch(finished):
 
 def test_nothing_to_learn_from_is_refused(tmp_path):
     with pytest.raises(InputError, match="streams"):
-        train(TINY, [], [], VALIDATION, tmp_path)
+        train(TINY, TrainingData([]), HELD_OUT, tmp_path)
 
 
 def test_stretches_too_short_for_the_fastest_replay_are_skipped(tmp_path, caplog):
     fast = replace(TINY, epochs=1, epoch_windows=16, augmentation=Augmentation(speeds=(0.6, 1.8)))
     short = swaying("short", 0.3, 1.5)
-    train(fast, [*STREAMS, short], [1.0] * 3, VALIDATION, tmp_path / "a")
+    train(fast, TrainingData([*STREAMS, short]), HELD_OUT, tmp_path / "a")
     assert "skipping 1 of 3 stretches" in caplog.text
     with pytest.raises(InputError, match="streams: found none with 361 samples"):
-        train(fast, [short], [1.0], VALIDATION, tmp_path / "b")
+        train(fast, TrainingData([short]), HELD_OUT, tmp_path / "b")
 
 
 def build_network_of(config: TrainingConfig) -> torch.nn.Module:
@@ -211,14 +212,15 @@ def test_a_recurrent_network_is_trained_on_successive_windows(tmp_path, monkeypa
     assert config.successive == 10
     # A step changes the weights that act only on a nonzero state.
     path = run(tmp_path / "row", config)
-    assert load_model(path).stateful_inference(2) is not None
+    assert load_model(path).is_recurrent
     first = DisplacementNetwork(build_network_of(config)).state_dict()
     last = safetensors.torch.load_file(path)
     change = last["lstm.weight_hh_l0"] - first["network.lstm.weight_hh_l0"]
     assert float(change.abs().max()) > 0.0
     # Streams shorter than ten seconds hold no ten successive windows.
+    short = TrainingData([swaying("short", 0.3, 5.0)])
     with pytest.raises(InputError, match="streams: found none with 3601 samples"):
-        train(config, [swaying("short", 0.3, 5.0)], [1.0], VALIDATION, tmp_path / "short")
+        train(config, short, HELD_OUT, tmp_path / "short")
 
 
 @pytest.mark.parametrize(("dense", "stride", "minutes"), [(200, 40, 7), (140, 50, 7), (15, 200, 4)])
@@ -228,12 +230,12 @@ def test_long_validation_data_are_thinned_by_minutes_for_recurrent_networks(
     """Of seven minutes in two recordings, the first of each and every n-th after it are used."""
     monkeypatch.setattr("stario.network.training.validation._DENSE_SAMPLES", 200 * dense)
     streams = [swaying("a", 0.3, 300.0), swaying("b", 0.3, 120.0)]
-    held_out = ValidationSet(streams, TINY, is_recurrent=True)
+    held_out = ValidationSet(TrainingData(streams), TINY, is_recurrent=True)
     assert held_out.stride == stride
     seconds = sum(len(stream) for stream in held_out.streams) / 200
     assert seconds == 60 * minutes
     assert list(dict.fromkeys(held_out.names)) == ["a", "b"]
-    others = ValidationSet(streams, TINY)
+    others = ValidationSet(TrainingData(streams), TINY)
     assert others.streams is streams
     assert others.stride == 20 * max(1, 420 // dense)
 

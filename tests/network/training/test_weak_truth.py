@@ -1,7 +1,6 @@
 """The leg loss: its invariance to yaw, its sensitivity to length, and its weights."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ from training_runs import shallow
 from stario.network.displacement import DisplacementNetwork
 from stario.network.training.augment import UNVARIED, Augmentation
 from stario.network.training.config import TrainingConfig, training_config
+from stario.network.training.data import TrainingData
 from stario.network.training.legs import LegBatch, LegSampler, ends_covariance, velocity_change
 from stario.network.training.parallel import Workers
 from stario.network.training.train import train
@@ -197,10 +197,10 @@ def test_training_with_legs_reduces_the_error_at_positions(tmp_path, monkeypatch
         likelihood_from=0.0, track_stretches=2, augmentation=PLAIN,
     )  # fmt: skip
     reports = []
+    data = TrainingData(streams, legs=[legs])
     train(
-        config, streams, [1.0] * len(streams), streams, tmp_path,
+        config, data, data, tmp_path,
         on_epoch=lambda report: reports.append(report.validation_by_recording),
-        legs=[legs], validation_legs=[legs],
     )  # fmt: skip
     assert reports[-1]["positions"] < 0.9 * reports[0]["positions"]
     assert (tmp_path / "checkpoint.safetensors").exists()
@@ -214,19 +214,18 @@ def test_a_recurrent_network_is_trained_on_stretches_in_rows(tmp_path, monkeypat
     streams = [stream.part(0, 4000) for stream in world_streams(WALK)]
     values = {"architecture": "RNIN", "epochs": 1, "batch": 20, "epoch_windows": 20}
     config = training_config({**values, "track_stretches": 1, "likelihood_from": 0.0})
-    weights, shapes = [1.0] * len(streams), []
-    run = partial(train, config, streams, weights, streams, legs=[legs], validation_legs=[legs])
+    data, shapes = TrainingData(streams, legs=[legs]), []
     original = DisplacementNetwork.forward
     monkeypatch.setattr(
         DisplacementNetwork,
         "forward",
         lambda self, *given: shapes.append(tuple(given[0].shape)) or original(self, *given),
     )
-    run(tmp_path / "rows")
+    train(config, data, data, tmp_path / "rows")
     assert shapes[0] == (3, 10, 6, 200)  # two rows with full truth, one stretch of a track
     assert (5, 10, 6, 200) in shapes
     with pytest.raises(ConfigError, match=r"positions: found 12, expected a multiple.*=10"):
-        train(replace(config, track_seconds=12), streams, weights, streams, tmp_path, legs=[legs])
+        train(replace(config, track_seconds=12), data, data, tmp_path)
 
 
 def test_invalid_positions_and_those_of_another_clock_make_no_legs():
@@ -242,11 +241,12 @@ def test_invalid_positions_and_those_of_another_clock_make_no_legs():
 def test_legs_of_short_walks_can_select_the_weights_alone():
     [legs] = leg_streams(with_positions("positions", 0.1))
     part = replace(legs, imu_N=legs.imu_N[: 8 * 200], facing_N=legs.facing_N[: 8 * 200])
-    held_out = ValidationSet(world_streams(WALK), TrainingConfig(), [part], chosen_by_legs=True)
+    data = TrainingData(world_streams(WALK), legs=[part], simulated=True)
+    held_out = ValidationSet(data, TrainingConfig())
     assert list(held_out.legs) == ["positions"]  # of eight seconds, though training uses twelve
     errors = {"walk": 5.0, "positions": 0.25}
     assert held_out.selection_error(errors) == 0.25
-    combined = ValidationSet(world_streams(WALK), TrainingConfig(), [part])
+    combined = ValidationSet(replace(data, simulated=False), TrainingConfig())
     assert combined.selection_error(errors) == 2.625
 
 
@@ -285,10 +285,9 @@ def test_a_recording_shorter_than_two_legs_is_not_told_to_change_the_recipe():
 
 def test_validation_skips_legs_without_information(caplog):
     """Their error would be 0, the best possible."""
-    held_out = ValidationSet(
-        world_streams(WALK), TrainingConfig(),
-        leg_streams(with_positions("waypoints", 25.0)), chosen_by_legs=True,
-    )  # fmt: skip
+    legs = leg_streams(with_positions("waypoints", 25.0))
+    data = TrainingData(world_streams(WALK), legs=legs, simulated=True)
+    held_out = ValidationSet(data, TrainingConfig())
     assert held_out.legs == {}
     assert held_out.selection_error({"walk": 5.0}) == 5.0
     assert "validation skips waypoints" in caplog.text

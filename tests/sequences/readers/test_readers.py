@@ -9,7 +9,7 @@ from recorded import DATA
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers import FORMATS, find_recordings, read_recording, write_csv
+from stario.sequences.readers import find_recordings, read_recording, write_csv
 from stario.sequences.readers.published.euroc import read_euroc
 from stario.sequences.readers.published.oxiod import read_oxiod
 from stario.sequences.sequence import BoolArray, ImuSequence
@@ -234,7 +234,7 @@ def test_formats_are_recognised_by_content(tmp_path, walk, phone_walk):
         read_recording(oxiod, format="csv")
 
 
-def test_unknown_content_is_shown_with_the_known_formats(tmp_path):
+def test_unknown_content_is_shown_with_where_to_find_the_known_formats(tmp_path):
     path = tmp_path / "imu.csv"
     for text, seen in (
         ("0.0,1,2,3,4,5,6\n", "0.0,1,2,3,4,5,6"),
@@ -246,7 +246,7 @@ def test_unknown_content_is_shown_with_the_known_formats(tmp_path):
         with pytest.raises(ReadError) as caught:
             read_recording(path)
         assert seen in str(caught.value)
-        assert all(name in str(caught.value) for name in FORMATS)
+        assert "--help" in str(caught.value)
     with pytest.raises(ReadError, match="no such file"):
         read_recording(tmp_path / "none.csv")
     with pytest.raises(ReadError, match=r"a folder with imu\.csv; imu\.csv holds 'seconds;"):
