@@ -5,7 +5,6 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from threading import Thread
 from typing import Any, ClassVar
 
@@ -28,6 +27,12 @@ class Shown:
         """Whether the page is wider than its window."""
         return self.page.evaluate("document.documentElement.scrollWidth > window.innerWidth")
 
+    def fits(self, size: tuple[int, int]) -> None:
+        """Wait until the page fits a window of another size."""
+        self.page.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
+        fits = "() => document.documentElement.scrollWidth <= window.innerWidth"
+        self.page.wait_for_function(fits)
+
 
 @pytest.fixture(scope="module")  # while it is open no other test can run an event loop
 def browser() -> Iterator[Any]:
@@ -40,33 +45,39 @@ def browser() -> Iterator[Any]:
         browser.close()
 
 
-@pytest.fixture
-def show(browser, tmp_path: Path):
+def open_page(
+    browser: Any, url: str, size: tuple[int, int] = DESKTOP, offline: bool = False
+) -> Shown:
     """Open an address; `offline`, a page that loads anything from the network fails."""
+    width, height = size
+    context = browser.new_context(
+        viewport={"width": width, "height": height}, has_touch=width < 600, offline=offline
+    )
+    context.set_default_timeout(20_000)
+    context.set_default_navigation_timeout(120_000)  # plotly loads slowly on a shared core
+    shown = Shown(context.new_page())
+    shown.page.on(
+        "console",
+        lambda m: shown.problems.append(m.text) if m.type in ("error", "warning") else None,
+    )
+    shown.page.on("pageerror", lambda error: shown.problems.append(str(error)))
+    shown.page.on("requestfailed", lambda r: shown.problems.append(f"failed: {r.url}"))
+    shown.page.goto(url)
+    shown.page.wait_for_selector("body[data-ready=yes]", timeout=120_000)
+    return shown
+
+
+@pytest.fixture
+def show(browser):
     opened = []
 
-    def show(url: str, size: tuple[int, int] = DESKTOP, offline: bool = False) -> Shown:
-        width, height = size
-        context = browser.new_context(
-            viewport={"width": width, "height": height}, has_touch=width < 600, offline=offline
-        )
-        context.set_default_timeout(20_000)
-        context.set_default_navigation_timeout(120_000)  # plotly loads slowly on a shared core
-        opened.append(context)
-        shown = Shown(context.new_page())
-        shown.page.on(
-            "console",
-            lambda m: shown.problems.append(m.text) if m.type in ("error", "warning") else None,
-        )
-        shown.page.on("pageerror", lambda error: shown.problems.append(str(error)))
-        shown.page.on("requestfailed", lambda r: shown.problems.append(f"failed: {r.url}"))
-        shown.page.goto(url)
-        shown.page.wait_for_selector("body[data-ready=yes]", timeout=120_000)
-        return shown
+    def show(url: str, size: tuple[int, int] = DESKTOP) -> Shown:
+        opened.append(open_page(browser, url, size))
+        return opened[-1]
 
     yield show
-    for context in opened:
-        context.close()
+    for shown in opened:
+        shown.page.context.close()
 
 
 class Tiles(BaseHTTPRequestHandler):

@@ -95,8 +95,7 @@ def test_height_and_floor_of_a_phone_with_a_barometer_are_shown(show, server, re
     assert shown.problems == []
 
 
-@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
-def test_a_walk_with_satellites_lies_on_the_map(show, tile_server, replay, tmp_path, size):
+def test_a_walk_with_satellites_lies_on_the_map(show, tile_server, replay, tmp_path):
     walk = demonstration()
     there = walk.truth.at(np.arange(walk.time[0] + 0.5, walk.time[0] + 12.0))
     v = there.velocity_W
@@ -112,7 +111,7 @@ def test_a_walk_with_satellites_lies_on_the_map(show, tile_server, replay, tmp_p
     with running(server):
         url = f"http://127.0.0.1:{server.port}"
         replay(replace(walk, satellites=receiver), f"{url}/data", 10.0, 12.0, "fred")
-        shown = show(url, size)
+        shown = show(url)
         shown.page.locator("#map image").first.wait_for(state="attached")
         shown.page.get_by_text("east [m]").wait_for()
         shown.page.get_by_text("map: 127.0.0.1").wait_for()
@@ -123,15 +122,15 @@ def test_a_walk_with_satellites_lies_on_the_map(show, tile_server, replay, tmp_p
         assert not shown.page.get_by_text("Zero here").is_visible()
         assert Tiles.asked
         assert not shown.overflows()
+        shown.fits(PHONE)
         assert shown.problems == []
 
 
-@pytest.mark.parametrize(("size", "name"), [(DESKTOP, "carl"), (PHONE, "carla")])
-def test_buttons_for_zero_place_and_stop_reach_the_server(show, server, replay, size, name):
-    url = f"http://127.0.0.1:{server.port}"
+def test_buttons_for_zero_place_and_stop_reach_the_server(show, server, replay):
+    url, name = f"http://127.0.0.1:{server.port}", "carl"
     replay(demonstration(), f"{url}/data", 10.0, 4.0, name)
     session = server.hub.sessions[name]
-    shown = show(url, size)
+    shown = show(url, PHONE)
     card = shown.page.locator(f"[data-device={name}]")
     card.get_by_text("Zero here").click()
     shown.page.wait_for_function(f"() => window.stario.devices.get('{name}').origin[0] !== 0")
@@ -151,6 +150,7 @@ def test_buttons_for_zero_place_and_stop_reach_the_server(show, server, replay, 
     shown.page.wait_for_function(f"() => !window.stario.devices.get('{name}').running")
     assert not session.running
     assert not shown.overflows()
+    shown.fits(DESKTOP)
     assert shown.problems == []
 
 
@@ -178,14 +178,14 @@ def test_a_command_without_an_answer_is_shown_and_any_name_can_be_commanded(show
     card.wait_for(state="detached")
 
 
-@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
-def test_page_of_a_server_that_requires_a_token_loads_with_it(show, tmp_path, size):
+def test_page_of_a_server_that_requires_a_token_loads_with_it(show, tmp_path):
     server = LiveServer(lambda: None, tmp_path, host="0.0.0.0", port=0)
     with running(server):
-        shown = show(f"http://127.0.0.1:{server.port}/?token={server.token}", size)
+        shown = show(f"http://127.0.0.1:{server.port}/?token={server.token}")
         address = shown.page.inner_text("#push-url")
         assert "127.0.0.1" not in address
         assert address.endswith(f":{server.port}/data?token={server.token}")
         shown.page.wait_for_function("document.getElementById('code').naturalWidth > 50")
         assert not shown.overflows()
+        shown.fits(PHONE)
         assert shown.problems == []

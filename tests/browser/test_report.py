@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from stario.sequences.attitude.rotations import about_z
 from stario.sequences.geodesy import Georeference
 from stario.sequences.sequence import ImuSequence, Trajectory
 
-from .conftest import DESKTOP, PHONE, Tiles
+from .conftest import DESKTOP, PHONE, Tiles, open_page
 
 SECONDS = 20.0
 
@@ -40,16 +41,75 @@ def report(comparison, tmp_path_factory):
     return write_report(folder / "report.html", comparison)
 
 
+@pytest.fixture(scope="module")
+def opened(browser, report):
+    """The report in windows of each size, opened once; the last tests below change it."""
+    return cache(lambda size: open_page(browser, report.as_uri(), size, offline=True))
+
+
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
-def test_report_loads_offline_without_errors_and_fits_the_screen(show, report, size):
-    shown = show(report.as_uri(), size, offline=True)
+def test_report_loads_offline_without_errors_and_fits_the_screen(opened, size):
+    shown = opened(size)
     assert shown.problems == []
     assert not shown.overflows()
     assert shown.page.inner_text("h1") == "walk </script><b>&"
 
 
-def test_slider_moves_the_cursor_on_the_map_and_every_panel(show, report, comparison):
-    shown = show(report.as_uri())
+def test_report_names_units_on_every_panel(opened, report):
+    shown = opened(DESKTOP)
+    titles = shown.page.evaluate(
+        "document.getElementById('time').layout.annotations.map(a => a.text)"
+    )
+    assert all(re.search(r"\[(m|m/s|m/s\^2|deg|deg/s|1)\]", title) for title in titles)
+    assert {title.split("[")[0] for title in titles} >= {
+        "Height ",
+        "Speed ",
+        "Accelerometer bias z ",
+    }
+    text = report.read_text()
+    assert not re.search(r"<(script|link|img)[^>]+(src|href)=\"http", text.split("<script>")[0])
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_everything_is_on_the_screen_and_nothing_covers_it(opened, size):
+    shown = opened(size)
+    page = shown.page
+    scrolling = "() => [...document.querySelectorAll('section')]"
+    scrolling += (
+        ".filter(s => s.scrollHeight > s.clientHeight + 1 || s.scrollWidth > s.clientWidth)"
+    )
+    assert page.evaluate(f"({scrolling})().length") == 0
+    last = page.locator("th", has_text="NIS").bounding_box()
+    assert last["x"] + last["width"] <= size[0]
+    # Scrolled to its end, the page's last card is above the bar with the slider.
+    page.evaluate("window.scrollTo(0, document.documentElement.scrollHeight)")
+    card, bar = page.locator("section").last.bounding_box(), page.locator("#bar").bounding_box()
+    assert card["y"] + card["height"] <= bar["y"]
+    if size == DESKTOP:
+        tools = page.locator("#map .modebar").bounding_box()
+        axes = page.locator("#map .bglayer rect, #map .nsewdrag").first.bounding_box()
+        assert tools["y"] + tools["height"] <= axes["y"]
+
+
+def test_report_opens_at_the_start_with_the_whole_track_and_its_scale(opened):
+    page = opened(DESKTOP).page
+    assert page.evaluate("+document.body.dataset.time") == pytest.approx(0.0, abs=0.05)
+    inside = "() => { const m = document.getElementById('map'), r = a => m.layout[a].range;"
+    inside += " const within = (v, [low, high]) => v === null || (low < v && v < high);"
+    inside += " return m.data.filter(t => t.legendgroup === 'track')"
+    inside += ".every(t => ['x', 'y'].every(a => t[a].every(v => within(v, r(`${a}axis`))))); }"
+    assert page.evaluate(inside)
+    bar = page.locator("#scale").bounding_box()["width"]
+    metres = float(page.inner_text("#scale").removesuffix(" m"))
+    x = page.evaluate(
+        "(({ _length, range }) => _length / (range[1] - range[0]))"
+        "(document.getElementById('map')._fullLayout.xaxis)"
+    )
+    assert bar == pytest.approx(metres * x, abs=1.0)
+
+
+def test_slider_moves_the_cursor_on_the_map_and_every_panel(opened, comparison):
+    shown = opened(DESKTOP)
     slide = "value => { const s = document.getElementById('slider'); s.value = value;"
     slide += " s.dispatchEvent(new Event('input')); }"
     cursor = "() => ({at: +document.body.dataset.time,"
@@ -75,66 +135,13 @@ def test_slider_moves_the_cursor_on_the_map_and_every_panel(show, report, compar
     assert shown.problems == []
 
 
-def test_the_button_of_a_track_hides_it_on_map_and_panels(show, report):
-    shown = show(report.as_uri())
+def test_the_button_of_a_track_hides_it_on_map_and_panels(opened):
+    shown = opened(DESKTOP)
     visible = "() => ['map', 'time'].map(id => document.getElementById(id).data"
     visible += ".filter(t => t.legendgroup === 'track' && t.visible !== false).length)"
     assert all(shown.page.evaluate(visible))
     shown.page.click("[data-track=track]")
     shown.page.wait_for_function(f"() => ({visible})().every(n => n === 0)", timeout=10_000)
-
-
-def test_report_names_units_on_every_panel(show, report):
-    shown = show(report.as_uri())
-    titles = shown.page.evaluate(
-        "document.getElementById('time').layout.annotations.map(a => a.text)"
-    )
-    assert all(re.search(r"\[(m|m/s|m/s\^2|deg|deg/s|1)\]", title) for title in titles)
-    assert {title.split("[")[0] for title in titles} >= {
-        "Height ",
-        "Speed ",
-        "Accelerometer bias z ",
-    }
-    text = report.read_text()
-    assert not re.search(r"<(script|link|img)[^>]+(src|href)=\"http", text.split("<script>")[0])
-
-
-@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
-def test_everything_is_on_the_screen_and_nothing_covers_it(show, report, size):
-    shown = show(report.as_uri(), size)
-    page = shown.page
-    scrolling = "() => [...document.querySelectorAll('section')]"
-    scrolling += (
-        ".filter(s => s.scrollHeight > s.clientHeight + 1 || s.scrollWidth > s.clientWidth)"
-    )
-    assert page.evaluate(f"({scrolling})().length") == 0
-    last = page.locator("th", has_text="NIS").bounding_box()
-    assert last["x"] + last["width"] <= size[0]
-    # Scrolled to its end, the page's last card is above the bar with the slider.
-    page.evaluate("window.scrollTo(0, document.documentElement.scrollHeight)")
-    card, bar = page.locator("section").last.bounding_box(), page.locator("#bar").bounding_box()
-    assert card["y"] + card["height"] <= bar["y"]
-    if size == DESKTOP:
-        tools = page.locator("#map .modebar").bounding_box()
-        axes = page.locator("#map .bglayer rect, #map .nsewdrag").first.bounding_box()
-        assert tools["y"] + tools["height"] <= axes["y"]
-
-
-def test_report_opens_at_the_start_with_the_whole_track_and_its_scale(show, report):
-    page = show(report.as_uri()).page
-    assert page.evaluate("+document.body.dataset.time") == pytest.approx(0.0, abs=0.05)
-    inside = "() => { const m = document.getElementById('map'), r = a => m.layout[a].range;"
-    inside += " const within = (v, [low, high]) => v === null || (low < v && v < high);"
-    inside += " return m.data.filter(t => t.legendgroup === 'track')"
-    inside += ".every(t => ['x', 'y'].every(a => t[a].every(v => within(v, r(`${a}axis`))))); }"
-    assert page.evaluate(inside)
-    bar = page.locator("#scale").bounding_box()["width"]
-    metres = float(page.inner_text("#scale").removesuffix(" m"))
-    x = page.evaluate(
-        "(({ _length, range }) => _length / (range[1] - range[0]))"
-        "(document.getElementById('map')._fullLayout.xaxis)"
-    )
-    assert bar == pytest.approx(metres * x, abs=1.0)
 
 
 def test_report_of_ten_minutes_is_below_two_megabytes(tmp_path, comparison):

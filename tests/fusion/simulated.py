@@ -125,7 +125,7 @@ def measured(
     noise: float = 0.03,
     **style: object,
 ) -> tuple[ImuSequence, ImuSequence, Oracle]:
-    """Return a walk, the same without the samples in a gap, and an oracle of the latter."""
-    walk = simulated_walk(seed, seconds, **style)
+    """Return a walk at 50 Hz, the same without samples in a gap, and an oracle of the latter."""
+    walk = simulated_walk(seed, seconds, 50.0, **style)
     holed = without(walk, (walk.time > gap[0]) & (walk.time < gap[1])) if any(gap) else walk
     return walk, holed, Oracle(holed, walk.truth, config, noise=noise, sigma=noise)

@@ -61,6 +61,7 @@ def test_a_restored_stream_continues_bit_for_bit(walk, make_oracle, without, sto
 
 
 def test_a_snapshot_includes_the_prior(walk, make_oracle):
+    walk = walk.slice(0.0, 5.0)
     model = make_oracle(walk, walk.truth, CONFIG)
     prior = PriorPose(np.eye(3), np.ones(3), np.array([5.0, 6.0, 7.0]))
     whole, other = Navigator(model, CONFIG, prior), Navigator(model, CONFIG)

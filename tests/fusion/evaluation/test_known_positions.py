@@ -124,21 +124,11 @@ def test_positions_that_fit_the_mirror_image_name_the_accelerometers_sign():
     assert "--accel-sign apple" in found.advice
 
 
-def test_a_run_says_what_an_inspection_says_of_the_axes():
-    assert case("run_silent_on_axes/gyro_not_rotated.csv")["gyro_axes"].level == "warning"
-
-
 def test_a_robot_that_turns_about_one_axis_gets_no_remedy_that_harms():
     found = case("planar_robot/robot.csv")
     assert not {code for code in found if code.startswith("truth_")}
     assert "track_scale" in found
     assert found["train"].advice == "Run `train`."
-
-
-def test_a_rate_that_may_be_in_degrees_is_asked():
-    assert (
-        "--gyro-unit deg/s" in case("gyro_degrees_planar_robot/robot.csv")["gyro_unit_open"].advice
-    )
 
 
 @pytest.fixture(scope="module")

@@ -105,16 +105,16 @@ CONFIG = NavigatorConfig(
 
 
 def test_a_snapshot_includes_the_alternative(make_walk, make_oracle):
-    walk = make_walk(1, 60.0)
+    walk = make_walk(1, 30.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.02)
-    parts = [walk.slice(0.0, 52.0 - 1e-9), walk.slice(52.0, 60.0)]
-    model = OffByOneMetre(oracle, 98, 106)
+    parts = [walk.slice(0.0, 22.0 - 1e-9), walk.slice(22.0, 30.0)]
+    model = OffByOneMetre(oracle, 38, 46)
     whole = Navigator(model, CONFIG)
     stream(whole, parts[0])
     # The false displacements have not ended yet.
     state = whole._stream.state
     assert isinstance(getattr(state, "alternative", None), AlternativeHypothesis)
-    second_model = OffByOneMetre(oracle, 98, 106)
+    second_model = OffByOneMetre(oracle, 38, 46)
     second_model.count = model.count
     resumed = Navigator(second_model, CONFIG)
     resumed.restore(whole.snapshot())

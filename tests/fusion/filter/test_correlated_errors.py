@@ -142,9 +142,9 @@ def straight_walk(rng: np.random.Generator, seconds: int) -> tuple[Driven, np.nd
 
 
 def test_the_covariance_is_that_of_drawn_errors():
-    """Of 100 walks; what the gains assume is a fraction of it."""
+    """Of 60 walks; what the gains assume is a fraction of it."""
     rng, seconds = np.random.default_rng(1), 30
-    filters, ends, nis = zip(*(straight_walk(rng, seconds) for _ in range(100)), strict=True)
+    filters, ends, nis = zip(*(straight_walk(rng, seconds) for _ in range(60)), strict=True)
     found = np.square([ekf.state.p_W - end for ekf, end in zip(filters, ends, strict=True)])
     reported = np.diag(filters[0].state.nav_state().covariance)[6:9]
     np.testing.assert_allclose(found.mean(axis=0)[:2], reported[:2], rtol=0.3)
@@ -154,7 +154,7 @@ def test_the_covariance_is_that_of_drawn_errors():
 
 @pytest.fixture(scope="module")
 def walk(make_walk):
-    return make_walk(3, 32.0)
+    return make_walk(3, 32.0, 50.0)
 
 
 @pytest.fixture(scope="module")

@@ -53,7 +53,9 @@ def test_a_position_before_a_gap_does_not_turn_the_track_after_it(backend, seed,
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize(("seed", "gap", "turn"), [(2, 6.0, 2.5), (18, 10.0, 1.8)])
+@pytest.mark.parametrize(
+    ("seed", "gap", "turn"), [(2, 6.0, 2.5), pytest.param(18, 10.0, 1.8, marks=pytest.mark.slow)]
+)
 def test_fixes_find_the_direction_again_after_a_gap_with_fixes_in_it(
     make_walk, make_oracle, without, backend, seed, gap, turn
 ):

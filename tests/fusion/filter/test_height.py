@@ -107,7 +107,7 @@ def test_moving_the_map_changes_nothing_that_pressure_tells(transform):
 @pytest.fixture(scope="module")
 def house():
     """Two minutes: stairs to the first floor, and a lift to the fourth."""
-    walk = simulate_house(9, 120.0, rate=100.0, air=Air(weather=0.01, door=0.3))
+    walk = simulate_house(9, 120.0, rate=50.0, air=Air(weather=0.01, door=0.3))
     return replace(walk, sequence=replace(walk.sequence, magnetometer=None))
 
 
@@ -173,7 +173,7 @@ def test_the_report_draws_floors_along_the_height(house_track):
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
 def test_a_stream_has_the_heights_of_the_recording(house, level_oracle, house_track, backend):
-    sequence = house.sequence.slice(0.0, 60.0)
+    sequence = house.sequence.slice(0.0, 45.0)
     pressures = dict(zip(sequence.barometer.time, sequence.barometer.pressure_hPa, strict=True))
     times = list(pressures)
     stream = Navigator(level_oracle, CONFIG, backend=backend)
@@ -194,11 +194,11 @@ def test_a_stream_has_the_heights_of_the_recording(house, level_oracle, house_tr
     same = np.interp([s.time for s in states], expected.time, expected.trajectory.position_W[:, 2])
     tolerance = 1e-6 if backend == "ekf" else 0.6
     np.testing.assert_allclose(heights, same, atol=tolerance)
-    assert stream.health.pressures["applied"] > 100
+    assert stream.health.pressures["applied"] > 75
 
 
 def test_weather_and_doors_on_a_level_floor_are_worth_their_sigma(make_walk):
-    walk = make_walk(seed=4, seconds=60.0)
+    walk = make_walk(seed=4, seconds=60.0, rate=50.0)
     doors = np.array([20.0, 40.0])
     air = Air(weather=0.03, door=0.5)
     with_air = replace(walk, barometer=simulate_barometer(walk.truth, air, doors, seed=1))

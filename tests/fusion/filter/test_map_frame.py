@@ -40,10 +40,10 @@ def stream_with_fixes(navigator: Navigator, walk: ImuSequence, fixes: list[Fix])
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_fixes_far_from_the_maps_origin_are_as_accurate_as_near_ones(backend):
-    walk, _, oracle = measured(3, 16.0, CONFIG)
+    walk, _, oracle = measured(3, 10.0, CONFIG)
     found = []
     for shift in (np.zeros(3), MAP):
-        fixes = fixes_of(walk, np.arange(5.0, 15.0, 3.0), shift)
+        fixes = fixes_of(walk, np.arange(3.0, 9.5, 3.0), shift)
         track = Navigator(oracle, CONFIG, backend=backend).run(walk, fixes=fixes)
         states = stream_with_fixes(Navigator(oracle, CONFIG, backend=backend), walk, fixes)
         assert track.health.fixes == {"applied": len(fixes)}
@@ -87,7 +87,7 @@ def test_fixes_recover_the_yaw_after_a_gap_that_lost_it(backend, gap):
 
 def test_the_graph_uses_no_fix_that_the_filter_refused(make_walk, make_oracle):
     """The yaw of a device that hangs upside down is undefined."""
-    walk = make_walk(3, 11.0, mount_rotvec=(np.pi, 0.0, 0.0))
+    walk = make_walk(3, 8.0, mount_rotvec=(np.pi, 0.0, 0.0))
     oracle = make_oracle(walk, walk.truth, CONFIG)
     ends = []
     for fixes in ([], [yaw_fix(6.03, 0.5, 0.01)]):
@@ -101,9 +101,9 @@ def test_the_graph_uses_no_fix_that_the_filter_refused(make_walk, make_oracle):
 
 
 def test_a_heading_alone_does_not_make_the_position_uncertain(make_walk, make_oracle):
-    walk = make_walk(4, 20.0)
+    walk = make_walk(4, 8.0)
     oracle = make_oracle(walk, walk.truth, CONFIG)
-    fixes = [yaw_fix(10.0, 1.0, 0.05)]
+    fixes = [yaw_fix(5.0, 1.0, 0.05)]
     track = Navigator(oracle, CONFIG, backend="graph").run(walk, fixes=fixes)
     assert track.health.fixes == {"applied": 1}
     assert np.linalg.norm(track.trajectory.position_W[0]) < 0.01
@@ -156,8 +156,8 @@ def yaw_error(walk: ImuSequence, states: list[NavState]) -> tuple[np.ndarray, np
     "off", [[200.0, 0.0, 0.0], pytest.param([0.0, -60.0, 0.0], marks=pytest.mark.slow)]
 )
 def test_a_wrong_first_position_does_not_turn_the_track(backend, off):
-    walk, _, oracle = measured(3, 40.0, CONFIG)
-    fixes = fixes_of(walk, np.arange(2.0, 38.0, 3.0), np.zeros(3))
+    walk, _, oracle = measured(3, 28.0, CONFIG)
+    fixes = fixes_of(walk, np.arange(2.0, 27.0, 3.0), np.zeros(3))
     bad = position_fix(fixes[0].time, fixes[0].value + off, fixes[0].covariance)
     states = stream_with_fixes(Navigator(oracle, CONFIG, backend=backend), walk, [bad, *fixes[1:]])
     error, sigma = yaw_error(walk, states[-20:])
@@ -200,9 +200,9 @@ def test_more_accurate_positions_move_a_stationary_track(still_model):
 
 
 def test_the_track_is_turned_about_its_prior_position():
-    walk, _, oracle = measured(3, 40.0, CONFIG)
+    walk, _, oracle = measured(3, 28.0, CONFIG)
     far, turn = np.array([100.0, 50.0, 0.0]), about_z(2.0)
-    fixes = fixes_of(walk, np.arange(3.0, 38.0, 3.0), far)
+    fixes = fixes_of(walk, np.arange(3.0, 27.0, 3.0), far)
     first = walk.truth.attitude_WB[0].as_matrix()
     p_W = turn.apply(walk.truth.position_W[0]) + far
     prior = PriorPose(first, np.zeros(3), p_W, yaw_sigma=3.0, position_sigma=1.0)
@@ -235,7 +235,7 @@ def test_uninformative_fixes_in_a_gap_leave_its_turn_as_uncertain(make_walk, wit
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_false_position_does_not_block_a_yaw(backend):
-    walk, _, oracle = measured(3, 20.0, CONFIG)
+    walk, _, oracle = measured(3, 12.0, CONFIG)
     first, off = fixes_of(walk, [2.0, 4.0], np.zeros(3))
     off = position_fix(off.time, off.value + np.array([60.0, 0.0, 0.0]), off.covariance)
     yaw = float(yaw_of(walk.truth.at(np.array([5.0])).attitude_WB)[0]) + 2.0
@@ -247,7 +247,7 @@ def test_a_false_position_does_not_block_a_yaw(backend):
 
 
 def test_a_horizontal_position_is_kept_over_a_coarser_one_with_height():
-    walk, _, oracle = measured(3, 20.0, CONFIG)
+    walk, _, oracle = measured(3, 8.0, CONFIG)
     start = true_at(walk, 1.5)
     plane = position_fix(1.5, [start[0], start[1], 0.0], np.diag([0.09, 0.09, 1e6]))
     coarse = position_fix(2.5, true_at(walk, 2.5) + np.array([6.0, 6.0, 0.0]), 64.0 * np.eye(3))

@@ -142,6 +142,7 @@ def test_if_the_graph_fails_the_track_is_the_filters_and_a_note_says_why(
     def fails(self, **options):
         raise IndeterminateError("velocity at 12.3 s is undetermined")
 
+    walk = walk.slice(0.0, 13.0)
     oracle = make_oracle(walk, walk.truth, CONFIG)
     filtered = Navigator(oracle, CONFIG, backend="ekf").run(walk)
     monkeypatch.setattr(KeyframeGraph, "solve", fails)
@@ -196,6 +197,7 @@ def test_a_lag_out_of_bounds_is_refused(lag):
 @pytest.mark.parametrize("time", [10.0, 10.37, 10.4])
 def test_a_position_fix_pulls_the_track_to_it_at_its_own_time(walk, make_oracle, time):
     """On a keyframe, between the filter's states, and on one of them."""
+    walk = walk.slice(0.0, 15.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
     prior = PriorPose(
         walk.truth.attitude_WB[0].as_matrix(), walk.truth.velocity_W[0], walk.truth.position_W[0]
@@ -203,16 +205,16 @@ def test_a_position_fix_pulls_the_track_to_it_at_its_own_time(walk, make_oracle,
     truth = walk.truth.at(np.array([time])).position_W[0]
     fix = position_fix(time, truth, 1e-4 * np.eye(3))
     track = graph(oracle, prior=prior).run(walk, fixes=[fix])
-    for each, limit in ((track, 0.06), (graph(oracle, prior=prior).run(walk), np.inf)):
-        near = np.abs(each.time - time) < 0.11
-        true = walk.truth.at(each.time[near]).position_W
-        assert np.linalg.norm(each.trajectory.position_W[near] - true, axis=1).max() < limit
+    near = np.abs(track.time - time) < 0.11
+    true = walk.truth.at(track.time[near]).position_W
+    assert np.linalg.norm(track.trajectory.position_W[near] - true, axis=1).max() < 0.06
     k = int(np.argmin(np.abs(track.time - time)))
     assert np.sqrt(track.covariance[k, 6:9, 6:9].trace()) < 0.08
     assert track.health.fixes == {"applied": 1}
 
 
 def test_the_track_meets_heading_and_velocity_fixes(walk, make_oracle):
+    walk = walk.slice(0.0, 16.0)
     oracle = make_oracle(walk, walk.truth, CONFIG)
     prior = PriorPose(walk.truth.attitude_WB[0].as_matrix(), walk.truth.velocity_W[0], np.zeros(3))
     truth = walk.truth.at(np.array([9.25, 14.0]))
@@ -265,8 +267,9 @@ def test_contradicting_fixes_are_weighed_until_the_track_has_converged(make_walk
 def test_accurate_positions_with_an_unknown_height_need_no_fall_back(
     walk, make_oracle, height_sigma
 ):
+    walk = walk.slice(0.0, 14.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.05, sigma=0.05)
-    times = np.arange(2.03, 19.0)
+    times = np.arange(2.03, 13.0)
     flat = walk.truth.at(times).position_W * [1.0, 1.0, 0.0]
     covariance = np.diag([1e-4, 1e-4, height_sigma**2])
     fixes = [position_fix(t, p, covariance) for t, p in zip(times, flat, strict=True)]
@@ -278,7 +281,7 @@ def test_accurate_positions_with_an_unknown_height_need_no_fall_back(
     states = stream(navigator, walk)
     assert navigator.health.notes == []
     for state, p_W in ((states[-1], states[-1].p_W), (track, track.trajectory.position_W[-1])):
-        true = walk.truth.at(np.array([min(np.atleast_1d(state.time)[-1], 20.0)])).position_W[0]
+        true = walk.truth.at(np.array([min(np.atleast_1d(state.time)[-1], 14.0)])).position_W[0]
         assert np.linalg.norm((p_W - true)[:2]) < 0.5
 
 

@@ -21,7 +21,7 @@ from .conftest import command, full_disk, send
 def full(client, hub, pushes):
     """A hub with as many devices as it may have."""
     for k in range(MAX_DEVICES):
-        send(client, pushes(f"phone{k}", seconds=2.0))
+        send(client, pushes(f"phone{k}", seconds=1.0))
     return hub
 
 
@@ -31,11 +31,11 @@ def test_the_device_silent_longest_makes_room_and_its_recording_is_whole(full, c
     for k, silent in ((3, 1.5), (5, 2.0)):
         full.sessions[f"phone{k}"].received -= silent * SILENT_SECONDS
     evicted = full.sessions["phone5"]
-    send(client, pushes("another", seconds=2.0))
+    send(client, pushes("another", seconds=0.4))
     assert "phone5" not in full.sessions
     assert len(full.sessions) == MAX_DEVICES
-    assert len(read_recording(evicted.track.path)) == 200
-    send(client, pushes("phone5", seconds=2.0))  # the other silent one makes room
+    assert len(read_recording(evicted.track.path)) == 100
+    send(client, pushes("phone5", seconds=0.4))  # the other silent one makes room
     assert "phone3" not in full.sessions
     sent = {device["id"]: device for device in viewer.message()["devices"]}
     assert sent["phone5"]["fresh"]

@@ -156,8 +156,7 @@ def test_a_gyroscope_that_stops_is_shown(session, batches):
     assert "no samples of gyroscope for 5 s" in session.status()["problem"]
 
 
-def test_a_gyroscope_in_another_unit_is_shown_though_the_track_begins_again(session, pushes):
-    batches = [parse_push(body) for body in pushes()]
+def test_a_gyroscope_in_another_unit_is_shown_though_the_track_begins_again(session, batches):
     shown = []
     for batch in batches:
         degrees = [

@@ -98,7 +98,7 @@ def test_a_velocity_without_a_direction_is_none(speed, bearing):
 @pytest.fixture(scope="module")
 def walk(make_walk):
     """A walk whose receiver is wrong by the same 4 m, and gives velocities in its second half."""
-    walk = make_walk(3, 60.0, 100.0)
+    walk = make_walk(3, 60.0, 50.0)
     there = walk.truth.at(np.arange(1.0, 59.0))
     xy = there.position_W[:, :2] + [4.0, 0.0]
     speed = np.where(there.time < 30.0, np.nan, np.linalg.norm(there.velocity_W[:, :2], axis=1))

@@ -168,6 +168,8 @@ def test_weights_and_commands_need_no_pytorch(tmp_path):
         "from pathlib import Path\n"
         "from stario.fusion import demonstration\n"
         "from stario.fusion.commands.cli import main\n"
+        "from stario.fusion.evaluation import results\n"
+        "results.save_figure = lambda figure, path: path.touch()\n"  # rendering is slow
         "from stario.sequences.readers import write_csv\n"
         f"path = Path({str(tmp_path / 'walk.csv')!r})\n"
         "write_csv(path, demonstration().slice(0.0, 5.0))\n"

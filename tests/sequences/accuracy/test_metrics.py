@@ -234,13 +234,6 @@ def test_relative_error_is_nan_if_a_gap_leaves_no_pair():
     assert found.ate_m > 0
 
 
-def test_estimate_longer_than_the_truth_is_only_partly_covered():
-    truth = straight(100.0)
-    found = evaluate_track(truth, truth.slice(50.0, 75.0))
-    assert found.coverage == pytest.approx(0.25, abs=1e-3)
-    assert found.duration_s == pytest.approx(25.0)
-
-
 def test_no_overlap_is_an_error_that_names_both_spans():
     truth = straight(10.0)
     later = replace(truth, time=truth.time + 100.0)

@@ -85,13 +85,17 @@ def test_two_exports_without_times_are_two_recordings_at_the_rate_given():
 
 
 def test_degrees_of_a_robot_that_turns_only_about_the_vertical_are_asked_for(caplog):
-    check_units(read_recording(case("gyro_degrees_planar_robot/robot.csv")))
+    read = read_recording(case("gyro_degrees_planar_robot/robot.csv"))
+    check_units(read)
     assert "--gyro-unit deg/s" in caplog.text
+    found = {found.code: found for found in inspect_recording(read).findings}
+    assert "--gyro-unit deg/s" in found["gyro_unit_open"].advice
 
 
 def test_axes_of_the_gyroscope_that_are_not_the_accelerometers_are_a_problem():
     read = read_recording(case("run_silent_on_axes/gyro_not_rotated.csv"))
-    assert any(found.code == "gyro_axes" for found in inspect_recording(read).findings)
+    levels = {found.code: found.level for found in inspect_recording(read).findings}
+    assert levels["gyro_axes"] == "warning"
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")

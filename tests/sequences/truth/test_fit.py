@@ -26,7 +26,7 @@ def recorded_in(sequence: ImuSequence, axes: str) -> ImuSequence:
 
 @pytest.fixture(scope="module")
 def walk():
-    return simulate_imu(generate_walk(8, 40.0, style=WalkStyle()), 200.0, seed=2)
+    return simulate_imu(generate_walk(8, 40.0, style=WalkStyle()), 100.0, seed=2)
 
 
 def test_a_truth_that_fits_needs_no_correction(walk):
