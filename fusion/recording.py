@@ -15,6 +15,7 @@ from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
 from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.imu.stateful import (
+    BATCH,
     Predictor,
     StatefulInference,
     WindowDisplacement,
@@ -30,9 +31,6 @@ from stario.sequences.inspection.constant_values import dead_axes
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Satellites
 from stario.sequences.time_order import MAX_IMU_GAP
 from stario.sequences.windows import WINDOW_SECONDS
-
-_BATCH = 512
-"""Number of windows per batch of the network."""
 
 Progress = Callable[[float], None]
 """Callback that receives the fraction of the work done, 0 to 1."""
@@ -168,10 +166,10 @@ def _displacements(
     begins = np.diff(gaps, prepend=gaps[0]) > 0
     measurements: list[WindowDisplacement | None] = [None] * len(intervals)
     weighted = []
-    for first in range(0, len(ends), _BATCH):
-        batch = ends[first : first + _BATCH]
+    for first in range(0, len(ends), BATCH):
+        batch = ends[first : first + BATCH]
         windows = [window for k in batch if (window := intervals[k].window) is not None]
-        displacements = displacements_of(network, windows, begins[first : first + _BATCH])
+        displacements = displacements_of(network, windows, begins[first : first + BATCH])
         weighted.append(weighted_force(np.stack([window.imu_N for window in windows])))
         for k, displacement in zip(batch, displacements, strict=True):
             measurements[k] = displacement

@@ -125,7 +125,7 @@ class WindowBuffer:
         )
 
 
-_BATCH = 512
+BATCH = 512
 """Number of windows given to a model at once."""
 
 
@@ -188,7 +188,7 @@ class StatefulInference:
         restarts: list[int] = []
         if begins is not None and self.is_recurrent:
             restarts = np.flatnonzero(begins).tolist()
-        edges = sorted({*range(0, len(heading), _BATCH), *restarts, len(heading)})
+        edges = sorted({*range(0, len(heading), BATCH), *restarts, len(heading)})
         answers = []
         for first, stop in pairwise(edges):
             if first in restarts:

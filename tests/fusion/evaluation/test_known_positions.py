@@ -112,21 +112,22 @@ def case(name: str) -> dict[str, Finding]:
 def test_positions_that_say_the_way_is_longer_are_told_with_the_factor():
     """A real walk with an instrument in the hand; nothing but its positions can tell."""
     found = case("handheld_walk_too_short/walk.csv")
-    assert found["track_scale"].values["scale"] > 1.5
+    assert found["track_scale"].values["scale"] == pytest.approx(1.9, abs=0.3)
     assert "nothing" not in found
     assert "train" not in found  # positions without attitude cannot teach the weights
 
 
 def test_positions_that_fit_the_mirror_image_name_the_accelerometers_sign():
     found = case("sign_flipped_with_positions/walk.csv")["mirror_image"]
+    assert found.values["error_m"] == pytest.approx(7.6, abs=0.5)
     assert found.values["mirrored_m"] < 1.2
-    assert found.values["error_m"] > 5.0 * found.values["mirrored_m"]
     assert "--accel-sign apple" in found.advice
 
 
 def test_a_robot_that_turns_about_one_axis_gets_no_remedy_that_harms():
     found = case("planar_robot/robot.csv")
     assert not {code for code in found if code.startswith("truth_")}
+    assert "track_scale" not in found  # weights that know virtual devices take it for no walker
     assert found["train"].advice == "Run `train`."
 
 
