@@ -1,17 +1,15 @@
-"""The two estimators, EKF and factor graph, of streams and of recordings.
+"""The track of a recording: filtered, and then smoothed as a whole by the graph.
 
-A stream's is stepped interval by interval. A recording is filtered, and then smoothed as a whole by
-the graph, which starts from the filter's states.
+The graph starts from the filter's states.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import partial
 from time import perf_counter
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -23,42 +21,21 @@ from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import ASSUMED, GYRO_BIAS
 from stario.fusion.filter.map_frame import YAW_UNKNOWN
 from stario.fusion.filter.record import Record, innovations_of
-from stario.fusion.graph import fixed_lag
 from stario.fusion.graph.batch import smooth
 from stario.fusion.graph.covariances import with_actual_covariances
-from stario.fusion.graph.whitening import IndeterminateError
-from stario.fusion.imu.intervals import ImuInterval, Start
-from stario.fusion.imu.stateful import WindowDisplacement
+from stario.fusion.graph.term import IndeterminateError
 from stario.fusion.place import known_fixes
 from stario.fusion.recording import PreprocessedRecording, Progress
-from stario.fusion.values.config import FilterConfig, NavigatorConfig
-from stario.fusion.values.fixes import Accepted, Fix, FixQueue, fix_list
+from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.fixes import Fix, FixQueue, fix_list
 from stario.fusion.values.floors import FloorChange, floor_changes
-from stario.fusion.values.health import Health, SampleCounts
-from stario.fusion.values.state import NavState, SmoothedPose, Track, track_from_states
+from stario.fusion.values.health import Health
+from stario.fusion.values.state import NavState, Track, track_from_states
 from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 
 BackendName = Literal["ekf", "graph"]
 """The EKF, or the factor graph: over the last seconds of a stream, over all of a recording."""
-
-
-class StreamState(Protocol):
-    """State of a stream between two intervals; see `filter.estimator_state`."""
-
-    def nav_state(self) -> NavState:
-        """Return the newest state."""
-
-    def health(self, counts: SampleCounts, f: FilterConfig) -> Health:
-        """Return the health report so far."""
-
-    @property
-    def time(self) -> float:
-        """Time of the newest state [s]."""
-
-    @property
-    def smoothed(self) -> SmoothedPose | None:
-        """Newest pose delayed by one window; None at first, and if there are none."""
 
 
 class FilteredRecording(NamedTuple):
@@ -75,26 +52,6 @@ class FilteredRecording(NamedTuple):
     def estimates(self) -> list[Estimate]:
         """The initial estimate and one per interval."""
         return [self.first, *(record.estimate for record in self.records)]
-
-
-class Backend(NamedTuple):
-    """What a back end does with a stream."""
-
-    begin: Callable[[NavigatorConfig, Start, PriorPose | None], Any]
-    """Return the first `StreamState` of a stream with this start."""
-    step: Callable[
-        [Any, ImuInterval, WindowDisplacement | None, Sequence[Fix], NavigatorConfig],
-        tuple[Any, Record],
-    ]
-    """Return the state after an interval with its displacement and fixes, and what was done."""
-    late_fix: Callable[[Any, Fix, NavigatorConfig], tuple[Any, list[Accepted]] | None]
-    """Return the state with a fix from the past, and all fixes since; None if it is too late."""
-
-
-BACKENDS: dict[BackendName, Backend] = {
-    "ekf": Backend(partial(estimator.begin, streaming=True), estimator.step, estimator.late_fix),
-    "graph": Backend(fixed_lag.begin, fixed_lag.step, fixed_lag.late_fix),
-}
 
 
 def _filtered_states(filtered: FilteredRecording) -> list[NavState]:

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stario.fusion.backends import BACKENDS, BackendName, track_recording
+from stario.fusion.backends import BackendName, track_recording
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.recording import PreprocessedRecording, Progress, preprocess, silent
@@ -57,7 +57,7 @@ class Navigator:
         backend: BackendName | None = None,
     ) -> None:
         if backend is not None:
-            check_choice("backend", backend, BACKENDS)
+            check_choice("backend", backend, get_args(BackendName))
         if not hasattr(model, "predict") or isinstance(model, type):
             remedy = "load_model(name) returns one"
             raise InputError("model", repr(model), "a model with `predict`", remedy)
@@ -174,8 +174,7 @@ class Navigator:
     @property
     def state(self) -> NavState | None:
         """Newest state of the stream; None during the first second."""
-        state = self._stream.state
-        return None if state is None else state.nav_state()
+        return self._stream.nav_state()
 
     @property
     def continuous(self) -> ContinuousPose | None:
@@ -189,8 +188,8 @@ class Navigator:
 
         It changes with each network update; None before the first, and for the graph.
         """
-        state = self._stream.state
-        return None if state is None else state.smoothed
+        stream = self._stream  # the filter alone has poses one window late
+        return stream.state.smoothed if stream.state and stream.graph is None else None
 
     @property
     def health(self) -> Health:

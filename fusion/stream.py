@@ -1,15 +1,20 @@
 """A navigator's stream: all that changes from sample to sample.
 
 A sample passes the front end, which cuts it into intervals; the network predicts the displacement
-of the window that ends with an interval, and both step the estimator.
+of the window that ends with an interval, and both step the filter, which the graph follows.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
-from stario.fusion.backends import BACKENDS, BackendName, StreamState
+from stario.fusion.backends import BackendName
+from stario.fusion.filter import estimator
+from stario.fusion.filter.estimator_state import EstimatorState
 from stario.fusion.filter.initial import PriorPose
+from stario.fusion.graph import fixed_lag
+from stario.fusion.graph.fixed_lag import FixedLagState
 from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
 from stario.fusion.imu.intervals import ImuInterval, Sample
@@ -23,17 +28,18 @@ from stario.sequences.errors import InputError
 
 
 class Stream:
-    """Front end, network's memory, estimator and waiting fixes of one stream.
+    """Front end, network's memory, filter, graph and waiting fixes of one stream.
 
     Args:
         model: predicts displacements.
         config: settings.
         prior: prior on the first pose, or None.
-        backend: name of the back end.
+        backend: "graph" has the fixed-lag graph follow the filter.
 
     Attributes:
         prior: the prior; None after the clock was set back.
-        state: state of the estimator; None before the first one.
+        state: state of the filter; None before the first one.
+        graph: the graph; None without one.
         continuous: newest pose without steps at updates; None before the first state.
     """
 
@@ -44,13 +50,14 @@ class Stream:
         prior: PriorPose | None,
         backend: BackendName,
     ) -> None:
-        self._model, self._config, self._backend = model, config, BACKENDS[backend]
+        self._model, self._config, self._backend = model, config, backend
         self.prior, self._fixes = prior, FixQueue()
         self._begin()
 
     def _begin(self) -> None:
         self.front_end = FrontEnd(self._config)
-        self.state: StreamState | None = None
+        self.state: EstimatorState | None = None
+        self.graph: FixedLagState | None = None
         self.continuous: ContinuousPose | None = None
         self._network = StatefulInference(self._model, self._config.filter.window_updates)
 
@@ -88,7 +95,9 @@ class Stream:
             self.front_end.sensors.check(interval)
             if self.state is None:
                 check_start(start, self._config.gravity, interval.table)
-                self.state = self._backend.begin(self._config, start, self.prior)
+                self.state = estimator.begin(self._config, start, self.prior, streaming=True)
+                if self._backend == "graph":
+                    self.graph = fixed_lag.begin(self.state, self._config)
                 self._fixes.start(start.time)
         except InputError:
             self._begin()
@@ -101,24 +110,37 @@ class Stream:
                 (displacement,) = displacements_of(self._network, [interval.window])
         finally:  # if the network fails, the IMU's motion must not be lost
             due = self._fixes.due(interval.stop)
-            self.state, _ = self._backend.step(
+            self.state, record = estimator.step(
                 self.state, interval.without_window(), displacement, due, self._config
             )
-        state = self.state.nav_state()
+            if self.graph is not None:
+                self.graph = fixed_lag.step(self.graph, self.state, record, self._config)
+        state = self._newest(self.state)
         self.continuous = copied(advanced(self.continuous, state))  # `state` is writable
         return state
+
+    def nav_state(self) -> NavState | None:
+        """Return the newest state; None before the first one."""
+        return None if self.state is None else self._newest(self.state)
+
+    def _newest(self, filtered: EstimatorState) -> NavState:
+        return filtered.nav_state() if self.graph is None else self.graph.nav_state(filtered)
 
     def take(self, fix: Fix) -> FixOutcome:
         """Apply a fix, or keep it until its time."""
         if self.state is None or fix.fault() or fix.time > self.state.time:
             return self._fixes.add(fix)
-        found = self._backend.late_fix(self.state, fix, self._config)
+        before, found = self.state, estimator.late_fix(self.state, fix, self._config)
         if found is None:
             self._fixes.refuse("too late")
             return "refused"
         self.state, accepted = found
+        if self.graph is not None:
+            self.graph = fixed_lag.late_fix(
+                self.graph, before, self.state, fix, accepted, self._config
+            )
         if self.continuous is not None:
-            state = self.state.nav_state()
+            state = self._newest(self.state)
             if state.map_frame != self.continuous.map_frame:
                 self.continuous = advanced(self.continuous, state)
         return next((applied.outcome for applied in accepted if applied.fix is fix), "refused")
@@ -126,11 +148,12 @@ class Stream:
     def health(self) -> Health:
         """Return the health report so far."""
         counts = self.front_end.counts
-        return self._fixes.health(
-            counts.health()
-            if self.state is None
-            else self.state.health(counts, self._config.filter)
-        )
+        if self.state is None:
+            return self._fixes.health(counts.health())
+        health = self.state.health(counts, self._config.filter, self.nav_state())
+        if self.graph is not None:
+            health = replace(health, notes=health.notes + self.graph.notes)
+        return self._fixes.health(health)
 
     def parts(self) -> dict[str, Any]:
         """Return all that a snapshot holds of the stream, by name."""
@@ -140,7 +163,8 @@ class Stream:
             "fixes": self._fixes,
             "network": self._network.memory,
             "continuous": self.continuous,
-            "estimator": self.state,
+            "filter": self.state,
+            "graph": self.graph,
         }
 
     def continue_from(self, parts: dict[str, Any]) -> None:
@@ -151,4 +175,5 @@ class Stream:
             raise InputError(
                 "snapshot: network", "a different kind of memory", "that of the same network"
             )
-        self._network.memory, self.state = parts["network"], parts["estimator"]
+        self._network.memory = parts["network"]
+        self.state, self.graph = parts["filter"], parts["graph"]

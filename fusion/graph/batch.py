@@ -12,7 +12,6 @@ from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.filter.record import Record
 from stario.fusion.graph.builder import GraphBuilder
 from stario.fusion.graph.factors import GyroBias, SamePlace
-from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.imu.barometer import CLIMB_DELAY
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.values.config import NavigatorConfig
@@ -80,15 +79,17 @@ def smooth(
         valid = record.displacement is not None and record.interval.stop not in revoked
         builder.step(record, record.offered if valid else None, placed, state)
     builder.close(local[-1])
+    graph = builder.graph
     if gyro_bias is not None:
-        builder.graph.add(GyroBias(builder.graph.last, *gyro_bias), gated=False)
+        b_g, covariance = gyro_bias
+        graph.add(GyroBias((graph.last,), covariance, b_g), gated=False)
     if config.place.closed:
-        ends = builder.graph.keyframes[0], builder.graph.last
-        builder.graph.add(SamePlace(*ends, _CLOSURE_SIGMA**2 * np.eye(3)), gated=False)
-    builder.graph.solve(trusted_rounds=_TRUSTED_ROUNDS)
-    solved = {state.time: state for state in all_states(builder.graph, builder.segments)}
+        covariance = _CLOSURE_SIGMA**2 * np.eye(3)
+        graph.add(SamePlace((0, graph.last), covariance), gated=False)
+    solved = graph.solve(trusted_rounds=_TRUSTED_ROUNDS)
+    states = {state.time: state for state in _all_states(solved, builder.segments)}
     return [
-        replace(solved[f.time], in_gap=f.in_gap, map_frame=f.map_frame).shifted(origin)
+        replace(states[f.time], in_gap=f.in_gap, map_frame=f.map_frame).shifted(origin)
         for f in filtered
     ]
 
@@ -152,14 +153,15 @@ def _inflated(first: NavState, prior: NavState, transforms: Sequence[FrameTransf
     return replace(first, covariance=covariance)
 
 
-def all_states(graph: KeyframeGraph, segments: dict[int, tuple[Segment, ...]]) -> list[NavState]:
-    """Return the keyframes of a solved graph and the states where the segments between them end."""
-    keyframes = graph.keyframes
-    states = [graph.state(keyframes[0])]
-    for i in keyframes[:-1]:
-        start, end = states[-1], graph.state(i + 1)
-        if len(segments[i]) > 1:
-            states += _interpolated_states(start, end, segments[i])
+def _all_states(
+    solved: dict[int, NavState], segments: dict[int, tuple[Segment, ...]]
+) -> list[NavState]:
+    """Return solved keyframes and the states where the segments between them end."""
+    first, *others = solved.values()
+    states = [first]
+    for pieces, end in zip(segments.values(), others, strict=False):
+        if len(pieces) > 1:
+            states += _interpolated_states(states[-1], end, pieces)
         states.append(end)
     return states
 

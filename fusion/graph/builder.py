@@ -12,19 +12,20 @@ from stario.fusion.filter.initial import tilt_sigma
 from stario.fusion.filter.record import Record
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.graph.factors import (
+    Coasting,
     Displacement,
     GyroBias,
     Height,
     Position,
-    Term,
     Tilt,
     Velocity,
     Yaw,
 )
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.keyframes import KeyframeGraph, shallow_copy
+from stario.fusion.graph.term import Term
 from stario.fusion.imu.barometer import HeightSample
-from stario.fusion.imu.gap import gap_rotation, yaw_variance
+from stario.fusion.imu.gap import gap_covariance, gap_rotation, yaw_variance
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval, split_at
 from stario.fusion.imu.preintegration import Segment, segment_of
 from stario.fusion.imu.stateful import WindowDisplacement
@@ -64,17 +65,12 @@ class GraphBuilder:
     """
 
     def __init__(
-        self,
-        config: NavigatorConfig,
-        first: NavState,
-        count: int = 0,
-        streaming: bool = False,
+        self, config: NavigatorConfig, first: NavState, count: int = 0, streaming: bool = False
     ) -> None:
-        self._config = config
+        self._config, f = config, config.filter
         self.graph = KeyframeGraph(first, config.filter.gate)
         self.segments: dict[int, tuple[Segment, ...]] = {0: ()}
         self.count = count
-        f = config.filter
         self._streaming = streaming
         self._overlap = 2 if f.update_rate % 2 == 0 else 1
         # The filter uses every window of a second, the graph only one or two of them.
@@ -90,7 +86,7 @@ class GraphBuilder:
     def copied(self) -> GraphBuilder:
         """Return a copy that may be changed; what both hold is never modified."""
         copy = shallow_copy(self)
-        copy.graph = self.graph.copied()
+        copy.graph = shallow_copy(self.graph)
         return copy
 
     def step(
@@ -148,26 +144,26 @@ class GraphBuilder:
             return
         graph = self.graph
         pieces = self.segments[graph.last]
-        segment, start = pieces[0], graph.keyframe(graph.last)
-        if len(pieces) > 1:
-            segment = self._segment_of(self._pending)
+        segment = pieces[0] if len(pieces) == 1 else self._segment_of(self._pending)
         if guess is None:
+            start = graph.states[graph.last]
             state = KeyframeState(*self.dead_reckoned(graph.last), start.b_g, start.b_a)
         else:
             state = KeyframeState.from_nav(guess)
         self._pending = []
-        self.segments[graph.add_keyframe(segment, state)] = ()
+        graph.add_keyframe(segment.stop, state, segment)
+        self.segments[graph.last] = ()
 
     def _segment_of(self, records: Sequence[Record]) -> Segment:
         """Preintegrate the samples of records since the last keyframe, with its biases."""
-        start = self.graph.keyframe(self.graph.last)
+        start = self.graph.states[self.graph.last]
         intervals, factors = [r.interval for r in records], [r.accel_factor for r in records]
         return segment_of(intervals, factors, start.b_g, start.b_a, self._config)
 
     def fix(self, fix: Fix) -> bool:
         """Add a fix up to now to the keyframe before it; return False if there is none."""
         graph = self.graph
-        before = [k for k in graph.keyframes if graph.time(k) <= fix.time + SAME_TIME]
+        before = [k for k, time in graph.times.items() if time <= fix.time + SAME_TIME]
         if not before:
             return False
         graph.add(self._fix_term(fix, before[-1]), gated=not self._streaming)
@@ -179,7 +175,7 @@ class GraphBuilder:
         Raises:
             IndeterminateError: their states are not determined.
         """
-        first = max((k for k in self.graph.keyframes if self.graph.time(k) <= time), default=0)
+        first = max((k for k, at in self.graph.times.items() if at <= time), default=0)
         self.graph.marginalise(first)
         self._window_keyframes = {n: k for n, k in self._window_keyframes.items() if k >= first}
         self.segments = {k: pieces for k, pieces in self.segments.items() if k >= first}
@@ -187,7 +183,7 @@ class GraphBuilder:
 
     def dead_reckoned(self, k: int, time: float = math.inf) -> Pose:
         """Dead-reckon from a keyframe to a time [s], or to the end of its data if earlier."""
-        R, v, p, b_g, b_a, _ = self.graph.keyframe(k)
+        R, v, p, b_g, b_a, _ = self.graph.states[k]
         if k in self._gaps:
             gap = self._gaps[k]
             until = min(time, gap.stop)
@@ -203,18 +199,22 @@ class GraphBuilder:
             R, v, p = end
         return R, v, p
 
-    def _cross(self, interval: ImuInterval, guess: NavState) -> None:
+    def _cross(self, gap: ImuInterval, guess: NavState) -> None:
         """Add a keyframe at the end of a gap."""
         self.close()
-        graph = self.graph
-        if interval.lost:
+        graph, before = self.graph, self.graph.last
+        if gap.lost:
             graph.add_disconnected(guess)  # the filter's new start
         else:
-            self._gaps[graph.last] = interval
-            graph.add_after_gap(interval, guess, self._config)
-            assert interval.levelled is not None  # it comes with the end of every gap
-            variance = tilt_sigma(interval.levelled, self._config) ** 2
-            graph.add(Tilt(graph.last, interval.levelled.up_B, variance * np.eye(3)), gated=False)
+            self._gaps[before] = gap
+            graph.add_keyframe(gap.stop, KeyframeState.from_nav(guess))
+            t, zero = gap.duration, np.zeros(3)
+            covariance = gap_covariance(t, yaw_variance(t, gap), zero, self._config)[2:, 2:]
+            rotation = gap_rotation(gap.table, t, graph.states[before].b_g)
+            graph.add(Coasting((before, graph.last), covariance, t, rotation), gated=False)
+            assert gap.levelled is not None  # it comes with the end of every gap
+            variance = tilt_sigma(gap.levelled, self._config) ** 2
+            graph.add(Tilt((graph.last,), variance * np.eye(3), gap.levelled.up_B), gated=False)
         self.count = 0
         self.segments[graph.last] = ()
         self._window_keyframes = {0: graph.last}
@@ -222,34 +222,36 @@ class GraphBuilder:
     def _add_displacement(self, i: int, displacement: WindowDisplacement) -> None:
         d_N, covariance_N, R_NB = displacement
         covariance = covariance_N * (self._overlap * self._config.filter.covariance_scale)
-        term = Displacement(i, self.graph.last, d_N, R_NB, covariance)
+        term = Displacement((i, self.graph.last), covariance, d_N, R_NB)
         self.graph.add(term, gated=not self._gated_by_filter)
 
     def _add_zero_velocity(self, zero_velocity: ZeroVelocity) -> None:
-        zero, k = np.zeros(3), self.graph.last
+        zero, at = np.zeros(3), (self.graph.last,)
         # One keyframe represents all intervals since the previous one.
         covariance = zero_velocity.covariance / self._spacing
-        self.graph.add(Velocity(k, zero, covariance[:3, :3], zero))
-        self.graph.add(GyroBias(k, zero_velocity.b_g, covariance[3:, 3:]))
+        self.graph.add(Velocity(at, covariance[:3, :3], zero, zero))
+        self.graph.add(GyroBias(at, covariance[3:, 3:], zero_velocity.b_g))
 
     def _add_height(self, sample: HeightSample) -> None:
         graph, k, before = self.graph, self.graph.last, self._last_height
-        i, variances = None, [sample.sigma**2]
+        measured: tuple[int, ...] = (k,)
+        variances = [sample.sigma**2]
         # In a stream the one before may have left the graph.
-        if before is not None and before[0] != k and before[0] in graph.keyframes:
-            i = before[0]
+        if before is not None and before[0] != k and before[0] in graph.times:
+            measured = (before[0], k)
             walked = WEATHER_WALK**2 * (sample.time - before[1]) + sample.stepped**2
             variances.append(walked)
         if before is None or before[0] != k:
-            graph.add_offset(k, sample.height - float(graph.keyframe(k).p_W[2]))
+            state = graph.states[k]
+            graph.states[k] = state._replace(offset=sample.height - float(state.p_W[2]))
             self._last_height = k, sample.time
-        dt = sample.time - graph.time(k)
-        graph.add(Height(i, k, sample.height, dt, np.diag(variances)), gated=False)
+        dt = sample.time - graph.times[k]
+        graph.add(Height(measured, np.diag(variances), sample.height, dt), gated=False)
 
     def _fix_term(self, fix: Fix, k: int) -> Term:
         graph = self.graph
-        dt = fix.time - graph.time(k)
-        R_k, v_k, p_k, *_ = graph.keyframe(k)
+        dt = fix.time - graph.times[k]
+        R_k, v_k, p_k, *_ = graph.states[k]
         R, v, p = (R_k, v_k, p_k) if dt <= SAME_TIME else self.dead_reckoned(k, fix.time)
         dt, f = max(dt, 0.0), self._config.filter
         # Noise of the IMU since the keyframe, or of the motion in a gap.
@@ -258,10 +260,10 @@ class GraphBuilder:
         drift = accel_noise**2 * dt * np.eye(3)
         if fix.kind == "position":
             covariance = fix.covariance + dt**2 / 3.0 * drift
-            return Position(k, fix.value, covariance, dt, p - p_k - dt * v_k)
+            return Position((k,), covariance, fix.value, dt, p - p_k - dt * v_k)
         if fix.kind == "velocity":
-            return Velocity(k, fix.value, fix.covariance + drift, v - v_k)
-        return Yaw(k, float(fix.value[0]), fix.covariance + turned, R_k.T @ R)
+            return Velocity((k,), fix.covariance + drift, fix.value, v - v_k)
+        return Yaw((k,), fix.covariance + turned, float(fix.value[0]), R_k.T @ R)
 
 
 def _pose_between(start: Pose, end: Pose, fraction: float, duration: float) -> Pose:

@@ -1,18 +1,77 @@
-"""Square roots of covariances: a prior's information, and a graph's covariances as they are."""
+"""Covariances of a graph: a prior's information, marginal ones, and what they are in truth."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
+import gtsam
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from stario.fusion.filter.estimates import Estimate, plain_covariances
 from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, symmetric
 from stario.fusion.values.state import NavState, changed
 from stario.sequences.sequence import FloatArray
 
+_KEYS = 3
+"""Number of successive variables of which the covariance is wanted: pose, velocity, biases."""
+
 _MIN_VARIANCE, _MIN_EIGENVALUE = 1e-16, 1e-12
 """Lower bounds of variances and of the eigenvalues of normalised covariances: less is rounding."""
+
+
+def marginal_covariances(net: Any) -> dict[int, FloatArray]:
+    """Return the covariance (15, 15) of pose, velocity and biases of every keyframe.
+
+    Its tangent is gtsam's. gtsam's own marginals use Cholesky's algorithm, which calls a pose
+    undetermined if its last axis is 4096 times as uncertain as the one before, as with positions
+    good to 5 cm and an unknown height. Variable x of the system R x + S y = d + n, with unit white
+    noise n and later variables y of covariance P, has the covariance R^-1 (I + S P S^T) R^-T, and
+    -R^-1 S P with y. So one pass back in time suffices, which keeps the rows of P that earlier
+    variables need.
+
+    Args:
+        net: gtsam's Bayes net by QR, with one conditional per variable in order of time; those of a
+            keyframe k are X(k), V(k), B(k) and perhaps more.
+
+    Raises:
+        RuntimeError: a variable is not determined; names it as gtsam does.
+    """
+    conditionals = [net.at(n) for n in range(net.size())]
+    place = {c.keys()[0]: n for n, c in enumerate(conditionals)}
+    parents = [[place[key] for key in c.keys()[1:]] for c in conditionals]
+    begin = np.cumsum([0, *(len(c.R()) for c in conditionals)])
+    variable = np.repeat(np.arange(len(parents)), np.diff(begin))  # by row
+    # The earliest variable that needs the covariance of each one.
+    first_use = np.arange(len(parents)) - _KEYS
+    for n, p in enumerate(parents):
+        first_use[p] = np.minimum(first_use[p], n)
+    covariances = {}
+    held = np.zeros(0, dtype=np.intp)  # rows of the variables that P covers, in order of time
+    P = np.zeros((0, 0))
+    for n in reversed(range(len(conditionals))):
+        c, rows = conditionals[n], np.arange(begin[n], begin[n + 1])
+        S = np.zeros((len(rows), len(P)))
+        if parents[n]:
+            needed = np.concatenate([np.arange(begin[m], begin[m + 1]) for m in parents[n]])
+            S[:, np.searchsorted(held, needed)] = c.S()
+        symbol = gtsam.Symbol(c.keys()[0])
+        try:
+            root = solve_triangular(c.R(), np.column_stack([np.eye(len(S)), S]))
+        except np.linalg.LinAlgError as error:
+            raise RuntimeError(f"Symbol: {chr(symbol.chr())}{symbol.index()}") from error
+        by_noise, by_later = root[:, : len(S)], -root[:, len(S) :]
+        cross = by_later @ P
+        own = symmetric(by_noise @ by_noise.T + cross @ by_later.T)
+        P, held = np.block([[own, cross], [cross.T, P]]), np.concatenate([rows, held])
+        if chr(symbol.chr()) == "x":
+            size = begin[n + _KEYS] - begin[n]
+            covariances[symbol.index()] = P[:size, :size]
+        kept = first_use[variable[held]] < n
+        if not kept.all():
+            P, held = P[np.ix_(kept, kept)], held[kept]
+    return covariances
 
 
 def root_information(covariance: FloatArray) -> FloatArray:

@@ -66,14 +66,10 @@ class KeyframeState(NamedTuple):
         keys = self.keys(k)
         return list(zip(keys, np.split(H, [6, 9, 15][: len(keys) - 1], axis=1), strict=True))
 
-    def like(self, other: KeyframeState) -> KeyframeState:
-        """Return the state without an offset if another has none."""
-        return self if other.offset is not None else self._replace(offset=None)
-
     def error_from(self, other: KeyframeState) -> FloatArray:
-        """Return the right-invariant error from another: theta, rho_v, rho_p, b_g, b_a, offset.
+        """Return the right-invariant error (15,), or (16,) with offsets, from another state.
 
-        It is (15,), or (16,) if the other has an offset.
+        In order: theta, rho_v, rho_p, b_g, b_a, offset.
         """
         R = self.R_WB @ other.R_WB.T
         pose = log_se23(R, self.v_W - R @ other.v_W, self.p_W - R @ other.p_W)

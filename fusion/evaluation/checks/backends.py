@@ -21,6 +21,7 @@ from stario.fusion.evaluation.checks.faults import (
 from stario.fusion.evaluation.compare import DEMONSTRATION_SEED, TRACK_OF, demonstration
 from stario.fusion.evaluation.scores import Column, parts, scored, table, wide
 from stario.fusion.evaluation.tracks import true_poses
+from stario.fusion.filter import estimator
 from stario.fusion.filter.record import innovations_of
 from stario.fusion.graph import fixed_lag
 from stario.fusion.imu.stateful import Predictor
@@ -173,15 +174,17 @@ def _streamed(
     preprocessed: PreprocessedRecording, config: NavigatorConfig
 ) -> tuple[Track, FloatArray]:
     """Return the newest states of the fixed-lag graph, and the processor time of each step [s]."""
-    state = fixed_lag.begin(config, preprocessed.start)
-    states, times = [state.nav_state()], []
+    filtered = estimator.begin(config, preprocessed.start, streaming=True)
+    graph = fixed_lag.begin(filtered, config)
+    states, times = [graph.nav_state(filtered)], []
     pairs = zip(preprocessed.intervals, preprocessed.measurements, strict=True)
     for interval, measurement in pairs:
         began = process_time()
-        state, _ = fixed_lag.step(state, interval, measurement, (), config)
-        states.append(state.nav_state())
+        filtered, record = estimator.step(filtered, interval, measurement, (), config)
+        graph = fixed_lag.step(graph, filtered, record, config)
+        states.append(graph.nav_state(filtered))
         times.append(process_time() - began)
-    health = state.health(preprocessed.front_end.counts, config.filter)
+    health = filtered.health(preprocessed.front_end.counts, config.filter, states[-1])
     return track_from_states(states, innovations_of([]), health), np.array(times)
 
 

@@ -7,21 +7,20 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, V, X
 
-from stario.fusion.graph.bearing import Bearing
 from stario.fusion.graph.factors import (
+    Bearing,
+    Coasting,
     Displacement,
     GyroBias,
     Position,
     Prior,
     SamePlace,
-    Term,
     Tilt,
     Velocity,
     Yaw,
 )
 from stario.fusion.graph.keyframe_state import KeyframeState
-from stario.fusion.graph.processes import Coasting
-from stario.fusion.graph.whitening import Whitened
+from stario.fusion.graph.term import Term, Whitened
 from stario.sequences.attitude.so3 import exp_so3
 
 EYE = np.eye(3)
@@ -48,17 +47,17 @@ def terms(rng: np.random.Generator, values: Any) -> list[Term]:
     # A window's levelled attitude differs from the world's in yaw, and a little in tilt.
     R_NB = exp_so3(np.array([0.0, 0.0, 0.9])) @ state.R_WB
     return [
-        Displacement(0, 1, rng.normal(size=3), R_NB, EYE),
-        Position(0, rng.normal(size=3), EYE, 0.4, rng.normal(size=3)),
-        Velocity(0, rng.normal(size=3), EYE, rng.normal(size=3)),
-        Yaw(0, 0.7, np.eye(1), exp_so3(rng.normal(0.0, 0.3, 3))),
-        GyroBias(0, rng.normal(size=3), EYE),
-        Prior(0, (state, next_state), rng.normal(size=(20, 30)), rng.normal(size=20)),
-        Prior(0, (state,), rng.normal(size=(9, 15)), rng.normal(size=9)),
-        Bearing(0, state.R_WB, rng.normal(size=3), rng.normal(size=6), 0.7, np.eye(1)),
-        Coasting(0, 1, 1.7, exp_so3(rng.normal(0.0, 0.3, 3)), np.eye(13)),
-        Tilt(0, np.array([0.6, 0.0, 0.8]), EYE),
-        SamePlace(0, 1, EYE),
+        Displacement((0, 1), EYE, rng.normal(size=3), R_NB),
+        Position((0,), EYE, rng.normal(size=3), 0.4, rng.normal(size=3)),
+        Velocity((0,), EYE, rng.normal(size=3), rng.normal(size=3)),
+        Yaw((0,), np.eye(1), 0.7, exp_so3(rng.normal(0.0, 0.3, 3))),
+        GyroBias((0,), EYE, rng.normal(size=3)),
+        Prior.white(0, (state, next_state), rng.normal(size=(20, 30)), rng.normal(size=20)),
+        Prior.white(0, (state,), rng.normal(size=(9, 15)), rng.normal(size=9)),
+        Bearing((0,), np.eye(1), state.R_WB, rng.normal(size=3), rng.normal(size=6), 0.7),
+        Coasting((0, 1), np.eye(13), 1.7, exp_so3(rng.normal(0.0, 0.3, 3))),
+        Tilt((0,), EYE, np.array([0.6, 0.0, 0.8])),
+        SamePlace((0, 1), EYE),
     ]
 
 
@@ -86,7 +85,7 @@ def test_jacobians_agree_with_finite_differences(which):
 def test_a_linear_factor_weighs_a_residual_by_the_inverse_of_its_correlated_covariance():
     rng = np.random.default_rng(8)
     values, root = random_values(rng), rng.normal(size=(3, 3))
-    term = Position(0, rng.normal(size=3), root @ root.T, 0.4, rng.normal(size=3))
+    term = Position((0,), root @ root.T, rng.normal(size=3), 0.4, rng.normal(size=3))
     factor = Whitened.of(term, np.inf).factor(values)
     residual, blocks = term.linearise(values)
     H = np.hstack([block for _, block in blocks])
@@ -107,7 +106,7 @@ def test_in_a_gap_velocity_and_biases_are_constant_and_a_turn_is_any_turn(yaw):
     values.update(X(1), gtsam.Pose3(gtsam.Rot3(turn @ tilted), a.p_W + 3.0 * v))
     values.update(V(1), v)
     values.update(B(1), gtsam.imuBias.ConstantBias(a.b_a, a.b_g))
-    residual, _ = Coasting(0, 1, 3.0, R_ij, np.eye(13)).linearise(values)
+    residual, _ = Coasting((0, 1), np.eye(13), 3.0, R_ij).linearise(values)
     np.testing.assert_allclose(residual, [-yaw, *np.zeros(12)], atol=1e-10)
 
 
@@ -115,7 +114,7 @@ def test_motion_in_a_gap_observes_no_turn_but_its_own():
     """Not even where the residual is far from zero, as in a first round."""
     values = random_values(np.random.default_rng(7))
     a, b = (KeyframeState.of(values, k) for k in (0, 1))
-    _, blocks = Coasting(0, 1, 1.7, EYE, np.eye(13)).linearise(values)
+    _, blocks = Coasting((0, 1), np.eye(13), 1.7, EYE).linearise(values)
     H, up = dict(blocks), np.array([0.0, 0.0, 1.0])
 
     def of_turn(k, s, about):
@@ -131,11 +130,13 @@ def test_a_tilt_is_that_of_the_measured_vertical_at_any_yaw():
     values = random_values(np.random.default_rng(6))
     R = KeyframeState.of(values, 0).R_WB
     turned = exp_so3(np.array([0.0, 0.0, 1.1])) @ R
-    residual, ((_, H),) = Tilt(0, turned[2], EYE).linearise(values)
+    residual, ((_, H),) = Tilt((0,), EYE, turned[2]).linearise(values)
     np.testing.assert_allclose(residual, 0.0, atol=1e-10)
     np.testing.assert_allclose(H[:, :3] @ R[2], 0.0, atol=1e-10)  # a turn about the vertical
     off = exp_so3(np.array([0.0, 0.1, 0.0])) @ R
-    assert np.linalg.norm(Tilt(0, off[2], EYE).linearise(values)[0]) == pytest.approx(np.sin(0.1))
+    assert np.linalg.norm(Tilt((0,), EYE, off[2]).linearise(values)[0]) == pytest.approx(
+        np.sin(0.1)
+    )
 
 
 def in_turned_world(values: Any, yaw: float, shift: np.ndarray) -> Any:
@@ -165,7 +166,7 @@ def test_a_prior_without_yaw_information_gains_none_wherever_it_is_linearised():
     there = random_values(rng)
     root = rng.normal(size=(30, 30))
     root[:, 17] = -root[:, 2]  # it constrains the turn from one keyframe to the next
-    prior = Prior(0, tuple(KeyframeState.of(there, k) for k in (0, 1)), root, np.zeros(30))
+    prior = Prior.white(0, tuple(KeyframeState.of(there, k) for k in (0, 1)), root, np.zeros(30))
     values = random_values(rng)
     up = np.array([0.0, 0.0, 1.0])
     turn = {}  # gtsam's tangent of a world turned about its origin

@@ -17,7 +17,7 @@ from stario.fusion.graph import keyframes
 from stario.fusion.graph.batch import smooth
 from stario.fusion.graph.keyframe_state import KeyframeState
 from stario.fusion.graph.keyframes import KeyframeGraph
-from stario.fusion.graph.whitening import IndeterminateError
+from stario.fusion.graph.term import IndeterminateError
 from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.fixes import position_fix, velocity_fix, yaw_fix
@@ -130,10 +130,10 @@ def test_an_undetermined_state_is_named(first, name):
     graph = KeyframeGraph(first_state(np.diag(sigma**2)), gate=0.997)
     samples = np.linspace(12.3, 13.3, 11), np.zeros((11, 3)), np.tile([0.0, 0.0, 9.80665], (11, 1))
     segment = preintegrate(*samples, np.zeros(3), np.zeros(3), ImuNoise(), 9.80665)
-    graph.add_keyframe(segment, KeyframeState.from_nav(first_state(np.eye(15))))
+    graph.add_keyframe(13.3, KeyframeState.from_nav(first_state(np.eye(15))), segment)
     with pytest.raises(IndeterminateError, match=rf"{name} at 1[23]\.3 s"):
         graph.solve()
-    np.testing.assert_array_equal(graph.keyframe(1).p_W, np.zeros(3))
+    np.testing.assert_array_equal(graph.states[1].p_W, np.zeros(3))
 
 
 def test_if_the_graph_fails_the_track_is_the_filters_and_a_note_says_why(

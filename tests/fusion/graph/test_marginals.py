@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, T, V, X
 
-from stario.fusion.graph.marginals import marginal_covariances
-from stario.fusion.graph.whitening import linear_factor
+from stario.fusion.graph.covariances import marginal_covariances
+from stario.fusion.graph.term import linear_factor
 
 WIDTHS = (6, 3, 6, 1)
 
