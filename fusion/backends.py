@@ -125,7 +125,7 @@ def track_recording(
     fixes, origin = known_fixes(recording, config.place, fix_list(fixes))
     queue = FixQueue(fixes, most=math.inf)  # all fixes of a recording are known from the start
     run = _filtered(recording, config, prior, queue, progress)
-    counts, innovations = recording.front_end.counts, innovations_of(run.records)
+    counts, innovations = recording.counts, innovations_of(run.records)
 
     def track(states: list[NavState], note: str = "", filtered: Track | None = None) -> Track:
         health = queue.health(run.last.health(counts, config.filter, states[-1]))

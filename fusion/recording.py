@@ -22,7 +22,7 @@ from stario.fusion.imu.stateful import (
     displacements_of,
 )
 from stario.fusion.values.config import NavigatorConfig
-from stario.fusion.values.health import SampleCounts
+from stario.fusion.values.health import Health
 from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 from stario.sequences.findings import warn
@@ -49,7 +49,8 @@ class PreprocessedRecording:
         update_rate: network updates per second that it was cut for.
         measurements: predicted displacement of the window ending with each interval, None if no
             window ends there.
-        front_end: the front end, with the sample counts and the start.
+        start: time and levelled attitude of the first sample.
+        counts: report of its samples, gaps and network.
         satellites: its satellite positions, None if it has none.
         positions: its positions known without attitude, None if it has none.
         seconds_front_end: computing time of the front end [s].
@@ -59,7 +60,8 @@ class PreprocessedRecording:
     intervals: list[ImuInterval]
     update_rate: int
     measurements: list[WindowDisplacement | None]
-    front_end: FrontEnd
+    start: Start
+    counts: Health
     satellites: Satellites | None
     positions: PositionTrack | None
     seconds_front_end: float
@@ -68,12 +70,6 @@ class PreprocessedRecording:
     def __repr__(self) -> str:
         windows = sum(m is not None for m in self.measurements)
         return f"PreprocessedRecording({len(self.intervals)} intervals, {windows} windows)"
-
-    @property
-    def start(self) -> Start:
-        """Time and levelled attitude of the first sample."""
-        assert self.front_end.start is not None  # `preprocess` refuses recordings without one
-        return self.front_end.start
 
 
 def preprocess(
@@ -96,7 +92,7 @@ def preprocess(
     if front_end.start is None or not any(e.window is not None for e in intervals):
         raise InputError(
             f"{sequence.name}: samples",
-            f"{front_end.counts.used} usable over {sequence.duration:.2f} s",
+            f"{front_end.counts.samples['used']} usable over {sequence.duration:.2f} s",
             f"an unbroken stretch of at least {WINDOW_SECONDS:g} s",
         )
     seconds_front_end = perf_counter() - began
@@ -109,7 +105,8 @@ def preprocess(
         intervals=[interval.without_window() for interval in intervals],
         update_rate=config.filter.update_rate,
         measurements=measurements,
-        front_end=front_end,
+        start=front_end.start,
+        counts=front_end.counts,
         satellites=sequence.satellites,
         positions=sequence.positions,
         seconds_front_end=seconds_front_end,
@@ -148,16 +145,16 @@ def cut_recording(
     front_end.finish()
     unused = config.filter.magnetometer and all(e.field_B is None for e in intervals)
     if magnetometer is not None and unused:  # it has another clock
-        front_end.counts.field_dropped = len(magnetometer.time)
+        front_end.counts.fields_dropped = len(magnetometer.time)
     if barometer is not None and all(e.height is None for e in intervals):
-        front_end.counts.pressure_dropped = len(barometer.time)
+        front_end.counts.pressures_dropped = len(barometer.time)
     return intervals, front_end
 
 
 def _displacements(
     intervals: Sequence[ImuInterval],
     network: StatefulInference,
-    counts: SampleCounts,
+    counts: Health,
     progress: Progress,
 ) -> list[WindowDisplacement | None]:
     """Predict the displacement of the window that ends with each interval; None without one."""

@@ -6,6 +6,7 @@ of the window that ends with an interval, and both step the filter, which the gr
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -149,7 +150,7 @@ class Stream:
         """Return the health report so far."""
         counts = self.front_end.counts
         if self.state is None:
-            return self._fixes.health(counts.health())
+            return self._fixes.health(deepcopy(counts))
         health = self.state.health(counts, self._config.filter, self.nav_state())
         if self.graph is not None:
             health = replace(health, notes=health.notes + self.graph.notes)

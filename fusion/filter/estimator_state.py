@@ -25,7 +25,7 @@ from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
 from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.values.config import FilterConfig
 from stario.fusion.values.fixes import Fix
-from stario.fusion.values.health import Health, SampleCounts
+from stario.fusion.values.health import Health
 from stario.fusion.values.state import NavState, SmoothedPose, changed
 from stario.sequences.windows import WINDOW_SECONDS
 
@@ -127,9 +127,7 @@ class EstimatorState:
         poses = to_final_frame(nav_states([self.released]), self.map_frame.transforms)
         return smoothed_pose(with_undirected(poses, self.map_frame.undirected)[0])
 
-    def health(
-        self, counts: SampleCounts, f: FilterConfig, state: NavState | None = None
-    ) -> Health:
+    def health(self, counts: Health, f: FilterConfig, state: NavState | None = None) -> Health:
         """Return the health report so far, with the sigmas of `state` if given."""
         health = self.counts.health(counts, state or self.nav_state())
         health.accel_noise_factor = self.statistics.accel_factor

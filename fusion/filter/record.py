@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
 from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.values.fixes import Accepted, Fix
-from stario.fusion.values.health import Health, SampleCounts
+from stario.fusion.values.health import Health
 from stario.fusion.values.state import Innovations, NavState, changed
 
 
@@ -129,7 +130,7 @@ class UpdateCounts:
             counts[outcome] = counts.get(outcome, 0) + 1
         return changed(self, **{kind: counts})
 
-    def health(self, counts: SampleCounts, state: NavState) -> Health:
+    def health(self, counts: Health, state: NavState) -> Health:
         """Return the health report: outcomes of samples and updates, and the state's sigmas."""
         groups = {
             "tilt_rad": slice(0, 2),
@@ -146,7 +147,7 @@ class UpdateCounts:
             for name, part in groups.items()
         }
         return changed(
-            counts.health(),
+            deepcopy(counts),
             updates=self.offered,
             gated=self.gated,
             refused=dict(self.refused),

@@ -24,17 +24,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 
 from stario.fusion.imu.intervals import NO_FLAGS, Flags, Sample
-from stario.fusion.values.health import Stopped
 from stario.sequences.clean_samples import MIN_RATE
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.constant_values import shaken, tilting
 from stario.sequences.sequence import BoolArray, FloatArray
 from stario.sequences.spikes import replace_spikes
 from stario.sequences.time_order import MAX_IMU_GAP
+
+Stopped = Literal["both", "gyroscope", "accelerometer"]
+"""What has stopped: both sensors, or one alone."""
 
 SET_BACK_SECONDS = 5.0
 """Late samples that advance for this long in a row [s] come from a clock that was set back; batches

@@ -39,7 +39,7 @@ from stario.fusion.imu.intervals import (
 from stario.fusion.imu.stateful import WindowBuffer
 from stario.fusion.imu.units import SensorCheck, warn_of_field
 from stario.fusion.values.config import NavigatorConfig
-from stario.fusion.values.health import SampleCounts
+from stario.fusion.values.health import Health
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
@@ -59,6 +59,13 @@ _ISOLATED_SAMPLES = 20
 _REPEATED_SAMPLES = 1000
 """This many samples with the first one's time show that times have too few digits."""
 
+_GAPS_LISTED = 100
+"""Maximum number of gaps listed one by one; an endless stream may have any number."""
+
+_SAMPLES = ("used", "not_finite", "frozen", "duplicate", "out_of_order", "future")
+"""What becomes of samples: used, or dropped because a value is NaN, infinite or absurdly large,
+because it repeats those before though the device is not at rest, or because of its time."""
+
 
 class FrontEnd:
     """Collects samples and yields intervals.
@@ -69,7 +76,7 @@ class FrontEnd:
     Attributes:
         newest: time of the newest accepted sample [s]; minus infinity before the first.
         sensors: check of units for streams, which cannot be checked as a whole.
-        counts: samples used and dropped.
+        counts: report of samples used, dropped and flagged, and of gaps.
         start: time and levelled attitude of the first sample; None during the first second.
     """
 
@@ -91,7 +98,8 @@ class FrontEnd:
         self._frozen = FrozenSensorDetector(config.gravity)
         self._outliers = OutlierDetector()
         self.sensors = SensorCheck()
-        self.counts = SampleCounts()
+        flagged = {"spike": 0, "saturated": 0}
+        self.counts = Health(samples=dict.fromkeys(_SAMPLES, 0), flagged=flagged)
         self.start: Start | None = None
 
     def push(self, sample: Sample) -> list[ImuInterval]:
@@ -103,10 +111,12 @@ class FrontEnd:
         """
         time = sample[0]
         if not (math.isfinite(time) and sum(map(abs, sample[1:])) < MAX_SENSOR_VALUE):
-            self.counts.not_finite += 1
+            self.counts.samples["not_finite"] += 1
             return []
         if stopped := self._frozen.stopped(sample):
-            self.counts.add_frozen(stopped)
+            self.counts.samples["frozen"] += 1
+            if stopped != "both":
+                self.counts.stopped[stopped] = self.counts.stopped.get(stopped, 0) + 1
             return []
         if self._unconfirmed and time > self.newest:
             self._drop_ahead(time)
@@ -114,12 +124,12 @@ class FrontEnd:
         if self._unconfirmed and time > newest:
             newest = self._unconfirmed[-1][0]
         if time == newest:
-            self.counts.duplicate += 1
+            self.counts.samples["duplicate"] += 1
             if self._samples and sample == self._samples[-1]:
                 self._clock.logged_twice()
             self._check_time_advances(time)
         elif time < newest:
-            self.counts.out_of_order += 1
+            self.counts.samples["out_of_order"] += 1
             late = self._clock.note_late(time, newest)
             self.counts.longest_late = max(self.counts.longest_late, late)
         elif self._unconfirmed or time - newest > MAX_IMU_GAP:
@@ -131,16 +141,16 @@ class FrontEnd:
     def push_field(self, time: float, field_B: FloatArray) -> None:
         """Add a magnetic field (3,) [uT] in B, before any later sample is pushed."""
         if self._config.filter.magnetometer and not self._fields.add(time, field_B, self.newest):
-            self.counts.field_dropped += 1
+            self.counts.fields_dropped += 1
 
     def push_pressure(self, time: float, pressure_hPa: float) -> None:
         """Add a pressure [hPa], before any later sample is pushed."""
         if not self._pressures.add(time, pressure_hPa, self.newest):
-            self.counts.pressure_dropped += 1
+            self.counts.pressures_dropped += 1
 
     def finish(self) -> None:
         """End the stream: drop the samples that still wait for others to confirm their times."""
-        self.counts.future += len(self._unconfirmed)
+        self.counts.samples["future"] += len(self._unconfirmed)
         self._unconfirmed = []
 
     def _drop_ahead(self, time: float) -> None:
@@ -151,7 +161,7 @@ class FrontEnd:
             ahead.clear()
         while len(ahead) > 1 and ahead[-1][0] > max(time, ahead[-2][0] + MAX_IMU_GAP):
             ahead.pop()
-        self.counts.future += count - len(ahead)
+        self.counts.samples["future"] += count - len(ahead)
 
     def _confirm(self, sample: Sample) -> list[ImuInterval]:
         """Queue a sample that jumps ahead in time or follows one; accept all once confirmed."""
@@ -167,11 +177,11 @@ class FrontEnd:
         time = sample[0]
         # On a clock that was set back, the sample before has the time of the first late one.
         before, self.newest = min(self.newest, self._clock.on_time(time)), time
-        self.counts.used += 1
+        self.counts.samples["used"] += 1
         if self._samples and time - before > _HOLE_SECONDS:
             self._hole = before, time
             if time - before > MAX_IMU_GAP:
-                self.counts.add_gap(before, time - before)
+                self._count_gap(before, time - before)
             if time - before > BRIDGED:
                 return self._span_gap(before, sample)
         self._samples.append(sample)
@@ -190,7 +200,7 @@ class FrontEnd:
             return []
         table = np.array(self._samples)
         # Those after the first are replaced in the samples, and counted, when these are cut.
-        self.counts.spike += int(replace_spikes(table[:, 1:])[0].any())
+        self.counts.flagged["spike"] += int(replace_spikes(table[:, 1:])[0].any())
         self._samples[0] = tuple(table[0].tolist())
         gravity = start_from_gravity(table[:, 0], table[:, 1:4], table[:, 4:7])
         rate = 1.0 / float(np.median(np.diff(table[:, 0])))
@@ -208,10 +218,16 @@ class FrontEnd:
         gap = ImuInterval(ends, True, self._attitude.R_NB, levelled=start)
         return [gap, *self._complete()]
 
+    def _count_gap(self, start: float, length: float) -> None:
+        counts = self.counts
+        counts.gap_count += 1
+        counts.longest_gap = max(counts.longest_gap, length)
+        counts.gaps = [*counts.gaps, (start, length)][-_GAPS_LISTED:]
+
     def _check_time_unit(self) -> None:
         """Refuse a stream in which every sample so far is isolated by gaps."""
         isolated = self.counts.gap_count
-        if isolated >= _ISOLATED_SAMPLES and self.counts.used == isolated + 1:
+        if isolated >= _ISOLATED_SAMPLES and self.counts.samples["used"] == isolated + 1:
             step = statistics.median(length for _, length in self.counts.gaps)
             raise InputError(
                 "time", f"samples {step:.3g} s apart", "50 to 1000 per second", "give times in s"
@@ -219,8 +235,9 @@ class FrontEnd:
 
     def _check_time_advances(self, time: float) -> None:
         """Refuse a stream that only repeats its first time, as seconds since 1970 in float32 do."""
-        if self.counts.used <= 1 and self.counts.duplicate >= _REPEATED_SAMPLES:
-            found = f"{self.counts.duplicate + 1} samples at {time:.10g} s"
+        repeated = self.counts.samples["duplicate"]
+        if self.counts.samples["used"] <= 1 and repeated >= _REPEATED_SAMPLES:
+            found = f"{repeated + 1} samples at {time:.10g} s"
             remedy = "give times in s with 64 bits"
             raise InputError("time", found, "a time that advances", remedy)
 
@@ -271,8 +288,8 @@ class FrontEnd:
 
     def _flag_outliers(self, table: FloatArray) -> Flags:
         flags = self._outliers.detect(table)
-        self.counts.spike += flags.spikes
-        self.counts.saturated += flags.saturated
+        self.counts.flagged["spike"] += flags.spikes
+        self.counts.flagged["saturated"] += flags.saturated
         return flags
 
     def _with_window(self, table: FloatArray, flags: Flags) -> ImuInterval:

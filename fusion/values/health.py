@@ -1,15 +1,11 @@
-"""Health report of a run, and the counts of samples from which it is made."""
+"""Health report of a run."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
 
 from stario.fusion.values.floors import FloorChange
-
-Stopped = Literal["both", "gyroscope", "accelerometer"]
-"""What has stopped: both sensors, or one alone."""
 
 
 @dataclass
@@ -139,92 +135,3 @@ def _sigma_words(name: str, sigma: float) -> str:
 def _counted(counts: dict[str, int]) -> str:
     """Format counts by reason; `none` if there are none."""
     return ", ".join(f"{reason} {n}" for reason, n in counts.items()) or "none"
-
-
-GAPS_LISTED = 100
-"""Maximum number of gaps listed one by one; an endless stream may have any number."""
-
-
-@dataclass
-class SampleCounts:
-    """Counts of the samples used, dropped and flagged, and of gaps; direction of the network.
-
-    Attributes:
-        used: samples used.
-        not_finite: dropped: a value is NaN, infinite or absurdly large.
-        frozen: dropped: the values of both sensors, or of one alone, repeat those before, though
-            the device is not at rest.
-        frozen_gyro: those of them in which the gyroscope alone had stopped.
-        frozen_accel: those of them in which the accelerometer alone had stopped.
-        duplicate: dropped: the time repeats the newest.
-        out_of_order: dropped: the time is before the newest.
-        longest_late: longest duration of consecutive samples out of order [s].
-        future: dropped: the time is ahead of later samples.
-        spike: used, but replaced because they differ too much from their neighbours.
-        saturated: used, but at the sensor's limit.
-        field_dropped: magnetic fields dropped: a value or a time is wrong, or the sensor stopped.
-        pressure_dropped: pressures dropped: a value or a time is wrong.
-        gap_count: stretches without samples longer than `MAX_IMU_GAP`.
-        longest_gap: length of the longest [s].
-        gaps: (start, length) [s] of the newest `GAPS_LISTED`.
-        set_back: amount by which a recording's clock was set back where its track ends [s].
-        network_turn: as in `Health`.
-        network_turn_sigma: likewise.
-    """
-
-    used: int = 0
-    not_finite: int = 0
-    frozen: int = 0
-    frozen_gyro: int = 0
-    frozen_accel: int = 0
-    duplicate: int = 0
-    out_of_order: int = 0
-    longest_late: float = 0.0
-    future: int = 0
-    spike: int = 0
-    saturated: int = 0
-    field_dropped: int = 0
-    pressure_dropped: int = 0
-    gap_count: int = 0
-    longest_gap: float = 0.0
-    gaps: list[tuple[float, float]] = field(default_factory=list)
-    set_back: float = 0.0
-    network_turn: float = 0.0
-    network_turn_sigma: float = math.pi
-
-    def add_frozen(self, stopped: Stopped) -> None:
-        """Count a sample in which sensors had stopped."""
-        self.frozen += 1
-        self.frozen_gyro += stopped == "gyroscope"
-        self.frozen_accel += stopped == "accelerometer"
-
-    def add_gap(self, start: float, length: float) -> None:
-        """Count a stretch without samples [s]."""
-        self.gap_count += 1
-        self.longest_gap = max(self.longest_gap, length)
-        self.gaps = [*self.gaps, (start, length)][-GAPS_LISTED:]
-
-    def health(self) -> Health:
-        """Return the part of the health report that concerns the samples."""
-        names = ("used", "not_finite", "frozen", "duplicate", "out_of_order", "future")
-        return Health(
-            samples={name: getattr(self, name) for name in names},
-            flagged={"spike": self.spike, "saturated": self.saturated},
-            gap_count=self.gap_count,
-            longest_gap=self.longest_gap,
-            gaps=list(self.gaps),
-            fields_dropped=self.field_dropped,
-            pressures_dropped=self.pressure_dropped,
-            set_back=self.set_back,
-            longest_late=self.longest_late,
-            stopped={
-                sensor: count
-                for sensor, count in (
-                    ("gyroscope", self.frozen_gyro),
-                    ("accelerometer", self.frozen_accel),
-                )
-                if count
-            },
-            network_turn=self.network_turn,
-            network_turn_sigma=self.network_turn_sigma,
-        )

@@ -184,7 +184,7 @@ def _streamed(
         graph = fixed_lag.step(graph, filtered, record, config)
         states.append(graph.nav_state(filtered))
         times.append(process_time() - began)
-    health = filtered.health(preprocessed.front_end.counts, config.filter, states[-1])
+    health = filtered.health(preprocessed.counts, config.filter, states[-1])
     return track_from_states(states, innovations_of([]), health), np.array(times)
 
 

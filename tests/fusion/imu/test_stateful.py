@@ -115,7 +115,7 @@ def test_a_recording_tells_a_network_that_walks_backwards(make_walk, make_oracle
             displacement, covariance = oracle.predict(windows)
             return -displacement, covariance
 
-    counts = Navigator(Backwards(), config).observe(sequence).front_end.counts
+    counts = Navigator(Backwards(), config).observe(sequence).counts
     assert abs(counts.network_turn) > np.radians(135.0)
     assert counts.network_turn_sigma < np.radians(20.0)
 

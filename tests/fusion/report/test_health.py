@@ -8,7 +8,6 @@ from told import health_verdict as findings
 
 from stario.fusion import Health, Navigator
 from stario.fusion.imu.gap import INTERPOLATED
-from stario.fusion.values.health import SampleCounts
 from stario.network import load_model
 from stario.sequences import read_recording
 from stario.sequences.findings import Finding
@@ -113,17 +112,8 @@ def test_standing_still_is_advised_only_where_the_yaw_drifts(gap, yaw_sigma, hel
 
 
 def test_samples_late_for_a_moment_are_not_worth_a_note() -> None:
-    late = [findings(SampleCounts(longest_late=seconds).health()) for seconds in (0.4, 0.6)]
+    late = [findings(Health(longest_late=seconds)) for seconds in (0.4, 0.6)]
     assert ["samples_late" in [f.code for f in found] for found in late] == [False, True]
-
-
-def test_of_endless_gaps_the_newest_are_listed_and_all_are_counted() -> None:
-    counts = SampleCounts()
-    for k in range(150):
-        counts.add_gap(float(k), 0.2)
-    health = counts.health()
-    assert health.gap_count == 150
-    assert [start for start, _ in health.gaps] == [float(k) for k in range(50, 150)]
 
 
 @pytest.mark.skipif(not BAGS.is_dir(), reason=f"no recordings at {BAGS}")
