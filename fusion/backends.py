@@ -38,42 +38,32 @@ BackendName = Literal["ekf", "graph"]
 """The EKF, or the factor graph: over the last seconds of a stream, over all of a recording."""
 
 
-class FilteredRecording(NamedTuple):
-    """A recording after the filter."""
+class _Filtered(NamedTuple):
+    """A recording after the filter: states from the start on, and what it did in each interval."""
 
-    first: Estimate
-    """The initial estimate."""
+    estimates: list[Estimate]
     records: list[Record]
-    """What the filter did, interval by interval."""
     last: EstimatorState
-    """The filter's state after the last interval."""
 
-    @property
-    def estimates(self) -> list[Estimate]:
-        """The initial estimate and one per interval."""
-        return [self.first, *(record.estimate for record in self.records)]
-
-
-def _filtered_states(filtered: FilteredRecording) -> list[NavState]:
-    """Return the filter's states in the final map frame."""
-    frame = filtered.last.map_frame
-    states = to_final_frame(nav_states(filtered.estimates), frame.transforms)
-    return with_undirected(states, frame.undirected)
+    def states(self) -> list[NavState]:
+        """Return the filter's states in the final map frame."""
+        frame = self.last.map_frame
+        states = to_final_frame(nav_states(self.estimates), frame.transforms)
+        return with_undirected(states, frame.undirected)
 
 
 def _smoothed_states(
-    filtered: FilteredRecording, config: NavigatorConfig
-) -> tuple[list[NavState], str]:
+    filtered: _Filtered, config: NavigatorConfig
+) -> tuple[list[NavState], list[str]]:
     """Optimise the whole track at once; the filter's states if the graph is indeterminate.
 
     Returns:
-        States in the final map frame, and a note for the health report if the graph failed.
+        States in the final map frame, and notes for the health report if the graph failed.
     """
     last, states = filtered.last, nav_states(filtered.estimates, ASSUMED)
-    frame, end = last.map_frame, states[-1]
+    frame, end, covariance = last.map_frame, states[-1], states[0].covariance.copy()
     has_field = last.ekf.field is not None
     bias = (end.b_g, end.covariance[GYRO_BIAS, GYRO_BIAS]) if has_field else None
-    covariance = states[0].covariance.copy()
     # The filter's last prior.
     covariance[GYRO_BIAS, GYRO_BIAS] = last.bias_prior.variance * np.eye(3)
     first = replace(states[0], covariance=covariance)
@@ -81,13 +71,13 @@ def _smoothed_states(
     try:
         solved = smooth(final, first, filtered.records, frame, config, bias)
     except IndeterminateError as error:
-        return _filtered_states(filtered), f"graph fell back to the filter's track: {error}"
+        return filtered.states(), [f"graph fell back to the filter's track: {error}"]
     turns = [
         frame_rotation(after.R_WB @ before.R_WB.T)
         for before, after in zip(states, final, strict=True)
     ]
     solved = with_actual_covariances(solved, filtered.estimates, np.array(turns))
-    return with_undirected(solved, frame.undirected), ""
+    return with_undirected(solved, frame.undirected), []
 
 
 def _floors(states: Sequence[NavState]) -> list[FloorChange]:
@@ -125,41 +115,41 @@ def track_recording(
     fixes, origin = known_fixes(recording, config.place, fix_list(fixes))
     queue = FixQueue(fixes, most=math.inf)  # all fixes of a recording are known from the start
     run = _filtered(recording, config, prior, queue, progress)
-    counts, innovations = recording.counts, innovations_of(run.records)
+    innovations = innovations_of(run.records)
 
-    def track(states: list[NavState], note: str = "", filtered: Track | None = None) -> Track:
-        health = queue.health(run.last.health(counts, config.filter, states[-1]))
-        if filtered is not None and not note:
-            health = _with_later_fixes(health, run)
+    def track(states: list[NavState], filtered: Track | None = None) -> Track:
+        health = queue.health(run.last.health(recording.counts, config.filter, states[-1]))
         if health.pressures:
             health.floors = _floors(states)
-        return track_from_states(
-            states,
-            innovations,
-            replace(health, notes=[*health.notes, *([note] if note else [])]),
+        return replace(
+            track_from_states(states),
+            innovations=innovations,
+            health=health,
             filtered=filtered,
             georeference=origin,
             seconds_network=recording.seconds_network,
             seconds_filter=recording.seconds_front_end + perf_counter() - began,
         )
 
-    found = track(_filtered_states(run))
+    found = track(run.states())
     if backend == "graph":
-        found = track(*_smoothed_states(run, config), filtered=found)
+        states, notes = _smoothed_states(run, config)
+        found = track(states, filtered=found)
+        assert found.health is not None
+        found.health.notes += notes
+        if not notes:
+            _count_later_fixes(found.health, run)
     progress(1.0)
     return found
 
 
-def _with_later_fixes(health: Health, run: FilteredRecording) -> Health:
+def _count_later_fixes(health: Health, run: _Filtered) -> None:
     """Count positions as applied that the graph has used although the filter could not yet."""
-    frame = run.last.map_frame
-    used = sum(frame.holds(fix) for record in run.records for fix in record.undirected)
-    if not used:
-        return health
-    counts = dict(health.fixes)
-    counts["applied"] = counts.get("applied", 0) + used
-    counts[YAW_UNKNOWN] -= used
-    return replace(health, fixes={name: n for name, n in counts.items() if n})
+    frame, fixes = run.last.map_frame, health.fixes
+    if used := sum(frame.holds(fix) for record in run.records for fix in record.undirected):
+        fixes["applied"] = fixes.get("applied", 0) + used
+        fixes[YAW_UNKNOWN] -= used
+        health.fixes = {name: n for name, n in fixes.items() if n}
 
 
 def _filtered(
@@ -168,16 +158,17 @@ def _filtered(
     prior: PriorPose | None,
     queue: FixQueue,
     progress: Progress,
-) -> FilteredRecording:
+) -> _Filtered:
     queue.start(recording.start.time)
     state = estimator.begin(config, recording.start, prior)
-    filtered = FilteredRecording(state.estimate(), [], state)
+    estimates, records = [state.estimate()], []
     pairs = zip(recording.intervals, recording.measurements, strict=True)
     for k, (interval, displacement) in enumerate(pairs):
         due = queue.due(interval.stop)
         state, record = estimator.step(state, interval, displacement, due, config)
-        filtered.records.append(record)
+        records.append(record)
+        estimates.append(record.estimate)
         if k % 500 == 0:
             progress(0.6 + 0.3 * k / len(recording.intervals))
     queue.refuse("after the end", len(queue.due(math.inf)))
-    return filtered._replace(last=state)
+    return _Filtered(estimates, records, state)

@@ -30,7 +30,7 @@ def known_fixes(
     """
     origin, found = place.georeference, list(fixes)
     metres = origin is None and any(fix.kind == "position" for fix in fixes)
-    positions = used_positions(recording.positions, recording.satellites is not None, place)
+    positions = used_positions(recording, place)
     if place.waypoints == "use" and positions is None:
         log.warning("no waypoint is used: the recording has none")
     if positions is not None:
@@ -55,34 +55,32 @@ def known_fixes(
 
 
 def used_positions(
-    positions: PositionTrack | None, satellites: bool, place: PlaceConfig
+    known: ImuSequence | PreprocessedRecording, place: PlaceConfig
 ) -> PositionTrack | None:
-    """Return the known positions that are used as fixes, but not those of `satellites`."""
-    used = place.waypoints == "use" and not _of_satellites(positions, satellites)
-    return positions if used else None
+    """Return a recording's known positions that are fixes, but not those of its satellites."""
+    return None if place.waypoints != "use" or _of_satellites(known) else known.positions
 
 
 def compared_with(sequence: ImuSequence, place: PlaceConfig) -> PositionTrack | None:
     """Return the known positions that a track may be compared with: those that it did not use."""
-    positions, satellites = sequence.positions, sequence.satellites is not None
-    if used_positions(positions, satellites, place) is not None:
+    if used_positions(sequence, place) is not None:
         return None
-    of_satellites = _of_satellites(positions, satellites)
-    return None if of_satellites and place.satellites != "compare" else positions
+    unused = not _of_satellites(sequence) or place.satellites == "compare"
+    return sequence.positions if unused else None
 
 
-def _of_satellites(positions: PositionTrack | None, satellites: bool) -> bool:
-    """Return whether known positions are those of the recording's `satellites`, if it has any."""
-    return satellites and positions is not None and positions.kind == "positions"
+def _of_satellites(known: ImuSequence | PreprocessedRecording) -> bool:
+    """Return whether known positions are those of the recording's satellites, if it has any."""
+    positions, satellites = known.positions, known.satellites
+    return satellites is not None and positions is not None and positions.kind == "positions"
 
 
 def used_words(sequence: ImuSequence, place: PlaceConfig) -> tuple[str, ...]:
     """Return which of a recording's own positions are used as fixes, in words."""
-    words = []
-    if place.satellites == "use" and sequence.satellites is not None:
-        words.append("satellite positions")
-    positions = used_positions(sequence.positions, sequence.satellites is not None, place)
-    return (*words, *([positions.kind] if positions is not None else []))
+    used = place.satellites == "use" and sequence.satellites is not None
+    positions = used_positions(sequence, place)
+    words = ("satellite positions",) if used else ()
+    return words if positions is None else (*words, positions.kind)
 
 
 def _in_map(
@@ -99,9 +97,8 @@ def _in_map(
 
 def _waypoint_fixes(positions: PositionTrack, xy: FloatArray) -> list[Fix]:
     """Return the fixes of positions at (N, 2) [m]; their heights, if any, are not used."""
-    sigma = np.full(len(positions), _WAYPOINT_SIGMA)
-    if positions.sigma is not None:
-        sigma = positions.sigma
+    usual = np.full(len(positions), _WAYPOINT_SIGMA)
+    sigma = usual if positions.sigma is None else positions.sigma
     return [
         position_fix(time, [x, y, 0.0], np.diag(np.square([s, s, UNKNOWN_HEIGHT])))
         for time, (x, y), s, valid in zip(positions.time, xy, sigma, positions.valid, strict=True)

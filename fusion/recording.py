@@ -100,17 +100,16 @@ def preprocess(
     began = perf_counter()
     network = StatefulInference(model, config.filter.window_updates)
     measurements = _displacements(intervals, network, front_end.counts, progress)
-    seconds_network = perf_counter() - began
     return PreprocessedRecording(
-        intervals=[interval.without_window() for interval in intervals],
-        update_rate=config.filter.update_rate,
-        measurements=measurements,
-        start=front_end.start,
-        counts=front_end.counts,
-        satellites=sequence.satellites,
-        positions=sequence.positions,
-        seconds_front_end=seconds_front_end,
-        seconds_network=seconds_network,
+        [interval.without_window() for interval in intervals],
+        config.filter.update_rate,
+        measurements,
+        front_end.start,
+        front_end.counts,
+        sequence.satellites,
+        sequence.positions,
+        seconds_front_end,
+        seconds_network=perf_counter() - began,
     )
 
 
@@ -123,13 +122,12 @@ def cut_recording(
     """
     front_end = FrontEnd(config)
     intervals: list[ImuInterval] = []
-    magnetometer, fields = sequence.magnetometer, deque[tuple[float, FloatArray]]()
+    magnetometer, barometer = sequence.magnetometer, sequence.barometer
+    fields, pressures = deque[tuple[float, FloatArray]](), deque[tuple[float, float]]()
     if magnetometer is not None:
         fields.extend(zip(magnetometer.time.tolist(), magnetometer.field, strict=True))
-    barometer, pressures = sequence.barometer, deque[tuple[float, float]]()
     if barometer is not None:
-        table = barometer.time.tolist(), barometer.pressure_hPa.tolist()
-        pressures.extend(zip(*table, strict=True))
+        pressures.extend(np.column_stack([barometer.time, barometer.pressure_hPa]).tolist())
     for sample in np.column_stack([sequence.time, sequence.gyro, sequence.accel]).tolist():
         # A wild timestamp must not release all later fields at once.
         until = min(sample[0], front_end.newest + MAX_IMU_GAP)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
 from statistics import median
 from typing import NamedTuple
 
@@ -90,19 +89,15 @@ class HeightSample(NamedTuple):
     stepped: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class _Line:
-    """A line through the last heights.
-
-    Attributes:
-        slope: [m/s].
-        scatter: standard deviation about it [m].
-        step_ratio: squared residuals about the best step, relative to those about the line.
-    """
+class _Line(NamedTuple):
+    """A line through the last heights."""
 
     slope: float
+    """[m/s]."""
     scatter: float
+    """Standard deviation about it [m]."""
     step_ratio: float
+    """Squared residuals about the best step, relative to those about the line."""
 
 
 class HeightBuffer(TimedBuffer[float]):

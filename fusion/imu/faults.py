@@ -115,9 +115,6 @@ _ALONE_SECONDS = 0.5
 _ALONE_SAMPLES = round(MIN_RATE * _ALONE_SECONDS)
 """Minimum number of samples in that time: a gap shows no motion."""
 
-_NEVER: Sample = (math.nan, math.nan, math.nan, math.nan, math.nan, math.nan, math.nan)
-"""Sample before the first: no value equals NaN."""
-
 
 class FrozenSensorDetector:
     """Detects sensors that have stopped and repeat their last values.
@@ -128,7 +125,7 @@ class FrozenSensorDetector:
 
     def __init__(self, gravity: float) -> None:
         self._gravity = gravity
-        self._last = _NEVER
+        self._last: Sample = (math.nan,) * 7  # before the first: no value equals NaN
         self._since = math.inf  # time of the first of equal samples [s]
         self._unclear = True  # whether a sensor repeats its values, or has never changed them
         self._gyro, self._accel = _Repetition(), _Repetition()
@@ -152,14 +149,11 @@ class FrozenSensorDetector:
             return "both"
         gyro, accel = self._gyro, self._accel
         # Both, whatever the first says: each has to know when its values change.
-        if same_gyro:
-            gyro.add(last, sample, shaken)
-        else:
-            gyro.restart(last)
-        if same_accel:
-            accel.add(last, sample, tilting)
-        else:
-            accel.restart(last)
+        for sensor, same, moves in ((gyro, same_gyro, shaken), (accel, same_accel, tilting)):
+            if same:
+                sensor.add(last, sample, moves)
+            else:
+                sensor.restart(last)
         self._unclear = same_gyro or same_accel or not (gyro.varied and accel.varied)
         return "gyroscope" if gyro.stopped else "accelerometer" if accel.stopped else None
 
@@ -188,13 +182,7 @@ class _Repetition:
             self._samples = []
 
     def add(self, last: Sample, sample: Sample, moves: Moves) -> None:
-        """Add a sample that repeats the values of the one before.
-
-        Args:
-            last: sample before.
-            sample: newest sample.
-            moves: whether samples show motion that the sensor's values rule out.
-        """
+        """Add a sample that repeats the values of the last one; ask the other sensor for motion."""
         if self.stopped or not self.varied:
             return
         if sample[0] < last[0]:  # a late sample, or the one before was ahead of its time

@@ -215,7 +215,7 @@ class FrontEnd:
         turn = gap_rotation(ends, first - ends[0, 0], self._attitude.b_g)
         self._attitude.level(turn, start)
         self._before_gap = None
-        gap = ImuInterval(ends, True, self._attitude.R_NB, levelled=start)
+        gap = ImuInterval(ends, self._attitude.R_NB, levelled=start)
         return [gap, *self._complete()]
 
     def _count_gap(self, start: float, length: float) -> None:
@@ -256,7 +256,7 @@ class FrontEnd:
         if len(before) == 1:
             return []
         self._attitude.advance(table[:, 0], table[:, 1:4], table[:, 4:])
-        return [ImuInterval(table, False, self._attitude.R_NB, flags=flags)]
+        return [ImuInterval(table, self._attitude.R_NB, flags=flags)]
 
     def _complete(self) -> list[ImuInterval]:
         intervals = []
@@ -304,4 +304,4 @@ class FrontEnd:
         self._windows.add(table, attitudes, flags)
         window = self._windows.window() if update else None
         R_NB = self._attitude.R_NB
-        return ImuInterval(table, False, R_NB, update, window, field_B, height, flags=flags)
+        return ImuInterval(table, R_NB, update, window, field_B, height, flags=flags)

@@ -81,19 +81,17 @@ class ImuInterval:
     Attributes:
         table: (n + 1, 7) samples: time [s], gyro [rad/s] and accel [m/s^2] in B, interpolated at
             both ends, which are on the grid.
-        gap: whether this is a gap too long to be bridged; its samples then carry no information.
         R_NB: (3, 3) levelled attitude at the end, after its correction by gravity.
         update: whether windows begin and end at this interval's end.
         window: the window that ends here; None if there is none.
         field_B: (3,) magnetic field at its end [uT]; None if none was measured.
         height: height by the pressure of the last half second; None if there is none.
-        levelled: attitude from gravity after a gap, estimated as at the first sample; None
-            elsewhere.
+        levelled: attitude from gravity after a gap too long to be bridged, estimated as at the
+            first sample; None elsewhere.
         flags: whether samples of either sensor are saturated, missing, or were spikes.
     """
 
     table: FloatArray
-    gap: bool
     R_NB: FloatArray
     update: bool = False
     window: Window | None = None
@@ -105,6 +103,11 @@ class ImuInterval:
     def without_window(self) -> ImuInterval:
         """Return a copy without the window, which an estimator does not need."""
         return changed(self, window=None)
+
+    @property
+    def gap(self) -> bool:
+        """Whether this is a gap too long to be bridged; its samples then carry no information."""
+        return self.levelled is not None
 
     @property
     def lost(self) -> bool:

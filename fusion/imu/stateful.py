@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple, Protocol
 
@@ -63,21 +62,6 @@ def slope_variance(d: FloatArray) -> FloatArray:
     return np.asarray(SLOPE_SIGMA**2 * np.square(d[..., :2]).sum(axis=-1))
 
 
-@dataclass(frozen=True, eq=False)
-class Block:
-    """One interval's part of a window.
-
-    Attributes:
-        imu_N: (6, n) gyroscope [rad/s] and specific force [m/s^2] in N.
-        R_NB: (3, 3) levelled attitude at its start.
-        flagged: whether it contains faulty or missing samples.
-    """
-
-    imu_N: NDArray[np.float32]
-    R_NB: FloatArray
-    flagged: bool
-
-
 _TAIL_SAMPLES = 4
 """Samples kept from the previous interval: half a step of the window's grid at the fastest rate."""
 
@@ -91,12 +75,15 @@ class WindowBuffer:
 
     def __init__(self, rate: int) -> None:
         self._grid = np.arange(round(WINDOW_RATE / rate)) / WINDOW_RATE
-        self._blocks: deque[Block] = deque(maxlen=round(rate * WINDOW_SECONDS))
+        # Each interval's part of a window: samples, levelled attitude at its start, and flag.
+        self._parts: deque[tuple[NDArray[np.float32], FloatArray, bool]] = deque(
+            maxlen=round(rate * WINDOW_SECONDS)
+        )
         self._tail: FloatArray | None = None  # time and turned IMU (k, 7) before the interval
 
     def clear(self) -> None:
         """Drop all samples, so that no window spans a gap."""
-        self._blocks.clear()
+        self._parts.clear()
         self._tail = None
 
     def add(self, table: FloatArray, attitudes: FloatArray, flags: Flags) -> None:
@@ -110,19 +97,15 @@ class WindowBuffer:
         samples = rows if tail is None else np.concatenate([tail, rows])
         imu_N = resample(samples[:, 0], samples[:, 1:], table[0, 0] + self._grid)
         flagged = flags.gyro or flags.accel or flags.missing
-        self._blocks.append(Block(imu_N.astype(np.float32).T, attitudes[0], flagged))
+        self._parts.append((imu_N.astype(np.float32).T, attitudes[0], flagged))
 
     def window(self) -> Window | None:
         """Return the second that ends with the newest interval, once it is complete."""
-        blocks = self._blocks
-        if len(blocks) < (blocks.maxlen or 0):
+        if len(self._parts) < (self._parts.maxlen or 0):
             return None
-        return Window(
-            imu_N=np.concatenate([block.imu_N for block in blocks], axis=1),
-            R_NB=blocks[0].R_NB,
-            heading=float(mean_heading(facing(np.array([block.R_NB for block in blocks])))),
-            flagged=any(block.flagged for block in blocks),
-        )
+        imu_N, R_NB, flagged = zip(*self._parts, strict=True)
+        heading = float(mean_heading(facing(np.array(R_NB))))
+        return Window(np.concatenate(imu_N, axis=1), R_NB[0], heading, any(flagged))
 
 
 BATCH = 512
@@ -185,9 +168,9 @@ class StatefulInference:
             InputError: the model's predictions are not arrays of these shapes, or a covariance is
                 asymmetric.
         """
-        restarts: list[int] = []
-        if begins is not None and self.is_recurrent:
-            restarts = np.flatnonzero(begins).tolist()
+        restarts = (
+            np.flatnonzero(begins).tolist() if self.is_recurrent and begins is not None else []
+        )
         edges = sorted({*range(0, len(heading), BATCH), *restarts, len(heading)})
         answers = []
         for first, stop in pairwise(edges):

@@ -48,29 +48,27 @@ def check_start(start: Start, gravity: float, table: FloatArray) -> None:
     warn("stream", downward(table[:, 4:7]))
     if not MIN_RATE <= start.rate <= MAX_RATE:
         raise InputError("time", f"{start.rate:.3g} samples a second", "50 to 1000")
-    if not _START_FORCE[0] <= start.force <= _START_FORCE[1]:
-        speed, size = (
-            float(np.median(np.linalg.norm(table[:, columns], axis=1)))
-            for columns in (slice(1, 4), slice(4, 7))
-        )
-        if speed > _SPINNING_RAD_S and _START_FORCE[0] <= size <= _START_FORCE[1]:
-            raise InputError(
-                "gyro", f"rotations of {speed:.3g} in the first second", "rad/s", _DEG_S
-            )
-        if _START_FORCE[0] <= speed <= _START_FORCE[1]:
-            fix = "gyro and accel are swapped: push(time, gyro, accel)"
-            raise InputError("gyro", f"values of {speed:.3g}, as of gravity", "rad/s", fix)
-        raise InputError(
-            "accel",
-            f"an average of {start.force:.3g} over the first second",
-            f"about {gravity:.2f} m/s^2",
-            "give specific force in m/s^2 with gravity left in, and rates in rad/s",
-        )
+    low, high = _START_FORCE
+    if low <= start.force <= high:
+        return
+    speed, size = (_typical_size(table[:, columns]) for columns in (slice(1, 4), slice(4, 7)))
+    if speed > _SPINNING_RAD_S and low <= size <= high:
+        raise InputError("gyro", f"rotations of {speed:.3g} in the first second", "rad/s", _DEG_S)
+    if low <= speed <= high:
+        fix = "gyro and accel are swapped: push(time, gyro, accel)"
+        raise InputError("gyro", f"values of {speed:.3g}, as of gravity", "rad/s", fix)
+    found = f"an average of {start.force:.3g} over the first second"
+    fix = "give specific force in m/s^2 with gravity left in, and rates in rad/s"
+    raise InputError("accel", found, f"about {gravity:.2f} m/s^2", fix)
+
+
+def _typical_size(vectors: FloatArray) -> float:
+    return float(np.median(np.linalg.norm(vectors, axis=1)))
 
 
 def warn_of_field(fields: FloatArray) -> None:
     """Warn of magnetic fields (N, 3) that are the earth's in another unit than uT."""
-    size = float(np.median(np.linalg.norm(fields, axis=1))) if len(fields) else 0.0
+    size = _typical_size(fields) if len(fields) else 0.0
     if advice := magnetic_advice(size):
         log.warning("magnetometer: found a field of %.3g, expected 25 to 65 uT: %s", size, advice)
 

@@ -43,28 +43,27 @@ def shaped(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
 
 def seconds(time: float) -> float:
     """Return a time [s] as a float; `InputError` if it is not a number."""
-    try:
-        if isinstance(time, str):
-            raise ValueError
-        return float(time)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError("time", shown(time), "a number of seconds") from None
+    return _number("time", time, "a number of seconds")
 
 
 def hectopascals(pressure: float) -> float:
     """Return a pressure [hPa] as a float; `InputError` if it is not one of the air in hPa."""
-    try:
-        if isinstance(pressure, str):
-            raise ValueError
-        value = float(pressure)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError("pressure", shown(pressure), "a number of hPa") from None
+    value = _number("pressure", pressure, "a number of hPa")
     low, high = PRESSURE_RANGE
     if math.isfinite(value) and not low <= value <= high:
         names = [name for name, hPa in _UNITS_HPA.items() if low <= value * hPa <= high]
         remedy = f"convert from {' or '.join(names)} to hPa" if names else "give it in hPa"
         raise InputError("pressure", f"{value:g}", f"{low:g} to {high:g} hPa", remedy)
     return value
+
+
+def _number(name: str, value: float, expected: str) -> float:
+    try:
+        if isinstance(value, str):
+            raise ValueError
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(name, shown(value), expected) from None
 
 
 def three(name: str, value: Vector) -> tuple[float, float, float]:

@@ -8,7 +8,6 @@ start. Only changes count, so that a height that drifts with the weather over an
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -73,8 +72,7 @@ class FloorChange(NamedTuple):
         return f"{floors} by {self.how}, {self.start:.0f} to {self.stop:.0f} s"
 
 
-@dataclass(frozen=True)
-class _Change:
+class _Change(NamedTuple):
     """A change of height between the seconds `start` and `stop`, by `climb` [m]."""
 
     start: int
@@ -108,11 +106,10 @@ def floor_changes(
     for change in changes:
         by = round(change.climb / spacing)
         if by:
-            start, stop = seconds[change.start], seconds[change.stop]
+            start, stop = float(seconds[change.start]), float(seconds[change.stop])
             how: How = "lift" if _stands(change, h, v) else "stairs"
-            to = floor + by
-            found.append(FloorChange(float(start), float(stop), floor, to, change.climb, how))
-            floor = to
+            found.append(FloorChange(start, stop, floor, floor + by, change.climb, how))
+            floor += by
     return found, spacing if found else 0.0
 
 

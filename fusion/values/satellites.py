@@ -55,18 +55,18 @@ def satellite_fixes(
 ) -> SatelliteFixes | None:
     """Return a receiver's positions and velocities as fixes; None if there is none to rely on.
 
-    Args:
-        satellites: positions as reported.
-        origin: the map they are to be given in; None begins one at the first good position, with x
-            east and y north.
+    They are given in the map of `origin`; None begins one at the first good position, with x east
+    and y north.
     """
     good = reliable(satellites)
     if not good.any():
         return None
     used = satellites.select(good)
     if origin is None:
-        latitude, longitude = used.latlon_deg[0].tolist()
-        origin = Georeference(latitude, longitude, altitude_m=_altitude(used))
+        altitude = _column(used.altitude_m, used)
+        known = altitude[np.isfinite(altitude)]
+        altitude_m = float(np.median(known)) if len(known) else math.nan
+        origin = Georeference(*used.latlon_deg[0].tolist(), altitude_m=altitude_m)
     sigma = _RADIUS_FACTOR / RADIUS_PER_SIGMA * _radius(used) * np.sqrt(_shared(used.time))
     positions = [
         position_fix(time, [x, y, 0.0], np.diag(np.square([s, s, UNKNOWN_HEIGHT])))
@@ -90,13 +90,6 @@ def _radius(satellites: Satellites) -> FloatArray:
 def _column(values: FloatArray | None, satellites: Satellites) -> FloatArray:
     """Return an optional column (N,), NaN where unknown."""
     return np.full(len(satellites), np.nan) if values is None else values
-
-
-def _altitude(satellites: Satellites) -> float:
-    """Return the median altitude [m]; NaN if none is known."""
-    altitude = _column(satellites.altitude_m, satellites)
-    known = altitude[np.isfinite(altitude)]
-    return float(np.median(known)) if len(known) else math.nan
 
 
 def _held(satellites: Satellites) -> BoolArray:

@@ -277,15 +277,7 @@ class Track:
         return {name: value for name, value in arrays.items() if value is not None}
 
 
-def track_from_states(
-    states: list[NavState],
-    innovations: Innovations | None = None,
-    health: Health | None = None,
-    filtered: Track | None = None,
-    georeference: Georeference | None = None,
-    seconds_network: float = 0.0,
-    seconds_filter: float = 0.0,
-) -> Track:
+def track_from_states(states: Sequence[NavState]) -> Track:
     """Stack states into a track; the first state after a gap is marked invalid."""
     covariance = np.array([s.covariance for s in states])
     trajectory = Trajectory(
@@ -301,10 +293,4 @@ def track_from_states(
         b_g=np.array([s.b_g for s in states]),
         b_a=np.array([s.b_a for s in states]),
         covariance=covariance,
-        innovations=innovations,
-        health=health,
-        filtered=filtered,
-        georeference=georeference,
-        seconds_network=seconds_network,
-        seconds_filter=seconds_filter,
     )

@@ -185,7 +185,8 @@ def _streamed(
         states.append(graph.nav_state(filtered))
         times.append(process_time() - began)
     health = filtered.health(preprocessed.counts, config.filter, states[-1])
-    return track_from_states(states, innovations_of([]), health), np.array(times)
+    track = replace(track_from_states(states), innovations=innovations_of([]), health=health)
+    return track, np.array(times)
 
 
 def speed_report(model: DisplacementModel) -> dict[str, Any]:

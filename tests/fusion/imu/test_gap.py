@@ -44,7 +44,7 @@ def gap_of(length: float, turn_rate: float) -> ImuInterval:
     after = Start(np.eye(3), False, 9.81, turn_rate, time=length, rate=100.0)
     ends = np.zeros((2, 7))
     ends[1, 0] = length
-    return ImuInterval(ends, True, np.eye(3), levelled=after)
+    return ImuInterval(ends, np.eye(3), levelled=after)
 
 
 @pytest.mark.parametrize("length", [0.3, 0.9, 3.0])

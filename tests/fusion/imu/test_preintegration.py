@@ -220,7 +220,7 @@ def test_a_walking_force_is_as_certain_as_its_density():
 
 def _standing(time: np.ndarray, accel: np.ndarray) -> Segment:
     table = np.column_stack([time, 0.0 * accel, accel])
-    interval = ImuInterval(table, gap=False, R_NB=np.eye(3))
+    interval = ImuInterval(table, np.eye(3))
     return segment_of([interval], [1.0], np.zeros(3), np.zeros(3), NavigatorConfig())
 
 
