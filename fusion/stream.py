@@ -14,8 +14,7 @@ from stario.fusion.backends import BackendName
 from stario.fusion.filter import estimator
 from stario.fusion.filter.estimator_state import EstimatorState
 from stario.fusion.filter.initial import PriorPose
-from stario.fusion.graph import fixed_lag
-from stario.fusion.graph.fixed_lag import FixedLagState
+from stario.fusion.graph.fixed_lag import FixedLag
 from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
 from stario.fusion.imu.intervals import ImuInterval, Sample
@@ -58,7 +57,7 @@ class Stream:
     def _begin(self) -> None:
         self.front_end = FrontEnd(self._config)
         self.state: EstimatorState | None = None
-        self.graph: FixedLagState | None = None
+        self.graph: FixedLag | None = None
         self.continuous: ContinuousPose | None = None
         self._network = StatefulInference(self._model, self._config.filter.window_updates)
 
@@ -98,7 +97,7 @@ class Stream:
                 check_start(start, self._config.gravity, interval.table)
                 self.state = estimator.begin(self._config, start, self.prior, streaming=True)
                 if self._backend == "graph":
-                    self.graph = fixed_lag.begin(self.state, self._config)
+                    self.graph = FixedLag(self.state, self._config)
                 self._fixes.start(start.time)
         except InputError:
             self._begin()
@@ -115,7 +114,7 @@ class Stream:
                 self.state, interval.without_window(), displacement, due, self._config
             )
             if self.graph is not None:
-                self.graph = fixed_lag.step(self.graph, self.state, record, self._config)
+                self.graph.step(self.state, record)
         state = self._newest(self.state)
         self.continuous = copied(advanced(self.continuous, state))  # `state` is writable
         return state
@@ -137,9 +136,7 @@ class Stream:
             return "refused"
         self.state, accepted = found
         if self.graph is not None:
-            self.graph = fixed_lag.late_fix(
-                self.graph, before, self.state, fix, accepted, self._config
-            )
+            self.graph.late_fix(before, self.state, fix, accepted)
         if self.continuous is not None:
             state = self._newest(self.state)
             if state.map_frame != self.continuous.map_frame:

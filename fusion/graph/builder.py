@@ -22,7 +22,7 @@ from stario.fusion.graph.factors import (
     Yaw,
 )
 from stario.fusion.graph.keyframe_state import KeyframeState
-from stario.fusion.graph.keyframes import KeyframeGraph, shallow_copy
+from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.graph.term import Term
 from stario.fusion.imu.barometer import HeightSample
 from stario.fusion.imu.gap import gap_covariance, gap_rotation, yaw_variance
@@ -82,12 +82,6 @@ class GraphBuilder:
         self._window_keyframes: dict[int, int] = {count: 0} if count % self._spacing == 0 else {}
         self._gaps: dict[int, ImuInterval] = {}  # by the keyframe before them
         self._last_height: tuple[int, float] | None = None  # keyframe and time
-
-    def copied(self) -> GraphBuilder:
-        """Return a copy that may be changed; what both hold is never modified."""
-        copy = shallow_copy(self)
-        copy.graph = shallow_copy(self.graph)
-        return copy
 
     def step(
         self,

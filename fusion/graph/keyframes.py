@@ -14,8 +14,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from copy import copy
-from typing import Any, TypeVar
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -51,17 +50,6 @@ _UNDETERMINED_SIGMA = 1e5
 
 _GROUPS = ("attitude", "velocity", "position", "gyroscope bias", "accelerometer bias")
 _NAMES = {"x": "pose", "v": "velocity", "b": "bias"}
-
-
-Held = TypeVar("Held")
-
-
-def shallow_copy(held: Held) -> Held:
-    """Return a copy of an object with copies of its lists and dictionaries."""
-    new = copy(held)
-    parts = {k: v.copy() for k, v in vars(held).items() if isinstance(v, dict | list)}
-    vars(new).update(parts)
-    return new
 
 
 class KeyframeGraph:

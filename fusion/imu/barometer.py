@@ -112,13 +112,7 @@ class HeightBuffer(TimedBuffer[float]):
         self._climbing = False
 
     def add(self, time: float, pressure_hPa: float, now: float) -> bool:
-        """Add a pressure [hPa]; return False if its value or time cannot be right.
-
-        Args:
-            time: its time [s].
-            pressure_hPa: [hPa].
-            now: as for `fits`.
-        """
+        """Add a pressure [hPa]; return False if it or its time cannot be right (see `fits`)."""
         low, high = PRESSURE_RANGE
         right = low <= pressure_hPa <= high and self.fits(time, now)
         return right and self.keep(time, pressure_hPa)

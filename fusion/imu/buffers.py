@@ -66,14 +66,9 @@ class FieldBuffer(TimedBuffer[FloatArray]):
         self._since = math.inf
 
     def add(self, time: float, field_B: FloatArray, now: float) -> bool:
-        """Add a field; return False if its value or time cannot be right, or the sensor stopped.
+        """Add a field (3,) in B [uT]; return False if it, its time or its sensor cannot be right.
 
-        It also returns False if too many fields wait, so that the first of them is dropped.
-
-        Args:
-            time: time of the field [s].
-            field_B: (3,) magnetic field in B [uT].
-            now: as for `fits`.
+        So it does if too many wait; `now` is as for `fits`.
         """
         value = tuple(field_B.tolist())
         if not (self.fits(time, now) and sum(map(abs, value)) < MAX_SENSOR_VALUE):

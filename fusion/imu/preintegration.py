@@ -121,14 +121,12 @@ def segment_of(
         b_a: (3,) accelerometer bias [m/s^2].
         config: noise and gravity.
     """
-    pairs = list(zip(intervals, accel_factors, strict=True))
+    pairs = zip(intervals, accel_factors, strict=True)
     noise = [_noise_of(e, factor, config) for e, factor in pairs]
-    first, *rest = intervals
-    steps: ImuNoise | list[ImuNoise] = noise[0]
-    table = first.table
-    if rest:
-        table = np.vstack([table, *(e.table[1:] for e in rest)])  # without the shared samples
-        steps = [d for e, d in zip(intervals, noise, strict=True) for _ in e.table[1:]]
+    table, steps = intervals[0].table, noise[:1] * (len(intervals[0].table) - 1)
+    for e, density in zip(intervals[1:], noise[1:], strict=True):
+        table = np.vstack([table, e.table[1:]])  # without the shared sample
+        steps += [density] * (len(e.table) - 1)
     time, gyro, accel = table[:, 0], table[:, 1:4], table[:, 4:]
     return preintegrate(time, gyro, accel, b_g, b_a, steps, config.gravity)
 
@@ -219,21 +217,14 @@ def _within_a_turn(
 ) -> tuple[FloatArray, Sequence[ImuNoise]]:
     """Limit the rotation of a segment, since gtsam's tangent is singular at a full turn.
 
-    Args:
-        rate: (n, 3) rates of its steps [rad/s].
-        dt: (n,) their lengths [s].
-        densities: n noise densities.
-
-    Returns:
-        Rates and densities; if the rotation was too large, the turn is unknown.
+    Return rates (n, 3) and densities; if the rotation was too large, the turn is unknown.
     """
     turn = float(np.linalg.norm(np.cumsum(rate * dt[:, None], axis=0), axis=1).max())
     if turn <= _MAX_TURN:
         return rate, densities
     unknown = math.pi / math.sqrt(dt.sum())
-    return rate * (_MAX_TURN / turn), [
-        replace(d, gyro_noise=max(d.gyro_noise, unknown)) for d in densities
-    ]
+    wider = [replace(d, gyro_noise=max(d.gyro_noise, unknown)) for d in densities]
+    return rate * (_MAX_TURN / turn), wider
 
 
 def corrected_increments(

@@ -39,6 +39,11 @@ _ORIGIN = (90.0, 360.0, 360.0)
 """Largest latitude, longitude and yaw of an origin [deg]."""
 
 
+def _check_flag(settings: object, name: str) -> None:
+    if not isinstance(getattr(settings, name), bool | np.bool_):
+        raise ConfigError(name, repr(getattr(settings, name)), "True or False")
+
+
 @dataclass(frozen=True)
 class FilterConfig:
     """Settings of the state-cloning EKF.
@@ -99,11 +104,10 @@ class FilterConfig:
         check_number(self, "gate", 0.5, 1.0)
         if self.gate == 1.0:
             raise ConfigError("gate", "1", "a probability from 0.5 to below 1")
-        for name in ("correlated_errors", "adaptive", "magnetometer"):
-            if not isinstance(getattr(self, name), bool | np.bool_):
-                raise ConfigError(name, repr(getattr(self, name)), "True or False")
         for item in fields(self):
-            if item.type == "float" and item.name != "gate":
+            if item.type == "bool":
+                _check_flag(self, item.name)
+            elif item.type == "float" and item.name != "gate":
                 check_number(self, item.name)
         if self.declination is not None:
             check_number(self, "declination", -math.pi, math.pi)
@@ -169,8 +173,7 @@ class PlaceConfig:
             value = getattr(self, name)
             if value not in choices:
                 raise ConfigError(name, repr(value), f"one of {', '.join(choices)}")
-        if not isinstance(self.closed, bool | np.bool_):
-            raise ConfigError("closed", repr(self.closed), "True or False")
+        _check_flag(self, "closed")
         if self.origin is not None:
             object.__setattr__(self, "origin", _checked_origin(self.origin))
 

@@ -91,23 +91,22 @@ class Health:
         if self.updates:
             nis = f"mean NIS {self.mean_nis:.2f} (expected {self.nis_expected})"
             outliers = {"outliers": self.gated, **self.refused}
-            found = {name: n for name, n in outliers.items() if n}
-            text.append(
-                ", ".join([f"updates {self.updates}", nis, *([_counted(found)] if found else [])])
-            )
+            found = _counted({name: n for name, n in outliers.items() if n})
+            refused = [] if found == "none" else [found]
+            text.append(", ".join([f"updates {self.updates}", nis, *refused]))
         else:
             text.append("updates none: no window was complete, or the device was stationary")
-        if self.fixes:
-            text.append(f"fixes {_counted(self.fixes)}")
-        if self.zero_velocity:
-            text.append(f"zero-velocity updates {_counted(self.zero_velocity)}")
-        if self.bearings:
-            text.append(f"bearings of the magnetic field {_counted(self.bearings)}")
+        for title, counts in (
+            ("fixes", self.fixes),
+            ("zero-velocity updates", self.zero_velocity),
+            ("bearings of the magnetic field", self.bearings),
+            ("heights by the pressure", self.pressures),
+        ):
+            if counts:
+                text.append(f"{title} {_counted(counts)}")
+        text += [str(change) for change in self.floors]
         if self.fields_dropped:
             text.append(f"magnetometer samples dropped: {self.fields_dropped}")
-        if self.pressures:
-            text.append(f"heights by the pressure {_counted(self.pressures)}")
-        text += [str(change) for change in self.floors]
         if self.pressures_dropped:
             text.append(f"pressures dropped: {self.pressures_dropped}")
         if self.accel_noise_factor > 1.0:

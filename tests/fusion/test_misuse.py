@@ -69,18 +69,11 @@ def test_a_wrong_argument_is_named(still_model, make, named):
         make(still_model)
 
 
-def test_a_fix_of_the_wrong_type_is_refused_with_a_remedy(walk, still_model):
-    for wrong in ([(1.0, "position")], ["fix"]):
-        for run in (Navigator(still_model).run, partial(compare, still_model)):
-            with pytest.raises(InputError, match="position_fix"):
-                run(walk, fixes=wrong)
-
-
-def test_a_single_fix_in_place_of_a_list_is_named(walk, still_model):
-    fix = position_fix(1.0, np.zeros(3), np.eye(3))
+@pytest.mark.parametrize("wrong", [[(1.0, "position")], ["fix"], yaw_fix(1.0, 0.0, 0.1)])
+def test_fixes_of_the_wrong_type_are_refused_with_a_remedy(walk, still_model, wrong):
     for run in (Navigator(still_model).run, partial(compare, still_model)):
-        with pytest.raises(InputError, match="fixes"):
-            run(walk, fixes=fix)
+        with pytest.raises(InputError, match=r"position_fix|fixes.*a list of them"):
+            run(walk, fixes=wrong)
 
 
 def test_numpy_numbers_are_accepted():

@@ -66,14 +66,6 @@ def test_the_error_stays_far_below_that_of_dead_reckoning(make_walk, make_oracle
     assert ate(track, walk) < 0.03 * alone
 
 
-def test_only_the_state_at_the_end_of_a_gap_is_invalid(walk, without, still_model):
-    """Where the device moved meanwhile is unknown until measurements follow."""
-    gappy = without(walk, (walk.time > 8.0) & (walk.time < 9.5))
-    for backend in ("ekf", "graph"):
-        track = Navigator(still_model, CONFIG, backend=backend).run(gappy)
-        assert track.time[~track.trajectory.valid] == pytest.approx([9.5], abs=0.01)
-
-
 def test_the_blocks_of_the_covariance_have_names():
     covariance, zero = np.arange(225.0).reshape(15, 15), np.zeros(3)
     state = NavState(0.0, np.eye(3), zero, zero, zero, zero, covariance)

@@ -23,7 +23,7 @@ from stario.fusion.evaluation.scores import Column, parts, scored, table, wide
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.filter import estimator
 from stario.fusion.filter.record import innovations_of
-from stario.fusion.graph import fixed_lag
+from stario.fusion.graph.fixed_lag import FixedLag
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.recording import PreprocessedRecording
@@ -175,13 +175,13 @@ def _streamed(
 ) -> tuple[Track, FloatArray]:
     """Return the newest states of the fixed-lag graph, and the processor time of each step [s]."""
     filtered = estimator.begin(config, preprocessed.start, streaming=True)
-    graph = fixed_lag.begin(filtered, config)
+    graph = FixedLag(filtered, config)
     states, times = [graph.nav_state(filtered)], []
     pairs = zip(preprocessed.intervals, preprocessed.measurements, strict=True)
     for interval, measurement in pairs:
         began = process_time()
         filtered, record = estimator.step(filtered, interval, measurement, (), config)
-        graph = fixed_lag.step(graph, filtered, record, config)
+        graph.step(filtered, record)
         states.append(graph.nav_state(filtered))
         times.append(process_time() - began)
     health = filtered.health(preprocessed.counts, config.filter, states[-1])

@@ -11,9 +11,8 @@ from support import stream
 
 from stario.fusion import Navigator, NavState
 from stario.fusion.filter import estimator
-from stario.fusion.filter.estimator_state import EstimatorState
 from stario.fusion.filter.initial import PriorPose
-from stario.fusion.graph import fixed_lag
+from stario.fusion.graph.fixed_lag import FixedLag
 from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.graph.term import IndeterminateError
 from stario.fusion.recording import PreprocessedRecording
@@ -74,30 +73,19 @@ def test_a_tilted_start_misleads_a_stream_no_more_than_the_filter(tilt, make_wal
     assert errors(ours, walk).max() < 1.1 * errors(theirs, walk).max() + 0.1
 
 
-Both = tuple[EstimatorState, fixed_lag.FixedLagState]
-
-
-def begun(preprocessed: PreprocessedRecording, config: NavigatorConfig) -> Both:
-    filtered = estimator.begin(config, preprocessed.start, streaming=True)
-    return filtered, fixed_lag.begin(filtered, config)
-
-
-def stepped(both: Both, interval: Any, measurement: Any, config: NavigatorConfig) -> Both:
-    filtered, record = estimator.step(both[0], interval, measurement, (), config)
-    return filtered, fixed_lag.step(both[1], filtered, record, config)
-
-
 def track_with_outliers(
     preprocessed: PreprocessedRecording, config: NavigatorConfig, metres: float, intervals: range
 ) -> tuple[np.ndarray, int]:
     """Positions until 3 s after intervals with false displacements, and the number gated."""
-    (filtered, graph), positions = begun(preprocessed, config), []
+    filtered = estimator.begin(config, preprocessed.start, streaming=True)
+    graph, positions = FixedLag(filtered, config), []
     for k in range(intervals.stop + 3 * config.filter.output_rate):
         measurement = preprocessed.measurements[k]
         if measurement is not None and k in intervals:
             measurement = measurement._replace(d_N=measurement.d_N + metres * np.eye(3)[0])
-        both = filtered, graph
-        filtered, graph = stepped(both, preprocessed.intervals[k], measurement, config)
+        interval = preprocessed.intervals[k]
+        filtered, record = estimator.step(filtered, interval, measurement, (), config)
+        graph.step(filtered, record)
         positions.append(graph.nav_state(filtered).p_W)
     return np.array(positions), filtered.counts.gated
 
@@ -268,22 +256,6 @@ def test_if_the_graph_fails_the_stream_continues_from_the_filter(walk, make_orac
         "fell back to the filter 1 times, last because velocity at 8.0 s is undetermined"
         in navigator.health.notes[0]
     )
-
-
-def test_a_step_leaves_the_state_before_it_as_it_was(walk, make_oracle):
-    walk = walk.slice(0.0, 11.0)
-    recording = Navigator(make_oracle(walk, walk.truth, CONFIG), CONFIG).observe(walk)
-    pairs = list(zip(recording.intervals, recording.measurements, strict=True))
-    saved, ends = begun(recording, CONFIG), []
-    for pair in pairs[:69]:
-        saved = stepped(saved, *pair, CONFIG)
-    for _ in range(2):
-        both = saved
-        for pair in pairs[69:105]:
-            both = stepped(both, *pair, CONFIG)
-        ends.append(both[1].nav_state(both[0]))
-    np.testing.assert_array_equal(ends[1].p_W, ends[0].p_W)
-    np.testing.assert_array_equal(ends[1].covariance, ends[0].covariance)
 
 
 def test_after_a_long_gap_the_graph_restarts(make_walk, make_oracle, without):
