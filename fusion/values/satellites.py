@@ -66,7 +66,8 @@ def satellite_fixes(
         altitude = _column(used.altitude_m, used)
         known = altitude[np.isfinite(altitude)]
         altitude_m = float(np.median(known)) if len(known) else math.nan
-        origin = Georeference(*used.latlon_deg[0].tolist(), altitude_m=altitude_m)
+        latitude, longitude = used.latlon_deg[0].tolist()
+        origin = Georeference(latitude, longitude, altitude_m=altitude_m)
     sigma = _RADIUS_FACTOR / RADIUS_PER_SIGMA * _radius(used) * np.sqrt(_shared(used.time))
     positions = [
         position_fix(time, [x, y, 0.0], np.diag(np.square([s, s, UNKNOWN_HEIGHT])))
