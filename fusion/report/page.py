@@ -30,7 +30,8 @@ from stario.fusion.report.panels import (
     numbers,
     style,
 )
-from stario.fusion.report.series import track_series, trajectory_series
+from stario.fusion.report.series import track_series
+from stario.fusion.values.health import Health
 from stario.fusion.values.state import Track
 from stario.sequences.accuracy.metrics import moved
 from stario.sequences.drawing.figures import clock
@@ -67,32 +68,22 @@ def write_report(path: Path, found: Comparison, tiles: str = "") -> Path:
     place = found.georeference if truth is None else None
     yaw = 0.0 if place is None else place.yaw
     series = {
-        name: track_series(found.tracks[name], moved(aligned, yaw, np.zeros(3), np.zeros(3)), start)
+        name: track_series(moved(aligned, yaw, np.zeros(3), np.zeros(3)), start, found.tracks[name])
         for name, aligned in found.aligned().items()
     }
-    true_series = None if truth is None else trajectory_series(truth, start)
+    true_series = None if truth is None else track_series(truth, start)
     # Dead reckoning is kilometres off within a minute: no axis fits it and the others.
     drawn = {name: s for name, s in series.items() if name != "dead_reckoning"}
     mapped = drawn if truth is None else series
-    health, innovations = track.health, track.innovations
-    panels = motion_panels(
-        drawn,
-        true_series,
-        [
-            change._replace(start=change.start - start, stop=change.stop - start)
-            for change in (health.floors if health else [])
-        ],
-    )
-    panels += bias_panels(series[MAIN])
+    health, innovations = track.health or Health(), track.innovations
+    floors = [c._replace(start=c.start - start, stop=c.stop - start) for c in health.floors]
+    panels = motion_panels(drawn, true_series, floors) + bias_panels(series[MAIN])
     if innovations is not None and len(innovations.time):
         panels += innovation_panels(innovations, start)
     known = shown_positions(sequence, track)
     if known is not None:
         known = replace(known, position_W=turned(known.position_W, yaw))
-    corrections = [
-        (t - start, metres, turn, cause)
-        for t, metres, turn, cause in (health.corrections if health else [])
-    ]
+    corrections = [(t - start, m, turn, why) for t, m, turn, why in health.corrections]
     north_up = place and replace(place, yaw=0.0)
     seen_from_above = map_figure(mapped, true_series, known, corrections, north_up, tiles)
     data = {

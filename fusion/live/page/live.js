@@ -284,16 +284,11 @@
       show(device, message.time);
     }
     if (!devices.size !== waiting) element("add").open = waiting = !devices.size;
-    const refused = Object.values(message.refused).reduce((sum, n) => sum + n, 0);
-    connection.textContent = several(devices.size, "device") + (refused ? `, ${several(refused, "message")} rejected` : "");
+    connection.textContent = several(devices.size, "device") + (message.refused ? `, ${several(message.refused, "message")} rejected` : "");
     connection.className = "";
     redraw();
   };
 
-  const forPhones = element("push-url").textContent.includes("?token=");
-  element("local").hidden = forPhones;
-  element("network").hidden = !forPhones;
-  if (forPhones) element("code").src = "page.svg";
   if (window.innerWidth <= 900) mapLayout.dragmode = "pan";
   draw().then(() => {
     watchMap();
