@@ -44,7 +44,6 @@ from starlette.templating import Jinja2Templates
 from stario.fusion.live.hub import Hub, Viewer
 from stario.fusion.live.payload import number_from, object_from, parse_lines, parse_push
 from stario.fusion.report.background import tile_images
-from stario.sequences.arrays import check_choice
 from stario.sequences.errors import InputError, StarioError
 from stario.sequences.units import ACCEL_UNITS, known_unit
 
@@ -52,8 +51,6 @@ MAX_BYTES = 4 * 1024 * 1024
 """Maximum size of a push [bytes]."""
 
 LOOPBACK = ["localhost", "127.0.0.1", "[::1]"]
-
-COMMANDS = ("start", "stop", "zero", "fix")
 
 MAX_VIEWERS = 50
 """Maximum number of pages that watch at once."""
@@ -200,7 +197,6 @@ async def _command(request: Request) -> Response:
     _check_origin(request)
     message = object_from("body", await _body(request))
     device, command = (str(message.get(key, "")) for key in ("device", "command"))
-    check_choice("command", command, COMMANDS)
     await hub.command(device, command, **(_fix_values(message) if command == "fix" else {}))
     return JSONResponse({"done": command})
 

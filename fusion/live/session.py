@@ -13,6 +13,7 @@ from stario.fusion.live.payload import BACKWARD, Batch
 from stario.fusion.live.places import Earth
 from stario.fusion.live.track import LiveTrack
 from stario.fusion.navigator import Navigator
+from stario.sequences.arrays import check_choice
 from stario.sequences.errors import InputError
 
 FORWARD = 60 * 10**9
@@ -59,7 +60,7 @@ class Session:
         """
         commands: dict[str, Callable[..., None]] = {"start": self.start, "stop": self.stop}
         commands |= {"zero": self.track.zero, "fix": self.track.fix}
-        commands[name](**values)
+        commands[check_choice("command", name, commands)](**values)
 
     def start(self) -> None:
         """Start a new track and a new recording."""

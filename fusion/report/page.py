@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import gzip
-import importlib.resources
 import json
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jinja2 import Template
+from jinja2 import Environment, FileSystemLoader
 from plotly.offline import get_plotlyjs
 
 from stario.fusion.evaluation.compare import METRIC_TITLES, Comparison, Metrics
@@ -42,6 +41,10 @@ from stario.sequences.sequence import ImuSequence
 
 _DIGITS = {"ate_m": 2, "ate_fit_m": 2, "rte_m": 2, "aye_rad": 1, "nees_median": 1, "nis_mean": 1}
 """Decimals of the table's columns."""
+
+_TEMPLATES = Environment(
+    loader=FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True
+)
 
 
 def write_report(path: Path, found: Comparison, tiles: str = "") -> Path:
@@ -91,7 +94,7 @@ def write_report(path: Path, found: Comparison, tiles: str = "") -> Path:
         "time": json.loads(time_figure(panels).to_json()),
         "cursors": [_cursor(name, drawn[name]) for name in sorted(drawn, key=MAIN.__ne__)],
     }
-    page = Template(_asset("report.html"), autoescape=True, trim_blocks=True).render(
+    page = _TEMPLATES.get_template("report.html").render(
         title=sequence.name,
         summary=sequence.summary().removeprefix(f"{sequence.name}: "),
         facts=_facts(sequence, track, series[MAIN]),
@@ -102,19 +105,12 @@ def write_report(path: Path, found: Comparison, tiles: str = "") -> Path:
         titles={key: METRIC_TITLES[key] for key in ([] if truth is None else _DIGITS)},
         metrics={style(name)[0]: [*_cells(m)] for name, m in found.metrics.items()},
         words=found.words,
-        css=_asset("report.css"),
-        script=_asset("report.js"),
         data=_packed(json.dumps(data, separators=(",", ":"))),
         plotly=_packed_plotly(),
     )
     with atomic_write(path) as file:
         file.write(page)
     return path
-
-
-def _asset(name: str) -> str:
-    """Read a text file of this package."""
-    return importlib.resources.files("stario.fusion.report").joinpath(name).read_text("utf-8")
 
 
 @cache
