@@ -28,7 +28,7 @@ def live(
     from stario.sequences.errors import InputError
     from stario.sequences.lazy import optional_package
 
-    for package in ("starlette", "uvicorn", "plotly", "segno"):
+    for package in ("starlette", "uvicorn", "jinja2", "plotly", "segno"):
         optional_package(package, "live")
     from stario.fusion import demonstration
     from stario.fusion.evaluation.results import check_folder

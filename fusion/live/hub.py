@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections import Counter
 from collections.abc import Callable, Set
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -43,9 +43,8 @@ class Hub:
         new_navigator: returns a new navigator for each track.
 
     Attributes:
-        sessions: sessions by device.
-        earth: where on the earth the map lies that they share.
-        refused: number of refused messages by transport.
+        earth: where on the earth the map lies that all devices share.
+        refused: number of refused messages.
         viewers: number of pages that watch.
         ending: whether the server is stopping and viewers must be disconnected.
     """
@@ -54,8 +53,7 @@ class Hub:
         self._folder, self._new_navigator = folder, new_navigator
         self.sessions: dict[str, Session] = {}
         self.earth = Earth()
-        self.refused: Counter[str] = Counter()
-        self.viewers, self.ending = 0, False
+        self.refused, self.viewers, self.ending = 0, 0, False
         self._news = asyncio.Event()
 
     async def take(self, *batches: Batch, accel_factor: float = 1.0) -> int:
@@ -72,11 +70,14 @@ class Hub:
             if batch.device in self.sessions:
                 self.sessions[batch.device].check(batch)
         self._make_room({batch.device for batch in known})
-        sessions = [self._session(batch.device) for batch in known]
-        for session in sessions:
-            session.received = received
+        for batch in known:
+            if batch.device not in self.sessions:
+                navigators = self._new_navigator
+                session = Session(batch.device, self._folder, navigators, self.earth)
+                self.sessions[batch.device] = session
+            self.sessions[batch.device].received = received
         count = 0
-        for session, batch in zip(sessions, known, strict=True):
+        for session, batch in [(self.sessions[batch.device], batch) for batch in known]:
             count += await self._in_thread(session, session.take, batch, received, accel_factor)
         return count
 
@@ -90,12 +91,7 @@ class Hub:
             devices = ", ".join(self.sessions) or "none yet"
             raise InputError("device", repr(device), f"a device that has sent data: {devices}")
         session = self.sessions[device]
-
-        def run() -> None:
-            of_track = name in ("zero", "fix")
-            getattr(session.track if of_track else session, name)(**values)
-
-        await self._in_thread(session, run)
+        await self._in_thread(session, partial(session.command, name, **values))
 
     async def release(self) -> None:
         """Process the pushes that have waited long enough for one before them."""
@@ -125,12 +121,6 @@ class Hub:
         """Close all recordings."""
         for session in self.sessions.values():
             self._close(session)
-
-    def _session(self, device: str) -> Session:
-        if device not in self.sessions:
-            session = Session(device, self._folder, self._new_navigator, self.earth)
-            self.sessions[device] = session
-        return self.sessions[device]
 
     async def _in_thread(self, session: Session, action: Callable[..., T], *arguments: Any) -> T:
         """Run an action of a session after those before it, and tell the viewers."""
@@ -174,11 +164,7 @@ class Hub:
 
 
 class Viewer:
-    """One viewer and the points it has received, so that only new ones are sent.
-
-    Args:
-        hub: hub to watch.
-    """
+    """One viewer and the points it has received, so that only new ones are sent."""
 
     def __init__(self, hub: Hub) -> None:
         self._hub = hub
@@ -206,4 +192,4 @@ class Viewer:
             if places is not self._places.get(device):
                 self._places[device] = news["places"] = places
             devices.append(session.status() | news)
-        return {"time": time.time(), "devices": devices, "refused": dict(self._hub.refused)}
+        return {"time": time.time(), "devices": devices, "refused": self._hub.refused}

@@ -13,19 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stario.fusion.live.payload import (
-    ACCEL_RAW,
-    BAROMETER,
-    GRAVITY,
-    GYRO,
-    GYRO_RAW,
-    LINEAR,
-    MAG,
-    ORIENTATION,
-    TOTAL,
-    Reading,
-    Vector,
-)
+from stario.fusion.live.payload import ACCELS, BAROMETER, GYROS, MAG, ORIENTATION, Reading, Vector
 from stario.sequences.sequence import FloatArray
 from stario.sequences.time_order import MAX_IMU_GAP
 
@@ -45,8 +33,6 @@ MAX_WAIT = 5 * 10**9
 """Maximum time [ns] a sensor's samples wait for those of the other."""
 
 _MAX_GAP = round(MAX_IMU_GAP * 1e9)
-_GYROS = (GYRO, GYRO_RAW)
-_ACCELS = ((TOTAL,), (LINEAR, GRAVITY), (ACCEL_RAW,))
 
 
 class Merger:
@@ -82,8 +68,9 @@ class Merger:
         end = max(self._newest.values(), default=0) - MAX_WAIT
         return next((name for name in self._streams if self._newest[name] < end), "")
 
-    def add(self, readings: Iterable[Reading]) -> list[Sample]:
-        """Add readings as they arrive; return the samples they complete."""
+    def add(self, readings: Iterable[Reading], places: Iterable[Reading] = ()) -> list[Sample]:
+        """Add readings, and places by satellites, as they arrive; return the completed samples."""
+        self._aside += places  # whoever reads the recording skips repeated ones
         if not self._streams:
             self._waiting += readings
             if not self._choose():
@@ -93,10 +80,6 @@ class Merger:
         for reading in sorted(readings, key=lambda reading: reading.time_ns):
             self._take(reading)
         return [*self._complete()]
-
-    def add_places(self, places: Iterable[Reading]) -> None:
-        """Add places by the satellite receiver; whoever reads the recording skips repeated ones."""
-        self._aside += places
 
     def aside(self) -> list[Reading]:
         """Return magnetic fields, pressures and places since the last call, in time order."""
@@ -134,8 +117,8 @@ class Merger:
     def _best(self) -> tuple[str, tuple[str, ...]]:
         """Return the best gyroscope and accelerometer of the readings so far; empty if none."""
         sensors = {reading.sensor for reading in self._waiting}
-        gyro = next((name for name in _GYROS if name in sensors), "")
-        return gyro, next((names for names in _ACCELS if set(names) <= sensors), ())
+        gyro = next((name for name in GYROS if name in sensors), "")
+        return gyro, next((names for names in ACCELS if set(names) <= sensors), ())
 
     def _choose(self) -> bool:
         """Choose the best sensors, once the stream is long enough to contain all of them."""

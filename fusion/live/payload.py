@@ -22,10 +22,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+import reprlib
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import groupby
+from itertools import chain, groupby
 from typing import Any
 
 from stario.sequences.errors import InputError
@@ -57,12 +58,13 @@ _MAX_TIME_NS = 2**63
 _MAX_NAME_LENGTH = 80
 _NORM_TOLERANCE = 0.05
 
-GYRO, GYRO_RAW = "gyroscope", "gyroscopeuncalibrated"
+GYRO, MAG, BAROMETER = "gyroscope", "magnetometer", "barometer"
 TOTAL, LINEAR, GRAVITY = "totalacceleration", "accelerometer", "gravity"
-ACCEL_RAW = "accelerometeruncalibrated"
-MAG = "magnetometer"
-BAROMETER = "barometer"
-_AXES = frozenset({GYRO, GYRO_RAW, TOTAL, LINEAR, GRAVITY, ACCEL_RAW, MAG})
+GYROS = GYRO, "gyroscopeuncalibrated"
+ACCELS = (TOTAL,), (LINEAR, GRAVITY), ("accelerometeruncalibrated",)
+"""Sensors that give a rate, and those that together give a specific force, the best ones first."""
+
+_AXES = {MAG, *GYROS, *chain(*ACCELS)}
 ORIENTATION = "orientation"
 """The phone's own attitude, of which only the vertical is used."""
 
@@ -75,7 +77,6 @@ class Reading:
     """One sample of one sensor.
 
     Attributes:
-        sensor: one of the names above.
         time_ns: time on the device's clock [ns].
         value: reading in rad/s, m/s^2 or uT; for an attitude, the upward unit vector in B; for the
             barometer, one number in hPa; for a place, latitude and longitude [deg], altitude [m],
@@ -92,9 +93,7 @@ class Batch:
     """Readings that arrived together from one device.
 
     Attributes:
-        device: name of the device.
         recording: the device's name for the recording; empty if it gives none.
-        readings: readings in order of arrival.
         number: place of a push among those of its recording; -1 if it gives none.
         places: places by the satellite receiver; their times, perhaps minutes old, decide nothing.
     """
@@ -141,23 +140,19 @@ def parse_push(body: bytes) -> Batch:
     ]
     readings = [reading for reading in known if reading.sensor != LOCATION]
     places = [reading for reading in known if reading.sensor == LOCATION]
-    times = [reading.time_ns for reading in readings]
-    if times and max(times) - min(times) > MAX_SPAN:
-        found = f"times {(max(times) - min(times)) / 1e9:.3g} s apart"
-        raise InputError("payload", found, f"at most {MAX_SPAN / 1e9:g} s in one push")
-    _check_unit(readings)
+    _check_times(readings)
     number = message.get("messageId")
     if not recording or type(number) is not int:
         number = -1
     return Batch(device, recording, readings, number, places)
 
 
-def _check_unit(readings: list[Reading]) -> None:
-    """Check that the times of a push can be nanoseconds, by the rate of each sensor.
-
-    Raises:
-        InputError: no sensor has so high a rate.
-    """
+def _check_times(readings: list[Reading]) -> None:
+    """Check that the times of a push can be nanoseconds, by their span and each sensor's rate."""
+    times = [reading.time_ns for reading in readings]
+    if times and max(times) - min(times) > MAX_SPAN:
+        found = f"times {(max(times) - min(times)) / 1e9:.3g} s apart"
+        raise InputError("payload", found, f"at most {MAX_SPAN / 1e9:g} s in one push")
     for sensor in {reading.sensor for reading in readings}:
         at = [reading.time_ns for reading in readings if reading.sensor == sensor]
         if len(at) >= _FEW_SAMPLES and max(at) - min(at) < (len(at) - 1) * _MIN_STEP:
@@ -197,7 +192,7 @@ def _line(line: bytes, sender: str) -> tuple[tuple[str, str], list[Reading]]:
     else:
         time_ns = _nanoseconds("t", 1e9 * number_from("t", message.get("t")))
     readings = [
-        Reading(sensor, time_ns, _vector(_three(key, message[key])))
+        Reading(sensor, time_ns, _three(key, message[key]))
         for key, sensor in (("gyro", GYRO), ("accel", TOTAL), ("mag", MAG))
         if key in message
     ]
@@ -208,11 +203,7 @@ def _line(line: bytes, sender: str) -> tuple[tuple[str, str], list[Reading]]:
 
 
 def object_from(where: str, text: bytes) -> Mapping[str, Any]:
-    """Parse a JSON object from arbitrary bytes.
-
-    Raises:
-        InputError: the bytes are not valid JSON, or not an object; the error names `where`.
-    """
+    """Parse a JSON object from arbitrary bytes; an error names `where`."""
     try:
         value = json.loads(text)
     except RecursionError:
@@ -231,7 +222,7 @@ def _pushed(where: str, entry: Mapping[str, Any]) -> Reading | None:
     if sensor in _AXES:
         time_ns = _nanoseconds(f"{where}.time", time)
         axes = _object(f"{where}.values", values)
-        value = _vector((f"{where}.values.{axis}", axes.get(axis)) for axis in "xyz")
+        value = tuple(_axis(f"{where}.values.{axis}", axes.get(axis)) for axis in "xyz")
         return Reading(sensor, time_ns, value)
     with suppress(InputError):
         if sensor in _OPTIONAL:
@@ -248,10 +239,6 @@ def _vertical(values: Mapping[str, Any]) -> Vector:
     return 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
 
 
-def _pressure(values: Mapping[str, Any]) -> Vector:
-    return (number_from("pressure", values.get("pressure")),)
-
-
 def _place(values: Mapping[str, Any]) -> Vector:
     known = (number_from(name, values.get(name)) for name in ("latitude", "longitude"))
     rest = (values.get(name) for name in ("altitude", "horizontalAccuracy", "speed", "bearing"))
@@ -260,7 +247,7 @@ def _place(values: Mapping[str, Any]) -> Vector:
 
 _OPTIONAL: dict[str, Callable[[Mapping[str, Any]], Vector]] = {
     ORIENTATION: _vertical,
-    BAROMETER: _pressure,
+    BAROMETER: lambda values: (number_from("pressure", values.get("pressure")),),
     LOCATION: _place,
 }
 
@@ -294,46 +281,33 @@ def _nanoseconds(where: str, value: Any) -> int:
     return value
 
 
-def _three(where: str, values: Any) -> list[tuple[str, Any]]:
+def _axis(where: str, value: Any) -> float:
+    """Return a reading along an axis; an error names its place in the message."""
+    if abs(number := number_from(where, value)) > MAX_READING:
+        raise InputError(where, f"{number:.3g}", f"at most {MAX_READING:g} rad/s, m/s^2 or uT")
+    return number
+
+
+def _three(where: str, values: Any) -> Vector:
     if not isinstance(values, list) or len(values) != 3:
         raise InputError(where, _describe(values), "a list of three numbers")
-    return [(f"{where}[{k}]", value) for k, value in enumerate(values)]
-
-
-def _vector(values: Iterable[tuple[str, Any]]) -> Vector:
-    """Return three readings, each given with its place in the message."""
-    numbers = {where: number_from(where, value) for where, value in values}
-    for where, number in numbers.items():
-        if abs(number) > MAX_READING:
-            expected = f"at most {MAX_READING:g} rad/s, m/s^2 or uT"
-            raise InputError(where, f"{number:.3g}", expected)
-    return tuple(numbers.values())
+    return tuple(_axis(f"{where}[{k}]", value) for k, value in enumerate(values))
 
 
 def number_from(where: str, value: Any) -> float:
-    """Return a finite number of a message.
-
-    Raises:
-        InputError: it is none; the error names `where`.
-    """
+    """Return a finite number of a message; an error names `where`."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(where, _describe(value), "a number")
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if not math.isfinite(number):
-        raise InputError(where, "no finite number", "a finite number")
-    return number
+    with suppress(OverflowError):
+        if math.isfinite(number := float(value)):
+            return number
+    raise InputError(where, "no finite number", "a finite number")
 
 
 def _describe(value: Any) -> str:
     """Return a short description of a value of any size."""
-    if value is None:
-        return "nothing"
     if isinstance(value, list):
         return f"a list of {len(value)}"
     if isinstance(value, dict):
         return "an object"
-    text = repr(value) if isinstance(value, (str, float, bool)) else str(value)[:20]
-    return text if len(text) <= 40 else f"{text[:40]}..."
+    return "nothing" if value is None else reprlib.repr(value)

@@ -57,14 +57,7 @@ _log = logging.getLogger(__name__)
 
 
 class Phyphox:
-    """Client of one phone.
-
-    Args:
-        address: host and port, such as 192.168.0.7:8080.
-
-    Raises:
-        InputError: it is not an HTTP address.
-    """
+    """Client of one phone; an error tells of an address that is none of HTTP."""
 
     def __init__(self, address: str) -> None:
         url = urlsplit(address if "//" in address else f"//{address}", scheme="http")
@@ -115,15 +108,13 @@ class Phyphox:
 
     def _is_forced(self, buffers: Mapping[str, Any]) -> bool:
         """Return whether whole buffers answer a request for their ends: once after a clear."""
-        times = [buffers.get(self._buffers[sensor][0]) for sensor in self._newest]
-        return any(isinstance(time, dict) and time.get("updateMode") == "full" for time in times)
+        times = [buffers.get(self._buffers[sensor][0], {}) for sensor in self._newest]
+        return any(time.get("updateMode") == "full" for time in times)
 
     def _is_behind(self) -> bool:
         """Return whether the phone's newest times lie before those known, after a lost answer."""
-        if not self._newest:
-            return False
         newest = {self._buffers[sensor][0]: time for sensor, time in self._newest.items()}
-        buffers = self._get(f"/get?{'&'.join(map(quote, newest))}").get("buffer")
+        buffers = newest and self._get(f"/get?{'&'.join(map(quote, newest))}").get("buffer")
         if not isinstance(buffers, dict):
             return False
         times = [(_column(buffers, name), time) for name, time in newest.items()]
@@ -159,21 +150,13 @@ class Phyphox:
 
 
 def _buffers_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
-    """Return the names of the buffers of time and values by sensor from phyphox's `/config`.
-
-    Raises:
-        InputError: the experiment lacks the gyroscope or the acceleration with g.
-    """
+    """Return the names of the buffers of time and values by sensor from phyphox's `/config`."""
     found: dict[str, tuple[str, ...]] = {}
-    inputs = config.get("inputs")
-    for source in inputs if isinstance(inputs, list) else []:
-        known = _SENSORS.get(str(source.get("source"))) if isinstance(source, dict) else None
-        if known is None:
-            continue
-        sensor, axes = known
+    for source in config.get("inputs", []):
+        sensor, axes = _SENSORS.get(source.get("source"), ("", ""))
         outputs = {k: v for output in source.get("outputs", []) for k, v in output.items()}
         names = [outputs.get(key) for key in ("t", *axes)]
-        if all(isinstance(name, str) for name in names):
+        if sensor and None not in names:
             found[sensor] = tuple(map(str, names))
     if GYRO not in found or not (TOTAL in found or {LINEAR, GRAVITY} <= set(found)):
         expected = "gyroscope and acceleration with g in one experiment"
@@ -201,12 +184,9 @@ async def follow(hub: Hub, phone: Phyphox) -> None:
 
 def _column(buffers: Mapping[str, Any], name: str, unknown: bool = False) -> list[float]:
     """Return the numbers of a buffer, up to the first invalid value or with NaN where `unknown`."""
-    buffer = buffers.get(name)
-    values = buffer.get("buffer") if isinstance(buffer, dict) else None
     numbers: list[float] = []
-    for value in values if isinstance(values, list) else []:
-        number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        valid = number and abs(value) < _LARGEST  # not NaN
+    for value in buffers.get(name, {}).get("buffer", []):
+        valid = isinstance(value, (int, float)) and abs(value) < _LARGEST  # not NaN
         if not (valid or unknown):
             break
         numbers.append(float(value) if valid else math.nan)

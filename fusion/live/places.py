@@ -56,13 +56,8 @@ class Earth:
 class Places:
     """Places of one recording. Not thread-safe, like its track.
 
-    Args:
-        use: what is to become of them, as in `PlaceConfig.satellites`.
-        earth: where the map lies.
-
     Attributes:
-        use: what becomes of them.
-        count: number of places.
+        use: what becomes of them, as in `PlaceConfig.satellites`.
         drawn: those to be drawn. A list that never changes: another takes its place.
     """
 

@@ -12,7 +12,7 @@ import ipaddress
 import secrets
 import signal
 import socket
-from collections import Counter
+import statistics
 from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -123,10 +123,9 @@ class LiveServer:
     @asynccontextmanager
     async def _beside(self, app: Starlette) -> AsyncIterator[None]:
         """Poll phones, let the simulated one walk and watch the clock; at last close recordings."""
-        work = [follow(self.hub, phone) for phone in self._phones]
-        work += (
-            [self._watch()] if self._demo is None else [self._watch(), walk(self.hub, self._demo)]
-        )
+        work = [self._watch(), *(follow(self.hub, phone) for phone in self._phones)]
+        if self._demo is not None:
+            work.append(walk(self.hub, self._demo))
         tasks = [asyncio.create_task(each) for each in work]
         self._started()
         yield
@@ -140,7 +139,9 @@ class LiveServer:
         while True:
             await asyncio.sleep(_POLL_SECONDS)
             now = asyncio.get_running_loop().time()
-            _close_overdue(self._server.server_state.connections, now)
+            for each in _waiting(self._server.server_state.connections):
+                if now - each.since > REQUEST_SECONDS:
+                    each.transport.abort()
             await self.hub.release()
             if self._server.should_exit:
                 self.hub.end()
@@ -167,8 +168,9 @@ class Connection(H11Protocol):
         self.since, self.answered, self._idle = self.loop.time(), False, False
         waiting = _waiting(self.connections)
         if len(waiting) > MAX_WAITING:
-            [(crowded, _)] = Counter(each.address for each in waiting).most_common(1)
-            crowd = (each for each in waiting if each.address == crowded)
+            addresses = [each.client and each.client[0] for each in waiting]
+            crowded = statistics.mode(addresses)
+            crowd = (c for c, at in zip(waiting, addresses, strict=True) if at == crowded)
             min(crowd, key=lambda each: (each.answered, each.since)).transport.abort()
 
     def data_received(self, data: bytes) -> None:
@@ -182,28 +184,15 @@ class Connection(H11Protocol):
         self.since, self.answered, self._idle = self.loop.time(), True, True
         super().on_response_complete()
 
-    @property
     def waits(self) -> bool:
-        """Whether the server needs more from the client before it can answer."""
+        """Return whether the server needs more from the client before it can answer."""
         if self.transport.is_closing():
             return False
         return self.cycle is None or self.cycle.response_complete or self.cycle.more_body
 
-    @property
-    def address(self) -> str:
-        """The client's address."""
-        return self.client[0] if self.client else ""
-
-
-def _close_overdue(connections: Iterable[object], now: float) -> None:
-    """Close the connections that have waited too long at a time of the event loop [s]."""
-    for each in _waiting(connections):
-        if now - each.since > REQUEST_SECONDS:
-            each.transport.abort()
-
 
 def _waiting(connections: Iterable[object]) -> list[Connection]:
-    return [each for each in connections if isinstance(each, Connection) and each.waits]
+    return [each for each in connections if isinstance(each, Connection) and each.waits()]
 
 
 def is_loopback(host: str) -> bool:
@@ -218,18 +207,15 @@ def is_loopback(host: str) -> bool:
 
 def _bound(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # Only with the protocol named does asyncio switch off Nagle's delay of 40 ms.
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind((host, port))
-        listener.listen()  # or another program could listen on the same port
+        listener = socket.create_server((host, port), family=family)
     except OSError as error:
-        listener.close()
         if isinstance(error, socket.gaierror):
             raise InputError("--host", host, "an address of this computer, or 0.0.0.0") from error
         found = f"{host} {port}: {error.strerror or error}"
         raise InputError("port", found, "a free port of this computer", "--port N") from error
+    # Connections inherit it; asyncio would leave Nagle's delay of 40 ms on.
+    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return listener
 
 

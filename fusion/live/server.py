@@ -1,6 +1,6 @@
 """HTTP side of the live server: receives pushes, serves one page.
 
-    GET  /        the page
+    GET  /        the page, with its files below /page
     GET  /events  updates for the page, as server-sent events
     GET  /background?left=-9&right=9&bottom=-9&top=9  map tiles between limits [m], for plotly
     POST /data    a push of Sensor Logger, or lines of JSON (application/x-ndjson)
@@ -18,32 +18,32 @@ could reach it.
 from __future__ import annotations
 
 import asyncio
-import gzip
 import hmac
-import importlib.resources
-import io
 import json
 import logging
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import AbstractAsyncContextManager, suppress
-from functools import cache
-from html import escape
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
+import segno
 from starlette.applications import Starlette
 from starlette.authentication import AuthenticationBackend, AuthenticationError
 from starlette.middleware import Middleware
 from starlette.middleware.authentication import AuthenticationMiddleware
+from starlette.middleware.gzip import GZipMiddleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
-from starlette.routing import Route
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+from starlette.templating import Jinja2Templates
 
 from stario.fusion.live.hub import Hub, Viewer
 from stario.fusion.live.payload import number_from, object_from, parse_lines, parse_push
-from stario.sequences.arrays import check_choice
+from stario.fusion.report.background import tile_images
 from stario.sequences.errors import InputError, StarioError
 from stario.sequences.units import ACCEL_UNITS, known_unit
 
@@ -51,8 +51,6 @@ MAX_BYTES = 4 * 1024 * 1024
 """Maximum size of a push [bytes]."""
 
 LOOPBACK = ["localhost", "127.0.0.1", "[::1]"]
-
-COMMANDS = ("start", "stop", "zero", "fix")
 
 MAX_VIEWERS = 50
 """Maximum number of pages that watch at once."""
@@ -65,12 +63,12 @@ _LINES = "application/x-ndjson"
 _SIDES = ("left", "right"), ("bottom", "top")
 """Limits of the map's axes in a request."""
 
-_POLICY = "content-security-policy"
-_HEADERS = {
-    "cache-control": "no-cache",
-    _POLICY: "default-src 'self'; style-src 'self' 'unsafe-inline'; "
-    "img-src 'self' data: blob:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
-}
+_POLICY = (
+    "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob: {tiles}; "
+    "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
+_HERE = Path(__file__).parent
+_TEMPLATES = Jinja2Templates(_HERE)
 
 _log = logging.getLogger(__name__)
 
@@ -91,6 +89,7 @@ def live_app(
         tiles: address of a map server's tiles; empty for none.
         beside: context of what runs as long as the server.
     """
+    files = _Files(directory=_HERE / "page", packages=[("plotly", "package_data")])
     guard = (
         Middleware(AuthenticationMiddleware, backend=TokenCheck(token), on_error=_unauthorised)
         if token
@@ -99,11 +98,8 @@ def live_app(
     app = Starlette(
         routes=[
             Route("/", _page),
+            Mount("/page", files, middleware=[Middleware(GZipMiddleware, compresslevel=4)]),
             Route("/background", _background),
-            Route("/live.css", _asset("live.css", "text/css")),
-            Route("/live.js", _asset("live.js", "text/javascript")),
-            Route("/plotly.js", _plotly),
-            Route("/page.svg", _page_code),
             Route("/events", _events),
             Route("/data", _data, methods=["POST"]),
             Route("/command", _command, methods=["POST"]),
@@ -115,6 +111,14 @@ def live_app(
     app.state.hub, app.state.token, app.state.host = hub, token, host
     app.state.tiles = tiles
     return app
+
+
+class _Files(StaticFiles):
+    def file_response(self, *arguments: Any, **named: Any) -> Response:
+        """Let a browser ask whether what it has is of this version."""
+        response = super().file_response(*arguments, **named)
+        response.headers["cache-control"] = "no-cache"
+        return response
 
 
 class TokenCheck(AuthenticationBackend):
@@ -131,7 +135,9 @@ class TokenCheck(AuthenticationBackend):
         """Raise an error if a request has no token."""
         bearer = conn.headers.get("authorization", "").removeprefix("Bearer ")
         shown = (conn.query_params.get("token", ""), bearer, conn.cookies.get(_COOKIE, ""))
-        if not any(tokens_match(each, self._token) for each in shown):
+        # In constant time; a text that came from outside may hold anything.
+        token, *given = (each.encode("utf-8", "surrogatepass") for each in (self._token, *shown))
+        if not any(hmac.compare_digest(each, token) for each in given):
             raise AuthenticationError(
                 "token: missing or wrong; add ?token=..., as the server printed when it started"
             )
@@ -140,11 +146,6 @@ class TokenCheck(AuthenticationBackend):
 def _unauthorised(conn: HTTPConnection, error: Exception) -> Response:
     # Without a token nobody keeps a connection.
     return JSONResponse({"error": str(error)}, 401, {"connection": "close"})
-
-
-def tokens_match(shown: str, token: str) -> bool:
-    """Return whether a token equals the required one, in constant time."""
-    return hmac.compare_digest(*(text.encode("utf-8", "surrogatepass") for text in (shown, token)))
 
 
 async def _data(request: Request) -> Response:
@@ -164,7 +165,7 @@ async def _data(request: Request) -> Response:
         else:
             batches = [await asyncio.to_thread(parse_push, body)]
     except InputError as error:
-        hub.refused["http"] += 1
+        hub.refused += 1
         _log.warning("a message is refused: %s", error)  # few apps show the response
         raise
     return JSONResponse({"samples": await hub.take(*batches, accel_factor=ACCEL_UNITS[name])})
@@ -196,7 +197,6 @@ async def _command(request: Request) -> Response:
     _check_origin(request)
     message = object_from("body", await _body(request))
     device, command = (str(message.get(key, "")) for key in ("device", "command"))
-    check_choice("command", command, COMMANDS)
     await hub.command(device, command, **(_fix_values(message) if command == "fix" else {}))
     return JSONResponse({"done": command})
 
@@ -239,24 +239,26 @@ async def _events(request: Request) -> Response:
 
 
 async def _page(request: Request) -> Response:
-    tiles = urlsplit(request.app.state.tiles)
-    text = _content("live.html").decode()
-    text = text.replace("PUSH_URL", escape(_url_for_phones(request, "data")))
-    text = text.replace("TILE_SERVER", escape(tiles.hostname or ""))
-    headers = dict(_HEADERS)
-    if tiles.hostname:
-        source = f"img-src {tiles.scheme}://{tiles.netloc} "
-        headers[_POLICY] = headers[_POLICY].replace("img-src ", source)
-    page = Response(text, media_type="text/html", headers=headers)
-    if token := request.app.state.token:
+    token, tiles = request.app.state.token, urlsplit(request.app.state.tiles)
+    server = f"{tiles.scheme}://{tiles.netloc}" if tiles.hostname else ""
+    code = segno.make(_url_for_phones(request, ""), micro=False).svg_data_uri(scale=4)
+    known = {"push_url": _url_for_phones(request, "data"), "token": token, "code": code}
+    page = _TEMPLATES.TemplateResponse(
+        request,
+        "live.html",
+        {**known, "tile_server": tiles.hostname or ""},
+        headers={
+            "cache-control": "no-cache",
+            "content-security-policy": _POLICY.format(tiles=server),
+        },
+    )
+    if token:
         page.set_cookie(_COOKIE, token, httponly=True, samesite="strict")
     return page
 
 
 async def _background(request: Request) -> Response:
     """Return the map's tiles between limits of its axes; none before a track is on the earth."""
-    from stario.fusion.report.background import tile_images
-
     limits = np.array([[_limit(request, side) for side in axis] for axis in _SIDES])
     if not (limits[:, 0] < limits[:, 1]).all():
         raise InputError("left, bottom", "not below right, top", "limits of the map's axes")
@@ -272,15 +274,6 @@ def _limit(request: Request, side: str) -> float:
     return _metres(side, value)
 
 
-async def _page_code(request: Request) -> Response:
-    """Return the page's address for phones as a QR code."""
-    import segno
-
-    image = io.BytesIO()
-    segno.make(_url_for_phones(request, ""), micro=False).save(image, kind="svg", scale=4)
-    return Response(image.getvalue(), media_type="image/svg+xml", headers=_HEADERS)
-
-
 def _url_for_phones(request: Request, path: str) -> str:
     """Return an address of this server as phones know it, with the token."""
     state = request.app.state
@@ -288,32 +281,6 @@ def _url_for_phones(request: Request, path: str) -> str:
     known = not state.host or request.url.hostname not in (*LOOPBACK, "::1")
     query = f"?token={state.token}" if state.token else ""
     return f"http://{request.url.netloc if known else state.host}/{path}{query}"
-
-
-def _asset(name: str, media: str) -> Any:
-    content = _content(name)
-
-    async def answer(request: Request) -> Response:
-        return Response(content, media_type=media, headers=_HEADERS)
-
-    return answer
-
-
-def _content(name: str) -> bytes:
-    return importlib.resources.files("stario.fusion.live").joinpath(name).read_bytes()
-
-
-async def _plotly(request: Request) -> Response:
-    headers = {"content-encoding": "gzip", "cache-control": "max-age=86400"}
-    content = await asyncio.to_thread(_compressed_plotly)
-    return Response(content, media_type="text/javascript", headers=headers)
-
-
-@cache
-def _compressed_plotly() -> bytes:
-    from plotly.offline import get_plotlyjs
-
-    return gzip.compress(get_plotlyjs().encode(), 6)
 
 
 async def _bad_request(request: Request, error: Exception) -> Response:

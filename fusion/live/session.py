@@ -13,6 +13,7 @@ from stario.fusion.live.payload import BACKWARD, Batch
 from stario.fusion.live.places import Earth
 from stario.fusion.live.track import LiveTrack
 from stario.fusion.navigator import Navigator
+from stario.sequences.arrays import check_choice
 from stario.sequences.errors import InputError
 
 FORWARD = 60 * 10**9
@@ -29,10 +30,8 @@ class Session:
         earth: where the map lies that all devices share.
 
     Attributes:
-        received: time of the last receipt [s since 1970].
+        received: time of the last receipt [s since 1970], set by the hub.
         running: whether data are processed.
-        track: current track.
-        thread: the thread in which the hub uses it.
         pending: number of the hub's calls that are not done.
         order: its pushes that wait for one before them.
     """
@@ -52,6 +51,17 @@ class Session:
         self._previous, self._opened_ns = "", 0  # recording before this, start of this
         self._begin()
 
+    def command(self, name: str, **values: float) -> None:
+        """Do what the page asks for: start, stop, zero or fix.
+
+        Raises:
+            InputError: it is not possible now.
+            OSError: it cannot be written.
+        """
+        commands: dict[str, Callable[..., None]] = {"start": self.start, "stop": self.stop}
+        commands |= {"zero": self.track.zero, "fix": self.track.fix}
+        commands[check_choice("command", name, commands)](**values)
+
     def start(self) -> None:
         """Start a new track and a new recording."""
         self.close()
@@ -64,24 +74,19 @@ class Session:
         self.running = True
 
     def take(self, batch: Batch, received: float, accel_factor: float = 1.0) -> int:
-        """Pass a batch to its track, once its turn has come.
+        """Pass a batch to its track at its turn; return the number of samples processed.
 
         Args:
-            batch: batch of this device.
+            batch: batch of this device, which has passed `check`.
             received: time of receipt [s since 1970].
             accel_factor: factor from its accelerometer's unit to specific force in m/s^2.
 
-        Returns:
-            Number of samples processed.
-
         Raises:
-            InputError: as `check`.
-            OSError: the recording cannot be written.
+            InputError, OSError: the recording cannot be written.
         """
-        self.received, self._factor = received, accel_factor
+        self._factor = accel_factor
         if not self.running:
             return 0
-        self.check(batch)
         if self._is_of_previous(batch):
             self.track.delayed += len(batch.readings)
             return 0
@@ -94,7 +99,9 @@ class Session:
         Raises:
             InputError: it does: two devices have one name.
         """
-        if self.running and self._is_of_previous(batch) and not self._is_late(batch):
+        if not (self.running and self._is_of_previous(batch)):
+            return
+        if batch.number < 0 or batch.middle_ns >= self._opened_ns:
             found = f"samples of two recordings in turn from {self.device!r}"
             fix = "give each phone a name of its own"
             raise InputError("device", found, "one at a time", fix)
@@ -146,9 +153,6 @@ class Session:
         """Return whether a batch is one of the recording before this."""
         named = batch.recording and batch.recording == self._previous != self._recording
         return bool(named and batch.readings)
-
-    def _is_late(self, batch: Batch) -> bool:
-        return batch.number >= 0 and batch.middle_ns < self._opened_ns
 
 
 MAX_DELAY = 0.8

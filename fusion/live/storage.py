@@ -40,15 +40,7 @@ _FIXES_HEADER = ("t", "kind", *"xyz", "sx", "sy", "sz")
 
 
 class LiveFile:
-    """Growing recording, with its fixes in a file next to it.
-
-    Args:
-        folder: folder to write into; created if missing.
-        device: part of the file's name.
-
-    Attributes:
-        path: path of the recording.
-        fixes_path: path of the fixes; the file exists once one was given.
+    """Growing recording of a device in a folder, with its fixes, once there are, next to it.
 
     Raises:
         InputError: the folder or file cannot be created.
@@ -104,13 +96,10 @@ def _write_whole(file: BinaryIO, rows: Iterable[Sequence[object]]) -> None:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     before, data = file.tell(), text.getvalue().encode()
-    try:
-        if file.write(data) < len(data):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    except OSError:
+    if file.write(data) < len(data):
         file.truncate(before)
         file.seek(before)
-        raise
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _new_file(folder: Path, device: str) -> tuple[Path, BinaryIO]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from operator import attrgetter
@@ -58,9 +59,6 @@ class LiveTrack:
         earth: where on the earth the map lies.
 
     Attributes:
-        drawn: displayed track.
-        places: places by satellites.
-        samples: number of samples processed.
         delayed: number of readings that came after a later recording had begun.
     """
 
@@ -95,21 +93,18 @@ class LiveTrack:
         return waiting[-1].time_ns if waiting and self._newest_ns >= 0 else self._newest_ns
 
     def process(self, batch: Batch, received: float, accel_factor: float) -> int:
-        """Write a batch to disk, then pass it to the navigator; return its number of samples.
-
-        Args:
-            batch: batch of this recording.
-            received: time of receipt [s since 1970].
-            accel_factor: factor from its accelerometer's unit to specific force in m/s^2.
-        """
+        """Write a batch to disk, then pass it to the navigator, as `Session.take` got it."""
         readings = batch.credible()
         self._stray += len(batch.readings) - len(readings)
         self._factor = accel_factor
         # Samples wait until they are on disk: when a failed push is repeated, they count as late.
-        samples = [*self._unwritten[0]]
-        for sample in self._merger.add(readings):
-            samples.append(sample._replace(accel=tuple(accel_factor * a for a in sample.accel)))
-        self._merger.add_places(batch.places)
+        samples = [
+            *self._unwritten[0],
+            *(
+                sample._replace(accel=tuple(accel_factor * a for a in sample.accel))
+                for sample in self._merger.add(readings, batch.places)
+            ),
+        ]
         if not samples:
             return 0
         aside = [*self._unwritten[1], *self._merger.aside()]
@@ -200,10 +195,8 @@ class LiveTrack:
 
     def _dropped(self) -> dict[str, int]:
         """Return the number of samples dropped, by reason."""
-        dropped = self._merger.dropped
-        late = dropped["late"] + self.delayed
-        counts = {**dropped, "late": late, "wrong time": self._stray, "not written": self._lost}
-        return {reason: count for reason, count in counts.items() if count}
+        here = {"late": self.delayed, "wrong time": self._stray, "not written": self._lost}
+        return dict(self._merger.dropped + Counter(here))
 
     def _write(self, samples: list[Sample], received: float, aside: list[Reading]) -> None:
         """Write to disk, or keep for the next attempt as much as memory allows."""
@@ -225,32 +218,25 @@ class LiveTrack:
         # Some of the others may lie ahead of the samples, which wait for the accelerometer.
         events: Iterable[Sample | Reading] = heapq.merge(aside, samples, key=attrgetter("time_ns"))
         for each in events:
-            if isinstance(each, Sample):
-                self._push(each)
-            else:
-                self._push_aside(each)
+            time = self._seconds(each.time_ns)
+            try:
+                self._push(time, each)
+            except InputError as error:  # in another unit
+                self._push_error, self._error_time = str(error), time
         self._update_health(self._seconds(samples[-1].time_ns))  # with or without a position
 
-    def _push_aside(self, reading: Reading) -> None:
-        time = self._seconds(reading.time_ns)
-        if reading.sensor == LOCATION:
-            self.places.add(time, reading.value)
-            return
-        try:
-            if reading.sensor == MAG:
-                self._navigator.push_magnetometer(time, reading.value)
-            else:
-                self._navigator.push_pressure(time, *reading.value)
-        except InputError as error:  # in another unit
-            self._push_error, self._error_time = str(error), time
+    def _push(self, time: float, event: Sample | Reading) -> None:
+        if isinstance(event, Sample):
+            self._advance(self._navigator.push(time, event.gyro, event.accel))
+        elif event.sensor == LOCATION:
+            self.places.add(time, event.value)
+        elif event.sensor == MAG:
+            self._navigator.push_magnetometer(time, event.value)
+        else:
+            self._navigator.push_pressure(time, *event.value)
 
-    def _push(self, sample: Sample) -> None:
-        time = self._seconds(sample.time_ns)
-        try:
-            state = self._navigator.push(time, sample.gyro, sample.accel)
-        except InputError as error:
-            self._push_error, self._error_time = str(error), time
-            return
+    def _advance(self, state: NavState | None) -> None:
+        """Draw a new state, after the satellites' fixes up to its time."""
         if state is None:
             return
         if state.time - self._error_time > _ERROR_SECONDS:
@@ -297,8 +283,8 @@ class LiveTrack:
 
     def _count(self, samples: Sequence[Sample]) -> None:
         """Update the number of samples and their rate, smoothed over some batches."""
-        first, last = samples[0].time_ns, samples[-1].time_ns
-        since = self._newest_ns if self._newest_ns >= 0 else first
+        last = samples[-1].time_ns
+        since = self._newest_ns if self._newest_ns >= 0 else samples[0].time_ns
         self._newest_ns = max(self._newest_ns, last)
         self.samples += len(samples)
         if last > since:

@@ -40,30 +40,24 @@ def check_tiles(url: str) -> str:
     return url
 
 
-def add_north(figure: go.Figure) -> None:
-    """Draw an arrow to the north, which is upwards."""
-    arrow = {"ax": 0, "ay": -34, "arrowside": "start", "arrowwidth": 2, "arrowcolor": INK}
-    figure.add_annotation(text="N", x=0.98, y=0.9, bgcolor="white", **arrow, **_note(13))
-
-
-def add_tiles(figure: go.Figure, place: Georeference, url: str) -> None:
-    """Draw the tiles of a map server below a figure with x east and y north.
+def add_place(figure: go.Figure, place: Georeference, tiles: str) -> None:
+    """Draw an arrow to the north, which is upwards, and the tiles of a map server if asked for.
 
     The browser asks the server when it opens the report.
 
     Args:
         figure: the figure, with the limits of its axes [m].
         place: where its origin lies.
-        url: address of a tile, with {z}, {x} and {y}.
+        tiles: address of a tile, with {z}, {x} and {y}; empty for none.
     """
-    limits = np.array([figure.layout.xaxis.range, figure.layout.yaxis.range], dtype=np.float64)
-    figure.update_layout(images=[*tile_images(place, limits, url)])
-    text, white = f"map: {urlsplit(url).hostname}", "rgba(255,255,255,0.8)"
-    figure.add_annotation(text=text, x=1.0, y=0.0, showarrow=False, bgcolor=white, **_note(11))
-
-
-def _note(size: int) -> dict[str, Any]:
-    return {"xref": "paper", "yref": "paper", "font": {"size": size, "color": INK}}
+    note = {"xref": "paper", "yref": "paper"}
+    arrow = {"ax": 0, "ay": -34, "arrowside": "start", "arrowwidth": 2, "arrowcolor": INK}
+    figure.add_annotation(text="N", x=0.98, y=0.9, bgcolor="white", **arrow, **note)
+    if tiles:
+        limits = np.array([figure.layout.xaxis.range, figure.layout.yaxis.range], dtype=np.float64)
+        figure.update_layout(images=[*tile_images(place, limits, tiles)])
+        look = {"showarrow": False, "bgcolor": "rgba(255,255,255,0.8)", "font": {"size": 11}}
+        figure.add_annotation(text=f"map: {urlsplit(tiles).hostname}", x=1.0, y=0.0, **look, **note)
 
 
 def tile_images(place: Georeference, limits: FloatArray, url: str) -> Iterator[dict[str, Any]]:
@@ -84,17 +78,9 @@ def tile_images(place: Georeference, limits: FloatArray, url: str) -> Iterator[d
     for x, y in product(range(int(left), int(right) + 1), range(int(top), int(bottom) + 1)):
         ends = place.xy(_latlon_of(np.array([[x, y], [x + 1, y + 1]]), zoom))
         address = url.replace("{z}", str(zoom)).replace("{x}", str(x)).replace("{y}", str(y))
-        yield {
-            "source": address,
-            "xref": "x",
-            "yref": "y",
-            "x": ends[0, 0],
-            "y": ends[0, 1],
-            "sizex": ends[1, 0] - ends[0, 0],
-            "sizey": ends[0, 1] - ends[1, 1],
-            "sizing": "stretch",
-            "layer": "below",
-        }
+        (west, north), (wide, high) = ends[0], abs(ends[1] - ends[0])
+        fixed = {"xref": "x", "yref": "y", "sizing": "stretch", "layer": "below"}
+        yield {"source": address, "x": west, "y": north, "sizex": wide, "sizey": high, **fixed}
 
 
 def _tile_of(latlon_deg: FloatArray, zoom: int) -> FloatArray:

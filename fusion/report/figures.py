@@ -12,8 +12,8 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from stario.fusion.filter.corrections import Correction
-from stario.fusion.report.background import add_north, add_tiles
-from stario.fusion.report.panels import FAINT, GRID, INK, MAIN, TRUTH, Panel, scatter, style
+from stario.fusion.report.background import add_place
+from stario.fusion.report.panels import FAINT, GRID, INK, MAIN, TRUTH, Panel, marks, scatter, style
 from stario.fusion.report.series import ellipse
 from stario.sequences.arrays import evenly_spaced, interpolated
 from stario.sequences.drawing.figures import clock
@@ -103,9 +103,7 @@ def map_figure(
         yaxis={"title": {"text": titles[1]}, "range": y, "scaleanchor": "x", "scaleratio": 1},
     )
     if place is not None:
-        add_north(figure)
-        if tiles:
-            add_tiles(figure, place, tiles)
+        add_place(figure, place, tiles)
     return figure
 
 
@@ -145,17 +143,13 @@ def _path(
         text += f"<br>%{{customdata[{k}]:.6f}}, %{{customdata[{k + 1}]:.6f}}"
         latlon = place.latlon_deg(np.nan_to_num(series[["x", "y", "z"]])).round(7)
         table = np.column_stack([table, latlon])
-    return scatter(
-        name,
-        series.x,
-        series.y,
-        digits=2,
-        name=label,
-        line={"color": colour, "dash": dash, "width": width},
-        customdata=table.tolist(),
-        hovertemplate=f"<b>{label}</b> at %{{customdata[0]:.1f}} s{text}"
-        "<br>speed %{customdata[1]:.2f} m/s<br>x %{x:.2f} m, y %{y:.2f} m<extra></extra>",
+    stroke = {"color": colour, "dash": dash, "width": width}
+    hover = (
+        f"<b>{label}</b> at %{{customdata[0]:.1f}} s{text}<br>speed %{{customdata[1]:.2f}} m/s"
+        "<br>x %{x:.2f} m, y %{y:.2f} m<extra></extra>"
     )
+    settings = {"name": label, "line": stroke, "customdata": table.tolist(), "hovertemplate": hover}
+    return scatter(name, series.x, series.y, digits=2, **settings)
 
 
 def _outlines(series: pd.DataFrame, largest: float) -> FloatArray:
@@ -188,42 +182,33 @@ def _arrows(series: pd.DataFrame) -> go.Scatter:
         "color": style(MAIN)[1],
         "line": {"color": "white", "width": 1},
     }
-    return scatter(MAIN, *at[moving].to_numpy().T, digits=2, mode="markers", marker=marker)
+    return marks(MAIN, at[moving].to_numpy().T, marker)
 
 
 def _ends(name: str, series: pd.DataFrame) -> go.Scatter:
     """Mark the start with an open circle, the end with a square; those of the main have times."""
     ends = _shown(series, 2).iloc[[0, -1]]
-    marker = {"symbol": ["circle-open", "square"], "size": 9, "line": {"width": 2}}
-    return scatter(
-        name,
-        ends.x,
-        ends.y,
-        digits=2,
-        mode="markers+text" if name == MAIN else "markers",
-        text=[clock(time) for time in ends.index],
-        textposition=["bottom right", "top left"],
-        marker={**marker, "color": style(name)[1]},
+    marker: dict[str, Any] = {"symbol": ["circle-open", "square"], "size": 9, "line": {"width": 2}}
+    marker["color"] = style(name)[1]
+    mode, text = "markers+text" if name == MAIN else "markers", [*map(clock, ends.index)]
+    sides = ["bottom right", "top left"]
+    return marks(
+        name, ends[["x", "y"]].to_numpy().T, marker, mode=mode, text=text, textposition=sides
     )
 
 
 def _corrections(series: pd.DataFrame, corrections: Sequence[Correction]) -> go.Scatter:
     """Mark where the main track was corrected, with time, size and cause."""
     times = np.array([time for time, *_ in corrections])
-    x, y = interpolated(times, series.index, series[["x", "y"]].to_numpy()).T
+    xy = interpolated(times, series.index, series[["x", "y"]].to_numpy()).T
     words = [
         f"{time:.1f} s: corrected by {metres:.1f} m, {math.degrees(turn):.0f} deg<br>{cause}"
         for time, metres, turn, cause in corrections
     ]
     edge = {"color": "black", "width": 1.5}
     marker = {"symbol": "triangle-up", "size": 12, "color": "#F0E442", "line": edge}
-    shown: dict[str, Any] = {
-        "name": "corrected",
-        "mode": "markers",
-        "marker": marker,
-        "text": words,
-    }
-    return scatter(MAIN, x, y, digits=2, hovertemplate="%{text}<extra></extra>", **shown)
+    hover = "%{text}<extra></extra>"
+    return marks(MAIN, xy, marker, name="corrected", text=words, hovertemplate=hover)
 
 
 def _known(known: PositionTrack) -> go.Scatter:
@@ -232,13 +217,7 @@ def _known(known: PositionTrack) -> go.Scatter:
     colour, size, width = (INK, 10, 2) if few else (FAINT, 5, 1)
     marker = {"symbol": "x-thin-open", "color": colour, "size": size, "line": {"width": width}}
     hover = f"{known.kind}: x %{{x:.2f}} m, y %{{y:.2f}} m, fitted to the track<extra></extra>"
-    shown: dict[str, Any] = {
-        "name": known.kind,
-        "mode": "markers",
-        "marker": marker,
-        "hovertemplate": hover,
-    }
-    return scatter("known", *known.position_W[:, :2].T, digits=2, **shown)
+    return marks("known", known.position_W[:, :2].T, marker, name=known.kind, hovertemplate=hover)
 
 
 def _shown(series: pd.DataFrame, most: int) -> pd.DataFrame:

@@ -7,7 +7,7 @@ the next thing to try. `stario.sequences.findings.verdict` joins them with those
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 
 from stario.fusion.imu.front_end import BRIDGED
@@ -65,11 +65,15 @@ def health_findings(health: Health) -> list[Finding]:
         found += [*_flagged(health), *_network(health)]
     elif health.zero_velocity.get("applied", 0) < _RESTING:
         text = "Too early to judge the motion: it takes ten seconds of it."
-        found += [*_flagged(health), Finding(TOO_EARLY, text, level="note")]
+        found += [*_flagged(health), _note(TOO_EARLY, text)]
     found += [*_floors(health), *_corrections(health), *_field(health)]
     found += [*_fixes(health), *_direction(health)]
     notes = (f"{note[:1].upper()}{note[1:]}." for note in health.notes)
     return found + [Finding(f"note_{k}", note) for k, note in enumerate(notes)]
+
+
+def _note(code: str, text: str, values: Mapping[str, object] | None = None) -> Finding:
+    return Finding(code, text, level="note", values=values or {})
 
 
 def _clock(health: Health) -> Iterator[Finding]:
@@ -85,8 +89,7 @@ def _clock(health: Health) -> Iterator[Finding]:
             f"Samples arrived late for {health.longest_late:.1f} s in a row: logged twice, or "
             "from a clock that was set back; if so, that time is missing, and counts as a gap."
         )
-        values = {"longest_s": health.longest_late}
-        yield Finding("samples_late", text, level="note", values=values)
+        yield _note("samples_late", text, {"longest_s": health.longest_late})
 
 
 def _stopped(health: Health) -> Iterator[Finding]:
@@ -112,18 +115,18 @@ def _samples(health: Health) -> Iterator[Finding]:
     share = count / max(1, used + count)
     amount = f"{share:.1%}" if share >= 0.001 else "Fewer than 0.1%"
     text = f"{amount} of the samples were dropped ({_counted(dropped)})."
+    advice = "Log gyroscope and accelerometer at the same rate, and close other apps."
+    if dropped.get("frozen", 0) > 0.5 * count:  # both sensors: of one alone it is told above
+        advice = (
+            "The sensors repeat their values: log them at their own rate; if they stopped for "
+            "good, restart the device and record again."
+        )
+    elif dropped.get("out_of_order", 0) > 0.5 * count:
+        advice = "`stario inspect` says when: sort the rows, or split the recording there."
     if share > DROPPED_SHARE:
-        advice = "Log gyroscope and accelerometer at the same rate, and close other apps."
-        if dropped.get("frozen", 0) > 0.5 * count:  # both sensors: of one alone it is told above
-            advice = (
-                "The sensors repeat their values: log them at their own rate; if they stopped for "
-                "good, restart the device and record again."
-            )
-        elif dropped.get("out_of_order", 0) > 0.5 * count:
-            advice = "`stario inspect` says when: sort the rows, or split the recording there."
         yield Finding("samples_dropped", text, advice, values=dropped)
     elif dropped:
-        yield Finding("samples_dropped", text, level="note", values=dropped)
+        yield _note("samples_dropped", text, dropped)
 
 
 def _flagged(health: Health) -> Iterator[Finding]:
@@ -155,7 +158,7 @@ def _gaps(health: Health) -> Iterator[Finding]:
         restore = "a yaw fix or position fixes after the gap restore the heading"
         yield Finding("gaps", text, f"{logger}; {restore}.", values=values)
     else:
-        yield Finding("gaps", text, level="note", values=values)
+        yield _note("gaps", text, values)
     gaps = [(start, length) for start, length in health.gaps if length > BRIDGED]
     between = [b - (a + length) for (a, length), (b, _) in pairwise(gaps)]
     if short := sum(seconds < START_SECONDS for seconds in between):
@@ -188,7 +191,7 @@ def _network(health: Health) -> Iterator[Finding]:
             "does not mean that the track's sigmas are too large: errors that last as long as the "
             "track do not show here."
         )
-        yield Finding("network_sigma", text, level="note", values={"nis_ratio": ratio})
+        yield _note("network_sigma", text, {"nis_ratio": ratio})
     turn, sigma = health.network_turn, health.network_turn_sigma
     if abs(turn) > max(TURNED_RAD, 3.0 * sigma):
         degrees, spread = math.degrees(turn), math.degrees(sigma)
@@ -219,9 +222,9 @@ def _corrections(health: Health) -> Iterator[Finding]:
 def _floors(health: Health) -> Iterator[Finding]:
     if not health.floors:
         return
-    ways = "; ".join(str(change) for change in health.floors)
-    values = {"floors": [change._asdict() for change in health.floors]}
-    yield Finding("floors", f"{ways[0].upper()}{ways[1:]}.", level="note", values=values)
+    ways = "; ".join(map(str, health.floors))
+    floors = [change._asdict() for change in health.floors]
+    yield _note("floors", f"{ways[0].upper()}{ways[1:]}.", {"floors": floors})
 
 
 def _field(health: Health) -> Iterator[Finding]:
@@ -237,17 +240,15 @@ def _field(health: Health) -> Iterator[Finding]:
         )
     elif offered - health.bearings.get("applied", 0) > 0.5 * offered:
         text = f"The magnetic field was of little use ({_counted(health.bearings)})."
-        yield Finding("field_useless", text, level="note", values=health.bearings)
+        yield _note("field_useless", text, health.bearings)
     if health.fields_dropped > _FIELDS_DROPPED:
         text = (
             f"{health.fields_dropped} magnetic fields were dropped: the sensor repeated its last "
             "value, or their times or values are wrong."
         )
-        values = {"count": health.fields_dropped}
-        yield Finding("fields_dropped", text, level="note", values=values)
+        yield _note("fields_dropped", text, {"count": health.fields_dropped})
     if refused := _counted(health.refused):
-        text = f"Displacements not used: {refused}."
-        yield Finding("displacements_refused", text, level="note", values=health.refused)
+        yield _note("displacements_refused", f"Displacements not used: {refused}.", health.refused)
 
 
 def _fixes(health: Health) -> Iterator[Finding]:
@@ -257,7 +258,7 @@ def _fixes(health: Health) -> Iterator[Finding]:
     other = {name: n for name, n in health.fixes.items() if name != "applied" and n}
     text = "1 fix applied" if applied == 1 else f"{applied} fixes applied"
     if not other:
-        yield Finding("fixes", f"{text}.", level="note", values=health.fixes)
+        yield _note("fixes", f"{text}.", health.fixes)
         return
     harmless = ("gated", "waiting", "yaw not known")
     refused = sum(n for name, n in other.items() if name not in harmless)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import gzip
-import importlib.resources
 import json
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jinja2 import Template
+from jinja2 import Environment, FileSystemLoader
 from plotly.offline import get_plotlyjs
 
 from stario.fusion.evaluation.compare import METRIC_TITLES, Comparison, Metrics
@@ -30,7 +29,8 @@ from stario.fusion.report.panels import (
     numbers,
     style,
 )
-from stario.fusion.report.series import track_series, trajectory_series
+from stario.fusion.report.series import track_series
+from stario.fusion.values.health import Health
 from stario.fusion.values.state import Track
 from stario.sequences.accuracy.metrics import moved
 from stario.sequences.drawing.figures import clock
@@ -41,6 +41,10 @@ from stario.sequences.sequence import ImuSequence
 
 _DIGITS = {"ate_m": 2, "ate_fit_m": 2, "rte_m": 2, "aye_rad": 1, "nees_median": 1, "nis_mean": 1}
 """Decimals of the table's columns."""
+
+_TEMPLATES = Environment(
+    loader=FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True
+)
 
 
 def write_report(path: Path, found: Comparison, tiles: str = "") -> Path:
@@ -67,32 +71,22 @@ def write_report(path: Path, found: Comparison, tiles: str = "") -> Path:
     place = found.georeference if truth is None else None
     yaw = 0.0 if place is None else place.yaw
     series = {
-        name: track_series(found.tracks[name], moved(aligned, yaw, np.zeros(3), np.zeros(3)), start)
+        name: track_series(moved(aligned, yaw, np.zeros(3), np.zeros(3)), start, found.tracks[name])
         for name, aligned in found.aligned().items()
     }
-    true_series = None if truth is None else trajectory_series(truth, start)
+    true_series = None if truth is None else track_series(truth, start)
     # Dead reckoning is kilometres off within a minute: no axis fits it and the others.
     drawn = {name: s for name, s in series.items() if name != "dead_reckoning"}
     mapped = drawn if truth is None else series
-    health, innovations = track.health, track.innovations
-    panels = motion_panels(
-        drawn,
-        true_series,
-        [
-            change._replace(start=change.start - start, stop=change.stop - start)
-            for change in (health.floors if health else [])
-        ],
-    )
-    panels += bias_panels(series[MAIN])
+    health, innovations = track.health or Health(), track.innovations
+    floors = [c._replace(start=c.start - start, stop=c.stop - start) for c in health.floors]
+    panels = motion_panels(drawn, true_series, floors) + bias_panels(series[MAIN])
     if innovations is not None and len(innovations.time):
         panels += innovation_panels(innovations, start)
     known = shown_positions(sequence, track)
     if known is not None:
         known = replace(known, position_W=turned(known.position_W, yaw))
-    corrections = [
-        (t - start, metres, turn, cause)
-        for t, metres, turn, cause in (health.corrections if health else [])
-    ]
+    corrections = [(t - start, m, turn, why) for t, m, turn, why in health.corrections]
     north_up = place and replace(place, yaw=0.0)
     seen_from_above = map_figure(mapped, true_series, known, corrections, north_up, tiles)
     data = {
@@ -100,7 +94,7 @@ def write_report(path: Path, found: Comparison, tiles: str = "") -> Path:
         "time": json.loads(time_figure(panels).to_json()),
         "cursors": [_cursor(name, drawn[name]) for name in sorted(drawn, key=MAIN.__ne__)],
     }
-    page = Template(_asset("report.html"), autoescape=True, trim_blocks=True).render(
+    page = _TEMPLATES.get_template("report.html").render(
         title=sequence.name,
         summary=sequence.summary().removeprefix(f"{sequence.name}: "),
         facts=_facts(sequence, track, series[MAIN]),
@@ -111,19 +105,12 @@ def write_report(path: Path, found: Comparison, tiles: str = "") -> Path:
         titles={key: METRIC_TITLES[key] for key in ([] if truth is None else _DIGITS)},
         metrics={style(name)[0]: [*_cells(m)] for name, m in found.metrics.items()},
         words=found.words,
-        css=_asset("report.css"),
-        script=_asset("report.js"),
         data=_packed(json.dumps(data, separators=(",", ":"))),
         plotly=_packed_plotly(),
     )
     with atomic_write(path) as file:
         file.write(page)
     return path
-
-
-def _asset(name: str) -> str:
-    """Read a text file of this package."""
-    return importlib.resources.files("stario.fusion.report").joinpath(name).read_text("utf-8")
 
 
 @cache

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
+from numpy.typing import ArrayLike
 
 from stario.fusion.values.floors import FloorChange
 from stario.fusion.values.state import Innovations
@@ -63,12 +65,7 @@ def motion_panels(
 ) -> list[Panel]:
     """Return panels of height, speed and yaw, and of position error if there is ground truth.
 
-    The main track has bands; more of them on one another would show none.
-
-    Args:
-        tracks: tables of `series`, by name.
-        truth: ground truth.
-        floors: the main track's changes of floor, in the time of the series.
+    The main track has bands, more of which on one another would show none, and its floors.
     """
     shown = dict(tracks) if truth is None else {TRUTH: truth, **tracks}
     first = next(iter(shown.values()))
@@ -90,31 +87,24 @@ def motion_panels(
 def bias_panels(series: pd.DataFrame) -> list[Panel]:
     """Return a panel per axis of the main track's biases; those of one bias share limits."""
     panels = []
-    for title, name, unit in (
-        ("Gyroscope bias", "gyro", "deg/s"),
-        ("Accelerometer bias", "accel", "m/s^2"),
-    ):
+    biases = ("Gyroscope bias", "gyro", "deg/s"), ("Accelerometer bias", "accel", "m/s^2")
+    for title, name, unit in biases:
         if f"{name} x" not in series:
             continue
-        axes = {
-            axis: _curve(MAIN, series[f"{name} {axis}"], unit, series[f"sigma {name} {axis}"])
+        curves = [
+            _curve(MAIN, series[f"{name} {axis}"], unit, series[f"sigma {name} {axis}"])
             for axis in "xyz"
-        }
-        all_axes = _fitted("", [trace for traces in axes.values() for trace in traces])
+        ]
+        limits = _fitted("", [*chain(*curves)]).layout
         panels += [
-            Panel(f"{title} {axis} [{unit}], band: 3 sigma", traces, all_axes.layout, LOW_HEIGHT)
-            for axis, traces in axes.items()
+            Panel(f"{title} {axis} [{unit}], band: 3 sigma", traces, limits, LOW_HEIGHT)
+            for axis, traces in zip("xyz", curves, strict=True)
         ]
     return panels
 
 
 def innovation_panels(innovations: Innovations, start: float) -> list[Panel]:
-    """Return panels of the innovations by axis with 3 sigma, and of their NIS.
-
-    Args:
-        innovations: innovations of an estimator's updates.
-        start: time of the recording's first sample [s].
-    """
+    """Return panels of the innovations by axis with 3 sigma, and of their NIS, from `start` [s]."""
     rows = evenly_spaced(len(innovations.time), _MAX_POINTS)
     rows = np.union1d(rows, np.flatnonzero(innovations.gated))  # draw all of these
     time, gated = innovations.time[rows] - start, innovations.gated[rows]
@@ -135,7 +125,7 @@ def innovation_panels(innovations: Innovations, start: float) -> list[Panel]:
 
 
 def scatter(
-    group: str, x: FloatArray, y: FloatArray, *, digits: int = 4, **settings: Any
+    group: str, x: ArrayLike, y: ArrayLike, *, digits: int = 4, **settings: Any
 ) -> go.Scatter:
     """Return a trace of a track's group: a line without hover text, but for other settings.
 
@@ -144,6 +134,14 @@ def scatter(
     usual = {"mode": "lines"} if "hovertemplate" in settings else _SILENT
     xy = {"x": numbers(x, 2), "y": numbers(y, digits)}
     return go.Scatter(legendgroup=group, **xy, **usual | settings)
+
+
+def marks(
+    group: str, xy: ArrayLike, marker: Mapping[str, Any], digits: int = 2, **settings: Any
+) -> go.Scatter:
+    """Return markers of a track's group at x and y (2, n), rounded as in `scatter`."""
+    x, y = np.asarray(xy)
+    return scatter(group, x, y, digits=digits, **{"mode": "markers", "marker": marker, **settings})
 
 
 def _curve(
@@ -158,22 +156,15 @@ def _curve(
     rows = np.union1d(evenly_spaced(len(values), _MAX_POINTS), np.flatnonzero(values.isna()))
     time, value = values.index.to_numpy()[rows], values.to_numpy()[rows]
     stroke = {"color": colour, "dash": dash, "width": 1.6}
+    line = scatter(name, time, value, name=label, line=stroke, hovertemplate="")
     hover = f"{label} %{{y:.3g}} {unit}"
     if sigma is None:
-        hover = f"{hover}<extra></extra>"
-        return [scatter(name, time, value, name=label, line=stroke, hovertemplate=hover)]
-    three = 3.0 * sigma.to_numpy()[rows]
+        return [line.update(hovertemplate=f"{hover}<extra></extra>")]
+    one = sigma.to_numpy()[rows]
     hover = f"{hover}, sigma %{{customdata:.2g}} {unit}<extra></extra>"
-    line = scatter(
-        name,
-        time,
-        value,
-        name=label,
-        line=stroke,
-        hovertemplate=hover,
-        customdata=numbers(three / 3),
-    )
-    return [_band(name, time, np.maximum(value - three, lowest), value + three, colour), line]
+    line.update(hovertemplate=hover, customdata=numbers(one))
+    low, high = np.maximum(value - 3.0 * one, lowest), value + 3.0 * one
+    return [_band(name, time, low, high, colour), line]
 
 
 def _floor_lines(height: pd.Series, floors: Sequence[FloorChange]) -> list[go.Scatter]:
@@ -189,9 +180,8 @@ def _floor_lines(height: pd.Series, floors: Sequence[FloorChange]) -> list[go.Sc
             continue
         text = [str(floor) if lines else f"floor {floor}"]
         words: dict[str, Any] = {"mode": "lines+text", "text": text, "textposition": "top right"}
-        dotted = {"color": FAINT, "dash": "dot", "width": 1}
-        level = np.full(2, inside.median())
-        lines.append(scatter(MAIN, np.array([start, stop]), level, line=dotted, **words))
+        words["line"] = {"color": FAINT, "dash": "dot", "width": 1}
+        lines.append(scatter(MAIN, [start, stop], [inside.median()] * 2, **words))
     return lines
 
 
@@ -225,13 +215,8 @@ def _dots(time: FloatArray, value: FloatArray, gated: BoolArray, unit: str) -> l
     for rows, name, marker in ((~gated, "used", used), (gated, "gated", weakened)):
         if rows.any():
             hover = f"{name} %{{y:.3g}} {unit}<extra></extra>"
-            shown: dict[str, Any] = {
-                "name": name,
-                "mode": "markers",
-                "marker": marker,
-                "hovertemplate": hover,
-            }
-            traces.append(scatter(INNOVATION, time[rows], value[rows], **shown))
+            xy = time[rows], value[rows]
+            traces.append(marks(INNOVATION, xy, marker, 4, name=name, hovertemplate=hover))
     return traces
 
 
@@ -254,6 +239,7 @@ def _whole_turns(series: pd.DataFrame, reference: pd.DataFrame) -> float:
     return 0.0 if np.isnan(off) else -360.0 * float(np.round(off / 360.0))
 
 
-def numbers(values: FloatArray, digits: int = 4) -> list[float | None]:
+def numbers(values: ArrayLike, digits: int = 4) -> list[float | None]:
     """Return values as rounded for the screen, None for NaN: as text they need little room."""
-    return [value if value == value else None for value in np.round(values, digits).tolist()]
+    rounded = np.round(np.asarray(values, dtype=np.float64), digits).tolist()
+    return [value if value == value else None for value in rounded]

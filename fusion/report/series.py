@@ -14,50 +14,49 @@ from stario.sequences.sequence import MAX_TRUTH_GAP, FloatArray, Trajectory
 MAX_POINTS = 1000
 """Maximum number of poses drawn per track; a screen shows no more, and the file stays small."""
 
-Columns = dict[str, FloatArray]
 
-
-def track_series(track: Track, aligned: Trajectory, start: float) -> pd.DataFrame:
-    """Return what is drawn of a track.
-
-    Columns are those of `trajectory_series` and, as far as they are known: "sigma speed" [m/s],
-    "sigma yaw" [deg], and of each axis "gyro x" [deg/s], "accel x" [m/s^2], which are biases, with
-    "sigma gyro x" and "sigma accel x".
-
-    Args:
-        track: track, with biases and covariance if it has them.
-        aligned: its trajectory as drawn, pose for pose.
-        start: time of the recording's first sample [s].
-    """
-    columns, P = _columns(aligned), track.covariance
-    if P is not None:
-        sigma = np.sqrt(P[:, range(15), range(15)])
-        if (velocity := track.trajectory.velocity_W) is not None:
-            columns["sigma speed"] = _speed_sigma(velocity, P[:, 3:6, 3:6])
-        columns["sigma yaw"] = np.degrees(sigma[:, 2])
-        biases = ("gyro", track.b_g, 9, np.degrees(1.0)), ("accel", track.b_a, 12, 1.0)
-        for name, bias, first, unit in biases:
-            if bias is None:
-                continue
-            for k, axis in enumerate("xyz"):
-                columns[f"{name} {axis}"] = unit * bias[:, k]
-                columns[f"sigma {name} {axis}"] = unit * sigma[:, first + k]
-    return _thinned(aligned, columns, start)
-
-
-def trajectory_series(trajectory: Trajectory, start: float) -> pd.DataFrame:
+def track_series(trajectory: Trajectory, start: float, track: Track | None = None) -> pd.DataFrame:
     """Return what is drawn of a trajectory; without velocities, speed is taken from positions.
 
     The index is the time since the recording's first sample [s]. Columns are x, y, z [m], speed
     [m/s] and yaw [deg], unwrapped; with a covariance also its xx, xy, yy [m^2], "sigma z" [m] and
     "sigma", the larger semi-axis of the horizontal 1-sigma ellipse [m]. A row is NaN where the pose
-    is not valid, and once in each gap.
+    is not valid, and once in each gap. As far as a track has them: "sigma speed" [m/s], "sigma yaw"
+    [deg], and of each axis "gyro x" [deg/s] and "accel x" [m/s^2], which are biases, with "sigma
+    gyro x" and "sigma accel x".
 
     Args:
-        trajectory: the poses.
+        trajectory: the poses as drawn.
         start: time of the recording's first sample [s].
+        track: the track of which these are the poses, one for one.
     """
-    return _thinned(trajectory, _columns(trajectory), start)
+    velocity, P = trajectory.velocity_W, trajectory.position_covariance_W
+    columns = dict(zip("xyz", trajectory.position_W.T, strict=True))
+    columns["speed"] = _speed(trajectory) if velocity is None else np.linalg.norm(velocity, axis=1)
+    columns["yaw"] = np.degrees(np.unwrap(yaw_of(trajectory.attitude_WB)))
+    if P is not None:
+        columns |= {"xx": P[:, 0, 0], "xy": P[:, 0, 1], "yy": P[:, 1, 1]}
+        columns["sigma z"] = np.sqrt(P[:, 2, 2])
+        columns["sigma"] = np.sqrt(np.linalg.eigvalsh(P[:, :2, :2])[:, 1])
+    if track is not None and track.covariance is not None:
+        columns |= _estimates(track, track.covariance)
+    return _thinned(trajectory, columns, start)
+
+
+def _estimates(track: Track, P: FloatArray) -> dict[str, FloatArray]:
+    """Return the columns of a track beyond its poses, from its covariance (N, 15, 15)."""
+    sigma = np.sqrt(P[:, range(15), range(15)])
+    columns = {"sigma yaw": np.degrees(sigma[:, 2])}
+    if (velocity := track.trajectory.velocity_W) is not None:
+        columns["sigma speed"] = _speed_sigma(velocity, P[:, 3:6, 3:6])
+    biases = ("gyro", track.b_g, 9, np.degrees(1.0)), ("accel", track.b_a, 12, 1.0)
+    for name, bias, first, unit in biases:
+        if bias is None:
+            continue
+        for k, axis in enumerate("xyz"):
+            columns[f"{name} {axis}"] = unit * bias[:, k]
+            columns[f"sigma {name} {axis}"] = unit * sigma[:, first + k]
+    return columns
 
 
 def ellipse(xx: float, xy: float, yy: float) -> FloatArray:
@@ -69,19 +68,7 @@ def ellipse(xx: float, xy: float, yy: float) -> FloatArray:
     return outline.T
 
 
-def _columns(trajectory: Trajectory) -> Columns:
-    velocity, P = trajectory.velocity_W, trajectory.position_covariance_W
-    columns: Columns = dict(zip("xyz", trajectory.position_W.T, strict=True))
-    columns["speed"] = _speed(trajectory) if velocity is None else np.linalg.norm(velocity, axis=1)
-    columns["yaw"] = np.degrees(np.unwrap(yaw_of(trajectory.attitude_WB)))
-    if P is not None:
-        columns |= {"xx": P[:, 0, 0], "xy": P[:, 0, 1], "yy": P[:, 1, 1]}
-        columns["sigma z"] = np.sqrt(P[:, 2, 2])
-        columns["sigma"] = np.sqrt(np.linalg.eigvalsh(P[:, :2, :2])[:, 1])
-    return columns
-
-
-def _thinned(trajectory: Trajectory, columns: Columns, start: float) -> pd.DataFrame:
+def _thinned(trajectory: Trajectory, columns: dict[str, FloatArray], start: float) -> pd.DataFrame:
     """Return at most `MAX_POINTS` rows, with one that is not shown in the middle of each gap."""
     time = trajectory.time
     rows = evenly_spaced(len(time), MAX_POINTS)

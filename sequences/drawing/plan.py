@@ -149,14 +149,8 @@ def _draw_timed_path(
 ) -> tuple[ScalarMappable, str]:
     """Draw a track from above, dark and wide at its start, bright and narrow at its end.
 
-    Args:
-        axes: axes in metres.
-        track: the track; gaps are left out.
-        label: its text in the legend.
-        fine: factor on the widths.
-
-    Returns:
-        Its colours by time since the start [s], for a colour bar, and that of the legend.
+    The widths have a factor `fine`. Returns its colours by time since the start [s], for a colour
+    bar, and that of the legend.
     """
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable

@@ -104,14 +104,8 @@ def draw_error(
 ) -> None:
     """Draw the horizontal error of tracks over time, and the sigma of the first one.
 
-    The sigma is that of the distance, (P_xx + P_yy)^1/2. The axes fit the first track; another may
-    leave them.
-
-    Args:
-        axes: empty axes.
-        tracks: tracks by name, in the truth's frame.
-        truth: the true track.
-        colour: the first one's colour.
+    The sigma is that of the distance, (P_xx + P_yy)^1/2. The axes fit the first track, which has
+    the colour; another may leave them.
     """
     reach = 0.0
     for k, (name, track) in enumerate(tracks.items()):

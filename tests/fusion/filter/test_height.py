@@ -15,7 +15,7 @@ from stario.fusion.filter.height import with_height, yielding
 from stario.fusion.imu.barometer import HeightSample
 from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.report.panels import motion_panels
-from stario.fusion.report.series import trajectory_series
+from stario.fusion.report.series import track_series
 from stario.sequences.atmosphere import standard_pressure
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
@@ -165,7 +165,7 @@ def test_the_check_of_heights_tells_with_from_without(house, level_oracle):
 
 
 def test_the_report_draws_floors_along_the_height(house_track):
-    series = trajectory_series(house_track.trajectory, 0.0)
+    series = track_series(house_track.trajectory, 0.0)
     panels = motion_panels({"track": series}, None, house_track.health.floors)
     labels = [trace.text[0] for trace in panels[0].traces if trace.text]
     assert labels == ["floor 0", "1", "4"]

@@ -207,7 +207,7 @@ def test_every_request_off_loopback_needs_the_token(hub, pushes):
         for answer in (
             client.get("/"),
             client.get("/events"),
-            client.get("/plotly.js"),
+            client.get("/page/plotly.min.js"),
             client.post("/data", content=body),
             client.post("/data?token=secre", content=body),
             command(client, "stop"),
@@ -220,7 +220,7 @@ def test_every_request_off_loopback_needs_the_token(hub, pushes):
         assert client.post("/data", content=body, headers=bearer).status_code == 200
         assert client.get("/").status_code == 401
         assert client.get("/?token=secret").status_code == 200
-        assert client.get("/live.js").status_code == 200  # authorised by the page's cookie
+        assert client.get("/page/live.js").status_code == 200  # authorised by the page's cookie
 
 
 def test_viewers_get_new_points_and_after_a_change_the_whole_track(client, hub, pushes):

@@ -3,7 +3,7 @@
 import plotly.graph_objects as go
 import pytest
 
-from stario.fusion.report.background import add_tiles, check_tiles
+from stario.fusion.report.background import add_place, check_tiles
 from stario.sequences.errors import InputError
 from stario.sequences.geodesy import Georeference
 
@@ -16,7 +16,7 @@ def test_tiles_lie_side_by_side_and_cover_the_drawn_part(size: float) -> None:
     figure = go.Figure()
     figure.update_xaxes(range=[-size, size])
     figure.update_yaxes(range=[-0.2 * size, 0.2 * size])
-    add_tiles(figure, Georeference(51.4779, 0.001), URL)
+    add_place(figure, Georeference(51.4779, 0.001), URL)
     images = figure.layout.images
     assert 4 <= len(images) <= 100
     left, top = min(i.x for i in images), max(i.y for i in images)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.report.figures import map_figure
 from stario.fusion.report.panels import motion_panels
-from stario.fusion.report.series import MAX_POINTS, trajectory_series
+from stario.fusion.report.series import MAX_POINTS, track_series
 from stario.sequences.sequence import PositionTrack, Trajectory
 
 pytest.importorskip("plotly", reason="pip install '.[report]'")
@@ -32,7 +32,7 @@ def stretches(values) -> int:
 def test_map_and_panels_break_where_poses_are_missing(rate):
     time = np.arange(0.0, 60.0, 1.0 / rate)
     track = along_x(time[(time < 20.0) | (time > 27.0)])
-    series = trajectory_series(track, 0.0)
+    series = track_series(track, 0.0)
     assert len(series) <= MAX_POINTS + 1
     inside = series[(series.index > 20.0) & (series.index < 27.0)]
     assert inside.isna().all(axis=None)
@@ -49,7 +49,7 @@ def test_map_and_panels_break_where_poses_are_missing(rate):
 def test_an_error_is_drawn_only_where_the_truth_is_known():
     time = np.arange(0.0, 60.0, 0.1)
     truth = along_x(time[(time < 20.0) | (time > 27.0)])
-    series, true = (trajectory_series(track, 0.0) for track in (along_x(time), truth))
+    series, true = (track_series(track, 0.0) for track in (along_x(time), truth))
     error = motion_panels({"track": series}, true)[0].traces[0]
     x, y = np.asarray(error.x), np.asarray(error.y, dtype=float)
     assert np.isnan(y[(x > 20.05) & (x < 26.95)]).all()
@@ -58,13 +58,13 @@ def test_an_error_is_drawn_only_where_the_truth_is_known():
 
 def test_a_device_at_rest_does_not_fill_the_map():
     track = along_x(np.arange(0.0, 60.0, 0.1), speed=5e-5)  # 3 mm
-    series = trajectory_series(replace(track, position_covariance_W=None), 0.0)
+    series = track_series(replace(track, position_covariance_W=None), 0.0)
     low, high = map_figure({"track": series}, None, None).layout.xaxis.range
     assert high - low >= 1.0
 
 
 def test_known_positions_are_within_the_map():
-    series = trajectory_series(along_x(np.arange(0.0, 10.0, 0.1)), 0.0)
+    series = track_series(along_x(np.arange(0.0, 10.0, 0.1)), 0.0)
     taps = PositionTrack(np.array([1.0, 9.0]), np.array([[0.0, -40.0], [9.0, 0.0]]), "waypoints")
     low, high = map_figure({"track": series}, None, taps).layout.yaxis.range
     assert low < -40.0
@@ -74,7 +74,7 @@ def test_known_positions_are_within_the_map():
 def test_no_ellipse_is_cut_by_the_axes_and_the_speed_band_ends_at_rest():
     track = along_x(np.arange(0.0, 60.0, 0.1))
     wide = np.linspace(0.0, 25.0, len(track.time))[:, None, None] * np.eye(3)  # up to 5 m, 1 sigma
-    series = trajectory_series(replace(track, position_covariance_W=wide), 0.0)
+    series = track_series(replace(track, position_covariance_W=wide), 0.0)
     series["sigma speed"] = 0.8
     figure = map_figure({"track": series}, None, None)
     outline = next(trace for trace in figure.data if trace.name == "3 sigma")
@@ -91,7 +91,7 @@ def test_arrows_point_where_the_device_goes_and_there_are_none_at_rest():
     time = np.arange(0.0, 200.0, 0.1)
     position = np.clip(time, 0.0, 100.0)[:, None] * [0.6, -0.8, 0.0]  # then at rest
     track = replace(along_x(time), position_W=position)
-    figure = map_figure({"track": trajectory_series(track, 0.0)}, None, None)
+    figure = map_figure({"track": track_series(track, 0.0)}, None, None)
     arrows = next(trace for trace in figure.data if trace.marker.symbol == "arrow")
     assert len(arrows.x) == 3
     # Clockwise from up, which is y.
@@ -99,7 +99,7 @@ def test_arrows_point_where_the_device_goes_and_there_are_none_at_rest():
 
 
 def test_a_correction_is_drawn_where_the_device_was_with_its_size_and_cause():
-    series = trajectory_series(along_x(np.arange(0.0, 60.0, 0.1)), 0.0)
+    series = track_series(along_x(np.arange(0.0, 60.0, 0.1)), 0.0)
     found = [(20.0, 2.5, np.radians(4.0), "network")]
     figure = map_figure({"track": series}, None, None, found)
     mark = next(trace for trace in figure.data if trace.name == "corrected")
@@ -108,7 +108,7 @@ def test_a_correction_is_drawn_where_the_device_was_with_its_size_and_cause():
 
 
 def test_many_known_positions_are_drawn_smaller_than_few_and_below_the_track():
-    series = trajectory_series(along_x(np.arange(0.0, 60.0, 0.1)), 0.0)
+    series = track_series(along_x(np.arange(0.0, 60.0, 0.1)), 0.0)
 
     def drawn(count: int):
         at = np.linspace(1.0, 59.0, count)

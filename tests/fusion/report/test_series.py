@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("plotly", reason="pip install '.[report]'")
 
 from stario.fusion.report.panels import motion_panels
-from stario.fusion.report.series import ellipse, track_series, trajectory_series
+from stario.fusion.report.series import ellipse, track_series
 from stario.fusion.values.state import Track
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.sequence import Trajectory
@@ -38,7 +38,7 @@ def along_y(yaw: float = 0.0) -> Track:
 
 
 def series_of(track: Track) -> pd.DataFrame:
-    return track_series(track, track.trajectory, 0.0)
+    return track_series(track.trajectory, 0.0, track)
 
 
 def test_columns_are_in_their_units_with_their_own_sigmas() -> None:
@@ -60,7 +60,7 @@ def test_columns_are_in_their_units_with_their_own_sigmas() -> None:
 
 def test_speed_of_positions_alone_is_their_rate() -> None:
     positions = Trajectory(TIME, np.outer(TIME, [0.0, 1.5, 0.0]), Rotation.identity(len(TIME)))
-    np.testing.assert_allclose(trajectory_series(positions, 0.0).speed, 1.5)
+    np.testing.assert_allclose(track_series(positions, 0.0).speed, 1.5)
 
 
 def test_an_ellipse_is_where_the_mahalanobis_distance_is_three() -> None:
@@ -72,7 +72,7 @@ def test_an_ellipse_is_where_the_mahalanobis_distance_is_three() -> None:
 
 def test_yaws_on_both_sides_of_half_a_turn_are_drawn_next_to_each_other() -> None:
     shown = {
-        name: trajectory_series(along_y(np.radians(yaw)).trajectory, 0.0)
+        name: track_series(along_y(np.radians(yaw)).trajectory, 0.0)
         for name, yaw in (("track", 179.0), ("filtered", -179.0))
     }
     yaw = {trace.name: trace.y for trace in motion_panels(shown, None)[2].traces if trace.name}

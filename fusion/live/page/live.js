@@ -35,8 +35,9 @@
     linecolor: "#767676", showline: true, ticks: "outside", ticklen: 4, tickcolor: "#767676" });
   const font = { family: "system-ui, sans-serif", size: 13, color: "#222222" };
   const base = { font, paper_bgcolor: "white", plot_bgcolor: "white", showlegend: false };
+  const fitted = { autorange: true, autorangeoptions: { include: [-3, 3] } };  // until the map is moved
   const mapLayout = { ...base, margin: { l: 54, r: 10, t: 6, b: 42 }, dragmode: "pan", hovermode: "closest", uirevision: 1,
-    xaxis: { ...axis("x [m]"), range: [-6, 6] }, yaxis: { ...axis("y [m]"), range: [-6, 6], scaleanchor: "x" } };
+    xaxis: { ...axis("x [m]"), ...fitted }, yaxis: { ...axis("y [m]"), ...fitted, scaleanchor: "x" } };
   const rows = [["Position sigma [m]", sigmaOf], ["Speed [m/s]", (p) => p[4]], ["Yaw [deg]", (p) => p[5]]];
   const timeLayout = { ...base, height: 460, margin: { l: 54, r: 10, t: 22, b: 42 }, hovermode: "x", dragmode: false, uirevision: 1,
     grid: { rows: 3, columns: 1, pattern: "independent", ygap: 0.38 },
@@ -47,26 +48,6 @@
     timeLayout[`yaxis${k ? k + 1 : ""}`] = { ...axis(""), ...(k === 2 ? { range: [-185, 185], dtick: 90 } : { rangemode: "tozero" }) };
   });
   const config = { responsive: true, displaylogo: false, displayModeBar: false, scrollZoom: true };
-
-  let following = true;
-  const fitted = () => {
-    const known = [...devices.values()].flatMap((d) => {
-      const points = thinned(d.points).map((p) => [p[10] - d.origin[0], p[11] - d.origin[1]]);
-      if (!points.length) return [];
-      const newest = d.points[d.points.length - 1];
-      const last = [newest[1] - d.origin[0], newest[2] - d.origin[1]];
-      const reach = Math.min(50, 3 * sigmaOf(newest));
-      const places = d.places.map((p) => [p[1] - d.origin[0], p[2] - d.origin[1]]);
-      return [...points, ...places, [last[0] - reach, last[1] - reach], [last[0] + reach, last[1] + reach]];
-    });
-    const [xs, ys] = [0, 1].map((k) => known.map((p) => p[k]));
-    const size = map.getBoundingClientRect();
-    const [wide, high] = [size.width - 64, size.height - 48];
-    const [x0, x1, y0, y1] = [Math.min(-1, ...xs), Math.max(1, ...xs), Math.min(-1, ...ys), Math.max(1, ...ys)];
-    const metres = 1.2 * Math.max((x1 - x0) / wide, (y1 - y0) / high, 6 / wide);
-    const [cx, cy] = [(x0 + x1) / 2, (y0 + y1) / 2];
-    return { x: [cx - 0.5 * metres * wide, cx + 0.5 * metres * wide], y: [cy - 0.5 * metres * high, cy + 0.5 * metres * high] };
-  };
 
   const draw = async () => {
     const [mapTraces, timeTraces, shapes] = [[], [], []];
@@ -82,7 +63,7 @@
         text: d.places.map((p) => `<b>${plain(d.label)}</b>, satellites at ${p[0].toFixed(0)} s${p[3] ? `<br>radius ${p[3].toFixed(0)} m` : ""}`) });
       mapTraces.push({ x: way.map((xy) => xy[0]), y: way.map((xy) => xy[1]), mode: "lines", line, text: points.map(words), hovertemplate: "%{text}<extra></extra>" });
       mapTraces.push({ x: last ? [place(last)[0]] : [], y: last ? [place(last)[1]] : [], mode: "markers+text", text: [plain(d.label)],
-        textposition: d.beside, hoverinfo: "skip", marker: { color: d.colour, symbol: d.symbol, size: 13, line: { color: "white", width: 2 } } });
+        textposition: d.beside, cliponaxis: false, hoverinfo: "skip", marker: { color: d.colour, symbol: d.symbol, size: 13, line: { color: "white", width: 2 } } });
       if (last) shapes.push({ type: "path", path: ellipse(last, d.origin), line: { color: d.colour, width: 1 }, fillcolor: d.colour + "22" });
       rows.forEach(([, value], k) => {
         let before = null;
@@ -96,12 +77,6 @@
         timeTraces.push({ x: points.map((p) => p[0]), y: ys, mode: "lines+markers", line, marker, xaxis: `x${k ? k + 1 : ""}`,
           yaxis: `y${k ? k + 1 : ""}`, hovertemplate: `${plain(d.label)} %{y:.2f}<extra></extra>` });
       });
-    }
-    if (following && mapTraces.length) {
-      const { x, y } = fitted();
-      mapLayout.xaxis.range = x;
-      mapLayout.yaxis.range = y;
-      mapLayout.uirevision += 1;
     }
     mapLayout.shapes = shapes;
     const onEarth = [...devices.values()].some((d) => d.georeferenced);
@@ -173,7 +148,7 @@
     }
   };
   element("tap-cancel").addEventListener("click", () => tap(null));
-  element("fit").addEventListener("click", () => { following = true; redraw(); });
+  element("fit").addEventListener("click", () => Plotly.relayout(map, { "xaxis.autorange": true, "yaxis.autorange": true }));
   const watchMap = () => {
     let pressed = null;
     map.addEventListener("pointerdown", (event) => { pressed = [event.clientX, event.clientY]; }, true);
@@ -190,12 +165,7 @@
       post(tapping, "fix", { x, y, sigma: Number(element("sigma").value) });
       tap(null);
     }, true);
-    map.on("plotly_relayout", (change) => {
-      if ("xaxis.range[0]" in change || "yaxis.range[0]" in change) {
-        following = false;
-        redraw();  // perhaps with other tiles
-      }
-    });
+    map.on("plotly_relayout", redraw);  // perhaps with other tiles
   };
 
   const button = (text, title, act) => {
@@ -284,17 +254,11 @@
       show(device, message.time);
     }
     if (!devices.size !== waiting) element("add").open = waiting = !devices.size;
-    const refused = Object.values(message.refused).reduce((sum, n) => sum + n, 0);
-    connection.textContent = several(devices.size, "device") + (refused ? `, ${several(refused, "message")} rejected` : "");
+    connection.textContent = several(devices.size, "device") + (message.refused ? `, ${several(message.refused, "message")} rejected` : "");
     connection.className = "";
     redraw();
   };
 
-  const forPhones = element("push-url").textContent.includes("?token=");
-  element("local").hidden = forPhones;
-  element("network").hidden = !forPhones;
-  if (forPhones) element("code").src = "page.svg";
-  if (window.innerWidth <= 900) mapLayout.dragmode = "pan";
   draw().then(() => {
     watchMap();
     const events = new EventSource("events" + location.search);
