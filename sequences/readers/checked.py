@@ -107,8 +107,7 @@ def rotations(
     field: str,
     quat: FloatArray,
     order: str = "wxyz",
-    first_row: int = 1,
-    rows: IntArray | None = None,
+    numbers: IntArray | None = None,
 ) -> Rotation:
     """Return rotations from unit quaternions.
 
@@ -117,20 +116,17 @@ def rotations(
         field: name of the quaternions, for errors.
         quat: (N, 4) quaternions.
         order: order of their components, `wxyz` or `xyzw`.
-        first_row: number of the first row, for errors.
-        rows: rows to return the rotations of; all if None.
+        numbers: (N,) numbers of the rows, for errors; from 1 if None.
 
     Raises:
         ReadError: a component is not finite or a norm differs from 1 by more than a percent; the
             error names the field and its row.
     """
-    rows = np.arange(len(quat)) if rows is None else rows
-    quat = quat[rows]
     norm = np.linalg.norm(quat, axis=1)
     bad = ~(np.abs(norm - 1.0) <= NORM_TOLERANCE)
     if bad.any():
         k = int(np.argmax(bad))
-        where = f"row {rows[k] + first_row}, {field}"
+        where = f"row {k + 1 if numbers is None else numbers[k]}, {field}"
         raise ReadError(
             path, where, f"norm {norm[k]:.4g}", "a unit quaternion", "cut the recording there"
         )
@@ -147,15 +143,19 @@ def captured_rotations(quat_xyzw: FloatArray) -> tuple[Rotation, BoolArray]:
     return Rotation.from_quat(np.where(known[:, None], quat_xyzw, [0.0, 0.0, 0.0, 1.0])), known
 
 
-def magnetometer(time: FloatArray, field: FloatArray, held: bool = True) -> Magnetometer | None:
+def magnetometer(
+    time: FloatArray, field: FloatArray | None, held: bool = True
+) -> Magnetometer | None:
     """Return the finite, non-zero samples of a magnetometer whose times advance; None if none.
 
     Args:
         time: (N,) sample times [s].
-        field: (N, 3) magnetic field [uT].
+        field: (N, 3) magnetic field [uT], if there is one.
         held: whether to skip repeated values if more than a third are repeated: some apps write
             the last reading at the IMU's rate.
     """
+    if field is None:
+        return None
     known = np.isfinite(field).all(axis=1) & np.isfinite(time) & field.any(axis=1)
     time, field = time[known], field[known]
     keep = increasing_mask(time)

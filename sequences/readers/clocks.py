@@ -1,8 +1,9 @@
-"""Inference of unnamed time units, and joining of sensors with separate sample times."""
+"""Samples at times of their own clock: its unit, and joining of sensors sampled apart."""
 
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
@@ -11,9 +12,10 @@ import numpy as np
 from stario.sequences.arrays import interpolated
 from stario.sequences.clean_samples import MAX_RATE, MIN_RATE, SHARED_TIMES
 from stario.sequences.errors import ReadError
+from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.phones.sensor_words import XSENS_CLOCK
 from stario.sequences.readers.text import IntArray, seconds
-from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray
+from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray, ImuSequence
 from stario.sequences.time_order import MAX_IMU_GAP, disorder, increasing_mask
 from stario.sequences.units import FILETIME_1970, FILETIME_NS, TIME_UNITS
 
@@ -46,19 +48,52 @@ _FEW_ROWS = 10
 """Number of rows below which a count may be a coincidence."""
 
 
+@dataclass(frozen=True)
+class Samples:
+    """Samples of a sensor.
+
+    Attributes:
+        stamps_ns: (N,) times [ns].
+        values: (N, K) values.
+        unit: unit named in the file; empty if none.
+        assumed_time_unit: unit that times without one were taken for; empty if it is certain.
+    """
+
+    stamps_ns: IntArray
+    values: FloatArray
+    unit: str = ""
+    assumed_time_unit: str = ""
+
+    def seconds(self, origin_ns: np.int64) -> FloatArray:
+        """Return the times (N,) [s] since an origin."""
+        return seconds(self.stamps_ns, origin_ns)
+
+
+def joined_sequence(
+    path: Path, name: str, gyro: Samples, accel: Samples, mag: Samples | None = None
+) -> tuple[ImuSequence, np.int64]:
+    """Return a recording of sensors sampled apart, and its first sample's time [ns].
+
+    Raises:
+        ReadError: as for `resample_to_gyro`.
+    """
+    stamps, rate, force = resample_to_gyro(path, gyro, accel)
+    start_ns = stamps[0]
+    field = None if mag is None else magnetometer(mag.seconds(start_ns), mag.values)
+    time = seconds(stamps, start_ns)
+    return ImuSequence(name, time, rate, force, magnetometer=field), start_ns
+
+
 def resample_to_gyro(
     path: Path,
-    gyro_ns: IntArray,
-    gyro: FloatArray,
-    accel_ns: IntArray,
-    accel: FloatArray,
+    gyro: Samples,
+    accel: Samples,
     names: tuple[str, str] = ("gyroscope", "accelerometer"),
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Interpolate the accelerometer to the gyroscope's samples in their common time span.
 
     Samples in an accelerometer gap of more than 0.1 s are skipped, since the force there is
-    unknown. Times are in ns from one origin: (N,) with samples (N, 3) of the gyroscope, (M,) with
-    samples (M, 3) of the accelerometer; `names` are for messages if they are other sensors'.
+    unknown. Both clocks have one origin; `names` are for messages if they are other sensors'.
 
     Returns:
         Time stamps (K,) [ns], gyroscope (K, 3) and accelerometer (K, 3).
@@ -66,13 +101,14 @@ def resample_to_gyro(
     Raises:
         ReadError: the two sensors do not overlap in time, or the accelerometer's rate is too low.
     """
-    accel_ns, accel = _sorted_samples(path, names[1], accel_ns, accel)
+    accel = _sorted_samples(path, names[1], accel)
+    gyro_ns, accel_ns = gyro.stamps_ns, accel.stamps_ns
     kept = (gyro_ns >= accel_ns[0]) & (gyro_ns <= accel_ns[-1])
     if not kept.any():
         origin = min(gyro_ns.min(), accel_ns[0])
         spans = [
-            f"{name} from {seconds(ns, origin).min():.3f} to {seconds(ns, origin).max():.3f} s"
-            for name, ns in zip(names, (gyro_ns, accel_ns), strict=True)
+            f"{name} from {time.min():.3f} to {time.max():.3f} s"
+            for name, time in zip(names, (gyro.seconds(origin), accel.seconds(origin)), strict=True)
         ]
         raise ReadError(path, "time", ", ".join(spans), "overlapping times on one clock")
     right = np.clip(np.searchsorted(accel_ns, gyro_ns), 1, len(accel_ns) - 1)
@@ -88,19 +124,19 @@ def resample_to_gyro(
             "%s: dropped %d of %d samples at whose times only one of two sensors was recorded",
             path, lost, len(kept),
         )  # fmt: skip
-    time, t = seconds(gyro_ns[kept], accel_ns[0]), seconds(accel_ns, accel_ns[0])
-    return gyro_ns[kept], gyro[kept], interpolated(time, t, accel)
+    time = seconds(gyro_ns[kept], accel_ns[0])
+    force = interpolated(time, accel.seconds(accel_ns[0]), accel.values)
+    return gyro_ns[kept], gyro.values[kept], force
 
 
-def _sorted_samples(
-    path: Path, name: str, stamps_ns: IntArray, values: FloatArray
-) -> tuple[IntArray, FloatArray]:
+def _sorted_samples(path: Path, name: str, samples: Samples) -> Samples:
     """Return a sensor's samples by increasing time, one at each, for interpolation.
 
     Rows late by milliseconds are sorted. Those of a clock that was set back are dropped: sorted,
     they would alternate with samples from another time.
     """
-    time = seconds(stamps_ns, stamps_ns[0])
+    stamps_ns, values = samples.stamps_ns, samples.values
+    time = samples.seconds(stamps_ns[0])
     set_back = float((np.maximum.accumulate(time) - time).max())
     if set_back > MAX_IMU_GAP and not disorder(time):
         kept = increasing_mask(time)
@@ -114,7 +150,7 @@ def _sorted_samples(
     fresh = np.append(True, np.diff(stamps_ns) > 0)
     differing = np.append(True, np.diff(values, axis=0).any(axis=1))
     _warn_of_few_times(path, name, stamps_ns[fresh], fresh | differing)
-    return stamps_ns[fresh], values[fresh]
+    return Samples(stamps_ns[fresh], values[fresh])
 
 
 def _warn_of_few_times(path: Path, name: str, stamps_ns: IntArray, samples: BoolArray) -> None:

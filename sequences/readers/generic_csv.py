@@ -46,6 +46,7 @@ from stario.sequences.readers.checked import (
 )
 from stario.sequences.readers.clocks import (
     LATEST_S,
+    Samples,
     assumed_unit,
     refuse_counts_and_dates,
     resample_to_gyro,
@@ -271,9 +272,11 @@ def _samples(
     if with_accel.sum() < 2 or not _in_separate_rows(with_accel[with_gyro]):
         return rows, rows.time[rows.is_imu], gyro[rows.is_imu], accel[rows.is_imu]
     ns = np.rint(np.where(known, rows.time, 0.0) * 1e9).astype(np.int64)
-    stamps, rate, force = resample_to_gyro(
-        path, ns[with_gyro], gyro[with_gyro], ns[with_accel], accel[with_accel]
+    of_gyro, of_accel = (
+        Samples(ns[rows_of], values[rows_of])
+        for rows_of, values in ((with_gyro, gyro), (with_accel, accel))
     )
+    stamps, rate, force = resample_to_gyro(path, of_gyro, of_accel)
     rows = replace(rows, time=rows.time - float(stamps[0]) * 1e-9)
     return rows, seconds(stamps, stamps[0]), rate, force
 

@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
-from stario.sequences.readers.clocks import resample_to_gyro, source_words
+from stario.sequences.readers.clocks import Samples, resample_to_gyro, source_words
 from stario.sequences.readers.columns import IMU, POSITION, named_columns
 from stario.sequences.readers.lines import head_lines, may_be_read
 from stario.sequences.readers.phones.alongside import (
@@ -51,7 +51,7 @@ from stario.sequences.readers.phones.files import (
     is_complete,
     phone_recordings,
 )
-from stario.sequences.readers.phones.samples import Samples, read_samples
+from stario.sequences.readers.phones.samples import read_samples
 from stario.sequences.readers.phones.sensor_layout import SensorTable, sensor_table
 from stario.sequences.readers.phones.sensor_words import (
     Sensor,
@@ -186,9 +186,7 @@ def assemble_recording(
     gyro = _read(files.tables["gyro"][0], "gyro")
     attitude = logged_attitude(files, gyro)
     accel, converted, maybe_apple = _force(files, attitude, core_motion)
-    stamps, rate, force = resample_to_gyro(
-        folder, gyro.stamps_ns, gyro.values, accel.stamps_ns, accel.values
-    )
+    stamps, rate, force = resample_to_gyro(folder, gyro, accel)
     converted["gyro"] = gyro.unit not in ("", "rad/s")
     recording = Recording(files.gyro, files.key, stamps[0], stamps[-1])
     reported = reported_positions(recording)
@@ -239,9 +237,8 @@ def _force(
     in_two_parts = total is None and gravity is not None
     if total is None and gravity is not None:
         stamps, force, gravity_B = resample_to_gyro(
-            files.gyro.parent, accel.stamps_ns, accel.values, gravity.stamps_ns, gravity.values,
-            ("linear acceleration", "gravity"),
-        )  # fmt: skip
+            files.gyro.parent, accel, gravity, ("linear acceleration", "gravity")
+        )
         accel = replace(accel, stamps_ns=stamps, values=force + gravity_B)
         _log.info("%s: added gravity from its own columns or file", files.shown)
     in_g = not accel.unit and is_in_g(accel.values)
@@ -282,4 +279,4 @@ def _magnetometer(files: PhoneFiles, start_ns: np.int64, stop_ns: np.int64) -> M
     if not inside.any():
         _log.warning("magnetometer skipped: none of its samples is within the recording")
         return None
-    return magnetometer(seconds(samples.stamps_ns, start_ns), samples.values)
+    return magnetometer(samples.seconds(start_ns), samples.values)

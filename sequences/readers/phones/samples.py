@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.clocks import assumed_unit, refuse_counts_and_dates, time_unit
+from stario.sequences.readers.clocks import (
+    Samples,
+    assumed_unit,
+    refuse_counts_and_dates,
+    time_unit,
+)
 from stario.sequences.readers.columns import unit_factor
 from stario.sequences.readers.phones.sensor_layout import SensorTable
 from stario.sequences.readers.phones.sensor_words import SENSORS, Sensor
@@ -21,23 +25,6 @@ _log = logging.getLogger(__name__)
 
 _WILD = 100.0
 """Factor beyond a sensor's limit at which one sample would spoil integrals and interpolation."""
-
-
-@dataclass(frozen=True)
-class Samples:
-    """Samples of a sensor.
-
-    Attributes:
-        stamps_ns: (N,) times [ns].
-        values: (N, 3) values.
-        unit: unit named in the file; empty if none.
-        assumed_time_unit: unit that times without one were taken for; empty if it is certain.
-    """
-
-    stamps_ns: IntArray
-    values: FloatArray
-    unit: str = ""
-    assumed_time_unit: str = ""
 
 
 def read_samples(table: SensorTable, sensor: Sensor, axes: str) -> Samples:

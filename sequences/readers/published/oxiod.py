@@ -28,7 +28,7 @@ from scipy.ndimage import binary_dilation, median_filter
 from stario.sequences.arrays import samples_in
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.checked import captured_rotations, magnetometer
-from stario.sequences.readers.clocks import resample_to_gyro, time_unit
+from stario.sequences.readers.clocks import Samples, joined_sequence, time_unit
 from stario.sequences.readers.lines import first_lines, first_numbers, numbers_in
 from stario.sequences.readers.text import IntArray, Table, read_table, seconds
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
@@ -102,12 +102,11 @@ def _sensor_rows(path: Path) -> tuple[ImuSequence, np.int64 | None]:
     """Read a file with a row for each sample of each sensor, at its own time."""
     table = read_table(path, columns=5)
     stamps, code = _stamps_ns(table), table.values[:, 1]
-    gyro, accel, magnetic = (code == c for c in (_GYROSCOPE, _ACCELEROMETER, _MAGNETIC))
-    xyz = table.values[:, 2:5]
-    imu_ns, rate, force = resample_to_gyro(path, stamps[gyro], xyz[gyro], stamps[accel], xyz[accel])
-    field = magnetometer(seconds(stamps[magnetic], imu_ns[0]), xyz[magnetic])
-    time = seconds(imu_ns, imu_ns[0])
-    return ImuSequence(_name(path), time, rate, force, magnetometer=field), imu_ns[0]
+    gyro, accel, field = (
+        Samples(stamps[code == c], table.values[code == c, 2:5])
+        for c in (_GYROSCOPE, _ACCELEROMETER, _MAGNETIC)
+    )
+    return joined_sequence(path, _name(path), gyro, accel, field)
 
 
 def _stamps_ns(table: Table) -> IntArray:
