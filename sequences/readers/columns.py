@@ -43,16 +43,6 @@ MAGNETIC_HEADER = "mx [uT],my [uT],mz [uT]"
 PRESSURE_HEADER = "p [hPa]"
 """Optional pressure of the air."""
 
-SATELLITE_HEADER = {
-    "lat": "lat [deg]",
-    "lon": "lon [deg]",
-    "alt": "alt [m]",
-    "acc": "acc [m]",
-    "speed": "speed [m/s]",
-    "bearing": "bearing [deg]",
-}
-"""Optional columns of a satellite receiver by canonical name; all but the first two may lack."""
-
 _log = logging.getLogger(__name__)
 
 Factor = TypeVar("Factor")
@@ -63,16 +53,22 @@ TRUTH = POSITION + QUAT
 SIGMA = "sp"
 MAGNETIC = ("mx", "my", "mz")
 PRESSURE = "p"
-RARE = (PRESSURE, *SATELLITE_HEADER)
-"""Quantities that some rows hold; a column of one in another unit is not read."""
-QUANTITIES = (*IMU, *MAGNETIC, *TRUTH, SIGMA, *RARE)
 
 RARE_UNITS: dict[str, Mapping[str, float]] = {
     PRESSURE: PRESSURE_UNITS | {"": math.nan},
     **dict.fromkeys(("lat", "lon"), DEGREES),
     **{name: UNITS[attribute] for name, attribute in OPTIONAL.items()},
 }
-"""Factors of their units; that of a pressure without one is told from its size."""
+"""Factors of the units of what some rows hold; a column in another unit is not read. The unit of a
+pressure without one is told from its size."""
+
+SATELLITE_HEADER = {
+    name: f"{name} [{next(iter(units))}]" for name, units in RARE_UNITS.items() if name != PRESSURE
+}
+"""Optional columns of a satellite receiver by canonical name; all but the first two may lack."""
+
+RARE = tuple(RARE_UNITS)
+QUANTITIES = (*IMU, *MAGNETIC, *TRUTH, SIGMA, *RARE)
 
 _STEMS = {
     "g": ("gyro", "gyr", "gyroscope", "w", "omega", "angular_velocity", "w_rs_s"),
@@ -210,18 +206,20 @@ def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
         expected += f",{MAGNETIC_HEADER}" if set(MAGNETIC) & set(missing) else ""
         raise ReadError(path, f"line {number}, header", f"no {', '.join(missing)}", expected, fix)
     if ignored:
-        _log.info("%s: columns ignored: %s", path, ", ".join(ignored))
-        if others := [title for title in ignored if _is_of_an_imu(title)]:
-            _log.warning("%s: columns of another IMU are not read: %s", path, ", ".join(others))
-        truth_like = [title for title in ignored if _LIKE_TRUTH.match(title)]
-        if truth_like and not truth:
-            _log.warning(
-                "%s: no ground truth is read from %s: it must have %s",
-                path, ", ".join(truth_like), TRUTH_HEADER,
-            )  # fmt: skip
+        _log_ignored(path, ignored, bool(truth))
     for name in (*truth, *([SIGMA] if SIGMA in columns else [])):
         unit_factor(path, columns[name], {"": 1.0} if name in QUAT else {"m": 1.0, "": 1.0})
     return columns
+
+
+def _log_ignored(path: Path, ignored: list[str], has_truth: bool) -> None:
+    _log.info("%s: columns ignored: %s", path, ", ".join(ignored))
+    if others := [title for title in ignored if _is_of_an_imu(title)]:
+        _log.warning("%s: columns of another IMU are not read: %s", path, ", ".join(others))
+    truth_like = ", ".join(title for title in ignored if _LIKE_TRUTH.match(title))
+    if truth_like and not has_truth:
+        message = "%s: no ground truth is read from %s: it must have %s"
+        _log.warning(message, path, truth_like, TRUTH_HEADER)
 
 
 def _is_of_an_imu(title: str) -> bool:
