@@ -72,11 +72,7 @@ _LARGEST_DEGREES = 90.0, 180.0
 
 
 def checked(path: Path, field: str, values: FloatArray) -> FloatArray:
-    """Return values (N,) or (N, K) if all are finite.
-
-    Raises:
-        ReadError: one is not; the error names the field and its row, counted from 1.
-    """
+    """Return values (N,) or (N, K) if all are finite."""
     good = np.isfinite(values).reshape(len(values), -1).all(axis=1)
     if not good.all():
         k = int(np.argmin(good))
@@ -87,11 +83,7 @@ def checked(path: Path, field: str, values: FloatArray) -> FloatArray:
 
 
 def finite_rows(path: Path, field: str, values: FloatArray) -> IntArray:
-    """Return the rows of values (N,) or (N, K) that are finite, and warn of the others.
-
-    Raises:
-        ReadError: most are not finite; the error names the field.
-    """
+    """Return the rows of values (N,) or (N, K) that are finite, and warn of the others."""
     rows = np.flatnonzero(np.isfinite(values).reshape(len(values), -1).all(axis=1))
     if lost := len(values) - len(rows):
         if lost > len(values) / 2:
@@ -260,9 +252,6 @@ def in_degrees(path: Path, latlon_deg: FloatArray) -> FloatArray:
     """Return latitudes and longitudes (N, 2), exchanged if only that makes them places.
 
     A few rows may hold anything; a single one proves nothing.
-
-    Raises:
-        ReadError: no row is in degrees.
     """
     present = latlon_deg[np.isfinite(latlon_deg).all(axis=1) & latlon_deg.any(axis=1)]
     if len(present) < 2 or known_places(present).any():

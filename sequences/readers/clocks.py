@@ -72,11 +72,7 @@ class Samples:
 def joined_sequence(
     path: Path, name: str, gyro: Samples, accel: Samples, mag: Samples | None = None
 ) -> tuple[ImuSequence, np.int64]:
-    """Return a recording of sensors sampled apart, and its first sample's time [ns].
-
-    Raises:
-        ReadError: as for `resample_to_gyro`.
-    """
+    """Return a recording of sensors sampled apart, and its first sample's time [ns]."""
     stamps, rate, force = resample_to_gyro(path, gyro, accel)
     start_ns = stamps[0]
     field = None if mag is None else magnetometer(mag.seconds(start_ns), mag.values)
@@ -176,9 +172,6 @@ def refuse_counts_and_dates(file: Path, title: str, time: FloatArray) -> None:
 
     Rows are counted as 0, 1, 2, ... or 1, 2, 3, ...; digits such as 20240501120059990 are a date
     and a time of day to the millisecond. Taken for one of the units either would be plausible.
-
-    Raises:
-        ReadError: the column holds either; not raised for fewer than ten rows.
     """
     count = len(time)
     if count < _FEW_ROWS:
@@ -212,9 +205,6 @@ def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.in
         time: (N,) in an unknown unit.
         start_ns: time of the recording's first sample on the same clock [ns].
         stop_ns: time of its last sample [ns].
-
-    Raises:
-        ReadError: no unit gives a time within a minute of the recording.
     """
     start, stop = float(start_ns) * 1e-9 - _MARGIN_S, float(stop_ns) * 1e-9 + _MARGIN_S
     # Times from zero fit finer units as well, but all at the start.

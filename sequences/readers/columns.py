@@ -124,11 +124,7 @@ class Header:
 
 
 def read_header(path: Path, lines: list[str]) -> Header:
-    """Return the header found in a file's lines.
-
-    Raises:
-        ReadError: there is none, or its columns or their units are invalid.
-    """
+    """Return the header found in a file's lines."""
     index = _header_index(lines)
     if index is None:
         raise ReadError(path, "header", "only comments", HEADER)

@@ -20,7 +20,12 @@ from stario.sequences.arrays import number_in
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.checked import checked
 from stario.sequences.readers.lines import is_row, read_lines
-from stario.sequences.readers.phones.files import is_complete, may_hold, names_both_sensors
+from stario.sequences.readers.phones.files import (
+    is_complete,
+    may_hold,
+    names_both_sensors,
+    text_files,
+)
 from stario.sequences.readers.phones.sensor_layout import clock_of
 from stario.sequences.readers.phones.sensor_words import sensor_of, words_of
 from stario.sequences.readers.table_head import TableHead, table_heads
@@ -218,14 +223,13 @@ def _texts(file: Path, least: int = 3) -> list[list[str]]:
 
 
 def _time_files(folder: Path) -> list[Path]:
-    return [f for f in sorted(folder.iterdir()) if may_hold(f) and set(words_of(f.stem)) <= _TIMES]
+    return [file for file, words in text_files(folder) if set(words) <= _TIMES]
 
 
 def _sensor_files(folder: Path) -> dict[str, list[Path]]:
     """Return a folder's files of gyroscopes, accelerometers and magnetometers."""
     files: dict[str, list[Path]] = {}
-    for file in sorted(folder.iterdir()):
-        sensor = sensor_of(words_of(file.stem)) if may_hold(file) else None
-        if sensor in ("gyro", "accel", "mag"):
+    for file, words in text_files(folder):
+        if (sensor := sensor_of(words)) in ("gyro", "accel", "mag"):
             files.setdefault(sensor, []).append(file)
     return files

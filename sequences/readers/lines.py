@@ -83,11 +83,7 @@ def read_json(path: Path) -> Any:
 
 
 def _without_padding(path: Path, content: bytes) -> bytes:
-    """Return a file's text without the zeros that a recorder which lost power left at its end.
-
-    Raises:
-        ReadError: there are zeros elsewhere, as in binary files.
-    """
+    """Return a file's text without the zeros that a recorder which lost power left at its end."""
     text = content.rstrip(b"\0")
     if b"\0" in text:
         raise ReadError(path, "file", "binary data", "UTF-8 text")

@@ -66,11 +66,7 @@ class TableHead:
     dates: frozenset[int] = frozenset()
 
     def read(self, columns: int | list[int]) -> Table:
-        """Read columns, given their number or indices, without a last row that is cut short.
-
-        Raises:
-            ReadError: a row is malformed.
-        """
+        """Read columns, given their number or indices, without a last row that is cut short."""
         return read_table(self.file, columns, self.row_format, killed=True)
 
     def clock(self, column: Column) -> Column:
@@ -188,9 +184,6 @@ def refuse_several_devices(table: Table, titles: Sequence[str], column: int) -> 
         table: the rows.
         titles: titles of the file's columns.
         column: index of a column of the sensor; rows in which it is blank do not count.
-
-    Raises:
-        ReadError: there are at least two devices.
     """
     for index, title in enumerate(titles):
         if "".join(words_of(title)) not in _TITLES:

@@ -31,7 +31,7 @@ from stario.sequences.readers.checked import (
 )
 from stario.sequences.readers.clocks import unit_within
 from stario.sequences.readers.columns import Column
-from stario.sequences.readers.phones.files import SUFFIXES
+from stario.sequences.readers.phones.files import text_files
 from stario.sequences.readers.phones.sensor_layout import clock_of
 from stario.sequences.readers.phones.sensor_words import is_time, sensor_of, unit_of, words_of
 from stario.sequences.readers.table_head import TableHead, table_heads
@@ -111,9 +111,6 @@ class _Columns:
         """Return the rows (N,) of `known` ones that hold something new within a recording.
 
         Their times [s] are returned as well.
-
-        Raises:
-            ReadError: all of several rows are at other times.
         """
         if self.held:
             values = table.values[:, 1:]
@@ -146,12 +143,8 @@ def _tables_alongside(
 ) -> Iterator[_Columns]:
     """Yield the tables that hold some quantities, the sensors' own first; never raises.
 
-    Args:
-        recording: the recording.
-        names: words of which the name of a file of theirs has one.
-        least: fewest numbers in a row.
-        places_in: function that returns the quantities' columns in a table, given also whether it
-            is the sensors'; none if it does not hold them.
+    Rows have at least `least` numbers, other files' names one of the words `names`. `places_in`
+    returns the columns in a table, given also whether it is the sensors'; none if it lacks them.
     """
     for file in (recording.sensors, *_files_named(recording, names)):
         own = file == recording.sensors
@@ -172,10 +165,9 @@ def _files_named(recording: Recording, names: set[str]) -> list[Path]:
     Not those of another recording: `two_gps.csv` next to `one_gyr.csv`.
     """
     key, found = set(recording.key.split()), []
-    for file in sorted(recording.sensors.parent.iterdir()):
-        words = set(words_of(file.stem))
-        mine = key <= words or words - names <= key
-        if file.suffix.lower() in SUFFIXES and names & words and mine:
+    for file, listed in text_files(recording.sensors.parent):
+        words = set(listed)
+        if names & words and (key <= words or words - names <= key):
             # `LocationGps.csv` holds satellite positions only, `Location.csv` those of all sources.
             found.append((not {"gps", "gnss"} & words, len(file.stem), file))
     return [file for *_, file in sorted(found)]
@@ -308,17 +300,11 @@ def as_known_positions(reported: Satellites) -> PositionTrack | None:
 
 
 def reference_points(recording: Recording) -> PositionTrack | None:
-    """Return the waypoints of a file such as `*_ref.csv` (time, x, y [m]), or None without one.
-
-    Raises:
-        ReadError: a row is malformed.
-    """
-    for file in sorted(recording.sensors.parent.iterdir()):
-        words = set(words_of(file.stem))
-        if file.suffix.lower() not in (".csv", ".txt") or not _POINT_FILES & words:
-            continue
-        head = next(table_heads(file, least=3), None)
-        if head is None or not set(recording.key.split()) <= words:
+    """Return the waypoints of a file such as `*_ref.csv` (time, x, y [m]), or None without one."""
+    for file, words in text_files(recording.sensors.parent):
+        named = _POINT_FILES & set(words) and set(recording.key.split()) <= set(words)
+        head = next(table_heads(file, least=3), None) if named else None
+        if head is None:
             continue
         table = head.read(3)
         unit = unit_within(file, table.values[:, 0], recording.start_ns, recording.stop_ns)

@@ -175,9 +175,6 @@ def assemble_recording(
         poses: pose files alongside them.
         orders: orders to try for their attitude, as for `with_pose`.
         core_motion: whether an iPhone wrote the files: values in g have Apple's sign.
-
-    Raises:
-        ReadError: a file is malformed or the sensors do not overlap in time.
     """
     folder = files.gyro.parent
     for file in files.unread:

@@ -31,10 +31,6 @@ def read_samples(table: SensorTable, sensor: Sensor, axes: str) -> Samples:
     """Read a sensor's samples in the columns `table.axes[axes]`.
 
     They are in rad/s, m/s^2 or uT if the file names a unit.
-
-    Raises:
-        ReadError: a row is malformed, a unit is unknown, a value exceeds any sensor's, or the
-            file holds several IMUs of which none can be chosen.
     """
     if table.conflict:
         fix = "keep the columns of one"
@@ -74,11 +70,7 @@ def _complete_rows(file: Path, sensor: Sensor, titles: str, values: FloatArray) 
 
 
 def _sound_samples(file: Path, sensor: Sensor, titles: str, values: FloatArray) -> BoolArray:
-    """Return which samples (N,) are not wild, such as infinite, and warn of those that are.
-
-    Raises:
-        ReadError: most exceed any sensor's.
-    """
+    """Return which samples (N,) are not wild, such as infinite, and warn of those that are."""
     size = np.abs(values).max(axis=1)
     typical = float(np.median(size))
     if typical > SENSORS[sensor].limit:

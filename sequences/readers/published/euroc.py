@@ -50,11 +50,7 @@ def read_euroc(path: Path) -> ImuSequence:
 
 
 def _check_titles(imu: Path) -> None:
-    """Check that a header which names the IMU's columns has them in EuRoC's order.
-
-    Raises:
-        ReadError: it has another order.
-    """
+    """Check that a header which names the IMU's columns has them in EuRoC's order."""
     header = next(iter(first_lines(imu, 1, comments=True)), "")
     names = canonical_names(header)
     if set(names) >= {"t", *IMU} and names[:7] != ["t", *IMU]:

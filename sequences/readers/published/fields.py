@@ -26,9 +26,6 @@ class Fields:
         arrays: the arrays.
         optional: names of those that may be missing, or hold NaN.
         first_row: number of the first row, for errors.
-
-    Raises:
-        ReadError: most rows have a value that is not finite.
     """
 
     def __init__(
@@ -78,9 +75,6 @@ def read_columns(
         clock: name and unit [ns] of the column of times.
         stems: axes by stem of the columns: those of `{"acce": "xyz"}` are `acce_x`, ...
         magnetic: stems, the first of which that is present becomes the optional `MAGNETIC`.
-
-    Raises:
-        ReadError: a column is missing or a row is malformed.
     """
     header = header_names(path)
     if header == [""]:
@@ -103,11 +97,7 @@ def read_columns(
 
 
 class JsonFields:
-    """The object in a JSON file.
-
-    Raises:
-        ReadError: the file does not exist or holds no JSON object.
-    """
+    """The object in a JSON file."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.fields = path, read_json(path)
@@ -124,11 +114,7 @@ class JsonFields:
         return value
 
     def array(self, name: str, *shape: int, value: Any = None) -> FloatArray:
-        """Return the finite numbers of a field, or of a value; a single one without a shape.
-
-        Raises:
-            ReadError: the field is missing or holds anything else.
-        """
+        """Return the finite numbers of a field, or of a value; a single one without a shape."""
         expected = f"{' x '.join(map(str, shape)) or 'a'} finite number{'s' if shape else ''}"
         value = self.get(name) if value is None else value
         if value is None:

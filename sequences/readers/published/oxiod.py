@@ -52,9 +52,6 @@ def read_oxiod(path: Path) -> ImuSequence:
     """Read `imuN.csv` and, if it lies alongside, the capture.
 
     The truth is None, with a warning logged, if too little of it agrees with the gyroscope.
-
-    Raises:
-        ReadError: a file is missing or cut short, or two of `syn` differ in their number of rows.
     """
     phone, start_ns = _sensor_rows(path) if _is_sensor_rows(path) else _phone(path)
     capture = capture_file(path)
@@ -125,30 +122,25 @@ def capture_file(path: Path) -> Path | None:
 
 def _truth(path: Path, phone: ImuSequence, start_ns: np.int64 | None) -> Trajectory | None:
     table = read_table(path, columns=max(8, len(first_numbers(path))))
-    position = table.values[:, -7:-4]
-    attitude_WV, valid = captured_rotations(table.values[:, -4:])
+    time, kept = phone.time, np.arange(len(table.values))
+    if start_ns is not None:
+        stamps, kept = np.unique(_stamps_ns(table), return_index=True)
+        time = seconds(stamps, start_ns)
+    elif len(kept) != len(time):
+        raise ReadError(path, "rows", str(len(kept)), f"{len(time)} as in the IMU's file")
+    # Left in as invalid, they would spoil the averages over their neighbours.
+    finite = np.isfinite(table.values[kept, -7:]).all(axis=1)
+    time, pose = time[finite], table.values[kept[finite], -7:]
+    position, (attitude_WV, valid) = pose[:, :3], captured_rotations(pose[:, 3:])
     valid &= (position != 0.0).any(axis=1)  # zeros are written while the body is out of sight
     known = np.isfinite(phone.gyro).all(axis=1) & np.isfinite(phone.accel).all(axis=1)
     imu = (phone.time[known], phone.gyro[known], phone.accel[known])
     try:
-        time, kept = phone.time, np.arange(len(table.values))
-        if start_ns is not None:
-            stamps, kept = np.unique(_stamps_ns(table), return_index=True)
-            time = seconds(stamps, start_ns)
-        elif len(kept) != len(time):
-            expected = f"{len(time)} as in the IMU's file"
-            raise ReadError(path, "rows", str(len(kept)), expected)
-        # Left in as invalid, they would spoil the averages over their neighbours.
-        finite = np.isfinite(table.values[kept, -7:]).all(axis=1)
-        time, kept = time[finite], kept[finite]
-        position, attitude_WV, valid = position[kept], attitude_WV[kept], valid[kept]
         valid &= ~_position_glitches(time, position)
         if start_ns is not None:
             time = time + clock_offset(*imu[:2], time, attitude_WV, valid)
         aligned = align_tracked_body(*imu, time, attitude_WV, valid, position)
     except InputError as error:
-        if isinstance(error, ReadError):
-            raise
         _log.warning("%s: ground truth rejected: %s", path, error)
         return None
     return Trajectory(
