@@ -35,7 +35,7 @@ _MARGIN_S = 60.0
 _DAY_NS, _EXCEL_DAYS = 86_400 * 10**9, (25_569.0, 73_050.0)
 """Unit of the dates of spreadsheets, and those of 1970 and 2100: days since the end of 1899."""
 
-LATEST_S = 4.1e9
+_LATEST_S = 4.1e9
 """Seconds from 1970 to 2100: a unit that makes times later is not theirs."""
 
 _SINCE_1970_S = 1e8
@@ -167,7 +167,7 @@ def _warn_of_few_times(path: Path, name: str, stamps_ns: IntArray, samples: Bool
         )  # fmt: skip
 
 
-def refuse_counts_and_dates(file: Path, title: str, time: FloatArray) -> None:
+def _refuse_counts_and_dates(file: Path, title: str, time: FloatArray) -> None:
     """Refuse a column without a unit that counts rows, or whose digits are dates.
 
     Rows are counted as 0, 1, 2, ... or 1, 2, 3, ...; digits such as 20240501120059990 are a date
@@ -221,21 +221,30 @@ def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.in
     return unit
 
 
-def assumed_unit(unit_ns: int, first: float) -> str:
-    """Return the unit that times without one were taken for, empty if no other is possible.
-
-    Args:
-        unit_ns: the unit [ns], as `time_unit` returns it.
-        first: the first time in that unit; one counted from 1970 fits no other unit.
-    """
-    if first * unit_ns * 1e-9 > _SINCE_1970_S:
-        return ""
-    return next(unit for unit, ns in TIME_UNITS.items() if ns == unit_ns)
-
-
 def source_words(source: str, unit: str) -> str:
     """Return a recording's source with the unit that its times were taken for, if there is one."""
     return f"{source}, times taken as {unit}" if unit else source
+
+
+def inferred_unit(
+    file: Path, title: str, time: FloatArray, or_seconds: bool = False
+) -> tuple[int, str]:
+    """Return the unit [ns] of times (N,) that name none, and its name if another is possible.
+
+    Counts of rows and dates without separators are refused: either would pass for times. Times
+    at a rate of no unit are refused too, or taken as seconds unless those are after 2100.
+    """
+    _refuse_counts_and_dates(file, title, time)
+    first = float(time[:1].sum())
+    try:
+        unit_ns = time_unit(file, time)
+    except ReadError:
+        if not or_seconds or abs(first) > _LATEST_S:
+            raise
+        return TIME_UNITS["s"], ""
+    if first * unit_ns * 1e-9 > _SINCE_1970_S:  # which fits no other unit
+        return unit_ns, ""
+    return unit_ns, next(unit for unit, ns in TIME_UNITS.items() if ns == unit_ns)
 
 
 def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:
@@ -259,12 +268,12 @@ def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:
     def fits(unit_ns: int) -> bool:
         return step > 0.0 and _RATES[0] <= 1e9 / (step * unit_ns) <= _RATES[1]
 
-    if not unit and 0.0 < (first - FILETIME_1970) * FILETIME_NS * 1e-9 < LATEST_S:
+    if not unit and 0.0 < (first - FILETIME_1970) * FILETIME_NS * 1e-9 < _LATEST_S:
         return FILETIME_NS
     if not unit and _EXCEL_DAYS[0] < first < _EXCEL_DAYS[1] and fits(_DAY_NS):
         return _DAY_NS
     for name, unit_ns in candidates.items():
-        if first * unit_ns * 1e-9 < LATEST_S and fits(unit_ns):
+        if first * unit_ns * 1e-9 < _LATEST_S and fits(unit_ns):
             _log.info("%s: its times name no unit, their rate fits %s", file, name)
             return unit_ns
     expected = f"10 to {MAX_RATE:.0f} samples per second in one of {', '.join(candidates)}"

@@ -106,7 +106,7 @@ _CELL = re.compile(r"\s*[\"']?\s*(?P<name>[^\[\(\"']*?)\s*(?:[\[\(](?P<unit>[^\]
 
 @dataclass(frozen=True)
 class Column:
-    """A quantity's position in a row, and its title and unit in the header, if there are any."""
+    """A quantity's position in a row, its title, and its unit in the tables' spelling, if any."""
 
     index: int
     title: str = ""
@@ -175,9 +175,10 @@ def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
     ignored = []
     for index, (text, name) in enumerate(zip(titles, _names(titles), strict=True)):
         title, unit = _cell(text)
+        unit = unit_named(unit)
         if not name or (name in RARE and name in columns):
             ignored.append(title)
-        elif name in RARE and unit_named(unit) not in RARE_UNITS[name]:
+        elif name in RARE and unit not in RARE_UNITS[name]:
             known = ", ".join(filter(None, RARE_UNITS[name]))
             _log.warning("%s: %s is not read: found unit %r, expected %s", path, title, unit, known)
         elif name in columns:
@@ -228,7 +229,7 @@ def _is_of_an_imu(title: str) -> bool:
 
 def unit_factor(path: Path, column: Column, known: Mapping[str, Factor]) -> Factor:
     """Return the factor of a column's unit; the first of `known` if the header names none."""
-    unit = unit_named(column.unit) or next(iter(known))
+    unit = column.unit or next(iter(known))
     if unit not in known:
         names = ", ".join(filter(None, known)) or "no unit"
         raise ReadError(path, f"header, {column.title}", f"unit {column.unit!r}", names)

@@ -45,13 +45,10 @@ from stario.sequences.readers.checked import (
     satellites,
 )
 from stario.sequences.readers.clocks import (
-    LATEST_S,
     Samples,
-    assumed_unit,
-    refuse_counts_and_dates,
+    inferred_unit,
     resample_to_gyro,
     source_words,
-    time_unit,
 )
 from stario.sequences.readers.columns import (
     IMU,
@@ -93,7 +90,6 @@ from stario.sequences.units import (
     GYRO_UNITS,
     MAGNETIC_UNITS,
     TIME_UNITS,
-    unit_named,
 )
 
 _log = logging.getLogger(__name__)
@@ -166,10 +162,6 @@ class _Rows:
         factors = np.array([unit_factor(self.path, self.columns[name], known) for name in names])
         return np.stack([self.values[name] for name in names], axis=1) * factors, factors
 
-    def unit(self, name: str) -> str:
-        """Return the unit of a column in the tables' spelling, empty without one."""
-        return unit_named(self.columns[name].unit)
-
 
 def _read_rows(path: Path) -> _Rows:
     lines = read_lines(path)
@@ -188,7 +180,12 @@ def _read_rows(path: Path) -> _Rows:
     if not is_imu.any():
         raise ReadError(path, "gx", "no row with IMU samples", "numbers in every IMU column")
     finite = table.values[np.isfinite(table.values[:, 0]), 0]
-    unit_ns, assumed = (10**9, "") if row_format.dated else _unit_ns(path, clock, finite)
+    if row_format.dated:
+        clock = replace(clock, unit="s")
+    if clock.unit:
+        unit_ns, assumed = unit_factor(path, clock, TIME_UNITS), ""
+    else:
+        unit_ns, assumed = inferred_unit(path, clock.title, finite, or_seconds=True)
     time = table.seconds(clock.index, clock.title, unit_ns, int(np.argmax(is_imu)))
     values = dict(zip(names[1:], table.values[:, 1:].T, strict=True))
     return _Rows(path, columns, values, time, is_imu, table.line_numbers, assumed)
@@ -243,19 +240,6 @@ def _imu_rows(table: Table, imu: list[int]) -> BoolArray:
     return is_imu
 
 
-def _unit_ns(path: Path, column: Column, time: FloatArray) -> tuple[int, str]:
-    """Return the unit of times [ns], and the one assumed by the rate if the header names none."""
-    if not column.unit:
-        refuse_counts_and_dates(path, column.title, time)
-        try:
-            unit_ns = time_unit(path, time)
-            return unit_ns, assumed_unit(unit_ns, float(time[0]))
-        except ReadError:
-            if len(time) and abs(float(time[0])) > LATEST_S:
-                raise
-    return unit_factor(path, column, TIME_UNITS), ""
-
-
 def _samples(
     rows: _Rows, gyro: FloatArray, accel: FloatArray
 ) -> tuple[_Rows, FloatArray, FloatArray, FloatArray]:
@@ -300,13 +284,13 @@ def _in_separate_rows(shared: BoolArray) -> bool:
 def _barometer(rows: _Rows) -> Barometer | None:
     if PRESSURE not in rows.values:
         return None
-    title, values = rows.columns[PRESSURE].title, rows.values[PRESSURE]
-    return barometer(rows.path, title, rows.time, values, rows.unit(PRESSURE))
+    column, values = rows.columns[PRESSURE], rows.values[PRESSURE]
+    return barometer(rows.path, column.title, rows.time, values, column.unit)
 
 
 def _satellites(rows: _Rows) -> Satellites | None:
     known = {
-        name: RARE_UNITS[name][rows.unit(name)] * rows.values[name]
+        name: RARE_UNITS[name][rows.columns[name].unit] * rows.values[name]
         for name in SATELLITE_HEADER
         if name in rows.values
     }

@@ -65,9 +65,10 @@ class TableHead:
     rows: FloatArray
     dates: frozenset[int] = frozenset()
 
-    def read(self, columns: int | list[int]) -> Table:
-        """Read columns, given their number or indices, without a last row that is cut short."""
-        return read_table(self.file, columns, self.row_format, killed=True)
+    def read(self, columns: int | Sequence[Column]) -> Table:
+        """Read columns, given their number or places, without a last row that is cut short."""
+        wanted = columns if isinstance(columns, int) else [place.index for place in columns]
+        return read_table(self.file, wanted, self.row_format, killed=True)
 
     def clock(self, column: Column) -> Column:
         """Return a clock's column with its unit, seconds if it holds dates."""

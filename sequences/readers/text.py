@@ -164,7 +164,7 @@ def read_table(
     if killed and len(rows) > 1:
         cut = ends_within_a_row(path, mark)
         try:
-            numbers_in_row(path, row_format, rows[-1], wanted, titles)
+            _numbers_in_row(path, row_format, rows[-1], wanted, titles)
         except ReadError:
             cut = True
         if cut:
@@ -175,11 +175,11 @@ def read_table(
         lines = [line for _, line in rows]
         values = np.loadtxt(lines, delimiter=mark, usecols=wanted, comments=None, ndmin=2)
     except ValueError:
-        values = np.array([numbers_in_row(path, row_format, row, wanted, titles) for row in rows])
+        values = np.array([_numbers_in_row(path, row_format, row, wanted, titles) for row in rows])
     return Table(path, row_format, wanted, values, rows)
 
 
-def numbers_in_row(
+def _numbers_in_row(
     path: Path, row_format: RowFormat, row: Row, wanted: list[int], titles: Sequence[str]
 ) -> list[float]:
     """Return the numbers in some columns of a row, NaN where a cell holds none."""

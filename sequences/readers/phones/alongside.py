@@ -14,6 +14,7 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -41,6 +42,8 @@ from stario.sequences.time_order import increasing_mask
 from stario.sequences.units import TIME_UNITS, unit_named
 
 _log = logging.getLogger(__name__)
+
+Kind = TypeVar("Kind")
 
 _PRESSURE_FILES = {"barometer", "barometers", "baro", "bar", "pressure", "pres"}
 _SATELLITE_FILES = {"location", "locations", "gps", "gnss"}
@@ -103,7 +106,7 @@ class _Columns:
 
     def read(self) -> Table:
         """Read the clock and the columns, in their order."""
-        return self.head.read([self.clock.index, *(p.index for p in self.places.values())])
+        return self.head.read([self.clock, *self.places.values()])
 
     def within(
         self, table: Table, known: BoolArray, recording: Recording
@@ -175,19 +178,32 @@ def _files_named(recording: Recording, names: set[str]) -> list[Path]:
 
 def recorded_pressure(recording: Recording) -> Barometer | None:
     """Return the pressure next to a recording's sensors; None if there is none that can be used."""
-    for columns in _tables_alongside(recording, _PRESSURE_FILES, 2, _pressure_in):
-        place = columns.places["pressure"]
+    tables = _tables_alongside(recording, _PRESSURE_FILES, 2, _pressure_in)
+    return next(_read_alongside("pressure", _pressure, tables, recording), None)
+
+
+def _read_alongside(
+    words: str,
+    read: Callable[[_Columns, Recording], Kind | None],
+    tables: Iterator[_Columns],
+    recording: Recording,
+) -> Iterator[Kind]:
+    """Yield what is read from tables, none of which is worth the recording."""
+    for columns in tables:
         try:
-            table = columns.read()
-            rows, time = columns.within(table, np.isfinite(table.values[:, 1]), recording)
-        except ReadError as error:  # the barometer is optional
-            _log.warning("pressure skipped: %s", error)
+            found = read(columns, recording)
+        except ReadError as error:
+            _log.warning("%s skipped: %s", words, error)
             continue
-        title = place.title or f"column {place.index + 1}"
-        found = barometer(table.path, title, time, table.values[rows, 1], place.unit)
         if found is not None:
-            return found
-    return None
+            yield found
+
+
+def _pressure(columns: _Columns, recording: Recording) -> Barometer | None:
+    table, place = columns.read(), columns.places["pressure"]
+    rows, time = columns.within(table, np.isfinite(table.values[:, 1]), recording)
+    title = place.title or f"column {place.index + 1}"
+    return barometer(table.path, title, time, table.values[rows, 1], place.unit)
 
 
 def _pressure_in(head: TableHead, is_sensors: bool) -> dict[str, Column]:
@@ -213,14 +229,8 @@ def _pressure_unit(title: str) -> str:
 
 def reported_positions(recording: Recording) -> Iterator[Satellites]:
     """Yield the satellite positions next to a recording's sensors, the best file's first."""
-    for columns in _tables_alongside(recording, _SATELLITE_FILES, 3, _satellites_in):
-        try:
-            found = _satellites(columns, recording)
-        except ReadError as error:  # positions are optional
-            _log.warning("satellite positions skipped: %s", error)
-            continue
-        if found is not None:
-            yield found
+    tables = _tables_alongside(recording, _SATELLITE_FILES, 3, _satellites_in)
+    return _read_alongside("satellite positions", _satellites, tables, recording)
 
 
 def _satellites_in(head: TableHead, is_sensors: bool) -> dict[str, Column]:

@@ -55,7 +55,7 @@ def logged_attitude(files: PhoneFiles, gyro: Samples) -> tuple[IntArray, Rotatio
     if table is None or not table.quaternion:
         return None
     try:
-        rows = table.read([table.clock, *table.quaternion])
+        rows = table.head.read([table.clock, *table.quaternion])
         unit_ns = time_unit(table.file, rows.values[:, 0], table.clock.unit)
         stamps = rows.stamps_ns(table.clock.index, unit_ns)
     except ReadError:  # attitude is optional

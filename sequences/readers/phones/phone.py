@@ -52,7 +52,7 @@ from stario.sequences.readers.phones.files import (
     phone_recordings,
 )
 from stario.sequences.readers.phones.samples import read_samples
-from stario.sequences.readers.phones.sensor_layout import SensorTable, sensor_table
+from stario.sequences.readers.phones.sensor_layout import sensor_table
 from stario.sequences.readers.phones.sensor_words import (
     Sensor,
     is_sensor_word,
@@ -180,7 +180,7 @@ def assemble_recording(
     for file in files.unread:
         why = f"it has {NO_SAMPLES}" if may_be_read(file) else "no permission"
         _log.warning("%s: not read: %s", file, why)
-    gyro = _read(files.tables["gyro"][0], "gyro")
+    gyro = read_samples(files.tables["gyro"][0], "gyro")
     attitude = logged_attitude(files, gyro)
     accel, converted, maybe_apple = _force(files, attitude, core_motion)
     stamps, rate, force = resample_to_gyro(folder, gyro, accel)
@@ -211,14 +211,6 @@ def assemble_recording(
     return replace(sequence, positions=positions)
 
 
-def _read(table: SensorTable, sensor: Sensor) -> Samples:
-    """Read the columns that the header gives for the sensor, or those of a file that names none."""
-    axes = next((key for key in (sensor, "") if key in table.axes), next(iter(table.axes), None))
-    if axes is None:
-        raise ReadError(table.file, "header", "no x, y and z", f"the axes of the {sensor}")
-    return read_samples(table, sensor, axes)
-
-
 def _force(
     files: PhoneFiles, attitude: tuple[IntArray, Rotation] | None, core_motion: bool
 ) -> tuple[Samples, dict[str, bool], bool]:
@@ -226,11 +218,12 @@ def _force(
 
     Which of unit and sign were converted follows, and whether it may have Apple's sign.
     """
-    candidates = [_read(table, "accel") for table in files.tables.get("accel", [])]
+    candidates = [read_samples(table, "accel") for table in files.tables.get("accel", [])]
     gravity_table = files.first("gravity")
-    gravity = None if gravity_table is None else _read(gravity_table, "gravity")
+    gravity = None if gravity_table is None else read_samples(gravity_table, "gravity")
     total = _with_gravity(candidates, or_g=gravity is None)
-    accel = total or (candidates[0] if candidates else _read(files.tables["linear"][0], "linear"))
+    first = total or next(iter(candidates), None)
+    accel = first or read_samples(files.tables["linear"][0], "linear")
     in_two_parts = total is None and gravity is not None
     if total is None and gravity is not None:
         stamps, force, gravity_B = resample_to_gyro(
@@ -268,7 +261,7 @@ def _magnetometer(files: PhoneFiles, start_ns: np.int64, stop_ns: np.int64) -> M
     if table is None:
         return None
     try:
-        samples = _read(table, "mag")
+        samples = read_samples(table, "mag")
     except ReadError as error:  # the magnetometer is optional
         _log.warning("magnetometer skipped: %s", error)
         return None

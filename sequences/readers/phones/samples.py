@@ -8,12 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.clocks import (
-    Samples,
-    assumed_unit,
-    refuse_counts_and_dates,
-    time_unit,
-)
+from stario.sequences.readers.clocks import Samples, inferred_unit, time_unit
 from stario.sequences.readers.columns import unit_factor
 from stario.sequences.readers.phones.sensor_layout import SensorTable
 from stario.sequences.readers.phones.sensor_words import SENSORS, Sensor
@@ -27,21 +22,22 @@ _WILD = 100.0
 """Factor beyond a sensor's limit at which one sample would spoil integrals and interpolation."""
 
 
-def read_samples(table: SensorTable, sensor: Sensor, axes: str) -> Samples:
-    """Read a sensor's samples in the columns `table.axes[axes]`.
+def read_samples(table: SensorTable, sensor: Sensor) -> Samples:
+    """Read a sensor's samples in the columns that name it, or in those of a file that names none.
 
     They are in rad/s, m/s^2 or uT if the file names a unit.
     """
     if table.conflict:
         fix = "keep the columns of one"
         raise ReadError(table.file, "header", f"several IMUs ({table.conflict})", "one", fix)
+    axes = next((key for key in (sensor, "") if key in table.axes), next(iter(table.axes), None))
+    if axes is None:
+        raise ReadError(table.file, "header", "no x, y and z", f"the axes of the {sensor}")
     places, clock = table.axes[axes], table.clocks.get(axes, table.clock)
     titles = ", ".join(p.title or f"column {p.index + 1}" for p in places)
-    rows = table.read([clock, *places, *table.biases])
+    rows = table.head.read([clock, *places, *table.biases])
     refuse_several_devices(rows, table.head.titles, places[0].index)
     kept = _complete_rows(table.file, sensor, titles, rows.values[:, 1:])
-    if not clock.unit:
-        refuse_counts_and_dates(table.file, clock.title or "time", rows.values[:, 0])
     time, values = rows.values[kept, 0], rows.values[kept, 1:4]
     if table.biases:
         values = values - rows.values[kept, 4:7]
@@ -49,10 +45,11 @@ def read_samples(table: SensorTable, sensor: Sensor, axes: str) -> Samples:
     values = unit_factor(table.file, named, SENSORS[sensor].units) * values
     sound = _sound_samples(table.file, sensor, titles, values)
     kept, time, values = kept[sound], time[sound], values[sound]
-    unit_ns = time_unit(table.file, time, clock.unit)
-    stamps = rows.stamps_ns(clock.index, unit_ns, kept)
-    assumed = "" if clock.unit else assumed_unit(unit_ns, float(time[0]))
-    return Samples(stamps, values, named.unit, assumed)
+    if clock.unit:
+        unit_ns, assumed = time_unit(table.file, time, clock.unit), ""
+    else:
+        unit_ns, assumed = inferred_unit(table.file, clock.title or "time", time)
+    return Samples(rows.stamps_ns(clock.index, unit_ns, kept), values, named.unit, assumed)
 
 
 def _complete_rows(file: Path, sensor: Sensor, titles: str, values: FloatArray) -> IntArray:

@@ -57,6 +57,13 @@ class Fields:
         return rotations(self._path, name, self._kept[name][:count], order, numbers)
 
 
+def file_in(path: Path, *names: str) -> Path | None:
+    """Return the first of some files in a folder, or the path itself if it is one of them."""
+    if path.is_dir():
+        return next((path / name for name in names if (path / name).is_file()), None)
+    return path if path.is_file() and path.name in names else None
+
+
 def header_names(path: Path) -> list[str]:
     """Return the cells of a file's first line, [""] for a file that is not text; never raises."""
     return [cell.strip().strip('"') for cell in (first_line(path) or "").split(",")]

@@ -32,7 +32,7 @@ from stario.sequences.readers.checked import finite_rows, magnetometer, rotation
 from stario.sequences.readers.clocks import Samples, joined_sequence
 from stario.sequences.readers.lines import first_line
 from stario.sequences.readers.poses import pose_files, with_pose
-from stario.sequences.readers.published.fields import MAGNETIC, header_names, read_columns
+from stario.sequences.readers.published.fields import MAGNETIC, file_in, header_names, read_columns
 from stario.sequences.readers.text import RowFormat, read_table
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
@@ -82,12 +82,11 @@ def is_ridi(path: Path) -> bool:
 
 
 def _data_file(path: Path) -> Path | None:
-    """Return the recording's `data.csv`, else a pickle in its place, else None."""
-    if path.is_file():
-        return path if path.suffix == ".csv" or path.name in _PICKLES else None
-    inside = path if path.name == "processed" else path / "processed"
-    files = (inside / name for name in ("data.csv", *_PICKLES))
-    return next((file for file in files if file.is_file()), None)
+    """Return the recording's `data.csv`, any other CSV, or else a pickle in its place."""
+    if path.suffix == ".csv" and path.is_file():
+        return path
+    inside = path / "processed" if path.is_dir() and path.name != "processed" else path
+    return file_in(inside, "data.csv", *_PICKLES)
 
 
 def _y_is_up(path: Path, attitude_WB: Rotation, accel: FloatArray) -> bool:

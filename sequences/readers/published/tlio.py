@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.arrays import interpolated, trapezoids
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import finite_rows, trajectory
-from stario.sequences.readers.published.fields import Fields, JsonFields
+from stario.sequences.readers.published.fields import Fields, JsonFields, file_in
 from stario.sequences.readers.text import IntArray, read_table, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
@@ -46,7 +46,7 @@ _COLUMN = re.compile(r"(?P<name>\w+)\((?P<width>\d+)\)$")
 
 def read_tlio(path: Path) -> ImuSequence:
     """Read a recording from its folder (resampled if both exist) or from one of its files."""
-    file = _file(path)
+    file = file_in(path, _RESAMPLED, _RAW)
     if file is None:
         raise ReadError(path, _RESAMPLED, "no such file", "a TLIO recording")
     return _read_raw(file) if file.suffix == ".csv" else _read_resampled(file)[1]
@@ -54,13 +54,7 @@ def read_tlio(path: Path) -> ImuSequence:
 
 def is_tlio(path: Path) -> bool:
     """Return whether a path leads to one of the two files."""
-    return _file(path) is not None
-
-
-def _file(path: Path) -> Path | None:
-    if path.is_dir():
-        return next((path / n for n in (_RESAMPLED, _RAW) if (path / n).is_file()), None)
-    return path if path.is_file() and path.name in (_RESAMPLED, _RAW) else None
+    return file_in(path, _RESAMPLED, _RAW) is not None
 
 
 def _read_resampled(file: Path) -> tuple[IntArray, ImuSequence]:
