@@ -196,15 +196,10 @@ def _is_date(digits: str) -> bool:
 
 
 def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.int64) -> int:
-    """Return the time unit [ns] with which most times lie within a recording.
+    """Return the time unit [ns] with which most times (N,) lie within a recording.
 
-    For rows too rare for `time_unit`.
-
-    Args:
-        file: the file, for messages.
-        time: (N,) in an unknown unit.
-        start_ns: time of the recording's first sample on the same clock [ns].
-        stop_ns: time of its last sample [ns].
+    For rows too rare for `time_unit`; the recording is from `start_ns` to `stop_ns` on the same
+    clock, and rows may precede or follow it by a minute.
     """
     start, stop = float(start_ns) * 1e-9 - _MARGIN_S, float(stop_ns) * 1e-9 + _MARGIN_S
     # Times from zero fit finer units as well, but all at the start.

@@ -84,13 +84,9 @@ def is_untimed(path: Path) -> bool:
 def unpack_joined(path: Path, folder: Path, rate: str = "") -> None:
     """Write the table with its times into a folder.
 
-    Args:
-        path: the file or folder.
-        folder: the folder to write into.
-        rate: samples per second of a recording without times; empty if it has some.
+    `rate` is that of a recording without times [samples/s]; empty if it has some.
 
     Raises:
-        ReadError: there are no times and no rate, or both; or a row is malformed.
         InputError: the rate is not a number above zero.
     """
     if path.is_dir():

@@ -181,10 +181,7 @@ def _with_most_numbers(rows: list[str], first: RowFormat) -> RowFormat:
 def refuse_several_devices(table: Table, titles: Sequence[str], column: int) -> None:
     """Refuse rows of several devices, whose samples must not be mixed.
 
-    Args:
-        table: the rows.
-        titles: titles of the file's columns.
-        column: index of a column of the sensor; rows in which it is blank do not count.
+    Rows in which a column of the sensor is blank do not count.
     """
     for index, title in enumerate(titles):
         if "".join(words_of(title)) not in _TITLES:

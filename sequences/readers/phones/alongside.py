@@ -82,11 +82,8 @@ _OF_ADVIO = ["time", "latitude", "longitude", "accuracy", "altitude", "vertical 
 class Recording:
     """What other files of a phone's recording must fit.
 
-    Attributes:
-        sensors: the gyroscope's file.
-        key: the words that the names of all files of the recording share.
-        start_ns: time of the first sample on the sensors' clock [ns].
-        stop_ns: time of the last sample [ns].
+    These are the gyroscope's file, the words `key` that the names of all files share, and the
+    times of first and last sample on the sensors' clock [ns].
     """
 
     sensors: Path

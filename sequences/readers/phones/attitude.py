@@ -75,14 +75,9 @@ def agreeing_attitude(
 ) -> tuple[IntArray, Rotation] | None:
     """Return the reading of an attitude that best fits the gyroscope, or None if none fits.
 
-    Args:
-        stamps: (N,) times [ns].
-        quaternion: (N, 4) x, y, z and w; rows that are not unit quaternions are skipped.
-        gyro: gyroscope samples, on the same clock.
-        named: whether the order is known; otherwise w, x, y and z is tried as well.
-
-    Returns:
-        Time stamps (K,) [ns] and K rotations, body to a world with z up.
+    Quaternions (N, 4) are x, y, z and w at times (N,) [ns] on the gyroscope's clock; unless their
+    order is `named`, w, x, y and z is tried as well. Those that are not unit quaternions are
+    skipped: K times [ns] and rotations, body to a world with z up, are returned.
     """
     good = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) < NORM_TOLERANCE
     stamps, quaternion = stamps[good], quaternion[good]

@@ -167,14 +167,10 @@ def assemble_recording(
     orders: Collection[str] = ("xyzw", "wxyz", "matrix"),
     core_motion: bool = False,
 ) -> ImuSequence:
-    """Assemble the recording of a set of files.
+    """Assemble the recording of a set of files and of poses alongside them.
 
-    Args:
-        name: name of the recording.
-        files: files by sensor.
-        poses: pose files alongside them.
-        orders: orders to try for their attitude, as for `with_pose`.
-        core_motion: whether an iPhone wrote the files: values in g have Apple's sign.
+    `orders` are as for `with_pose`; `core_motion` says that an iPhone wrote the files: values in g
+    have Apple's sign.
     """
     folder = files.gyro.parent
     for file in files.unread:

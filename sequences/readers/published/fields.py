@@ -77,11 +77,9 @@ def read_columns(
 ) -> tuple[FloatArray, Fields]:
     """Return the times since the first row [s] and the columns of a CSV with a header.
 
-    Args:
-        path: the file.
-        clock: name and unit [ns] of the column of times.
-        stems: axes by stem of the columns: those of `{"acce": "xyz"}` are `acce_x`, ...
-        magnetic: stems, the first of which that is present becomes the optional `MAGNETIC`.
+    The `clock` is the name and the unit [ns] of the column of times. Columns are named by a stem
+    and axes: those of `{"acce": "xyz"}` are `acce_x`, ... The first of the `magnetic` stems that is
+    present becomes the optional `MAGNETIC`.
     """
     header = header_names(path)
     if header == [""]:
@@ -90,9 +88,9 @@ def read_columns(
     wanted = [clock[0], *(name for some in names.values() for name in some)]
     if missing := [name for name in wanted if name not in header]:
         raise ReadError(path, "header", f"no {', '.join(missing)}", "columns of these names")
-    for fields in ([f"{stem}_{axis}" for axis in "xyz"] for stem in magnetic):
-        if MAGNETIC not in names and set(fields) <= set(header):
-            names[MAGNETIC] = fields
+    for some in ([f"{stem}_{axis}" for axis in "xyz"] for stem in magnetic):
+        if MAGNETIC not in names and set(some) <= set(header):
+            names[MAGNETIC] = some
     used = [clock[0], *(name for some in names.values() for name in some)]
     table = read_table(path, [header.index(name) for name in used], RowFormat(skip=1))
     columns = dict(zip(used, table.values.T, strict=True))
