@@ -21,6 +21,7 @@ _log = logging.getLogger(__name__)
 _HEAD_BYTES = 32768
 _TAIL_BYTES = 16384
 _MARK = re.compile(r'(?:^|[;\t"])\s*[-+]?\d*([.,])\d+(?:[eE][-+]?\d+)?\s*(?=[;\t"]|$)')
+_BLANKS_MARK = re.compile(_MARK.pattern.replace(r"\t", r"\s"))
 _QUOTED_MARK = re.compile(
     r'(?:^|[,"])\s*[-+]?\d*(\.|,(?=\d+(?:[eE][-+]?\d+)?\s*"))\d'  # a comma only within quotes
 )
@@ -168,12 +169,12 @@ def _decoded(content: bytes) -> str:
         return content.decode("latin-1")
 
 
-def decimal_mark(lines: Iterable[str], delimiter: str) -> str:
+def decimal_mark(lines: Iterable[str], delimiter: str | None) -> str:
     """Return the decimal mark of a file's numbers, that of the first one with a fraction.
 
     A comma that separates cells is one only within quotes.
     """
-    mark = _QUOTED_MARK if delimiter == "," else _MARK
+    mark = {",": _QUOTED_MARK, None: _BLANKS_MARK}.get(delimiter, _MARK)
     return next((match[1] for line in lines if (match := mark.search(line))), ".")
 
 
