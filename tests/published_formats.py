@@ -89,6 +89,30 @@ def names(stem: str, axes: str = "xyz") -> str:
     return ",".join(f"{stem}_{axis}" for axis in axes)
 
 
+def euroc(folder: Path, walk: ImuSequence, velocity: bool = True) -> Written:
+    """EuRoC's layout, or TUM-VI's without velocity: truth at half the rate, not from the start."""
+    truth, rows = walk.truth, slice(40, -60, 2)
+    assert truth.velocity_W is not None
+    axes = [f"{s}_RS_S_{axis} [{unit}]" for s, unit in (("w", "rad s^-1"), ("a", "m s^-2"))
+            for axis in "xyz"]  # fmt: skip
+    header = ",".join(["#timestamp [ns]", *axes])
+    samples = text(stamps_ns(walk.time), walk.gyro, walk.accel)
+    save(folder / "mav0/imu0/data.csv", header, samples)
+    columns = [truth.position_W, wxyz(truth.attitude_WB), *([truth.velocity_W] * velocity)]
+    header = "#timestamp, p_RS_R_x [m], ..." + ", v_RS_R_x [m s^-1]" * velocity
+    poses = text(stamps_ns(truth.time[rows]), *(values[rows] for values in columns))
+    name = "state_groundtruth_estimate0" if velocity else "mocap0"
+    save(folder / f"mav0/{name}/data.csv", header, poses)
+    known = Trajectory(truth.time[rows], truth.position_W[rows], truth.attitude_WB[rows],
+                       truth.velocity_W[rows] if velocity else None)  # fmt: skip
+    expected = replace(cut(walk, slice(None)), name=folder.name, truth=known, magnetometer=None)
+    return Written(folder, expected)
+
+
+def tumvi(folder: Path, walk: ImuSequence) -> Written:
+    return euroc(folder, walk, velocity=False)
+
+
 def ronin(folder: Path, walk: ImuSequence, **info: object) -> Written:
     h5py = pytest.importorskip("h5py")
     folder.mkdir(parents=True, exist_ok=True)
@@ -365,6 +389,8 @@ def ros_message(
 
 
 WRITERS: dict[str, tuple[str, float, Writer]] = {
+    "euroc": ("euroc", 200.0, euroc),
+    "tumvi": ("euroc", 200.0, tumvi),
     "ronin": ("ronin", 200.0, ronin),
     "ridi": ("ridi", 200.0, ridi),
     "imunet": ("ridi", 200.0, imunet),

@@ -1,4 +1,8 @@
-"""Readers, one module per format; a recording's format is recognised by its content."""
+"""Readers, one module per format; a recording's format is recognised by its content.
+
+Whatever is wrong with a file, readers and their helpers raise `ReadError`; only functions that may
+be called from outside, and those that raise anything else, say so. Recognising never raises.
+"""
 
 from __future__ import annotations
 
@@ -72,13 +76,9 @@ class Format:
 def _read_unpacked(
     unpack: Callable[..., None], source: str, path: Path, **options: str
 ) -> ImuSequence:
-    """Read the only recording unpacked from `path`; errors name `path` and the file in it.
+    """Read the one recording that `unpack` writes of `path`; errors name `path` and its file.
 
-    Args:
-        unpack: function that writes the content of `path` into a folder.
-        source: the recording's source in words; empty if the files in the folder tell.
-        path: the file or folder.
-        options: further arguments of `unpack`.
+    An empty `source` is told by the files.
     """
     with tempfile.TemporaryDirectory(prefix="stario-") as temporary:
         folder = Path(temporary)
@@ -203,12 +203,7 @@ def find_recordings(
 
 
 def _readable(path: str | Path, expected: str) -> Path:
-    """Return a path, checked to be that of a file or a folder that may be read.
-
-    Raises:
-        InputError: it is not a path.
-        ReadError: it does not exist, is a pipe or a device, or lacks permission.
-    """
+    """Return a path, checked to be that of a file or a folder that may be read."""
     if not isinstance(path, str | Path):
         raise InputError("path", shown(path), f"the path of {expected}")
     path = Path(path)

@@ -207,13 +207,8 @@ def _part(
 ) -> dict[str, Any] | None:
     """Return the times that increase and the columns of a part by name; None without it.
 
-    Args:
-        path: the recording, for errors.
-        group: its group.
-        stem: name of the part.
-        required: shapes, any of which a row of a column may have.
-        optional: shapes of those that may lack, and may hold NaN.
-        known: whether it is a truth: others may then hold NaN too, but where it is "valid".
+    A row of a `required` column may have any of some shapes; `optional` columns may lack, and hold
+    NaN. In a truth (`known`), others may hold NaN too where "valid" is False.
     """
     if stem not in group:
         return None

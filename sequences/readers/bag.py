@@ -13,7 +13,7 @@ be those of the IMU in a world with z up; `stario inspect` reports if they are n
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -31,12 +31,11 @@ from stario.sequences.readers.checked import (
     satellites,
     trajectory,
 )
-from stario.sequences.readers.clocks import resample_to_gyro
+from stario.sequences.readers.clocks import Samples, resample_to_gyro
 from stario.sequences.readers.lines import first_bytes
 from stario.sequences.readers.phones.attitude import agreeing_attitude, device_attitude
-from stario.sequences.readers.phones.samples import Samples
-from stario.sequences.readers.text import IntArray, seconds
-from stario.sequences.sequence import FloatArray, ImuSequence, Satellites, Trajectory
+from stario.sequences.readers.text import seconds
+from stario.sequences.sequence import ImuSequence, Satellites, Trajectory
 from stario.sequences.units import MAGNETIC_UNITS
 
 _log = logging.getLogger(__name__)
@@ -83,41 +82,41 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
         InputError: rosbags is not installed.
     """
     messages = _messages(path, imu_topic, truth_topic)
-    imu = messages[_IMU]
-    stamps, gyro, accel = imu.stamps_ns, imu.values[:, _GYRO], imu.values[:, _ACCEL]
-    if (force := messages.get(_APART)) is not None:
-        stamps, gyro, accel = resample_to_gyro(
-            path, stamps, gyro, force.stamps_ns, force.values[:, _ACCEL]
-        )
-    time = {kind: seconds(m.stamps_ns, stamps[0]) for kind, m in messages.items()}
-    values = {kind: m.values for kind, m in messages.items()}
-    poses = next((m for kind, m in messages.items() if kind not in (_IMU, _APART, *_OTHERS)), None)
-    field, pressure, places = (values.get(kind) for kind in _OTHERS)
-    own = agreeing_attitude(
-        imu.stamps_ns, imu.values[:, _ORIENTATION], Samples(imu.stamps_ns, imu.values[:, _GYRO])
-    )
-    return ImuSequence(
+    imu = messages.pop(_IMU)
+    gyro = Samples(imu.stamps_ns, imu.values[:, _GYRO])
+    stamps, rate, force = gyro.stamps_ns, gyro.values, imu.values[:, _ACCEL]
+    if (apart := messages.pop(_APART, None)) is not None:
+        accel = Samples(apart.stamps_ns, apart.values[:, _ACCEL])
+        stamps, rate, force = resample_to_gyro(path, gyro, accel)
+    field, pressure, places = (messages.pop(kind, None) for kind in _OTHERS)
+    poses = next(iter(messages.values()), None)
+    own = agreeing_attitude(imu.stamps_ns, imu.values[:, _ORIENTATION], gyro)
+    start_ns = stamps[0]
+    sequence = ImuSequence(
         name=path.resolve().stem,
-        time=seconds(stamps, stamps[0]),
-        gyro=gyro,
-        accel=accel,
-        truth=None if poses is None else _truth(path, poses, stamps[0]),
-        magnetometer=None
-        if field is None
-        else magnetometer(time[_MAGNETIC], field[:, :3] * MAGNETIC_UNITS["T"]),
-        device_attitude=device_attitude(own, stamps[0]),
-        barometer=None
-        if pressure is None
-        else barometer(path, messages[_PRESSURE].topic, time[_PRESSURE], pressure[:, 0], "Pa"),
-        satellites=None if places is None else _satellites(places, time[_SATELLITES]),
+        time=seconds(stamps, start_ns),
+        gyro=rate,
+        accel=force,
+        truth=None if poses is None else _truth(path, poses, start_ns),
+        device_attitude=device_attitude(own, start_ns),
+        satellites=None if places is None else _satellites(places, start_ns),
     )
+    if field is not None:
+        values = field.values[:, :3] * MAGNETIC_UNITS["T"]
+        sequence = replace(sequence, magnetometer=magnetometer(field.seconds(start_ns), values))
+    if pressure is not None:
+        time, values = pressure.seconds(start_ns), pressure.values[:, 0]
+        air = barometer(path, pressure.topic, time, values, "Pa")
+        sequence = replace(sequence, barometer=air)
+    return sequence
 
 
-def _satellites(values: FloatArray, time: FloatArray) -> Satellites | None:
+def _satellites(places: _Messages, start_ns: np.int64) -> Satellites | None:
+    values = places.values
     variance = 0.5 * (values[:, 3] + values[:, 7])  # zero if unknown
     radius = RADIUS_PER_SIGMA * np.sqrt(np.maximum(variance, 0.0))
     rest = {"altitude_m": values[:, 2], "radius_m": radius}
-    return satellites(time, values[:, :2], rest)
+    return satellites(places.seconds(start_ns), values[:, :2], rest)
 
 
 def is_bag(path: Path) -> bool:
@@ -130,13 +129,11 @@ def is_bag(path: Path) -> bool:
     )
 
 
-@dataclass(frozen=True)
-class _Messages:
-    """A topic's messages: stamps (N,) [ns] and the doubles at their ends (N, K)."""
+@dataclass(frozen=True, kw_only=True)
+class _Messages(Samples):
+    """A topic's messages: the doubles at their ends (N, K)."""
 
     topic: str
-    stamps_ns: IntArray
-    values: FloatArray
 
 
 def _messages(path: Path, imu_topic: str, truth_topic: str) -> dict[str, _Messages]:
@@ -234,12 +231,12 @@ def _decoded(
     if kind != _IMU:  # whose order is reported and mended for all formats
         order = np.argsort(stamps, kind="stable")
         stamps, values = stamps[order], values[order]
-    return _Messages(topic, stamps, values)
+    return _Messages(stamps, values, topic=topic)
 
 
 def _truth(path: Path, poses: _Messages, start_ns: np.int64) -> Trajectory:
     rows = finite_rows(path, poses.topic, poses.values[:, :7])
-    quat = poses.values[:, 3:7]
-    attitude_WB = rotations(path, f"{poses.topic}, quaternion", quat, "xyzw", 0, rows)
-    time = seconds(poses.stamps_ns[rows], start_ns)
+    quat = poses.values[rows, 3:7]
+    attitude_WB = rotations(path, f"{poses.topic}, quaternion", quat, "xyzw", rows)
+    time = poses.seconds(start_ns)[rows]
     return trajectory(path, time, poses.values[rows, :3], attitude_WB)

@@ -72,11 +72,7 @@ _LARGEST_DEGREES = 90.0, 180.0
 
 
 def checked(path: Path, field: str, values: FloatArray) -> FloatArray:
-    """Return values (N,) or (N, K) if all are finite.
-
-    Raises:
-        ReadError: one is not; the error names the field and its row, counted from 1.
-    """
+    """Return values (N,) or (N, K) if all are finite."""
     good = np.isfinite(values).reshape(len(values), -1).all(axis=1)
     if not good.all():
         k = int(np.argmin(good))
@@ -87,11 +83,7 @@ def checked(path: Path, field: str, values: FloatArray) -> FloatArray:
 
 
 def finite_rows(path: Path, field: str, values: FloatArray) -> IntArray:
-    """Return the rows of values (N,) or (N, K) that are finite, and warn of the others.
-
-    Raises:
-        ReadError: most are not finite; the error names the field.
-    """
+    """Return the rows of values (N,) or (N, K) that are finite, and warn of the others."""
     rows = np.flatnonzero(np.isfinite(values).reshape(len(values), -1).all(axis=1))
     if lost := len(values) - len(rows):
         if lost > len(values) / 2:
@@ -107,8 +99,7 @@ def rotations(
     field: str,
     quat: FloatArray,
     order: str = "wxyz",
-    first_row: int = 1,
-    rows: IntArray | None = None,
+    numbers: IntArray | None = None,
 ) -> Rotation:
     """Return rotations from unit quaternions.
 
@@ -117,20 +108,17 @@ def rotations(
         field: name of the quaternions, for errors.
         quat: (N, 4) quaternions.
         order: order of their components, `wxyz` or `xyzw`.
-        first_row: number of the first row, for errors.
-        rows: rows to return the rotations of; all if None.
+        numbers: (N,) numbers of the rows, for errors; from 1 if None.
 
     Raises:
         ReadError: a component is not finite or a norm differs from 1 by more than a percent; the
             error names the field and its row.
     """
-    rows = np.arange(len(quat)) if rows is None else rows
-    quat = quat[rows]
     norm = np.linalg.norm(quat, axis=1)
     bad = ~(np.abs(norm - 1.0) <= NORM_TOLERANCE)
     if bad.any():
         k = int(np.argmax(bad))
-        where = f"row {rows[k] + first_row}, {field}"
+        where = f"row {k + 1 if numbers is None else numbers[k]}, {field}"
         raise ReadError(
             path, where, f"norm {norm[k]:.4g}", "a unit quaternion", "cut the recording there"
         )
@@ -147,15 +135,19 @@ def captured_rotations(quat_xyzw: FloatArray) -> tuple[Rotation, BoolArray]:
     return Rotation.from_quat(np.where(known[:, None], quat_xyzw, [0.0, 0.0, 0.0, 1.0])), known
 
 
-def magnetometer(time: FloatArray, field: FloatArray, held: bool = True) -> Magnetometer | None:
+def magnetometer(
+    time: FloatArray, field: FloatArray | None, held: bool = True
+) -> Magnetometer | None:
     """Return the finite, non-zero samples of a magnetometer whose times advance; None if none.
 
     Args:
         time: (N,) sample times [s].
-        field: (N, 3) magnetic field [uT].
+        field: (N, 3) magnetic field [uT], if there is one.
         held: whether to skip repeated values if more than a third are repeated: some apps write
             the last reading at the IMU's rate.
     """
+    if field is None:
+        return None
     known = np.isfinite(field).all(axis=1) & np.isfinite(time) & field.any(axis=1)
     time, field = time[known], field[known]
     keep = increasing_mask(time)
@@ -260,9 +252,6 @@ def in_degrees(path: Path, latlon_deg: FloatArray) -> FloatArray:
     """Return latitudes and longitudes (N, 2), exchanged if only that makes them places.
 
     A few rows may hold anything; a single one proves nothing.
-
-    Raises:
-        ReadError: no row is in degrees.
     """
     present = latlon_deg[np.isfinite(latlon_deg).all(axis=1) & latlon_deg.any(axis=1)]
     if len(present) < 2 or known_places(present).any():

@@ -1,8 +1,9 @@
-"""Inference of unnamed time units, and joining of sensors with separate sample times."""
+"""Samples at times of their own clock: its unit, and joining of sensors sampled apart."""
 
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
@@ -11,9 +12,10 @@ import numpy as np
 from stario.sequences.arrays import interpolated
 from stario.sequences.clean_samples import MAX_RATE, MIN_RATE, SHARED_TIMES
 from stario.sequences.errors import ReadError
+from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.phones.sensor_words import XSENS_CLOCK
 from stario.sequences.readers.text import IntArray, seconds
-from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray
+from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray, ImuSequence
 from stario.sequences.time_order import MAX_IMU_GAP, disorder, increasing_mask
 from stario.sequences.units import FILETIME_1970, FILETIME_NS, TIME_UNITS
 
@@ -33,7 +35,7 @@ _MARGIN_S = 60.0
 _DAY_NS, _EXCEL_DAYS = 86_400 * 10**9, (25_569.0, 73_050.0)
 """Unit of the dates of spreadsheets, and those of 1970 and 2100: days since the end of 1899."""
 
-LATEST_S = 4.1e9
+_LATEST_S = 4.1e9
 """Seconds from 1970 to 2100: a unit that makes times later is not theirs."""
 
 _SINCE_1970_S = 1e8
@@ -46,19 +48,48 @@ _FEW_ROWS = 10
 """Number of rows below which a count may be a coincidence."""
 
 
+@dataclass(frozen=True)
+class Samples:
+    """Samples of a sensor.
+
+    Attributes:
+        stamps_ns: (N,) times [ns].
+        values: (N, K) values.
+        unit: unit named in the file; empty if none.
+        assumed_time_unit: unit that times without one were taken for; empty if it is certain.
+    """
+
+    stamps_ns: IntArray
+    values: FloatArray
+    unit: str = ""
+    assumed_time_unit: str = ""
+
+    def seconds(self, origin_ns: np.int64) -> FloatArray:
+        """Return the times (N,) [s] since an origin."""
+        return seconds(self.stamps_ns, origin_ns)
+
+
+def joined_sequence(
+    path: Path, name: str, gyro: Samples, accel: Samples, mag: Samples | None = None
+) -> tuple[ImuSequence, np.int64]:
+    """Return a recording of sensors sampled apart, and its first sample's time [ns]."""
+    stamps, rate, force = resample_to_gyro(path, gyro, accel)
+    start_ns = stamps[0]
+    field = None if mag is None else magnetometer(mag.seconds(start_ns), mag.values)
+    time = seconds(stamps, start_ns)
+    return ImuSequence(name, time, rate, force, magnetometer=field), start_ns
+
+
 def resample_to_gyro(
     path: Path,
-    gyro_ns: IntArray,
-    gyro: FloatArray,
-    accel_ns: IntArray,
-    accel: FloatArray,
+    gyro: Samples,
+    accel: Samples,
     names: tuple[str, str] = ("gyroscope", "accelerometer"),
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Interpolate the accelerometer to the gyroscope's samples in their common time span.
 
     Samples in an accelerometer gap of more than 0.1 s are skipped, since the force there is
-    unknown. Times are in ns from one origin: (N,) with samples (N, 3) of the gyroscope, (M,) with
-    samples (M, 3) of the accelerometer; `names` are for messages if they are other sensors'.
+    unknown. Both clocks have one origin; `names` are for messages if they are other sensors'.
 
     Returns:
         Time stamps (K,) [ns], gyroscope (K, 3) and accelerometer (K, 3).
@@ -66,13 +97,14 @@ def resample_to_gyro(
     Raises:
         ReadError: the two sensors do not overlap in time, or the accelerometer's rate is too low.
     """
-    accel_ns, accel = _sorted_samples(path, names[1], accel_ns, accel)
+    accel = _sorted_samples(path, names[1], accel)
+    gyro_ns, accel_ns = gyro.stamps_ns, accel.stamps_ns
     kept = (gyro_ns >= accel_ns[0]) & (gyro_ns <= accel_ns[-1])
     if not kept.any():
         origin = min(gyro_ns.min(), accel_ns[0])
         spans = [
-            f"{name} from {seconds(ns, origin).min():.3f} to {seconds(ns, origin).max():.3f} s"
-            for name, ns in zip(names, (gyro_ns, accel_ns), strict=True)
+            f"{name} from {time.min():.3f} to {time.max():.3f} s"
+            for name, time in zip(names, (gyro.seconds(origin), accel.seconds(origin)), strict=True)
         ]
         raise ReadError(path, "time", ", ".join(spans), "overlapping times on one clock")
     right = np.clip(np.searchsorted(accel_ns, gyro_ns), 1, len(accel_ns) - 1)
@@ -88,19 +120,19 @@ def resample_to_gyro(
             "%s: dropped %d of %d samples at whose times only one of two sensors was recorded",
             path, lost, len(kept),
         )  # fmt: skip
-    time, t = seconds(gyro_ns[kept], accel_ns[0]), seconds(accel_ns, accel_ns[0])
-    return gyro_ns[kept], gyro[kept], interpolated(time, t, accel)
+    time = seconds(gyro_ns[kept], accel_ns[0])
+    force = interpolated(time, accel.seconds(accel_ns[0]), accel.values)
+    return gyro_ns[kept], gyro.values[kept], force
 
 
-def _sorted_samples(
-    path: Path, name: str, stamps_ns: IntArray, values: FloatArray
-) -> tuple[IntArray, FloatArray]:
+def _sorted_samples(path: Path, name: str, samples: Samples) -> Samples:
     """Return a sensor's samples by increasing time, one at each, for interpolation.
 
     Rows late by milliseconds are sorted. Those of a clock that was set back are dropped: sorted,
     they would alternate with samples from another time.
     """
-    time = seconds(stamps_ns, stamps_ns[0])
+    stamps_ns, values = samples.stamps_ns, samples.values
+    time = samples.seconds(stamps_ns[0])
     set_back = float((np.maximum.accumulate(time) - time).max())
     if set_back > MAX_IMU_GAP and not disorder(time):
         kept = increasing_mask(time)
@@ -114,7 +146,7 @@ def _sorted_samples(
     fresh = np.append(True, np.diff(stamps_ns) > 0)
     differing = np.append(True, np.diff(values, axis=0).any(axis=1))
     _warn_of_few_times(path, name, stamps_ns[fresh], fresh | differing)
-    return stamps_ns[fresh], values[fresh]
+    return Samples(stamps_ns[fresh], values[fresh])
 
 
 def _warn_of_few_times(path: Path, name: str, stamps_ns: IntArray, samples: BoolArray) -> None:
@@ -135,14 +167,11 @@ def _warn_of_few_times(path: Path, name: str, stamps_ns: IntArray, samples: Bool
         )  # fmt: skip
 
 
-def refuse_counts_and_dates(file: Path, title: str, time: FloatArray) -> None:
+def _refuse_counts_and_dates(file: Path, title: str, time: FloatArray) -> None:
     """Refuse a column without a unit that counts rows, or whose digits are dates.
 
     Rows are counted as 0, 1, 2, ... or 1, 2, 3, ...; digits such as 20240501120059990 are a date
     and a time of day to the millisecond. Taken for one of the units either would be plausible.
-
-    Raises:
-        ReadError: the column holds either; not raised for fewer than ten rows.
     """
     count = len(time)
     if count < _FEW_ROWS:
@@ -167,18 +196,10 @@ def _is_date(digits: str) -> bool:
 
 
 def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.int64) -> int:
-    """Return the time unit [ns] with which most times lie within a recording.
+    """Return the time unit [ns] with which most times (N,) lie within a recording.
 
-    For rows too rare for `time_unit`.
-
-    Args:
-        file: the file, for messages.
-        time: (N,) in an unknown unit.
-        start_ns: time of the recording's first sample on the same clock [ns].
-        stop_ns: time of its last sample [ns].
-
-    Raises:
-        ReadError: no unit gives a time within a minute of the recording.
+    For rows too rare for `time_unit`; the recording is from `start_ns` to `stop_ns` on the same
+    clock, and rows may precede or follow it by a minute.
     """
     start, stop = float(start_ns) * 1e-9 - _MARGIN_S, float(stop_ns) * 1e-9 + _MARGIN_S
     # Times from zero fit finer units as well, but all at the start.
@@ -195,21 +216,30 @@ def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.in
     return unit
 
 
-def assumed_unit(unit_ns: int, first: float) -> str:
-    """Return the unit that times without one were taken for, empty if no other is possible.
-
-    Args:
-        unit_ns: the unit [ns], as `time_unit` returns it.
-        first: the first time in that unit; one counted from 1970 fits no other unit.
-    """
-    if first * unit_ns * 1e-9 > _SINCE_1970_S:
-        return ""
-    return next(unit for unit, ns in TIME_UNITS.items() if ns == unit_ns)
-
-
 def source_words(source: str, unit: str) -> str:
     """Return a recording's source with the unit that its times were taken for, if there is one."""
     return f"{source}, times taken as {unit}" if unit else source
+
+
+def inferred_unit(
+    file: Path, title: str, time: FloatArray, or_seconds: bool = False
+) -> tuple[int, str]:
+    """Return the unit [ns] of times (N,) that name none, and its name if another is possible.
+
+    Counts of rows and dates without separators are refused: either would pass for times. Times
+    at a rate of no unit are refused too, or taken as seconds unless those are after 2100.
+    """
+    _refuse_counts_and_dates(file, title, time)
+    first = float(time[:1].sum())
+    try:
+        unit_ns = time_unit(file, time)
+    except ReadError:
+        if not or_seconds or abs(first) > _LATEST_S:
+            raise
+        return TIME_UNITS["s"], ""
+    if first * unit_ns * 1e-9 > _SINCE_1970_S:  # which fits no other unit
+        return unit_ns, ""
+    return unit_ns, next(unit for unit, ns in TIME_UNITS.items() if ns == unit_ns)
 
 
 def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:
@@ -233,12 +263,12 @@ def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:
     def fits(unit_ns: int) -> bool:
         return step > 0.0 and _RATES[0] <= 1e9 / (step * unit_ns) <= _RATES[1]
 
-    if not unit and 0.0 < (first - FILETIME_1970) * FILETIME_NS * 1e-9 < LATEST_S:
+    if not unit and 0.0 < (first - FILETIME_1970) * FILETIME_NS * 1e-9 < _LATEST_S:
         return FILETIME_NS
     if not unit and _EXCEL_DAYS[0] < first < _EXCEL_DAYS[1] and fits(_DAY_NS):
         return _DAY_NS
     for name, unit_ns in candidates.items():
-        if first * unit_ns * 1e-9 < LATEST_S and fits(unit_ns):
+        if first * unit_ns * 1e-9 < _LATEST_S and fits(unit_ns):
             _log.info("%s: its times name no unit, their rate fits %s", file, name)
             return unit_ns
     expected = f"10 to {MAX_RATE:.0f} samples per second in one of {', '.join(candidates)}"

@@ -43,16 +43,6 @@ MAGNETIC_HEADER = "mx [uT],my [uT],mz [uT]"
 PRESSURE_HEADER = "p [hPa]"
 """Optional pressure of the air."""
 
-SATELLITE_HEADER = {
-    "lat": "lat [deg]",
-    "lon": "lon [deg]",
-    "alt": "alt [m]",
-    "acc": "acc [m]",
-    "speed": "speed [m/s]",
-    "bearing": "bearing [deg]",
-}
-"""Optional columns of a satellite receiver by canonical name; all but the first two may lack."""
-
 _log = logging.getLogger(__name__)
 
 Factor = TypeVar("Factor")
@@ -63,16 +53,22 @@ TRUTH = POSITION + QUAT
 SIGMA = "sp"
 MAGNETIC = ("mx", "my", "mz")
 PRESSURE = "p"
-RARE = (PRESSURE, *SATELLITE_HEADER)
-"""Quantities that some rows hold; a column of one in another unit is not read."""
-QUANTITIES = (*IMU, *MAGNETIC, *TRUTH, SIGMA, *RARE)
 
 RARE_UNITS: dict[str, Mapping[str, float]] = {
     PRESSURE: PRESSURE_UNITS | {"": math.nan},
     **dict.fromkeys(("lat", "lon"), DEGREES),
     **{name: UNITS[attribute] for name, attribute in OPTIONAL.items()},
 }
-"""Factors of their units; that of a pressure without one is told from its size."""
+"""Factors of the units of what some rows hold; a column in another unit is not read. The unit of a
+pressure without one is told from its size."""
+
+SATELLITE_HEADER = {
+    name: f"{name} [{next(iter(units))}]" for name, units in RARE_UNITS.items() if name != PRESSURE
+}
+"""Optional columns of a satellite receiver by canonical name; all but the first two may lack."""
+
+RARE = tuple(RARE_UNITS)
+QUANTITIES = (*IMU, *MAGNETIC, *TRUTH, SIGMA, *RARE)
 
 _STEMS = {
     "g": ("gyro", "gyr", "gyroscope", "w", "omega", "angular_velocity", "w_rs_s"),
@@ -110,7 +106,7 @@ _CELL = re.compile(r"\s*[\"']?\s*(?P<name>[^\[\(\"']*?)\s*(?:[\[\(](?P<unit>[^\]
 
 @dataclass(frozen=True)
 class Column:
-    """A quantity's position in a row, and its title and unit in the header, if there are any."""
+    """A quantity's position in a row, its title, and its unit in the tables' spelling, if any."""
 
     index: int
     title: str = ""
@@ -128,11 +124,7 @@ class Header:
 
 
 def read_header(path: Path, lines: list[str]) -> Header:
-    """Return the header found in a file's lines.
-
-    Raises:
-        ReadError: there is none, or its columns or their units are invalid.
-    """
+    """Return the header found in a file's lines."""
     index = _header_index(lines)
     if index is None:
         raise ReadError(path, "header", "only comments", HEADER)
@@ -183,9 +175,10 @@ def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
     ignored = []
     for index, (text, name) in enumerate(zip(titles, _names(titles), strict=True)):
         title, unit = _cell(text)
+        unit = unit_named(unit)
         if not name or (name in RARE and name in columns):
             ignored.append(title)
-        elif name in RARE and unit_named(unit) not in RARE_UNITS[name]:
+        elif name in RARE and unit not in RARE_UNITS[name]:
             known = ", ".join(filter(None, RARE_UNITS[name]))
             _log.warning("%s: %s is not read: found unit %r, expected %s", path, title, unit, known)
         elif name in columns:
@@ -210,18 +203,20 @@ def _columns(path: Path, number: int, titles: list[str]) -> dict[str, Column]:
         expected += f",{MAGNETIC_HEADER}" if set(MAGNETIC) & set(missing) else ""
         raise ReadError(path, f"line {number}, header", f"no {', '.join(missing)}", expected, fix)
     if ignored:
-        _log.info("%s: columns ignored: %s", path, ", ".join(ignored))
-        if others := [title for title in ignored if _is_of_an_imu(title)]:
-            _log.warning("%s: columns of another IMU are not read: %s", path, ", ".join(others))
-        truth_like = [title for title in ignored if _LIKE_TRUTH.match(title)]
-        if truth_like and not truth:
-            _log.warning(
-                "%s: no ground truth is read from %s: it must have %s",
-                path, ", ".join(truth_like), TRUTH_HEADER,
-            )  # fmt: skip
+        _log_ignored(path, ignored, bool(truth))
     for name in (*truth, *([SIGMA] if SIGMA in columns else [])):
         unit_factor(path, columns[name], {"": 1.0} if name in QUAT else {"m": 1.0, "": 1.0})
     return columns
+
+
+def _log_ignored(path: Path, ignored: list[str], has_truth: bool) -> None:
+    _log.info("%s: columns ignored: %s", path, ", ".join(ignored))
+    if others := [title for title in ignored if _is_of_an_imu(title)]:
+        _log.warning("%s: columns of another IMU are not read: %s", path, ", ".join(others))
+    truth_like = ", ".join(title for title in ignored if _LIKE_TRUTH.match(title))
+    if truth_like and not has_truth:
+        message = "%s: no ground truth is read from %s: it must have %s"
+        _log.warning(message, path, truth_like, TRUTH_HEADER)
 
 
 def _is_of_an_imu(title: str) -> bool:
@@ -234,7 +229,7 @@ def _is_of_an_imu(title: str) -> bool:
 
 def unit_factor(path: Path, column: Column, known: Mapping[str, Factor]) -> Factor:
     """Return the factor of a column's unit; the first of `known` if the header names none."""
-    unit = unit_named(column.unit) or next(iter(known))
+    unit = column.unit or next(iter(known))
     if unit not in known:
         names = ", ".join(filter(None, known)) or "no unit"
         raise ReadError(path, f"header, {column.title}", f"unit {column.unit!r}", names)

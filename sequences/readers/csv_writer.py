@@ -34,23 +34,20 @@ def write_csv(path: Path | str, sequence: ImuSequence) -> None:
         InputError: the folder does not exist, or `sequence` has the wrong type.
     """
     check_type("sequence", sequence, ImuSequence, "call write_csv(path, sequence)")
-    truth, field = sequence.truth, sequence.magnetometer
+    truth, field, known = sequence.truth, sequence.magnetometer, sequence.positions
     header, rows = HEADER, _Written(sequence)
     if field is not None:
         header += f",{MAGNETIC_HEADER}"
         rows.add(field.time, field.field)
-    if truth is None and sequence.positions is not None:
-        known = sequence.positions
-        header += "," + ",".join(TRUTH_HEADER.split(",")[: known.position_W.shape[1]])
-        values = known.position_W
-        if known.sigma is not None:
-            header += f",{SIGMA_HEADER}"
-            values = np.column_stack([values, known.sigma])
-        rows.add(known.time[known.valid], values[known.valid])
     if truth is not None:
         header += f",{TRUTH_HEADER}"
         poses = np.column_stack([truth.position_W, truth.quat_xyzw])
         rows.add(truth.time[truth.valid], poses[truth.valid])
+    elif known is not None:
+        header += "," + ",".join(TRUTH_HEADER.split(",")[: known.position_W.shape[1]])
+        header += "" if known.sigma is None else f",{SIGMA_HEADER}"
+        columns = [known.position_W] if known.sigma is None else [known.position_W, known.sigma]
+        rows.add(known.time[known.valid], np.column_stack(columns)[known.valid])
     if sequence.barometer is not None:
         header += f",{PRESSURE_HEADER}"
         rows.add(sequence.barometer.time, sequence.barometer.pressure_hPa[:, None])

@@ -45,12 +45,10 @@ from stario.sequences.readers.checked import (
     satellites,
 )
 from stario.sequences.readers.clocks import (
-    LATEST_S,
-    assumed_unit,
-    refuse_counts_and_dates,
+    Samples,
+    inferred_unit,
     resample_to_gyro,
     source_words,
-    time_unit,
 )
 from stario.sequences.readers.columns import (
     IMU,
@@ -92,7 +90,6 @@ from stario.sequences.units import (
     GYRO_UNITS,
     MAGNETIC_UNITS,
     TIME_UNITS,
-    unit_named,
 )
 
 _log = logging.getLogger(__name__)
@@ -113,17 +110,12 @@ separate rows: neither sensor at rest reads exactly 0, 0, 0."""
 
 def read_generic_csv(path: Path) -> ImuSequence:
     """Read a generic CSV in the format that the module's docstring describes."""
-    lines = read_lines(path)
-    header = read_header(path, lines)
-    rows = _read_rows(path, lines, header)
-    gyro, gyro_factors = _vectors(path, header, rows, "g", GYRO_UNITS)
-    accel, accel_factors = _vectors(path, header, rows, "a", ACCEL_UNITS)
-    rows, time, gyro, accel = _samples(path, rows, gyro, accel)
-    truth, positions = _ground_truth(path, rows)
-    field = None
-    if "mx" in rows.table:
-        vectors, _ = _vectors(path, header, rows, "m", MAGNETIC_UNITS)
-        field = magnetometer(rows.time, vectors, held=False)
+    rows = _read_rows(path)
+    gyro, gyro_factors = rows.vectors("g", GYRO_UNITS)
+    accel, accel_factors = rows.vectors("a", ACCEL_UNITS)
+    rows, time, gyro, accel = _samples(rows, gyro, accel)
+    truth, positions = _ground_truth(rows)
+    field = rows.vectors("m", MAGNETIC_UNITS)[0] if "mx" in rows.values else None
     converted = {
         "gyro": gyro_factors != 1.0,
         "accel": np.abs(accel_factors) != 1.0,
@@ -136,9 +128,9 @@ def read_generic_csv(path: Path) -> ImuSequence:
         accel=accel,
         truth=truth,
         positions=positions,
-        magnetometer=field,
-        barometer=_barometer(path, header, rows),
-        satellites=_satellites(path, header, rows),
+        magnetometer=magnetometer(rows.time, field, held=False),
+        barometer=_barometer(rows),
+        satellites=_satellites(rows),
         source=source_words("generic CSV", rows.assumed_unit),
         converted=frozenset(sensor for sensor, done in converted.items() if done.any()),
     )
@@ -151,29 +143,29 @@ def is_generic_csv(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Content of the rows.
+    """Columns (N,) of a file by canonical name, times [s], and the mask of IMU samples.
 
-    Attributes:
-        table: columns (N,) by canonical name.
-        time: (N,) times [s].
-        is_imu: (N,) mask of IMU samples.
-        line_numbers: line number of each row.
-        assumed_unit: unit that times without one were taken for; empty if it is certain.
+    `assumed_unit` is the unit that times without one were taken for, empty if it is certain.
     """
 
-    table: dict[str, FloatArray]
+    path: Path
+    columns: Mapping[str, Column]
+    values: dict[str, FloatArray]
     time: FloatArray
     is_imu: BoolArray
     line_numbers: Sequence[int]
-    assumed_unit: str = ""
+    assumed_unit: str
+
+    def vectors(self, letter: str, known: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
+        """Return three columns (N, 3) in the first unit of `known`, and the factors (3,) to it."""
+        names = [letter + axis for axis in "xyz"]
+        factors = np.array([unit_factor(self.path, self.columns[name], known) for name in names])
+        return np.stack([self.values[name] for name in names], axis=1) * factors, factors
 
 
-def _read_rows(path: Path, lines: list[str], header: Header) -> _Rows:
-    """Return the rows of a file, given its lines and its header.
-
-    Raises:
-        ReadError: there is none, or one is malformed; names its line and column.
-    """
+def _read_rows(path: Path) -> _Rows:
+    lines = read_lines(path)
+    header = read_header(path, lines)
     separator, columns, clock = header.separator, header.columns, header.columns["t"]
     decimal = decimal_mark(lines[header.lines :], separator)
     cells = _first_cells(path, lines, header, decimal)
@@ -188,19 +180,24 @@ def _read_rows(path: Path, lines: list[str], header: Header) -> _Rows:
     if not is_imu.any():
         raise ReadError(path, "gx", "no row with IMU samples", "numbers in every IMU column")
     finite = table.values[np.isfinite(table.values[:, 0]), 0]
-    unit_ns, assumed = (10**9, "") if row_format.dated else _unit_ns(path, clock, finite)
+    if row_format.dated:
+        clock = replace(clock, unit="s")
+    if clock.unit:
+        unit_ns, assumed = unit_factor(path, clock, TIME_UNITS), ""
+    else:
+        unit_ns, assumed = inferred_unit(path, clock.title, finite, or_seconds=True)
     time = table.seconds(clock.index, clock.title, unit_ns, int(np.argmax(is_imu)))
     values = dict(zip(names[1:], table.values[:, 1:].T, strict=True))
-    return _Rows(values, time, is_imu, table.line_numbers, assumed)
+    return _Rows(path, columns, values, time, is_imu, table.line_numbers, assumed)
 
 
 def _table(path: Path, header: Header, names: list[str], row_format: RowFormat) -> Table:
     """Return columns; without the rare ones, the last, where these hold something else."""
     places = [header.columns[name] for name in names]
     used, titles = [place.index for place in places], [place.title for place in places]
-    killed = ends_within_a_row(path, header.separator)
     try:
-        return read_table(path, used, row_format, titles, killed)
+        cut = ends_within_a_row(path, header.separator)
+        return read_table(path, used, row_format, titles, killed=cut)
     except ReadError as error:
         if not set(RARE) & set(names):
             raise
@@ -224,8 +221,7 @@ def _first_cells(path: Path, lines: list[str], header: Header, decimal: str) -> 
 
 def _warn_of_wide_rows(table: Table, header: Header) -> None:
     """Say that rows hold more values than there are titles: two lines became one, for example."""
-    mark = header.separator
-    most = len(header.titles) - 1
+    mark, most = header.separator, len(header.titles) - 1
     wide = [number for number, line in table.rows if line.rstrip(f"{mark} ").count(mark) > most]
     if wide:
         more = f" and {len(wide) - 1} others" if len(wide) > 1 else ""
@@ -244,21 +240,8 @@ def _imu_rows(table: Table, imu: list[int]) -> BoolArray:
     return is_imu
 
 
-def _unit_ns(path: Path, column: Column, time: FloatArray) -> tuple[int, str]:
-    """Return the unit of times [ns], and the one assumed by the rate if the header names none."""
-    if not column.unit:
-        refuse_counts_and_dates(path, column.title, time)
-        try:
-            unit_ns = time_unit(path, time)
-            return unit_ns, assumed_unit(unit_ns, float(time[0]))
-        except ReadError:
-            if len(time) and abs(float(time[0])) > LATEST_S:
-                raise
-    return unit_factor(path, column, TIME_UNITS), ""
-
-
 def _samples(
-    path: Path, rows: _Rows, gyro: FloatArray, accel: FloatArray
+    rows: _Rows, gyro: FloatArray, accel: FloatArray
 ) -> tuple[_Rows, FloatArray, FloatArray, FloatArray]:
     """Return the rows, and times (N,), gyroscope and accelerometer (N, 3) of the IMU samples.
 
@@ -266,14 +249,13 @@ def _samples(
     gyroscope, and the time of all rows starts at the first one at which both are known.
     """
     known = rows.is_imu & np.isfinite(rows.time)
-    gyro, accel = _without_zeros(path, gyro, accel)
-    with_gyro, with_accel = (known & ~np.isnan(values).any(axis=1) for values in (gyro, accel))
-    if with_accel.sum() < 2 or not _in_separate_rows(with_accel[with_gyro]):
+    gyro, accel = _without_zeros(rows.path, gyro, accel)
+    of_gyro, of_accel = (known & ~np.isnan(values).any(axis=1) for values in (gyro, accel))
+    if of_accel.sum() < 2 or not _in_separate_rows(of_accel[of_gyro]):
         return rows, rows.time[rows.is_imu], gyro[rows.is_imu], accel[rows.is_imu]
     ns = np.rint(np.where(known, rows.time, 0.0) * 1e9).astype(np.int64)
-    stamps, rate, force = resample_to_gyro(
-        path, ns[with_gyro], gyro[with_gyro], ns[with_accel], accel[with_accel]
-    )
+    rates, forces = Samples(ns[of_gyro], gyro[of_gyro]), Samples(ns[of_accel], accel[of_accel])
+    stamps, rate, force = resample_to_gyro(rows.path, rates, forces)
     rows = replace(rows, time=rows.time - float(stamps[0]) * 1e-9)
     return rows, seconds(stamps, stamps[0]), rate, force
 
@@ -299,34 +281,23 @@ def _in_separate_rows(shared: BoolArray) -> bool:
     return bool(shared.mean() < _SHARED_ROWS and np.diff(shared).mean() > _ALTERNATING)
 
 
-def _vectors(
-    path: Path, header: Header, rows: _Rows, letter: str, known: Mapping[str, float]
-) -> tuple[FloatArray, FloatArray]:
-    """Return three columns (N, 3) in the first unit of `known`, and the factors (3,) to it."""
-    names = [letter + axis for axis in "xyz"]
-    factors = np.array([unit_factor(path, header.columns[name], known) for name in names])
-    values = np.stack([rows.table[name] for name in names], axis=1)
-    return values * factors, factors
-
-
-def _barometer(path: Path, header: Header, rows: _Rows) -> Barometer | None:
-    if PRESSURE not in rows.table:
+def _barometer(rows: _Rows) -> Barometer | None:
+    if PRESSURE not in rows.values:
         return None
-    column = header.columns[PRESSURE]
-    values = rows.table[PRESSURE]
-    return barometer(path, column.title, rows.time, values, unit_named(column.unit))
+    column, values = rows.columns[PRESSURE], rows.values[PRESSURE]
+    return barometer(rows.path, column.title, rows.time, values, column.unit)
 
 
-def _satellites(path: Path, header: Header, rows: _Rows) -> Satellites | None:
+def _satellites(rows: _Rows) -> Satellites | None:
     known = {
-        name: RARE_UNITS[name][unit_named(header.columns[name].unit)] * rows.table[name]
+        name: RARE_UNITS[name][rows.columns[name].unit] * rows.values[name]
         for name in SATELLITE_HEADER
-        if name in rows.table
+        if name in rows.values
     }
     if not known:
         return None
     try:
-        latlon_deg = in_degrees(path, np.stack([known["lat"], known["lon"]], axis=1))
+        latlon_deg = in_degrees(rows.path, np.stack([known["lat"], known["lon"]], axis=1))
     except ReadError as error:  # satellites are optional
         _log.warning("satellites skipped: %s", error)
         return None
@@ -340,12 +311,12 @@ def kind_of_positions(time: FloatArray) -> Literal["positions", "waypoints"]:
     return "waypoints" if sparse else "positions"
 
 
-def _ground_truth(path: Path, rows: _Rows) -> tuple[Trajectory | None, PositionTrack | None]:
+def _ground_truth(rows: _Rows) -> tuple[Trajectory | None, PositionTrack | None]:
     """Return the poses, or else the positions; None if fewer than two rows hold them."""
-    names = [name for name in (*TRUTH, SIGMA) if name in rows.table]
+    names = [name for name in (*TRUTH, SIGMA) if name in rows.values]
     if not names:
         return None, None
-    values = np.stack([rows.table[name] for name in names], axis=1)
+    values = np.stack([rows.values[name] for name in names], axis=1)
     kept = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(rows.time))
     has_attitude = "qx" in names
     listed = len(kept) > 0 and not rows.is_imu[kept[0] : kept[-1] + 1].any()
@@ -354,21 +325,24 @@ def _ground_truth(path: Path, rows: _Rows) -> tuple[Trajectory | None, PositionT
     kept = kept[increasing_mask(rows.time[kept])]
     if len(kept) < 2:
         what = ("ground truth", "trajectory") if has_attitude else ("a position", "track")
-        _log.warning("%s: %d rows hold %s, too few for a %s", path, len(kept), *what)
+        _log.warning("%s: %d rows hold %s, too few for a %s", rows.path, len(kept), *what)
         return None, None
     time, values = rows.time[kept], values[kept]
+
+    def refusal(bad: BoolArray, field: str, found: str, expected: str, fix: str = "") -> ReadError:
+        where = f"line {rows.line_numbers[kept[np.argmax(bad)]]}, {field}"
+        return ReadError(rows.path, where, found, expected, fix)
+
     if not has_attitude:
         sigma = values[:, -1] if SIGMA in names else None
         if sigma is not None and sigma.min() <= 0.0:
-            where = f"line {rows.line_numbers[kept[np.argmin(sigma)]]}, sp"
-            raise ReadError(path, where, f"{sigma.min():g}", "a standard deviation above 0 m")
+            found = f"{sigma.min():g}"
+            raise refusal(sigma == sigma.min(), SIGMA, found, "a standard deviation above 0 m")
         place = values if sigma is None else values[:, :-1]
         return None, PositionTrack(time, place, kind_of_positions(time), sigma=sigma)
     norm = np.linalg.norm(values[:, 3:], axis=1)
     bad = np.abs(norm - 1.0) > NORM_TOLERANCE
     if bad.any():
-        k = int(np.argmax(bad))
-        where = f"line {rows.line_numbers[kept[k]]}, qx qy qz qw"
-        fix = "leave the row's truth blank"
-        raise ReadError(path, where, f"norm {norm[k]:.4g}", "a unit quaternion", fix)
+        found, fix = f"norm {norm[np.argmax(bad)]:.4g}", "leave the row's truth blank"
+        raise refusal(bad, "qx qy qz qw", found, "a unit quaternion", fix)
     return Trajectory(time, values[:, :3], Rotation.from_quat(values[:, 3:])), None

@@ -19,8 +19,14 @@ import numpy as np
 from stario.sequences.arrays import number_in
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.checked import checked
+from stario.sequences.readers.columns import Column
 from stario.sequences.readers.lines import is_row, read_lines
-from stario.sequences.readers.phones.files import is_complete, may_hold, names_both_sensors
+from stario.sequences.readers.phones.files import (
+    is_complete,
+    may_hold,
+    names_both_sensors,
+    text_files,
+)
 from stario.sequences.readers.phones.sensor_layout import clock_of
 from stario.sequences.readers.phones.sensor_words import sensor_of, words_of
 from stario.sequences.readers.table_head import TableHead, table_heads
@@ -78,13 +84,9 @@ def is_untimed(path: Path) -> bool:
 def unpack_joined(path: Path, folder: Path, rate: str = "") -> None:
     """Write the table with its times into a folder.
 
-    Args:
-        path: the file or folder.
-        folder: the folder to write into.
-        rate: samples per second of a recording without times; empty if it has some.
+    `rate` is that of a recording without times [samples/s]; empty if it has some.
 
     Raises:
-        ReadError: there are no times and no rate, or both; or a row is malformed.
         InputError: the rate is not a number above zero.
     """
     if path.is_dir():
@@ -127,7 +129,7 @@ def _with_clock(head: TableHead) -> list[str]:
     """Return the lines of a table with one column of times in place of several."""
     columns = _clock_columns(head)
     used, titles = list(columns.values()), _titles(head)
-    values = head.read(used).values
+    values = head.read([Column(k) for k in used]).values
     checked(head.file, ", ".join(titles[k] for k in used), values)
     stamps = _stamps_ns(dict(zip(columns, values.T.astype(np.int64), strict=True)))
     return _rewritten(head, "time [ns]", map(str, stamps.tolist()), set(used))
@@ -218,14 +220,13 @@ def _texts(file: Path, least: int = 3) -> list[list[str]]:
 
 
 def _time_files(folder: Path) -> list[Path]:
-    return [f for f in sorted(folder.iterdir()) if may_hold(f) and set(words_of(f.stem)) <= _TIMES]
+    return [file for file, words in text_files(folder) if set(words) <= _TIMES]
 
 
 def _sensor_files(folder: Path) -> dict[str, list[Path]]:
     """Return a folder's files of gyroscopes, accelerometers and magnetometers."""
     files: dict[str, list[Path]] = {}
-    for file in sorted(folder.iterdir()):
-        sensor = sensor_of(words_of(file.stem)) if may_hold(file) else None
-        if sensor in ("gyro", "accel", "mag"):
+    for file, words in text_files(folder):
+        if (sensor := sensor_of(words)) in ("gyro", "accel", "mag"):
             files.setdefault(sensor, []).append(file)
     return files

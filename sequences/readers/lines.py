@@ -21,6 +21,7 @@ _log = logging.getLogger(__name__)
 _HEAD_BYTES = 32768
 _TAIL_BYTES = 16384
 _MARK = re.compile(r'(?:^|[;\t"])\s*[-+]?\d*([.,])\d+(?:[eE][-+]?\d+)?\s*(?=[;\t"]|$)')
+_BLANKS_MARK = re.compile(_MARK.pattern.replace(r"\t", r"\s"))
 _QUOTED_MARK = re.compile(
     r'(?:^|[,"])\s*[-+]?\d*(\.|,(?=\d+(?:[eE][-+]?\d+)?\s*"))\d'  # a comma only within quotes
 )
@@ -83,11 +84,7 @@ def read_json(path: Path) -> Any:
 
 
 def _without_padding(path: Path, content: bytes) -> bytes:
-    """Return a file's text without the zeros that a recorder which lost power left at its end.
-
-    Raises:
-        ReadError: there are zeros elsewhere, as in binary files.
-    """
+    """Return a file's text without the zeros that a recorder which lost power left at its end."""
     text = content.rstrip(b"\0")
     if b"\0" in text:
         raise ReadError(path, "file", "binary data", "UTF-8 text")
@@ -172,12 +169,12 @@ def _decoded(content: bytes) -> str:
         return content.decode("latin-1")
 
 
-def decimal_mark(lines: Iterable[str], delimiter: str) -> str:
+def decimal_mark(lines: Iterable[str], delimiter: str | None) -> str:
     """Return the decimal mark of a file's numbers, that of the first one with a fraction.
 
     A comma that separates cells is one only within quotes.
     """
-    mark = _QUOTED_MARK if delimiter == "," else _MARK
+    mark = {",": _QUOTED_MARK, None: _BLANKS_MARK}.get(delimiter, _MARK)
     return next((match[1] for line in lines if (match := mark.search(line))), ".")
 
 

@@ -39,9 +39,6 @@ def list_entries(path: Path) -> Iterator[tuple[Path, AttributeFilter] | ReadErro
     Names are relative to the list's folder or a folder in it. If that folder holds no folders, they
     may also be relative to its parent or a folder in that. `data1/imu3.csv` is also found as
     `data1/syn/imu3.csv` (OxIOD).
-
-    Raises:
-        ReadError: the list cannot be read or names nothing, or is some other long text.
     """
     numbered = enumerate(read_lines(path), 1)
     entries = [(k, *_parsed(x.split("#")[0])) for k, x in numbered if is_row(x)]

@@ -55,15 +55,11 @@ _SAME_CLOCK_S = 0.1
 
 
 @dataclass(frozen=True)
-class PoseCandidate:
-    """A pose file's rows in one of the possible interpretations.
+class _Poses:
+    """A pose file's rows, read in an order "xyzw", "wxyz" or "matrix".
 
-    Attributes:
-        file: the file.
-        stamps_ns: (N,) times [ns], strictly increasing.
-        position: (N, 3) positions [m].
-        attitude: N rotations, from an unknown body to an unknown world.
-        order: how the attitude was read: "xyzw", "wxyz" or "matrix".
+    Times (N,) [ns] increase strictly; positions (N, 3) [m] and N rotations are from an unknown body
+    to an unknown world.
     """
 
     file: Path
@@ -92,28 +88,19 @@ def with_pose(
     files: list[Path],
     orders: Collection[str] = ("xyzw", "wxyz", "matrix"),
 ) -> ImuSequence:
-    """Return the recording with the best of the pose files as ground truth, if one agrees.
+    """Return a recording without truth with the best of the pose files as such, if one agrees.
 
-    Args:
-        sequence: a recording without truth.
-        start_ns: time of its first sample on the poses' clock [ns].
-        files: candidate pose files.
-        orders: orders to try for the attitude, restricted if a data set specifies it.
-
-    Raises:
-        ReadError: a file's rows are malformed.
+    Its first sample is at `start_ns` on the poses' clock [ns]; `orders` of the attitude are
+    tried, fewer where a data set specifies it.
     """
-    candidates = [
-        candidate for file in files for candidate in pose_rows(file) if candidate.order in orders
-    ]
-    fitted = (_fitted(sequence, start_ns, candidate) for candidate in candidates)
-    fits = [fit for fit in fitted if fit is not None]
+    candidates = [poses for file in files for poses in _read_poses(file) if poses.order in orders]
+    fits = [fit for poses in candidates if (fit := _fitted(sequence, start_ns, poses)) is not None]
     if not fits:
+        names = ", ".join(file.name for file in files)
         if candidates:
-            names = ", ".join(dict.fromkeys(candidate.file.name for candidate in candidates))
+            names = ", ".join(dict.fromkeys(poses.file.name for poses in candidates))
             _log.warning("%s: no poses in %s agree with the gyroscope", sequence.name, names)
         elif files:
-            names = ", ".join(file.name for file in files)
             _log.warning("%s: no row in %s holds a pose", sequence.name, names)
         return sequence
     best = max(fit.aligned.correlation for fit in fits)
@@ -123,12 +110,8 @@ def with_pose(
     return _posed(sequence, chosen)
 
 
-def pose_rows(file: Path) -> list[PoseCandidate]:
-    """Return a file's poses in each possible interpretation; none if it holds no poses.
-
-    Raises:
-        ReadError: a row is malformed.
-    """
+def _read_poses(file: Path) -> list[_Poses]:
+    """Return a file's poses in each possible interpretation; none if it holds no poses."""
     head = next(table_heads(file), None)
     if head is None or head.rows.shape[1] < 8:
         return []
@@ -150,18 +133,18 @@ def pose_rows(file: Path) -> list[PoseCandidate]:
     used = used[increasing_mask(seconds(stamps[used], stamps[used[0]]))]
     stamps, position, rotation = stamps[used], position[used], rotation[used]
     if columns == 13:
-        return [PoseCandidate(file, stamps, position, Rotation.from_matrix(rotation), "matrix")]
-    return [
-        PoseCandidate(file, stamps, position, Rotation.from_quat(rotation[:, order]), name)
-        for name, order in (("xyzw", [0, 1, 2, 3]), ("wxyz", [1, 2, 3, 0]))
-    ]
+        read = {"matrix": Rotation.from_matrix(rotation)}
+    else:
+        orders = {"xyzw": [0, 1, 2, 3], "wxyz": [1, 2, 3, 0]}
+        read = {name: Rotation.from_quat(rotation[:, order]) for name, order in orders.items()}
+    return [_Poses(file, stamps, position, attitude, order) for order, attitude in read.items()]
 
 
 @dataclass(frozen=True)
 class _Fit:
     """Fit of poses to the IMU: times on the IMU's clock, alignment and mount R_PB."""
 
-    candidate: PoseCandidate
+    poses: _Poses
     time: FloatArray
     aligned: BodyAlignment
     mount: Rotation
@@ -172,11 +155,9 @@ class _Fit:
         return float(self.mount.magnitude())
 
 
-def _fitted(
-    sequence: ImuSequence, start_ns: np.int64 | int, candidate: PoseCandidate
-) -> _Fit | None:
+def _fitted(sequence: ImuSequence, start_ns: np.int64 | int, poses: _Poses) -> _Fit | None:
     time, gyro, accel = clean_samples(sequence)
-    pose_time, attitude = seconds(candidate.stamps_ns, start_ns), candidate.attitude
+    pose_time, attitude = seconds(poses.stamps_ns, start_ns), poses.attitude
     valid = np.ones(len(pose_time), dtype=np.bool_)
     try:
         aligned = None
@@ -194,7 +175,7 @@ def _fitted(
     if aligned.correlation < _MIN_CORRELATION:
         return None
     mount = _squared(max(aligned.mounts, key=lambda piece: piece[1] - piece[0])[2])
-    return _Fit(candidate, pose_time, aligned, mount)
+    return _Fit(poses, pose_time, aligned, mount)
 
 
 def _squared(mount: Rotation) -> Rotation:
@@ -205,33 +186,32 @@ def _squared(mount: Rotation) -> Rotation:
 
 
 def _log_choice(sequence: ImuSequence, fits: list[_Fit], chosen: _Fit) -> None:
-    name = chosen.candidate.file.name
+    name = chosen.poses.file.name
     _log.info(
         "%s: truth is %s, attitude as %s, %.0f degrees from the IMU's axes, correlation %.3f",
-        sequence.name, name, chosen.candidate.order, np.degrees(chosen.turn),
+        sequence.name, name, chosen.poses.order, np.degrees(chosen.turn),
         chosen.aligned.correlation,
     )  # fmt: skip
     for other in fits:
-        if other.candidate.file != chosen.candidate.file and other.turn > _SAME_AXES_RAD:
+        if other.poses.file != chosen.poses.file and other.turn > _SAME_AXES_RAD:
             _log.warning(
                 "%s: the ground truth is %s; %s is rotated %.0f degrees from the IMU's axes",
-                sequence.name, name, other.candidate.file.name, np.degrees(other.turn),
+                sequence.name, name, other.poses.file.name, np.degrees(other.turn),
             )  # fmt: skip
 
 
 def _posed(sequence: ImuSequence, fit: _Fit) -> ImuSequence:
-    candidate, time = fit.candidate, fit.time + fit.aligned.lag
-    attitude_PB = candidate.attitude * fit.mount
-    truth = Trajectory(time, candidate.position, attitude_PB, valid=fit.aligned.valid)
+    poses, time = fit.poses, fit.time + fit.aligned.lag
+    attitude_PB = poses.attitude * fit.mount
+    truth = Trajectory(time, poses.position, attitude_PB, valid=fit.aligned.valid)
     sequence = accel_axes(sequence, truth)
     inside = (sequence.time >= time[0]) & (sequence.time <= time[-1])
     pose = truth.at(np.unique(sequence.time[inside]))
     force = interpolated(pose.time, sequence.time, sequence.accel)
     up = pose.attitude_WB.apply(force)[pose.valid].mean(axis=0)
     if np.linalg.norm(up) < MIN_GRAVITY_FORCE:
-        _log.warning(
-            "%s: rejected %s: no gravity to level its poses", sequence.name, candidate.file.name
-        )
+        message = "%s: rejected %s: no gravity to level its poses"
+        _log.warning(message, sequence.name, poses.file.name)
         return replace(sequence, truth=None)
     if min(up[1:]) < -_DOWN * np.linalg.norm(up):  # worlds have y or z up
         _log.warning("%s: inverted the accelerometer, which has Apple's sign", sequence.name)
@@ -243,5 +223,5 @@ def _posed(sequence: ImuSequence, fit: _Fit) -> ImuSequence:
             truth, position_W=R_WP.apply(truth.position_W), attitude_WB=R_WP * truth.attitude_WB
         )
     except InputError as error:
-        raise ReadError(candidate.file, "poses", str(error), "finite numbers") from None
+        raise ReadError(poses.file, "poses", str(error), "finite numbers") from None
     return replace(sequence, truth=truth)

@@ -17,18 +17,14 @@ import numpy as np
 from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.columns import Column, with_units_below
-from stario.sequences.readers.lines import head_lines, unquoted, with_seconds
+from stario.sequences.readers.lines import decimal_mark, head_lines, unquoted, with_seconds
 from stario.sequences.readers.phones.sensor_words import axis_of, is_time, words_of
 from stario.sequences.readers.text import RowFormat, Table, is_missing, read_table
 from stario.sequences.sequence import FloatArray
 
-_FORMATS = tuple(
-    RowFormat(delimiter=delimiter, decimal=decimal)
-    for delimiter in (";", "\t", ",", None)
-    for decimal in (".", ",")
-)
-"""Separators (None for blanks) and decimal marks in the order in which they are tried; commas may
-be both if cells are quoted."""
+_SEPARATORS = (";", "\t", ",", None)
+"""Separators in the order in which they are tried, None for blanks; a comma may be the decimal mark
+as well if cells are quoted."""
 
 _MARK_ROWS = 5
 """Number of rows that determine the decimal mark."""
@@ -65,13 +61,10 @@ class TableHead:
     rows: FloatArray
     dates: frozenset[int] = frozenset()
 
-    def read(self, columns: int | list[int]) -> Table:
-        """Read columns, given their number or indices, without a last row that is cut short.
-
-        Raises:
-            ReadError: a row is malformed.
-        """
-        return read_table(self.file, columns, self.row_format, killed=True)
+    def read(self, columns: int | Sequence[Column]) -> Table:
+        """Read columns, given their number or places, without a last row that is cut short."""
+        wanted = columns if isinstance(columns, int) else [place.index for place in columns]
+        return read_table(self.file, wanted, self.row_format, killed=True)
 
     def clock(self, column: Column) -> Column:
         """Return a clock's column with its unit, seconds if it holds dates."""
@@ -153,11 +146,13 @@ def first_row(lines: list[str], least: int = 4) -> RowFormat | None:
     for k, line in enumerate(lines):
         if line.lstrip().startswith("#"):
             continue
-        for row_format in _FORMATS:
+        for delimiter in _SEPARATORS:
+            decimal = decimal_mark(lines[k : k + _MARK_ROWS], delimiter)
+            row_format = RowFormat(k, delimiter, decimal)
             cells = row_format.cells(line)
-            numbers = _count_numbers(cells)
+            numbers = sum(math.isfinite(number_of(cell)) for cell in cells)
             if numbers >= least and 2 * numbers >= sum(bool(cell.strip()) for cell in cells):
-                return replace(_with_most_numbers(lines[k : k + _MARK_ROWS], row_format), skip=k)
+                return row_format
     return None
 
 
@@ -166,31 +161,10 @@ def number_of(cell: str) -> float:
     return number_in(cell.strip(" \"'"))
 
 
-def _count_numbers(cells: list[str]) -> int:
-    return sum(math.isfinite(number_of(cell)) for cell in cells)
-
-
-def _with_most_numbers(rows: list[str], first: RowFormat) -> RowFormat:
-    """Return the decimal mark that gives the most numbers: a row of integers fits either."""
-    if first.delimiter == ",":
-        return first
-
-    def numbers(row_format: RowFormat) -> int:
-        return sum(_count_numbers(row_format.cells(line)) for line in rows)
-
-    return max(first, replace(first, decimal="." if first.decimal == "," else ","), key=numbers)
-
-
 def refuse_several_devices(table: Table, titles: Sequence[str], column: int) -> None:
     """Refuse rows of several devices, whose samples must not be mixed.
 
-    Args:
-        table: the rows.
-        titles: titles of the file's columns.
-        column: index of a column of the sensor; rows in which it is blank do not count.
-
-    Raises:
-        ReadError: there are at least two devices.
+    Rows in which a column of the sensor is blank do not count.
     """
     for index, title in enumerate(titles):
         if "".join(words_of(title)) not in _TITLES:

@@ -51,11 +51,7 @@ class RowFormat:
         return unquoted(line, self.delimiter, self.decimal).split(self.delimiter)
 
     def rows(self, path: Path) -> list[Row]:
-        """Return the rows of a file, without quotes.
-
-        Raises:
-            ReadError: the file cannot be read or has none.
-        """
+        """Return the rows of a file, without quotes."""
         lines = read_lines(path)
         if self.decimal != "." or any('"' in line for line in lines):
             lines = [unquoted(line, self.delimiter, self.decimal) for line in lines]
@@ -104,9 +100,6 @@ class Table:
             column: index of the column in the file.
             unit_ns: its unit [ns].
             kept: rows to return the times of; all if None.
-
-        Raises:
-            ReadError: a cell is not a time.
         """
         rows = range(len(self.rows)) if kept is None else kept.tolist()
         since_1970 = FILETIME_1970 if unit_ns == FILETIME_NS else 0
@@ -127,9 +120,6 @@ class Table:
             title: its title, for errors.
             unit_ns: its unit [ns].
             origin: the row; if it has no time, the first one below that has.
-
-        Raises:
-            ReadError: a cell is not a time.
         """
         times = self._times(column, title, range(len(self.rows)), finite=False)
         start = next((time for time in times[origin:] if time.is_finite()), Decimal(0))
@@ -174,7 +164,7 @@ def read_table(
     if killed and len(rows) > 1:
         cut = ends_within_a_row(path, mark)
         try:
-            numbers_in_row(path, row_format, rows[-1], wanted, titles)
+            _numbers_in_row(path, row_format, rows[-1], wanted, titles)
         except ReadError:
             cut = True
         if cut:
@@ -185,18 +175,14 @@ def read_table(
         lines = [line for _, line in rows]
         values = np.loadtxt(lines, delimiter=mark, usecols=wanted, comments=None, ndmin=2)
     except ValueError:
-        values = np.array([numbers_in_row(path, row_format, row, wanted, titles) for row in rows])
+        values = np.array([_numbers_in_row(path, row_format, row, wanted, titles) for row in rows])
     return Table(path, row_format, wanted, values, rows)
 
 
-def numbers_in_row(
+def _numbers_in_row(
     path: Path, row_format: RowFormat, row: Row, wanted: list[int], titles: Sequence[str]
 ) -> list[float]:
-    """Return the numbers in some columns of a row, NaN where a cell holds none.
-
-    Raises:
-        ReadError: the row is cut short or holds something that is not a number.
-    """
+    """Return the numbers in some columns of a row, NaN where a cell holds none."""
     number, cells = row[0], row[1].split(row_format.delimiter)
     if len(cells) <= max(wanted):
         fix = "is the file cut short?"

@@ -11,7 +11,7 @@ from stario.sequences.arrays import check_type
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.files import atomic_write
-from stario.sequences.readers.text import RowFormat, numbers_in_row
+from stario.sequences.readers.text import RowFormat, read_table
 from stario.sequences.sequence import Trajectory
 
 _REMEDY = "pass track.trajectory, or Track.from_states(states).trajectory"
@@ -50,8 +50,7 @@ def read_tum(path: Path | str) -> Trajectory:
         if (cells := len(line.split())) != count:
             expected = f"{count}: {' '.join(_FIELDS)}"
             raise ReadError(path, f"line {number}", f"{cells} values", expected)
-    wanted = list(range(count))
-    rows = np.array([numbers_in_row(path, row_format, row, wanted, _FIELDS) for row in numbered])
+    rows = read_table(path, count, row_format, _FIELDS).values
 
     def refusal(k: int, field: str, found: str, expected: str) -> ReadError:
         return ReadError(path, f"line {numbered[k][0]}, {field}", found, expected)

@@ -61,11 +61,7 @@ def is_zip(path: Path) -> bool:
 
 
 def unpack_zip(path: Path, folder: Path) -> None:
-    """Unpack a zip's text files, and those of the zips in it, into a folder.
-
-    Raises:
-        ReadError: the zip is damaged, encrypted or far too large.
-    """
+    """Unpack a zip's text files, and those of the zips in it, into a folder."""
     try:
         left = _extract(path, path, folder, _MAX_BYTES)
         for inner in sorted(folder.rglob("*.zip")):
@@ -136,11 +132,7 @@ def is_json_export(path: Path) -> bool:
 
 
 def unpack_json(path: Path, folder: Path) -> None:
-    """Write a file for each sensor into a folder.
-
-    Raises:
-        ReadError: the file is not a JSON array of objects that name sensors.
-    """
+    """Write a file for each sensor into a folder."""
     objects = read_json(path)
     if not isinstance(objects, list) or not all(isinstance(row, dict) for row in objects):
         raise ReadError(path, "file", "other JSON", "an array of objects, one for each sample")
@@ -173,11 +165,7 @@ def is_echo(lines: list[str]) -> bool:
 
 
 def unpack_long_form(path: Path, folder: Path) -> None:
-    """Write a file for each sensor into a folder.
-
-    Raises:
-        ReadError: the file cannot be read or has another form.
-    """
+    """Write a file for each sensor into a folder."""
     lines = [line for line in read_lines(path) if is_row(line)]
     found = _column_of_sensors(lines)
     if found is None:

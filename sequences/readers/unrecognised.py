@@ -38,10 +38,7 @@ _CONTAINERS = {
 def unrecognised(path: Path, inside: list[Path], known: str) -> ReadError:
     """Return an error that describes what was found instead of a recording.
 
-    Args:
-        path: the file or folder.
-        inside: the recordings below it.
-        known: what would have been a recording.
+    There may be recordings `inside` a folder; `known` is what would have been one.
     """
     if inside:
         found, fix = f"a folder of {len(inside)} recordings", f"name one, such as {inside[0]}"

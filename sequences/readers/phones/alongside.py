@@ -14,6 +14,7 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -31,7 +32,7 @@ from stario.sequences.readers.checked import (
 )
 from stario.sequences.readers.clocks import unit_within
 from stario.sequences.readers.columns import Column
-from stario.sequences.readers.phones.files import SUFFIXES
+from stario.sequences.readers.phones.files import text_files
 from stario.sequences.readers.phones.sensor_layout import clock_of
 from stario.sequences.readers.phones.sensor_words import is_time, sensor_of, unit_of, words_of
 from stario.sequences.readers.table_head import TableHead, table_heads
@@ -41,6 +42,8 @@ from stario.sequences.time_order import increasing_mask
 from stario.sequences.units import TIME_UNITS, unit_named
 
 _log = logging.getLogger(__name__)
+
+Kind = TypeVar("Kind")
 
 _PRESSURE_FILES = {"barometer", "barometers", "baro", "bar", "pressure", "pres"}
 _SATELLITE_FILES = {"location", "locations", "gps", "gnss"}
@@ -79,11 +82,8 @@ _OF_ADVIO = ["time", "latitude", "longitude", "accuracy", "altitude", "vertical 
 class Recording:
     """What other files of a phone's recording must fit.
 
-    Attributes:
-        sensors: the gyroscope's file.
-        key: the words that the names of all files of the recording share.
-        start_ns: time of the first sample on the sensors' clock [ns].
-        stop_ns: time of the last sample [ns].
+    These are the gyroscope's file, the words `key` that the names of all files share, and the
+    times of first and last sample on the sensors' clock [ns].
     """
 
     sensors: Path
@@ -103,7 +103,7 @@ class _Columns:
 
     def read(self) -> Table:
         """Read the clock and the columns, in their order."""
-        return self.head.read([self.clock.index, *(p.index for p in self.places.values())])
+        return self.head.read([self.clock, *self.places.values()])
 
     def within(
         self, table: Table, known: BoolArray, recording: Recording
@@ -111,9 +111,6 @@ class _Columns:
         """Return the rows (N,) of `known` ones that hold something new within a recording.
 
         Their times [s] are returned as well.
-
-        Raises:
-            ReadError: all of several rows are at other times.
         """
         if self.held:
             values = table.values[:, 1:]
@@ -146,12 +143,8 @@ def _tables_alongside(
 ) -> Iterator[_Columns]:
     """Yield the tables that hold some quantities, the sensors' own first; never raises.
 
-    Args:
-        recording: the recording.
-        names: words of which the name of a file of theirs has one.
-        least: fewest numbers in a row.
-        places_in: function that returns the quantities' columns in a table, given also whether it
-            is the sensors'; none if it does not hold them.
+    Rows have at least `least` numbers, other files' names one of the words `names`. `places_in`
+    returns the columns in a table, given also whether it is the sensors'; none if it lacks them.
     """
     for file in (recording.sensors, *_files_named(recording, names)):
         own = file == recording.sensors
@@ -172,10 +165,9 @@ def _files_named(recording: Recording, names: set[str]) -> list[Path]:
     Not those of another recording: `two_gps.csv` next to `one_gyr.csv`.
     """
     key, found = set(recording.key.split()), []
-    for file in sorted(recording.sensors.parent.iterdir()):
-        words = set(words_of(file.stem))
-        mine = key <= words or words - names <= key
-        if file.suffix.lower() in SUFFIXES and names & words and mine:
+    for file, listed in text_files(recording.sensors.parent):
+        words = set(listed)
+        if names & words and (key <= words or words - names <= key):
             # `LocationGps.csv` holds satellite positions only, `Location.csv` those of all sources.
             found.append((not {"gps", "gnss"} & words, len(file.stem), file))
     return [file for *_, file in sorted(found)]
@@ -183,19 +175,32 @@ def _files_named(recording: Recording, names: set[str]) -> list[Path]:
 
 def recorded_pressure(recording: Recording) -> Barometer | None:
     """Return the pressure next to a recording's sensors; None if there is none that can be used."""
-    for columns in _tables_alongside(recording, _PRESSURE_FILES, 2, _pressure_in):
-        place = columns.places["pressure"]
+    tables = _tables_alongside(recording, _PRESSURE_FILES, 2, _pressure_in)
+    return next(_read_alongside("pressure", _pressure, tables, recording), None)
+
+
+def _read_alongside(
+    words: str,
+    read: Callable[[_Columns, Recording], Kind | None],
+    tables: Iterator[_Columns],
+    recording: Recording,
+) -> Iterator[Kind]:
+    """Yield what is read from tables, none of which is worth the recording."""
+    for columns in tables:
         try:
-            table = columns.read()
-            rows, time = columns.within(table, np.isfinite(table.values[:, 1]), recording)
-        except ReadError as error:  # the barometer is optional
-            _log.warning("pressure skipped: %s", error)
+            found = read(columns, recording)
+        except ReadError as error:
+            _log.warning("%s skipped: %s", words, error)
             continue
-        title = place.title or f"column {place.index + 1}"
-        found = barometer(table.path, title, time, table.values[rows, 1], place.unit)
         if found is not None:
-            return found
-    return None
+            yield found
+
+
+def _pressure(columns: _Columns, recording: Recording) -> Barometer | None:
+    table, place = columns.read(), columns.places["pressure"]
+    rows, time = columns.within(table, np.isfinite(table.values[:, 1]), recording)
+    title = place.title or f"column {place.index + 1}"
+    return barometer(table.path, title, time, table.values[rows, 1], place.unit)
 
 
 def _pressure_in(head: TableHead, is_sensors: bool) -> dict[str, Column]:
@@ -221,14 +226,8 @@ def _pressure_unit(title: str) -> str:
 
 def reported_positions(recording: Recording) -> Iterator[Satellites]:
     """Yield the satellite positions next to a recording's sensors, the best file's first."""
-    for columns in _tables_alongside(recording, _SATELLITE_FILES, 3, _satellites_in):
-        try:
-            found = _satellites(columns, recording)
-        except ReadError as error:  # positions are optional
-            _log.warning("satellite positions skipped: %s", error)
-            continue
-        if found is not None:
-            yield found
+    tables = _tables_alongside(recording, _SATELLITE_FILES, 3, _satellites_in)
+    return _read_alongside("satellite positions", _satellites, tables, recording)
 
 
 def _satellites_in(head: TableHead, is_sensors: bool) -> dict[str, Column]:
@@ -308,17 +307,11 @@ def as_known_positions(reported: Satellites) -> PositionTrack | None:
 
 
 def reference_points(recording: Recording) -> PositionTrack | None:
-    """Return the waypoints of a file such as `*_ref.csv` (time, x, y [m]), or None without one.
-
-    Raises:
-        ReadError: a row is malformed.
-    """
-    for file in sorted(recording.sensors.parent.iterdir()):
-        words = set(words_of(file.stem))
-        if file.suffix.lower() not in (".csv", ".txt") or not _POINT_FILES & words:
-            continue
-        head = next(table_heads(file, least=3), None)
-        if head is None or not set(recording.key.split()) <= words:
+    """Return the waypoints of a file such as `*_ref.csv` (time, x, y [m]), or None without one."""
+    for file, words in text_files(recording.sensors.parent):
+        named = _POINT_FILES & set(words) and set(recording.key.split()) <= set(words)
+        head = next(table_heads(file, least=3), None) if named else None
+        if head is None:
             continue
         table = head.read(3)
         unit = unit_within(file, table.values[:, 0], recording.start_ns, recording.stop_ns)

@@ -21,10 +21,9 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.arrays import integral, interpolated
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.clocks import time_unit
+from stario.sequences.readers.clocks import Samples, time_unit
 from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.files import PhoneFiles
-from stario.sequences.readers.phones.samples import Samples
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import DeviceAttitude, FloatArray
 from stario.sequences.time_order import increasing_mask
@@ -56,7 +55,7 @@ def logged_attitude(files: PhoneFiles, gyro: Samples) -> tuple[IntArray, Rotatio
     if table is None or not table.quaternion:
         return None
     try:
-        rows = table.read([table.clock, *table.quaternion])
+        rows = table.head.read([table.clock, *table.quaternion])
         unit_ns = time_unit(table.file, rows.values[:, 0], table.clock.unit)
         stamps = rows.stamps_ns(table.clock.index, unit_ns)
     except ReadError:  # attitude is optional
@@ -76,14 +75,9 @@ def agreeing_attitude(
 ) -> tuple[IntArray, Rotation] | None:
     """Return the reading of an attitude that best fits the gyroscope, or None if none fits.
 
-    Args:
-        stamps: (N,) times [ns].
-        quaternion: (N, 4) x, y, z and w; rows that are not unit quaternions are skipped.
-        gyro: gyroscope samples, on the same clock.
-        named: whether the order is known; otherwise w, x, y and z is tried as well.
-
-    Returns:
-        Time stamps (K,) [ns] and K rotations, body to a world with z up.
+    Quaternions (N, 4) are x, y, z and w at times (N,) [ns] on the gyroscope's clock; unless their
+    order is `named`, w, x, y and z is tried as well. Those that are not unit quaternions are
+    skipped: K times [ns] and rotations, body to a world with z up, are returned.
     """
     good = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) < NORM_TOLERANCE
     stamps, quaternion = stamps[good], quaternion[good]

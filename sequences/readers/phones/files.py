@@ -102,7 +102,6 @@ def phone_recordings(folder: Path) -> list[PhoneFiles]:
 
 def groups_of(folder: Path) -> list[PhoneFiles]:
     """Return a folder's files of each recording, complete or not; never raises."""
-    named = [(file, words_of(file.stem)) for file in sorted(folder.iterdir()) if may_hold(file)]
 
     def preference(item: tuple[Path, list[str]]) -> tuple[bool, bool, bool]:
         """Return a sort key: uncalibrated files last, total force first, then calibrated files."""
@@ -110,7 +109,7 @@ def groups_of(folder: Path) -> list[PhoneFiles]:
         return is_uncalibrated(words), "total" not in words, not {"calibrated", "mot"} & {*words}
 
     groups: dict[str, PhoneFiles] = {}
-    for file, words in sorted(named, key=preference):
+    for file, words in sorted(text_files(folder), key=preference):
         # iOS Logger's `Motion.txt` is an attitude.
         sensor: Sensor | None = "attitude" if words == ["motion"] else sensor_of(words)
         table = sensor_table(file) if sensor else None
@@ -146,14 +145,18 @@ def sensors_in(path: Path) -> list[Sensor]:
         table = sensor_table(path) if may_hold(path) else None
         order: tuple[Sensor, ...] = ("accel", "linear", "gyro", "mag")
         return [sensor for sensor in order if table is not None and sensor in table.axes]
-    files = [file for file in sorted(path.iterdir()) if may_hold(file)]
-    named = [(sensor_of(words_of(file.stem)), file) for file in files]
+    named = ((sensor_of(words), file) for file, words in text_files(path))
     return list(dict.fromkeys(s for s, file in named if s is not None and sensor_table(file)))
 
 
 def may_hold(file: Path) -> bool:
     """Return whether a file may hold samples as text, by its name; never raises."""
     return file.suffix.lower() in SUFFIXES and file.is_file() and not file.name.startswith(".")
+
+
+def text_files(folder: Path) -> list[tuple[Path, list[str]]]:
+    """Return the files of a folder that may hold samples, each with the words of its name."""
+    return [(file, words_of(file.stem)) for file in sorted(folder.iterdir()) if may_hold(file)]
 
 
 def _merged_groups(groups: list[PhoneFiles]) -> PhoneFiles:

@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
-from stario.sequences.readers.clocks import resample_to_gyro, source_words
+from stario.sequences.readers.clocks import Samples, resample_to_gyro, source_words
 from stario.sequences.readers.columns import IMU, POSITION, named_columns
 from stario.sequences.readers.lines import head_lines, may_be_read
 from stario.sequences.readers.phones.alongside import (
@@ -51,8 +51,8 @@ from stario.sequences.readers.phones.files import (
     is_complete,
     phone_recordings,
 )
-from stario.sequences.readers.phones.samples import Samples, read_samples
-from stario.sequences.readers.phones.sensor_layout import SensorTable, sensor_table
+from stario.sequences.readers.phones.samples import read_samples
+from stario.sequences.readers.phones.sensor_layout import sensor_table
 from stario.sequences.readers.phones.sensor_words import (
     Sensor,
     is_sensor_word,
@@ -167,28 +167,19 @@ def assemble_recording(
     orders: Collection[str] = ("xyzw", "wxyz", "matrix"),
     core_motion: bool = False,
 ) -> ImuSequence:
-    """Assemble the recording of a set of files.
+    """Assemble the recording of a set of files and of poses alongside them.
 
-    Args:
-        name: name of the recording.
-        files: files by sensor.
-        poses: pose files alongside them.
-        orders: orders to try for their attitude, as for `with_pose`.
-        core_motion: whether an iPhone wrote the files: values in g have Apple's sign.
-
-    Raises:
-        ReadError: a file is malformed or the sensors do not overlap in time.
+    `orders` are as for `with_pose`; `core_motion` says that an iPhone wrote the files: values in g
+    have Apple's sign.
     """
     folder = files.gyro.parent
     for file in files.unread:
         why = f"it has {NO_SAMPLES}" if may_be_read(file) else "no permission"
         _log.warning("%s: not read: %s", file, why)
-    gyro = _read(files.tables["gyro"][0], "gyro")
+    gyro = read_samples(files.tables["gyro"][0], "gyro")
     attitude = logged_attitude(files, gyro)
     accel, converted, maybe_apple = _force(files, attitude, core_motion)
-    stamps, rate, force = resample_to_gyro(
-        folder, gyro.stamps_ns, gyro.values, accel.stamps_ns, accel.values
-    )
+    stamps, rate, force = resample_to_gyro(folder, gyro, accel)
     converted["gyro"] = gyro.unit not in ("", "rad/s")
     recording = Recording(files.gyro, files.key, stamps[0], stamps[-1])
     reported = reported_positions(recording)
@@ -216,14 +207,6 @@ def assemble_recording(
     return replace(sequence, positions=positions)
 
 
-def _read(table: SensorTable, sensor: Sensor) -> Samples:
-    """Read the columns that the header gives for the sensor, or those of a file that names none."""
-    axes = next((key for key in (sensor, "") if key in table.axes), next(iter(table.axes), None))
-    if axes is None:
-        raise ReadError(table.file, "header", "no x, y and z", f"the axes of the {sensor}")
-    return read_samples(table, sensor, axes)
-
-
 def _force(
     files: PhoneFiles, attitude: tuple[IntArray, Rotation] | None, core_motion: bool
 ) -> tuple[Samples, dict[str, bool], bool]:
@@ -231,17 +214,17 @@ def _force(
 
     Which of unit and sign were converted follows, and whether it may have Apple's sign.
     """
-    candidates = [_read(table, "accel") for table in files.tables.get("accel", [])]
+    candidates = [read_samples(table, "accel") for table in files.tables.get("accel", [])]
     gravity_table = files.first("gravity")
-    gravity = None if gravity_table is None else _read(gravity_table, "gravity")
+    gravity = None if gravity_table is None else read_samples(gravity_table, "gravity")
     total = _with_gravity(candidates, or_g=gravity is None)
-    accel = total or (candidates[0] if candidates else _read(files.tables["linear"][0], "linear"))
+    first = total or next(iter(candidates), None)
+    accel = first or read_samples(files.tables["linear"][0], "linear")
     in_two_parts = total is None and gravity is not None
     if total is None and gravity is not None:
         stamps, force, gravity_B = resample_to_gyro(
-            files.gyro.parent, accel.stamps_ns, accel.values, gravity.stamps_ns, gravity.values,
-            ("linear acceleration", "gravity"),
-        )  # fmt: skip
+            files.gyro.parent, accel, gravity, ("linear acceleration", "gravity")
+        )
         accel = replace(accel, stamps_ns=stamps, values=force + gravity_B)
         _log.info("%s: added gravity from its own columns or file", files.shown)
     in_g = not accel.unit and is_in_g(accel.values)
@@ -274,7 +257,7 @@ def _magnetometer(files: PhoneFiles, start_ns: np.int64, stop_ns: np.int64) -> M
     if table is None:
         return None
     try:
-        samples = _read(table, "mag")
+        samples = read_samples(table, "mag")
     except ReadError as error:  # the magnetometer is optional
         _log.warning("magnetometer skipped: %s", error)
         return None
@@ -282,4 +265,4 @@ def _magnetometer(files: PhoneFiles, start_ns: np.int64, stop_ns: np.int64) -> M
     if not inside.any():
         _log.warning("magnetometer skipped: none of its samples is within the recording")
         return None
-    return magnetometer(seconds(samples.stamps_ns, start_ns), samples.values)
+    return magnetometer(samples.seconds(start_ns), samples.values)

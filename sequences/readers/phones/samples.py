@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.clocks import assumed_unit, refuse_counts_and_dates, time_unit
+from stario.sequences.readers.clocks import Samples, inferred_unit, time_unit
 from stario.sequences.readers.columns import unit_factor
 from stario.sequences.readers.phones.sensor_layout import SensorTable
 from stario.sequences.readers.phones.sensor_words import SENSORS, Sensor
@@ -23,42 +22,22 @@ _WILD = 100.0
 """Factor beyond a sensor's limit at which one sample would spoil integrals and interpolation."""
 
 
-@dataclass(frozen=True)
-class Samples:
-    """Samples of a sensor.
-
-    Attributes:
-        stamps_ns: (N,) times [ns].
-        values: (N, 3) values.
-        unit: unit named in the file; empty if none.
-        assumed_time_unit: unit that times without one were taken for; empty if it is certain.
-    """
-
-    stamps_ns: IntArray
-    values: FloatArray
-    unit: str = ""
-    assumed_time_unit: str = ""
-
-
-def read_samples(table: SensorTable, sensor: Sensor, axes: str) -> Samples:
-    """Read a sensor's samples in the columns `table.axes[axes]`.
+def read_samples(table: SensorTable, sensor: Sensor) -> Samples:
+    """Read a sensor's samples in the columns that name it, or in those of a file that names none.
 
     They are in rad/s, m/s^2 or uT if the file names a unit.
-
-    Raises:
-        ReadError: a row is malformed, a unit is unknown, a value exceeds any sensor's, or the
-            file holds several IMUs of which none can be chosen.
     """
     if table.conflict:
         fix = "keep the columns of one"
         raise ReadError(table.file, "header", f"several IMUs ({table.conflict})", "one", fix)
+    axes = next((key for key in (sensor, "") if key in table.axes), next(iter(table.axes), None))
+    if axes is None:
+        raise ReadError(table.file, "header", "no x, y and z", f"the axes of the {sensor}")
     places, clock = table.axes[axes], table.clocks.get(axes, table.clock)
     titles = ", ".join(p.title or f"column {p.index + 1}" for p in places)
-    rows = table.read([clock, *places, *table.biases])
+    rows = table.head.read([clock, *places, *table.biases])
     refuse_several_devices(rows, table.head.titles, places[0].index)
     kept = _complete_rows(table.file, sensor, titles, rows.values[:, 1:])
-    if not clock.unit:
-        refuse_counts_and_dates(table.file, clock.title or "time", rows.values[:, 0])
     time, values = rows.values[kept, 0], rows.values[kept, 1:4]
     if table.biases:
         values = values - rows.values[kept, 4:7]
@@ -66,10 +45,11 @@ def read_samples(table: SensorTable, sensor: Sensor, axes: str) -> Samples:
     values = unit_factor(table.file, named, SENSORS[sensor].units) * values
     sound = _sound_samples(table.file, sensor, titles, values)
     kept, time, values = kept[sound], time[sound], values[sound]
-    unit_ns = time_unit(table.file, time, clock.unit)
-    stamps = rows.stamps_ns(clock.index, unit_ns, kept)
-    assumed = "" if clock.unit else assumed_unit(unit_ns, float(time[0]))
-    return Samples(stamps, values, named.unit, assumed)
+    if clock.unit:
+        unit_ns, assumed = time_unit(table.file, time, clock.unit), ""
+    else:
+        unit_ns, assumed = inferred_unit(table.file, clock.title or "time", time)
+    return Samples(rows.stamps_ns(clock.index, unit_ns, kept), values, named.unit, assumed)
 
 
 def _complete_rows(file: Path, sensor: Sensor, titles: str, values: FloatArray) -> IntArray:
@@ -87,11 +67,7 @@ def _complete_rows(file: Path, sensor: Sensor, titles: str, values: FloatArray) 
 
 
 def _sound_samples(file: Path, sensor: Sensor, titles: str, values: FloatArray) -> BoolArray:
-    """Return which samples (N,) are not wild, such as infinite, and warn of those that are.
-
-    Raises:
-        ReadError: most exceed any sensor's.
-    """
+    """Return which samples (N,) are not wild, such as infinite, and warn of those that are."""
     size = np.abs(values).max(axis=1)
     typical = float(np.median(size))
     if typical > SENSORS[sensor].limit:

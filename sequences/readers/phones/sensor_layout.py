@@ -11,7 +11,6 @@ devices apart, whose sensors must not be mixed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -31,7 +30,6 @@ from stario.sequences.readers.phones.sensor_words import (
     unit_of,
 )
 from stario.sequences.readers.table_head import TableHead, table_heads
-from stario.sequences.readers.text import Table
 from stario.sequences.sequence import FloatArray
 
 Axes = tuple[Column, Column, Column]
@@ -82,10 +80,6 @@ class SensorTable:
     def file(self) -> Path:
         """The file."""
         return self.head.file
-
-    def read(self, columns: Sequence[Column]) -> Table:
-        """Read columns; arguments and errors as for `TableHead.read`."""
-        return self.head.read([place.index for place in columns])
 
 
 def sensor_table(file: Path) -> SensorTable | None:

@@ -17,7 +17,7 @@ import numpy as np
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import captured_rotations, pose_mask
 from stario.sequences.readers.columns import IMU, canonical_names
-from stario.sequences.readers.lines import first_line, first_lines
+from stario.sequences.readers.lines import first_line
 from stario.sequences.readers.phones.sensor_words import time_unit_of
 from stario.sequences.readers.text import read_table, seconds
 from stario.sequences.sequence import ImuSequence, Trajectory
@@ -50,12 +50,8 @@ def read_euroc(path: Path) -> ImuSequence:
 
 
 def _check_titles(imu: Path) -> None:
-    """Check that a header which names the IMU's columns has them in EuRoC's order.
-
-    Raises:
-        ReadError: it has another order.
-    """
-    header = next(iter(first_lines(imu, 1, comments=True)), "")
+    """Check that a header which names the IMU's columns has them in EuRoC's order."""
+    header = _header(imu)
     names = canonical_names(header)
     if set(names) >= {"t", *IMU} and names[:7] != ["t", *IMU]:
         expected = "time, gyroscope xyz and accelerometer xyz first"
@@ -63,10 +59,13 @@ def _check_titles(imu: Path) -> None:
         raise ReadError(imu, "header", repr(header.strip()[:80]), expected, fix)
 
 
+def _header(path: Path) -> str:
+    return first_line(path, comments=True) or ""
+
+
 def _unit_ns(path: Path) -> int:
     """Return the unit of a file's times [ns], nanoseconds unless its title names another."""
-    title = next(iter(first_lines(path, 1, comments=True)), "").split(",")[0]
-    return TIME_UNITS.get(time_unit_of(title), 1)
+    return TIME_UNITS.get(time_unit_of(_header(path).split(",")[0]), 1)
 
 
 def is_euroc(path: Path) -> bool:

@@ -28,7 +28,7 @@ from scipy.ndimage import binary_dilation, median_filter
 from stario.sequences.arrays import samples_in
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.checked import captured_rotations, magnetometer
-from stario.sequences.readers.clocks import resample_to_gyro, time_unit
+from stario.sequences.readers.clocks import Samples, joined_sequence, time_unit
 from stario.sequences.readers.lines import first_lines, first_numbers, numbers_in
 from stario.sequences.readers.text import IntArray, Table, read_table, seconds
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
@@ -52,9 +52,6 @@ def read_oxiod(path: Path) -> ImuSequence:
     """Read `imuN.csv` and, if it lies alongside, the capture.
 
     The truth is None, with a warning logged, if too little of it agrees with the gyroscope.
-
-    Raises:
-        ReadError: a file is missing or cut short, or two of `syn` differ in their number of rows.
     """
     phone, start_ns = _sensor_rows(path) if _is_sensor_rows(path) else _phone(path)
     capture = capture_file(path)
@@ -102,12 +99,11 @@ def _sensor_rows(path: Path) -> tuple[ImuSequence, np.int64 | None]:
     """Read a file with a row for each sample of each sensor, at its own time."""
     table = read_table(path, columns=5)
     stamps, code = _stamps_ns(table), table.values[:, 1]
-    gyro, accel, magnetic = (code == c for c in (_GYROSCOPE, _ACCELEROMETER, _MAGNETIC))
-    xyz = table.values[:, 2:5]
-    imu_ns, rate, force = resample_to_gyro(path, stamps[gyro], xyz[gyro], stamps[accel], xyz[accel])
-    field = magnetometer(seconds(stamps[magnetic], imu_ns[0]), xyz[magnetic])
-    time = seconds(imu_ns, imu_ns[0])
-    return ImuSequence(_name(path), time, rate, force, magnetometer=field), imu_ns[0]
+    gyro, accel, field = (
+        Samples(stamps[code == c], table.values[code == c, 2:5])
+        for c in (_GYROSCOPE, _ACCELEROMETER, _MAGNETIC)
+    )
+    return joined_sequence(path, _name(path), gyro, accel, field)
 
 
 def _stamps_ns(table: Table) -> IntArray:
@@ -126,30 +122,25 @@ def capture_file(path: Path) -> Path | None:
 
 def _truth(path: Path, phone: ImuSequence, start_ns: np.int64 | None) -> Trajectory | None:
     table = read_table(path, columns=max(8, len(first_numbers(path))))
-    position = table.values[:, -7:-4]
-    attitude_WV, valid = captured_rotations(table.values[:, -4:])
+    time, kept = phone.time, np.arange(len(table.values))
+    if start_ns is not None:
+        stamps, kept = np.unique(_stamps_ns(table), return_index=True)
+        time = seconds(stamps, start_ns)
+    elif len(kept) != len(time):
+        raise ReadError(path, "rows", str(len(kept)), f"{len(time)} as in the IMU's file")
+    # Left in as invalid, they would spoil the averages over their neighbours.
+    finite = np.isfinite(table.values[kept, -7:]).all(axis=1)
+    time, pose = time[finite], table.values[kept[finite], -7:]
+    position, (attitude_WV, valid) = pose[:, :3], captured_rotations(pose[:, 3:])
     valid &= (position != 0.0).any(axis=1)  # zeros are written while the body is out of sight
     known = np.isfinite(phone.gyro).all(axis=1) & np.isfinite(phone.accel).all(axis=1)
     imu = (phone.time[known], phone.gyro[known], phone.accel[known])
     try:
-        time, kept = phone.time, np.arange(len(table.values))
-        if start_ns is not None:
-            stamps, kept = np.unique(_stamps_ns(table), return_index=True)
-            time = seconds(stamps, start_ns)
-        elif len(kept) != len(time):
-            expected = f"{len(time)} as in the IMU's file"
-            raise ReadError(path, "rows", str(len(kept)), expected)
-        # Left in as invalid, they would spoil the averages over their neighbours.
-        finite = np.isfinite(table.values[kept, -7:]).all(axis=1)
-        time, kept = time[finite], kept[finite]
-        position, attitude_WV, valid = position[kept], attitude_WV[kept], valid[kept]
         valid &= ~_position_glitches(time, position)
         if start_ns is not None:
             time = time + clock_offset(*imu[:2], time, attitude_WV, valid)
         aligned = align_tracked_body(*imu, time, attitude_WV, valid, position)
     except InputError as error:
-        if isinstance(error, ReadError):
-            raise
         _log.warning("%s: ground truth rejected: %s", path, error)
         return None
     return Trajectory(

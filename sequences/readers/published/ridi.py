@@ -21,6 +21,7 @@ camera, the display, the sensor); the one that agrees with the gyroscope is used
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,26 +29,19 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import finite_rows, magnetometer, rotations, trajectory
-from stario.sequences.readers.clocks import resample_to_gyro
+from stario.sequences.readers.clocks import Samples, joined_sequence
 from stario.sequences.readers.lines import first_line
 from stario.sequences.readers.poses import pose_files, with_pose
-from stario.sequences.readers.published.by_name import NamedColumns, axes_of, header_names
-from stario.sequences.readers.text import IntArray, RowFormat, read_table, seconds
-from stario.sequences.sequence import FloatArray, ImuSequence, Magnetometer, Trajectory
+from stario.sequences.readers.published.fields import MAGNETIC, file_in, header_names, read_columns
+from stario.sequences.readers.text import RowFormat, read_table
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
 _log = logging.getLogger(__name__)
 
-UPRIGHT = Rotation.from_euler("x", 90.0, degrees=True)
+_UPRIGHT = Rotation.from_euler("x", 90.0, degrees=True)
 """Rotation from a world with y up to one with z up: (x, y, z) becomes (x, -z, y)."""
 
-_COLUMNS = (
-    "time",
-    *axes_of("gyro"),
-    *axes_of("acce"),
-    *axes_of("pos"),
-    *axes_of("ori", "wxyz"),
-    *axes_of("rv", "wxyz"),
-)
+_STEMS = {"gyro": "xyz", "acce": "xyz", "pos": "xyz", "ori": "wxyz", "rv": "wxyz"}
 _OWN = ("rv_x", "rv_w", "ori_w", "linacce_x", "grav_x")
 """Names that distinguish this header from others with a gyroscope and an accelerometer."""
 
@@ -58,46 +52,44 @@ _FILES = ("acce.txt", "gyro.txt", "orientation.txt", "pose.txt")
 
 def read_ridi(path: Path) -> ImuSequence:
     """Read a recording from its folder, its `processed` folder or its `data.csv`."""
-    file = data_file(path)
+    file = _data_file(path)
     if file is None:
         raise ReadError(path, "processed/data.csv", "no such file", "a RIDI or IMUNet recording")
     if file.name in _PICKLES:
         fix = "write the table to data.csv next to it with pandas' to_csv"
         raise ReadError(file, "file", "a pickle, which may run code", "processed/data.csv", fix)
-    columns = NamedColumns(file, _COLUMNS, magnetic=("magnet",))
-    time, accel = columns.seconds("time"), columns.stack("acce")
-    pose, game_rv = columns.rotations("ori"), columns.rotations("rv")
+    time, fields = read_columns(file, ("time", 1), _STEMS)
+    pose, game_rv = fields.rotations("ori"), fields.rotations("rv")
     attitude_WB = pose[0] * game_rv[0].inv() * game_rv
-    if y_is_up(file, attitude_WB, accel):
-        attitude_WB = UPRIGHT * attitude_WB
+    if _y_is_up(file, attitude_WB, fields["acce"]):
+        attitude_WB = _UPRIGHT * attitude_WB
     return ImuSequence(
         name=_name(file),
         time=time,
-        gyro=columns.stack("gyro"),
-        accel=accel,
-        truth=trajectory(file, time, columns.stack("pos"), attitude_WB),
-        magnetometer=columns.magnetometer(time),
+        gyro=fields["gyro"],
+        accel=fields["acce"],
+        truth=trajectory(file, time, fields["pos"], attitude_WB),
+        magnetometer=magnetometer(time, fields.optional(MAGNETIC)),
     )
 
 
 def is_ridi(path: Path) -> bool:
     """Return whether a path leads to a CSV with these columns, or to a pickle in its place."""
-    file = data_file(path)
+    file = _data_file(path)
     if file is None or file.name in _PICKLES:
         return file is not None
     return len(set(_OWN) & set(header_names(file))) >= 2
 
 
-def data_file(path: Path) -> Path | None:
-    """Return the recording's `data.csv`, else a pickle in its place, else None."""
-    if path.is_file():
-        return path if path.suffix == ".csv" or path.name in _PICKLES else None
-    inside = path if path.name == "processed" else path / "processed"
-    files = (inside / name for name in ("data.csv", *_PICKLES))
-    return next((file for file in files if file.is_file()), None)
+def _data_file(path: Path) -> Path | None:
+    """Return the recording's `data.csv`, any other CSV, or else a pickle in its place."""
+    if path.suffix == ".csv" and path.is_file():
+        return path
+    inside = path / "processed" if path.is_dir() and path.name != "processed" else path
+    return file_in(inside, "data.csv", *_PICKLES)
 
 
-def y_is_up(path: Path, attitude_WB: Rotation, accel: FloatArray) -> bool:
+def _y_is_up(path: Path, attitude_WB: Rotation, accel: FloatArray) -> bool:
     """Return whether an attitude's world has y up instead of z, by the mean specific force (N, 3).
 
     A warning names the file if neither axis is near the force.
@@ -120,20 +112,18 @@ def read_imunet(path: Path) -> ImuSequence:
     if is_ridi(path):
         return read_ridi(path)
     folder = path if path.is_dir() else path.parent
-    gyro_ns, gyro = _rows(folder / "gyro.txt", 3)
-    accel_ns, accel = _rows(folder / "acce.txt", 3)
-    stamps, gyro, accel = resample_to_gyro(folder, gyro_ns, gyro, accel_ns, accel)
-    time = seconds(stamps, stamps[0])
-    poses = pose_files(folder)
-    sequence = ImuSequence(
-        name=folder.resolve().name,
-        time=time,
-        gyro=gyro,
-        accel=accel,
-        truth=_truth(folder, stamps[0], time, accel) if len(poses) == 1 else None,
-        magnetometer=_magnetometer(folder / "magnet.txt", stamps[0]),
+    field = folder / "magnet.txt"
+    sequence, start_ns = joined_sequence(
+        folder,
+        folder.resolve().name,
+        _samples(folder / "gyro.txt", 3),
+        _samples(folder / "acce.txt", 3),
+        _samples(field, 3) if field.is_file() and first_line(field) is not None else None,
     )
-    return sequence if sequence.truth else with_pose(sequence, stamps[0], poses)
+    poses = pose_files(folder)
+    if len(poses) != 1:
+        return with_pose(sequence, start_ns, poses)
+    return replace(sequence, truth=_truth(folder, start_ns, sequence))
 
 
 def is_imunet(path: Path) -> bool:
@@ -141,34 +131,27 @@ def is_imunet(path: Path) -> bool:
     return path.is_dir() and all((path / name).is_file() for name in _FILES)
 
 
-def _magnetometer(path: Path, start_ns: np.int64) -> Magnetometer | None:
-    if not path.is_file() or first_line(path) is None:
-        return None
-    table = read_table(path, 4, RowFormat(delimiter=None))
-    return magnetometer(seconds(table.stamps_ns(), start_ns), table.values[:, 1:])
-
-
-def _rows(path: Path, width: int) -> tuple[IntArray, FloatArray]:
+def _samples(path: Path, width: int) -> Samples:
     table = read_table(path, 1 + width, RowFormat(delimiter=None))
     rows = finite_rows(path, "values", table.values)
-    return table.stamps_ns(kept=rows), table.values[rows, 1:]
+    return Samples(table.stamps_ns(kept=rows), table.values[rows, 1:])
 
 
-def _truth(folder: Path, start_ns: np.int64, time: FloatArray, accel: FloatArray) -> Trajectory:
-    pose_ns, pose = _rows(folder / "pose.txt", 7)
-    rv_ns, rv = _rows(folder / "orientation.txt", 4)
-    kept = np.unique(rv_ns, return_index=True)[1]
-    game_rv = rotations(folder / "orientation.txt", "quaternion", rv[kept], "xyzw")
-    inside = (pose_ns >= rv_ns[kept[0]]) & (pose_ns <= rv_ns[kept[-1]])
+def _truth(folder: Path, start_ns: np.int64, sequence: ImuSequence) -> Trajectory:
+    file = folder / "pose.txt"
+    pose, rv = _samples(file, 7), _samples(folder / "orientation.txt", 4)
+    pose_time = pose.seconds(start_ns)
+    rv_time, kept = np.unique(rv.seconds(start_ns), return_index=True)
+    game_rv = rotations(folder / "orientation.txt", "quaternion", rv.values[kept], "xyzw")
+    inside = (pose_time >= rv_time[0]) & (pose_time <= rv_time[-1])
     if not inside.any() or len(kept) < 2:
-        raise ReadError(folder / "pose.txt", "time", "no pose", "poses during orientation.txt")
-    pose_ns, pose = pose_ns[inside], pose[inside]
-    known = Slerp(seconds(rv_ns[kept], start_ns), game_rv)
-    pose_time = seconds(pose_ns, start_ns)
-    start = rotations(folder / "pose.txt", "quaternion", pose[:, 3:7], "xyzw")[0]
+        raise ReadError(file, "time", "no pose", "poses during orientation.txt")
+    pose_time, poses = pose_time[inside], pose.values[inside]
+    known = Slerp(rv_time, game_rv)
+    start = rotations(file, "quaternion", poses[:, 3:7], "xyzw")[0]
     R_WU = start * known(pose_time[0]).inv()
-    attitude_WB, position = R_WU * known(pose_time), pose[:, :3]
-    at_force = R_WU * known(np.clip(time, known.times[0], known.times[-1]))
-    if y_is_up(folder / "pose.txt", at_force, accel):
-        attitude_WB, position = UPRIGHT * attitude_WB, UPRIGHT.apply(position)
-    return trajectory(folder / "pose.txt", pose_time, position, attitude_WB)
+    attitude_WB, position = R_WU * known(pose_time), poses[:, :3]
+    at_force = R_WU * known(np.clip(sequence.time, rv_time[0], rv_time[-1]))
+    if _y_is_up(file, at_force, sequence.accel):
+        attitude_WB, position = _UPRIGHT * attitude_WB, _UPRIGHT.apply(position)
+    return trajectory(file, pose_time, position, attitude_WB)

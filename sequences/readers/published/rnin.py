@@ -14,21 +14,15 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import trajectory
-from stario.sequences.readers.published.by_name import NamedColumns, axes_of, header_names
+from stario.sequences.readers.checked import magnetometer, trajectory
+from stario.sequences.readers.published.fields import MAGNETIC, header_names, read_columns
 from stario.sequences.sequence import ImuSequence
 
 _FILE = "SenseINS.csv"
-_COLUMNS = (
-    *axes_of("gyro"),
-    *axes_of("acce"),
-    *axes_of("gt_q", "wxyz"),
-    *axes_of("gt_p"),
-    *axes_of("vio_q", "wxyz"),
-    *axes_of("vio_p"),
-    *axes_of("vio_gyro_bias"),
-    *axes_of("vio_acce_bias"),
-)
+_STEMS = {
+    **dict.fromkeys(("gyro", "acce", "gt_p", "vio_p", "vio_gyro_bias", "vio_acce_bias"), "xyz"),
+    **dict.fromkeys(("gt_q", "vio_q"), "wxyz"),
+}
 _MAGNETIC = ("magnet", "mag", "magn")
 """Stems of the magnetic field's columns [uT], which only some copies have."""
 
@@ -40,19 +34,16 @@ def read_rnin(path: Path) -> ImuSequence:
     file = path / _FILE if path.is_dir() else path
     if not file.is_file():
         raise ReadError(file, "file", "no such file", f"a recording's {_FILE}")
-    time_name = "times" if "times" in header_names(file) else "time"
-    columns = NamedColumns(file, (time_name, *_COLUMNS), magnetic=_MAGNETIC)
-    time = columns.seconds(time_name, unit_ns=10**9)
-    captured = bool((np.ptp(columns.stack("gt_q", "wxyz"), axis=0) > 0).any())
-    source = "gt" if captured else "vio"
-    attitude_WB = columns.rotations(f"{source}_q")
+    clock = "times" if "times" in header_names(file) else "time"
+    time, fields = read_columns(file, (clock, 10**9), _STEMS, _MAGNETIC)
+    source = "gt" if (np.ptp(fields["gt_q"], axis=0) > 0).any() else "vio"
     return ImuSequence(
         name=_name(file),
         time=time,
-        gyro=columns.stack("gyro") - columns.stack("vio_gyro_bias")[-1],
-        accel=columns.stack("acce") - columns.stack("vio_acce_bias")[-1],
-        truth=trajectory(file, time, columns.stack(f"{source}_p"), attitude_WB),
-        magnetometer=columns.magnetometer(time),
+        gyro=fields["gyro"] - fields["vio_gyro_bias"][-1],
+        accel=fields["acce"] - fields["vio_acce_bias"][-1],
+        truth=trajectory(file, time, fields[f"{source}_p"], fields.rotations(f"{source}_q")),
+        magnetometer=magnetometer(time, fields.optional(MAGNETIC)),
     )
 
 

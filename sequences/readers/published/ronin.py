@@ -25,27 +25,18 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.archive import is_hdf5, opened_hdf5
-from stario.sequences.readers.checked import (
-    finite_rows,
-    magnetometer,
-    rotations,
-    trajectory,
-)
-from stario.sequences.readers.published.by_name import JsonFields
-from stario.sequences.readers.text import IntArray
+from stario.sequences.readers.checked import magnetometer, trajectory
+from stario.sequences.readers.published.fields import Fields, JsonFields
 from stario.sequences.sequence import FloatArray, ImuSequence
 
-_FIELDS = {
-    "synced/time": (),
-    "synced/gyro_uncalib": (3,),
-    "synced/acce": (3,),
-    "synced/game_rv": (4,),
-    "pose/tango_pos": (3,),
-    "pose/tango_ori": (4,),
-}
-_EKF = "pose/ekf_ori"
-_MAGNETIC = "synced/magnet"
-_OPTIONAL = {_EKF: (4,), _MAGNETIC: (3,)}
+_TIME, _GYRO, _ACCEL = "synced/time", "synced/gyro_uncalib", "synced/acce"
+_GAME_RV, _EKF, _MAGNETIC = "synced/game_rv", "pose/ekf_ori", "synced/magnet"
+_POSITION, _ATTITUDE = "pose/tango_pos", "pose/tango_ori"
+_OPTIONAL = (_EKF, _MAGNETIC)
+_WIDTHS = {_GYRO: 3, _ACCEL: 3, _GAME_RV: 4, _POSITION: 3, _ATTITUDE: 4, _EKF: 4, _MAGNETIC: 3}
+
+_ERRORS = {"gyro": "gyro_integration_error", _GAME_RV: "grv_ori_error", _EKF: "ekf_ori_error"}
+"""Names of the errors at a recording's end of the sources of attitude [degrees]."""
 
 _TRUSTED_DEG = 20.0
 """Maximum error at which the game rotation vector is used, whatever the other errors."""
@@ -58,26 +49,22 @@ def read_ronin(path: Path) -> ImuSequence:
         raise ReadError(file, "file", "no such file", "the recording's HDF5 file")
     info = JsonFields(file.with_name("info.json"))
     fields = _fields(file)
-    required = np.column_stack([fields[name] for name in _FIELDS])
-    rows = finite_rows(file, "synced and pose", required)
-    gyro = fields["synced/gyro_uncalib"] - info.array("imu_init_gyro_bias", 3)
-    bias, scale = info.array("imu_acce_bias", 3), info.array("imu_acce_scale", 3)
-    accel = scale * (fields["synced/acce"] - bias)
-    attitude_WB = _device_attitude(file, info, fields, gyro, rows)
-    frame, last = info.get("start_frame", 0), int(rows[-1])
+    gyro = fields[_GYRO] - info.array("imu_init_gyro_bias", 3)
+    accel = info.array("imu_acce_scale", 3) * (fields[_ACCEL] - info.array("imu_acce_bias", 3))
+    attitude_WB = _device_attitude(info, fields, gyro)
+    frame, last = info.get("start_frame", 0), int(fields.rows[-1])
     if not isinstance(frame, int) or not 0 <= frame <= last:
         raise ReadError(info.path, "start_frame", repr(frame), f"a row from 0 to {last}")
-    start = int(np.searchsorted(rows, frame))
-    rows, attitude_WB = rows[start:], attitude_WB[start:]
-    time = fields["synced/time"][rows]
+    used = slice(int(np.searchsorted(fields.rows, frame)), None)
+    time, field = fields[_TIME][used], fields.optional(_MAGNETIC)
     time = time - time[0]
     return ImuSequence(
         name=file.resolve().parent.name,
         time=time,
-        gyro=gyro[rows],
-        accel=accel[rows],
-        truth=trajectory(file, time, fields["pose/tango_pos"][rows], attitude_WB),
-        magnetometer=magnetometer(time, fields[_MAGNETIC][rows]) if _MAGNETIC in fields else None,
+        gyro=gyro[used],
+        accel=accel[used],
+        truth=trajectory(file, time, fields[_POSITION][used], attitude_WB[used]),
+        magnetometer=None if field is None else magnetometer(time, field[used]),
     )
 
 
@@ -86,57 +73,37 @@ def is_ronin(path: Path) -> bool:
     return (path / "data.hdf5").is_file() or is_hdf5(path)
 
 
-def _fields(file: Path) -> dict[str, FloatArray]:
+def _fields(file: Path) -> Fields:
     """Return the required fields and the optional ones present, all of one length."""
     with opened_hdf5(file, "HDF5 data") as data:
-        names = [*_FIELDS, *(name for name in _OPTIONAL if name in data)]
-        missing = [name for name in names if name not in data]
-        if missing:
-            raise ReadError(file, missing[0], "no such field", ", ".join(_FIELDS))
-        fields = {name: np.asarray(data[name], dtype=np.float64) for name in names}
-    count = len(fields["synced/time"]) if fields["synced/time"].ndim == 1 else 0
-    for name, values in fields.items():
-        shape = (count, *(_FIELDS | _OPTIONAL)[name])
+        names = [name for name in (_TIME, *_WIDTHS) if name in data or name not in _OPTIONAL]
+        if missing := [name for name in names if name not in data]:
+            raise ReadError(file, missing[0], "no such field", ", ".join(names))
+        arrays = {name: np.asarray(data[name], dtype=np.float64) for name in names}
+    count = len(arrays[_TIME]) if arrays[_TIME].ndim == 1 else 0
+    for name, values in arrays.items():
+        shape = (count, _WIDTHS[name]) if name in _WIDTHS else (count,)
         if values.shape != shape or not count:
-            raise ReadError(file, name, f"shape {values.shape}", f"{shape} as for synced/time")
-    return fields
+            raise ReadError(file, name, f"shape {values.shape}", f"{shape} as for {_TIME}")
+    return Fields(file, arrays, _OPTIONAL)
 
 
-def _device_attitude(
-    file: Path,
-    info: JsonFields,
-    fields: dict[str, FloatArray],
-    gyro: FloatArray,
-    rows: IntArray,
-) -> Rotation:
+def _device_attitude(info: JsonFields, fields: Fields, gyro: FloatArray) -> Rotation:
     """Return the phone's attitude in the Tango's world, from the source the authors would use."""
-
-    def attitudes(name: str, rows: IntArray) -> Rotation:
-        return rotations(file, name, fields[name], first_row=0, rows=rows)
-
-    game_rv = attitudes("synced/game_rv", rows)
-    name = _source(info, _EKF in fields)
-    if name == "game_rv":
-        source = game_rv
-    elif name == "ekf":
-        source = attitudes(_EKF, rows)
+    game_rv = fields.rotations(_GAME_RV)
+    name = _source(info, fields)
+    if name == "gyro":
+        source = game_rv[0] * integrated_gyro(fields[_TIME], gyro)
     else:
-        source = game_rv[0] * integrated_gyro(fields["synced/time"][rows], gyro[rows])
-    first = attitudes("pose/tango_ori", rows[:1])[0]
-    calibration = info.array("start_calibration", 4)[None]
-    R_TB = rotations(info.path, "start_calibration", calibration, first_row=0)[0]
-    return first * R_TB * source[0].inv() * source
+        source = game_rv if name == _GAME_RV else fields.rotations(name)
+    first = fields.rotations(_ATTITUDE, count=1)[0]
+    return first * info.rotation("start_calibration") * source[0].inv() * source
 
 
-def _source(info: JsonFields, has_ekf: bool) -> str:
-    fields = {"gyro": "gyro_integration_error", "game_rv": "grv_ori_error", "ekf": "ekf_ori_error"}
-    if not has_ekf:
-        del fields["ekf"]
-    errors = {
-        name: float(info.array(field))
-        for name, field in fields.items()
-        if info.get(field) is not None
-    }
-    if errors.get("game_rv", 0.0) <= _TRUSTED_DEG:
-        return "game_rv"
+def _source(info: JsonFields, fields: Fields) -> str:
+    known = [name for name in _ERRORS if name in fields or name == "gyro"]
+    given = [name for name in known if info.get(_ERRORS[name]) is not None]
+    errors = {name: float(info.array(_ERRORS[name])) for name in given}
+    if errors.get(_GAME_RV, 0.0) <= _TRUSTED_DEG:
+        return _GAME_RV
     return min(errors, key=lambda name: errors[name])

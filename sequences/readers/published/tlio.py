@@ -25,28 +25,28 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import interpolated, trapezoids
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import finite_rows, rotations, trajectory
-from stario.sequences.readers.published.by_name import JsonFields
+from stario.sequences.readers.checked import finite_rows, trajectory
+from stario.sequences.readers.published.fields import Fields, JsonFields, file_in
 from stario.sequences.readers.text import IntArray, read_table, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
 _RESAMPLED, _RAW = "imu0_resampled.npy", "imu_samples_0.csv"
 _DESCRIPTION, _CALIBRATION = "imu0_resampled_description.json", "calibration.json"
 
-_WIDTHS = {
-    "ts_us": 1,
-    "gyr_compensated_rotated_in_World": 3,
-    "acc_compensated_rotated_in_World": 3,
-    "pos_World_Device": 3,
-}
-_VELOCITY = "vel_World"
+_TIME, _GYRO, _ACCEL = (
+    "ts_us",
+    "gyr_compensated_rotated_in_World",
+    "acc_compensated_rotated_in_World",
+)
+_POSITION, _VELOCITY = "pos_World_Device", "vel_World"
+_WIDTHS = {_TIME: 1, _GYRO: 3, _ACCEL: 3, _POSITION: 3}
 _QUATERNIONS = {"qxyzw_World_Device": "xyzw", "qwxyz_World_Device": "wxyz"}
 _COLUMN = re.compile(r"(?P<name>\w+)\((?P<width>\d+)\)$")
 
 
 def read_tlio(path: Path) -> ImuSequence:
     """Read a recording from its folder (resampled if both exist) or from one of its files."""
-    file = _file(path)
+    file = file_in(path, _RESAMPLED, _RAW)
     if file is None:
         raise ReadError(path, _RESAMPLED, "no such file", "a TLIO recording")
     return _read_raw(file) if file.suffix == ".csv" else _read_resampled(file)[1]
@@ -54,13 +54,7 @@ def read_tlio(path: Path) -> ImuSequence:
 
 def is_tlio(path: Path) -> bool:
     """Return whether a path leads to one of the two files."""
-    return _file(path) is not None
-
-
-def _file(path: Path) -> Path | None:
-    if path.is_dir():
-        return next((path / n for n in (_RESAMPLED, _RAW) if (path / n).is_file()), None)
-    return path if path.is_file() and path.name in (_RESAMPLED, _RAW) else None
+    return file_in(path, _RESAMPLED, _RAW) is not None
 
 
 def _read_resampled(file: Path) -> tuple[IntArray, ImuSequence]:
@@ -70,26 +64,15 @@ def _read_resampled(file: Path) -> tuple[IntArray, ImuSequence]:
     width = max(place.stop for place in places.values())
     if table.ndim != 2 or table.shape[1] < width or not len(table):
         raise ReadError(file, "array", f"shape {table.shape}", f"(N, {width}) as in {_DESCRIPTION}")
-    quat_name = next(name for name in _QUATERNIONS if name in places)
-    rows = finite_rows(file, "array", table[:, :width])
-    order, quat = _QUATERNIONS[quat_name], table[:, places[quat_name]]
-    attitude_WB = rotations(file, quat_name, quat, order, first_row=0, rows=rows)
-    table = table[rows]
-    us = table[:, places["ts_us"].start]
+    fields = Fields(file, {name: table[:, place] for name, place in places.items()})
+    quat = next(name for name in _QUATERNIONS if name in fields)
+    attitude_WB = fields.rotations(quat, _QUATERNIONS[quat])
+    us, gyro, accel = fields[_TIME][:, 0], fields[_GYRO], fields[_ACCEL]
     time = (us - us[0]) * 1e-6
-    gyro = table[:, places["gyr_compensated_rotated_in_World"]]
-    accel = table[:, places["acc_compensated_rotated_in_World"]]
     if not _in_body_axes(time, gyro, attitude_WB):
         gyro, accel = (attitude_WB.apply(values, inverse=True) for values in (gyro, accel))
-    position_W = table[:, places["pos_World_Device"]]
-    velocity_W = table[:, places[_VELOCITY]] if _VELOCITY in places else None
-    sequence = ImuSequence(
-        name=file.resolve().parent.name,
-        time=time,
-        gyro=gyro,
-        accel=accel,
-        truth=trajectory(file, time, position_W, attitude_WB, velocity_W),
-    )
+    truth = trajectory(file, time, fields[_POSITION], attitude_WB, fields.optional(_VELOCITY))
+    sequence = ImuSequence(file.resolve().parent.name, time, gyro, accel, truth)
     return np.rint(us).astype(np.int64), sequence
 
 
@@ -156,9 +139,8 @@ def _read_raw(file: Path) -> ImuSequence:
     if not resampled.is_file():
         return sequence
     stamps_us, posed = _read_resampled(resampled)
-    return replace(
-        sequence, truth=_imu_pose(calibration, sequence, stamps_us, posed, int(stamps[0]))
-    )
+    offset = (int(stamps_us[0]) * 1000 - int(stamps[0])) * 1e-9
+    return replace(sequence, truth=_imu_pose(calibration, sequence, posed, offset))
 
 
 def _calibrated(calibration: JsonFields, sensor: str, raw: FloatArray) -> FloatArray:
@@ -171,34 +153,24 @@ def _calibrated(calibration: JsonFields, sensor: str, raw: FloatArray) -> FloatA
 
 
 def _imu_pose(
-    calibration: JsonFields,
-    sequence: ImuSequence,
-    stamps_us: IntArray,
-    posed: ImuSequence,
-    start_ns: int,
-) -> Trajectory | None:
-    """Return the IMU's pose on the raw samples' clock, computed from the device's."""
-    offset = (int(stamps_us[0]) * 1000 - start_ns) * 1e-9
-    time = posed.time + offset
-    R_DI, p_DI = _device_imu(calibration)
+    calibration: JsonFields, sequence: ImuSequence, posed: ImuSequence, offset: float
+) -> Trajectory:
+    """Return the IMU's pose from the device's, whose clock is `offset` behind [s]."""
+    time, truth = posed.time + offset, posed.truth
     inside = (time >= sequence.time[0]) & (time <= sequence.time[-1])
-    if posed.truth is None or not inside.any():
+    if truth is None or not inside.any():
         found = f"times offset by {offset:.3f} s"
-        raise ReadError(calibration.path.with_name(_RESAMPLED), "ts_us", found, f"those of {_RAW}")
-    rate_I = interpolated(time[inside], sequence.time, sequence.gyro)
-    misfit = [
-        float(np.square(R.apply(rate_I) - posed.gyro[inside]).mean())
-        for R in (Rotation.identity(), R_DI)
-    ]
-    truth = posed.truth
+        raise ReadError(calibration.path.with_name(_RESAMPLED), _TIME, found, f"those of {_RAW}")
     truth = replace(truth, time=truth.time + offset)
-    if misfit[0] <= misfit[1]:
-        return truth
-    return Trajectory(
-        time=truth.time,
-        position_W=truth.position_W + truth.attitude_WB.apply(p_DI),
-        attitude_WB=truth.attitude_WB * R_DI,
+    R_DI, p_DI = _device_imu(calibration)
+    rate_I = interpolated(time[inside], sequence.time, sequence.gyro)
+    own, turned = (
+        np.square(rate - posed.gyro[inside]).mean() for rate in (rate_I, R_DI.apply(rate_I))
     )
+    if own <= turned:
+        return truth
+    position_W = truth.position_W + truth.attitude_WB.apply(p_DI)
+    return Trajectory(truth.time, position_W, truth.attitude_WB * R_DI)
 
 
 def _device_imu(calibration: JsonFields) -> tuple[Rotation, FloatArray]:
@@ -208,7 +180,5 @@ def _device_imu(calibration: JsonFields) -> tuple[Rotation, FloatArray]:
     if quat is None:
         return Rotation.identity(), np.zeros(3)
     nested = isinstance(quat, list) and len(quat) == 2 and isinstance(quat[1], list)
-    flat = [quat[0], *quat[1]] if nested else quat
-    quat_wxyz = calibration.as_array(name, flat, 4)[None]
-    R_DI = rotations(calibration.path, name, quat_wxyz, first_row=0)[0]
+    R_DI = calibration.rotation(name, [quat[0], *quat[1]] if nested else quat)
     return R_DI, calibration.array("T_Device_Imu.Translation", 3)

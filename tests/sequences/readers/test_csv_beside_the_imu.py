@@ -1,6 +1,7 @@
 """Beside the IMU in a generic CSV: positions, their accuracy, pressure and satellites."""
 
-from dataclasses import fields, replace
+import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,38 +15,7 @@ from stario.sequences import Barometer, Satellites
 from stario.sequences.errors import ReadError
 from stario.sequences.readers import read_recording, write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
-from stario.sequences.sequence import (
-    FloatArray,
-    ImuSequence,
-    PositionTrack,
-)
-
-
-@pytest.mark.parametrize(
-    ("every", "columns", "kind"), [(4.0, 2, "waypoints"), (0.5, 3, "positions")]
-)
-def test_positions_without_attitude_are_kept_as_such(tmp_path, walk, every, columns, kind):
-    time = np.arange(walk.time[0] + 0.3, walk.time[-1], every)
-    position = walk.truth.at(time).position_W[:, :columns]
-    known = PositionTrack(time, position, kind)
-    write_csv(tmp_path / "walk.csv", replace(walk, truth=None, positions=known))
-    found = read_recording(tmp_path / "walk.csv")
-    assert found.truth is None
-    assert found.positions.kind == kind
-    np.testing.assert_allclose(found.positions.time, time - walk.time[0], atol=1e-9)
-    np.testing.assert_array_equal(found.positions.position_W, position)
-    np.testing.assert_array_equal(found.accel, walk.accel)
-
-
-def test_the_accuracy_of_positions_is_kept(tmp_path, walk):
-    time = np.arange(1.0, 6.0)
-    place, sigma = np.stack([time, -time], axis=1), 0.5 * time
-    known = PositionTrack(time, place, "positions", sigma=sigma)
-    write_csv(tmp_path / "walk.csv", replace(walk, truth=None, positions=known))
-    found = read_recording(tmp_path / "walk.csv").positions
-    assert found.sigma is not None
-    np.testing.assert_array_equal(found.position_W, place)
-    np.testing.assert_array_equal(found.sigma, sigma)
+from stario.sequences.sequence import FloatArray, ImuSequence, Magnetometer, PositionTrack
 
 
 @pytest.mark.parametrize(
@@ -133,9 +103,26 @@ def receivers(draw: st.DrawFn) -> Satellites:
     return Satellites(time, place, altitude, radius, perhaps(0.0, 99.0), perhaps(0.0, 360.0))
 
 
+@st.composite
+def fields(draw: st.DrawFn) -> Magnetometer:
+    time = draw(times)
+    return Magnetometer(time, draw(arrays(np.float64, (len(time), 3), elements=st.floats(1, 99))))
+
+
+@st.composite
+def tracks(draw: st.DrawFn) -> PositionTrack:
+    """Two or more positions: a track, or with two seconds or more between them waypoints."""
+    time = draw(times.filter(lambda found: len(found) > 1))
+    shape = len(time), draw(st.integers(2, 3))
+    place = draw(arrays(np.float64, shape, elements=st.floats(-1e4, 1e4)))
+    sigma = draw(st.none() | arrays(np.float64, len(time), elements=st.floats(0.01, 99.0)))
+    sparse = np.median(np.diff(time)) >= 2.0
+    return PositionTrack(time, place, "waypoints" if sparse else "positions", sigma=sigma)
+
+
 def assert_same(found: object, expected: object) -> None:
     assert type(found) is type(expected)
-    for field in fields(expected) if expected is not None else ():
+    for field in dataclasses.fields(expected) if expected is not None else ():
         one, other = (getattr(part, field.name) for part in (found, expected))
         assert (one is None) == (other is None), field.name
         if one is not None:
@@ -143,14 +130,21 @@ def assert_same(found: object, expected: object) -> None:
 
 
 @settings(max_examples=60, deadline=None)
-@given(barometer=st.none() | barometers(), satellites=st.none() | receivers())
-def test_what_is_written_is_read_back(tmp_path_factory, barometer, satellites):
+@given(
+    st.fixed_dictionaries({
+        "barometer": st.none() | barometers(),
+        "satellites": st.none() | receivers(),
+        "magnetometer": st.none() | fields(),
+        "positions": st.none() | tracks(),
+    })
+)  # fmt: skip
+def test_what_is_written_is_read_back(tmp_path_factory, parts):
     path = tmp_path_factory.mktemp("csv") / "walk.csv"
-    write_csv(path, replace(IMU, barometer=barometer, satellites=satellites))
+    write_csv(path, replace(IMU, **parts))
     found = read_recording(path)
     np.testing.assert_array_equal(found.accel, IMU.accel)
-    assert_same(found.barometer, barometer)
-    assert_same(found.satellites, satellites)
+    for name, part in parts.items():
+        assert_same(getattr(found, name), part)
 
 
 def file_of(folder: Path, titles: str, cells: str) -> Path:

@@ -83,11 +83,6 @@ def test_a_pose_on_another_clock_does_not_exhaust_memory(walk):
         clock_offset(walk.time, walk.gyro, time, truth.attitude_WB, truth.valid)
 
 
-def test_a_slice_outside_the_truth_has_none(walk):
-    short = replace(walk, truth=walk.truth.slice(0.0, 1.0))
-    assert short.slice(5.0, 6.0).truth is None
-
-
 @pytest.mark.parametrize(
     "cut",
     [

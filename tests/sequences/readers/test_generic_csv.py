@@ -1,5 +1,4 @@
 import logging
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,22 +10,8 @@ from stario.sequences.readers.columns import HEADER, TRUTH_HEADER
 from stario.sequences.readers.generic_csv import read_generic_csv
 from stario.sequences.sequence import (
     ImuSequence,
-    Magnetometer,
 )
 from stario.sequences.units import with_units
-
-
-def test_a_magnetometer_is_read_back_from_shared_and_separate_rows(tmp_path, walk):
-    time = np.concatenate([walk.time[2:40:3], walk.time[40:900:7] + 0.001])
-    field = np.random.default_rng(2).normal(0.0, 30.0, (len(time), 3))
-    given = replace(walk, magnetometer=Magnetometer(time, field))
-    write_csv(tmp_path / "walk.csv", given)
-    read = read_generic_csv(tmp_path / "walk.csv")
-    assert np.array_equal(read.magnetometer.time, time)
-    assert np.array_equal(read.magnetometer.field, field)
-    assert np.array_equal(read.accel, walk.accel)
-    assert read.truth is not None
-    assert len(read.truth) == len(walk)
 
 
 def test_bad_samples_and_their_order_are_kept(tmp_path, walk):
@@ -73,23 +58,6 @@ def test_a_count_of_rows_is_no_time_unless_it_has_a_unit(tmp_path, first, caplog
     with caplog.at_level(logging.INFO):
         assert read(header, 10).rate == pytest.approx(100.0)
     assert "own.csv: its times name no unit, their rate fits ms" in caplog.text
-
-
-def test_column_order_is_free_and_unknown_columns_are_ignored(tmp_path, caplog):
-    path = write_lines(
-        tmp_path / "order.csv",
-        "# phone in the left hand",
-        "",
-        "activity,az,ay,ax,temperature [C],gz,gy,gx,qw,t [ms]",
-        "walk,9.0,2.0,1.0,30,0.3,0.2,0.1,1,1000",
-        "stand, 9.0, 2.0 ,1.0,,0.3,0.2,0.1,1,1010",
-    )
-    with caplog.at_level(logging.INFO):
-        read = read_generic_csv(path)
-    assert "activity, temperature, qw" in caplog.text
-    assert read.time.tolist() == [0.0, 0.01]
-    assert np.allclose(read.gyro, [0.1, 0.2, 0.3])
-    assert np.allclose(read.accel, [1.0, 2.0, 9.0])
 
 
 def test_slower_truth_has_only_its_own_rows(tmp_path):

@@ -26,6 +26,8 @@ def test_a_recording_is_read_back_as_written(written, read):
         assert np.abs(read.truth.time - expected.truth.time).max() < 1e-8
         assert np.abs(read.truth.position_W - expected.truth.position_W).max() < 1e-6
         assert max_angle(read.truth.attitude_WB, expected.truth.attitude_WB) < 1e-6
+        if expected.truth.velocity_W is not None:
+            np.testing.assert_allclose(read.truth.velocity_W, expected.truth.velocity_W)
     assert (read.magnetometer is None) == (expected.magnetometer is None)
     if expected.magnetometer is not None:
         np.testing.assert_allclose(read.magnetometer.time, expected.magnetometer.time, atol=1e-8)
