@@ -190,7 +190,8 @@ def _propagated(
                 accepted.append(Accepted(fix, result.scale))
             elif result.reason == map_frame.YAW_UNKNOWN:
                 undirected.append(fix)
-    s = s.both(with_velocity_bounded)
+    if interval.flags.missed:
+        s = s.both(with_velocity_bounded)
     if interval.levelled is not None:
         sigma = tilt_sigma(interval.levelled, config)
         levelled, _ = ekf.update_tilt(s.ekf, interval.levelled.up_B, sigma)

@@ -115,8 +115,8 @@ def _check_tilt(prior: PriorPose, start: Start) -> None:
 def with_velocity_bounded(s: EkfState) -> EkfState:
     """Return the state with a pedestrian's velocity as a measurement, if less is known about it.
 
-    After an impact that the accelerometer could not follow, and in gaps, the velocity would
-    otherwise carry the track away until the next window ends.
+    After an impact that the accelerometer could not follow the velocity would otherwise carry the
+    track away until the next window ends.
     """
     if s.P[VELOCITY, VELOCITY].diagonal().max() <= VELOCITY_SIGMA**2:
         return s

@@ -38,10 +38,6 @@ _MISSING_GYRO, _MISSING_ACCEL = 0.1, 1.0
 """Noise densities where up to a fifth of a second is missing and was interpolated [rad/s/sqrt(Hz),
 m/s^2/sqrt(Hz)]: a pedestrian's rates change by some tenths of a rad/s in that time."""
 
-_MISSED = 2.0
-"""Sigma of the force beyond a sensor's limit, as a multiple of that limit: a phone that falls 1 m
-stops within 10 to 20 ms at 30 to 60 g, of which it measures 8 or 16."""
-
 _RATE_STEP = 0.05
 """Resolution of rate x sqrt(duration) [rad/sqrt(s)], so that few noise models are created: its
 product with `gyro_scale` is far below the noise without rotation."""
@@ -143,18 +139,13 @@ def _noise_of(interval: ImuInterval, accel_factor: float, config: NavigatorConfi
     A rotation that is off by `gyro_scale` of what was turned over a duration t is that of white
     noise with density gyro_scale * rate * sqrt(t). An impact is shorter than a step between
     samples: the force's mean over a step is as uncertain as the force changes in it, and what a
-    sensor missed at its limit is of the limit's size (`_MISSED`).
+    sensor missed at its limit is unknown.
     """
     rate = rms(interval.gyro) * math.sqrt(interval.duration)
     steps = round(rate / _RATE_STEP) if config.noise.gyro_scale else 0
     if config.filter.adaptive and config.noise.accel_noise:
-        steps_s = np.diff(interval.table[:, 0])
-        change = np.diff(interval.accel, axis=0) * steps_s[:, None]
-        missed = 0.0
-        if interval.flags.accel and interval.flags.saturated:
-            seconds = (interval.flags.saturated + 1) * float(steps_s.mean())
-            missed = _MISSED * seconds * float(np.abs(interval.accel).max())
-        unknown = float(np.vdot(change, change)) + 3.0 * missed**2
+        change = np.diff(interval.accel, axis=0) * np.diff(interval.table[:, 0])[:, None]
+        unknown = float(np.vdot(change, change)) + 3.0 * interval.flags.missed**2
         assumed = 3.0 * interval.duration * (accel_factor * config.noise.accel_noise) ** 2
         accel_factor *= in_steps(math.sqrt(1.0 + unknown / assumed))
     return _widened_noise(config, accel_factor, interval.flags, steps)
