@@ -260,7 +260,7 @@ class OutlierDetector:
         )
 
     def _missed(self, time: FloatArray, saturated: FloatArray) -> float:
-        """Return the sigma of the velocity [m/s] missed by axes with samples at their limit (3,)."""
+        """Return the sigma of the velocity missed [m/s], of axes with samples at a limit (3,)."""
         if not saturated.any():
             return 0.0
         seconds = (saturated + (saturated > 0.0)) * np.diff(time).mean()
