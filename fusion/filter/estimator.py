@@ -13,7 +13,13 @@ from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.estimator_state import EstimatorState, rewound, with_step
 from stario.fusion.filter.gained import Gained, gained_information
 from stario.fusion.filter.gyro_bias import GyroBiasPrior, first_prior, is_due, with_prior_replaced
-from stario.fusion.filter.initial import PriorPose, first_state, state_after_loss, tilt_sigma
+from stario.fusion.filter.initial import (
+    PriorPose,
+    first_state,
+    state_after_loss,
+    tilt_sigma,
+    with_velocity_bounded,
+)
 from stario.fusion.filter.jacobians import GYRO_BIAS
 from stario.fusion.filter.kalman import UpdateResult
 from stario.fusion.filter.map_frame import Mapped
@@ -184,6 +190,8 @@ def _propagated(
                 accepted.append(Accepted(fix, result.scale))
             elif result.reason == map_frame.YAW_UNKNOWN:
                 undirected.append(fix)
+    if interval.flags.missed:
+        s = s.both(with_velocity_bounded)
     if interval.levelled is not None:
         sigma = tilt_sigma(interval.levelled, config)
         levelled, _ = ekf.update_tilt(s.ekf, interval.levelled.up_B, sigma)

@@ -9,7 +9,8 @@ import numpy as np
 
 from stario.fusion.filter.ekf import initialised
 from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.filter.jacobians import POSITION
+from stario.fusion.filter.jacobians import POSITION, VELOCITY
+from stario.fusion.filter.kalman import Linear, update
 from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.values.checked import checked, checked_rotation
 from stario.fusion.values.config import MIN_PRIOR_SIGMA, NavigatorConfig
@@ -22,8 +23,8 @@ from stario.sequences.settings import check_number
 STILL_TILT_SIGMA = 0.01
 """Tilt sigma of the first attitude if the device was at rest [rad]."""
 
-GAP_VELOCITY_SIGMA = 1.5
-"""Standard deviation of a pedestrian's mean velocity over a long gap, per axis [m/s]."""
+VELOCITY_SIGMA = 1.5
+"""Standard deviation of a pedestrian's velocity per axis [m/s]."""
 
 _MAX_PRIOR_TILT = 1.0
 """Angle [rad] between a prior's vertical and that of the first second, beyond three sigmas of the
@@ -111,6 +112,18 @@ def _check_tilt(prior: PriorPose, start: Start) -> None:
         raise InputError("prior: R_WB", found, expected, "R_WB maps vectors from B to W")
 
 
+def with_velocity_bounded(s: EkfState) -> EkfState:
+    """Return the state with a pedestrian's velocity as a measurement, if less is known about it.
+
+    After an impact that the accelerometer could not follow the velocity would otherwise carry the
+    track away until the next window ends.
+    """
+    if s.P[VELOCITY, VELOCITY].diagonal().max() <= VELOCITY_SIGMA**2:
+        return s
+    measured = Linear(-s.v_W, [(VELOCITY.start, np.eye(3))], VELOCITY_SIGMA**2 * np.eye(3))
+    return update(s, measured)[0]
+
+
 def state_after_loss(s: EkfState, interval: ImuInterval, config: NavigatorConfig) -> EkfState:
     """Return the state after a long gap: tilt from gravity, velocity and yaw unknown."""
     f, start = config.filter, interval.levelled
@@ -121,7 +134,7 @@ def state_after_loss(s: EkfState, interval: ImuInterval, config: NavigatorConfig
     tilt = tilt_sigma(start, config)
     covariance[:3, :3] = np.diag(np.square([tilt, tilt, UNKNOWN_YAW]))
     covariance[3:6, 3:6] = max(f.velocity_sigma, MIN_PRIOR_SIGMA) ** 2 * np.eye(3)
-    reach = min(GAP_VELOCITY_SIGMA * seconds, MAX_GAP_DISTANCE)
+    reach = min(VELOCITY_SIGMA * seconds, MAX_GAP_DISTANCE)
     covariance[POSITION, POSITION] += reach**2 * np.eye(3)
     walks = np.repeat([config.noise.gyro_walk, config.noise.accel_walk], 3)
     turn_on_sigma = np.repeat([f.gyro_bias_sigma, f.accel_bias_sigma], 3)  # limits the walk

@@ -24,7 +24,7 @@ from stario.sequences.sequence import FloatArray
 CORE = 15
 """Size of the error state of one navigation state."""
 
-POSITION, GYRO_BIAS = slice(6, 9), slice(9, 12)
+VELOCITY, POSITION, GYRO_BIAS = slice(3, 6), slice(6, 9), slice(9, 12)
 """Rows of position and gyroscope bias in the error state and in the covariance of a `NavState`."""
 
 CLONE = 6

@@ -29,6 +29,7 @@ from stario.fusion.values.fixes import Fix, yaw_fix
 from stario.fusion.values.lie import yaw_twist
 from stario.fusion.values.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
+from stario.sequences.inspection.magnetic import HELD_CHANGE
 from stario.sequences.sequence import FloatArray
 
 WANDER_METRES, WANDER_SECONDS = 5.0, 60.0
@@ -80,6 +81,10 @@ OxIOD, RIDI, KIPD and tyrex."""
 _FIRST_SPREAD, _FIRST_COUNT = 0.2, 20
 """Spread as in a building, and the number of bearings that it counts as."""
 
+_HELD_FACTOR = 10.0
+"""Factor on the variance of a field that the device has carried on by its own gyroscope, as in
+seven tenths of tyrex' half seconds: its bearing tells little that ours does not."""
+
 _SIZE_TOLERANCE, _DIP_TOLERANCE = 0.05, 0.05
 """Deviations from the place's usual size (fraction) and dip [rad] that double the variance."""
 
@@ -98,6 +103,7 @@ class MagneticReference:
         dip: usual angle below the horizontal [rad].
         spread: mean deviation of size (fraction) and dip [rad] from these along the path.
         places: number of bearings averaged in it.
+        measured: size of the last field, with the device's hard iron [uT].
         rotation: how the field has changed while the device rotated.
         pose: attitude R_WB (3, 3) and position p_W (3,) [m] at the last bearing.
     """
@@ -108,6 +114,7 @@ class MagneticReference:
     dip: float = 0.0
     spread: float = _FIRST_SPREAD
     places: int = _FIRST_COUNT
+    measured: float = 0.0
     rotation: FieldRotation = field(default_factory=FieldRotation)
     pose: tuple[FloatArray, FloatArray] | None = None
 
@@ -142,6 +149,10 @@ class MagneticReference:
         x, y, _ = s.p_W - self.pose[1]
         return math.hypot(x, y) > _NEW_PLACE
 
+    def is_held(self, measured: float) -> bool:
+        """Return whether a field (size [uT]) is the last one, carried on by the gyroscope."""
+        return abs(measured - self.measured) < HELD_CHANGE * self.measured
+
     def updated(self, time: float, size: float, dip: float, travelled: bool) -> MagneticReference:
         """Return the reference after one more bearing: clipped means, as robust as medians.
 
@@ -149,7 +160,8 @@ class MagneticReference:
             time: time of the bearing [s].
             size: size of the field [uT].
             dip: angle below the horizontal [rad].
-            travelled: whether at another place than the one before: one alone shows no spread.
+            travelled: whether measured at another place than the one before: one alone shows no
+                spread, nor does a field that is held.
         """
         count = self.count + 1
         if count == 1:
@@ -238,7 +250,10 @@ def update_bearing(
     reference = changed(reference, rotation=rotation)
     if rotation.contradicts_gyro:
         return s, UpdateResult("contradicts the gyroscope"), changed(reference, time=now)
-    reference = reference.updated(now, size, dip, reference.travelled(s))
+    held = reference.is_held(measured)
+    reference = reference.updated(now, size, dip, reference.travelled(s) and not held)
+    reference = changed(reference, measured=measured)
     sigma = BEARING_SIGMA * reference.wander_sigma / WANDER_SIGMA
     variance = sigma**2 * (1.0 + reference.unusual(size, dip) ** 2)
+    variance *= _HELD_FACTOR if held else 1.0
     return *ekf.update_bearing(s, m_B, variance, chi2_quantile(_GATE, 1)), reference

@@ -17,7 +17,10 @@ zeros of an accelerometer are no measurement at all, not even of a free fall, wh
 Outliers: spikes are replaced (`sequences.spikes`). Saturation shows as values of a moving axis that
 repeat exactly and more than once at the largest magnitude measured so far; two that are equal by
 chance, at a magnitude soon exceeded, do not count. What the sensor missed is unknown, so these are
-only flagged.
+only flagged. A phone that falls 1 m stops within 10 to 20 ms at 30 to 60 g, of which its
+accelerometer measures 8 or 16: the force that it misses is of its limit's size. What recurs, as in
+a runner's pocket with a limit of 2 g, the filter learns from its innovations; what happens once
+must be said at once.
 """
 
 from __future__ import annotations
@@ -203,6 +206,12 @@ _LARGE_VALUE = np.array([3.0, 3.0, 3.0, 15.0, 15.0, 15.0])
 _MIN_REPEATS = 2.0
 """Minimum number of repetitions at the same limit that cannot be chance."""
 
+_MISSED = 2.0
+"""Sigma of the force beyond an accelerometer's limit, as a multiple of that limit."""
+
+_RECENT_SECONDS = 60.0
+"""Time for which an impact counts as recent [s]: each has the less weight the more there were."""
+
 _NO_AXES = np.zeros(6)
 
 
@@ -212,6 +221,8 @@ class OutlierDetector:
     def __init__(self) -> None:
         self.largest = np.zeros(6)
         self._repeats = np.zeros(6)  # of each axis at its current largest magnitude
+        self._impacts = 0.0  # recent ones, each weighted by its age
+        self._time = -math.inf
 
     def detect(self, table: FloatArray) -> Flags:
         """Replace spikes in place and return the faults.
@@ -232,8 +243,21 @@ class OutlierDetector:
         if not bad.any():
             return NO_FLAGS
         return Flags(
-            bool(bad[:3].any()), bool(bad[3:].any()), int(spikes.max()), int(saturated.max())
+            bool(bad[:3].any()),
+            bool(bad[3:].any()),
+            int(spikes.max()),
+            int(saturated.max()),
+            self._missed(table[:, 0], saturated[3:]),
         )
+
+    def _missed(self, time: FloatArray, saturated: FloatArray) -> float:
+        """Return the sigma of the velocity missed [m/s], of axes with samples at a limit (3,)."""
+        if not saturated.any():
+            return 0.0
+        seconds = (saturated + (saturated > 0.0)) * np.diff(time).mean()
+        recent = self._impacts * math.exp((self._time - time[-1]) / _RECENT_SECONDS)
+        self._impacts, self._time = recent + 1.0, float(time[-1])
+        return float((_MISSED * self.largest[3:] * seconds).max() / (1.0 + recent))
 
     def _count_saturated(self, values: FloatArray) -> FloatArray:
         """Return the number of samples per axis (6,) that repeat at the axis's limit."""

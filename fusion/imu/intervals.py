@@ -44,6 +44,7 @@ class Flags(NamedTuple):
         accel: the same for the accelerometer.
         spikes: number of samples replaced.
         saturated: number of samples at the limit.
+        missed: sigma of the velocity that the accelerometer missed there, per axis [m/s].
         missing: whether samples are missing and were interpolated from those around them.
     """
 
@@ -51,6 +52,7 @@ class Flags(NamedTuple):
     accel: bool = False
     spikes: int = 0
     saturated: int = 0
+    missed: float = 0.0
     missing: bool = False
 
 

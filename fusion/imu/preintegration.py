@@ -136,14 +136,16 @@ def _noise_of(interval: ImuInterval, accel_factor: float, config: NavigatorConfi
 
     A rotation that is off by `gyro_scale` of what was turned over a duration t is that of white
     noise with density gyro_scale * rate * sqrt(t). An impact is shorter than a step between
-    samples: the force's mean over a step is as uncertain as the force changes in it.
+    samples: the force's mean over a step is as uncertain as the force changes in it, and what a
+    sensor missed at its limit is unknown.
     """
     rate = rms(interval.gyro) * math.sqrt(interval.duration)
     steps = round(rate / _RATE_STEP) if config.noise.gyro_scale else 0
     if config.filter.adaptive and config.noise.accel_noise:
         change = np.diff(interval.accel, axis=0) * np.diff(interval.table[:, 0])[:, None]
+        unknown = float(np.vdot(change, change)) + 3.0 * interval.flags.missed**2
         assumed = 3.0 * interval.duration * (accel_factor * config.noise.accel_noise) ** 2
-        accel_factor *= in_steps(math.sqrt(1.0 + float(np.vdot(change, change)) / assumed))
+        accel_factor *= in_steps(math.sqrt(1.0 + unknown / assumed))
     return _widened_noise(config, accel_factor, interval.flags, steps)
 
 

@@ -69,7 +69,7 @@ class FilterConfig:
         accel_bias_sigma: sigma of the initial accelerometer bias [m/s^2].
         gap_gyro_noise: noise density of the tilt in a gap, and of a saturated gyroscope
             [rad/s/sqrt(Hz)].
-        gap_accel_noise: noise density of the velocity in a gap, and of a saturated accelerometer
+        gap_accel_noise: noise density of the velocity in a gap, and of an accelerometer with spikes
             [m/s^2/sqrt(Hz)].
         stillness_noise: factor on a phone's white noise below which a second of samples counts as
             stationary; 0 disables zero-velocity updates.

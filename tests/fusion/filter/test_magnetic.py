@@ -149,6 +149,24 @@ def test_a_field_of_unusual_size_has_less_weight():
     assert gains[1] > gains[0]
 
 
+def test_a_field_that_the_device_carries_on_tells_little_of_yaw_and_nothing_of_the_place():
+    wander, remaining = [], []
+    for noise in (0.02, 0.0):
+        rng, reference = np.random.default_rng(2), MagneticReference()
+        s = propagated_field(state(), 1e6, 0.4)
+        start = s.P[2, 2]
+        for k in range(30):
+            s = replace(s, time=0.5 * k)
+            s.X[0, :, 4] += np.array([0.5, 0.0, 0.0])
+            size = 1.0 + noise * rng.normal()
+            s, _, reference = update_bearing(s, reference, s.R_WB.T @ FIELD_W * size)
+            reference = replace(reference, pose=(s.R_WB, s.p_W))
+        wander.append(reference.wander_sigma)
+        remaining.append(s.P[2, 2] / start)
+    assert wander[0] < 0.3 < wander[1]
+    assert remaining[0] <= remaining[1]
+
+
 def test_the_bias_is_consistent_in_a_quiet_and_in_a_disturbed_field(make_oracle):
     walk = generate_walk(3, 50.0, style=WalkStyle(carry="handheld", mount_rotvec=(0.0, 0.0, 0.4)))
     for disturbance in (0.5, 8.0):

@@ -27,6 +27,17 @@ def count_saturated(gyro_x: np.ndarray, size: int = 11) -> int:
     return sum(found)
 
 
+def test_an_impact_beyond_the_range_is_an_event_and_one_a_second_is_not():
+    detector, missed = OutlierDetector(), []
+    for second in range(10):
+        rows = np.zeros((11, 7))
+        rows[:, 0], rows[:, 6] = second + 0.005 * np.arange(11), 9.81
+        rows[4:8, 6] = 80.0
+        missed.append(detector.detect(rows).missed)
+    assert missed[0] == pytest.approx(2.0 * 80.0 * 0.02)
+    assert missed[-1] < 0.15 * missed[0]
+
+
 def test_coarse_values_that_repeat_while_rising_are_not_saturated():
     rising = 0.1 * np.round(np.arange(0.0, 200.0) / 2.0)  # each value twice
     assert count_saturated(rising) == 0

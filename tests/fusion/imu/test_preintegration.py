@@ -7,7 +7,8 @@ from se23 import exp_se23
 
 from stario.fusion import NavigatorConfig
 from stario.fusion.filter.jacobians import propagated
-from stario.fusion.imu.intervals import ImuInterval
+from stario.fusion.imu.faults import OutlierDetector
+from stario.fusion.imu.intervals import NO_FLAGS, Flags, ImuInterval
 from stario.fusion.imu.preintegration import (
     Segment,
     corrected_increments,
@@ -211,6 +212,21 @@ def test_an_impact_between_samples_is_as_uncertain_as_the_force_changes():
     assert (np.abs(errors) < 2.0 * np.array(sigmas)).all()
 
 
+@pytest.mark.parametrize("rate", [200.0, 400.0])
+def test_what_a_sensor_missed_at_its_limit_is_within_its_sigma(rate):
+    """A phone on a floor: 6 m/s within 20 ms, of which an accelerometer of 8 g measures a fifth."""
+    t, limit = np.arange(0.0, 0.1 + 0.5 / rate, 1.0 / rate), 8.0 * GRAVITY
+    for centre in np.linspace(0.045, 0.055, 11):
+        phase = np.clip((t - centre) / 0.02 + 0.5, 0.0, 1.0)
+        pulse = 6.0 * np.pi / 2.0 / 0.02 * np.sin(np.pi * phase)
+        accel = np.outer(np.minimum(GRAVITY + pulse, limit), [0.0, 0.0, 1.0])
+        flags = OutlierDetector().detect(np.column_stack([t, 0.0 * accel, accel]))
+        segment = _standing(t, accel, flags)
+        velocity = segment.predict(np.eye(3), *np.zeros((4, 3)))[1][2]
+        assert abs(velocity - 6.0) > 4.0
+        assert abs(velocity - 6.0) < 3.0 * np.sqrt(segment.pim.preintMeasCov()[8, 8])
+
+
 def test_a_walking_force_is_as_certain_as_its_density():
     t = np.linspace(0.0, 0.1, 11)
     accel = np.outer(GRAVITY + 4.0 * np.sin(2.0 * np.pi * 2.0 * t), [0.0, 0.0, 1.0])
@@ -218,9 +234,9 @@ def test_a_walking_force_is_as_certain_as_its_density():
     assert variance == pytest.approx(0.1 * NavigatorConfig().noise.accel_noise ** 2, rel=0.05)
 
 
-def _standing(time: np.ndarray, accel: np.ndarray) -> Segment:
+def _standing(time: np.ndarray, accel: np.ndarray, flags: Flags = NO_FLAGS) -> Segment:
     table = np.column_stack([time, 0.0 * accel, accel])
-    interval = ImuInterval(table, np.eye(3))
+    interval = ImuInterval(table, np.eye(3), flags=flags)
     return segment_of([interval], [1.0], np.zeros(3), np.zeros(3), NavigatorConfig())
 
 

@@ -26,7 +26,9 @@ from stario.network.model import load_model
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence
+from stario.sequences.simulation.imu import ImuErrors, simulate_imu
 from stario.sequences.simulation.moments import MOMENTS
+from stario.sequences.simulation.walks import generate_walk
 
 BY_NAME = {moment.name: moment for moment in MOMENTS}
 
@@ -45,6 +47,14 @@ def test_the_table_counts_small_ratios_and_small_corrections():
     start = lines[2].split()
     assert start[3:] == ["2", "2.00", "2.00", "4.00", "2.00", "2.00", "50%", "0.5", "20.0", "50%"]
     assert lines[3].split()[0] == "all"
+
+
+def test_a_fall_beyond_the_sensors_range_makes_no_correction_of_a_metre(monkeypatch):
+    monkeypatch.setattr(moments, "MOMENTS", (BY_NAME["drop"],))
+    monkeypatch.setattr(moments, "PLACES", {"middle": 0.5})
+    walk = simulate_imu(generate_walk(2, 20.0), 200.0, ImuErrors(), 2)
+    found = moment_costs(load_model(), walk, NavigatorConfig())
+    assert (values(found, "step") < 1.0).all()
 
 
 def test_a_step_that_the_velocity_does_not_explain_is_a_correction(walk):
