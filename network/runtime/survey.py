@@ -159,7 +159,8 @@ class _LivingResults(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        self._sizes, self.peak = WeakIdKeyDictionary(), 0
+        self._sizes: Any = WeakIdKeyDictionary()
+        self.peak = 0
 
     def __torch_dispatch__(
         self, function: Any, types: Any, args: Any = (), kwargs: Any = None

@@ -1,9 +1,4 @@
-"""The training recipe, common to all networks: its loss and its schedule.
-
-The mean is learned by squared error throughout. Sigma joins later, through the Gaussian
-likelihood e^2 / (2 sigma^2) + log sigma of the mean's current error (detached): the joint
-likelihood, even weighted by sigma (Seitzer et al. 2022), starves the mean of gradient wherever
-sigma is large, and the large errors dominate the error of a track.
+"""The training recipe, common to all networks, and its schedule.
 
 The learning rate warms up and falls along a cosine as a function of the step alone, so a run that
 is interrupted and resumed follows the same schedule.
@@ -14,9 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-
-import torch
-from torch import Tensor
 
 from stario.network.architectures import ARCHITECTURES
 from stario.network.training.augment import Augmentation, reach_of
@@ -55,9 +47,6 @@ FINE_TUNING: dict[str, object] = {
 }  # fmt: skip
 """Settings for weights that know walking already: those of the default weights' last stage, but
 slower, and mixed with the initial weights. A few walks otherwise make a network forget the rest."""
-
-SIGMA_WEIGHT = 0.05
-"""Weight of the likelihood next to the squared error [m^2]: the square of a good error."""
 
 LEAST_SECONDS = 4
 """Minimum windows per stretch of weak truth: two changes of velocity over two seconds."""
@@ -119,7 +108,7 @@ class TrainingConfig:
             place; above 1 only for a recurrent network.
         seed: seed of initial weights, draws and dropout.
         waypoint_stretches: stretches between waypoints per step, where recordings have them
-            (`stario.network.training.weak_truth`).
+            (`stario.network.training.losses`).
         waypoint_seconds: number of windows in each of them.
         track_stretches: stretches along a track of positions without attitude, per step.
         track_seconds: number of windows in each; few, because heads and phones drift
@@ -204,12 +193,6 @@ class TrainingConfig:
     def steps(self) -> int:
         """Maximum number of steps of the run."""
         return self.epochs * self.steps_per_epoch
-
-
-def loss_with_sigma(squared: Tensor, log_sigma: Tensor) -> Tensor:
-    """Return the mean of squared errors (B, 3) [m^2] plus the weighted likelihood of sigma."""
-    likelihood = 0.5 * squared.detach() * torch.exp(-2.0 * log_sigma) + log_sigma
-    return (squared + SIGMA_WEIGHT * likelihood).sum(1).mean()
 
 
 def learning_rate(config: TrainingConfig, step: int) -> float:

@@ -1,6 +1,6 @@
 """Stretches of weak ground truth drawn for training: windows with the legs between known positions.
 
-`stario.network.training.weak_truth` has the equations.
+`stario.network.training.losses` has the equations.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,7 +16,6 @@ from torch import Tensor
 
 from stario.network.training.augment import Augmentation, Stretches, augmented, heading_of
 from stario.network.training.config import TrainingConfig
-from stario.network.training.parallel import Workers
 from stario.sequences.arrays import runs
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.legs import LegStream
@@ -35,8 +34,7 @@ _SETTINGS = {"waypoints": "waypoint", "positions": "track"}
 """How the recipe's settings for stretches of each kind begin: `waypoint_seconds`, for example."""
 
 
-@dataclass(frozen=True, eq=False)
-class LegBatch:
+class LegBatch(NamedTuple):
     """S stretches of K windows with up to M legs each.
 
     Attributes:
@@ -61,16 +59,6 @@ class LegBatch:
     seconds: Tensor
     known: Tensor
     velocity_change: Tensor
-
-    def to(self, device: torch.device) -> LegBatch:
-        """Return the batch on another device."""
-        return LegBatch(**{name: value.to(device) for name, value in vars(self).items()})
-
-    def shared(self, among: Workers) -> LegBatch:
-        """Return this process's stretches; all of them if they cannot be divided evenly."""
-        if len(self.known) % among.count:
-            return self
-        return LegBatch(**{name: among.share(value) for name, value in vars(self).items()})
 
 
 class LegSampler:

@@ -10,7 +10,7 @@ and for legs, which are averaged within each process.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -40,9 +40,13 @@ class Workers:
         """Whether this is the process that writes and reports."""
         return self.rank == 0
 
-    def share(self, batch: Tensor) -> Tensor:
-        """Return this process's rows of a batch that all processes have drawn."""
-        return batch[self.rank :: self.count]
+    def share(self, drawn: Sequence[Tensor]) -> list[Tensor]:
+        """Return this process's rows of tensors that all have drawn, on its device.
+
+        All rows, if their number cannot be divided evenly.
+        """
+        rows = slice(None) if len(drawn[0]) % self.count else slice(self.rank, None, self.count)
+        return [part[rows].to(self.device) for part in drawn]
 
     def wrapped(self, network: nn.Module, idle: bool) -> nn.Module:
         """Return the network with gradients averaged over the processes.

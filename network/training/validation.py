@@ -14,7 +14,7 @@ from stario.network.training.augment import UNVARIED
 from stario.network.training.config import LEAST_SECONDS, TrainingConfig
 from stario.network.training.data import TrainingData
 from stario.network.training.legs import LegBatch, LegSampler, by_kind
-from stario.network.training.weak_truth import leg_loss
+from stario.network.training.losses import leg_loss
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.legs import LegStream
@@ -147,7 +147,7 @@ class ValidationSet:
 
     @torch.inference_mode()
     def _leg_error(self, network: DisplacementNetwork, batch: LegBatch) -> float:
-        batch = batch.to(network.gravity.device)
+        batch = LegBatch(*(part.to(network.gravity.device) for part in batch))
         windows = batch.windows if network.is_recurrent else batch.windows.flatten(0, 1)
         mean, log_sigma, *_ = network(windows)
         shape = batch.windows.shape[:2]

@@ -21,14 +21,13 @@ import torch
 from stario.network.training.augment import Augmentation
 from stario.network.training.config import TrainingConfig
 from stario.network.training.data import TrainingData
-from stario.network.training import run
-from stario.network.training.train import train
+from stario.network.training import train
 from training_runs import swaying
 
 if sys.argv[2] == "plain":  # no batch norm: what two processes compute is the same number
     torch.manual_seed(0)
     plain = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(1200, 6))
-    run.build_network = lambda name: copy.deepcopy(plain)
+    train.build_network = lambda name: copy.deepcopy(plain)
 config = TrainingConfig(
     architecture="TLIO", epochs=2, epoch_windows=64, batch=16, rate=1e-3, device="cpu",
     likelihood_from=0.5, average=0.5, dropout=0.0,
@@ -40,7 +39,7 @@ def kill(step, loss):
 learned, held_out = (
     TrainingData([swaying(*given)]) for given in (("a", 0.3, 20.0), ("b", 0.8, 6.0))
 )
-train(config, learned, held_out, Path(sys.argv[1]), kill)
+train.train(config, learned, held_out, Path(sys.argv[1]), kill)
 """
 
 
@@ -86,7 +85,7 @@ def test_without_a_launcher_the_only_process_is_the_leader():
         assert group.is_leader
         assert group.mean(3.0) == group.broadcast(3.0) == 3.0
         batch = torch.arange(7)
-        assert torch.equal(group.share(batch), batch)
+        assert torch.equal(group.share([batch])[0], batch)
 
 
 def launch(monkeypatch: pytest.MonkeyPatch, **variables: str) -> None:

@@ -1,4 +1,4 @@
-"""The result of a training run: weights with their card, calibrated on held-out recordings.
+"""Calibration of a network's sigma on held-out recordings.
 
 A network predicts which windows are hard better than how hard they are. Its log sigma is therefore
 stretched and shifted, sigma = scale * exp(exponent * log_sigma), with the pair of highest
@@ -8,56 +8,15 @@ squared normalised error is clipped so that these do not dominate.
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict
-from pathlib import Path
-
 import numpy as np
 from scipy.optimize import minimize
 
-from stario.network.card import Calibration, Card
-from stario.network.displacement import DisplacementNetwork
-from stario.network.model import save_model
-from stario.network.training.config import TrainingConfig
-from stario.network.training.validation import ValidationSet
+from stario.network.card import Calibration
 from stario.sequences.sequence import FloatArray
 
 _FLOOR_M = 0.01
 _CLIP = 25.0
 _MAX_EXPONENT = 4.0
-
-
-def write_result(
-    path: Path,
-    network: DisplacementNetwork,
-    config: TrainingConfig,
-    held_out: ValidationSet,
-    trained_on: list[str],
-    kept: Calibration | None,
-    learned: bool,
-) -> None:
-    """Calibrate a network, unless a calibration is given, and write it with its card.
-
-    Args:
-        path: path of the weights.
-        network: network to write.
-        config: its recipe.
-        held_out: recordings to calibrate and report errors on.
-        trained_on: description of the training data.
-        kept: calibration of other weights, if it is to be kept.
-        learned: whether the network was also trained on `held_out`: its errors then say nothing
-            about other recordings, and are named accordingly.
-    """
-    residuals, log_sigma = held_out.residuals(network)
-    errors = "validation_mse_m2" + ("_after_it_was_learned" if learned else "")
-    card = Card(
-        architecture=config.architecture,
-        calibration=kept or calibrate(residuals, log_sigma),
-        trained_on=trained_on,
-        recipe=json.loads(json.dumps(asdict(config))),
-        figures={errors: held_out.errors(network, residuals)},
-    )
-    save_model(path, network, card)
 
 
 def calibrate(error: FloatArray, log_sigma: FloatArray) -> Calibration:

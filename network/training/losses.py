@@ -1,8 +1,13 @@
-"""The loss of weak ground truth: positions without attitude, and waypoints.
+"""The losses of full and of weak ground truth.
 
-A stretch of levelled IMU is cut into windows one second apart; the network's displacements d_k are
-chained along the gyroscope's yaw. A leg m lies between two instants of known position, D_m apart.
-With a_mk the time [s] shared by window k and leg m,
+With full truth, the mean is learned by squared error throughout. Sigma joins later, through the
+Gaussian likelihood e^2 / (2 sigma^2) + log sigma of the mean's current error (detached): the joint
+likelihood, even weighted by sigma (Seitzer et al. 2022), starves the mean of gradient wherever
+sigma is large, and the large errors dominate the error of a track.
+
+Weak truth is positions without attitude, or waypoints. A stretch of levelled IMU is cut into
+windows one second apart; the network's displacements d_k are chained along the gyroscope's yaw. A
+leg m lies between two instants of known position, D_m apart. With a_mk the time [s] shared by window k and leg m,
 
     D^_m = sum_k a_mk d_k,   psi = arg sum_m conj(D^_m) D_m / T_m,   r_m = exp(i psi) D^_m - D_m
 
@@ -40,8 +45,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from stario.network.training.config import SIGMA_WEIGHT
 from stario.network.training.legs import VARIANCE_RATE, LegBatch
+
+SIGMA_WEIGHT = 0.05
+"""Weight of the likelihood next to the squared error [m^2]: the square of a good error."""
 
 VELOCITY_SIGMA = 0.1
 """Standard deviation per axis of the accelerometer's changes of velocity, s_a [m/s]."""
@@ -52,6 +59,12 @@ correlation that chance produces among a dozen changes of velocity."""
 
 _HUBER = 3.0
 """Whitened residuals beyond this many standard deviations count linearly."""
+
+
+def loss_with_sigma(squared: Tensor, log_sigma: Tensor) -> Tensor:
+    """Return the mean of squared errors (B, 3) [m^2] plus the weighted likelihood of sigma."""
+    likelihood = 0.5 * squared.detach() * torch.exp(-2.0 * log_sigma) + log_sigma
+    return (squared + SIGMA_WEIGHT * likelihood).sum(1).mean()
 
 
 def leg_residuals(displacement_N: Tensor, legs: LegBatch) -> Tensor:
