@@ -39,15 +39,15 @@ class Architecture:
 
 
 ARCHITECTURES = {
-    "R-ResNet": Architecture("baselines.plain", "RoninResNet", 4.635, 38.252),
-    "R-LSTM": Architecture("baselines.plain", "RoninLstm", 13.589, 57.473),
-    "RNIN": Architecture("baselines.rnin", "Rnin", 5.259, 72.032, heads=2),
-    "I-IMUNet": Architecture("baselines.imunet", "ImuNet", 3.659, 18.838),
-    "I-MobileNet": Architecture("baselines.plain", "MobileNet", 3.179, 34.559),
-    "I-MnasNet": Architecture("baselines.plain", "MnasNet", 2.979, 25.256),
-    "I-EfficientNetB0": Architecture("baselines.plain", "EfficientNetB0", 3.232, 28.831),
-    "DeepILS": Architecture("baselines.plain", "DeepIls", 2.291, 15.287),
-    "TLIO": Architecture("baselines.plain", "Tlio", 5.424, 39.436, heads=2),
+    "R-ResNet": Architecture("baselines.networks", "RoninResNet", 4.635, 38.252),
+    "R-LSTM": Architecture("baselines.networks", "RoninLstm", 13.589, 57.473),
+    "RNIN": Architecture("baselines.networks", "Rnin", 5.259, 72.032, heads=2),
+    "I-IMUNet": Architecture("baselines.networks", "ImuNet", 3.659, 18.838),
+    "I-MobileNet": Architecture("baselines.networks", "MobileNet", 3.179, 34.559),
+    "I-MnasNet": Architecture("baselines.networks", "MnasNet", 2.979, 25.256),
+    "I-EfficientNetB0": Architecture("baselines.networks", "EfficientNetB0", 3.232, 28.831),
+    "DeepILS": Architecture("baselines.networks", "DeepIls", 2.291, 15.287),
+    "TLIO": Architecture("baselines.networks", "Tlio", 5.424, 39.436, heads=2),
     "StarIO without MSGCU": Architecture(
         "stario", "StarIO", 2.252, 21.555, options={"gated_unit": False}
     ),

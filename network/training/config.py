@@ -52,15 +52,10 @@ LEAST_SECONDS = 4
 """Minimum windows per stretch of weak truth: two changes of velocity over two seconds."""
 
 _COUNTS = {
-    "epochs": 1,
-    "epoch_windows": 1,
-    "batch": 1,
-    "patience": 1,
-    "successive": 1,
-    "waypoint_stretches": 1,
-    "waypoint_seconds": LEAST_SECONDS,
-    "track_stretches": 1,
-    "track_seconds": LEAST_SECONDS,
+    **dict.fromkeys(("epochs", "epoch_windows", "batch", "patience", "successive"), 1),
+    **dict.fromkeys(("waypoint_stretches", "track_stretches"), 1),
+    **dict.fromkeys(("waypoint_seconds", "track_seconds"), LEAST_SECONDS),
+    "seed": 0,
 }
 
 _CHOICES = {
@@ -70,15 +65,7 @@ _CHOICES = {
     "attitude": ("levelled", "true"),
 }
 
-_RANGES = (
-    ("rate", 1e-8, 1.0),
-    ("warm_up", 0.0, 1.0),
-    ("weight_decay", 0.0, 1.0),
-    ("likelihood_from", 0.0, 1.0),
-    ("clip", 1e-6, 1e6),
-    ("average", 0.0, 1.0),
-    ("learned", 0.0, 1.0),
-)
+_SHARES = ("warm_up", "weight_decay", "likelihood_from", "average", "learned")
 
 
 @dataclass(frozen=True)
@@ -157,8 +144,12 @@ class TrainingConfig:
             value = getattr(self, name)
             if not (isinstance(value, int) and value >= least):
                 raise ConfigError(name, repr(value), f"an integer of {least} or more")
-        for name, low, high in _RANGES:
-            check_number(self, name, low, high)
+        for name in _SHARES:
+            check_number(self, name, 0.0, 1.0)
+        check_number(self, "rate", 1e-8, 1.0)
+        check_number(self, "clip", 1e-6, 1e6)
+        if self.dropout is not None:
+            check_number(self, "dropout", 0.0, 0.99)
         for name, share in self.shares.items():
             is_number = isinstance(share, int | float) and not isinstance(share, bool)
             if not (is_number and 0.0 <= share <= 1.0):
@@ -169,15 +160,9 @@ class TrainingConfig:
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
                 raise ConfigError(name, repr(getattr(self, name)), f"one of {', '.join(choices)}")
-        if not (isinstance(self.seed, int) and 0 <= self.seed < 2**31):
-            raise ConfigError("seed", repr(self.seed), "an integer from 0 to 2^31 - 1")
-        dropout = 0.0 if self.dropout is None else self.dropout
-        if not (isinstance(dropout, int | float) and 0.0 <= dropout < 1.0):
-            raise ConfigError("dropout", repr(self.dropout), "a share from 0 to below 1, or none")
         if self.batch % self.successive:
-            raise ConfigError(
-                "batch", str(self.batch), f"a multiple of successive={self.successive}"
-            )
+            expected = f"a multiple of successive={self.successive}"
+            raise ConfigError("batch", str(self.batch), expected)
 
     @property
     def reach(self) -> int:

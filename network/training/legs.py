@@ -90,12 +90,8 @@ class LegSampler:
                 "%s: skipping %d of %d stretches, which hold no two legs within %d s",
                 streams[0].kind, found.count([]), len(found), seconds,
             )  # fmt: skip
-        self._runs = [
-            (index, first, count)
-            for index, beginnings in enumerate(found)
-            for first, count in beginnings
-        ]
-        counts = torch.tensor([count for _, _, count in self._runs], dtype=torch.float64)
+        self._runs = [(index, *run) for index, beginnings in enumerate(found) for run in beginnings]
+        counts = torch.tensor(self._runs, dtype=torch.float64)[:, 2]
         self._cumulative = (counts / counts.sum()).cumsum(0)
         self._streams, self._generator = list(streams), generator
         device = generator.device
@@ -194,15 +190,14 @@ def leg_samplers(
         InputError: a kind has no stretch that is long enough for two legs.
         ConfigError: the windows in a stretch are not a multiple of `config.successive`.
     """
-    kinds = by_kind(streams, config)
-    for kind, _, seconds, _ in kinds:
+    samplers = []
+    for kind, members, seconds, stretches in by_kind(streams, config):
         if seconds % config.successive:
             expected = f"a multiple of successive={config.successive}"
             raise ConfigError(f"seconds in a stretch with {kind}", str(seconds), expected)
-    return [
-        (LegSampler(members, seconds, config.augmentation, generator), stretches)
-        for _, members, seconds, stretches in kinds
-    ]
+        sampler = LegSampler(members, seconds, config.augmentation, generator)
+        samplers.append((sampler, stretches))
+    return samplers
 
 
 def by_kind(

@@ -7,7 +7,8 @@ sigma is large, and the large errors dominate the error of a track.
 
 Weak truth is positions without attitude, or waypoints. A stretch of levelled IMU is cut into
 windows one second apart; the network's displacements d_k are chained along the gyroscope's yaw. A
-leg m lies between two instants of known position, D_m apart. With a_mk the time [s] shared by window k and leg m,
+leg m lies between two instants of known position, D_m apart. With a_mk the
+time [s] shared by window k and leg m,
 
     D^_m = sum_k a_mk d_k,   psi = arg sum_m conj(D^_m) D_m / T_m,   r_m = exp(i psi) D^_m - D_m
 

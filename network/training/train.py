@@ -233,8 +233,9 @@ class TrainingRun:
         found = held_out.errors(candidate) if self.workers.is_leader else {}
         report = EpochReport(
             epoch=self.step // self.config.steps_per_epoch,
-            training_error=self.workers.mean(float(np.mean(errors))),
-            validation_error=self.workers.broadcast(held_out.selection_error(found)),
+            training_error=self.workers.total(float(np.mean(errors))) / self.workers.count,
+            # That of no recordings is 0.
+            validation_error=self.workers.total(held_out.selection_error(found)),
             validation_by_recording=found,
             windows_per_second=windows / (drawing_s + learning_s),
             drawing_share=drawing_s / (drawing_s + learning_s),

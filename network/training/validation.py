@@ -32,11 +32,9 @@ log = logging.getLogger(__name__)
 _STRIDE = 20
 """Samples between the starts of successive windows."""
 
-_STRIDES = (20, 40, 50, 100, 200)
-"""Strides for recurrent networks: each window follows one from a second before, as at inference."""
-
 _DENSE_SAMPLES = 200 * 60 * 15
-"""For N times this many samples in total, windows are cut at N times that stride."""
+"""For N times this many samples in total, windows are cut at N times that stride. For recurrent
+networks, one minute in N is cut: each window follows one from a second before, as at inference."""
 
 _BATCH = 256
 """Windows per batch."""
@@ -63,20 +61,22 @@ class ValidationSet:
     def __init__(
         self, data: TrainingData, config: TrainingConfig, is_recurrent: bool = False
     ) -> None:
-        streams, self._simulated = data.streams, data.simulated
+        self.streams, self._simulated = data.streams, data.simulated
         self.legs = _drawn_once(data.legs, config)
         # Hours of data are cut sparsely: the variety of motion matters, not the number of windows.
-        length = sum(len(stream) for stream in streams)
-        self.stride = max(_STRIDE, _STRIDE * (length // _DENSE_SAMPLES))
-        if is_recurrent:
-            thinned = max(s for s in _STRIDES if s <= self.stride)
-            every, self.stride = self.stride // thinned, thinned
-            streams = _minutes(streams, every) if every > 1 else streams
-        self.streams = streams
-        counts = [len(window_starts(stream, self.stride)) for stream in streams]
+        every = max(1, sum(len(stream) for stream in data.streams) // _DENSE_SAMPLES)
+        self.stride = _STRIDE if is_recurrent else _STRIDE * every
+        if is_recurrent and every > 1:
+            minute = 60 * WINDOW_SAMPLES
+            self.streams = [
+                stream.part(first, first + minute)
+                for stream in data.streams
+                for first in range(0, len(stream), every * minute)
+            ]
+        counts = [len(window_starts(stream, self.stride)) for stream in self.streams]
         if not sum(counts):
             raise InputError("validation", "no window", "stretches longer than a second")
-        self.names = np.repeat([stream.name for stream in streams], counts)
+        self.names = np.repeat([stream.name for stream in self.streams], counts)
 
     @torch.inference_mode()
     def residuals(self, network: DisplacementNetwork) -> tuple[np.ndarray, np.ndarray]:
@@ -152,16 +152,6 @@ class ValidationSet:
         mean, log_sigma, *_ = network(windows)
         shape = batch.windows.shape[:2]
         return float(leg_loss(mean.view(*shape, 3), log_sigma.view(*shape, 3), batch)[1])
-
-
-def _minutes(streams: Sequence[WorldStream], every: int) -> list[WorldStream]:
-    """Return one minute out of every `every` of each stream, starting with the first."""
-    minute = 60 * WINDOW_SAMPLES
-    return [
-        stream.part(first, first + minute)
-        for stream in streams
-        for first in range(0, len(stream), every * minute)
-    ]
 
 
 def _drawn_once(legs: Sequence[LegStream], config: TrainingConfig) -> dict[str, LegBatch]:
