@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike
 
 from stario.network.architectures import ARCHITECTURES
 from stario.network.card import Card, card_path, dump_card, read_weights
-from stario.network.runtime.engines import Engine, Float32Array
-from stario.network.runtime.onnx_engine import load_onnx, weights_engine
+from stario.network.runtime.engines import Engine, Float32Array, load_onnx, weights_engine
 from stario.sequences.errors import InputError, WeightsError
 from stario.sequences.files import atomic_write
 from stario.sequences.sequence import FloatArray

@@ -18,8 +18,7 @@ from torch.utils.weak import WeakIdKeyDictionary
 
 from stario.network.architectures import ARCHITECTURES, architecture, build_network
 from stario.network.displacement import DisplacementNetwork
-from stario.network.runtime.engines import Engine
-from stario.network.runtime.onnx_engine import weights_engine
+from stario.network.runtime.engines import Engine, weights_engine
 from stario.network.runtime.torch_engine import TorchEngine
 from stario.sequences.drawing.text_table import aligned, figure
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray

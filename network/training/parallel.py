@@ -15,8 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, distributed, nn
-from torch.nn.parallel import DistributedDataParallel
+from torch import Tensor, distributed
 
 from stario.sequences.errors import ConfigError
 
@@ -47,19 +46,6 @@ class Workers:
         """
         rows = slice(None) if len(drawn[0]) % self.count else slice(self.rank, None, self.count)
         return [part[rows].to(self.device) for part in drawn]
-
-    def wrapped(self, network: nn.Module, idle: bool) -> nn.Module:
-        """Return the network with gradients averaged over the processes.
-
-        Args:
-            network: network on this process's device.
-            idle: whether some parameters get no gradient in some steps, such as a separate head
-                for sigma before sigma is learned.
-        """
-        if self.count == 1:
-            return network
-        ids = [self.device] if self.device.type == "cuda" else None
-        return DistributedDataParallel(network, device_ids=ids, find_unused_parameters=idle)
 
     def total(self, value: float) -> float:
         """Return the sum of the processes' numbers, in all of them."""

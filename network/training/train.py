@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 
 from stario.network.architectures import architecture, build_network
 from stario.network.card import Calibration, Card
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import DisplacementModel, save_model
 from stario.network.training.augment import WindowSampler
-from stario.network.training.calibration import calibrate
 from stario.network.training.captured import CapturedStep
 from stario.network.training.checkpoint import (
     damaged,
@@ -41,7 +41,7 @@ from stario.network.training.history import EpochReport, History
 from stario.network.training.legs import LegBatch, leg_samplers
 from stario.network.training.losses import leg_loss, loss_with_sigma
 from stario.network.training.parallel import Workers, workers
-from stario.network.training.validation import ValidationSet
+from stario.network.training.validation import ValidationSet, calibrate
 from stario.sequences.datasets.stream_cache import Stream
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.files import write_json
@@ -188,9 +188,13 @@ class TrainingRun:
             weight_decay=config.weight_decay,
             capturable=recorded,
         )
-        idle = architecture(config.architecture).heads > 1
-        shared = workers.wrapped(self.network, idle=idle)
-        self._shared: Any = torch.compile(shared) if config.compiled else shared
+        self._shared: Any = self.network
+        if workers.count > 1:  # gradients are averaged over the processes
+            # A separate head for sigma gets none before sigma is learned.
+            idle = architecture(config.architecture).heads > 1
+            self._shared = DistributedDataParallel(self.network, find_unused_parameters=idle)
+        if config.compiled:
+            self._shared = torch.compile(self._shared)
         if not workers.is_leader:
             torch.manual_seed(config.seed + workers.rank)  # independent dropout
 

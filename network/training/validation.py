@@ -1,4 +1,10 @@
-"""Validation of a network in training on held-out recordings."""
+"""Validation of a network in training on held-out recordings, and calibration of its sigma.
+
+A network predicts which windows are hard better than how hard they are. Its log sigma is therefore
+stretched and shifted, sigma = scale * exp(exponent * log_sigma), with the pair of highest
+likelihood on the errors of validation windows. No sigma explains the errors of a few windows; the
+squared normalised error is clipped so that these do not dominate.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +14,9 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 
+from stario.network.card import Calibration
 from stario.network.displacement import DisplacementNetwork
 from stario.network.training.augment import UNVARIED
 from stario.network.training.config import LEAST_SECONDS, TrainingConfig
@@ -18,6 +26,7 @@ from stario.network.training.losses import leg_loss
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.legs import LegStream
+from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import (
     WINDOW_SAMPLES,
     WorldStream,
@@ -41,6 +50,10 @@ _BATCH = 256
 
 _STRETCHES = 48
 """Number of stretches for each kind of weak truth."""
+
+_FLOOR_M = 0.01
+_CLIP = 25.0
+_MAX_EXPONENT = 4.0
 
 _NOTICEABLE = 0.02
 """Logarithm of a ratio of errors in validation that is worth a warning."""
@@ -170,3 +183,32 @@ def _drawn_once(legs: Sequence[LegStream], config: TrainingConfig) -> dict[str, 
             continue
         found[kind] = sampler.batch(_STRETCHES)
     return found
+
+
+def calibrate(error: FloatArray, log_sigma: FloatArray) -> Calibration:
+    """Fit a calibration to errors (M, 3) [m] and log sigmas (M, 3).
+
+    x and y share scale and exponent.
+    """
+    scale_h, exponent_h = _fit(error[:, :2].ravel(), log_sigma[:, :2].ravel())
+    scale_z, exponent_z = _fit(error[:, 2], log_sigma[:, 2])
+    return Calibration(
+        scale=(scale_h, scale_h, scale_z),
+        exponent=(exponent_h, exponent_h, exponent_z),
+        floor=(_FLOOR_M,) * 3,
+    )
+
+
+def _fit(error: FloatArray, log_sigma: FloatArray) -> tuple[float, float]:
+    """Return the scale and exponent that minimise the clipped negative log-likelihood."""
+
+    def cost(parameters: FloatArray) -> float:
+        log_scale, exponent = parameters
+        variance = np.exp(2.0 * (log_scale + exponent * log_sigma)) + _FLOOR_M**2
+        normalised = np.minimum(error**2 / variance, _CLIP)
+        return float(np.mean(normalised + np.log(variance)))
+
+    # An uninformative sigma is ignored (exponent 0), never used with its sign reversed.
+    bounds = [(-10.0, 10.0), (0.0, _MAX_EXPONENT)]
+    log_scale, exponent = minimize(cost, [0.0, 1.0], method="Nelder-Mead", bounds=bounds).x
+    return float(np.exp(log_scale)), float(exponent)
