@@ -88,7 +88,8 @@ def survey(names: Sequence[str]) -> list[ModelRow]:
     torch.manual_seed(0)
     networks = [DisplacementNetwork(build_network(name)) for name in names]
     in_torch = _times([TorchEngine(network) for network in networks])
-    graphs = [_graph_engine(*pair) for pair in zip(names, networks, strict=True)]
+    states = [safetensors.torch.save(network.network.state_dict()) for network in networks]
+    graphs = [weights_engine(*pair) for pair in zip(names, states, strict=True)]
     in_onnx = iter(_times([engine for engine in graphs if engine is not None]))
     return [
         ModelRow(
@@ -110,10 +111,6 @@ def survey_table(rows: Sequence[ModelRow]) -> str:
         times = [figure(each.get(str(batch))) for each in found for batch in BATCHES]
         table.append([row.name, *row.counts(), *times, f"{row.peak_memory_mb:.1f}"])
     return "\n".join([*aligned(table), _WORDS.format(threads=torch.get_num_threads())])
-
-
-def _graph_engine(name: str, network: DisplacementNetwork) -> Engine | None:
-    return weights_engine(name, safetensors.torch.save(network.network.state_dict()))
 
 
 def _times(engines: Sequence[Engine]) -> list[dict[str, float]]:
@@ -150,7 +147,7 @@ def peak_bytes(network: torch.nn.Module) -> int:
     weights = [*network.parameters(), *network.buffers()]
     with torch.no_grad(), _LivingResults() as results:
         network(torch.zeros(1, 6, WINDOW_SAMPLES))
-    return sum(tensor.nbytes for tensor in weights) + results.peak
+    return results.peak + sum(tensor.nbytes for tensor in weights)
 
 
 class _LivingResults(TorchDispatchMode):  # type: ignore[no-untyped-call]
@@ -159,7 +156,7 @@ class _LivingResults(TorchDispatchMode):  # type: ignore[no-untyped-call]
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
         self._sizes: Any = WeakIdKeyDictionary()
-        self.peak = 0
+        self.peak: int = 0
 
     def __torch_dispatch__(
         self, function: Any, types: Any, args: Any = (), kwargs: Any = None

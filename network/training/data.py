@@ -66,16 +66,13 @@ def recording_streams(
         if isinstance(outcome, Skipped):
             skipped.append(outcome)
         else:
+            name = unused_name(outcome[0].name, names)  # validation averages over names
+            names.add(name)
+            if name != outcome[0].name:
+                outcome = [replace(stream, name=name) for stream in outcome]
             licence = str(archive_attributes(path).get("licence", ""))
-            recordings.append(RecordingStreams(path, _distinct(outcome, names), licence))
+            recordings.append(RecordingStreams(path, outcome, licence))
     return recordings, skipped
-
-
-def _distinct(streams: Sequence[Stream], taken: set[str]) -> Sequence[Stream]:
-    """Return a recording's streams under a name of its own: validation averages over names."""
-    name = unused_name(streams[0].name, taken)
-    taken.add(name)
-    return streams if name == streams[0].name else [replace(s, name=name) for s in streams]
 
 
 @dataclass(frozen=True)

@@ -40,25 +40,25 @@ class LegBatch(NamedTuple):
     Attributes:
         windows: (S, K, 6, 200) as presented to the network.
         R_NH: (S, K, 3, 3) maps the network's predictions to N and undoes the mirroring.
+        velocity_change: (S, K - 2, 2) change of the mean velocity in N over two seconds, by the
+            accelerometer, as returned by `velocity_change` [m/s].
         share: (S, M, K) time shared by a leg and a window [s].
         displacement: (S, M, 3) of the legs [m]; zero where there is no leg.
         whitening: (S, M, M) maps residuals to unit variance; zero where there is no leg.
         variance: (S, M) of the legs, due to their ends alone [m^2].
         seconds: (S, M) duration of the legs [s]; 1 where there is no leg.
         known: (S, M) whether there is a leg.
-        velocity_change: (S, K - 2, 2) change of the mean velocity in N over two seconds, by the
-            accelerometer, as returned by `velocity_change` [m/s].
     """
 
     windows: Tensor
     R_NH: Tensor
+    velocity_change: Tensor
     share: Tensor
     displacement: Tensor
     whitening: Tensor
     variance: Tensor
     seconds: Tensor
     known: Tensor
-    velocity_change: Tensor
 
 
 class LegSampler:
@@ -110,7 +110,7 @@ class LegSampler:
             device = self._generator.device
             rows = torch.randint(_BANK, (size,), generator=self._generator, device=device)
             drawn = [part[rows] for part in self._bank]
-        stream, begin, share, displacement, whitening, variance, seconds, known = drawn
+        stream, begin, *legs = drawn
         length = self._seconds * WINDOW_SAMPLES
         imu_N = self._imu_N.gathered(stream, begin, length)
         facing_N = self._facing_N.gathered(stream, begin, length)[:, ::HEADING_STEP]
@@ -119,10 +119,7 @@ class LegSampler:
         imu_N = imu_N.view(-1, WINDOW_SAMPLES, 6)
         imu, R_NH = augmented(imu_N, heading, self.augmentation, self._generator, self._seconds)
         windows = imu.transpose(1, 2).reshape(size, self._seconds, 6, WINDOW_SAMPLES)
-        return LegBatch(
-            windows.contiguous(), R_NH.view(size, -1, 3, 3),
-            share, displacement, whitening, variance, seconds, known, change,
-        )  # fmt: skip
+        return LegBatch(windows.contiguous(), R_NH.view(size, -1, 3, 3), change, *legs)
 
     def _drawn(self, size: int, generator: torch.Generator) -> list[Tensor]:
         """Return the streams' numbers and first samples of stretches (S,), and their legs."""

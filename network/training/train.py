@@ -28,7 +28,6 @@ from stario.network.card import Calibration, Card
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import DisplacementModel, save_model
 from stario.network.training.augment import WindowSampler
-from stario.network.training.captured import CapturedStep
 from stario.network.training.checkpoint import (
     damaged,
     exclusive,
@@ -47,6 +46,9 @@ from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.files import write_json
 
 log = logging.getLogger(__name__)
+
+_UNRECORDED = 3
+"""Steps before the recording, which let libraries choose their kernels and allocate memory."""
 
 
 def train(
@@ -317,7 +319,7 @@ class TrainingRun:
         A recurrent network receives them as rows of `config.successive` windows.
         """
         if self.network.is_recurrent:
-            windows = windows.unflatten(0, (-1, self.config.successive))
+            windows = windows.view(-1, self.config.successive, *windows.shape[1:])
         mixed = self.config.precision == "bfloat16"
         with torch.autocast(self.device.type, torch.bfloat16, enabled=mixed):
             mean, log_sigma, *_ = self._shared(windows)
@@ -385,6 +387,54 @@ class TrainingRun:
                 torch.cuda.set_rng_state(tensors["random.cuda"], self.device)
         else:
             torch.manual_seed(self.config.seed + self.workers.rank + self.step)
+
+
+class CapturedStep:
+    """A training step recorded once on a GPU, for inputs of fixed shapes, and replayed as a whole.
+
+    These networks have thousands of small kernels, and launching them one by one takes longer than
+    they run. A CUDA graph launches all of a step at once. It works on fixed memory: a step's inputs
+    are copied to where the recorded step reads them.
+
+    Args:
+        step: function of a list of tensors on a GPU, and of a flag on which its operations depend;
+            it changes the weights and returns a tensor, never waiting for the GPU.
+    """
+
+    def __init__(self, step: Callable[[list[Tensor], bool], Tensor]) -> None:
+        self._step = step
+        self._stage: object = None
+        self._left = _UNRECORDED
+        self._inputs: list[Tensor] = []
+        self._result = torch.empty(0)
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def __call__(self, inputs: list[Tensor], flag: bool) -> Tensor:
+        """Take a step, recorded anew when the flag or a shape changes."""
+        stage = flag, [part.shape for part in inputs]
+        if stage != self._stage:
+            self._stage, self._left, self._graph = stage, _UNRECORDED, None
+        if self._left:
+            self._left -= 1
+            return self._aside(inputs, flag)
+        if self._graph is None:
+            self._inputs = [part.clone() for part in inputs]
+            self._graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self._graph):
+                self._result = self._step(self._inputs, flag)
+        for own, new in zip(self._inputs, inputs, strict=True):
+            own.copy_(new)
+        self._graph.replay()
+        return self._result
+
+    def _aside(self, inputs: list[Tensor], flag: bool) -> Tensor:
+        """Take a step on another stream, as a recording demands of the steps before it."""
+        stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            result = self._step(inputs, flag)
+        torch.cuda.current_stream().wait_stream(stream)
+        return result
 
 
 def _weights(network: nn.Module) -> list[Tensor]:

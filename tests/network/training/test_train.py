@@ -17,11 +17,10 @@ from stario.network.architectures import build_network
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import load_model
 from stario.network.training.augment import Augmentation
-from stario.network.training.captured import CapturedStep
 from stario.network.training.config import TrainingConfig, training_config
 from stario.network.training.data import TrainingData
 from stario.network.training.history import EpochReport, History
-from stario.network.training.train import TrainingRun, train
+from stario.network.training.train import CapturedStep, TrainingRun, train
 from stario.network.training.validation import ValidationSet, calibrate
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
