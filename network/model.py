@@ -186,7 +186,8 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
 def _torch_engine(architecture: str, content: bytes, path: Path) -> Engine:
     import safetensors.torch
 
-    from stario.network.runtime.torch_engine import TorchEngine, trainable
+    from stario.network.displacement import trainable
+    from stario.network.runtime.torch_engine import TorchEngine
 
     try:
         return TorchEngine(trainable(architecture, safetensors.torch.load(content)))

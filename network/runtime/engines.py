@@ -126,7 +126,7 @@ class OnnxEngine(Engine):
             raise InputError("model", "an exported graph", "a safetensors file of weights")
         import torch
 
-        from stario.network.runtime.torch_engine import trainable
+        from stario.network.displacement import trainable
 
         state = {name: torch.tensor(tensor) for name, tensor in self._tensors.items()}
         return trainable(self._architecture, state)

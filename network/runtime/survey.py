@@ -145,7 +145,8 @@ def median_milliseconds(engines: Sequence[Engine], batch: int, runs: int) -> Flo
 def peak_bytes(network: torch.nn.Module) -> int:
     """Return the size of the weights and the most that the results for one window take at once."""
     weights = [*network.parameters(), *network.buffers()]
-    with torch.no_grad(), _LivingResults() as results:
+    results = _LivingResults()
+    with torch.no_grad(), results:
         network(torch.zeros(1, 6, WINDOW_SAMPLES))
     return results.peak + sum(tensor.nbytes for tensor in weights)
 
