@@ -1,8 +1,7 @@
-"""Registry of networks by their names in the paper's table; each is imported when it is built."""
+"""Registry of networks by their names in the paper's table."""
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -17,16 +16,14 @@ class Architecture:
     """A network's class and its figures in the paper's table.
 
     Attributes:
-        module: module of the class, below `stario.network`.
-        attribute: name of the class, which takes the number of outputs.
+        kind: name of the class, which takes the number of outputs.
         parameters: parameters in the paper's table [millions].
         flops: FLOPs for one window in the paper's table [millions].
         heads: 2 if displacement and log sigma have a head each, both counted by the table.
         options: arguments of the class besides the number of outputs.
     """
 
-    module: str
-    attribute: str
+    kind: str
     parameters: float
     flops: float
     heads: int = 1
@@ -39,19 +36,17 @@ class Architecture:
 
 
 ARCHITECTURES = {
-    "R-ResNet": Architecture("baselines.plain", "RoninResNet", 4.635, 38.252),
-    "R-LSTM": Architecture("baselines.plain", "RoninLstm", 13.589, 57.473),
-    "RNIN": Architecture("baselines.rnin", "Rnin", 5.259, 72.032, heads=2),
-    "I-IMUNet": Architecture("baselines.imunet", "ImuNet", 3.659, 18.838),
-    "I-MobileNet": Architecture("baselines.plain", "MobileNet", 3.179, 34.559),
-    "I-MnasNet": Architecture("baselines.plain", "MnasNet", 2.979, 25.256),
-    "I-EfficientNetB0": Architecture("baselines.plain", "EfficientNetB0", 3.232, 28.831),
-    "DeepILS": Architecture("baselines.plain", "DeepIls", 2.291, 15.287),
-    "TLIO": Architecture("baselines.plain", "Tlio", 5.424, 39.436, heads=2),
-    "StarIO without MSGCU": Architecture(
-        "stario", "StarIO", 2.252, 21.555, options={"gated_unit": False}
-    ),
-    "StarIO": Architecture("stario", "StarIO", 2.762, 25.122),
+    "R-ResNet": Architecture("RoninResNet", 4.635, 38.252),
+    "R-LSTM": Architecture("RoninLstm", 13.589, 57.473),
+    "RNIN": Architecture("Rnin", 5.259, 72.032, heads=2),
+    "I-IMUNet": Architecture("ImuNet", 3.659, 18.838),
+    "I-MobileNet": Architecture("MobileNet", 3.179, 34.559),
+    "I-MnasNet": Architecture("MnasNet", 2.979, 25.256),
+    "I-EfficientNetB0": Architecture("EfficientNetB0", 3.232, 28.831),
+    "DeepILS": Architecture("DeepIls", 2.291, 15.287),
+    "TLIO": Architecture("Tlio", 5.424, 39.436, heads=2),
+    "StarIO without MSGCU": Architecture("StarIO", 2.252, 21.555, options={"gated_unit": False}),
+    "StarIO": Architecture("StarIO", 2.762, 25.122),
 }
 """Networks by name, in the order of the paper's table."""
 
@@ -78,6 +73,9 @@ def build_network(name: str, outputs: int = 6) -> nn.Module:
         InputError: no network has that name.
     """
     entry = architecture(name)
-    module = importlib.import_module(f"stario.network.{entry.module}")
-    network: nn.Module = getattr(module, entry.attribute)(outputs, **entry.options)
+    from stario.network.baselines import networks
+    from stario.network.stario import StarIO
+
+    kind = StarIO if entry.kind == "StarIO" else getattr(networks, entry.kind)
+    network: nn.Module = kind(outputs, **entry.options)
     return network

@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from stario.sequences.errors import WeightsError
+from stario.sequences.errors import ConfigError, WeightsError
 from stario.sequences.sequence import FloatArray
+from stario.sequences.settings import with_settings
 from stario.sequences.windows import WINDOW_RATE, WINDOW_SAMPLES
 
 FORMAT = 1
@@ -32,6 +33,15 @@ _STEEPEST = 10.0
 
 CHANNELS = ["gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"]
 
+_FIXED = {
+    "format": FORMAT,
+    "outputs": 6,
+    "rate": WINDOW_RATE,
+    "samples": WINDOW_SAMPLES,
+    "channels": CHANNELS,
+}
+"""Fields that are the same on every card."""
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -44,11 +54,24 @@ class Calibration:
         scale: factors on the network's sigma.
         exponent: powers of the network's sigma.
         floor: minimum sigma [m], above 0.
+
+    Raises:
+        ConfigError: a value is out of range.
     """
 
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     exponent: tuple[float, float, float] = (1.0, 1.0, 1.0)
     floor: tuple[float, float, float] = (0.005, 0.005, 0.005)
+
+    def __post_init__(self) -> None:
+        for name in ("scale", "exponent", "floor"):
+            values = getattr(self, name)
+            if len(values) != 3 or not all(math.isfinite(v) and v >= 0.0 for v in values):
+                raise ConfigError(name, repr(values), "three finite numbers of 0 or more")
+        if min(self.floor) <= 0.0:
+            raise ConfigError("floor", repr(self.floor), "above 0, against a covariance of 0")
+        if max(self.exponent) > _STEEPEST:
+            raise ConfigError("exponent", repr(self.exponent), f"up to {_STEEPEST:g}")
 
     def variance(self, log_sigma: FloatArray) -> FloatArray:
         """Return calibrated variances (M, 3) [m^2] for log sigmas (M, 3)."""
@@ -73,6 +96,9 @@ class Card:
         recipe: the command and settings that produced the weights.
         figures: results on named recordings.
         format: version of the card's layout.
+
+    Raises:
+        ConfigError: the card describes other windows.
     """
 
     architecture: str
@@ -87,6 +113,13 @@ class Card:
     recipe: dict[str, Any] = field(default_factory=dict)
     figures: dict[str, Any] = field(default_factory=dict)
     format: int = FORMAT
+
+    def __post_init__(self) -> None:
+        for name, expected in _FIXED.items():
+            if getattr(self, name) != expected:
+                raise ConfigError(name, repr(getattr(self, name)), repr(expected))
+        if self.frame not in FRAMES:
+            raise ConfigError("frame", repr(self.frame), repr(FRAME))
 
 
 def card_path(weights: Path) -> Path:
@@ -116,11 +149,7 @@ def read_weights(weights: Path) -> tuple[bytes, Card]:
     for needed in (weights, path):
         if not needed.is_file():
             raise WeightsError(needed, "file", "nothing there", "weights and card in one folder")
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise WeightsError(path, "card", str(error), "a StarIO weights card") from error
-    card = parse_card(text, path)
+    card = parse_card(path.read_bytes(), path)
     content = weights.read_bytes()
     digest = hashlib.sha256(content).hexdigest()
     if digest != card.sha256:
@@ -134,7 +163,7 @@ def read_weights(weights: Path) -> tuple[bytes, Card]:
     return content, card
 
 
-def parse_card(text: str, path: Path) -> Card:
+def parse_card(text: str | bytes, path: Path) -> Card:
     """Parse a card from its JSON text.
 
     Args:
@@ -147,42 +176,11 @@ def parse_card(text: str, path: Path) -> Card:
     try:
         content = json.loads(text)
         content.pop("known_motion", None)  # on cards until 2026; nothing depends on it any more
-        missing = {f.name for f in fields(Card)} - {*content}
-        if missing:
-            raise ValueError(f"no {sorted(missing)[0]!r}")
-        calibration = _calibration(content.pop("calibration"))
-        unknown = set(content) - {f.name for f in fields(Card)}
-        if unknown:
-            raise ValueError(f"unknown key {sorted(unknown)[0]!r}")
-        card = Card(calibration=calibration, **content)
-        for name in ("architecture", "sha256"):
-            if not isinstance(getattr(card, name), str):
-                raise ValueError(f"{name} {getattr(card, name)!r}")
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        for kind, given in ((Card, content), (Calibration, content.get("calibration", {}))):
+            if isinstance(given, dict) and (lacking := {f.name for f in fields(kind)} - {*given}):
+                raise ValueError(f"no {min(lacking)!r} in {kind.__name__.lower()}")
+        return with_settings(Card(""), content)
+    except ConfigError as error:
+        raise WeightsError(path, error.field, error.found, error.expected) from error
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise WeightsError(path, "card", str(error), "a StarIO weights card") from error
-    _check(card, path)
-    return card
-
-
-def _calibration(content: dict[str, list[float]]) -> Calibration:
-    names = [f.name for f in fields(Calibration)]
-    if not isinstance(content, dict) or sorted(content) != sorted(names):
-        raise ValueError(f"calibration {content!r}")
-    for name, values in content.items():
-        if len(values) != 3 or not all(math.isfinite(v) and v >= 0.0 for v in values):
-            raise ValueError(f"calibration.{name} {values!r}")
-    if min(content["floor"]) <= 0.0:
-        raise ValueError(f"calibration.floor {content['floor']!r}, allowing a covariance of 0")
-    if max(content["exponent"]) > _STEEPEST:
-        raise ValueError(f"calibration.exponent {content['exponent']!r}, above {_STEEPEST:g}")
-    return Calibration(**{name: (x, y, z) for name, (x, y, z) in content.items()})
-
-
-def _check(card: Card, path: Path) -> None:
-    usual = Card(card.architecture)
-    for name in ("format", "outputs", "rate", "samples", "channels"):
-        found, expected = getattr(card, name), getattr(usual, name)
-        if found != expected:
-            raise WeightsError(path, name, repr(found), repr(expected))
-    if card.frame not in FRAMES:
-        raise WeightsError(path, "frame", repr(card.frame), repr(FRAME))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from stario.network.architectures import build_network
 from stario.sequences.sequence import STANDARD_GRAVITY
 
 LOG_SIGMA_RANGE = (-6.0, 3.0)
@@ -49,3 +51,14 @@ class DisplacementNetwork(nn.Module):
         output, *after = network.step(centred, state) if self.is_recurrent else (network(centred),)
         output = output.float()
         return output[..., :3], output[..., 3:].clamp(*LOG_SIGMA_RANGE), *after
+
+
+def trainable(architecture: str, state: Mapping[str, Tensor]) -> DisplacementNetwork:
+    """Build a network with its weights, in evaluation mode.
+
+    Raises:
+        RuntimeError: the tensors are not those of the architecture.
+    """
+    network = DisplacementNetwork(build_network(architecture))
+    network.network.load_state_dict(state)
+    return network.eval()

@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike
 
 from stario.network.architectures import ARCHITECTURES
 from stario.network.card import Card, card_path, dump_card, read_weights
-from stario.network.runtime.engines import Engine, Float32Array
-from stario.network.runtime.onnx_engine import load_onnx, weights_engine
+from stario.network.runtime.engines import Engine, Float32Array, load_onnx, weights_engine
 from stario.sequences.errors import InputError, WeightsError
 from stario.sequences.files import atomic_write
 from stario.sequences.sequence import FloatArray
@@ -187,7 +186,8 @@ def load_model(name_or_path: str | Path = "default") -> DisplacementModel:
 def _torch_engine(architecture: str, content: bytes, path: Path) -> Engine:
     import safetensors.torch
 
-    from stario.network.runtime.torch_engine import TorchEngine, trainable
+    from stario.network.displacement import trainable
+    from stario.network.runtime.torch_engine import TorchEngine
 
     try:
         return TorchEngine(trainable(architecture, safetensors.torch.load(content)))

@@ -2,7 +2,7 @@
 
 The displacement between two waypoints, or two instants of a position track, is known in the map
 frame, but its yaw relative to the levelled IMU is not. From such recordings a network learns on
-stretches of levelled IMU samples with their legs (`stario.network.training.weak_truth`).
+stretches of levelled IMU samples with their legs (`stario.network.training.losses`).
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ def narrow(patch: pytest.MonkeyPatch) -> None:
 
 def shallow(patch: pytest.MonkeyPatch) -> None:
     """Give RNIN one residual block in place of eight; its memory stays as it is."""
-    one_block = "stario.network.baselines.rnin.residual_groups"
+    one_block = "stario.network.baselines.networks.residual_groups"
     patch.setattr(one_block, lambda block: block(64, 512, 8))
 
 

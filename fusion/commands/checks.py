@@ -88,10 +88,8 @@ def models(
     """List parameters, FLOPs, time and memory of each network next to the paper's values."""
     from stario.network.architectures import ARCHITECTURES
     from stario.network.runtime.survey import survey, survey_table
-    from stario.sequences.datasets.cache_files import cache_folder
 
-    with common.progress_bar("models") as progress:
-        rows = survey(names or list(ARCHITECTURES), cache_folder(), progress)
+    rows = survey(names or list(ARCHITECTURES))
     common.print_result(as_json, rows, survey_table(rows))
 
 

@@ -101,8 +101,8 @@ def train(
     from stario.fusion.evaluation.results import make_folder
     from stario.network.model import load_model
     from stario.network.training.config import INSERTED
-    from stario.network.training.data import recording_streams, seconds_of, virtual_recordings
-    from stario.network.training.moments import moment_streams
+    from stario.network.training.data import recording_streams, seconds_of
+    from stario.network.training.made import moment_streams, virtual_recordings
     from stario.network.training.parallel import is_leader
     from stario.network.training.splits import warn_of_learned
     from stario.network.training.train import train as train_network
@@ -249,7 +249,8 @@ def _material(
     folder: Path,
 ) -> TrainingData:
     """Return what is learned from, if anything has full ground truth."""
-    from stario.network.training.data import cached_walks, mix_sources
+    from stario.network.training.data import mix_sources
+    from stario.network.training.made import cached_walks
 
     simulated = cached_walks(walks, recipe.seed, folder, recipe.attitude)
     material = mix_sources(recorded, simulated, recipe.shares, recipe.reach, moments)
@@ -267,7 +268,8 @@ def _validation(
     recorded: list[RecordingStreams], required: bool, recipe: TrainingConfig, folder: Path
 ) -> TrainingData:
     """Return what is selected and calibrated on, if there is any or none is required."""
-    from stario.network.training.data import cached_walks, validation_data
+    from stario.network.training.data import validation_data
+    from stario.network.training.made import cached_walks
 
     if required and not any(recording.streams for recording in recorded):
         raise InputError(

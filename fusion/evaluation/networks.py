@@ -21,7 +21,7 @@ from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.values.config import NavigatorConfig
 from stario.network.model import DisplacementModel
-from stario.network.runtime.cost import table_cost
+from stario.network.runtime.survey import table_counts
 from stario.sequences.accuracy.metrics import (
     CONVENTIONS,
     Convention,
@@ -65,7 +65,7 @@ class NetworkTable:
 
     Attributes:
         convention: how position errors are averaged.
-        parameters: parameter count by network, in the table's order, by the paper's convention.
+        parameters: parameter count by network, in the table's order.
         scores: `METRICS` of the tracks of `PROTOCOLS`, with labels `network` and `weights`.
         samples: tracks of some recordings.
     """
@@ -156,7 +156,7 @@ def network_table(
         name = distinct_name(sample.recording, names)
         scores.append(rows.assign(recording=name))
         samples.append(replace(sample, recording=name))
-    parameters = {model.name: table_cost(model.name).parameters for _, model in models}
+    parameters = {model.name: table_counts(model.name)[0] for _, model in models}
     return NetworkTable(convention, parameters, joined(scores), samples[:MAX_DRAWN])
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +28,7 @@ from stario.fusion.evaluation.scores import Spread, joined, scored
 from stario.fusion.paper_table.runs import CONVENTION, Run, read_run
 from stario.fusion.paper_table.sets import DataSet, published, set_of
 from stario.network.architectures import ARCHITECTURES
-from stario.network.runtime.cost import table_cost
-from stario.network.runtime.survey import BATCHES, ModelRow, survey
+from stario.network.runtime.survey import BATCHES, ModelRow, survey, table_counts
 from stario.network.training.config import TrainingConfig
 from stario.sequences.accuracy.metrics import CONVENTIONS
 from stario.sequences.drawing.text_table import figure, markdown
@@ -222,7 +221,9 @@ def known_costs(names: Sequence[str], out: Path) -> list[ModelRow]:
     """Return parameters, FLOPs, memory and time, measured once per folder and network."""
     path = out / "costs.json"
     rows = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
-    measured = {row["name"]: ModelRow(**row) for row in rows}
+    columns = {column.name for column in fields(ModelRow)}
+    # Rows of an earlier version counted otherwise.
+    measured = {row["name"]: ModelRow(**row) for row in rows if row.keys() == columns}
     if missing := [name for name in names if name not in measured]:
         measured |= {row.name: row for row in survey(missing)}
         write_json(path, list(measured.values()))
@@ -272,7 +273,7 @@ def _for_figures(table: SetTable, completed: Completed) -> NetworkTable | None:
     """Return the networks' errors on recordings with poses, for the figures; None without any."""
     scores = table.scores
     names = [name for name in table.rows["network"] if name in ARCHITECTURES]
-    parameters = {name: table_cost(name).parameters for name in names}
+    parameters = {name: table_counts(name)[0] for name in names}
     chosen = scores["network"].isin(parameters) & scores["track"].isin(PROTOCOLS)
     chosen &= scores["metric"].isin(METRICS)
     if not chosen.any():

@@ -18,12 +18,12 @@ from stario.fusion.paper_table.sets import DataSet
 from stario.network.training.config import TrainingConfig, training_config
 from stario.network.training.data import (
     RecordingStreams,
-    cached_walks,
     mix_sources,
     recording_streams,
     validation_data,
 )
 from stario.network.training.history import EpochReport, History
+from stario.network.training.made import cached_walks
 from stario.network.training.train import train
 from stario.sequences.datasets.batch import Skipped
 from stario.sequences.datasets.cache_files import recording_stamps

@@ -1,4 +1,4 @@
-"""Export to ONNX; `onnx_engine` loads the files.
+"""Export to ONNX; `engines` loads the files.
 
 The graph maps `windows` (batch, 6, 200), as in `DisplacementModel.predict`, to `displacement`
 (batch, 3) [m] and `log_sigma` (batch, 3); that of a recurrent network also takes `state`
@@ -20,7 +20,7 @@ import torch
 
 from stario.network.card import dump_card
 from stario.network.displacement import DisplacementNetwork
-from stario.network.runtime.onnx_engine import CARD_KEY
+from stario.network.runtime.engines import CARD_KEY
 from stario.network.stario import StarIO
 from stario.sequences.files import atomic_write
 from stario.sequences.lazy import optional_package
@@ -50,10 +50,9 @@ def export_onnx(model: DisplacementModel, path: Path) -> None:
     optional_package("onnx", "onnx")
     network = model.training_form
     if isinstance(network.network, StarIO):
-        from stario.network.runtime.stario_graph import stario_graph, with_weights
+        from stario.network.runtime.stario_graph import stario_graph
 
-        state = {name: tensor.numpy() for name, tensor in network.network.state_dict().items()}
-        graph = with_weights(stario_graph(network.network), state)
+        graph = stario_graph(network.network, with_weights=True)
     else:
         graph = _traced(network)
     card = {"frame": model.card.frame, CARD_KEY: dump_card(model.card)}

@@ -31,7 +31,7 @@ from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 from torch import nn
 
 from stario.network.displacement import LOG_SIGMA_RANGE
-from stario.network.runtime.onnx_engine import GRAPHS
+from stario.network.runtime.engines import GRAPHS
 from stario.network.stario import EPSILON, Block, StarIO
 from stario.sequences.files import atomic_write
 from stario.sequences.sequence import STANDARD_GRAVITY
@@ -44,12 +44,12 @@ _ELSEWHERE = "the weights' safetensors file"
 """Location of the tensors' data; whoever loads the graph provides them."""
 
 
-def stario_graph(network: StarIO) -> ModelProto:
-    """Build the graph of `DisplacementNetwork(network)` without its weights.
+def stario_graph(network: StarIO, with_weights: bool = False) -> ModelProto:
+    """Build the graph of `DisplacementNetwork(network)`, with its weights or without.
 
     It maps `windows` (batch, 6, 200) to `displacement` (batch, 3) [m] and `log_sigma` (batch, 3).
     """
-    graph = _Graph({name: tuple(t.shape) for name, t in network.state_dict().items()})
+    graph = _Graph({k: v.numpy() for k, v in network.state_dict().items()}, with_weights)
     gravity = np.zeros((6, 1), np.float32)
     gravity[5] = STANDARD_GRAVITY
     x = graph.op("Sub", "windows", graph.constant(gravity))
@@ -61,33 +61,26 @@ def stario_graph(network: StarIO) -> ModelProto:
     return graph.model()
 
 
-def with_weights(graph: ModelProto, weights: Mapping[str, NDArray[Any]]) -> ModelProto:
-    """Return a copy of a graph that contains its weights, by their names."""
-    complete = ModelProto()
-    complete.CopyFrom(graph)
-    for tensor in complete.graph.initializer:
-        if tensor.name in weights:
-            tensor.CopyFrom(numpy_helper.from_array(weights[tensor.name], tensor.name))
-    return complete
-
-
 class _Graph:
     """A graph being built: each method appends nodes and returns the name of their result.
 
     Args:
-        shapes: shapes of the weights by name.
+        weights: the weights by name.
+        contained: whether the graph contains them.
     """
 
-    def __init__(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        self._shapes = shapes
+    def __init__(self, weights: Mapping[str, NDArray[Any]], contained: bool) -> None:
+        self._weights, self._contained = weights, contained
         self._nodes: list[NodeProto] = []
         self._tensors: dict[str, TensorProto] = {}
 
     def weight(self, name: str) -> str:
         """Refer to a tensor of the weights."""
-        tensor = TensorProto(name=name, dims=self._shapes[name], data_type=TensorProto.FLOAT)
-        tensor.data_location = TensorProto.EXTERNAL
-        tensor.external_data.add(key="location", value=_ELSEWHERE)
+        tensor = numpy_helper.from_array(self._weights[name], name)
+        if not self._contained:
+            tensor.ClearField("raw_data")
+            tensor.data_location = TensorProto.EXTERNAL
+            tensor.external_data.add(key="location", value=_ELSEWHERE)
         self._tensors[name] = tensor
         return name
 
@@ -120,10 +113,10 @@ class _Graph:
 
     def product(self, x: str, name: str) -> str:
         """Apply a linear layer or a 1x1 convolution to rows (N, C)."""
-        weight, shape = self.weight(f"{name}.weight"), self._shapes[f"{name}.weight"]
+        weight, shape = self.weight(f"{name}.weight"), self._weights[f"{name}.weight"].shape
         if len(shape) == 3:
             weight = self.reshape(weight, *shape[:2])
-        bias = [self.weight(f"{name}.bias")] if f"{name}.bias" in self._shapes else []
+        bias = [self.weight(f"{name}.bias")] if f"{name}.bias" in self._weights else []
         return str(self.op("Gemm", x, weight, *bias, transB=1))
 
     def epsilon(self) -> str:

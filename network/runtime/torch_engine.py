@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
 from typing import Any
 
 import torch
-from torch import Tensor
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from stario.network.architectures import build_network
 from stario.network.baselines.parts import ConvNorm
 from stario.network.displacement import DisplacementNetwork
 from stario.network.runtime.engines import Answer, Engine, Float32Array
@@ -38,17 +35,6 @@ class TorchEngine(Engine):
         with torch.inference_mode():
             mean, log_sigma, *after = self._network(*map(torch.from_numpy, given))
         return mean.numpy(), log_sigma.numpy(), after[0].numpy() if after else state
-
-
-def trainable(architecture: str, state: Mapping[str, Tensor]) -> DisplacementNetwork:
-    """Build a network with its weights, in evaluation mode.
-
-    Raises:
-        RuntimeError: the tensors are not those of the architecture.
-    """
-    network = DisplacementNetwork(build_network(architecture))
-    network.network.load_state_dict(state)
-    return network.eval()
 
 
 def _folded(network: DisplacementNetwork) -> DisplacementNetwork:

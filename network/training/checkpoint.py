@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import safetensors
 import safetensors.torch
@@ -60,16 +60,18 @@ def read_checkpoint(
         with safetensors.safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    except (safetensors.SafetensorError, OSError) as error:
-        raise damaged(path, error) from error
-    if "config" not in metadata:
-        raise ReadError(path, "checkpoint", "no recipe in it", "a checkpoint of a training run")
-    try:
         recipe, step = dict(json.loads(metadata["config"])), int(metadata["step"])
         reports = [EpochReport(**report) for report in json.loads(metadata["history"])]
-    except (KeyError, TypeError, ValueError) as error:
+    except (safetensors.SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         raise damaged(path, error) from error
-    _check_same(path, recipe, config)
+    for name, expected in json.loads(json.dumps(asdict(config))).items():
+        if recipe.get(name) != expected:
+            raise ConfigError(
+                f"{path}: {name}",
+                repr(recipe.get(name)),
+                f"{expected!r}, as in this run",
+                "resume with the same settings or train into another folder",
+            )
     if metadata.get("material") != material:
         raise ConfigError(
             str(path),
@@ -85,18 +87,6 @@ def damaged(path: Path, error: Exception) -> ReadError:
     found = f"{type(error).__name__}: {first_mismatch(error)}"[:120]
     fix = "remove it to train anew, or train into another folder (--out)"
     return ReadError(path, "checkpoint", found, "a complete checkpoint", fix)
-
-
-def _check_same(path: Path, found: dict[str, Any], config: TrainingConfig) -> None:
-    expected = json.loads(json.dumps(asdict(config)))
-    for name in expected:
-        if found.get(name) != expected[name]:
-            raise ConfigError(
-                f"{path}: {name}",
-                repr(found.get(name)),
-                f"{expected[name]!r}, as in this run",
-                "resume with the same settings or train into another folder",
-            )
 
 
 LOCK_FILE = ".lock"

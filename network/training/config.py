@@ -1,9 +1,4 @@
-"""The training recipe, common to all networks: its loss and its schedule.
-
-The mean is learned by squared error throughout. Sigma joins later, through the Gaussian
-likelihood e^2 / (2 sigma^2) + log sigma of the mean's current error (detached): the joint
-likelihood, even weighted by sigma (Seitzer et al. 2022), starves the mean of gradient wherever
-sigma is large, and the large errors dominate the error of a track.
+"""The training recipe, common to all networks, and its schedule.
 
 The learning rate warms up and falls along a cosine as a function of the step alone, so a run that
 is interrupted and resumed follows the same schedule.
@@ -14,9 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-
-import torch
-from torch import Tensor
 
 from stario.network.architectures import ARCHITECTURES
 from stario.network.training.augment import Augmentation, reach_of
@@ -56,22 +48,14 @@ FINE_TUNING: dict[str, object] = {
 """Settings for weights that know walking already: those of the default weights' last stage, but
 slower, and mixed with the initial weights. A few walks otherwise make a network forget the rest."""
 
-SIGMA_WEIGHT = 0.05
-"""Weight of the likelihood next to the squared error [m^2]: the square of a good error."""
-
 LEAST_SECONDS = 4
 """Minimum windows per stretch of weak truth: two changes of velocity over two seconds."""
 
 _COUNTS = {
-    "epochs": 1,
-    "epoch_windows": 1,
-    "batch": 1,
-    "patience": 1,
-    "successive": 1,
-    "waypoint_stretches": 1,
-    "waypoint_seconds": LEAST_SECONDS,
-    "track_stretches": 1,
-    "track_seconds": LEAST_SECONDS,
+    **dict.fromkeys(("epochs", "epoch_windows", "batch", "patience", "successive"), 1),
+    **dict.fromkeys(("waypoint_stretches", "track_stretches"), 1),
+    **dict.fromkeys(("waypoint_seconds", "track_seconds"), LEAST_SECONDS),
+    "seed": 0,
 }
 
 _CHOICES = {
@@ -81,15 +65,7 @@ _CHOICES = {
     "attitude": ("levelled", "true"),
 }
 
-_RANGES = (
-    ("rate", 1e-8, 1.0),
-    ("warm_up", 0.0, 1.0),
-    ("weight_decay", 0.0, 1.0),
-    ("likelihood_from", 0.0, 1.0),
-    ("clip", 1e-6, 1e6),
-    ("average", 0.0, 1.0),
-    ("learned", 0.0, 1.0),
-)
+_SHARES = ("warm_up", "weight_decay", "likelihood_from", "average", "learned")
 
 
 @dataclass(frozen=True)
@@ -119,7 +95,7 @@ class TrainingConfig:
             place; above 1 only for a recurrent network.
         seed: seed of initial weights, draws and dropout.
         waypoint_stretches: stretches between waypoints per step, where recordings have them
-            (`stario.network.training.weak_truth`).
+            (`stario.network.training.losses`).
         waypoint_seconds: number of windows in each of them.
         track_stretches: stretches along a track of positions without attitude, per step.
         track_seconds: number of windows in each; few, because heads and phones drift
@@ -168,8 +144,12 @@ class TrainingConfig:
             value = getattr(self, name)
             if not (isinstance(value, int) and value >= least):
                 raise ConfigError(name, repr(value), f"an integer of {least} or more")
-        for name, low, high in _RANGES:
-            check_number(self, name, low, high)
+        for name in _SHARES:
+            check_number(self, name, 0.0, 1.0)
+        check_number(self, "rate", 1e-8, 1.0)
+        check_number(self, "clip", 1e-6, 1e6)
+        if self.dropout is not None:
+            check_number(self, "dropout", 0.0, 0.99)
         for name, share in self.shares.items():
             is_number = isinstance(share, int | float) and not isinstance(share, bool)
             if not (is_number and 0.0 <= share <= 1.0):
@@ -180,15 +160,9 @@ class TrainingConfig:
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
                 raise ConfigError(name, repr(getattr(self, name)), f"one of {', '.join(choices)}")
-        if not (isinstance(self.seed, int) and 0 <= self.seed < 2**31):
-            raise ConfigError("seed", repr(self.seed), "an integer from 0 to 2^31 - 1")
-        dropout = 0.0 if self.dropout is None else self.dropout
-        if not (isinstance(dropout, int | float) and 0.0 <= dropout < 1.0):
-            raise ConfigError("dropout", repr(self.dropout), "a share from 0 to below 1, or none")
         if self.batch % self.successive:
-            raise ConfigError(
-                "batch", str(self.batch), f"a multiple of successive={self.successive}"
-            )
+            expected = f"a multiple of successive={self.successive}"
+            raise ConfigError("batch", str(self.batch), expected)
 
     @property
     def reach(self) -> int:
@@ -204,12 +178,6 @@ class TrainingConfig:
     def steps(self) -> int:
         """Maximum number of steps of the run."""
         return self.epochs * self.steps_per_epoch
-
-
-def loss_with_sigma(squared: Tensor, log_sigma: Tensor) -> Tensor:
-    """Return the mean of squared errors (B, 3) [m^2] plus the weighted likelihood of sigma."""
-    likelihood = 0.5 * squared.detach() * torch.exp(-2.0 * log_sigma) + log_sigma
-    return (squared + SIGMA_WEIGHT * likelihood).sum(1).mean()
 
 
 def learning_rate(config: TrainingConfig, step: int) -> float:

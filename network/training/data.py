@@ -1,11 +1,9 @@
-"""Training data: recordings and simulated walks."""
+"""Training data: the streams of recordings, and how often each is drawn."""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -14,28 +12,16 @@ import numpy as np
 from stario.network.training.config import INSERTED, MADE, SIMULATED
 from stario.sequences.arrays import rms
 from stario.sequences.datasets.batch import Skipped
-from stario.sequences.datasets.cache_files import recording_stamps
-from stario.sequences.datasets.stream_cache import Stream, cached
+from stario.sequences.datasets.stream_cache import Stream
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.files import unused_name
 from stario.sequences.legs import LegStream
 from stario.sequences.readers.archive import archive_attributes, split_name
 from stario.sequences.sequence import STANDARD_GRAVITY
-from stario.sequences.simulation.body import places_on, virtual_imu
-from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
-from stario.sequences.simulation.motion_capture import body_clips, read_body
-from stario.sequences.simulation.walks import generate_walk
-from stario.sequences.windows import WINDOW_RATE, Attitude, WorldStream, world_streams
-
-log = logging.getLogger(__name__)
+from stario.sequences.windows import WINDOW_RATE, WorldStream
 
 _SIMULATED_SHARE = 0.4
 """Default share of simulated walks among all windows."""
-
-_WALK_SECONDS = 60.0
-
-_NOT_CARRIED = ("foot",)
-"""Places at which nobody carries a phone."""
 
 _SHORTEST = 400
 """Minimum number of samples of a stretch, 2 s; shorter ones are dropped."""
@@ -80,16 +66,13 @@ def recording_streams(
         if isinstance(outcome, Skipped):
             skipped.append(outcome)
         else:
+            name = unused_name(outcome[0].name, names)  # validation averages over names
+            names.add(name)
+            if name != outcome[0].name:
+                outcome = [replace(stream, name=name) for stream in outcome]
             licence = str(archive_attributes(path).get("licence", ""))
-            recordings.append(RecordingStreams(path, _distinct(outcome, names), licence))
+            recordings.append(RecordingStreams(path, outcome, licence))
     return recordings, skipped
-
-
-def _distinct(streams: Sequence[Stream], taken: set[str]) -> Sequence[Stream]:
-    """Return a recording's streams under a name of its own: validation averages over names."""
-    name = unused_name(streams[0].name, taken)
-    taken.add(name)
-    return streams if name == streams[0].name else [replace(s, name=name) for s in streams]
 
 
 @dataclass(frozen=True)
@@ -264,56 +247,3 @@ def split_off(
 
 def _is_long(stream: Stream) -> bool:
     return len(stream) >= _SHORTEST and (isinstance(stream, WorldStream) or len(stream.start) > 1)
-
-
-def cached_walks(count: int, seed: int, folder: Path, attitude: Attitude) -> list[WorldStream]:
-    """Return streams of a simulated phone's IMU along walks of one minute, cached in `folder`."""
-
-    def build() -> list[WorldStream]:
-        rng = np.random.default_rng(seed)
-        streams = []
-        for index in range(count):
-            walk, sensor = (int(k) for k in rng.integers(2**31, size=2))
-            trajectory = generate_walk(walk, _WALK_SECONDS)
-            name = f"walk-{index}"
-            simulated = simulate_imu(trajectory, 200.0, PHONE_IMU, sensor, name=name)
-            streams += world_streams(simulated, attitude=attitude)
-        return streams
-
-    module = Path(__file__).read_text(encoding="utf-8")
-    key = {"kind": "generated", "values": [count, seed, attitude], "module": module}
-    return [s for s in cached(key, build, folder) if isinstance(s, WorldStream)]
-
-
-def virtual_recordings(files: Iterable[Path], seed: int, folder: Path) -> list[RecordingStreams]:
-    """Return streams of virtual devices, one at each place on the body, for each clip.
-
-    They are along the true attitude: a clip of a few seconds is too short to be levelled. Clips
-    below two seconds are left out. Streams are cached in `folder`.
-
-    Raises:
-        ReadError: a file cannot be read.
-    """
-    recordings: list[RecordingStreams] = []
-    for index, clip in enumerate(clip for file in files for clip in body_clips(file)):
-        stamps = recording_stamps(clip)
-        key = {"kind": "virtual", "values": [str(clip), stamps, seed, index]}
-        try:
-            found = cached(key, partial(_devices_on, clip, (seed, index)), folder)
-        except InputError as error:
-            log.info("%s: %s", clip, error)
-            continue
-        licence = str(archive_attributes(clip).get("licence", ""))
-        recordings.append(RecordingStreams(clip, found, licence, is_virtual=True))
-    return recordings
-
-
-def _devices_on(clip: Path, seed: tuple[int, int]) -> list[WorldStream]:
-    motion = read_body(clip)
-    rng = np.random.default_rng(seed)
-    streams = []
-    for place in places_on(motion):
-        if place not in _NOT_CARRIED:
-            device = virtual_imu(motion, place, 200.0, PHONE_IMU, int(rng.integers(2**31)))
-            streams += world_streams(device, attitude="true")
-    return streams

@@ -1,6 +1,6 @@
 """Stretches of weak ground truth drawn for training: windows with the legs between known positions.
 
-`stario.network.training.weak_truth` has the equations.
+`stario.network.training.losses` has the equations.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,7 +16,6 @@ from torch import Tensor
 
 from stario.network.training.augment import Augmentation, Stretches, augmented, heading_of
 from stario.network.training.config import TrainingConfig
-from stario.network.training.parallel import Workers
 from stario.sequences.arrays import runs
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.legs import LegStream
@@ -35,42 +34,31 @@ _SETTINGS = {"waypoints": "waypoint", "positions": "track"}
 """How the recipe's settings for stretches of each kind begin: `waypoint_seconds`, for example."""
 
 
-@dataclass(frozen=True, eq=False)
-class LegBatch:
+class LegBatch(NamedTuple):
     """S stretches of K windows with up to M legs each.
 
     Attributes:
         windows: (S, K, 6, 200) as presented to the network.
         R_NH: (S, K, 3, 3) maps the network's predictions to N and undoes the mirroring.
+        velocity_change: (S, K - 2, 2) change of the mean velocity in N over two seconds, by the
+            accelerometer, as returned by `velocity_change` [m/s].
         share: (S, M, K) time shared by a leg and a window [s].
         displacement: (S, M, 3) of the legs [m]; zero where there is no leg.
         whitening: (S, M, M) maps residuals to unit variance; zero where there is no leg.
         variance: (S, M) of the legs, due to their ends alone [m^2].
         seconds: (S, M) duration of the legs [s]; 1 where there is no leg.
         known: (S, M) whether there is a leg.
-        velocity_change: (S, K - 2, 2) change of the mean velocity in N over two seconds, by the
-            accelerometer, as returned by `velocity_change` [m/s].
     """
 
     windows: Tensor
     R_NH: Tensor
+    velocity_change: Tensor
     share: Tensor
     displacement: Tensor
     whitening: Tensor
     variance: Tensor
     seconds: Tensor
     known: Tensor
-    velocity_change: Tensor
-
-    def to(self, device: torch.device) -> LegBatch:
-        """Return the batch on another device."""
-        return LegBatch(**{name: value.to(device) for name, value in vars(self).items()})
-
-    def shared(self, among: Workers) -> LegBatch:
-        """Return this process's stretches; all of them if they cannot be divided evenly."""
-        if len(self.known) % among.count:
-            return self
-        return LegBatch(**{name: among.share(value) for name, value in vars(self).items()})
 
 
 class LegSampler:
@@ -102,12 +90,8 @@ class LegSampler:
                 "%s: skipping %d of %d stretches, which hold no two legs within %d s",
                 streams[0].kind, found.count([]), len(found), seconds,
             )  # fmt: skip
-        self._runs = [
-            (index, first, count)
-            for index, beginnings in enumerate(found)
-            for first, count in beginnings
-        ]
-        counts = torch.tensor([count for _, _, count in self._runs], dtype=torch.float64)
+        self._runs = [(index, *run) for index, beginnings in enumerate(found) for run in beginnings]
+        counts = torch.tensor(self._runs, dtype=torch.float64)[:, 2]
         self._cumulative = (counts / counts.sum()).cumsum(0)
         self._streams, self._generator = list(streams), generator
         device = generator.device
@@ -126,7 +110,7 @@ class LegSampler:
             device = self._generator.device
             rows = torch.randint(_BANK, (size,), generator=self._generator, device=device)
             drawn = [part[rows] for part in self._bank]
-        stream, begin, share, displacement, whitening, variance, seconds, known = drawn
+        stream, begin, *legs = drawn
         length = self._seconds * WINDOW_SAMPLES
         imu_N = self._imu_N.gathered(stream, begin, length)
         facing_N = self._facing_N.gathered(stream, begin, length)[:, ::HEADING_STEP]
@@ -135,10 +119,7 @@ class LegSampler:
         imu_N = imu_N.view(-1, WINDOW_SAMPLES, 6)
         imu, R_NH = augmented(imu_N, heading, self.augmentation, self._generator, self._seconds)
         windows = imu.transpose(1, 2).reshape(size, self._seconds, 6, WINDOW_SAMPLES)
-        return LegBatch(
-            windows.contiguous(), R_NH.view(size, -1, 3, 3),
-            share, displacement, whitening, variance, seconds, known, change,
-        )  # fmt: skip
+        return LegBatch(windows.contiguous(), R_NH.view(size, -1, 3, 3), change, *legs)
 
     def _drawn(self, size: int, generator: torch.Generator) -> list[Tensor]:
         """Return the streams' numbers and first samples of stretches (S,), and their legs."""
@@ -206,15 +187,14 @@ def leg_samplers(
         InputError: a kind has no stretch that is long enough for two legs.
         ConfigError: the windows in a stretch are not a multiple of `config.successive`.
     """
-    kinds = by_kind(streams, config)
-    for kind, _, seconds, _ in kinds:
+    samplers = []
+    for kind, members, seconds, stretches in by_kind(streams, config):
         if seconds % config.successive:
             expected = f"a multiple of successive={config.successive}"
             raise ConfigError(f"seconds in a stretch with {kind}", str(seconds), expected)
-    return [
-        (LegSampler(members, seconds, config.augmentation, generator), stretches)
-        for _, members, seconds, stretches in kinds
-    ]
+        sampler = LegSampler(members, seconds, config.augmentation, generator)
+        samplers.append((sampler, stretches))
+    return samplers
 
 
 def by_kind(

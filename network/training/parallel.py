@@ -10,13 +10,12 @@ and for legs, which are averaged within each process.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
-from torch.nn.parallel import DistributedDataParallel
+from torch import Tensor, distributed
 
 from stario.sequences.errors import ConfigError
 
@@ -40,57 +39,27 @@ class Workers:
         """Whether this is the process that writes and reports."""
         return self.rank == 0
 
-    def share(self, batch: Tensor) -> Tensor:
-        """Return this process's rows of a batch that all processes have drawn."""
-        return batch[self.rank :: self.count]
+    def share(self, drawn: Sequence[Tensor]) -> list[Tensor]:
+        """Return this process's rows of tensors that all have drawn, on its device.
 
-    def wrapped(self, network: nn.Module, idle: bool) -> nn.Module:
-        """Return the network with gradients averaged over the processes.
-
-        Args:
-            network: network on this process's device.
-            idle: whether some parameters get no gradient in some steps, such as a separate head
-                for sigma before sigma is learned.
+        All rows, if their number cannot be divided evenly.
         """
-        if self.count == 1:
-            return network
-        ids = [self.device] if self.device.type == "cuda" else None
-        return DistributedDataParallel(network, device_ids=ids, find_unused_parameters=idle)
+        rows = slice(None) if len(drawn[0]) % self.count else slice(self.rank, None, self.count)
+        return [part[rows].to(self.device) for part in drawn]
 
-    def mean(self, value: float) -> float:
-        """Return a number averaged over the processes."""
-        if self.count == 1:
-            return value
-        total = torch.tensor(value, dtype=torch.float64, device=self.device)
-        torch.distributed.all_reduce(total)
-        return float(total) / self.count
-
-    def broadcast(self, value: float) -> float:
-        """Return the leading process's number in all processes."""
+    def total(self, value: float) -> float:
+        """Return the sum of the processes' numbers, in all of them."""
         if self.count == 1:
             return value
         tensor = torch.tensor(value, dtype=torch.float64, device=self.device)
-        torch.distributed.broadcast(tensor, 0)
+        distributed.all_reduce(tensor)
         return float(tensor)
 
 
 def is_leader() -> bool:
     """Return whether this process is the only one or the launcher's first one."""
-    return _count() == 1 or os.environ["RANK"] == "0"
-
-
-def _count() -> int:
-    """Return the number of processes; 1 unless the launcher has set all of its variables.
-
-    Job schedulers set some of them for processes that do not belong together.
-    """
-    if not all(name in os.environ for name in ("RANK", "WORLD_SIZE", "MASTER_ADDR")):
-        return 1
-    words = os.environ["WORLD_SIZE"]
-    if not (words.isdecimal() and int(words) >= 1):
-        fix = "start several processes with torchrun, or unset it"
-        raise ConfigError("WORLD_SIZE", repr(words), "the number of processes", fix)
-    return int(words)
+    # Job schedulers set such variables, too, for processes that do not belong together.
+    return not distributed.is_torchelastic_launched() or os.environ["RANK"] == "0"
 
 
 @contextmanager
@@ -102,30 +71,23 @@ def workers(device: str, batch: int) -> Iterator[Workers]:
         batch: rows to divide evenly among the processes.
 
     Raises:
-        ConfigError: no GPU is available for "cuda", the batch cannot be divided evenly, or the
-            number of processes is no number.
+        ConfigError: no GPU is available for "cuda", or the batch cannot be divided evenly.
     """
-    count = _count()
-    chosen = _device(device)
-    if count == 1:
+    has_gpu = torch.cuda.is_available()
+    if device == "cuda" and not has_gpu:
+        raise ConfigError("device", "cuda, but no GPU is available", "cpu or auto")
+    chosen = torch.device("cpu")
+    if has_gpu and device != "cpu":
+        chosen = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+    if not distributed.is_torchelastic_launched() or os.environ["WORLD_SIZE"] == "1":
         yield Workers(0, 1, chosen)
         return
+    count = int(os.environ["WORLD_SIZE"])
     if batch % count:
         raise ConfigError("batch", f"{batch} for {count} processes", "a multiple of their number")
-    backend = "nccl" if chosen.type == "cuda" else "gloo"
-    torch.distributed.init_process_group(backend)
+    distributed.init_process_group("nccl" if chosen.type == "cuda" else "gloo")
     try:
-        yield Workers(torch.distributed.get_rank(), count, chosen)
-        torch.distributed.barrier()
+        yield Workers(distributed.get_rank(), count, chosen)
+        distributed.barrier()
     finally:
-        torch.distributed.destroy_process_group()
-
-
-def _device(name: str) -> torch.device:
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    if name == "cuda":
-        if not torch.cuda.is_available():
-            raise ConfigError("device", "cuda, but no GPU is available", "cpu or auto")
-        return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
-    return torch.device(name)
+        distributed.destroy_process_group()

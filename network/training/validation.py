@@ -1,4 +1,10 @@
-"""Validation of a network in training on held-out recordings."""
+"""Validation of a network in training on held-out recordings, and calibration of its sigma.
+
+A network predicts which windows are hard better than how hard they are. Its log sigma is therefore
+stretched and shifted, sigma = scale * exp(exponent * log_sigma), with the pair of highest
+likelihood on the errors of validation windows. No sigma explains the errors of a few windows; the
+squared normalised error is clipped so that these do not dominate.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +14,19 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 
+from stario.network.card import Calibration
 from stario.network.displacement import DisplacementNetwork
 from stario.network.training.augment import UNVARIED
 from stario.network.training.config import LEAST_SECONDS, TrainingConfig
 from stario.network.training.data import TrainingData
 from stario.network.training.legs import LegBatch, LegSampler, by_kind
-from stario.network.training.weak_truth import leg_loss
+from stario.network.training.losses import leg_loss
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.legs import LegStream
+from stario.sequences.sequence import FloatArray
 from stario.sequences.windows import (
     WINDOW_SAMPLES,
     WorldStream,
@@ -32,17 +41,19 @@ log = logging.getLogger(__name__)
 _STRIDE = 20
 """Samples between the starts of successive windows."""
 
-_STRIDES = (20, 40, 50, 100, 200)
-"""Strides for recurrent networks: each window follows one from a second before, as at inference."""
-
 _DENSE_SAMPLES = 200 * 60 * 15
-"""For N times this many samples in total, windows are cut at N times that stride."""
+"""For N times this many samples in total, windows are cut at N times that stride. For recurrent
+networks, one minute in N is cut: each window follows one from a second before, as at inference."""
 
 _BATCH = 256
 """Windows per batch."""
 
 _STRETCHES = 48
 """Number of stretches for each kind of weak truth."""
+
+_FLOOR_M = 0.01
+_CLIP = 25.0
+_MAX_EXPONENT = 4.0
 
 _NOTICEABLE = 0.02
 """Logarithm of a ratio of errors in validation that is worth a warning."""
@@ -63,20 +74,22 @@ class ValidationSet:
     def __init__(
         self, data: TrainingData, config: TrainingConfig, is_recurrent: bool = False
     ) -> None:
-        streams, self._simulated = data.streams, data.simulated
+        self.streams, self._simulated = data.streams, data.simulated
         self.legs = _drawn_once(data.legs, config)
         # Hours of data are cut sparsely: the variety of motion matters, not the number of windows.
-        length = sum(len(stream) for stream in streams)
-        self.stride = max(_STRIDE, _STRIDE * (length // _DENSE_SAMPLES))
-        if is_recurrent:
-            thinned = max(s for s in _STRIDES if s <= self.stride)
-            every, self.stride = self.stride // thinned, thinned
-            streams = _minutes(streams, every) if every > 1 else streams
-        self.streams = streams
-        counts = [len(window_starts(stream, self.stride)) for stream in streams]
+        every = max(1, sum(len(stream) for stream in data.streams) // _DENSE_SAMPLES)
+        self.stride = _STRIDE if is_recurrent else _STRIDE * every
+        if is_recurrent and every > 1:
+            minute = 60 * WINDOW_SAMPLES
+            self.streams = [
+                stream.part(first, first + minute)
+                for stream in data.streams
+                for first in range(0, len(stream), every * minute)
+            ]
+        counts = [len(window_starts(stream, self.stride)) for stream in self.streams]
         if not sum(counts):
             raise InputError("validation", "no window", "stretches longer than a second")
-        self.names = np.repeat([stream.name for stream in streams], counts)
+        self.names = np.repeat([stream.name for stream in self.streams], counts)
 
     @torch.inference_mode()
     def residuals(self, network: DisplacementNetwork) -> tuple[np.ndarray, np.ndarray]:
@@ -147,21 +160,11 @@ class ValidationSet:
 
     @torch.inference_mode()
     def _leg_error(self, network: DisplacementNetwork, batch: LegBatch) -> float:
-        batch = batch.to(network.gravity.device)
+        batch = LegBatch(*(part.to(network.gravity.device) for part in batch))
         windows = batch.windows if network.is_recurrent else batch.windows.flatten(0, 1)
         mean, log_sigma, *_ = network(windows)
         shape = batch.windows.shape[:2]
         return float(leg_loss(mean.view(*shape, 3), log_sigma.view(*shape, 3), batch)[1])
-
-
-def _minutes(streams: Sequence[WorldStream], every: int) -> list[WorldStream]:
-    """Return one minute out of every `every` of each stream, starting with the first."""
-    minute = 60 * WINDOW_SAMPLES
-    return [
-        stream.part(first, first + minute)
-        for stream in streams
-        for first in range(0, len(stream), every * minute)
-    ]
 
 
 def _drawn_once(legs: Sequence[LegStream], config: TrainingConfig) -> dict[str, LegBatch]:
@@ -180,3 +183,32 @@ def _drawn_once(legs: Sequence[LegStream], config: TrainingConfig) -> dict[str, 
             continue
         found[kind] = sampler.batch(_STRETCHES)
     return found
+
+
+def calibrate(error: FloatArray, log_sigma: FloatArray) -> Calibration:
+    """Fit a calibration to errors (M, 3) [m] and log sigmas (M, 3).
+
+    x and y share scale and exponent.
+    """
+    scale_h, exponent_h = _fit(error[:, :2].ravel(), log_sigma[:, :2].ravel())
+    scale_z, exponent_z = _fit(error[:, 2], log_sigma[:, 2])
+    return Calibration(
+        scale=(scale_h, scale_h, scale_z),
+        exponent=(exponent_h, exponent_h, exponent_z),
+        floor=(_FLOOR_M,) * 3,
+    )
+
+
+def _fit(error: FloatArray, log_sigma: FloatArray) -> tuple[float, float]:
+    """Return the scale and exponent that minimise the clipped negative log-likelihood."""
+
+    def cost(parameters: FloatArray) -> float:
+        log_scale, exponent = parameters
+        variance = np.exp(2.0 * (log_scale + exponent * log_sigma)) + _FLOOR_M**2
+        normalised = np.minimum(error**2 / variance, _CLIP)
+        return float(np.mean(normalised + np.log(variance)))
+
+    # An uninformative sigma is ignored (exponent 0), never used with its sign reversed.
+    bounds = [(-10.0, 10.0), (0.0, _MAX_EXPONENT)]
+    log_scale, exponent = minimize(cost, [0.0, 1.0], method="Nelder-Mead", bounds=bounds).x
+    return float(np.exp(log_scale)), float(exponent)

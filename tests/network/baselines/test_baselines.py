@@ -3,8 +3,7 @@ import torch
 from torch import nn
 
 from stario.network.architectures import ARCHITECTURES, build_network
-from stario.network.baselines.imunet import NoiseLayer
-from stario.network.baselines.rnin import Rnin
+from stario.network.baselines.networks import NoiseLayer, Rnin
 
 
 def windows(count: int, seed: int = 0) -> torch.Tensor:

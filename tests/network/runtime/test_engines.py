@@ -17,9 +17,14 @@ from stario.network.architectures import ARCHITECTURES, build_network
 from stario.network.card import Card
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import load_model, save_model
-from stario.network.runtime import onnx_engine
-from stario.network.runtime.engines import Engine, Float32Array
-from stario.network.runtime.onnx_engine import GRAPHS, OnnxEngine, weights_engine
+from stario.network.runtime import engines
+from stario.network.runtime.engines import (
+    GRAPHS,
+    Engine,
+    Float32Array,
+    OnnxEngine,
+    weights_engine,
+)
 from stario.network.runtime.survey import random_windows
 from stario.network.runtime.torch_engine import TorchEngine
 from stario.network.stario import StarIO
@@ -106,7 +111,7 @@ def test_the_packaged_graph_is_that_of_the_network():
     onnx = pytest.importorskip("onnx")
     from stario.network.runtime.stario_graph import stario_graph
 
-    path = Path(onnx_engine.__file__).with_name(GRAPHS["StarIO"])
+    path = Path(engines.__file__).with_name(GRAPHS["StarIO"])
     packaged = onnx.load(path, load_external_data=False).graph
     built = stario_graph(StarIO()).graph
     assert list(packaged.node) == list(built.node)

@@ -8,8 +8,13 @@ from cut_windows import windows_of
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from stario.network.training.augment import UNVARIED, Augmentation, WindowSampler, heading_of
-from stario.network.training.lever_arm import sample_swing
+from stario.network.training.augment import (
+    UNVARIED,
+    Augmentation,
+    WindowSampler,
+    heading_of,
+    sample_swing,
+)
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.windows import WINDOW_SAMPLES, WorldStream, world_streams

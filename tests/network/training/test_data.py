@@ -13,8 +13,8 @@ from stario.network.training.data import (
     mix_sources,
     recording_streams,
     split_off,
-    virtual_recordings,
 )
+from stario.network.training.made import virtual_recordings
 from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.datasets.batch import Skipped
 from stario.sequences.errors import ConfigError, InputError

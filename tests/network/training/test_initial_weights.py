@@ -12,13 +12,9 @@ from training_runs import HELD_OUT, STREAMS, TINY, VALIDATION, run
 
 from stario.network.card import Calibration
 from stario.network.model import load_model
-from stario.network.training.config import (
-    TrainingConfig,
-    learning_rate,
-    loss_with_sigma,
-    training_config,
-)
+from stario.network.training.config import TrainingConfig, learning_rate, training_config
 from stario.network.training.data import TrainingData
+from stario.network.training.losses import loss_with_sigma
 from stario.network.training.splits import read_packaged_list, warn_of_learned
 from stario.network.training.train import train
 from stario.network.training.validation import ValidationSet

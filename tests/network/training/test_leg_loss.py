@@ -12,11 +12,16 @@ import torch
 from stario.network.architectures import build_network
 from stario.network.displacement import DisplacementNetwork
 from stario.network.training.augment import Augmentation
-from stario.network.training.config import SIGMA_WEIGHT, TrainingConfig
+from stario.network.training.config import TrainingConfig
 from stario.network.training.data import TrainingData
 from stario.network.training.legs import VARIANCE_RATE, LegBatch, LegSampler
+from stario.network.training.losses import (
+    SIGMA_WEIGHT,
+    VELOCITY_SIGMA,
+    direction_loss,
+    leg_loss,
+)
 from stario.network.training.validation import ValidationSet
-from stario.network.training.weak_truth import VELOCITY_SIGMA, direction_loss, leg_loss
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.legs import LegStream
 from stario.sequences.sequence import FloatArray
@@ -88,8 +93,8 @@ def drawn():
     varied = Augmentation(tilt=0.0, gyro_bias=0.0, accel_bias=0.0, gyro_noise=0.0, accel_noise=0.0)
     batch = LegSampler([stream], SECONDS, varied, torch.Generator().manual_seed(2)).batch(STRETCHES)
     begins = batch.windows[:, 0, 5, 0].double() / 200.0
-    double = {k: v.double() if v.is_floating_point() else v for k, v in vars(batch).items()}
-    return LegBatch(**double), [Stretch(stream, float(begin)) for begin in begins]
+    double = LegBatch(*(v.double() if v.is_floating_point() else v for v in batch))
+    return double, [Stretch(stream, float(begin)) for begin in begins]
 
 
 def slope(function: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:

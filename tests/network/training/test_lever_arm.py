@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from stario.network.training.lever_arm import Swing, apply_swing, sample_swing
+from stario.network.training.augment import Swing, apply_swing, sample_swing
 
 GRAVITY = 9.80665
 

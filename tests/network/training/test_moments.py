@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stario.network.training.moments import moment_streams
+from stario.network.training.made import moment_streams
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk

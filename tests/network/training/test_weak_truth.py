@@ -12,10 +12,10 @@ from stario.network.training.augment import UNVARIED, Augmentation
 from stario.network.training.config import TrainingConfig, training_config
 from stario.network.training.data import TrainingData
 from stario.network.training.legs import LegBatch, LegSampler, ends_covariance, velocity_change
+from stario.network.training.losses import direction_loss, leg_residuals
 from stario.network.training.parallel import Workers
 from stario.network.training.train import train
 from stario.network.training.validation import ValidationSet
-from stario.network.training.weak_truth import direction_loss, leg_residuals
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.legs import LegStream, leg_streams
@@ -174,11 +174,10 @@ def test_a_track_at_a_low_rate_has_legs_except_across_its_gaps(every, legs):
 
 def test_stretches_are_divided_among_two_processes_but_not_among_three():
     batch, cpu = batch_of(with_positions("positions", 0.1)), torch.device("cpu")
-    halves = [batch.shared(Workers(rank, 2, cpu)) for rank in (0, 1)]
-    for name, value in vars(batch).items():
-        parts = [getattr(half, name) for half in halves]
+    halves = [Workers(rank, 2, cpu).share(batch) for rank in (0, 1)]
+    for value, *parts in zip(batch, *halves, strict=True):
         torch.testing.assert_close(torch.stack(parts, dim=1).flatten(0, 1), value)
-    assert batch.shared(Workers(1, 3, cpu)) is batch
+    assert all(map(torch.equal, Workers(1, 3, cpu).share(batch), batch))
 
 
 def test_a_recording_without_positions_has_no_legs():

@@ -1,8 +1,14 @@
-"""The loss of weak ground truth: positions without attitude, and waypoints.
+"""The losses of full and of weak ground truth.
 
-A stretch of levelled IMU is cut into windows one second apart; the network's displacements d_k are
-chained along the gyroscope's yaw. A leg m lies between two instants of known position, D_m apart.
-With a_mk the time [s] shared by window k and leg m,
+With full truth, the mean is learned by squared error throughout. Sigma joins later, through the
+Gaussian likelihood e^2 / (2 sigma^2) + log sigma of the mean's current error (detached): the joint
+likelihood, even weighted by sigma (Seitzer et al. 2022), starves the mean of gradient wherever
+sigma is large, and the large errors dominate the error of a track.
+
+Weak truth is positions without attitude, or waypoints. A stretch of levelled IMU is cut into
+windows one second apart; the network's displacements d_k are chained along the gyroscope's yaw. A
+leg m lies between two instants of known position, D_m apart. With a_mk the
+time [s] shared by window k and leg m,
 
     D^_m = sum_k a_mk d_k,   psi = arg sum_m conj(D^_m) D_m / T_m,   r_m = exp(i psi) D^_m - D_m
 
@@ -40,8 +46,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from stario.network.training.config import SIGMA_WEIGHT
 from stario.network.training.legs import VARIANCE_RATE, LegBatch
+
+SIGMA_WEIGHT = 0.05
+"""Weight of the likelihood next to the squared error [m^2]: the square of a good error."""
 
 VELOCITY_SIGMA = 0.1
 """Standard deviation per axis of the accelerometer's changes of velocity, s_a [m/s]."""
@@ -54,23 +62,26 @@ _HUBER = 3.0
 """Whitened residuals beyond this many standard deviations count linearly."""
 
 
+def loss_with_sigma(squared: Tensor, log_sigma: Tensor) -> Tensor:
+    """Return the mean of squared errors (B, 3) [m^2] plus the weighted likelihood of sigma."""
+    likelihood = 0.5 * squared.detach() * torch.exp(-2.0 * log_sigma) + log_sigma
+    return (squared + SIGMA_WEIGHT * likelihood).sum(1).mean()
+
+
 def leg_residuals(displacement_N: Tensor, legs: LegBatch) -> Tensor:
     """Return residuals (S, M, 3) [m] of displacements (S, K, 3) in N after a fit of the yaw."""
     predicted = torch.einsum("smk,skc->smc", legs.share, displacement_N)
-    a, b = predicted.detach(), legs.displacement
+    a, b = _complex(predicted), _complex(legs.displacement)
     weight = legs.known / legs.seconds
-    real = (weight * (a * b)[..., :2].sum(-1)).sum(1)
-    imaginary = (weight * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])).sum(1)
-    psi = torch.atan2(imaginary, real)[:, None]
-    turned = torch.stack(
-        [
-            psi.cos() * predicted[..., 0] - psi.sin() * predicted[..., 1],
-            psi.sin() * predicted[..., 0] + psi.cos() * predicted[..., 1],
-            predicted[..., 2],
-        ],
-        dim=-1,
-    )
-    return (turned - b) * legs.known[..., None]
+    psi = (weight * a.detach().conj() * b).sum(1, keepdim=True).angle()
+    turned = torch.polar(torch.ones_like(psi), psi) * a - b
+    vertical = predicted[..., 2] - legs.displacement[..., 2]
+    return torch.stack([turned.real, turned.imag, vertical], dim=-1) * legs.known[..., None]
+
+
+def _complex(vectors: Tensor) -> Tensor:
+    """Return horizontal vectors (..., 2 or 3) as complex numbers (...)."""
+    return torch.complex(vectors[..., 0], vectors[..., 1])
 
 
 def leg_loss(displacement_H: Tensor, log_sigma_H: Tensor, legs: LegBatch) -> tuple[Tensor, Tensor]:
@@ -97,11 +108,11 @@ def leg_loss(displacement_H: Tensor, log_sigma_H: Tensor, legs: LegBatch) -> tup
 
 def direction_loss(displacement_N: Tensor, legs: LegBatch) -> Tensor:
     """Return the loss of displacements (S, K, 3) in N that contradict the accelerometer [m^2]."""
-    d, a = displacement_N[:, 2:, :2] - displacement_N[:, :-2, :2], legs.velocity_change
-    real = (d * a).sum((1, 2))
-    imaginary = (d[..., 0] * a[..., 1] - d[..., 1] * a[..., 0]).sum(1)
-    size = (real**2 + imaginary**2 + 1e-12).sqrt()  # keeps the gradient finite where nothing moves
-    chance = _CHANCE * d.detach().norm(dim=(1, 2)) * a.norm(dim=(1, 2))
-    excess = 2.0 * (_COS_TURNED * size - real - chance).clamp(min=0.0) / a.shape[1]
+    d, a = _complex(displacement_N[:, 2:] - displacement_N[:, :-2]), _complex(legs.velocity_change)
+    c = (d.conj() * a).sum(1)
+    # The small number keeps the gradient finite where nothing moves.
+    size = (c.real**2 + c.imag**2 + 1e-12).sqrt()
+    chance = _CHANCE * d.detach().norm(dim=1) * a.norm(dim=1)
+    excess = 2.0 * (_COS_TURNED * size - c.real - chance).clamp(min=0.0) / a.shape[1]
     loss: Tensor = VARIANCE_RATE * excess.mean() / VELOCITY_SIGMA**2
     return loss
