@@ -108,6 +108,16 @@ class Rest:
         """Total length of all stretches [s]."""
         return sum(stop - start for start, stop in self.stretches)
 
+    def as_dict(self) -> dict[str, object]:
+        """Return the statistics as plain values, with units in their names."""
+        return {
+            "seconds": self.seconds,
+            "gyro_bias_rad_s": self.gyro_bias,
+            "gyro_noise_rad_s_sqrt_hz": self.gyro_noise,
+            "accel_norm_m_s2": self.accel_norm,
+            "accel_noise_m_s2_sqrt_hz": self.accel_noise,
+        }
+
 
 def find_rest(sequence: ImuSequence) -> Rest | None:
     """Find the stretches at rest; None if the device is never stationary for a second.
