@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stario.fusion.imu.buffers import TimedBuffer
-from stario.sequences.atmosphere import pressure_altitude
+from stario.sequences.units import pressure_altitude
 from stario.sequences.sequence import FloatArray
 
 PRESSURE_RANGE = (300.0, 1100.0)

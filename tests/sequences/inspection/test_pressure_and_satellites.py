@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from told import told
 
 from stario.sequences.findings import Assessment, Finding
+from stario.sequences.geodesy import Georeference
 from stario.sequences.inspection.outside_sensors import assess_barometer, assess_satellites
 from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.sequence import (
@@ -16,11 +17,10 @@ from stario.sequences.sequence import (
     Satellites,
     Trajectory,
 )
-from stario.sequences.simulation.barometer import Air, simulate_barometer
 from stario.sequences.simulation.house import simulate_house
-from stario.sequences.simulation.receiver import Sky, simulate_satellites
+from stario.sequences.simulation.outside_sensors import simulate_barometer, simulate_satellites
 
-CALM = Air(weather=0.0, door=0.0, noise=0.05)
+CALM = {"weather": 0.0, "door": 0.0, "noise": 0.05}
 
 
 def climbing(height: FloatArray) -> Trajectory:
@@ -70,14 +70,14 @@ def test_a_house_is_inspected_in_a_line_for_each_sensor(house):
 @pytest.mark.parametrize("noise", [0.05, 0.2])
 def test_noise_is_measured_on_stairs_as_well(noise):
     stairs = climbing(np.cumsum(np.full(600, 0.035)))
-    found = pressure(simulate_barometer(stairs, replace(CALM, noise=noise, rate=5.0)))
+    found = pressure(simulate_barometer(stairs, **CALM | {"noise": noise, "rate": 5.0}))
     assert found.figures["noise_m"] == pytest.approx(noise, rel=0.2)
     assert found.figures["height_range_m"] == pytest.approx(21.0, rel=0.1)
 
 
 def test_a_door_is_a_step_and_stairs_or_a_lift_are_none():
     doors = np.array([20.0])
-    stepped = pressure(simulate_barometer(LEVEL, replace(CALM, door=0.8), doors, seed=1))
+    stepped = pressure(simulate_barometer(LEVEL, doors, 1, **CALM | {"door": 0.8}))
     [step] = stepped.figures["steps"]
     assert step["time_s"] == pytest.approx(20.0, abs=1.0)
     assert abs(step["rise_m"]) > 0.35
@@ -85,12 +85,13 @@ def test_a_door_is_a_step_and_stairs_or_a_lift_are_none():
     speed[100:240] = 0.35  # stairs
     speed[400:480] = 1.0  # a lift
     assert (
-        pressure(simulate_barometer(climbing(np.cumsum(0.1 * speed)), CALM)).figures["steps"] == []
+        pressure(simulate_barometer(climbing(np.cumsum(0.1 * speed)), **CALM)).figures["steps"]
+        == []
     )
 
 
 def test_a_jump_that_is_no_height_is_a_problem():
-    calm = simulate_barometer(LEVEL, CALM)
+    calm = simulate_barometer(LEVEL, **CALM)
     hPa = calm.pressure_hPa - 2.0 * (calm.time > 30.0)
     found = pressure(replace(calm, pressure_hPa=hPa)).findings
     assert codes(found) == ["pressure_jump"]
@@ -99,12 +100,12 @@ def test_a_jump_that_is_no_height_is_a_problem():
 
 
 def test_repeated_samples_and_wind_are_good_to_know():
-    calm = simulate_barometer(LEVEL, CALM)
+    calm = simulate_barometer(LEVEL, **CALM)
     held = replace(calm, pressure_hPa=np.repeat(calm.pressure_hPa[::4], 4)[: len(calm)])
     found = pressure(held)
     assert found.figures["repeated_share"] == pytest.approx(0.75, abs=0.02)
     assert [(f.code, f.level) for f in found.findings] == [("pressure_held", "note")]
-    windy = pressure(simulate_barometer(LEVEL, replace(CALM, noise=0.6)))
+    windy = pressure(simulate_barometer(LEVEL, **CALM | {"noise": 0.6}))
     assert [(f.code, f.level) for f in windy.findings] == [("pressure_noise", "note")]
 
 
@@ -131,7 +132,7 @@ def test_a_barometer_on_another_clock_is_a_problem(house):
 
 
 def test_exchanged_latitude_and_longitude_contradict_the_speed():
-    reported = simulate_satellites(LEVEL, Sky(azimuth=1.0, sigma=1.0))
+    reported = simulate_satellites(LEVEL, Georeference(48.0, 11.0, 0.6), sigma=1.0)
     right = receiver(reported)
     assert right.findings == []
     assert right.figures["doppler"]["correlation"] > 0.9
@@ -141,12 +142,12 @@ def test_exchanged_latitude_and_longitude_contradict_the_speed():
 
 
 def test_positions_far_to_the_east_are_judged_although_they_cannot_be_exchanged():
-    assert receiver(simulate_satellites(LEVEL, Sky(sigma=1.0, longitude=118.9))).findings == []
+    assert receiver(simulate_satellites(LEVEL, Georeference(48.0, 118.9), sigma=1.0)).findings == []
 
 
 def test_minutes_in_place_of_decimals_contradict_the_speed():
     """48 degrees 7.038 minutes as 48.07038."""
-    reported = simulate_satellites(LEVEL, Sky(sigma=1.0, latitude=48.3, longitude=11.3))
+    reported = simulate_satellites(LEVEL, Georeference(48.3, 11.3), sigma=1.0)
     whole, part = np.divmod(reported.latlon_deg, 1.0)
     found = receiver(replace(reported, latlon_deg=whole + 0.6 * part)).findings
     assert codes(found) == ["satellites_scale"]
@@ -154,7 +155,7 @@ def test_minutes_in_place_of_decimals_contradict_the_speed():
 
 
 def test_stale_positions_and_jumps_are_good_to_know():
-    reported = simulate_satellites(LEVEL, Sky(sigma=1.0))
+    reported = simulate_satellites(LEVEL, sigma=1.0)
     place = reported.latlon_deg.copy()
     place[20:40] = place[20]
     place[50] += 0.01

@@ -106,7 +106,8 @@ def test_gaps_and_wrong_times_are_counted(walk):
     assert timing["times_backward"] == 1
     assert timing["samples_not_finite"] == 1
     # The two samples with wrong times leave gaps where they should have been.
-    assert (lost := timing["samples_lost_in_gaps"]) >= 250 + 3
+    lost = timing["samples_lost_in_gaps"]
+    assert lost >= 250 + 3
     places = f"{lost} samples missing in {len(timing['gaps'])} places; longest"
     assert any(line.startswith(places) for line in found.lines())
     assert timing["jitter_s"] < 1e-9
