@@ -29,11 +29,10 @@ import numpy as np
 
 from stario.fusion.imu.intervals import NO_FLAGS, Flags, Sample
 from stario.fusion.values.health import Stopped
-from stario.sequences.clean_samples import MIN_RATE
+from stario.sequences.clean_samples import MIN_RATE, replace_spikes
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.constant_values import shaken, tilting
 from stario.sequences.sequence import BoolArray, FloatArray
-from stario.sequences.spikes import replace_spikes
 from stario.sequences.time_order import MAX_IMU_GAP
 
 SET_BACK_SECONDS = 5.0
