@@ -78,8 +78,9 @@ def test_a_lag_outside_the_search_range_is_not_reported_as_measured(lag):
 
 def test_magnets_wrong_axes_apples_sign_and_wrong_units_are_detected():
     good = walk(MagneticField())
-    magnets = tuple((t, t + 4.0, 150.0) for t in np.arange(2.0, 56.0, 8.0).tolist())
-    disturbed = assess_magnetometer(walk(MagneticField(magnets=magnets)))
+    time, field = good.magnetometer.time, good.magnetometer.field
+    near = field + np.outer((time % 8.0 < 4.0) * np.sign(np.sin(time)), [150.0, 0.0, 0.0])
+    disturbed = assess_magnetometer(replace(good, magnetometer=Magnetometer(time, near)))
     assert disturbed.figures["verdict"] == "not usable"
     turned = Magnetometer(good.magnetometer.time, good.magnetometer.field[:, [1, 2, 0]])
     wrong = assess_magnetometer(replace(good, magnetometer=turned))
