@@ -166,18 +166,19 @@ def assessed_positions(fit: PositionFit | None) -> Assessment:
     if fit is None:
         why = "too little motion, or a wrong attitude"
         return Assessment({}, [f"  against the accelerometer: positions not compared ({why})"], [])
+    axes = ["xyz"[axis] for axis in fit.axes]
     figures = {
         "correlation": fit.correlation,
         "correlation_turned": fit.turned_correlation,
         "scale": fit.scale,
         "turned_rad": fit.turned,
         "mirrored": fit.mirrored,
-        "axes": ["xyz"[axis] for axis in fit.axes],
+        "axes": axes,
     }
     line = (
         f"  against the accelerometer: positions scaled by {fit.scale:.3g}, "
         f"turned by {math.degrees(fit.turned):.0f} deg{' and mirrored' if fit.mirrored else ''}, "
-        f"correlation {fit.correlation:.3f} in {', '.join(figures['axes'])}"
+        f"correlation {fit.correlation:.3f} in {', '.join(axes)}"
     )
     return Assessment(figures, [line], [])
 
