@@ -107,7 +107,7 @@ def assess_truth(sequence: ImuSequence, refusal: str) -> tuple[Assessment, Truth
         The assessment, and the fit of truth and gyroscope; None if they cannot be compared.
     """
     found = examine_truth(sequence, refusal)
-    findings, fit = [*found.findings], None
+    findings, fit = [*found.findings], found.fit
     lines = [f"truth: {sequence.truth_summary()}"]
     coverage = against_gyro = against_accel = None
     if sequence.truth is not None:
@@ -117,7 +117,7 @@ def assess_truth(sequence: ImuSequence, refusal: str) -> tuple[Assessment, Truth
             f"{coverage['rate_hz']:.1f} Hz, {coverage['gaps']} gaps "
             f"(longest step {coverage['longest_gap_s']:.2f} s), path of {coverage['path_m']:.1f} m"
         ]
-    if fit := found.fit:
+    if fit:
         yaw = None if fit.one_axis else yaw_drift(replace(sequence, truth=found.truth), fit)
         gyro, accel = assessed_fit(fit, yaw), assessed_positions(found.positions)
         against_gyro, against_accel = gyro.figures, accel.figures or None
