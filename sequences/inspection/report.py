@@ -113,7 +113,7 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         **timing.figures,
         "accel_norm_mean_m_s2": accel,
         "gyro_norm_mean_rad_s": gyro,
-        "rest": rest and rest.as_dict(),
+        "rest": rest and {"seconds": rest.seconds, **vars(rest)},
         "gyro_axes": axes and axes.figures,
         **truth.figures,
         "device_attitudes": own,
@@ -166,12 +166,12 @@ def _timing(sequence: ImuSequence, given: int, not_finite: int) -> Assessment:
 def _rest_lines(rest: Rest | None) -> list[str]:
     if rest is None:
         return ["at rest: never for a full second, so noise and bias are unknown"]
-    bias = ", ".join(f"{value:+.5f}" for value in rest.gyro_bias)
+    bias = ", ".join(f"{value:+.5f}" for value in rest.gyro_bias_rad_s)
     return [
         f"at rest: {rest.seconds:.1f} s in {len(rest.stretches)} stretch"
         + "es" * (len(rest.stretches) != 1),
-        f"  gyroscope: bias {bias} rad/s, noise {rest.gyro_noise:.2e} rad/s/sqrt(Hz)",
-        f"  accelerometer: {rest.accel_norm:.4f} m/s^2 "
-        f"({rest.accel_norm - STANDARD_GRAVITY:+.4f} relative to gravity), "
-        f"noise {rest.accel_noise:.2e} m/s^2/sqrt(Hz)",
+        f"  gyroscope: bias {bias} rad/s, noise {rest.gyro_noise_rad_s_sqrt_hz:.2e} rad/s/sqrt(Hz)",
+        f"  accelerometer: {rest.accel_norm_m_s2:.4f} m/s^2 "
+        f"({rest.accel_norm_m_s2 - STANDARD_GRAVITY:+.4f} relative to gravity), "
+        f"noise {rest.accel_noise_m_s2_sqrt_hz:.2e} m/s^2/sqrt(Hz)",
     ]

@@ -8,8 +8,8 @@ all right, so the slower fit to the gyroscope is needed only where they disagree
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -49,16 +49,10 @@ _RESTING_RAD_S, _RESTING_RAD = 0.03, np.deg2rad(3.0)
 noise, and a capture's."""
 
 
-@dataclass(frozen=True, eq=False)
-class TruthFindings:
-    """Result of `examine_truth`.
+class TruthFindings(NamedTuple):
+    """Poses compared, without those of lost tracking; both comparisons; what stands out.
 
-    Attributes:
-        truth: the poses compared, without those of lost tracking; None if nothing was compared.
-        fit: fit of truth and gyroscope; None if they cannot be compared.
-        positions: comparison of positions and accelerometer; None if they cannot be compared, or
-            if the attitude is wrong.
-        findings: what stands out.
+    Each is None if there is nothing to compare, and that of the positions if the attitude is wrong.
     """
 
     truth: Trajectory | None = None
