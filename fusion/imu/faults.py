@@ -14,7 +14,7 @@ From then on it counts as stopped until its values change. Samples of a stopped 
 so that they are treated as a gap. A sensor whose values have never changed is dead (`units`). Three
 zeros of an accelerometer are no measurement at all, not even of a free fall, which has noise.
 
-Outliers: spikes are replaced (`sequences.spikes`). Saturation shows as values of a moving axis that
+Outliers: spikes are replaced (`sequences.clean_samples`). Saturation shows as values of a moving axis that
 repeat exactly and more than once at the largest magnitude measured so far; two that are equal by
 chance, at a magnitude soon exceeded, do not count. What the sensor missed is unknown, so these are
 only flagged.
