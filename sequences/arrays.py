@@ -91,17 +91,9 @@ def number_in(text: str) -> float:
 def check_type(
     name: str, value: object, kind: type, remedy: str = "", optional: bool = False
 ) -> None:
-    """Check the type of an argument.
+    """Raise InputError unless an argument has the type, or is None if that is `optional`.
 
-    Args:
-        name: name of the argument.
-        value: value given.
-        kind: required type.
-        remedy: how to obtain a value of that type.
-        optional: whether the argument may be None.
-
-    Raises:
-        InputError: the type differs; names the argument.
+    It names the argument, and by `remedy` how to obtain a value of that type.
     """
     if not (isinstance(value, kind) or (optional and value is None)):
         expected = f"a value of type {kind.__name__}" + (" or None" if optional else "")
@@ -109,11 +101,7 @@ def check_type(
 
 
 def check_choice(name: str, value: object, choices: Iterable[Choice]) -> Choice:
-    """Return an argument, checked to be one of the known names.
-
-    Raises:
-        InputError: it is not; names the argument and the choices.
-    """
+    """Return an argument; raise InputError, which names the choices, unless it is one of them."""
     known = tuple(choices)
     if not (isinstance(value, str) and value in known):
         raise InputError(name, shown(value), f"one of {', '.join(known)}")
@@ -123,8 +111,7 @@ def check_choice(name: str, value: object, choices: Iterable[Choice]) -> Choice:
 def generator(seed: int, *stream: int) -> np.random.Generator:
     """Return the random generator of a seed, one of its own for each `stream`.
 
-    Raises:
-        InputError: the seed is not an integer >= 0.
+    Raises InputError unless the seed is an integer >= 0.
     """
     if not (isinstance(seed, int | np.integer) and seed >= 0):
         raise InputError("seed", shown(seed), "an integer >= 0")
@@ -145,8 +132,7 @@ def first_of(names: Sequence[str], most: int = 5) -> str:
 def numbers(name: str, value: object) -> FloatArray:
     """Return an array-like as float64, NaN where a masked array has no value.
 
-    Raises:
-        InputError: it holds dates, text or rows of unequal length; names it.
+    Raises InputError if it holds dates, text or rows of unequal length.
     """
     try:
         masked = np.ma.getmaskarray(value) if isinstance(value, np.ma.MaskedArray) else None
@@ -161,11 +147,7 @@ def numbers(name: str, value: object) -> FloatArray:
 
 
 def some_times(name: str, value: FloatArray) -> FloatArray:
-    """Return times (N,) [s] in any order, checked to be numbers and not empty.
-
-    Raises:
-        InputError: they are not.
-    """
+    """Return times (N,) [s] in any order; raise InputError unless they are numbers, one or more."""
     time = numbers(name, value)
     if time.ndim != 1 or time.size == 0:
         raise InputError(name, f"shape {time.shape}", "(N,) with at least one sample")
@@ -173,11 +155,7 @@ def some_times(name: str, value: FloatArray) -> FloatArray:
 
 
 def checked_time(name: str, value: FloatArray) -> FloatArray:
-    """Return times (N,) [s], checked to be finite and strictly increasing.
-
-    Raises:
-        InputError: a time is not finite, or the times do not strictly increase.
-    """
+    """Return times (N,) [s]; raise InputError unless they are finite and strictly increase."""
     time = some_times(name, value)
     if not np.isfinite(time).all():
         raise InputError(name, "a value that is not finite", "finite seconds")
@@ -191,11 +169,7 @@ def checked_time(name: str, value: FloatArray) -> FloatArray:
 
 
 def checked_valid(name: str, value: BoolArray, time: FloatArray) -> BoolArray:
-    """Return flags (N,) of the rows at `time` (N,), all True if there are none.
-
-    Raises:
-        InputError: their number differs.
-    """
+    """Return flags (N,), all True if there are none; raise InputError if `time` (N,) has others."""
     valid = np.asarray(value, dtype=np.bool_)
     if valid.size == 0:
         return np.ones(len(time), dtype=np.bool_)
@@ -205,11 +179,7 @@ def checked_valid(name: str, value: BoolArray, time: FloatArray) -> BoolArray:
 
 
 def check_rotations(name: str, value: Rotation, time: FloatArray) -> None:
-    """Check that a value holds a rotation for each time (N,).
-
-    Raises:
-        InputError: it has another type, or their number differs.
-    """
+    """Raise InputError unless a value holds a rotation for each time (N,)."""
     check_type(name, value, Rotation, "Rotation.from_quat(quat_xyzw)")
     if value.single:  # it has no length
         raise InputError(name, "a single rotation", f"{len(time)} as time")
@@ -220,11 +190,7 @@ def check_rotations(name: str, value: Rotation, time: FloatArray) -> None:
 def checked_array(
     name: str, value: FloatArray, shape: tuple[int, ...], where: BoolArray | bool = True
 ) -> FloatArray:
-    """Return `value` as an array, checked for its shape and for finite rows at `where`.
-
-    Raises:
-        InputError: the shape differs, or a row at `where` has a value that is not finite.
-    """
+    """Return an array; raise InputError unless it has the shape, and finite rows at `where`."""
     array = numbers(name, value)
     if array.shape != shape:
         raise InputError(name, f"shape {array.shape}", f"{shape}")

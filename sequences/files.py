@@ -67,12 +67,7 @@ def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[I
 
 @contextmanager
 def atomic_path(path: Path | str) -> Iterator[Path]:
-    """Yield a temporary path for libraries that open files themselves; else as `atomic_write`.
-
-    Raises:
-        InputError: the folder does not exist, `path` is a folder, or the system refuses to write
-            there.
-    """
+    """Yield a temporary path for libraries that open files themselves; else as `atomic_write`."""
     path = Path(path)
     with temporary_path(path, "a file") as temporary:
         if path.is_dir():
@@ -172,11 +167,7 @@ def write_json(path: Path | str, obj: object) -> None:
 
 
 def json_text(obj: object) -> str:
-    """Return the text that `write_json` writes.
-
-    Raises:
-        InputError: the object holds a value without a plain counterpart.
-    """
+    """Return the text that `write_json` writes; raises what that does for the object."""
     return json.dumps(_plain(obj), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 

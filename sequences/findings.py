@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 Level = Literal["warning", "good", "note"]
 """Severity: worth acting on, nothing to do, or good to know."""
@@ -60,6 +60,21 @@ class Finding:
     def line(self) -> str:
         """Return the finding as a line to print; those to act on begin with "!"."""
         return f"{'! ' if self.level == 'warning' else '  '}{self}"
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """What one part of an inspection found.
+
+    Attributes:
+        figures: what was measured, by name; units are in the names.
+        lines: the same as lines to print.
+        findings: what stands out.
+    """
+
+    figures: dict[str, Any]
+    lines: list[str]
+    findings: list[Finding]
 
 
 def verdict(findings: Iterable[Finding]) -> list[Finding]:

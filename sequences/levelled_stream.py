@@ -16,9 +16,8 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.arrays import even_grid
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.stacks import slerp
-from stario.sequences.clean_samples import unbroken
+from stario.sequences.clean_samples import spike_free_samples, unbroken
 from stario.sequences.sequence import FloatArray, ImuSequence
-from stario.sequences.spikes import spike_free_samples
 from stario.sequences.windows import (
     WINDOW_RATE,
     WINDOW_SAMPLES,

@@ -7,9 +7,11 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
+
 from stario.sequences.arrays import check_type, shown
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
+from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 
 TIME_UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 """Nanoseconds per unit: whole numbers, so that nanoseconds since 1970 can be read exactly."""
@@ -54,6 +56,10 @@ PRESSURE_UNITS = {
 METRES_PER_HPA = 8.43
 """Height that a hectopascal is worth near the sea."""
 
+_SEA_LEVEL_HPA, _SCALE_M, _EXPONENT = 1013.25, 44_330.77, 5.25588
+"""Of the standard atmosphere (ISO 2533): pressure at the sea's level [hPa], temperature there over
+its fall with altitude [m], exponent of the temperature, g M / (R 0.0065 K/m)."""
+
 LOWEST_HPA, HIGHEST_HPA = 300.0, 1100.0
 """Range of phones' barometers, from 9 km above the sea to 0.7 km below it."""
 
@@ -69,6 +75,20 @@ _PRESSURES = {
 def pressure_unit_of(value: float) -> str:
     """Return the unit in which a value is a plausible pressure, empty if it is in none."""
     return next((unit for unit, (low, high) in _PRESSURES.items() if low <= value <= high), "")
+
+
+def pressure_altitude(pressure_hPa: FloatArray) -> FloatArray:
+    """Return altitudes (N,) [m] in the standard atmosphere, 8.4 m/hPa at the sea's level.
+
+    Differences are as much too small as the air is warmer than 15 degrees less 6.5 per kilometre:
+    2 % in a room.
+    """
+    return np.asarray(_SCALE_M * (1.0 - (pressure_hPa / _SEA_LEVEL_HPA) ** (1.0 / _EXPONENT)))
+
+
+def standard_pressure(altitude: FloatArray) -> FloatArray:
+    """Return the pressure (N,) [hPa] of the standard atmosphere at altitudes (N,) [m]."""
+    return np.asarray(_SEA_LEVEL_HPA * (1.0 - altitude / _SCALE_M) ** _EXPONENT)
 
 
 SPEED_UNITS = {"m/s": 1.0, "km/h": 1.0 / 3.6, "mph": 0.44704, "kn": 1852.0 / 3600.0}

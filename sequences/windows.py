@@ -35,10 +35,9 @@ from stario.sequences.arrays import (
 )
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import about_z, yaw_of
-from stario.sequences.clean_samples import unbroken
+from stario.sequences.clean_samples import spike_free_samples, unbroken
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
-from stario.sequences.spikes import spike_free_samples
 from stario.sequences.time_order import MAX_IMU_GAP
 
 WINDOW_RATE = 200.0

@@ -49,7 +49,9 @@ def inspect(
             sequence,
             rotation=None if fit is None else (fit.times, fit.speed),
             rest=rest.stretches if rest else (),
-            gaps=[(start, start + length) for start, length in found.timing.gaps],
+            gaps=[
+                (gap["start_s"], gap["start_s"] + gap["length_s"]) for gap in found.figures["gaps"]
+            ],
         )
         save_figure(figure, folder / "inspection.png")
         track = None

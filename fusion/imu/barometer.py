@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from stario.fusion.imu.buffers import TimedBuffer
-from stario.sequences.atmosphere import pressure_altitude
 from stario.sequences.sequence import FloatArray
+from stario.sequences.units import pressure_altitude
 
 PRESSURE_RANGE = (300.0, 1100.0)
 """Pressures at which people walk [hPa]: 9 km above the sea, and the Dead Sea's shore."""

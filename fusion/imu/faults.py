@@ -14,9 +14,9 @@ From then on it counts as stopped until its values change. Samples of a stopped 
 so that they are treated as a gap. A sensor whose values have never changed is dead (`units`). Three
 zeros of an accelerometer are no measurement at all, not even of a free fall, which has noise.
 
-Outliers: spikes are replaced (`sequences.spikes`). Saturation shows as values of a moving axis that
-repeat exactly and more than once at the largest magnitude measured so far; two that are equal by
-chance, at a magnitude soon exceeded, do not count. What the sensor missed is unknown, so these are
+Outliers: spikes are replaced (`sequences.clean_samples`). Saturation shows as values of a moving
+axis that repeat exactly and more than once at the largest magnitude measured so far; two that are
+equal by chance, at a magnitude soon exceeded, do not count. What the sensor missed is unknown, so these are
 only flagged. A phone that falls 1 m stops within 10 to 20 ms at 30 to 60 g, of which its
 accelerometer measures 8 or 16: the force that it misses is of its limit's size. What recurs, as in
 a runner's pocket with a limit of 2 g, the filter learns from its innovations; what happens once
@@ -32,11 +32,10 @@ from typing import Literal
 import numpy as np
 
 from stario.fusion.imu.intervals import NO_FLAGS, Flags, Sample
-from stario.sequences.clean_samples import MIN_RATE
+from stario.sequences.clean_samples import MIN_RATE, replace_spikes
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.constant_values import shaken, tilting
 from stario.sequences.sequence import BoolArray, FloatArray
-from stario.sequences.spikes import replace_spikes
 from stario.sequences.time_order import MAX_IMU_GAP
 
 Stopped = Literal["both", "gyroscope", "accelerometer"]

@@ -41,9 +41,9 @@ from stario.fusion.imu.units import SensorCheck, warn_of_field
 from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.health import Health
 from stario.sequences.attitude.levelling import START_SECONDS, LevelledAttitude, start_from_gravity
+from stario.sequences.clean_samples import replace_spikes
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import MAX_SENSOR_VALUE, FloatArray
-from stario.sequences.spikes import replace_spikes
 from stario.sequences.time_order import CONFIRMED, CONFIRMED_FAR, FAR_AHEAD, MAX_IMU_GAP
 
 BRIDGED = 0.2

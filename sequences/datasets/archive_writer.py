@@ -17,7 +17,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_path, unused_name
 from stario.sequences.lazy import optional_package
 from stario.sequences.readers.archive import POSITIONS_OPTIONAL, SATELLITES_OPTIONAL, SUFFIXES
-from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
+from stario.sequences.sequence import FloatArray, ImuSequence
 
 _log = logging.getLogger(__name__)
 
@@ -56,58 +56,56 @@ def write_archive(path: Path | str, sequences: Iterable[ImuSequence]) -> list[st
 
 
 def _write(group: Any, sequence: ImuSequence) -> None:
-    columns = {"imu/t": sequence.time, "imu/gyro": sequence.gyro, "imu/accel": sequence.accel}
-    if sequence.magnetometer is not None:
-        columns["mag/t"] = sequence.magnetometer.time
-        columns["mag/field"] = sequence.magnetometer.field
-    if sequence.device_attitude is not None:
-        columns["attitude/t"] = sequence.device_attitude.time
-        columns["attitude/quat_xyzw"] = sequence.device_attitude.attitude_WB.as_quat()
-    if sequence.barometer is not None:
-        columns["pressure/t"] = sequence.barometer.time
-        columns["pressure/hPa"] = sequence.barometer.pressure_hPa
-    if sequence.satellites is not None:
-        names = ("latlon_deg", *SATELLITES_OPTIONAL)
-        columns |= _known_columns("satellites", sequence.satellites, names)
-    if sequence.truth is not None:
-        columns |= _pose_columns(sequence.truth)
-    if sequence.positions is not None:
-        columns |= _position_columns(sequence, sequence.positions)
+    satellites = {name: name for name in ("latlon_deg", *SATELLITES_OPTIONAL)}
+    columns = {
+        "imu/t": sequence.time,
+        "imu/gyro": sequence.gyro,
+        "imu/accel": sequence.accel,
+        **_known("mag", sequence.magnetometer, field="field"),
+        **_known("attitude", sequence.device_attitude, quat_xyzw="attitude_WB"),
+        **_known("pressure", sequence.barometer, hPa="pressure_hPa"),
+        **_known("satellites", sequence.satellites, **satellites),
+        **_known(
+            "truth",
+            sequence.truth,
+            p="position_W",
+            quat_xyzw="attitude_WB",
+            velocity="velocity_W",
+            position_covariance="position_covariance_W",
+            valid="valid",
+        ),
+        **_positions(sequence),
+    }
     for name, values in columns.items():
         group.create_dataset(name, data=values, **(_COMPRESSION if len(values) else {}))
     for key, value in sequence.attributes.items():
         group.attrs[key] = value
 
 
-def _pose_columns(truth: Trajectory) -> dict[str, FloatArray]:
-    columns: dict[str, Any] = {
-        "truth/t": truth.time,
-        "truth/p": truth.position_W,
-        "truth/quat_xyzw": truth.quat_xyzw,
-        "truth/velocity": truth.velocity_W,
-        "truth/position_covariance": truth.position_covariance_W,
-        "truth/valid": None if truth.valid.all() else truth.valid,
-    }
-    return {name: values for name, values in columns.items() if values is not None}
-
-
-def _position_columns(sequence: ImuSequence, track: PositionTrack) -> dict[str, FloatArray]:
+def _positions(sequence: ImuSequence) -> dict[str, FloatArray]:
+    track = sequence.positions
+    if track is None:
+        return {}
+    stem, place = "truth", "p"
     if track.kind == "waypoints":
         stem, place = "waypoints", "xy" if track.position_W.shape[1] == 2 else "p"
-    elif sequence.truth is None:
-        stem, place = "truth", "p"
-    else:
+    elif sequence.truth is not None:
         _log.warning("%s: positions alongside true poses are not written", sequence.name)
         return {}
-    columns = _known_columns(stem, track, POSITIONS_OPTIONAL)
-    columns[f"{stem}/{place}"] = track.position_W
-    if not track.valid.all():
-        columns[f"{stem}/valid"] = track.valid
+    names = {name: name for name in (*POSITIONS_OPTIONAL, "valid")}
+    return _known(stem, track, **{place: "position_W"}, **names)
+
+
+def _known(stem: str, part: Timed | None, **names: str) -> dict[str, FloatArray]:
+    """Return the time and the known attributes of a part by their datasets' names.
+
+    Flags are left out if all are True, which is what a reader takes for granted.
+    """
+    if part is None:
+        return {}
+    columns = {f"{stem}/t": part.time}
+    for name, attribute in names.items():
+        value = getattr(part, attribute)
+        if value is not None and not (attribute == "valid" and value.all()):
+            columns[f"{stem}/{name}"] = value.as_quat() if attribute == "attitude_WB" else value
     return columns
-
-
-def _known_columns(stem: str, part: Timed, names: Iterable[str]) -> dict[str, Any]:
-    """Return the time and the known attributes of a part, by the names of their datasets."""
-    columns = {f"{stem}/{name}": getattr(part, name) for name in names}
-    known = {name: values for name, values in columns.items() if values is not None}
-    return {f"{stem}/t": part.time, **known}

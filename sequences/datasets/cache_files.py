@@ -71,7 +71,7 @@ def recording_stamps(path: Path) -> list[tuple[str, int, int]]:
 def remove_unused(folder: Path) -> None:
     """Remove files that other code has written and that have not been read for 30 days."""
     for file in folder.iterdir():
-        if file.suffix in (_SUFFIX, ".judged") and not file.name.startswith(_code()):
+        if file.suffix == _SUFFIX and not file.name.startswith(_code()):
             with suppress(OSError):  # another process has removed it, or has it open on Windows
                 stat = file.stat()
                 if time.time() - max(stat.st_atime, stat.st_mtime) > _UNUSED_S:

@@ -9,15 +9,16 @@ much as they do in the device's axes. A wrong sign of the whole accelerometer ch
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from stario.sequences.arrays import samples_in
 from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.clean_samples import clean_samples, unbroken
-from stario.sequences.findings import Finding
+from stario.sequences.findings import Assessment, Finding
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
+
+COMPARED = "units, signs and axes: compared"
 
 _MIN_TILT = 0.2
 """Change of gravity between successive seconds in the device's axes that counts, relative to it."""
@@ -37,42 +38,12 @@ all sets one exceeds it (median 0.1); with two axes swapped or all signs changed
 with one sign changed two in three."""
 
 
-@dataclass(frozen=True)
-class GyroAxes:
-    """Agreement of the gyroscope with gravity, named as in `Inspection.as_dict`.
+def compare_gyro_axes(sequence: ImuSequence) -> Assessment:
+    """Compare how gravity turns in the device's axes with the gyroscope.
 
-    Attributes:
-        tilts: number of changes of gravity in the device's axes.
-        unexplained: share of them that the gyroscope leaves unexplained, by sums of squares; NaN
-            without any.
+    The figure "tilts" is the number of changes of gravity, "unexplained" the share of them that
+    the gyroscope does not explain, by sums of squares; NaN without any.
     """
-
-    tilts: int
-    unexplained: float
-
-    @property
-    def compared(self) -> bool:
-        """Whether the device tilted often enough for a verdict."""
-        return self.tilts >= _MIN_TILTS
-
-    def findings(self) -> list[Finding]:
-        """Return a finding if the axes differ."""
-        if not self.compared or self.unexplained <= _MAX_UNEXPLAINED:
-            return []
-        return [
-            Finding(
-                "gyro_axes",
-                f"gyroscope: leaves {self.unexplained:.0%} of gravity's changes in {self.tilts} "
-                "tilts unexplained, expected less than half",
-                "are its axes and signs the accelerometer's? (On rides, accelerations look like "
-                "tilts.)",
-                values=asdict(self),
-            )
-        ]
-
-
-def compare_gyro_axes(sequence: ImuSequence) -> GyroAxes:
-    """Compare how gravity turns in the device's axes with the gyroscope."""
     time, gyro, accel = clean_samples(sequence)
     rows = [
         _changes(time[start:stop], gyro[start:stop], accel[start:stop])
@@ -80,8 +51,21 @@ def compare_gyro_axes(sequence: ImuSequence) -> GyroAxes:
         if time[stop - 1] - time[start] > _MIN_SECONDS
     ]
     changes = np.concatenate([np.empty((0, 2)), *rows])
-    unexplained, total = changes.sum(axis=0)
-    return GyroAxes(len(changes), float(unexplained / total) if len(changes) else math.nan)
+    left, total = changes.sum(axis=0)
+    tilts, unexplained = len(changes), float(left / total) if len(changes) else math.nan
+    figures = {"tilts": tilts, "unexplained": unexplained}
+    if tilts < _MIN_TILTS:
+        line = "units: compared; the device tilts too seldom to compare the sensors' axes"
+        return Assessment(figures, [line], [])
+    found = []
+    if unexplained > _MAX_UNEXPLAINED:
+        text = (
+            f"gyroscope: leaves {unexplained:.0%} of gravity's changes in {tilts} tilts "
+            "unexplained, expected less than half"
+        )
+        fix = "are its axes and signs the accelerometer's? (On rides, accelerations look like "
+        found.append(Finding("gyro_axes", text, f"{fix}tilts.)", values=figures))
+    return Assessment(figures, [COMPARED], found)
 
 
 def _changes(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:

@@ -15,7 +15,8 @@ except for the gyroscope's drift. Its steadiness within a minute is what a filte
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -30,11 +31,11 @@ from stario.sequences.arrays import (
 )
 from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.clean_samples import clean_samples, longest_unbroken
-from stario.sequences.findings import Finding
+from stario.sequences.findings import Assessment, Finding
 from stario.sequences.sequence import FloatArray, ImuSequence
 from stario.sequences.units import magnetic_advice
 
-LAGS_S = np.arange(-0.05, 0.151, 0.01)
+_LAGS_S = np.arange(-0.05, 0.151, 0.01)
 """Lags of the time stamps that are tried [s]."""
 
 _SIZES_UT = (15.0, 90.0)
@@ -42,7 +43,7 @@ _LEVEL_UT = 6.0
 _VERDICTS = (("good", math.radians(12.0), 0.75), ("coarse", math.radians(25.0), 0.5))
 """Maximum RMS of the bearing [rad] and minimum correlation of each verdict."""
 
-WINDOW_S, _TOLD_S = 60.0, 40.0
+_WINDOW_S, _TOLD_S = 60.0, 40.0
 """Span within which the bearing's steadiness is stated, and below which there is no verdict [s]:
 a line absorbs most of what happens in a shorter one."""
 
@@ -74,135 +75,13 @@ _HALF_SECOND, _TURNED_RAD = 0.5, 0.05
 """Half seconds in which the field turns by more than this in the sensor's axes are examined."""
 
 
-@dataclass(frozen=True, eq=False)
-class MagneticFindings:
-    """Findings about a magnetometer.
-
-    Attributes:
-        samples: number of samples as recorded.
-        rate_hz: median rate [Hz].
-        size_median_uT: median magnitude of the field [uT].
-        size_p10_p90_uT: 10th and 90th percentile of the magnitude [uT].
-        dip_rad: median angle below the horizontal [rad].
-        correlation_with_gyroscope: correlation of dm/dt and -w x (m - b); None if the device hardly
-            turns.
-        lag_s: time by which the samples are stamped late [s]; None in that case, and if it is
-            outside the range searched.
-        hard_iron_uT: hard iron b (3,) [uT]; None if the lag is.
-        hard_iron_sigma_uT: standard deviation of the hard iron (3,) [uT]; None if the lag is.
-        assessed_s: span of the samples that were assessed [s].
-        levelled_bearing_rms_rad: median RMS of the bearing about a line over a minute [rad].
-        gyroscope_drift_rad_s: median slope of that line: the gyroscope's drift in yaw [rad/s].
-        held_share: share of the half seconds with rotation in which the device extrapolated the
-            field instead of measuring it.
-    """
-
-    samples: int
-    rate_hz: float
-    size_median_uT: float
-    size_p10_p90_uT: tuple[float, float]
-    dip_rad: float
-    correlation_with_gyroscope: float | None
-    lag_s: float | None
-    hard_iron_uT: FloatArray | None
-    hard_iron_sigma_uT: FloatArray | None
-    assessed_s: float
-    levelled_bearing_rms_rad: float
-    gyroscope_drift_rad_s: float
-    held_share: float
-
-    @property
-    def verdict(self) -> str:
-        """Quality of the levelled bearing as a yaw reference.
-
-        It is "good", "coarse", "not usable", or "too short to tell".
-        """
-        if self.assessed_s < _TOLD_S:
-            return "too short to tell"
-        level = self.size_median_uT * math.cos(self.dip_rad)
-        agreement = self.correlation_with_gyroscope
-        for word, steady, follows in _VERDICTS:
-            agrees = agreement is None or agreement > follows
-            if self.levelled_bearing_rms_rad < steady and level > _LEVEL_UT and agrees:
-                return word
-        return "not usable"
-
-    def as_dict(self) -> dict[str, object]:
-        """Return the findings as plain values, with units in their names."""
-        return vars(self) | {"verdict": self.verdict}
-
-    def lines(self) -> list[str]:
-        """Return the findings as lines to print."""
-        low, high = self.size_p10_p90_uT
-        lines = [
-            f"magnetometer: {self.samples} samples, {self.rate_hz:.1f} Hz, "
-            f"{self.size_median_uT:.1f} uT (80 % within {low:.1f} to {high:.1f}), "
-            f"dip {math.degrees(self.dip_rad):.0f} deg"
-        ]
-        if self.correlation_with_gyroscope is not None:
-            lines.append(
-                f"  against the gyroscope: correlation {self.correlation_with_gyroscope:.3f}, "
-                f"{self._lag_words()}"
-            )
-        within = " within a minute" if self.assessed_s > WINDOW_S else ""
-        lines.append(
-            f"  levelled bearing over {self.assessed_s:.0f} s: steady to "
-            f"{math.degrees(self.levelled_bearing_rms_rad):.1f} deg{within}, drifts by "
-            f"{math.degrees(60.0 * self.gyroscope_drift_rad_s):+.1f} deg/min against the "
-            f"gyroscope; as a yaw reference: {self.verdict}"
-        )
-        if self.held_share > _REPORTED_SHARE:
-            lines.append(
-                f"  constant in magnitude: extrapolated by the device's own gyroscope "
-                f"{self.held_share:.0%} of the time that it turns, and given little weight then"
-            )
-        return lines
-
-    def findings(self) -> list[Finding]:
-        """Return what stands out."""
-        result = []
-        iron = certain_iron(self.hard_iron_uT, self.hard_iron_sigma_uT)
-        agreement, size = self.correlation_with_gyroscope, self.size_median_uT
-        if not _SIZES_UT[0] < size < _SIZES_UT[1]:
-            text = f"magnetometer: found {size:.3g} uT, expected the earth's 25 to 65"
-            fix = magnetic_advice(size) or "is it uncalibrated, in another unit or near a magnet?"
-            result.append(Finding("field_size", text, fix, values={"size_uT": size}))
-        if agreement is not None and agreement < _VERDICTS[-1][2]:
-            text = f"magnetometer: does not follow the gyroscope (correlation {agreement:.2f})"
-            fix = "a disturbed field, stale readings or different axes"
-            result.append(Finding("field_axes", text, fix, values={"correlation": agreement}))
-        if iron is not None:
-            offset = ", ".join(f"{b:+.0f}" for b in iron)
-            text = f"magnetometer: the device adds a constant field of {offset} uT (hard iron)"
-            result.append(
-                Finding("hard_iron", text, level="note", values={"iron_uT": iron.tolist()})
-            )
-        if self.dip_rad < -_UP_RAD:
-            up = math.degrees(-self.dip_rad)
-            text = f"magnetometer: points up by {up:.0f} degrees, as south of the magnetic equator"
-            fix = "elsewhere, the accelerometer has Apple's sign: pass `--accel-sign apple`"
-            result.append(Finding("field_up", text, fix, values={"up_deg": up}))
-        return result
-
-    def _lag_words(self) -> str:
-        if self.lag_s is None or self.hard_iron_uT is None or self.hard_iron_sigma_uT is None:
-            first, last = (1e3 * lag for lag in (LAGS_S[0], LAGS_S[-1]))
-            return f"lag outside {first:+.0f} to {last:+.0f} ms; lag and hard iron unknown"
-        pairs = zip(self.hard_iron_uT, self.hard_iron_sigma_uT, strict=True)
-        iron = ", ".join(f"{b:+.1f} +- {s:.1f}" for b, s in pairs)
-        return f"lag {1e3 * self.lag_s:+.0f} ms, hard iron {iron} uT"
-
-
-def certain_iron(iron: FloatArray | None, sigma: FloatArray | None) -> FloatArray | None:
-    """Return the hard iron if it must be removed before the field is assessed."""
-    if iron is None or sigma is None:
-        return None
-    sure = np.abs(iron) > _SURE * sigma
-    return iron if np.linalg.norm(iron[sure]) > _IRON_UT else None
-
-
-def assess_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
+def assess_magnetometer(sequence: ImuSequence) -> Assessment | None:
     """Assess up to ten minutes of the magnetometer; None if there is none or too little.
+
+    The figure "lag_s" is by how much the samples are stamped late, "held_share" the share of the
+    half seconds with rotation in which the device extrapolated the field instead of measuring it.
+    The bearing's deviation and its drift are about a line over a minute. What the gyroscope tells
+    is None if the device hardly turns; lag and hard iron are also if the lag is out of range.
 
     Raises:
         InputError: as for `clean_samples`.
@@ -223,27 +102,104 @@ def assess_magnetometer(sequence: ImuSequence) -> MagneticFindings | None:
         agreement, lag, iron, sigma = _against_gyro(time, gyro, stamps, values)
     following = np.clip(np.searchsorted(time, stamps), 0, len(time) - 1)
     R_NB = levelled_attitudes(time, gyro, accel)[following]
-    certain = certain_iron(iron, sigma)
+    certain = _certain_iron(iron, sigma)
     field_N = np.einsum("nij,nj->ni", R_NB, values if certain is None else values - certain)
     level = np.hypot(field_N[:, 0], field_N[:, 1])
     spread, drift = _steadiness(stamps, field_N[:, :2])
-    sizes = np.linalg.norm(values, axis=1)
-    low, median, high = np.percentile(sizes, [10.0, 50.0, 90.0]).tolist()
-    return MagneticFindings(
-        samples=len(field),
-        rate_hz=field.rate,
-        size_median_uT=median,
-        size_p10_p90_uT=(low, high),
-        dip_rad=float(np.median(np.arctan2(-field_N[:, 2], level))),
-        correlation_with_gyroscope=agreement,
-        lag_s=lag,
-        hard_iron_uT=iron,
-        hard_iron_sigma_uT=sigma,
-        assessed_s=float(stamps[-1] - stamps[0]),
-        levelled_bearing_rms_rad=spread,
-        gyroscope_drift_rad_s=drift,
-        held_share=_held(stamps, values),
+    low, median, high = np.percentile(np.linalg.norm(values, axis=1), [10.0, 50.0, 90.0]).tolist()
+    figures = {
+        "samples": len(field),
+        "rate_hz": field.rate,
+        "size_median_uT": median,
+        "size_p10_p90_uT": (low, high),
+        "dip_rad": float(np.median(np.arctan2(-field_N[:, 2], level))),
+        "correlation_with_gyroscope": agreement,
+        "lag_s": lag,
+        "hard_iron_uT": iron,
+        "hard_iron_sigma_uT": sigma,
+        "assessed_s": float(stamps[-1] - stamps[0]),
+        "levelled_bearing_rms_rad": spread,
+        "gyroscope_drift_rad_s": drift,
+        "held_share": _held(stamps, values),
+    }
+    figures["verdict"] = _verdict(figures)
+    return Assessment(figures, _lines(figures), _findings(figures, certain))
+
+
+def _verdict(figures: Mapping[str, Any]) -> str:
+    """Return the quality of the levelled bearing as a yaw reference."""
+    if figures["assessed_s"] < _TOLD_S:
+        return "too short to tell"
+    level = figures["size_median_uT"] * math.cos(figures["dip_rad"])
+    agreement = figures["correlation_with_gyroscope"]
+    for word, steady, follows in _VERDICTS:
+        agrees = agreement is None or agreement > follows
+        if figures["levelled_bearing_rms_rad"] < steady and level > _LEVEL_UT and agrees:
+            return word
+    return "not usable"
+
+
+def _lines(figures: Mapping[str, Any]) -> list[str]:
+    low, high = figures["size_p10_p90_uT"]
+    lines = [
+        f"magnetometer: {figures['samples']} samples, {figures['rate_hz']:.1f} Hz, "
+        f"{figures['size_median_uT']:.1f} uT (80 % within {low:.1f} to {high:.1f}), "
+        f"dip {math.degrees(figures['dip_rad']):.0f} deg"
+    ]
+    agreement, lag = figures["correlation_with_gyroscope"], figures["lag_s"]
+    if agreement is not None:
+        first, last = (1e3 * limit for limit in (_LAGS_S[0], _LAGS_S[-1]))
+        words = f"lag outside {first:+.0f} to {last:+.0f} ms; lag and hard iron unknown"
+        if lag is not None:
+            pairs = zip(figures["hard_iron_uT"], figures["hard_iron_sigma_uT"], strict=True)
+            iron = ", ".join(f"{b:+.1f} +- {s:.1f}" for b, s in pairs)
+            words = f"lag {1e3 * lag:+.0f} ms, hard iron {iron} uT"
+        lines.append(f"  against the gyroscope: correlation {agreement:.3f}, {words}")
+    within = " within a minute" if figures["assessed_s"] > _WINDOW_S else ""
+    lines.append(
+        f"  levelled bearing over {figures['assessed_s']:.0f} s: steady to "
+        f"{math.degrees(figures['levelled_bearing_rms_rad']):.1f} deg{within}, drifts by "
+        f"{math.degrees(60.0 * figures['gyroscope_drift_rad_s']):+.1f} deg/min against the "
+        f"gyroscope; as a yaw reference: {figures['verdict']}"
     )
+    if figures["held_share"] > _REPORTED_SHARE:
+        lines.append(
+            f"  constant in magnitude: extrapolated by the device's own gyroscope "
+            f"{figures['held_share']:.0%} of the time that it turns, and given little weight then"
+        )
+    return lines
+
+
+def _findings(figures: Mapping[str, Any], iron: FloatArray | None) -> list[Finding]:
+    result = []
+    agreement, size = figures["correlation_with_gyroscope"], figures["size_median_uT"]
+    if not _SIZES_UT[0] < size < _SIZES_UT[1]:
+        text = f"magnetometer: found {size:.3g} uT, expected the earth's 25 to 65"
+        fix = magnetic_advice(size) or "is it uncalibrated, in another unit or near a magnet?"
+        result.append(Finding("field_size", text, fix, values={"size_uT": size}))
+    if agreement is not None and agreement < _VERDICTS[-1][2]:
+        text = f"magnetometer: does not follow the gyroscope (correlation {agreement:.2f})"
+        fix = "a disturbed field, stale readings or different axes"
+        result.append(Finding("field_axes", text, fix, values={"correlation": agreement}))
+    if iron is not None:
+        offset = ", ".join(f"{b:+.0f}" for b in iron)
+        text = f"magnetometer: the device adds a constant field of {offset} uT (hard iron)"
+        values = {"iron_uT": iron.tolist()}
+        result.append(Finding("hard_iron", text, level="note", values=values))
+    if figures["dip_rad"] < -_UP_RAD:
+        up = math.degrees(-figures["dip_rad"])
+        text = f"magnetometer: points up by {up:.0f} degrees, as south of the magnetic equator"
+        fix = "elsewhere, the accelerometer has Apple's sign: pass `--accel-sign apple`"
+        result.append(Finding("field_up", text, fix, values={"up_deg": up}))
+    return result
+
+
+def _certain_iron(iron: FloatArray | None, sigma: FloatArray | None) -> FloatArray | None:
+    """Return the hard iron if it must be removed before the field is assessed."""
+    if iron is None or sigma is None:
+        return None
+    sure = np.abs(iron) > _SURE * sigma
+    return iron if np.linalg.norm(iron[sure]) > _IRON_UT else None
 
 
 def _against_gyro(
@@ -253,7 +209,7 @@ def _against_gyro(
 
     A lag at the edge of the search is not the best one and corrupts the hard iron: both are None.
     """
-    edge = _SPAN_S + float(np.abs(LAGS_S).max())
+    edge = _SPAN_S + float(np.abs(_LAGS_S).max())
     grid = even_grid(max(time[0], stamps[0]) + edge, min(time[-1], stamps[-1]) - edge, _STEP_S)
     if len(grid) < 20:
         return None, None, None, None
@@ -276,12 +232,12 @@ def _against_gyro(
         expected = -np.cross(rate, mean - iron).ravel()
         return correlation(change.ravel(), expected), iron, np.asarray(spread, dtype=np.float64)
 
-    scores = np.array([fit(lag)[0] for lag in LAGS_S])
+    scores = np.array([fit(lag)[0] for lag in _LAGS_S])
     best = int(np.argmax(scores))
     if best in (0, len(scores) - 1):
         return float(scores[best]), None, None, None
-    step = float(LAGS_S[1] - LAGS_S[0])
-    lag = float(LAGS_S[best]) + peak_offset(*scores[best - 1 : best + 2]) * step
+    step = float(_LAGS_S[1] - _LAGS_S[0])
+    lag = float(_LAGS_S[best]) + peak_offset(*scores[best - 1 : best + 2]) * step
     agreement, iron, spread = fit(lag)
     return agreement, lag, iron, spread
 
@@ -311,9 +267,9 @@ def _steadiness(time: FloatArray, level: FloatArray) -> tuple[float, float]:
     field = level[:, 0] + 1j * level[:, 1]
     smooth = np.convolve(field, np.ones(count) / count, mode="same")
     spreads, slopes = [], []
-    last = max(float(time[-1]) - 0.5 * WINDOW_S, float(time[0]) + 1e-9)
-    for edge in even_grid(time[0], last, WINDOW_S):
-        part = (time >= edge) & (time < edge + WINDOW_S)
+    last = max(float(time[-1]) - 0.5 * _WINDOW_S, float(time[0]) + 1e-9)
+    for edge in even_grid(time[0], last, _WINDOW_S):
+        part = (time >= edge) & (time < edge + _WINDOW_S)
         if part.sum() > count:
             clock = time[part] - edge
             line = np.polyfit(clock, np.unwrap(np.angle(smooth[part])), 1)

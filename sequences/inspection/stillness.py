@@ -87,21 +87,21 @@ def _is_bias(rate: FloatArray, accel: FloatArray, seconds: float) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """Sensor statistics at rest.
+    """Sensor statistics at rest, named as in an inspection's figures.
 
     Attributes:
         stretches: first and last time of each stretch [s].
-        gyro_bias: (3,) mean rate [rad/s], including the earth's 7e-5 rad/s.
-        gyro_noise: white noise density [rad/s/sqrt(Hz)], root mean square over the axes.
-        accel_norm: mean magnitude of the force [m/s^2], with bias and scale error along gravity.
-        accel_noise: white noise density [m/s^2/sqrt(Hz)], root mean square over the axes.
+        gyro_bias_rad_s: (3,) mean rate [rad/s], including the earth's 7e-5 rad/s.
+        gyro_noise_rad_s_sqrt_hz: density of white noise, root mean square over the axes.
+        accel_norm_m_s2: mean magnitude of the force, with bias and scale error along gravity.
+        accel_noise_m_s2_sqrt_hz: as that of the gyroscope.
     """
 
     stretches: tuple[tuple[float, float], ...]
-    gyro_bias: FloatArray
-    gyro_noise: float
-    accel_norm: float
-    accel_noise: float
+    gyro_bias_rad_s: FloatArray
+    gyro_noise_rad_s_sqrt_hz: float
+    accel_norm_m_s2: float
+    accel_noise_m_s2_sqrt_hz: float
 
     @property
     def seconds(self) -> float:
@@ -140,10 +140,10 @@ def find_rest(sequence: ImuSequence) -> Rest | None:
     tau = 2 * per_bin * float(np.median(np.diff(time)))
     return Rest(
         stretches=tuple((float(start[a]), float(stop[b - 1])) for a, b in spans),
-        gyro_bias=np.concatenate(still_rates).mean(axis=(0, 1)),
-        gyro_noise=_density(still_rates, tau),
-        accel_norm=float(norms.mean()),
-        accel_noise=_density(still_forces, tau),
+        gyro_bias_rad_s=np.concatenate(still_rates).mean(axis=(0, 1)),
+        gyro_noise_rad_s_sqrt_hz=_density(still_rates, tau),
+        accel_norm_m_s2=float(norms.mean()),
+        accel_noise_m_s2_sqrt_hz=_density(still_forces, tau),
     )
 
 

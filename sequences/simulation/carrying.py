@@ -11,6 +11,7 @@ finds in recordings carried so: phones in pockets, read, swung and at the ear (t
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -105,29 +106,24 @@ def _wobble(gait: Gait, wobble: float, pitch: float) -> FloatArray:
     return np.asarray(turn)
 
 
-def _handheld(gait: Gait) -> CarryMotion:
-    """Return the motion of a device held in front, not quite as lively as the trunk."""
-    rng = gait.rng
-    motion = _held(gait, 1.5, _STRIKES["handheld"], 0.1, 0.03, -0.08)
-    return _displaced(motion, rng.uniform(0.2, 0.45), rng.uniform(-0.2, 0.2), 0.7 * gait.height)
+def _in_hand(
+    gait: Gait,
+    carry: str,
+    bounce: float,
+    tremor: float,
+    wobble: float,
+    pitch: float,
+    reach: tuple[float, float, float] = (0.45, 0.2, 0.7),
+    surge: float = HELD_SURGE,
+) -> CarryMotion:
+    """Return the motion of a device in one or two hands; other arguments as `_held`.
 
-
-def _in_front(gait: Gait) -> CarryMotion:
-    """Return the motion of a device laid flat on a hand, which bounces more than the trunk."""
-    rng = gait.rng
-    motion = _held(gait, 3.3, _STRIKES["in-front"], 0.1, 0.05, 0.15)
-    return _displaced(motion, rng.uniform(0.2, 0.45), rng.uniform(-0.2, 0.2), 0.7 * gait.height)
-
-
-def _texting(gait: Gait) -> CarryMotion:
-    """Return the motion of a device that is read: the arms keep it steadier than the trunk."""
-    rng = gait.rng
-    motion = _held(gait, 1.15, _STRIKES["texting"], 0.04, 0.1, 0.12, 0.6)
-    return _displaced(motion, rng.uniform(0.2, 0.4), rng.uniform(-0.1, 0.1), 0.72 * gait.height)
-
-
-def _displaced(motion: CarryMotion, x: float, y: float, z: float) -> CarryMotion:
-    return CarryMotion(motion.offset_H + np.array([x, y, z]), motion.turn_H)
+    `reach` is how far ahead and aside it is at most [m], and how high, in heights of the person.
+    """
+    rng, (ahead, aside, up) = gait.rng, reach
+    motion = _held(gait, bounce, _STRIKES[carry], tremor, wobble, pitch, surge)
+    place = [rng.uniform(0.2, ahead), rng.uniform(-aside, aside), up * gait.height]
+    return CarryMotion(motion.offset_H + np.array(place), motion.turn_H)
 
 
 def _call(gait: Gait) -> CarryMotion:
@@ -160,48 +156,35 @@ def _swinging(gait: Gait) -> CarryMotion:
     return CarryMotion(offset, turn + ring.turn_H)
 
 
-def _pocket(gait: Gait) -> CarryMotion:
-    """Return the motion of a device in a front pocket: it swings and shakes with the thigh."""
-    rng = gait.rng
-    amplitude = np.radians(14.5)
-    place = (0.08, -rng.uniform(0.05, 0.12) * gait.height)
-    return _on_thigh(gait, amplitude, place, 1.5, TRUNK_SURGE, 1.5 * SWAY, _STRIKES["pocket"], 0.0)
-
-
-def _back_pocket(gait: Gait) -> CarryMotion:
-    """Return the motion of a device in a back pocket: it turns with pelvis and thigh."""
-    rng = gait.rng
-    amplitude = np.radians(11.5)
-    place = (-0.1, -rng.uniform(0.02, 0.06) * gait.height)
-    return _on_thigh(gait, amplitude, place, 1.4, 1.2, 2.0 * SWAY, _STRIKES["back-pocket"], 2.1)
-
-
 def _on_thigh(
     gait: Gait,
-    amplitude: float,
-    place: tuple[float, float],
+    carry: str,
+    swing: float,
+    ahead: float,
+    depths: tuple[float, float],
     bounce: float,
     surge: float,
     sway: float,
-    strike: Strike,
     pelvis: float,
 ) -> CarryMotion:
-    """Return the motion of a device at a place (x, z) [m] from the hip that swings with a leg.
+    """Return the motion of a device in trousers: it swings and shakes with the thigh.
 
-    `pelvis` [rad] is the lag of its yaw behind the stride.
+    It swings by `swing` [deg], and is `ahead` of the hip [m] and below it by `depths`, in heights
+    of the person; `pelvis` [rad] is the lag of its yaw behind the stride.
     """
     rng, n = gait.rng, len(gait)
+    amplitude, below = np.radians(swing), -rng.uniform(*depths) * gait.height
     forward = np.radians(rng.uniform(0.0, 12.0))
     angle = _pendulum(gait, amplitude * np.sqrt(gait.vigor), forward, harmonic=0.3)
     hip = np.array([0.0, -0.1, 0.52 * gait.height])
-    ring = heel_strikes(gait, strike)
+    ring = heel_strikes(gait, _STRIKES[carry])
     shift = rng.uniform(-0.7, 0.7, 2)
     stride = gait.phase / 2.0 + shift[0] - pelvis
     yaw = 0.3 * gait.effort * np.cos(stride)
     roll = 0.1 * gait.effort * np.cos(stride - 2.3 + shift[1])
     roll += 0.03 * drift(rng, n, gait.rate, 1.0)
-    offset = _about(2, yaw, hip) + _about(1, -angle, np.array([place[0], 0.0, place[1]]))
-    offset += trunk(gait, bounce, surge, sway) + ring.offset_H
+    offset = _about(2, yaw, hip) + _about(1, -angle, np.array([ahead, 0.0, below]))
+    offset += trunk(gait, bounce, surge, sway * SWAY) + ring.offset_H
     # All of this is for the right leg; the left one does the mirror image.
     side = rng.choice([-1.0, 1.0])
     turn = np.stack([roll, -angle, yaw], axis=1) + ring.turn_H
@@ -256,18 +239,32 @@ def _rig(gait: Gait) -> CarryMotion:
 
 
 CARRIES: dict[str, Callable[[Gait], CarryMotion]] = {
-    "handheld": _handheld,
-    "in-front": _in_front,
-    "texting": _texting,
+    "handheld": partial(
+        _in_hand, carry="handheld", bounce=1.5, tremor=0.1, wobble=0.03, pitch=-0.08
+    ),
+    "in-front": partial(
+        _in_hand, carry="in-front", bounce=3.3, tremor=0.1, wobble=0.05, pitch=0.15
+    ),
+    "texting": partial(
+        _in_hand, carry="texting", bounce=1.15, tremor=0.04, wobble=0.1, pitch=0.12,
+        reach=(0.4, 0.1, 0.72), surge=0.6,
+    ),
     "call": _call,
     "swinging": _swinging,
-    "pocket": _pocket,
-    "back-pocket": _back_pocket,
+    "pocket": partial(
+        _on_thigh, carry="pocket", swing=14.5, ahead=0.08, depths=(0.05, 0.12), bounce=1.5,
+        surge=TRUNK_SURGE, sway=1.5, pelvis=0.0,
+    ),
+    "back-pocket": partial(
+        _on_thigh, carry="back-pocket", swing=11.5, ahead=-0.1, depths=(0.02, 0.06), bounce=1.4,
+        surge=1.2, sway=2.0, pelvis=2.1,
+    ),
     "bag": _bag,
     "trolley": _trolley,
     "rig": _rig,
-}
-"""Function of every carrying mode, by name."""
+}  # fmt: skip
+"""Function of every carrying mode, by name: on a flat hand a device bounces more than the trunk,
+one that is read less; in a back pocket it turns with the pelvis as well."""
 
 
 def _looks(gait: Gait, spread: FloatArray) -> FloatArray:

@@ -13,11 +13,16 @@ import numpy as np
 
 from stario.sequences.arrays import generator
 from stario.sequences.errors import InputError
+from stario.sequences.geodesy import Georeference
 from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
-from stario.sequences.simulation.barometer import USUAL_AIR, Air, simulate_barometer
 from stario.sequences.simulation.imu import PHONE_IMU, ImuErrors, simulate_imu
 from stario.sequences.simulation.magnetometer import INDOOR_FIELD
-from stario.sequences.simulation.receiver import Sky, simulate_satellites
+from stario.sequences.simulation.outside_sensors import (
+    PLACE,
+    latlon_at,
+    simulate_barometer,
+    simulate_satellites,
+)
 from stario.sequences.simulation.routes import TREAD, Command, corridor, route_along
 from stario.sequences.simulation.walks import WalkStyle, carried_along, check_amount
 
@@ -99,8 +104,6 @@ def simulate_house(
     rate: float = 200.0,
     style: WalkStyle | None = HANDHELD,
     errors: ImuErrors = PHONE_IMU,
-    air: Air = USUAL_AIR,
-    sky: Sky | None = None,
     name: str = "house",
 ) -> HouseWalk:
     """Simulate a walk from the street through a house.
@@ -111,9 +114,6 @@ def simulate_house(
         rate: sampling rate of the IMU [Hz].
         style: person and carrying mode; None draws them.
         errors: errors of the IMU.
-        air: pressure of the air and errors of the barometer.
-        sky: place on the earth and errors of the receiver; None for the default in a direction that
-            is drawn.
         name: name of the recording.
 
     Raises:
@@ -129,20 +129,18 @@ def simulate_house(
         style = WalkStyle.random(rng)
     if style.carry == "trolley":
         raise InputError("carry", "trolley", "a device that a person carries on stairs")
-    sky = Sky(azimuth=float(rng.uniform(-np.pi, np.pi))) if sky is None else sky
+    place = replace(PLACE, yaw=PLACE.yaw - float(rng.uniform(-np.pi, np.pi)))
     plan = _plan(rng, duration, style.preferred_speed)
     route = route_along(rng, plan.commands, round(duration * _RATE) + 1, _RATE, walls=True)
     walk = carried_along(rng, route, _RATE, style)
     sequence = simulate_imu(walk, rate, errors, seed, name=name, magnetic_field=INDOOR_FIELD)
     entered = plan.stays[0].stop
-    reported = simulate_satellites(
-        walk, sky, between_houses=walk.time > 0.5 * entered, indoors=walk.time > entered, seed=seed
-    )
+    between_houses, indoors = walk.time > 0.5 * entered, walk.time > entered
     sequence = replace(
         sequence,
-        positions=_waypoints(walk, plan.stays[1:], sky),
-        barometer=simulate_barometer(walk, air, np.array(plan.doors), seed),
-        satellites=reported,
+        positions=_waypoints(walk, plan.stays[1:], place),
+        barometer=simulate_barometer(walk, np.array(plan.doors), seed),
+        satellites=simulate_satellites(walk, place, between_houses, indoors, seed),
     )
     return HouseWalk(sequence, plan.stays)
 
@@ -210,10 +208,10 @@ def _lift(rng: np.random.Generator, floors: int) -> list[Command]:
     ]
 
 
-def _waypoints(walk: Trajectory, stays: list[Stay], sky: Sky) -> PositionTrack:
+def _waypoints(walk: Trajectory, stays: list[Stay], place: Georeference) -> PositionTrack:
     """Return the device's positions at the beginning and the end of each stay."""
     time = np.array([t for stay in stays for t in (stay.start, stay.stop)])
     position_W = walk.at(time).position_W
     floor = np.repeat([float(stay.floor) for stay in stays], 2)
-    degrees = sky.degrees(position_W)
-    return PositionTrack(time, position_W, "waypoints", latlon_deg=degrees, floor=floor)
+    latlon_deg = latlon_at(place, position_W)
+    return PositionTrack(time, position_W, "waypoints", latlon_deg=latlon_deg, floor=floor)

@@ -136,15 +136,8 @@ def simulate_imu(
     up = np.array([0.0, 0.0, gravity])
     accel = truth.attitude_WB.apply(acceleration_W + up, inverse=True)
     rng = generator(seed)
-    noise = errors.noise
-    gyro = _measured(
-        gyro, rate, rng, (noise.gyro_noise, noise.gyro_walk), errors.gyro_turn_on,
-        errors.gyro_scale, errors.misalignment, errors.gyro_range,
-    )  # fmt: skip
-    accel = _measured(
-        accel, rate, rng, (noise.accel_noise, noise.accel_walk), errors.accel_turn_on,
-        errors.accel_scale, errors.misalignment, errors.accel_range,
-    )  # fmt: skip
+    gyro = _measured(gyro, "gyro", rate, rng, errors)
+    accel = _measured(accel, "accel", rate, rng, errors)
     seen = None if magnetic_field is None else simulate_magnetometer(truth, magnetic_field, seed)
     return ImuSequence(name, truth.time, gyro, accel, truth, magnetometer=seen)
 
@@ -195,18 +188,14 @@ def _attitude_and_rate(
 
 
 def _measured(
-    true: FloatArray,
-    rate: float,
-    rng: np.random.Generator,
-    densities: tuple[float, float],
-    turn_on: float,
-    scale: float,
-    misalignment: float,
-    limit: float,
+    true: FloatArray, sensor: str, rate: float, rng: np.random.Generator, errors: ImuErrors
 ) -> FloatArray:
-    """Return a sensor's measurements (N, 3) of the values `true` (N, 3)."""
-    white, walk = densities
-    axes = Rotation.from_rotvec(misalignment * rng.standard_normal(3)).as_matrix()
+    """Return the measurements (N, 3) by "gyro" or "accel" of the values `true` (N, 3)."""
+    of_sensor = {**vars(errors.noise), **vars(errors)}
+    white, walk, turn_on, scale, limit = (
+        of_sensor[f"{sensor}_{name}"] for name in ("noise", "walk", "turn_on", "scale", "range")
+    )
+    axes = Rotation.from_rotvec(errors.misalignment * rng.standard_normal(3)).as_matrix()
     scales = 1.0 + scale * rng.standard_normal(3)
     steps = walk / math.sqrt(rate) * rng.standard_normal(true.shape)
     steps[0] = turn_on * rng.standard_normal(3)

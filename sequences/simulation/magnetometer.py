@@ -7,13 +7,20 @@ be. It depends on position only, so that a person who returns measures the same 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
 from stario.sequences.arrays import generator
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, Magnetometer, Trajectory
+from stario.sequences.settings import check_number
+
+EARTH_W = 48.0 * np.array([math.cos(math.radians(63.0)), 0.0, -math.sin(math.radians(63.0))])
+"""The earth's field [uT]: it dips by 63 degrees, and W's x axis points to magnetic north."""
+
+_RATE = 50.0
+"""Sampling rate [Hz]."""
 
 _WAVES = 128
 _STREAM = 0x6D6167
@@ -25,43 +32,29 @@ class MagneticField:
     """Magnetic field around a device, and the errors of its magnetometer.
 
     Attributes:
-        strength: magnitude of the earth's field [uT].
-        dip: angle of the earth's field below the horizontal [rad], negative south of the magnetic
-            equator.
-        azimuth: direction of its horizontal part in W, counter-clockwise from x [rad].
         disturbance: root mean square of the building's field [uT].
         length: length over which the building's field changes [m].
         hard_iron: constant offset in B that the device adds [uT].
         noise: standard deviation of a sample, per axis [uT].
-        magnets: start [s], end [s] and magnitude [uT] of fields that move with the device.
-        rate: sampling rate [Hz].
         lag: delay of the timestamps [s].
 
     Raises:
-        InputError: a value is not finite, a magnitude is negative, or length or rate is not
-            positive.
+        InputError: a value is not finite, a magnitude is negative, or the length below 0.01 m.
     """
 
-    strength: float = 48.0
-    dip: float = math.radians(63.0)
-    azimuth: float = 0.0
     disturbance: float = 0.0
     length: float = 3.0
     hard_iron: tuple[float, float, float] = (0.0, 0.0, 0.0)
     noise: float = 0.4
-    magnets: tuple[tuple[float, float, float], ...] = ()
-    rate: float = 50.0
     lag: float = 0.0
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if not np.isfinite(np.asarray(value, dtype=np.float64)).all():
-                raise InputError(item.name, repr(value), "finite numbers")
-            if item.name in ("strength", "disturbance", "noise") and value < 0.0:
-                raise InputError(item.name, repr(value), "a magnitude >= 0 uT")
-            if item.name in ("length", "rate") and value <= 0.0:
-                raise InputError(item.name, repr(value), "a number > 0")
+        check_number(self, "disturbance")
+        check_number(self, "length", 0.01)
+        check_number(self, "noise")
+        check_number(self, "lag", -math.inf)
+        if not np.isfinite(self.hard_iron).all():
+            raise InputError("hard_iron", repr(self.hard_iron), "finite numbers")
 
 
 INDOOR_FIELD = MagneticField(disturbance=8.0, length=2.0, hard_iron=(3.0, -2.0, 4.0), lag=0.03)
@@ -82,24 +75,13 @@ def simulate_magnetometer(
         InputError: there are fewer than two valid poses, or the seed is not an integer >= 0.
     """
     rng = generator(seed, _STREAM)
-    count = int((truth.time[-1] - truth.time[0]) * magnetic_field.rate) + 1
-    time = np.minimum(truth.time[0] + np.arange(count) / magnetic_field.rate, truth.time[-1])
+    count = int((truth.time[-1] - truth.time[0]) * _RATE) + 1
+    time = np.minimum(truth.time[0] + np.arange(count) / _RATE, truth.time[-1])
     pose = truth.at(time)
-    field_W = _earth(magnetic_field) + _building(magnetic_field, pose.position_W, rng)
+    field_W = EARTH_W + _building(magnetic_field, pose.position_W, rng)
     field_B = pose.attitude_WB.apply(field_W, inverse=True) + np.array(magnetic_field.hard_iron)
-    for start, stop, size in magnetic_field.magnets:
-        direction = rng.standard_normal(3)
-        near = (time >= start) & (time <= stop)
-        field_B[near] += size * direction / np.linalg.norm(direction)
     field_B += magnetic_field.noise * rng.standard_normal(field_B.shape)
     return Magnetometer(time + magnetic_field.lag, field_B)
-
-
-def _earth(magnetic_field: MagneticField) -> FloatArray:
-    """Return the earth's field (3,) in W [uT]."""
-    dip, azimuth = magnetic_field.dip, magnetic_field.azimuth
-    level = [math.cos(dip) * math.cos(azimuth), math.cos(dip) * math.sin(azimuth), -math.sin(dip)]
-    return magnetic_field.strength * np.array(level)
 
 
 def _building(

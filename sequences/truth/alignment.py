@@ -27,6 +27,8 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray
 from stario.sequences.truth.mounts import (
     MIN_FIT_S,
+    Piece,
+    Rotations,
     disagreeing,
     fitted_mounts,
     heading_turn,
@@ -90,12 +92,12 @@ def align_tracked_body(
     sizes = _agreement(gyro_B, truth_time, attitude_WV, valid, 0.04, sizes_only=True)
     lag = _best_lag(sizes, _MAX_LAG_S)
     time = truth_time + lag
-    attitude_B = gyro_B.attitude(time)
-    valid = valid & ~disagreeing(time, attitude_WV, attitude_B)
-    pieces = pieces_between_jumps(time, attitude_WV, attitude_B, valid)
+    both = Rotations(time, attitude_WV, gyro_B.attitude(time))
+    valid = valid & ~disagreeing(both)
+    pieces = pieces_between_jumps(both, valid)
     start, stop = max(pieces, key=lambda piece: piece[1] - piece[0], default=(0, 0))
     _check_length("capture that agrees with the gyroscope", time[start:stop])
-    mounts = fitted_mounts(time, attitude_WV, gyro_B, pieces)
+    mounts = fitted_mounts(both, gyro_B, pieces)
     kept = np.zeros_like(valid)
     for start, stop in pieces:
         kept[start:stop] = valid[start:stop]
@@ -103,7 +105,8 @@ def align_tracked_body(
     rates = _agreement(gyro_B, time, _mounted(attitude_WV, pieces, mounts), kept, 0.06)
     lag += _best_lag(rates, _REMAINING_LAG_S)
     time = truth_time + lag
-    mounts = fitted_mounts(time, attitude_WV, gyro_B, pieces)
+    both = Rotations(time, attitude_WV, gyro_B.attitude(time))
+    mounts = fitted_mounts(both, gyro_B, pieces)
     force_B, rate_B = interpolated(time, imu_time, accel), interpolated(time, imu_time, gyro)
     attitude_WB, leveling = _level(_mounted(attitude_WV, pieces, mounts), force_B, kept)
     if position_WV is not None:
@@ -112,8 +115,8 @@ def align_tracked_body(
         mounts = [mount * turn for mount in mounts]
         attitude_WB, leveling = _level(_mounted(attitude_WV, pieces, mounts), force_B, kept)
     # With the mount known, glitches about another axis than the motion's are detected as well.
-    drift = composed(attitude_WB, gyro_B.attitude(time).inv())
-    kept &= ~disagreeing(time, drift, Rotation.identity(len(drift)))
+    drift = composed(attitude_WB, both.attitude_B.inv())
+    kept &= ~disagreeing(Rotations(time, drift, Rotation.identity(len(drift))))
     return BodyAlignment(
         lag=lag,
         # Over a shorter span, the capture's noise hides a trolley's turns.
@@ -128,9 +131,7 @@ def align_tracked_body(
     )
 
 
-def _mounted(
-    attitude_WV: Rotation, pieces: list[tuple[int, int]], mounts: list[Rotation]
-) -> Rotation:
+def _mounted(attitude_WV: Rotation, pieces: list[Piece], mounts: list[Rotation]) -> Rotation:
     """Return the IMU's attitude in the capture system's world, each piece with its mount."""
     quat_WB = attitude_WV.as_quat()
     for (start, stop), mount in zip(pieces, mounts, strict=True):

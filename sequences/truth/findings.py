@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.conventions import axes_matrix, axes_named, permuted
-from stario.sequences.findings import Finding
+from stario.sequences.findings import Assessment, Finding
 from stario.sequences.legs import jumps
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.truth.fit import EDGE_S, MAX_OFFSET_S, TruthFit, YawDrift
@@ -60,9 +60,9 @@ def truth_finding(
     return Finding(f"truth_{code}", f"truth: {found}", fix, values=values, spoils_truth=spoils)
 
 
-def fit_as_dict(fit: TruthFit, yaw: YawDrift | None) -> dict[str, object]:
-    """Return the fit as plain values, with units in their names."""
-    return {
+def assessed_fit(fit: TruthFit, yaw: YawDrift | None) -> Assessment:
+    """Return the fit and the gyroscope's drift as figures and lines, and a scale that is wrong."""
+    figures = {
         "time_offset_s": fit.time_offset,
         "correlation": fit.correlation,
         "misalignment_rad": fit.misalignment,
@@ -74,40 +74,29 @@ def fit_as_dict(fit: TruthFit, yaw: YawDrift | None) -> dict[str, object]:
         "axes": fit.axes(),
         "yaw": yaw and {"scale": yaw.scale, "bias_rad_s": yaw.bias, "left_rad": yaw.residual_rms},
     }
-
-
-def fit_lines(fit: TruthFit, yaw: YawDrift | None) -> list[str]:
-    """Return the fit as lines to print."""
     if fit.one_axis:
-        return ["  against the gyroscope: one axis of rotation determines neither clock nor axes"]
+        line = "  against the gyroscope: one axis of rotation determines neither clock nor axes"
+        return Assessment(figures, [line], [])
     lines = [
         f"  against the gyroscope: time offset {1e3 * fit.time_offset:+.1f} ms, "
         f"misalignment {math.degrees(fit.misalignment):.2f} deg, "
         f"correlation {fit.correlation:.3f}, "
         f"world tilted by {math.degrees(fit.tilt):.2f} deg"
     ]
-    if yaw is not None:
-        lines.append(
-            f"  yaw: the gyroscope {_scale_words(yaw)} and drifts by "
-            f"{math.degrees(yaw.bias):+.3f} deg/s; "
-            f"residual {math.degrees(yaw.residual_rms):.1f} deg"
-        )
-    return lines
-
-
-def _scale_words(yaw: YawDrift) -> str:
-    return f"reads {100 * abs(yaw.scale):.1f} % too {'high' if yaw.scale > 0.0 else 'low'}"
-
-
-def scale_findings(fit: TruthFit, yaw: YawDrift | None) -> list[Finding]:
-    """Return a finding if the gyroscope's scale is wrong, where the truth can show it."""
+    if yaw is None:
+        return Assessment(figures, lines, [])
+    reads = f"reads {100 * abs(yaw.scale):.1f} % too {'high' if yaw.scale > 0.0 else 'low'}"
+    lines.append(
+        f"  yaw: the gyroscope {reads} and drifts by {math.degrees(yaw.bias):+.3f} deg/s; "
+        f"residual {math.degrees(yaw.residual_rms):.1f} deg"
+    )
     same_frames = fit.misalignment < _TURNED_RAD and fit.tilt < _LEANING_RAD  # else yaws differ
-    if yaw is None or abs(yaw.scale) <= _SCALED or not (fit.consistent and same_frames):
-        return []
+    wrong = abs(yaw.scale) > _SCALED and fit.consistent and same_frames
     if yaw.residual_rms > _EXPLAINED_RAD and abs(yaw.scale) < _UNMISTAKABLE:
-        return []
-    text = f"gyroscope: {_scale_words(yaw)}, compared with the truth"
-    return [Finding("gyro_scale", text, values={"scale": yaw.scale})]
+        wrong = False
+    text = f"gyroscope: {reads}, compared with the truth"
+    found = [Finding("gyro_scale", text, values={"scale": yaw.scale})] if wrong else []
+    return Assessment(figures, lines, found)
 
 
 def fit_findings(fit: TruthFit, refusal: str) -> list[Finding]:
@@ -172,30 +161,26 @@ def _inconsistent(fit: TruthFit) -> Finding:
     )
 
 
-def positions_as_dict(fit: PositionFit) -> dict[str, object]:
-    """Return the comparison as plain values, with units in their names."""
-    return {
+def assessed_positions(fit: PositionFit | None) -> Assessment:
+    """Return the comparison as figures, and as a line that says why there is none."""
+    if fit is None:
+        why = "too little motion, or a wrong attitude"
+        return Assessment({}, [f"  against the accelerometer: positions not compared ({why})"], [])
+    axes = ["xyz"[axis] for axis in fit.axes]
+    figures = {
         "correlation": fit.correlation,
         "correlation_turned": fit.turned_correlation,
         "scale": fit.scale,
         "turned_rad": fit.turned,
         "mirrored": fit.mirrored,
-        "axes": ["xyz"[axis] for axis in fit.axes],
+        "axes": axes,
     }
-
-
-def position_line(fit: PositionFit | None) -> str:
-    """Return the comparison as a line to print."""
-    if fit is None:
-        why = "too little motion, or a wrong attitude"
-        return f"  against the accelerometer: positions not compared ({why})"
-    mirrored = " and mirrored" if fit.mirrored else ""
-    axes = ", ".join("xyz"[axis] for axis in fit.axes)
-    return (
+    line = (
         f"  against the accelerometer: positions scaled by {fit.scale:.3g}, "
-        f"turned by {math.degrees(fit.turned):.0f} deg{mirrored}, "
-        f"correlation {fit.correlation:.3f} in {axes}"
+        f"turned by {math.degrees(fit.turned):.0f} deg{' and mirrored' if fit.mirrored else ''}, "
+        f"correlation {fit.correlation:.3f} in {', '.join(axes)}"
     )
+    return Assessment(figures, [line], [])
 
 
 def position_fit_findings(fit: PositionFit) -> list[Finding]:

@@ -39,7 +39,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence
 from stario.sequences.time_order import MAX_IMU_GAP
 from stario.sequences.truth.alignment import BodyAlignment, align_tracked_body, clock_offset
-from stario.sequences.truth.mounts import turns_about_one_axis
+from stario.sequences.truth.mounts import Rotations
 
 MAX_OFFSET_S = 5.0
 """Largest time offset searched, in either direction [s]."""
@@ -143,25 +143,25 @@ def fit_truth(sequence: ImuSequence) -> TruthFit:
     valid = pose.valid & ~np.isin(np.searchsorted(time, grid) - 1, gaps)
     aligned = align_tracked_body(time, gyro, accel, grid, pose.attitude_WB, valid)
     gyro_B = GyroIntegral(time, gyro)
+    fitted = grid + aligned.lag
+    both = Rotations(fitted, pose.attitude_WB, gyro_B.attitude(fitted))
     begin, end, mount = max(aligned.mounts, key=lambda piece: piece[1] - piece[0])
-    piece = np.searchsorted(grid + aligned.lag, [begin, end])
+    piece = np.searchsorted(fitted, [begin, end])
     return TruthFit(
         time_offset=coarse + aligned.lag,
         correlation=aligned.correlation,
         R_TB=mount,
         tilt=float(aligned.leveling_WW.magnitude()),
         agreeing=float(aligned.valid.sum() / max(valid.sum(), 1)),
-        jumps=_jumps(gyro_B, time[gaps], aligned, grid + aligned.lag),
+        jumps=_jumps(gyro_B, time[gaps], aligned, fitted),
         accel_against=_accel_against(
-            interpolated(grid + aligned.lag, time, accel)[aligned.valid],
+            interpolated(fitted, time, accel)[aligned.valid],
             pose.attitude_WB[aligned.valid],
             mount,
         ),
-        one_axis=turns_about_one_axis(
-            grid + aligned.lag, pose.attitude_WB, gyro_B, (piece[0], piece[1])
-        ),
+        one_axis=both.about_one_axis((piece[0], piece[1])),
         applied_axes=sequence.axes,
-        times=grid + aligned.lag,
+        times=fitted,
         speed=_speed(pose.attitude_WB, pose.valid),
     )
 

@@ -8,7 +8,8 @@ all right, so the slower fit to the gyroscope is needed only where they disagree
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -16,7 +17,7 @@ from scipy.ndimage import median_filter
 from stario.sequences.arrays import check_type, rms, runs, scatter
 from stario.sequences.clean_samples import usable
 from stario.sequences.errors import InputError
-from stario.sequences.findings import Finding, warn
+from stario.sequences.findings import Assessment, Finding, warn
 from stario.sequences.sequence import (
     FloatArray,
     ImuSequence,
@@ -24,8 +25,15 @@ from stario.sequences.sequence import (
     is_gap,
     low_rate_message,
 )
-from stario.sequences.truth.findings import fit_findings, position_fit_findings, truth_finding
-from stario.sequences.truth.fit import TruthFit, fit_truth
+from stario.sequences.truth.findings import (
+    assessed_fit,
+    assessed_positions,
+    fit_findings,
+    known_position_findings,
+    position_fit_findings,
+    truth_finding,
+)
+from stario.sequences.truth.fit import TruthFit, fit_truth, yaw_drift
 from stario.sequences.truth.mounts import MIN_FIT_S
 from stario.sequences.truth.positions import PositionFit, fit_positions
 
@@ -41,16 +49,10 @@ _RESTING_RAD_S, _RESTING_RAD = 0.03, np.deg2rad(3.0)
 noise, and a capture's."""
 
 
-@dataclass(frozen=True, eq=False)
-class TruthFindings:
-    """Result of `examine_truth`.
+class TruthFindings(NamedTuple):
+    """Poses compared, without those of lost tracking; both comparisons; what stands out.
 
-    Attributes:
-        truth: the poses compared, without those of lost tracking; None if nothing was compared.
-        fit: fit of truth and gyroscope; None if they cannot be compared.
-        positions: comparison of positions and accelerometer; None if they cannot be compared, or
-            if the attitude is wrong.
-        findings: what stands out.
+    Each is None if there is nothing to compare, and that of the positions if the attitude is wrong.
     """
 
     truth: Trajectory | None = None
@@ -90,6 +92,51 @@ def examine_truth(sequence: ImuSequence, refusal: str = "") -> TruthFindings:
         if positions and same and not refusal:  # the accelerometer's unit would explain all
             found += position_fit_findings(positions)
     return TruthFindings(truth, fit, positions, tuple(found))
+
+
+def assess_truth(sequence: ImuSequence, refusal: str) -> tuple[Assessment, TruthFit | None]:
+    """Assess a recording's true poses or known positions; arguments as `examine_truth`.
+
+    Returns:
+        The assessment, and the fit of truth and gyroscope; None if they cannot be compared.
+    """
+    found = examine_truth(sequence, refusal)
+    findings, fit = [*found.findings], found.fit
+    lines = [f"truth: {sequence.truth_summary()}"]
+    coverage = against_gyro = against_accel = None
+    if sequence.truth is not None:
+        coverage = _coverage(sequence, sequence.truth)
+        lines = [
+            f"truth: covers {100 * coverage['coverage']:.1f} % of the samples, "
+            f"{coverage['rate_hz']:.1f} Hz, {coverage['gaps']} gaps "
+            f"(longest step {coverage['longest_gap_s']:.2f} s), path of {coverage['path_m']:.1f} m"
+        ]
+    if fit:
+        yaw = None if fit.one_axis else yaw_drift(replace(sequence, truth=found.truth), fit)
+        gyro, accel = assessed_fit(fit, yaw), assessed_positions(found.positions)
+        against_gyro, against_accel = gyro.figures, accel.figures or None
+        lines += gyro.lines + accel.lines
+        findings += gyro.findings
+    figures = {
+        "truth": coverage,
+        "truth_against_gyroscope": against_gyro,
+        "positions_against_accelerometer": against_accel,
+    }
+    return Assessment(figures, lines, findings + known_position_findings(sequence)), fit
+
+
+def _coverage(sequence: ImuSequence, truth: Trajectory) -> dict[str, Any]:
+    """Return for how many samples the truth is known, its rate, its gaps and its path."""
+    times = np.unique(sequence.time[np.isfinite(sequence.time)])
+    known = truth.time[truth.valid]
+    steps = np.diff(known)
+    return {
+        "coverage": float(truth.covers(times).mean()) if len(known) > 1 else 0.0,
+        "rate_hz": float(1.0 / np.median(steps)) if len(steps) else 0.0,
+        "gaps": int(is_gap(steps).sum()),
+        "longest_gap_s": float(steps.max(initial=0.0)),
+        "path_m": truth.path_length(),
+    }
 
 
 def truth_findings(sequence: ImuSequence) -> list[Finding]:

@@ -16,12 +16,12 @@ from stario.fusion.imu.barometer import HeightSample
 from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.report.panels import motion_panels
 from stario.fusion.report.series import track_series
-from stario.sequences.atmosphere import standard_pressure
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import Barometer, ImuSequence
-from stario.sequences.simulation.barometer import Air, simulate_barometer
 from stario.sequences.simulation.house import simulate_house
+from stario.sequences.simulation.outside_sensors import simulate_barometer
+from stario.sequences.units import standard_pressure
 
 CONFIG = NavigatorConfig()
 
@@ -107,7 +107,7 @@ def test_moving_the_map_changes_nothing_that_pressure_tells(transform):
 @pytest.fixture(scope="module")
 def house():
     """Two minutes: stairs to the first floor, and a lift to the fourth."""
-    walk = simulate_house(9, 120.0, rate=50.0, air=Air(weather=0.01, door=0.3))
+    walk = simulate_house(9, 120.0, rate=50.0)
     return replace(walk, sequence=replace(walk.sequence, magnetometer=None))
 
 
@@ -200,8 +200,9 @@ def test_a_stream_has_the_heights_of_the_recording(house, level_oracle, house_tr
 def test_weather_and_doors_on_a_level_floor_are_worth_their_sigma(make_walk):
     walk = make_walk(seed=4, seconds=60.0, rate=50.0)
     doors = np.array([20.0, 40.0])
-    air = Air(weather=0.03, door=0.5)
-    with_air = replace(walk, barometer=simulate_barometer(walk.truth, air, doors, seed=1))
+    with_air = replace(
+        walk, barometer=simulate_barometer(walk.truth, doors, 1, weather=0.03, door=0.5)
+    )
     track = Navigator(Level(), CONFIG).run(with_air)
     assert climb_error(track, with_air) < 1.0
 

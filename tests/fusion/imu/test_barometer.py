@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stario.fusion.imu.barometer import HeightBuffer, HeightSample
-from stario.sequences.atmosphere import pressure_altitude, standard_pressure
+from stario.sequences.units import pressure_altitude, standard_pressure
 
 RATE = 8.0
 

@@ -192,7 +192,7 @@ def test_files_of_other_code_are_removed_once_nobody_uses_them(recording, tmp_pa
     folder = tmp_path / "cache"
     streams_of(recording, folder, Reader())
     (own,) = folder.iterdir()
-    names = (own.name, "0-old.streams", "0-old.judged", "0-recent.streams", "notes.txt")
+    names = (own.name, "0-old.streams", "0-recent.streams", "notes.txt")
     for name in names:
         (folder / name).touch()
         os.utime(folder / name, (0, 0))

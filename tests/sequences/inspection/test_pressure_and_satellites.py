@@ -7,13 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from told import told
 
-from stario.sequences.findings import Finding
-from stario.sequences.inspection.outside_sensors import (
-    PressureFindings,
-    SatelliteFindings,
-    assess_barometer,
-    assess_satellites,
-)
+from stario.sequences.findings import Assessment, Finding
+from stario.sequences.geodesy import Georeference
+from stario.sequences.inspection.outside_sensors import assess_barometer, assess_satellites
 from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.sequence import (
     Barometer,
@@ -21,11 +17,10 @@ from stario.sequences.sequence import (
     Satellites,
     Trajectory,
 )
-from stario.sequences.simulation.barometer import Air, simulate_barometer
 from stario.sequences.simulation.house import simulate_house
-from stario.sequences.simulation.receiver import Sky, simulate_satellites
+from stario.sequences.simulation.outside_sensors import simulate_barometer, simulate_satellites
 
-CALM = Air(weather=0.0, door=0.0, noise=0.05)
+CALM = {"weather": 0.0, "door": 0.0, "noise": 0.05}
 
 
 def climbing(height: FloatArray) -> Trajectory:
@@ -39,13 +34,13 @@ def climbing(height: FloatArray) -> Trajectory:
 LEVEL = climbing(np.zeros(600))
 
 
-def pressure(barometer: Barometer) -> PressureFindings:
+def pressure(barometer: Barometer) -> Assessment:
     found = assess_barometer(barometer)
     assert found is not None
     return found
 
 
-def receiver(reported: Satellites) -> SatelliteFindings:
+def receiver(reported: Satellites) -> Assessment:
     found = assess_satellites(reported)
     assert found is not None
     return found
@@ -75,40 +70,43 @@ def test_a_house_is_inspected_in_a_line_for_each_sensor(house):
 @pytest.mark.parametrize("noise", [0.05, 0.2])
 def test_noise_is_measured_on_stairs_as_well(noise):
     stairs = climbing(np.cumsum(np.full(600, 0.035)))
-    found = pressure(simulate_barometer(stairs, replace(CALM, noise=noise, rate=5.0)))
-    assert found.noise_m == pytest.approx(noise, rel=0.2)
-    assert found.height_range_m == pytest.approx(21.0, rel=0.1)
+    found = pressure(simulate_barometer(stairs, **CALM | {"noise": noise, "rate": 5.0}))
+    assert found.figures["noise_m"] == pytest.approx(noise, rel=0.2)
+    assert found.figures["height_range_m"] == pytest.approx(21.0, rel=0.1)
 
 
 def test_a_door_is_a_step_and_stairs_or_a_lift_are_none():
     doors = np.array([20.0])
-    stepped = pressure(simulate_barometer(LEVEL, replace(CALM, door=0.8), doors, seed=1))
-    [(time, rise)] = stepped.steps
-    assert time == pytest.approx(20.0, abs=1.0)
-    assert abs(rise) > 0.35
+    stepped = pressure(simulate_barometer(LEVEL, doors, 1, **CALM | {"door": 0.8}))
+    [step] = stepped.figures["steps"]
+    assert step["time_s"] == pytest.approx(20.0, abs=1.0)
+    assert abs(step["rise_m"]) > 0.35
     speed = np.zeros(600)
     speed[100:240] = 0.35  # stairs
     speed[400:480] = 1.0  # a lift
-    assert pressure(simulate_barometer(climbing(np.cumsum(0.1 * speed)), CALM)).steps == ()
+    assert (
+        pressure(simulate_barometer(climbing(np.cumsum(0.1 * speed)), **CALM)).figures["steps"]
+        == []
+    )
 
 
 def test_a_jump_that_is_no_height_is_a_problem():
-    calm = simulate_barometer(LEVEL, CALM)
+    calm = simulate_barometer(LEVEL, **CALM)
     hPa = calm.pressure_hPa - 2.0 * (calm.time > 30.0)
-    found = pressure(replace(calm, pressure_hPa=hPa)).findings()
+    found = pressure(replace(calm, pressure_hPa=hPa)).findings
     assert codes(found) == ["pressure_jump"]
     assert found[0].values["rise_m"] == pytest.approx(16.9, abs=0.2)
     assert found[0].values["time_s"] == pytest.approx(30.0, abs=1.0)
 
 
 def test_repeated_samples_and_wind_are_good_to_know():
-    calm = simulate_barometer(LEVEL, CALM)
+    calm = simulate_barometer(LEVEL, **CALM)
     held = replace(calm, pressure_hPa=np.repeat(calm.pressure_hPa[::4], 4)[: len(calm)])
     found = pressure(held)
-    assert found.repeated_share == pytest.approx(0.75, abs=0.02)
-    assert [(f.code, f.level) for f in found.findings()] == [("pressure_held", "note")]
-    windy = pressure(simulate_barometer(LEVEL, replace(CALM, noise=0.6)))
-    assert [(f.code, f.level) for f in windy.findings()] == [("pressure_noise", "note")]
+    assert found.figures["repeated_share"] == pytest.approx(0.75, abs=0.02)
+    assert [(f.code, f.level) for f in found.findings] == [("pressure_held", "note")]
+    windy = pressure(simulate_barometer(LEVEL, **CALM | {"noise": 0.6}))
+    assert [(f.code, f.level) for f in windy.findings] == [("pressure_noise", "note")]
 
 
 @pytest.mark.parametrize(
@@ -134,38 +132,38 @@ def test_a_barometer_on_another_clock_is_a_problem(house):
 
 
 def test_exchanged_latitude_and_longitude_contradict_the_speed():
-    reported = simulate_satellites(LEVEL, Sky(azimuth=1.0, sigma=1.0))
+    reported = simulate_satellites(LEVEL, Georeference(48.0, 11.0, 0.6), sigma=1.0)
     right = receiver(reported)
-    assert right.findings() == []
-    assert right.doppler.correlation > 0.9
-    assert right.doppler.scale == pytest.approx(1.0, abs=0.1)
+    assert right.findings == []
+    assert right.figures["doppler"]["correlation"] > 0.9
+    assert right.figures["doppler"]["scale"] == pytest.approx(1.0, abs=0.1)
     wrong = receiver(replace(reported, latlon_deg=reported.latlon_deg[:, ::-1]))
-    assert codes(wrong.findings()) == ["satellites_exchanged"]
+    assert codes(wrong.findings) == ["satellites_exchanged"]
 
 
 def test_positions_far_to_the_east_are_judged_although_they_cannot_be_exchanged():
-    assert receiver(simulate_satellites(LEVEL, Sky(sigma=1.0, longitude=118.9))).findings() == []
+    assert receiver(simulate_satellites(LEVEL, Georeference(48.0, 118.9), sigma=1.0)).findings == []
 
 
 def test_minutes_in_place_of_decimals_contradict_the_speed():
     """48 degrees 7.038 minutes as 48.07038."""
-    reported = simulate_satellites(LEVEL, Sky(sigma=1.0, latitude=48.3, longitude=11.3))
+    reported = simulate_satellites(LEVEL, Georeference(48.3, 11.3), sigma=1.0)
     whole, part = np.divmod(reported.latlon_deg, 1.0)
-    found = receiver(replace(reported, latlon_deg=whole + 0.6 * part)).findings()
+    found = receiver(replace(reported, latlon_deg=whole + 0.6 * part)).findings
     assert codes(found) == ["satellites_scale"]
     assert found[0].values["scale"] == pytest.approx(0.6, abs=0.05)
 
 
 def test_stale_positions_and_jumps_are_good_to_know():
-    reported = simulate_satellites(LEVEL, Sky(sigma=1.0))
+    reported = simulate_satellites(LEVEL, sigma=1.0)
     place = reported.latlon_deg.copy()
     place[20:40] = place[20]
     place[50] += 0.01
     found = receiver(replace(reported, latlon_deg=place))
-    assert [(f.code, f.level) for f in found.findings()] == [
+    assert [(f.code, f.level) for f in found.findings] == [
         ("satellites_stale", "note"),
         ("satellites_jump", "note"),
     ]
-    [(start, length)] = found.stale
-    assert (start, length) == (pytest.approx(20.0), pytest.approx(19.0))
-    assert max(found.jumps_m) > 1000.0
+    [stale] = found.figures["stale"]
+    assert stale == {"start_s": pytest.approx(20.0), "length_s": pytest.approx(19.0)}
+    assert max(found.figures["jumps_m"]) > 1000.0

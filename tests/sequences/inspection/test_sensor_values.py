@@ -1,6 +1,5 @@
 """Values that never change, are stuck, at their limit or wild: refused, named or tolerated."""
 
-import logging
 import warnings
 from dataclasses import replace
 
@@ -9,7 +8,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from told import UP, refusal, told
 
-from stario.sequences.findings import warn
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.inspection.constant_values import (
     dead_axes,
@@ -129,15 +127,6 @@ def test_a_dead_axis_is_named(mounted, sensor, axis, value):
     (problem,) = dead_axes(replace(mounted, **{sensor: values}))
     name = {"gyro": "gyroscope", "accel": "accelerometer"}[sensor]
     assert f"{name}: its {'xyz'[axis]} axis never changes" in str(problem)
-
-
-def test_inspect_reports_it_and_the_log_warns_once(mounted, caplog):
-    dead = replace(mounted, gyro=mounted.gyro * [1.0, 1.0, 0.0])
-    assert any("its z axis" in problem for problem in told(dead))
-    assert "axis" not in caplog.text
-    with caplog.at_level(logging.WARNING):
-        warn(dead.name, dead_axes(dead))
-    assert caplog.text.count("its z axis") == 1
 
 
 def test_motion_in_a_plane_is_no_problem():

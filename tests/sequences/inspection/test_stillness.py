@@ -28,10 +28,10 @@ def test_noise_and_bias_match_the_sensor_at_any_rate(rate):
     rest = find_rest(device_at_rest(60.0, rate))
     assert rest.seconds == pytest.approx(60.0, abs=0.6)
     assert len(rest.stretches) == 1
-    np.testing.assert_allclose(rest.gyro_bias, BIAS, atol=5e-4)
-    assert rest.accel_norm == pytest.approx(STANDARD_GRAVITY + 0.05, abs=2e-3)
-    assert rest.gyro_noise == pytest.approx(NOISE.gyro_noise, rel=0.1)
-    assert rest.accel_noise == pytest.approx(NOISE.accel_noise, rel=0.1)
+    np.testing.assert_allclose(rest.gyro_bias_rad_s, BIAS, atol=5e-4)
+    assert rest.accel_norm_m_s2 == pytest.approx(STANDARD_GRAVITY + 0.05, abs=2e-3)
+    assert rest.gyro_noise_rad_s_sqrt_hz == pytest.approx(NOISE.gyro_noise, rel=0.1)
+    assert rest.accel_noise_m_s2_sqrt_hz == pytest.approx(NOISE.accel_noise, rel=0.1)
 
 
 def test_a_walk_contains_no_rest():
@@ -67,7 +67,7 @@ def test_a_large_bias_is_one_if_gravity_does_not_turn():
     still, bias = device_at_rest(10.0, 100.0), np.array([-0.12, 0.0, 0.02])
     rest = find_rest(ImuSequence("t", still.time, still.gyro - BIAS + bias, still.accel))
     assert rest.seconds == pytest.approx(10.0, abs=0.6)
-    np.testing.assert_allclose(rest.gyro_bias, bias, atol=1e-3)
+    np.testing.assert_allclose(rest.gyro_bias_rad_s, bias, atol=1e-3)
 
 
 def test_less_than_a_second_of_rest_is_too_short():

@@ -1,22 +1,24 @@
 """Simulated walks through a house: floors, pressure and satellites."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.atmosphere import standard_pressure
 from stario.sequences.errors import InputError
-from stario.sequences.geodesy import east_north
+from stario.sequences.geodesy import Georeference, east_north, turned
 from stario.sequences.sequence import FloatArray, Trajectory
-from stario.sequences.simulation.barometer import Air, simulate_barometer
 from stario.sequences.simulation.house import SHORTEST, simulate_house
-from stario.sequences.simulation.receiver import Sky, simulate_satellites
+from stario.sequences.simulation.outside_sensors import (
+    LASTING_S,
+    STREET,
+    simulate_barometer,
+    simulate_satellites,
+)
 from stario.sequences.simulation.walks import WalkStyle
+from stario.sequences.units import standard_pressure
 
 METRES_PER_HPA = 8.43
-STILL_AIR = Air(weather=0.0, door=0.0, noise=0.0)
+STILL_AIR = {"weather": 0.0, "door": 0.0, "noise": 0.0}
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +72,7 @@ def test_stairs_are_climbed_step_by_step_and_a_lift_stands(way):
 
 def test_pressure_falls_with_height_as_in_the_standard_atmosphere(walk):
     truth = walk.sequence.truth
-    found = simulate_barometer(truth, replace(STILL_AIR, altitude=110.0), np.array([30.0]))
+    found = simulate_barometer(truth, np.array([30.0]), **STILL_AIR)
     true = truth.at(found.time).position_W[:, 2]
     np.testing.assert_allclose(height(found.pressure_hPa), true - true[0], atol=0.2)
     np.testing.assert_allclose(standard_pressure(np.array([0.0, 1000.0])), [1013.25, 898.75], 1e-4)
@@ -78,27 +80,26 @@ def test_pressure_falls_with_height_as_in_the_standard_atmosphere(walk):
 
 def test_weather_doors_and_noise_have_the_stated_sizes():
     trajectory = standing(6000.0)
-    air = Air(weather=0.02, door=0.0, noise=0.0)
-    wandered = height(simulate_barometer(trajectory, air).pressure_hPa)[:: 60 * 8]
+    wandered = height(simulate_barometer(trajectory, door=0.0, noise=0.0).pressure_hPa)[:: 60 * 8]
     assert np.diff(wandered).std() == pytest.approx(0.02 * np.sqrt(60.0), rel=0.3)
     doors = np.arange(30.0, 6000.0, 60.0)
-    stepped = simulate_barometer(trajectory, replace(STILL_AIR, door=0.35), doors)
+    stepped = simulate_barometer(trajectory, doors, weather=0.0, noise=0.0)
     levels = height(stepped.pressure_hPa)[:: 60 * 8]
     assert np.diff(levels).std() == pytest.approx(0.35 * np.sqrt(2.0), rel=0.3)
-    noisy = height(simulate_barometer(trajectory, replace(STILL_AIR, noise=0.1)).pressure_hPa)
+    noisy = height(simulate_barometer(trajectory, weather=0.0, door=0.0).pressure_hPa)
     assert noisy.std() == pytest.approx(0.1, rel=0.1)
 
 
 def test_errors_of_satellites_last_and_are_larger_between_houses():
     trajectory = standing(20_000.0)
-    sky = Sky(sigma=2.5, street=3.0, lasting=30.0)
+    place = Georeference(48.0, 11.0)
     between = trajectory.time > 10_000.0
-    found = simulate_satellites(trajectory, sky, between_houses=between)
-    error = east_north(np.vstack([[sky.latitude, sky.longitude], found.latlon_deg]))[1:]
+    found = simulate_satellites(trajectory, place, between)
+    error = east_north(np.vstack([[48.0, 11.0], found.latlon_deg]))[1:]
     early, late = error[found.time < 10_000.0], error[found.time > 10_000.0]
     np.testing.assert_allclose(early.std(axis=0), 2.5, rtol=0.15)
-    np.testing.assert_allclose(late.std(axis=0), 7.5, rtol=0.15)
-    for lag, share in ((30, np.exp(-1.0)), (200, 0.0)):
+    np.testing.assert_allclose(late.std(axis=0), 2.5 * STREET, rtol=0.15)
+    for lag, share in ((round(LASTING_S), np.exp(-1.0)), (200, 0.0)):
         kept = np.mean(early[lag:] * early[:-lag]) / np.mean(early**2)
         assert kept == pytest.approx(share, abs=0.15)
 
@@ -114,8 +115,8 @@ def test_a_receiver_indoors_repeats_its_last_position(walk):
 
 def test_doppler_velocity_and_positions_agree_on_where_north_is(walk):
     truth, entered = walk.sequence.truth, walk.stays[0].stop
-    sky = Sky(azimuth=2.0, sigma=0.0)
-    found = simulate_satellites(truth, sky).slice(1.0, entered - 1.0)
+    there = Georeference(48.0, 11.0, yaw=-0.4)
+    found = simulate_satellites(truth, there, sigma=0.0).slice(1.0, entered - 1.0)
     assert found.bearing_deg is not None
     bearing = np.radians(found.bearing_deg)
     velocity = found.speed_m_s[:, None] * np.stack([np.sin(bearing), np.cos(bearing)], axis=1)
@@ -124,13 +125,7 @@ def test_doppler_velocity_and_positions_agree_on_where_north_is(walk):
     assert np.sqrt(np.mean(np.square(moved - velocity[1:-1]))) < 0.25
     assert np.sqrt(np.mean(np.square(moved))) > 0.5
     true = truth.at(found.time).position_W
-    np.testing.assert_allclose(place, sky.east_north(true - true[0])[:, :2], atol=0.02)
-
-
-def test_other_air_changes_no_other_sensor(walk):
-    other = simulate_house(2, 120.0, rate=50.0, air=STILL_AIR)
-    np.testing.assert_array_equal(other.sequence.accel, walk.sequence.accel)
-    assert other.stays == walk.stays
+    np.testing.assert_allclose(place, turned((true - true[0])[:, :2], there.yaw), atol=0.02)
 
 
 def test_a_walk_too_short_for_a_house_is_refused():

@@ -18,7 +18,7 @@ from stario.sequences.simulation.imu import (
     ImuErrors,
     simulate_imu,
 )
-from stario.sequences.simulation.magnetometer import simulate_magnetometer
+from stario.sequences.simulation.magnetometer import EARTH_W, simulate_magnetometer
 from stario.sequences.simulation.walks import generate_walk
 
 UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
@@ -195,20 +195,17 @@ def in_world(walk: ImuSequence, magnetic_field: MagneticField) -> FloatArray:
 
 
 def test_the_earths_field_is_constant_in_the_world(walk):
-    field_W = in_world(walk, replace(QUIET, azimuth=0.7))
-    np.testing.assert_allclose(np.linalg.norm(field_W, axis=1), 48.0)
-    np.testing.assert_allclose(np.ptp(field_W, axis=0), 0.0, atol=1e-9)
-    assert math.atan2(field_W[0, 1], field_W[0, 0]) == pytest.approx(0.7)
-    assert field_W[0, 2] == pytest.approx(-48.0 * math.sin(QUIET.dip))
+    field_W = in_world(walk, QUIET)
+    np.testing.assert_allclose(field_W, np.tile(EARTH_W, (len(field_W), 1)), atol=1e-9)
 
 
 def test_a_buildings_field_has_its_strength_and_depends_on_position_only(walk):
-    building = replace(QUIET, strength=0.0, disturbance=8.0, length=2.0, rate=100.0)
-    time = np.arange(0.0, 400.0, 0.01)
+    building = replace(QUIET, disturbance=8.0, length=2.0)
+    time = np.arange(20_001) / 50.0
     path = np.stack([0.9 * time, 30.0 * np.sin(0.01 * time), 0.0 * time], axis=1)
     truth = walk.truth
     long = Trajectory(time, path, truth.attitude_WB[np.zeros(len(time), dtype=int)])
-    sizes = np.linalg.norm(simulate_magnetometer(long, building, seed=2).field, axis=1)
+    sizes = np.linalg.norm(in_world(replace(walk, truth=long), building) - EARTH_W, axis=1)
     assert np.sqrt(np.square(sizes).mean()) == pytest.approx(8.0, rel=0.3)
     back = replace(long, position_W=path[::-1])
     again = simulate_magnetometer(back, building, seed=2).field[::-1]
@@ -217,16 +214,12 @@ def test_a_buildings_field_has_its_strength_and_depends_on_position_only(walk):
     )
 
 
-def test_magnets_act_while_near_and_hard_iron_always(walk):
+def test_hard_iron_is_added_and_stamps_are_late(walk):
     iron = (3.0, -2.0, 4.0)
-    disturbed = replace(QUIET, hard_iron=iron, magnets=((10.0, 20.0, 150.0),), lag=0.03)
     plain = simulate_magnetometer(walk.truth, QUIET)
-    seen = simulate_magnetometer(walk.truth, disturbed)
+    seen = simulate_magnetometer(walk.truth, replace(QUIET, hard_iron=iron, lag=0.03))
     np.testing.assert_allclose(seen.time, plain.time + 0.03)
-    added = seen.field - plain.field
-    near = (plain.time >= 10.0) & (plain.time <= 20.0)
-    np.testing.assert_allclose(added[~near], np.tile(iron, ((~near).sum(), 1)))
-    np.testing.assert_allclose(np.linalg.norm(added[near] - iron, axis=1), 150.0)
+    np.testing.assert_allclose(seen.field - plain.field, np.tile(iron, (len(plain), 1)))
 
 
 def test_the_imu_is_the_same_with_and_without_a_magnetometer(walk):
@@ -238,7 +231,7 @@ def test_the_imu_is_the_same_with_and_without_a_magnetometer(walk):
 
 
 @pytest.mark.parametrize(
-    "change", [{"rate": 0.0}, {"length": -1.0}, {"noise": -1.0}, {"hard_iron": (math.nan, 0, 0)}]
+    "change", [{"length": -1.0}, {"noise": -1.0}, {"hard_iron": (math.nan, 0, 0)}]
 )
 def test_invalid_field_parameters_are_refused(change):
     with pytest.raises(InputError, match=next(iter(change))):

@@ -9,12 +9,11 @@ from stario.sequences import ImuSequence, PositionTrack
 from stario.sequences.attitude.rotations import GyroIntegral
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulation import insertion
-from stario.sequences.simulation.barometer import Air, simulate_barometer
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
 from stario.sequences.simulation.insertion import Inserted, insert_moment
 from stario.sequences.simulation.magnetometer import MagneticField
 from stario.sequences.simulation.moments import MOMENTS
-from stario.sequences.simulation.receiver import simulate_satellites
+from stario.sequences.simulation.outside_sensors import simulate_barometer, simulate_satellites
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.units import METRES_PER_HPA
 
@@ -149,7 +148,7 @@ def test_pressure_goes_on_in_a_moment_and_satellites_after_it(walk):
     assert walk.truth is not None
     full = replace(
         walk,
-        barometer=simulate_barometer(walk.truth, Air(weather=0.0, door=0.0, noise=0.02)),
+        barometer=simulate_barometer(walk.truth, weather=0.0, door=0.0, noise=0.02),
         satellites=simulate_satellites(walk.truth),
     )
     found = insert_moment(full, walk.truth, BY_NAME["table"], 0.5, seed=1)
