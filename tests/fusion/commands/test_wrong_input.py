@@ -61,7 +61,6 @@ def test_a_broken_file_is_named_in_one_line(stario, tmp_path, content, words):
         (["evaluate", "RECORDING", "--by", "mood"], ["--by", "mood"]),
         (["evaluate", "RECORDING", "--against", "default"], ["--against", "--by"]),
         (["evaluate", "RECORDING", "--filtered"], ["--filtered", "--by"]),
-        (["evaluate", "RECORDING", "--by", "set", "--models", "default"], ["--models", "--by"]),
         (["run", "RECORDING", "--format", "fax"], ["format", "fax"]),
         (["run", "RECORDING", "--gyro-unit", "rpm"], [".csv: --gyro-unit: found 'rpm'"]),
         (["inspect", "RECORDING", "--axes=x,y"], [".csv: --axes: found 'x,y'"]),
@@ -102,8 +101,6 @@ def test_a_broken_file_is_named_in_one_line(stario, tmp_path, content, words):
         (["train", "missing.csv"], ["missing.csv", "no such file"]),
         (["train", "--data", ".", "--where", "person=dan"], ["--where: found use with --data"]),
         (["train", "--generated", "1", "--out", "RECORDING"], ["folder"]),
-        (["evaluate", "RECORDING", "--convention", "ronin"], ["--convention", "--models"]),
-        (["evaluate", "RECORDING", "--models", "default", "--convention", "tlio"], ["convention"]),
     ],
 )
 def test_invalid_arguments_give_a_one_line_error(stario, recording, arguments, words):
@@ -120,8 +117,6 @@ def test_invalid_arguments_give_a_one_line_error(stario, recording, arguments, w
         ("inspect RECORDING --format csv --where person=dan", "--where --format"),
         ("evaluate RECORDING --data .", "--data with PATH"),
         ("evaluate RECORDING --split validation", "--split without --data"),
-        ("evaluate RECORDING --runs other", "--runs without --models"),
-        ("evaluate RECORDING --model open --models default", "--model with --models"),
         ("evaluate RECORDING --by set --no-magnetometer", "--no-magnetometer with --by"),
         ("evaluate RECORDING --by set --config settings.toml", "--config with --by"),
         ("check backends --model open", "--model simulated"),
