@@ -64,8 +64,7 @@ def evaluate(
 
     if out is not None:
         check_folder(out)
-    options.refuse_unused_sources(context, paths, data)
-    _refuse_unused(context, by)
+    _refuse_unused(context, by, bool(paths), data)
     listed, skipped = _listed(reading, paths or [], data, split)
     files = [entry.path for entry in listed]
     if data is not None:
@@ -82,8 +81,14 @@ def evaluate(
     common.exit_if_skipped([*skipped, *failed])
 
 
-def _refuse_unused(context: typer.Context, by: str | None) -> None:
-    """Refuse options that the chosen kind of evaluation does not use."""
+def _refuse_unused(context: typer.Context, by: str | None, named: bool, data: Path | None) -> None:
+    """Refuse options that the chosen recordings and kind of evaluation do not use."""
+    if named:
+        options.refuse(context, "with PATH", "one of the two", "data")
+    if data is None:
+        options.refuse(context, "without --data", "use with --data", "split")
+    else:
+        options.refuse(context, "with --data", "use with PATH: name the archive", "where")
     if by is None:
         options.refuse(
             context, "without --by", "a grouping, such as --by set", "against", "filtered"
