@@ -317,7 +317,9 @@ def refuse(context: typer.Context, found: str, expected: str, *names: str) -> No
 def expanded(command: Callable[..., None]) -> Callable[..., None]:
     """Put the options of groups, data classes such as `Reading`, in place of a command's groups."""
     parameters = _parameters(command)
-    groups = {p.name: p.annotation for p in parameters if is_dataclass(p.annotation)}
+    groups: dict[str, Any] = {
+        p.name: p.annotation for p in parameters if is_dataclass(p.annotation)
+    }
     options = [
         option.replace(kind=inspect.Parameter.KEYWORD_ONLY)
         for parameter in parameters
