@@ -147,8 +147,8 @@ def _gains(
         figures[TRACK_OF[name]] = _gain(track, sequence, path, alone, seconds)
     if graph:
         track, times = _streamed(preprocessed, config)
-        found = _gain(track, sequence, path, alone, float(times.sum()))
-        figures["fixed_lag"] = {**found, "slowest_ms": 1e3 * float(times.max())}
+        stream = _gain(track, sequence, path, alone, float(times.sum()))
+        figures["fixed_lag"] = {**stream, "slowest_ms": 1e3 * float(times.max())}
     return scored(sequence.name, figures)
 
 
