@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, get_args
@@ -14,7 +14,6 @@ from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.pedestrian import Model
-    from stario.fusion.values.config import NavigatorConfig
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.splits import ListEntry
 
@@ -55,15 +54,6 @@ def evaluate(
     filtered: bool = options.flag(
         False, "--filtered", help="With --by: also report the filter's mean NIS; slow."
     ),
-    models: str | None = typer.Option(
-        None,
-        help="Networks to compare, separated by commas: names from `stario check models`, "
-        "default, or weights files; several weights of one network are averaged.",
-    ),
-    runs: options.Runs = Path("runs"),
-    convention: str = typer.Option(
-        "rms", help="How --models averages position errors: rms, ronin or mean."
-    ),
     jobs: options.Jobs = 1,
     out: options.EvaluateOut = None,
     as_json: options.Json = False,
@@ -74,19 +64,14 @@ def evaluate(
 
     if out is not None:
         check_folder(out)
-    options.refuse_unused_sources(context, paths, data)
-    _refuse_unused(context, by, models)
+    _refuse_unused(context, by, bool(paths), data)
     listed, skipped = _listed(reading, paths or [], data, split)
     files = [entry.path for entry in listed]
-    named = [estimating.model, against or ""] if models is None else common.names_in(models)
     if data is not None:
-        warn_of_learned(named, files, data)
+        warn_of_learned([estimating.model, against or ""], files, data)
     if by is not None:
         groups = {entry.path: entry.group for entry in listed}
         found, failed = _groups(groups, reading, by, estimating.model, against, filtered, jobs)
-    elif models is not None:
-        settings = estimating.settings()
-        found, failed = _networks(named, runs, files, reading, settings, convention, jobs)
     else:
         found, failed = _tracks(files, reading, estimating, jobs, out)
     if found is not None:
@@ -96,22 +81,21 @@ def evaluate(
     common.exit_if_skipped([*skipped, *failed])
 
 
-def _refuse_unused(context: typer.Context, by: str | None, models: str | None) -> None:
-    """Refuse options that the chosen kind of evaluation does not use."""
+def _refuse_unused(context: typer.Context, by: str | None, named: bool, data: Path | None) -> None:
+    """Refuse options that the chosen recordings and kind of evaluation do not use."""
+    if named:
+        options.refuse(context, "with PATH", "one of the two", "data")
+    if data is None:
+        options.refuse(context, "without --data", "use with --data", "split")
+    else:
+        options.refuse(context, "with --data", "use with PATH: name the archive", "where")
     if by is None:
         options.refuse(
             context, "without --by", "a grouping, such as --by set", "against", "filtered"
         )
     else:
-        options.refuse(context, "with --by", "--model and --against", "models")
         alone = "use without: the network alone is judged"
         options.refuse(context, "with --by", alone, "config", "magnetometer", "declination")
-    if models is None:
-        options.refuse(
-            context, "without --models", "networks named with --models", "convention", "runs"
-        )
-    else:
-        options.refuse(context, "with --models", "one of the two", "model")
 
 
 def _listed(
@@ -160,34 +144,6 @@ def _tracks(
     records = {each.name: each.record for each in scores}
     write = partial(write_summary, records=records, config=settings, origin=origin)
     return _Found(summary(scores), summary_table(scores), write), skipped
-
-
-def _networks(
-    names: Sequence[str],
-    runs: Path,
-    files: list[Path],
-    reading: options.Reading,
-    settings: NavigatorConfig,
-    convention: str,
-    jobs: int,
-) -> tuple[_Found | None, list[Skipped]]:
-    """Return the table of networks, and the recordings that were skipped."""
-    from stario.fusion.evaluation.figures import write_table
-    from stario.fusion.evaluation.networks import network_table, networks_on
-    from stario.network.model import load_model, weights_named
-    from stario.sequences.accuracy.metrics import Convention
-    from stario.sequences.arrays import check_choice
-
-    averaging: Convention = check_choice("convention", convention, get_args(Convention))
-    models = [(name, load_model(weights_named(name, runs))) for name in names]
-    work = partial(
-        networks_on, models=models, config=settings, read=reading.read, convention=averaging
-    )
-    found, skipped = common.each_used("evaluate", work, files, jobs)
-    if not found:
-        return None, skipped
-    table = network_table(found, models, averaging)
-    return _Found(table.as_dict(), table.text(), partial(write_table, table=table)), skipped
 
 
 def _groups(

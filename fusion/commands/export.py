@@ -6,7 +6,6 @@ from pathlib import Path
 
 import typer
 
-from stario.fusion.commands import options
 from stario.sequences.errors import InputError
 
 
@@ -15,7 +14,9 @@ def export(
         "default",
         help="Network: a name from `stario check models`, default, or weights with their card.",
     ),
-    runs: options.Runs = Path("runs"),
+    runs: Path = typer.Option(
+        Path("runs"), help="Folder of training runs in which named networks are found."
+    ),
     out: Path | None = typer.Option(None, help="File to write. Default: ./NETWORK.onnx"),
 ) -> None:
     """Export a network with its calibration as ONNX; `--model FILE.onnx` then runs it anywhere."""

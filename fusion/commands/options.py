@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import partial, wraps
 from pathlib import Path
@@ -29,9 +29,6 @@ flag = partial(typer.Option, metavar="")
 _PATHS = typer.Argument(metavar="PATH...", help="Recordings, folders or list files.")
 Paths = Annotated[list[Path], _PATHS]
 OptionalPaths = Annotated[list[Path] | None, _PATHS]
-Runs = Annotated[
-    Path, typer.Option(help="Folder of training runs in which named networks are found.")
-]
 Cache = Annotated[
     Path | None,
     typer.Option(help="Folder for cached windows. Default: STARIO_CACHE or ~/.cache/stario."),
@@ -299,8 +296,8 @@ def _numbers_in(option: str, text: str) -> tuple[float, ...]:
         raise InputError(option, repr(text), expected) from None
 
 
-READING = tuple(field.name for field in fields(Reading))
-"""Names of all options of reading, to refuse them where nothing is read."""
+READING, ESTIMATING = (tuple(f.name for f in fields(group)) for group in (Reading, Estimator))
+"""Names of all options of both groups, to refuse them where they would do nothing."""
 
 
 def refuse(context: typer.Context, found: str, expected: str, *names: str) -> None:
@@ -317,55 +314,31 @@ def refuse(context: typer.Context, found: str, expected: str, *names: str) -> No
             raise InputError((spelled or option.opts)[0], f"use {found}", expected)
 
 
-def refuse_unused_sources(
-    context: typer.Context, paths: list[Path] | None, data: Path | None
-) -> None:
-    """Refuse options of recordings that are not read: from PATH, or from a split of --data."""
-    if paths:
-        refuse(context, "with PATH", "one of the two", "data")
-    if data is None:
-        refuse(context, "without --data", "use with --data", "split")
-    else:
-        refuse(context, "with --data", "use with PATH: name the archive", "where")
-
-
 def expanded(command: Callable[..., None]) -> Callable[..., None]:
-    """Expand a command's parameters of an option group into its options, defined only once.
-
-    Groups are data classes, such as `Reading`; their fields may be groups, too.
-    """
-    options = [o.replace(kind=inspect.Parameter.KEYWORD_ONLY) for o in _options_of(command)]
+    """Put the options of groups, data classes such as `Reading`, in place of a command's groups."""
+    parameters = _parameters(command)
+    groups: dict[str, Any] = {
+        p.name: p.annotation for p in parameters if is_dataclass(p.annotation)
+    }
+    options = [
+        option.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        for parameter in parameters
+        for option in (_parameters(groups.get(parameter.name)) or [parameter])
+    ]
 
     @wraps(command)
     def flat(**values: Any) -> None:
-        command(**_grouped(command, values))
+        for name, group in groups.items():
+            values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
+        command(**values)
 
     flat.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     flat.__annotations__ = {option.name: option.annotation for option in options}
     return flat
 
 
-def _options_of(what: Callable[..., Any]) -> list[inspect.Parameter]:
-    """Return the parameters of a command or group, with the options of groups in their place."""
-    return [
-        option
-        for parameter, group in _parameters(what)
-        for option in (_options_of(group) if group else [parameter])
-    ]
-
-
-def _grouped(what: Callable[..., Any], values: Mapping[str, object]) -> dict[str, Any]:
-    """Return the arguments of a command or group from the values of its options."""
-    return {
-        parameter.name: group(**_grouped(group, values)) if group else values[parameter.name]
-        for parameter, group in _parameters(what)
-    }
-
-
-def _parameters(what: Callable[..., Any]) -> list[tuple[inspect.Parameter, Any]]:
-    """Return the parameters of a command or group, each with its group if it is one."""
-    parameters = inspect.signature(what, eval_str=True).parameters.values()
-    return [(p, p.annotation if is_dataclass(p.annotation) else None) for p in parameters]
+def _parameters(what: Callable[..., Any] | None) -> list[inspect.Parameter]:
+    return [*inspect.signature(what, eval_str=True).parameters.values()] if what else []
 
 
 def _attributes(words: Iterable[str]) -> dict[str, list[str]]:

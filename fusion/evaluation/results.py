@@ -45,14 +45,10 @@ RESULTS = {
     "metrics.json": ("config.json", "run.json"),
     "health.json": (*_FIGURES, *_TRACKS[:4], "track.rrd", "track.geojson", "track.gpx"),
     "dead_reckoning.npz": (*_FIGURES, *_TRACKS, "truth.tum"),
-    "networks.json": (
-        *("networks.csv", "ate_parameters.png", "distributions.png", "pde.png"),
-        "trajectories.png",
-    ),
     "groups.json": ("groups.csv", "recordings.csv", "groups.png"),
 }
 """Files of a run, by one that only such a run writes: of every `run`, `compare` and `evaluate`; of
-`run`; of a recording in `compare` and `evaluate`; of `evaluate --models`; of `evaluate --by`.
+`run`; of a recording in `compare` and `evaluate`; of `evaluate --by`.
 
 Those of `inspect` are not here: they describe the recording, and it writes all of them anew."""
 

@@ -62,6 +62,15 @@ def parts(
     return [*found, (whole, scores)] if whole and len(found) > 1 else found
 
 
+def by_track(scores: pd.DataFrame) -> list[tuple[tuple[str, str], pd.DataFrame]]:
+    """Return the tracks of each of `parts`, named by both."""
+    return [
+        ((group, str(track)), part)
+        for group, found in parts(scores)
+        for track, part in found.groupby("track", sort=False)
+    ]
+
+
 def values(scores: pd.DataFrame, metric: str, **where: str) -> FloatArray:
     """Return the known values (n,) of a metric, of the rows with these labels."""
     chosen = scores["metric"] == metric

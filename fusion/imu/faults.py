@@ -16,8 +16,8 @@ zeros of an accelerometer are no measurement at all, not even of a free fall, wh
 
 Outliers: spikes are replaced (`sequences.clean_samples`). Saturation shows as values of a moving
 axis that repeat exactly and more than once at the largest magnitude measured so far; two that are
-equal by chance, at a magnitude soon exceeded, do not count. What the sensor missed is unknown, so these are
-only flagged. A phone that falls 1 m stops within 10 to 20 ms at 30 to 60 g, of which its
+equal by chance, at a magnitude soon exceeded, do not count. What the sensor missed is unknown, so
+these are only flagged. A phone that falls 1 m stops within 10 to 20 ms at 30 to 60 g, of which its
 accelerometer measures 8 or 16: the force that it misses is of its limit's size. What recurs, as in
 a runner's pocket with a limit of 2 g, the filter learns from its innovations; what happens once
 must be said at once.

@@ -18,13 +18,13 @@ from itertools import product
 from pathlib import Path
 from time import process_time
 
+from stario.fusion.evaluation.compare import TRACK_TITLES
 from stario.fusion.evaluation.displacement_error import (
     block_sums,
     known_truth,
     recording_errors,
     usable_streams,
 )
-from stario.fusion.evaluation.networks import MAX_DRAWN, OWN_ATTITUDE, metrics_of, protocol_figures
 from stario.fusion.evaluation.pedestrian import NAME as PDR
 from stario.fusion.evaluation.pedestrian import (
     Model,
@@ -33,7 +33,9 @@ from stario.fusion.evaluation.pedestrian import (
     pedestrian_track,
     piece_of,
 )
-from stario.fusion.evaluation.tracks import true_poses
+from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude, true_poses
+from stario.fusion.imu.stateful import Predictor
+from stario.fusion.navigator import Navigator
 from stario.fusion.paper_table.sets import ALL, FIRST, DataSet
 from stario.fusion.paper_table.training import (
     TEMPORARY_FILES,
@@ -43,25 +45,29 @@ from stario.fusion.paper_table.training import (
     run_recipe,
     train_run,
 )
-from stario.fusion.values.config import NavigatorConfig
 from stario.network.architectures import ARCHITECTURES, architecture
 from stario.network.model import load_model
 from stario.network.training.config import TrainingConfig
-from stario.sequences.accuracy.metrics import Convention
+from stario.sequences.accuracy.metrics import PoseErrors, align, evaluate_track, pose_errors
 from stario.sequences.arrays import check_choice
 from stario.sequences.datasets.batch import Skipped, each, without_skipped
 from stario.sequences.datasets.splits import ListEntry
 from stario.sequences.errors import ConfigError, InputError, ReadError
 from stario.sequences.files import write_json
 from stario.sequences.lazy import optional_package
-from stario.sequences.sequence import FloatArray, ImuSequence
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.truth.problems import warn_of_truth
 
 LEADING = ("StarIO", "R-ResNet", "DeepILS", "StarIO without MSGCU")
 """Networks that are completed first, and with several seeds."""
 
-CONVENTION: Convention = "ronin"
-"""How errors are averaged: as in the paper."""
+TRUE_ATTITUDE, OWN_ATTITUDE, FILTERED = "network_true_attitude", "network", "filtered"
+
+PROTOCOLS = {name: TRACK_TITLES[name] for name in (TRUE_ATTITUDE, OWN_ATTITUDE, FILTERED)}
+"""Tracks of a network and their titles; the first is that of the papers' protocol."""
+
+MAX_DRAWN = 4
+"""Number of recordings whose tracks are kept for a figure."""
 
 
 @dataclass(frozen=True)
@@ -206,13 +212,35 @@ def _recording(
         return row, {}
     if isinstance(model, PedestrianDeadReckoning):
         track = pedestrian_track(sequence).trajectory
-        row["tracks"] = {OWN_ATTITUDE: metrics_of(track, true_poses(sequence), CONVENTION)}
+        row["tracks"] = {OWN_ATTITUDE: _errors_of(track, true_poses(sequence))}
         return row, {}
-    row["tracks"], errors = protocol_figures(model, sequence, NavigatorConfig(), CONVENTION)
+    row["tracks"], errors = _protocol_errors(model, sequence)
     time, squares = errors.estimate.time, (errors.position_W[:, :2] ** 2).sum(axis=1)
     blocks["ate"] = block_sums(time - time[0], squares).tolist()
     xy = {"track": errors.estimate.position_W[:, :2], "truth": errors.truth.position_W[:, :2]}
     return row, {"time": time, **xy}
+
+
+def _protocol_errors(
+    model: Predictor, sequence: ImuSequence
+) -> tuple[dict[str, dict[str, float]], PoseErrors]:
+    """Return the errors of the tracks of `PROTOCOLS`, and those of the poses of the first."""
+    truth = true_poses(sequence)
+    navigator = Navigator(model, backend="ekf")
+    preprocessed = navigator.observe(sequence)
+    tracks = {
+        TRUE_ATTITUDE: network_track_true_attitude(model, sequence, navigator.config).trajectory,
+        OWN_ATTITUDE: network_track(preprocessed).trajectory,
+        FILTERED: navigator.track(preprocessed).trajectory,
+    }
+    figures = {name: _errors_of(track, truth) for name, track in tracks.items()}
+    return figures, pose_errors(align(tracks[TRUE_ATTITUDE], truth, "first"), truth)
+
+
+def _errors_of(track: Trajectory, truth: Trajectory) -> dict[str, float]:
+    """Return the errors of a track, averaged as in the paper."""
+    result = evaluate_track(track, truth, convention="ronin")
+    return {"ate_m": result.ate_m, "rte_m": result.rte_m, "pde": result.pde}
 
 
 def _model(run: Run, folder: Path) -> Model:

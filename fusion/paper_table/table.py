@@ -10,30 +10,19 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.bootstrap import Interval, block_rows, ranks
-from stario.fusion.evaluation.figures import write_table
-from stario.fusion.evaluation.networks import (
-    FILTERED,
-    METRICS,
-    OWN_ATTITUDE,
-    PROTOCOLS,
-    TRUE_ATTITUDE,
-    NetworkTable,
-    Sample,
-)
 from stario.fusion.evaluation.pedestrian import NAME as PDR
 from stario.fusion.evaluation.scores import Spread, joined, scored
-from stario.fusion.paper_table.runs import CONVENTION, Run, read_run
+from stario.fusion.paper_table.figures import Sample, write_figures
+from stario.fusion.paper_table.runs import FILTERED, OWN_ATTITUDE, TRUE_ATTITUDE, Run, read_run
 from stario.fusion.paper_table.sets import DataSet, published, set_of
 from stario.network.architectures import ARCHITECTURES
-from stario.network.runtime.survey import BATCHES, ModelRow, survey, table_counts
+from stario.network.runtime.survey import BATCHES, ModelRow, survey
 from stario.network.training.config import TrainingConfig
 from stario.sequences.accuracy.metrics import CONVENTIONS
 from stario.sequences.drawing.text_table import figure, markdown
 from stario.sequences.files import atomic_write, write_json, write_rows
-from stario.sequences.sequence import Trajectory
 
 REFERENCE_NETWORK = "StarIO"
 """Reference network that the others' errors are compared with."""
@@ -264,31 +253,27 @@ def write_results(
     ]
     write_rows(out / "table.csv", means)
     for name, table in tables.items() if drawn else ():
-        if (found := _for_figures(table, completed[name])) is not None:
-            write_table(out / name / "figures", found)
+        scores = table.scores
+        known = set(scores.loc[scores["track"] == TRUE_ATTITUDE, "network"])
+        parameters = {row.name: row.parameters for row in costs if row.name in known}
+        if parameters:
+            samples = _samples(completed[name])
+            write_figures(out / name / "figures", scores, parameters, samples)
     return text
 
 
-def _for_figures(table: SetTable, completed: Completed) -> NetworkTable | None:
-    """Return the networks' errors on recordings with poses, for the figures; None without any."""
-    scores = table.scores
-    names = [name for name in table.rows["network"] if name in ARCHITECTURES]
-    parameters = {name: table_counts(name)[0] for name in names}
-    chosen = scores["network"].isin(parameters) & scores["track"].isin(PROTOCOLS)
-    chosen &= scores["metric"].isin(METRICS)
-    if not chosen.any():
-        return None
-    found = scores[chosen].rename(columns={"seed": "weights"})
-    found["weights"] = "seed " + found["weights"].astype(str)
+def _samples(completed: Completed) -> list[Sample]:
+    """Return the tracks to draw, of networks trained with the first seed."""
     samples: dict[str, Sample] = {}
-    firsts = {c["network"]: c["recordings"] for c in completed if c["seed"] == 0}
-    for network, one in ((name, one) for name in names for one in firsts.get(name, ())):
-        if drawn := one.get("drawn"):
-            truth = np.pad(np.array(drawn["truth"]), ((0, 0), (0, 1)))
-            path = Trajectory(np.array(drawn["time"]), truth, Rotation.identity(len(truth)))
-            sample = samples.setdefault(one["recording"], Sample(one["recording"], path, {}))
-            sample.tracks[network] = np.array(drawn["track"])
-    return NetworkTable(CONVENTION, parameters, found, list(samples.values()))
+    for content in completed:
+        chosen = content["network"] in ARCHITECTURES and content["seed"] == 0
+        for one in content["recordings"] if chosen else ():
+            if drawn := one.get("drawn"):
+                time, truth, track = (np.array(drawn[key]) for key in ("time", "truth", "track"))
+                new = Sample(one["recording"], time, truth, {})
+                sample = samples.setdefault(one["recording"], new)
+                sample.tracks[content["network"]] = track
+    return list(samples.values())
 
 
 def table_text(

@@ -11,7 +11,7 @@ import torch
 
 import stario.network
 from stario.network.card import MAX_SIGMA, Calibration, card_path
-from stario.network.model import load_model
+from stario.network.model import load_model, weights_named
 from stario.network.stario import moments, rms_normalised
 from stario.sequences.errors import InputError, StarioError, WeightsError
 
@@ -180,3 +180,13 @@ def test_normalised_windows_have_unit_mean_square_at_any_scale():
     x = torch.randn(3, 8, 50) * torch.tensor([0.1, 1.0, 1e4]).view(3, 1, 1)
     square = rms_normalised(x).square().mean(dim=(1, 2))
     torch.testing.assert_close(square, torch.ones(3), rtol=2e-3, atol=0.0)
+
+
+def test_weights_are_found_by_network_name_in_the_runs_folder(tmp_path):
+    assert weights_named("StarIO", tmp_path) == "default"
+    assert weights_named("some/file.onnx", tmp_path) == "some/file.onnx"
+    with pytest.raises(WeightsError, match=r"stario train --model 'RNIN'"):
+        weights_named("RNIN", tmp_path)
+    (tmp_path / "RNIN").mkdir()
+    (tmp_path / "RNIN" / "model.safetensors").touch()
+    assert weights_named("RNIN", tmp_path) == tmp_path / "RNIN" / "model.safetensors"

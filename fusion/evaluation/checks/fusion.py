@@ -1,8 +1,10 @@
 """The fusion on recordings, by group: beside its network, with fixes, samples missing, heights.
 
-- Benefit: errors of the filtered and the smoothed track relative to the network's, whose
-  displacements are chained along the attitude levelled from the IMU. They are horizontal, root mean
-  square after a fit of yaw and position: over all poses, or at the waypoints.
+- Benefit: errors of the filtered and the smoothed track, and of a stream's fixed-lag graph,
+  relative to the network's, whose displacements are chained along the attitude levelled from the
+  IMU. They are horizontal, root mean square after a fit of yaw and position: over all poses, or at
+  the waypoints. Simulated walks, measured with white noise of known size, show the estimators
+  alone.
 - Fixes: true positions at equal intervals with white errors; is the error as large as reported?
   Only the second half of each track counts: by then several fixes have determined the direction.
 - Missing samples: a short gap at each of several instants, and samples dropped at random. Results
@@ -13,20 +15,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import get_args
+from time import process_time
 
 import numpy as np
 import pandas as pd
 
 from stario.fusion.backends import BackendName
-from stario.fusion.evaluation.checks.faults import drops, gap
+from stario.fusion.evaluation.checks.faults import (
+    DummyPredictor,
+    drops,
+    gap,
+    matched_config,
+    with_true_displacements,
+)
 from stario.fusion.evaluation.compare import TRACK_OF, Metrics, measure
 from stario.fusion.evaluation.displacement_error import known_truth
 from stario.fusion.evaluation.known_positions import MIN_POSITIONS, position_error, true_path
 from stario.fusion.evaluation.scores import (
     Column,
+    by_track,
     geometric_mean,
     median_degrees,
     parts,
@@ -35,18 +44,28 @@ from stario.fusion.evaluation.scores import (
     table,
 )
 from stario.fusion.evaluation.tracks import network_track, true_poses
+from stario.fusion.filter import estimator
+from stario.fusion.filter.record import innovations_of
+from stario.fusion.graph.fixed_lag import FixedLag
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
+from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.fixes import Fix, position_fix
 from stario.fusion.values.floors import floor_at
 from stario.fusion.values.lie import yaw_twist
-from stario.fusion.values.state import Track
+from stario.fusion.values.state import Track, track_from_states
 from stario.sequences.accuracy.metrics import pose_errors
 from stario.sequences.accuracy.nees import nees
 from stario.sequences.arrays import even_grid
 from stario.sequences.errors import InputError
+from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Trajectory
+from stario.sequences.simulation.imu import PHONE_IMU, ImuErrors, simulate_imu
+from stario.sequences.simulation.walks import generate_walk
+
+DISPLACEMENT_NOISE = 0.03
+"""White noise of the displacements of simulated walks, per axis [m]."""
 
 SIGMA_BOUND = 3.0
 """Maximum yaw error of a consistent track, in standard deviations."""
@@ -71,12 +90,14 @@ def fusion_gain(
     model: Predictor,
     sequence: ImuSequence,
     config: NavigatorConfig,
-    backends: Sequence[BackendName] = get_args(BackendName),
+    graph: bool = False,
 ) -> pd.DataFrame:
-    """Score the network alone and the back ends: `error_m`, its `ratio` to the network's, NIS.
+    """Score the network alone and the filter: `error_m`, its `ratio` to the network's, NIS.
 
     The error is also given in percent of the true path (of the legs between waypoints; not where
-    positions are known whose noise adds up).
+    positions are known whose noise adds up), and the processor time without the network
+    (`s_per_min` of data). With `graph` also the graph of the recording, `track`, and the newest
+    states of a stream's, `fixed_lag`, with its `slowest_ms`.
 
     With true poses also the NEES of position, and at the end of the truth the yaw error relative to
     its start [rad], the yaw's reported standard deviation [rad], and whether the error is good and
@@ -85,28 +106,87 @@ def fusion_gain(
     Raises:
         InputError: it has no ground truth or too few known positions, or cannot be run.
     """
-    truth, (kind, _) = sequence.truth, known_truth(sequence)
+    known_truth(sequence)  # before anything slow
+    return _gains(Navigator(model, config).observe(sequence), sequence, config, graph)
+
+
+def simulated_gain(seed: int, seconds: float, graph: bool = False) -> pd.DataFrame:
+    """Score a simulated walk, measured once a second by its displacements with white noise.
+
+    The sensor has the white noise of `ImuNoise` and a phone's biases, no other errors; the
+    estimators are given the exact standard deviations. Person and carry are drawn at random.
+    """
+    errors = ImuErrors(
+        noise=ImuNoise(),
+        gyro_turn_on=PHONE_IMU.gyro_turn_on,
+        accel_turn_on=PHONE_IMU.accel_turn_on,
+    )
+    config = matched_config(errors)
+    config = replace(config, filter=replace(config.filter, update_rate=1))
+    walk = generate_walk(seed, seconds)
+    sequence = simulate_imu(walk, 200.0, errors, seed, name=f"walk {seed}")
+    preprocessed = Navigator(DummyPredictor(), config).observe(sequence)
+    preprocessed = with_true_displacements(preprocessed, walk, config, seed, DISPLACEMENT_NOISE)
+    return _gains(preprocessed, sequence, config, graph).assign(group="simulated")
+
+
+def _gains(
+    preprocessed: PreprocessedRecording, sequence: ImuSequence, config: NavigatorConfig, graph: bool
+) -> pd.DataFrame:
+    kind, _ = known_truth(sequence)
     path = 0.0 if kind == "positions" else true_path(sequence)
-    preprocessed = Navigator(model, config).observe(sequence)
     alone = fitted_error(measure(network_track(preprocessed), sequence))
     if math.isnan(alone):
         found = f"fewer than {MIN_POSITIONS} within the track"
         raise InputError(f"{sequence.name}: positions", found, f"{MIN_POSITIONS} or more")
     figures: dict[str, Metrics] = {"network": {"error_m": alone}}
+    backends: tuple[BackendName, ...] = ("ekf", "graph") if graph else ("ekf",)
     for name in backends:
-        track = Navigator(model, config, backend=name).track(preprocessed)
-        measured = measure(track, sequence)
-        error = fitted_error(measured)
-        figures[TRACK_OF[name]] = {
-            "error_m": error,
-            "percent": 100.0 * error / path if path else None,
-            "ratio": error / alone,
-            "nis": measured["nis_mean"],
-        }
-        if truth is not None:
-            yaw = _yaw_at_the_end(track, truth)
-            figures[TRACK_OF[name]] |= {"nees": measured["nees_median"], **yaw}
+        began = process_time()
+        track = Navigator(DummyPredictor(), config, backend=name).track(preprocessed)
+        seconds = process_time() - began
+        figures[TRACK_OF[name]] = _gain(track, sequence, path, alone, seconds)
+    if graph:
+        track, times = _streamed(preprocessed, config)
+        stream = _gain(track, sequence, path, alone, float(times.sum()))
+        figures["fixed_lag"] = {**stream, "slowest_ms": 1e3 * float(times.max())}
     return scored(sequence.name, figures)
+
+
+def _gain(
+    track: Track, sequence: ImuSequence, path: float, alone: float, seconds: float
+) -> Metrics:
+    measured = measure(track, sequence)
+    error = fitted_error(measured)
+    yaw = {} if sequence.truth is None else _yaw_at_the_end(track, sequence.truth)
+    return {
+        "error_m": error,
+        "percent": 100.0 * error / path if path else None,
+        "ratio": error / alone,
+        "nis": measured["nis_mean"],
+        "nees": measured["nees_median"],
+        "s_per_min": 60.0 * seconds / float(track.time[-1] - track.time[0]),
+        **yaw,
+    }
+
+
+def _streamed(
+    preprocessed: PreprocessedRecording, config: NavigatorConfig
+) -> tuple[Track, FloatArray]:
+    """Return the newest states of the fixed-lag graph, and the processor time of each step [s]."""
+    filtered = estimator.begin(config, preprocessed.start, streaming=True)
+    graph = FixedLag(filtered, config)
+    states, times = [graph.nav_state(filtered)], []
+    pairs = zip(preprocessed.intervals, preprocessed.measurements, strict=True)
+    for interval, measurement in pairs:
+        began = process_time()
+        filtered, record = estimator.step(filtered, interval, measurement, (), config)
+        graph.step(filtered, record)
+        states.append(graph.nav_state(filtered))
+        times.append(process_time() - began)
+    health = filtered.health(preprocessed.counts, config.filter, states[-1])
+    track = replace(track_from_states(states), innovations=innovations_of([]), health=health)
+    return track, np.array(times)
 
 
 def fitted_error(figures: Metrics) -> float:
@@ -136,35 +216,43 @@ def _percentile_95(ratios: FloatArray) -> float:
 
 
 def fusion_gain_table(scores: pd.DataFrame) -> str:
-    """Return a row for each group: ratios to the network, NIS, and yaw error at the end."""
-    tracks = [name for name in scores["track"].unique() if name != "network"]
-    network, first = {"track": "network"}, {"track": tracks[0]}
-    columns = [
-        Column("n", "error_m", ".0f", len, network),
-        Column("network", "error_m", where=network),
-    ]
-    for name in tracks:
-        where = {"track": name}
-        columns += [
-            Column(f"{name} mean", "ratio", ".2f", geometric_mean, where),
-            Column("p95", "ratio", ".2f", _percentile_95, where),
-            Column("worst", "ratio", ".2f", np.max, where),
-            Column("% of path", "percent", ".1f", np.median, where),
-        ]
-    columns += [
-        Column("NIS", "nis", ".1f", np.mean, first),
-        Column("NEES", "nees", ".1f", np.median, first),
-        Column("yaw deg", "yaw_error", ".1f", median_degrees, first),
-        Column("< 10 deg", "yaw_good", ".0%", np.mean, first),
-        Column("< 3 sigma", "yaw_covered", ".0%", np.mean, first),
-    ]
-    notes = (
-        "network: median error [m]; ratios to it: geometric mean, 95th percentile, worst",
-        "% of path: error over the length of the true path, median",
+    """Return a row for each group and track: ratios to the network, NIS, NEES, yaw at the end.
+
+    Below are ratios of the other tracks' errors to the filter's: geometric means with their
+    standard errors, without which two similar estimators seem to differ.
+    """
+    columns = (
+        Column("n", "error_m", ".0f", len),
+        Column("error m", "error_m"),
+        Column("% of path", "percent", ".1f"),
+        Column("ratio", "ratio", over=geometric_mean),
+        Column("p95", "ratio", over=_percentile_95),
+        Column("worst", "ratio", over=np.max),
+        Column("NIS", "nis", ".1f", np.mean),
+        Column("NEES", "nees", ".1f"),
+        Column("yaw deg", "yaw_error", ".1f", median_degrees),
+        Column("< 10 deg", "yaw_good", ".0%", np.mean),
+        Column("< 3 sigma", "yaw_covered", ".0%", np.mean),
+        Column("s/min", "s_per_min"),
+        Column("slowest ms", "slowest_ms", ".1f", np.max),
+    )
+    notes = [
+        "error: median, after a fit of yaw and position; ratio to the network's error: geometric "
+        "mean, 95th percentile, worst",
         "NIS: mean, 3 expected; NEES of position: median, 2.4 expected; yaw: error at the end "
         "relative to the start",
-    )
-    return table(parts(scores), columns, notes=notes)
+        "s/min: processor time without the network per minute of data; slowest: update of a stream",
+        *_to_filtered(scores[scores["metric"] == "error_m"]),
+    ]
+    return table(by_track(scores), columns, ("group", "track"), notes)
+
+
+def _to_filtered(errors: pd.DataFrame) -> Iterator[str]:
+    by_name = errors.pivot_table("value", ["group", "recording"], "track", sort=False)
+    for name in by_name.columns.difference(["network", "filtered"], sort=False):
+        logs = np.log(by_name[name] / by_name["filtered"])
+        ratio = math.exp(logs.mean())
+        yield f"{name} / filtered: {ratio:.2f} +- {ratio * logs.sem():.2f} (geometric mean)"
 
 
 def track_with_fixes(
@@ -356,9 +444,4 @@ def heights_table(scores: pd.DataFrame) -> str:
         f"at waypoints, relative to the first, {FLOOR_METRES:g} m a floor (the truth, if there is "
         "one); NEES: 0.45 expected (median)"
     )
-    rows = [
-        ((group, track), part)
-        for group, found in parts(scores)
-        for track, part in parts(found, by="track", whole=None)
-    ]
-    return table(rows, columns, ("group", "track"), notes=[note])
+    return table(by_track(scores), columns, ("group", "track"), notes=[note])

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from stario.fusion.backends import BackendName
 from stario.fusion.evaluation.compare import TRACK_OF
 from stario.fusion.evaluation.displacement_error import fit_yaw_and_position, known_truth, planar
-from stario.fusion.evaluation.scores import Column, geometric_mean, joined, parts, scored, table
+from stario.fusion.evaluation.scores import Column, by_track, geometric_mean, joined, scored, table
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.direction import Complex
 from stario.fusion.imu.stateful import Predictor
@@ -105,11 +105,6 @@ def moment_costs(
 
 def moment_table(scores: pd.DataFrame) -> str:
     """Return a row for each moment, place and track: ratios of errors, largest corrections."""
-    rows = [
-        ((group, str(track)), part)
-        for track, chosen in scores.groupby("track", sort=False)
-        for group, part in parts(chosen)
-    ]
     step, turn = (Column("", f"{m}_without", over=np.max).value(scores) for m in ("step", "turn"))
     notes = [
         "without: median error [m] of the parts before and after, each fitted in yaw and position;",
@@ -118,7 +113,7 @@ def moment_table(scores: pd.DataFrame) -> str:
         f"step, turn: largest correction between two outputs (without moments {step:.2f} m, "
         f"{turn:.1f} deg); share with at most {MAX_STEP:g} m and {MAX_TURN:g} deg",
     ]
-    return table(rows, _COLUMNS, ("moment", "track"), notes)
+    return table(by_track(scores), _COLUMNS, ("moment", "track"), notes)
 
 
 def _with_truth(sequence: ImuSequence) -> ImuSequence:

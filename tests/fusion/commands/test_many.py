@@ -212,12 +212,12 @@ def test_run_writes_the_filters_track_on_request(stario, recording, tmp_path):
     np.testing.assert_array_equal(*times)
 
 
-def test_backends_compares_filter_and_graph(stario):
-    done = stario("check", "backends", "--walks", "1", "--seconds", "10", "--json")
+def test_check_fusion_compares_filter_and_graphs_on_simulated_walks(stario):
+    done = stario("check", "fusion", "--walks", "1", "--seconds", "10", "--graph", "--json")
     assert done.code == 0
-    content = json.loads(done.out)
-    assert set(content["summary"]["median_ate_m"]) == {"filtered", "track", "fixed_lag"}
-    assert content["scores"][0]["recording"] == "walk 0"
+    scores = json.loads(done.out)
+    assert [one["track"] for one in scores] == ["network", "filtered", "track", "fixed_lag"]
+    assert {(one["recording"], one["group"]) for one in scores} == {("walk 0", "simulated")}
 
 
 def test_set_in_the_name_of_weights_is_the_first_word_of_a_group(monkeypatch):

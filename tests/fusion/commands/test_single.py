@@ -31,7 +31,7 @@ COMMANDS = (
     *("run", "live", "compare", "evaluate", "inspect"),
     *("convert", "train", "simulate", "export"),
 )
-CHECKS = ("models", "backends", "faults", "consistency", "benchmark")
+CHECKS = ("models", "fusion", "faults", "consistency", "benchmark")
 
 
 # --- help and usage ----------------------------------------------------------------------------

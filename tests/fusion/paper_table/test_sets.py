@@ -10,6 +10,7 @@ import pytest
 from recorded import DATA
 
 from stario.fusion.paper_table import sets, training
+from stario.fusion.paper_table.figures import pde_boxes
 from stario.fusion.paper_table.sets import ALL, FIRST, DataSet, development_sets, published
 from stario.fusion.paper_table.table import COLUMNS, set_table, table_text, work_of
 from stario.fusion.paper_table.training import ReaderConfig, run_recipe, train_run
@@ -129,6 +130,13 @@ def test_errors_are_means_over_recordings_in_their_units():
     assert rows["pde"].item() == pytest.approx(3.0)  # in %, where it is known
     known = [key for key in COLUMNS if rows[key].notna().any()]
     assert known == ["ate", "rte", "pde"]
+
+
+def test_no_panel_of_the_drift_cuts_its_boxes():
+    table = set_table(DATASET, [content(1.5), content(2.5, "R-ResNet")], {})
+    for axes in pde_boxes(table.scores, {"StarIO": "red", "R-ResNet": "blue"}).axes:
+        assert axes.get_ylim()[0] == 0.0
+        assert axes.dataLim.y1 <= axes.get_ylim()[1]
 
 
 def test_recordings_that_weights_have_learned_are_counted_among_the_tested_ones():

@@ -1,18 +1,21 @@
 """Checks of recordings by group: fusion and network, fixes, missing samples."""
 
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 import pandas as pd
 import pytest
 from support import CONFIG
 
+from stario.fusion.evaluation.checks import fusion
 from stario.fusion.evaluation.checks.fusion import (
     end_shift_table,
     end_shifts,
     fixes_table,
     fusion_gain,
     fusion_gain_table,
+    simulated_gain,
     track_with_fixes,
     true_fixes,
 )
@@ -44,21 +47,40 @@ def test_ratios_are_geometric_means_by_group():
         row("b", "x", 2.0, 1.0, nis=3.0, nees=5.0, yaw_error=-0.9, yaw_good=0.0),
         row("c", "y", 0.5, 2.0, nis=1.0),
     ]
-    _, x, y, pooled, *_ = fusion_gain_table(joined(rows)).splitlines()
-    assert x.split()[:4] == ["x", "2", "1.00", "1.00"]
-    assert x.split()[4:6] == ["1.87", "2.00"]  # 95th percentile on a logarithmic scale, and worst
-    assert x.split()[-5:-1] == ["3.0", "3.0", "26.1", "50%"]
-    assert y.split()[3] == "0.50"
-    assert pooled.split()[:2] == ["all", "3"]
+    _, alone, x, _, y, pooled, *_ = map(str.split, fusion_gain_table(joined(rows)).splitlines())
+    assert alone[:4] == ["x", "network", "2", "1.00"]
+    assert x[:2] == ["x", "filtered"]
+    assert x[5:8] == ["1.00", "1.87", "2.00"]  # 95th percentile on a logarithmic scale, and worst
+    assert x[8:12] == ["3.0", "3.0", "26.1", "50%"]
+    assert y[5] == "0.50"
+    assert pooled[:3] == ["all", "network", "3"]
+
+
+def test_ratios_of_two_tracks_are_geometric_means_with_their_standard_error():
+    ratios = (0.5, 0.8, 1.0, 1.25, 2.0)
+    figures = ({"filtered": {"error_m": 3.0}, "track": {"error_m": 3.0 * r}} for r in ratios)
+    scores = [scored(f"walk {k}", {"network": {}, **found}) for k, found in enumerate(figures)]
+    expected = np.std(np.log(ratios), ddof=1) / np.sqrt(5)
+    assert f"track / filtered: 1.00 +- {expected:.2f}" in fusion_gain_table(joined(scores))
+
+
+def test_time_is_per_minute_of_data(monkeypatch):
+    """With a clock that advances by a second on every reading."""
+    clock = count()
+    monkeypatch.setattr(fusion, "process_time", lambda: float(next(clock)))
+    found = simulated_gain(0, 10.0, graph=True)
+    for name in ("filtered", "track"):
+        assert values(found, "s_per_min", track=name) == pytest.approx([60.0 / 10.0])
+    assert values(found, "slowest_ms") == [1e3]
 
 
 def test_the_error_of_the_fusion_at_waypoints_agrees_with_its_error_at_poses(walk, make_oracle):
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
-    poses = fusion_gain(oracle, walk, CONFIG, ("ekf",))
+    poses = fusion_gain(oracle, walk, CONFIG)
     every = slice(None, None, 500)
     at = walk.truth.time[every], walk.truth.position_W[every, :2]
     at_waypoints = replace(walk, truth=None, positions=PositionTrack(*at, "waypoints"))
-    waypoints = fusion_gain(oracle, at_waypoints, CONFIG, ("ekf",))
+    waypoints = fusion_gain(oracle, at_waypoints, CONFIG)
     assert of(poses, "error_m") < 0.5
     assert of(waypoints, "error_m") == pytest.approx(of(poses, "error_m"), abs=0.2)
     path = walk.truth.path_length()
@@ -75,14 +97,14 @@ def test_the_yaw_error_is_that_since_the_start_next_to_the_sigma_of_yaw(walk, ma
         truth, position_W=turn.apply(truth.position_W), attitude_WB=turn * truth.attitude_WB
     )
     found, rotated = (
-        fusion_gain(oracle, replace(walk, truth=each), CONFIG, ("ekf",)) for each in (truth, other)
+        fusion_gain(oracle, replace(walk, truth=each), CONFIG) for each in (truth, other)
     )
     assert of(rotated, "yaw_error") == pytest.approx(of(found, "yaw_error"), abs=1e-9)
     assert abs(of(found, "yaw_error")) < 0.1
     track = Navigator(oracle, CONFIG, backend="ekf").run(walk)
     assert of(found, "yaw_sigma") == pytest.approx(np.sqrt(track.covariance[-1, 2, 2]))
     half = truth.slice(truth.time[0], 0.5 * truth.time[-1])
-    shorter = fusion_gain(oracle, replace(walk, truth=half), CONFIG, ("ekf",))
+    shorter = fusion_gain(oracle, replace(walk, truth=half), CONFIG)
     at_its_end = np.flatnonzero(track.time <= half.time[-1])[-1]
     assert of(shorter, "yaw_sigma") == pytest.approx(np.sqrt(track.covariance[at_its_end, 2, 2]))
 
