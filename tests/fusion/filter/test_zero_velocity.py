@@ -65,8 +65,8 @@ def test_a_moving_device_is_not_at_rest(make_walk, carry):
 
 
 def test_rest_needs_a_whole_second_and_a_gap_ends_it():
-    intervals, _ = cut_recording(lying(6.0), CONFIG)
-    intervals[30] = replace(intervals[30], gap=True)
+    intervals, front_end = cut_recording(lying(6.0), CONFIG)
+    intervals[30] = replace(intervals[30], levelled=front_end.start)
     found = at_rest(intervals)
     assert not any(found[:9])
     assert all(found[9:30])
