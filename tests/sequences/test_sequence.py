@@ -187,6 +187,14 @@ def test_slicing_a_sequence_also_slices_its_truth():
     assert part.duration == 0.5
 
 
+def test_a_slice_outside_the_truth_has_none():
+    zeros = np.zeros((len(GRID), 3))
+    truth = screw(GRID).slice(0.0, 0.2)
+    assert ImuSequence("cut", GRID, zeros, zeros, truth).slice(0.5, 1.0).truth is None
+    with pytest.raises(InputError, match="at least one sample"):
+        truth.slice(0.5, 1.0)
+
+
 def test_rotating_the_world_adds_to_the_yaw_at_any_tilt():
     attitudes = Rotation.random(200, rng=np.random.default_rng(1))
     for yaw in (-2.0, 0.3, 3.0):

@@ -8,6 +8,7 @@ from stario.fusion.filter.correlated_errors import displacement_errors
 from stario.fusion.filter.ekf import clone
 from stario.fusion.filter.ekf import initialised as filter_state
 from stario.fusion.filter.estimates import plain_covariances
+from stario.fusion.filter.initial import VELOCITY_SIGMA, with_velocity_bounded
 from stario.fusion.imu.preintegration import Segment, preintegrate
 from stario.fusion.values.config import FilterConfig
 from stario.fusion.values.state import NavState
@@ -295,3 +296,19 @@ def test_estimates_share_no_memory_with_the_filter(driven):
     for estimate in (driven.state.estimate(), driven.state.clone_estimate(2)):
         assert not np.shares_memory(estimate.covariances, driven.covariances)
         assert not np.shares_memory(estimate.X, driven.state.X)
+
+
+def test_a_pedestrians_velocity_is_told_only_where_less_is_known():
+    ekf, zero = Driven(2), np.zeros(3)
+    for sigma in (0.5, 10.0):
+        covariance = 0.01 * np.eye(15)
+        covariance[3:6, 3:6] = sigma**2 * np.eye(3)
+        v_W = np.array([5.0, 0.0, 0.0])
+        ekf.initialise(NavState(0.0, np.eye(3), v_W, zero, zero, zero, covariance))
+        given = ekf.state
+        bounded = with_velocity_bounded(given)
+        if sigma < VELOCITY_SIGMA:
+            assert bounded is given
+        else:
+            assert abs(bounded.v_W[0]) < 0.5
+            assert np.sqrt(bounded.P[3, 3]) < VELOCITY_SIGMA

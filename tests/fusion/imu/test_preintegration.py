@@ -224,7 +224,8 @@ def test_what_a_sensor_missed_at_its_limit_is_within_its_sigma(rate):
         segment = _standing(t, accel, flags)
         velocity = segment.predict(np.eye(3), *np.zeros((4, 3)))[1][2]
         assert abs(velocity - 6.0) > 4.0
-        assert abs(velocity - 6.0) < 3.0 * np.sqrt(segment.pim.preintMeasCov()[8, 8])
+        sigma = np.sqrt(segment.pim.preintMeasCov()[8, 8])
+        assert abs(velocity - 6.0) < 3.0 * sigma < 15.0
 
 
 def test_a_walking_force_is_as_certain_as_its_density():
