@@ -207,15 +207,18 @@ def is_loopback(host: str) -> bool:
 
 def _bound(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    # Only with the protocol named does asyncio switch off Nagle's delay of 40 ms.
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
-        listener = socket.create_server((host, port), family=family)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((host, port))
+        listener.listen()  # or another program could listen on the same port
     except OSError as error:
+        listener.close()
         if isinstance(error, socket.gaierror):
             raise InputError("--host", host, "an address of this computer, or 0.0.0.0") from error
         found = f"{host} {port}: {error.strerror or error}"
         raise InputError("port", found, "a free port of this computer", "--port N") from error
-    # Connections inherit it; asyncio would leave Nagle's delay of 40 ms on.
-    listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return listener
 
 

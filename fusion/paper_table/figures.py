@@ -98,7 +98,11 @@ def _distributions(scores: pd.DataFrame, colours: Mapping[str, str]) -> Figure:
     for axes, metric, title in zip(panels, ("ate_m", "rte_m"), ("ATE [m]", "RTE [m]"), strict=True):
         for k, (name, colour) in enumerate(colours.items()):
             error = values(scores, metric, network=name, track=TRUE_ATTITUDE)
-            axes.ecdf(np.append(0.0, error), ls=_STYLES[k % 3], color=colour, lw=1.6, label=name)
+            if not len(error):
+                continue
+            weights = np.append(0.0, np.ones(len(error)))  # the curve begins at 0
+            style = {"ls": _STYLES[k % 3], "color": colour, "lw": 1.6, "label": name}
+            axes.ecdf(np.append(0.0, error), weights, **style)
         axes.set(xlabel=title, ylim=(0.0, 1.02))
         axes.set_xlim(left=0.0)
         apply_style(axes)
@@ -159,7 +163,8 @@ def _draw_sample(
         names = [_BASELINE, *(stario or [n for n in names if n != _BASELINE])]
     for name in names[:4]:
         track, where = sample.tracks[name], {"network": name, "track": TRUE_ATTITUDE}
-        ate, rte = (values(scores, metric, **where)[0] for metric in ("ate_m", "rte_m"))
+        found = (values(scores, metric, **where) for metric in ("ate_m", "rte_m"))
+        ate, rte = (error[0] if len(error) else np.nan for error in found)
         label = f"{name}: ATE {ate:.2f} m, RTE {rte:.2f} m"  # of the first seed, which is drawn
         axes.plot(track[:, 0], track[:, 1], color=colours[name], lw=1.2, label=label)
         axes.plot(*track[-1], "s", color=colours[name], ms=6, mec="white")

@@ -252,7 +252,8 @@ def _to_filtered(errors: pd.DataFrame) -> Iterator[str]:
     for name in by_name.columns.difference(["network", "filtered"], sort=False):
         logs = np.log(by_name[name] / by_name["filtered"])
         ratio = math.exp(logs.mean())
-        yield f"{name} / filtered: {ratio:.2f} +- {ratio * logs.sem():.2f} (geometric mean)"
+        error = ratio * logs.sem() if logs.count() > 1 else 0.0
+        yield f"{name} / filtered: {ratio:.2f} +- {error:.2f} (geometric mean)"
 
 
 def track_with_fixes(

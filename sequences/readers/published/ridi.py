@@ -112,13 +112,12 @@ def read_imunet(path: Path) -> ImuSequence:
     if is_ridi(path):
         return read_ridi(path)
     folder = path if path.is_dir() else path.parent
-    field = folder / "magnet.txt"
     sequence, start_ns = joined_sequence(
         folder,
         folder.resolve().name,
         _samples(folder / "gyro.txt", 3),
         _samples(folder / "acce.txt", 3),
-        _samples(field, 3) if field.is_file() and first_line(field) is not None else None,
+        _field(folder / "magnet.txt"),
     )
     poses = pose_files(folder)
     if len(poses) != 1:
@@ -135,6 +134,14 @@ def _samples(path: Path, width: int) -> Samples:
     table = read_table(path, 1 + width, RowFormat(delimiter=None))
     rows = finite_rows(path, "values", table.values)
     return Samples(table.stamps_ns(kept=rows), table.values[rows, 1:])
+
+
+def _field(path: Path) -> Samples | None:
+    """Return the magnetometer's samples, also those that are not finite: it is optional."""
+    if not path.is_file() or first_line(path) is None:
+        return None
+    table = read_table(path, 4, RowFormat(delimiter=None))
+    return Samples(table.stamps_ns(), table.values[:, 1:])
 
 
 def _truth(folder: Path, start_ns: np.int64, sequence: ImuSequence) -> Trajectory:
