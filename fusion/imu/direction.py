@@ -57,12 +57,19 @@ class Direction:
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of `turn` [rad], as of a slope given its coherence; maximum pi."""
+        """Standard deviation of `turn` [rad], as of a slope given its coherence; maximum pi.
+
+        The coherence of n pairs that have nothing in common is 1 / n in the mean, not 0: without
+        this share, a few seconds without a turn would give a direction that nothing has measured.
+        """
         both = self.network * self.accelerometer
-        coherence = abs(self.product) ** 2 / both if both else 0.0
-        if coherence == 0.0 or self.count < 1.0:
+        if self.count <= 1.0 or not both:
             return math.pi
-        return min(math.pi, math.sqrt((1.0 - coherence) / (2.0 * coherence * self.count)))
+        coherence = abs(self.product) ** 2 / both
+        common = (self.count * coherence - 1.0) / (self.count - 1.0)
+        if common <= 0.0:
+            return math.pi
+        return min(math.pi, math.sqrt(max(0.0, 1.0 - common) / (2.0 * common * self.count)))
 
 
 def weighted_force(windows_N: NDArray[np.float32]) -> Complex:
