@@ -16,13 +16,13 @@ import numpy as np
 from stario.fusion.filter import estimator
 from stario.fusion.filter.estimates import Estimate, nav_states
 from stario.fusion.filter.estimator_state import EstimatorState
-from stario.fusion.filter.frame_transform import frame_rotation, to_final_frame, with_undirected
+from stario.fusion.filter.frame_transform import frame_rotation, to_final_frame, with_unknown_yaws
 from stario.fusion.filter.initial import PriorPose
-from stario.fusion.filter.jacobians import ASSUMED, GYRO_BIAS
+from stario.fusion.filter.jacobians import GAIN, GYRO_BIAS
 from stario.fusion.filter.map_frame import YAW_UNKNOWN
 from stario.fusion.filter.record import Record, innovations_of
 from stario.fusion.graph.batch import smooth
-from stario.fusion.graph.covariances import with_actual_covariances
+from stario.fusion.graph.covariances import with_reported_covariances
 from stario.fusion.graph.term import IndeterminateError
 from stario.fusion.place import known_fixes
 from stario.fusion.recording import PreprocessedRecording, Progress
@@ -49,7 +49,7 @@ class _Filtered(NamedTuple):
         """Return the filter's states in the final map frame."""
         frame = self.last.map_frame
         states = to_final_frame(nav_states(self.estimates), frame.transforms)
-        return with_undirected(states, frame.undirected)
+        return with_unknown_yaws(states, frame.unknown_yaws)
 
 
 def _smoothed_states(
@@ -60,7 +60,7 @@ def _smoothed_states(
     Returns:
         States in the final map frame, and notes for the health report if the graph failed.
     """
-    last, states = filtered.last, nav_states(filtered.estimates, ASSUMED)
+    last, states = filtered.last, nav_states(filtered.estimates, GAIN)
     frame, end, covariance = last.map_frame, states[-1], states[0].covariance.copy()
     has_field = last.ekf.field is not None
     bias = (end.b_g, end.covariance[GYRO_BIAS, GYRO_BIAS]) if has_field else None
@@ -76,8 +76,8 @@ def _smoothed_states(
         frame_rotation(after.R_WB @ before.R_WB.T)
         for before, after in zip(states, final, strict=True)
     ]
-    solved = with_actual_covariances(solved, filtered.estimates, np.array(turns))
-    return with_undirected(solved, frame.undirected), []
+    solved = with_reported_covariances(solved, filtered.estimates, np.array(turns))
+    return with_unknown_yaws(solved, frame.unknown_yaws), []
 
 
 def _floors(states: Sequence[NavState]) -> list[FloorChange]:
@@ -146,7 +146,7 @@ def track_recording(
 def _count_later_fixes(health: Health, run: _Filtered) -> None:
     """Count positions as applied that the graph has used although the filter could not yet."""
     frame, fixes = run.last.map_frame, health.fixes
-    if used := sum(frame.holds(fix) for record in run.records for fix in record.undirected):
+    if used := sum(frame.holds(fix) for record in run.records for fix in record.without_yaw):
         fixes["applied"] = fixes.get("applied", 0) + used
         fixes[YAW_UNKNOWN] -= used
         health.fixes = {name: n for name, n in fixes.items() if n}

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from stario.fusion.backends import BackendName, track_recording
 from stario.fusion.filter.initial import PriorPose
-from stario.fusion.imu.stateful import Predictor
+from stario.fusion.imu.inference import Predictor
 from stario.fusion.recording import PreprocessedRecording, Progress, preprocess, silent
 from stario.fusion.snapshot import check_same, pack, unpack
 from stario.fusion.stream import Stream

@@ -13,14 +13,14 @@ import numpy as np
 from stario.fusion.imu.direction import Direction, direction, weighted_force
 from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
-from stario.fusion.imu.intervals import ImuInterval, Start
-from stario.fusion.imu.stateful import (
+from stario.fusion.imu.inference import (
     BATCH,
     Predictor,
     StatefulInference,
     WindowDisplacement,
     displacements_of,
 )
+from stario.fusion.imu.intervals import ImuInterval, Start
 from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.health import Health
 from stario.sequences.arrays import check_type

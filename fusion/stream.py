@@ -17,8 +17,8 @@ from stario.fusion.filter.initial import PriorPose
 from stario.fusion.graph.fixed_lag import FixedLag
 from stario.fusion.imu.faults import ClockSetBackError
 from stario.fusion.imu.front_end import FrontEnd
+from stario.fusion.imu.inference import Predictor, StatefulInference, displacements_of
 from stario.fusion.imu.intervals import ImuInterval, Sample
-from stario.fusion.imu.stateful import Predictor, StatefulInference, displacements_of
 from stario.fusion.imu.units import check_start
 from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.fixes import Fix, FixOutcome, FixQueue

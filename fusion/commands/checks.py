@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from stario.fusion.backends import BackendName
-    from stario.fusion.imu.stateful import Predictor
+    from stario.fusion.imu.inference import Predictor
     from stario.fusion.values.config import NavigatorConfig
     from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence

@@ -22,7 +22,7 @@ from stario.fusion.evaluation.tracks import (
     true_poses,
 )
 from stario.fusion.evaluation.verdict import recording_verdict
-from stario.fusion.imu.stateful import Predictor
+from stario.fusion.imu.inference import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.place import compared_with, used_words
 from stario.fusion.recording import Progress, silent

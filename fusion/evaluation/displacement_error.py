@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.imu.direction import Complex, Direction, direction, weighted_force
-from stario.fusion.imu.stateful import Predictor, StatefulInference
+from stario.fusion.imu.inference import Predictor, StatefulInference
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.errors import InputError
 from stario.sequences.findings import warn

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.displacement_error import Piece, planar, predicted
 from stario.fusion.imu.direction import Complex
-from stario.fusion.imu.stateful import Predictor
+from stario.fusion.imu.inference import Predictor
 from stario.fusion.values.state import Track
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from stario.fusion.imu.inference import Predictor, StatefulInference
 from stario.fusion.imu.preintegration import preintegrate
-from stario.fusion.imu.stateful import Predictor, StatefulInference
 from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.state import Track

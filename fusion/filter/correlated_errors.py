@@ -13,7 +13,7 @@ import numpy as np
 
 from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS, EkfState
 from stario.fusion.filter.kalman import gauss_markov
-from stario.fusion.imu.stateful import slope_variance
+from stario.fusion.imu.inference import slope_variance
 from stario.fusion.values.config import FilterConfig
 from stario.fusion.values.state import changed
 from stario.sequences.sequence import FloatArray
@@ -88,5 +88,5 @@ def with_considered_propagated(s: EkfState) -> EkfState:
     Each takes a Gauss-Markov step of unit variance. Only displacements ask for them.
     """
     kept = np.exp((s.considered_time - s.time) / CONSIDERED_SECONDS)
-    actual = gauss_markov(s.P_actual, s.considered_rows, kept, 1.0)
+    actual = gauss_markov(s.P_reported, s.considered_rows, kept, 1.0)
     return changed(s, covariances=np.array((s.P, actual)), considered_time=s.time)

@@ -15,7 +15,7 @@ from stario.fusion.filter.ekf import Updated, update_displacement
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.innovations import InnovationStatistics
 from stario.fusion.filter.kalman import UpdateResult
-from stario.fusion.imu.stateful import WindowDisplacement
+from stario.fusion.imu.inference import WindowDisplacement
 from stario.fusion.values.config import FilterConfig
 from stario.fusion.values.lie import yaw_rotation
 from stario.fusion.values.state import changed
@@ -45,7 +45,7 @@ class Displaced(NamedTuple):
     statistics: InnovationStatistics
     result: UpdateResult
     """Outcome in the filter."""
-    revoked: tuple[float, ...]
+    rejected_later: tuple[float, ...]
     """Times of earlier displacements that were false after all [s]."""
 
 
@@ -67,8 +67,8 @@ def update_with(
     if before.alternative is None or not result.accepted:
         return Displaced(changed(before, ekf=ekf), statistics, result, ())
     other, fits = _alternative_with(displacement, before.alternative, statistics, f)
-    after, revoked = Hypotheses(ekf, other).judged(fits, not result.gated)
-    return Displaced(after, statistics, result, revoked)
+    after, rejected_later = Hypotheses(ekf, other).judged(fits, not result.gated)
+    return Displaced(after, statistics, result, rejected_later)
 
 
 def _alternative_with(

@@ -14,9 +14,9 @@ import numpy as np
 from stario.fusion.filter.correlated_errors import DisplacementErrors, with_considered_propagated
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import (
-    ACTUAL,
     CLONED,
     CORE,
+    REPORTED,
     Propagation,
     bearing_jacobian,
     displacement_jacobian,
@@ -184,7 +184,7 @@ def update_position_W(
     predicted = s.X[0, :, 4]
     residual = p_W - s.origin_W - predicted
     measured = Linear(residual, position_jacobian(predicted), covariance)
-    return update(s, measured, gate, gains_from=ACTUAL)
+    return update(s, measured, gate, gains_from=REPORTED)
 
 
 def update_velocity_W(
@@ -192,7 +192,7 @@ def update_velocity_W(
 ) -> Updated:
     """Update with the current velocity (3,) [m/s] in the true W, covariance (3, 3)."""
     measured = Linear(v_W - s.v_W, velocity_jacobian(s.v_W), covariance)
-    return update(s, measured, gate, gains_from=ACTUAL)
+    return update(s, measured, gate, gains_from=REPORTED)
 
 
 def update_tilt(s: EkfState, up_B: FloatArray, sigma: float) -> Updated:
@@ -211,7 +211,7 @@ def update_yaw(s: EkfState, yaw: float, sigma: float, gate: float | None = None)
     if not math.isfinite(residual[0]):
         return s, UpdateResult("yaw not defined upside down")
     measured = Linear(residual, yaw_jacobian(s.R_WB), np.array([[sigma * sigma]]))
-    return update(s, measured, gate, gains_from=ACTUAL)
+    return update(s, measured, gate, gains_from=REPORTED)
 
 
 def update_bearing(
@@ -228,6 +228,6 @@ def update_bearing(
     assert s.field is not None
     m_W = s.R_WB @ (m_B - s.field.hard_iron_B)
     bearing = math.atan2(m_W[1], m_W[0])
-    residual = math.remainder(bearing - s.field.azimuth - s.field.wander, 2.0 * math.pi)
+    residual = math.remainder(bearing - s.field.azimuth - s.field.disturbance, 2.0 * math.pi)
     blocks = bearing_jacobian(s.R_WB, m_W, s.field_row)
     return update(s, Linear(np.array([residual]), blocks, np.array([[variance]])), gate)

@@ -13,11 +13,11 @@ import numpy as np
 
 from stario.fusion.filter.estimates import Estimate, nav_states
 from stario.fusion.filter.jacobians import (
-    ACTUAL,
-    ASSUMED,
     CLONE,
     CLONED,
     CORE,
+    GAIN,
+    REPORTED,
     plain_covariance,
     symmetric,
 )
@@ -48,12 +48,12 @@ class FieldState:
     Attributes:
         azimuth: constant part of the horizontal field's azimuth in W, counter-clockwise from x
             [rad].
-        wander: part of the azimuth that changes from place to place [rad].
+        disturbance: part of the azimuth that changes from place to place [rad].
         hard_iron_B: (3,) the device's own field [uT].
     """
 
     azimuth: float
-    wander: float
+    disturbance: float
     hard_iron_B: FloatArray
 
 
@@ -113,20 +113,20 @@ class EkfState:
         n = clones_end + len(CONSIDERED_SECONDS)
         P = np.zeros((2, n, n))
         P[:, :CORE, :CORE] = plain_covariance(state.covariance, -X[0, :, 3:].T)
-        P[ACTUAL, clones_end:, clones_end:] = np.eye(len(CONSIDERED_SECONDS))
+        P[REPORTED, clones_end:, clones_end:] = np.eye(len(CONSIDERED_SECONDS))
         times = (None,) * slots, state.time
         return cls(state.time, X, origin_W, state.b_g, state.b_a, P, *times)
 
     @property
     def P(self) -> FloatArray:
         """Covariance (n, n) of the error as assumed for the gains."""
-        P: FloatArray = self.covariances[ASSUMED]
+        P: FloatArray = self.covariances[GAIN]
         return P
 
     @property
-    def P_actual(self) -> FloatArray:
+    def P_reported(self) -> FloatArray:
         """Covariance (n, n) of the error as it is."""
-        P: FloatArray = self.covariances[ACTUAL]
+        P: FloatArray = self.covariances[REPORTED]
         return P
 
     @property
@@ -167,7 +167,7 @@ class EkfState:
 
     @property
     def field_row(self) -> int:
-        """First row of the magnetic field's error: azimuth, wander, hard iron (3)."""
+        """First row of the magnetic field's error: azimuth, disturbance, hard iron (3)."""
         return self.offset_row + (self.offset is not None)
 
     @property
@@ -228,9 +228,10 @@ class EkfState:
         xi[1:, ::2] = error[CORE : self.considered_rows.start].reshape(-1, 2, 3)
         field = self.field
         if field is not None:
-            azimuth, wander, *_ = error[self.field_row :].tolist()
+            azimuth, disturbance, *_ = error[self.field_row :].tolist()
             hard_iron_B = field.hard_iron_B + error[self.field_row + 2 :]
-            field = FieldState(field.azimuth + azimuth, field.wander + wander, hard_iron_B)
+            azimuth, disturbance = field.azimuth + azimuth, field.disturbance + disturbance
+            field = FieldState(azimuth, disturbance, hard_iron_B)
         offset = self.offset
         if offset is not None:
             offset = changed(offset, metres=offset.metres + float(error[self.offset_row]))

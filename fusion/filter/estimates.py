@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stario.fusion.filter.jacobians import ACTUAL, CLONED, plain_covariance
+from stario.fusion.filter.jacobians import CLONED, REPORTED, plain_covariance
 from stario.fusion.values.state import NavState, SmoothedPose
 from stario.sequences.sequence import FloatArray
 
@@ -44,19 +44,19 @@ class Estimate:
     map_frame: int = 0
 
 
-def plain_covariances(estimates: Sequence[Estimate], which: int = ACTUAL) -> FloatArray:
+def plain_covariances(estimates: Sequence[Estimate], which: int = REPORTED) -> FloatArray:
     """Return covariances (N, n, n) of plain errors in W's axes, each true minus estimate.
 
     Args:
         estimates: N estimates.
-        which: `ACTUAL` or `ASSUMED`.
+        which: `REPORTED` or `GAIN`.
     """
     P = np.array([e.covariances[which] for e in estimates])
     X = np.array([e.X for e in estimates])
     return plain_covariance(P, X[:, :, 3:].transpose(0, 2, 1))
 
 
-def nav_states(estimates: Sequence[Estimate], which: int = ACTUAL) -> list[NavState]:
+def nav_states(estimates: Sequence[Estimate], which: int = REPORTED) -> list[NavState]:
     """Convert estimates to `NavState`; arguments as `plain_covariances`."""
     states = []
     for k in range(0, len(estimates), _CHUNK):

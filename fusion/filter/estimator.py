@@ -26,9 +26,9 @@ from stario.fusion.filter.map_frame import Mapped
 from stario.fusion.filter.record import Record
 from stario.fusion.filter.zero_velocity import ZeroVelocity, update_zero_velocity
 from stario.fusion.imu.gap import INTERPOLATED
+from stario.fusion.imu.inference import WindowDisplacement
 from stario.fusion.imu.intervals import ImuInterval, Start, split_at_fixes
 from stario.fusion.imu.preintegration import Segment, segment_of
-from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.fixes import Accepted, Fix, by_time
 from stario.fusion.values.state import changed
@@ -84,7 +84,7 @@ def step(
     s = changed(with_step(s, interval, displacement, fixes), in_gap=interval.gap)
     if interval.gap or fixes:
         s = changed(s, alternative=None)
-    s, segment, accepted, undirected = _propagated(s, interval, accel_factor, fixes, config)
+    s, segment, accepted, without_yaw = _propagated(s, interval, accel_factor, fixes, config)
     s = _with_height(s, interval)
     before = s.ekf
     s, zero_velocity = _with_rest(s, interval, config)
@@ -95,7 +95,7 @@ def step(
     used = offered
     if offered is not None and climb_rate is not None:
         used = height.yielding(offered, climb_rate)
-    s, outcome, revoked = _with_displacement(s, used, config)
+    s, outcome, rejected_later = _with_displacement(s, used, config)
     s, before = s.with_correction(before, "network"), s.ekf
     s, bearing = _with_bearing(s, interval)
     s = s.with_correction(before, "magnetic field")
@@ -103,7 +103,7 @@ def step(
     before = s.ekf
     if config.filter.adaptive and is_due(interval, s.begun):
         P = s.ekf.P[GYRO_BIAS, GYRO_BIAS]
-        prior = s.bias_prior.updated(s.ekf.b_g, P, _wander(s, config))
+        prior = s.bias_prior.updated(s.ekf.b_g, P, _walked(s, config))
         s = _with_prior(s, prior, config).with_correction(before, "gyroscope's bias")
     released = s.released
     if interval.update or interval.gap:
@@ -114,11 +114,11 @@ def step(
         segment,
         offered,
         outcome,
-        revoked,
+        rejected_later,
         zero_velocity,
         bearing,
         accepted + north,
-        undirected,
+        without_yaw,
         s.estimate(),
         s.released if s.released is not released else None,
         climb_rate,
@@ -176,7 +176,7 @@ def _propagated(
         return _with_yaw_lost(s), None, [], []
     segment: Segment | None = None
     accepted: list[Accepted] = []
-    undirected: list[Fix] = []
+    without_yaw: list[Fix] = []
     pieces = split_at_fixes(interval, fixes)
     for piece, due in pieces:
         if piece is not None and interval.gap:
@@ -189,14 +189,14 @@ def _propagated(
             if result.accepted:
                 accepted.append(Accepted(fix, result.scale))
             elif result.reason == map_frame.YAW_UNKNOWN:
-                undirected.append(fix)
+                without_yaw.append(fix)
     if interval.flags.missed:
         s = s.both(with_velocity_bounded)
     if interval.levelled is not None:
         sigma = tilt_sigma(interval.levelled, config)
         levelled, _ = ekf.update_tilt(s.ekf, interval.levelled.up_B, sigma)
         s = changed(s, ekf=levelled)
-    return s, (segment if len(pieces) == 1 else None), accepted, undirected
+    return s, (segment if len(pieces) == 1 else None), accepted, without_yaw
 
 
 def _with_yaw_lost(s: EstimatorState) -> EstimatorState:
@@ -268,11 +268,11 @@ def _with_displacement(
     """Update with a displacement; return the outcome and the times of earlier false ones, too."""
     if displacement is None:
         return s, None, ()
-    after, statistics, result, revoked = displacements.update_with(
+    after, statistics, result, rejected_later = displacements.update_with(
         displacement, s.hypotheses, s.statistics, config.filter
     )
     s = changed(s, statistics=statistics, counts=s.counts.add_displacement(result))
-    return s.with_hypotheses(after), result, revoked
+    return s.with_hypotheses(after), result, rejected_later
 
 
 def _with_bearing(s: EstimatorState, interval: ImuInterval) -> tuple[EstimatorState, Gained | None]:
@@ -294,7 +294,7 @@ def _with_north(
 ) -> tuple[EstimatorState, list[Accepted]]:
     """Apply the yaw from magnetic north once, if a declination is set and yaw is unknown."""
     declination = config.filter.declination
-    if declination is None or s.map_frame.oriented:
+    if declination is None or s.map_frame.yaw_known:
         return s, []
     fix = magnetic.north_fix(s.ekf, s.magnetic, declination)
     if fix is None:
@@ -309,12 +309,12 @@ def _with_north(
 
 def _with_prior(s: EstimatorState, prior: GyroBiasPrior, config: NavigatorConfig) -> EstimatorState:
     """Replace the bias's prior in both filters as if it had been used from the start."""
-    wander = _wander(s, config)
-    old, new = s.bias_prior.variance + wander, prior.variance + wander
+    walked = _walked(s, config)
+    old, new = s.bias_prior.variance + walked, prior.variance + walked
     return changed(s.both(lambda state: with_prior_replaced(state, old, new)), bias_prior=prior)
 
 
-def _wander(s: EstimatorState, config: NavigatorConfig) -> float:
+def _walked(s: EstimatorState, config: NavigatorConfig) -> float:
     """Return the variance by which the gyroscope's bias may have changed since the start."""
     return float(config.noise.gyro_walk**2 * max(0.0, s.time - s.begun))
 

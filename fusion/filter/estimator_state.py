@@ -15,14 +15,14 @@ from stario.fusion.filter.alternative import AlternativeHypothesis, Hypotheses
 from stario.fusion.filter.corrections import correction
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.estimates import Estimate, nav_states, smoothed_pose
-from stario.fusion.filter.frame_transform import MapFrameState, to_final_frame, with_undirected
+from stario.fusion.filter.frame_transform import MapFrameState, to_final_frame, with_unknown_yaws
 from stario.fusion.filter.gyro_bias import GyroBiasPrior
 from stario.fusion.filter.innovations import InnovationStatistics
 from stario.fusion.filter.magnetic import MagneticReference
 from stario.fusion.filter.record import UpdateCounts
 from stario.fusion.filter.zero_velocity import Stillness
+from stario.fusion.imu.inference import WindowDisplacement
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
-from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.values.config import FilterConfig
 from stario.fusion.values.fixes import Fix
 from stario.fusion.values.health import Health
@@ -117,7 +117,7 @@ class EstimatorState:
 
     def nav_state(self) -> NavState:
         """Return the newest state with plain errors and, if the map has one, its unknown yaw."""
-        return with_undirected(nav_states([self.estimate()]), self.map_frame.undirected)[0]
+        return with_unknown_yaws(nav_states([self.estimate()]), self.map_frame.unknown_yaws)[0]
 
     @property
     def smoothed(self) -> SmoothedPose | None:
@@ -125,14 +125,14 @@ class EstimatorState:
         if self.released is None:
             return None
         poses = to_final_frame(nav_states([self.released]), self.map_frame.transforms)
-        return smoothed_pose(with_undirected(poses, self.map_frame.undirected)[0])
+        return smoothed_pose(with_unknown_yaws(poses, self.map_frame.unknown_yaws)[0])
 
     def health(self, counts: Health, f: FilterConfig, state: NavState | None = None) -> Health:
         """Return the health report so far, with the sigmas of `state` if given."""
         health = self.counts.health(counts, state or self.nav_state())
         health.accel_noise_factor = self.statistics.accel_factor
         health.network_error_level = self.statistics.error_level
-        if f.declination is not None and not self.map_frame.oriented:
+        if f.declination is not None and not self.map_frame.yaw_known:
             health.notes.append("north could not be determined: the track starts with yaw zero")
         return health
 

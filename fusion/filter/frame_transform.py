@@ -33,7 +33,7 @@ class FrameTransform:
         R: (3, 3) rotation about the vertical.
         shift: (3,) translation [m].
         pivot: (3,) point of the new frame that an error of the turn leaves in place [m].
-        placed: whether it is a shift by a position fix rather than a turn.
+        is_shift: whether it is a shift by a position fix rather than a turn.
         since: states before this time [s] are not transformed: they are in the map already.
         until: states from this time [s] on are not transformed either.
         yaw_sigma: standard deviation of the turn [rad].
@@ -46,7 +46,7 @@ class FrameTransform:
     R: FloatArray
     shift: FloatArray
     pivot: FloatArray
-    placed: bool
+    is_shift: bool
     since: float
     until: float = math.inf
     yaw_sigma: float = 0.0
@@ -65,7 +65,7 @@ class FrameTransform:
         A[POSITION, 2] = -self.by_yaw
         covariance = A @ state.covariance @ A.T
         yaw_since = max(0.0, self.drift - state.covariance[2, 2])
-        if self.placed:
+        if self.is_shift:
             drift = self.position_drift - without_yaw(state.covariance, POSITION)
             covariance[POSITION, POSITION] += self.position_covariance + _positive_part(drift)
             covariance[POSITION, POSITION] += yaw_since * np.outer(self.by_yaw, self.by_yaw)
@@ -96,7 +96,7 @@ def frame_rotation(R: FloatArray) -> FloatArray:
     return A
 
 
-def unoriented_stretch(pivot: FloatArray, since: float, until: float) -> FrameTransform:
+def unknown_yaw(pivot: FloatArray, since: float, until: float) -> FrameTransform:
     """Return a transform that keeps a stretch in place but makes its yaw about a pivot unknown."""
     zero = np.zeros(3)
     return FrameTransform(np.eye(3), zero, pivot, False, since, until, yaw_sigma=UNKNOWN_YAW)
@@ -107,8 +107,8 @@ class MapFrameState:
     """State of the map frame.
 
     Attributes:
-        placed: whether the track's position in it is known.
-        oriented: whether the track's yaw in it is known.
+        position_known: whether the track's position in it is known.
+        yaw_known: whether the track's yaw in it is known.
         transforms: frame transforms so far, which bring earlier states to the current frame.
         pivot: (3,) point about which the track may be turned [m].
         since: time before which the next transforms leave the track as it is [s].
@@ -117,17 +117,17 @@ class MapFrameState:
         distance_mismatches: number of latest positions in a row whose distance from the pivot
             differs from the track's.
         outlier_residuals: (3,) residuals of the latest positions if they were outliers [m].
-        unoriented: yaw uncertainty of stretches that were placed before a gap and never oriented,
-            applied once the frame is oriented.
+        earlier_unknown_yaws: yaw uncertainty of stretches that were placed before a gap and never
+            turned, applied once the frame's yaw is known.
         jumps: number of times that the track, not the positions, proved to be wrong.
         yaw_variance: variance of the track's own yaw when it was placed [rad^2].
         since_jump: number of positions since the last jump.
-        arbitrary_yaw: whether the track's covariance does not know that its yaw is not the map's:
-            that of the start, zero without a pose, or one that has proved to be wrong.
+        yaw_offset_unknown: whether the track's covariance does not know that its yaw is not the
+            map's: that of the start, zero without a pose, or one that has proved to be wrong.
     """
 
-    placed: bool
-    oriented: bool
+    position_known: bool
+    yaw_known: bool
     transforms: tuple[FrameTransform, ...] = ()
     pivot: FloatArray = field(default_factory=lambda: np.zeros(3))
     since: float = -math.inf
@@ -135,21 +135,21 @@ class MapFrameState:
     alignment: PlanarAlignment = field(default_factory=PlanarAlignment)
     distance_mismatches: int = 0
     outlier_residuals: tuple[FloatArray, ...] = ()
-    unoriented: tuple[FrameTransform, ...] = ()
+    earlier_unknown_yaws: tuple[FrameTransform, ...] = ()
     jumps: int = 0
     yaw_variance: float = 0.0
-    arbitrary_yaw: bool = False
+    yaw_offset_unknown: bool = False
     since_jump: float = math.inf
 
     @property
-    def undirected(self) -> tuple[FrameTransform, ...]:
-        """Yaw uncertainty in the map of stretches that were placed and not yet oriented."""
-        if self.oriented:
+    def unknown_yaws(self) -> tuple[FrameTransform, ...]:
+        """Yaw uncertainty in the map of stretches that were placed and not yet turned."""
+        if self.yaw_known:
             return ()
         # A track that fixes have never moved keeps its own frame, in which its first yaw is zero.
-        if not (self.arbitrary_yaw and (self.placed or self.transforms)):
-            return self.unoriented
-        return (*self.unoriented, unoriented_stretch(self.pivot, self.since, math.inf))
+        if not (self.yaw_offset_unknown and (self.position_known or self.transforms)):
+            return self.earlier_unknown_yaws
+        return (*self.earlier_unknown_yaws, unknown_yaw(self.pivot, self.since, math.inf))
 
     def holds(self, fix: Fix) -> bool:
         """Return whether a fix holds for the track in its final frame.
@@ -157,12 +157,12 @@ class MapFrameState:
         Of a stretch whose yaw in the map has never become known, only the position that placed it
         does: others would bend the track to lie in an arbitrary direction.
         """
-        undirected = (
+        stretches = (
             each
-            for each in (*self.undirected, *self.transforms)
+            for each in (*self.unknown_yaws, *self.transforms)
             if each.yaw_sigma >= UNKNOWN_YAW and each.since <= fix.time < each.until
         )
-        return all(np.array_equal(fix.value, each.pivot) for each in undirected)
+        return all(np.array_equal(fix.value, each.pivot) for each in stretches)
 
 
 def _turn_moments(variance: float) -> tuple[float, float, float]:
@@ -202,12 +202,12 @@ def to_final_frame(
     return [moved(state) for state in states]
 
 
-def with_undirected(states: list[NavState], undirected: Sequence[FrameTransform]) -> list[NavState]:
+def with_unknown_yaws(states: list[NavState], yaws: Sequence[FrameTransform]) -> list[NavState]:
     """Return the states of a track with the yaw uncertainty of stretches without a direction.
 
     The filter keeps the arbitrary yaw of such a stretch as if it were known, so that the first fix
     that determines it turns the track exactly; those who read the states must know better.
     """
-    for stretch in undirected:
+    for stretch in yaws:
         states = [changed(stretch.state(s), map_frame=s.map_frame) for s in states]
     return states

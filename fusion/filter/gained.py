@@ -1,6 +1,6 @@
 """What a magnetic bearing says about attitude and bias, for those without states of the field.
 
-The azimuth of the field, its wander and the hard iron are states of the filter alone. A bearing
+The field's azimuth, its disturbance and the hard iron are states of the filter alone. A bearing
 lowers the filter's covariance P of z = (theta, b_g) by k k^T, so for z alone it acts like a
 measurement of u^T z with variance 1 - k^T u, u = P^-1 k. With these measurements a graph that
 treats everything else as the filter does arrives at the filter's covariance, although the errors of

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, GYRO_BIAS
+from stario.fusion.filter.jacobians import GAIN, GYRO_BIAS, REPORTED
 from stario.fusion.filter.kalman import corrected
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval
 from stario.fusion.values.config import MIN_PRIOR_SIGMA, FilterConfig
@@ -41,7 +41,7 @@ class GyroBiasPrior:
     sigma: float
     variance: float
 
-    def updated(self, b_g: FloatArray, P: FloatArray, wander: float) -> GyroBiasPrior:
+    def updated(self, b_g: FloatArray, P: FloatArray, walked: float) -> GyroBiasPrior:
         """Return the prior with its variance's mean given the estimated bias.
 
         (nu sigma^2 + E|b|^2) / (nu + 1): the inverse gamma distribution that makes b a t variable
@@ -51,9 +51,9 @@ class GyroBiasPrior:
         Args:
             b_g: (3,) bias as estimated by the filter [rad/s].
             P: (3, 3) its covariance [rad^2/s^2].
-            wander: variance by which the bias may have changed since the start [rad^2/s^2].
+            walked: variance by which the bias may have changed since the start [rad^2/s^2].
         """
-        return changed(self, variance=self._mean(float(b_g @ b_g + np.trace(P)) - 3.0 * wander))
+        return changed(self, variance=self._mean(float(b_g @ b_g + np.trace(P)) - 3.0 * walked))
 
     def widest(self) -> GyroBiasPrior:
         """Return the prior with its mean variance, before anything is known of the bias."""
@@ -105,7 +105,7 @@ def with_prior_replaced(s: EkfState, old: float, new: float) -> EkfState:
         H = np.eye(3, before.shape[1], k=GYRO_BIAS.start)
         s = corrected(s, -s.b_g, H, np.array((R, R)))
         if step > old:  # the error gains what the gains forget, however large it is
-            actual = before[ACTUAL] + s.P - before[ASSUMED]
+            actual = before[REPORTED] + s.P - before[GAIN]
             s = changed(s, covariances=np.array((s.P, actual)))
         old = step
     return s

@@ -22,7 +22,7 @@ from stario.fusion.filter.jacobians import position_jacobian, velocity_jacobian
 from stario.fusion.filter.kalman import Linear, UpdateResult, update
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.imu.barometer import HeightSample
-from stario.fusion.imu.stateful import WindowDisplacement
+from stario.fusion.imu.inference import WindowDisplacement
 from stario.fusion.values.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.sequence import FloatArray

@@ -75,7 +75,7 @@ class PriorPose:
 
 def tilt_sigma(start: Start, config: NavigatorConfig) -> float:
     """Return the standard deviation of an attitude's tilt from gravity [rad]."""
-    return STILL_TILT_SIGMA if start.still else start.liveliness * config.filter.tilt_sigma
+    return STILL_TILT_SIGMA if start.still else start.motion_intensity * config.filter.tilt_sigma
 
 
 def first_state(start: Start, prior: PriorPose | None, config: NavigatorConfig) -> EkfState:

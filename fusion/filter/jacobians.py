@@ -33,7 +33,7 @@ CLONE = 6
 CLONED = np.array([0, 1, 2, 6, 7, 8])
 """Rows of theta and rho_p, which a clone copies."""
 
-ASSUMED, ACTUAL = 0, 1
+GAIN, REPORTED = 0, 1
 """Indices of the covariances: as assumed for the gains, and of the error that these gains leave."""
 
 Block = tuple[int, FloatArray]
@@ -169,10 +169,10 @@ def propagated(
     adjoint = invariant_from_local(R, v, p)
     local = np.ascontiguousarray(segment.pim.residualCovariance())  # faster products
     noise = np.empty((2, CORE, CORE))
-    noise[ASSUMED] = adjoint @ local @ adjoint.T
+    noise[GAIN] = adjoint @ local @ adjoint.T
     actual = adjoint.copy()
     actual[:, 3:9] *= math.sqrt(accel_share)
-    noise[ACTUAL] = actual @ local @ actual.T
+    noise[REPORTED] = actual @ local @ actual.T
 
     transition = _nav_transition(segment.duration, segment.gravity)
     by_bias = adjoint[:9, :9] @ bias_jacobian

@@ -18,7 +18,7 @@ from filterpy.kalman import predict as filterpy_predict
 from scipy.linalg.lapack import dposv, dpotrf
 
 from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, CORE, Block, symmetric
+from stario.fusion.filter.jacobians import CORE, GAIN, REPORTED, Block, symmetric
 from stario.fusion.values.state import changed
 from stario.sequences.sequence import FloatArray
 
@@ -97,7 +97,7 @@ def update(
     measured: Linear,
     gate: float | None = None,
     inflation: float | None = 1.0,
-    gains_from: int = ASSUMED,
+    gains_from: int = GAIN,
 ) -> tuple[EkfState, UpdateResult]:
     """Update a state with a measurement.
 
@@ -107,7 +107,7 @@ def update(
         gate: NIS above which it counts as an outlier; None for no gate.
         inflation: an outlier's covariance is multiplied by this power of NIS / gate, so that a run
             of outliers can still correct a wrong filter; None rejects outliers.
-        gains_from: which covariance determines the gains: `ASSUMED` or `ACTUAL`.
+        gains_from: which covariance determines the gains: `GAIN` or `REPORTED`.
 
     Returns:
         The state and the outcome. Values that are not finite and covariances that are not positive
@@ -119,10 +119,10 @@ def update(
     H = measured.jacobian(s.covariances.shape[1])
     R = np.array((covariance, covariance if noise is None else noise))
     S = H @ s.covariances @ H.T + R
-    nis, gate_nis = _nis(residual, S[ACTUAL]), _nis(residual, S[gains_from])
+    nis, gate_nis = _nis(residual, S[REPORTED]), _nis(residual, S[gains_from])
     if not math.isfinite(gate_nis):
         return s, UpdateResult("innovation covariance not invertible")
-    sigma, scale = np.sqrt(S[ACTUAL].diagonal()), 1.0
+    sigma, scale = np.sqrt(S[REPORTED].diagonal()), 1.0
     if gate is not None and gate_nis > gate:
         if inflation is None:
             return s, UpdateResult("gated", nis, 1.0, residual, sigma, gate_nis)
@@ -132,7 +132,7 @@ def update(
 
 
 def corrected(
-    s: EkfState, residual: FloatArray, H: FloatArray, R: FloatArray, gains_from: int = ASSUMED
+    s: EkfState, residual: FloatArray, H: FloatArray, R: FloatArray, gains_from: int = GAIN
 ) -> EkfState:
     """Return the state after a measurement with H (m, n) and R (2, m, m), whatever they are.
 
@@ -145,8 +145,8 @@ def corrected(
     K[s.considered_rows] = 0.0
     A = np.eye(len(K)) - K @ H
     P = s.covariances.copy()
-    P[ASSUMED] = filter_.P
-    for which in (ACTUAL,) if gains_from == ASSUMED else (ASSUMED, ACTUAL):
+    P[GAIN] = filter_.P
+    for which in (REPORTED,) if gains_from == GAIN else (GAIN, REPORTED):
         # With any gain, Joseph's form gives the covariance of the error that it leaves.
         P[which] = A @ s.covariances[which] @ A.T + K @ R[which] @ K.T
     return changed(s.plus(K @ residual), covariances=symmetric(P))

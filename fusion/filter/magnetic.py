@@ -2,8 +2,8 @@
 
 README.md, "Magnetometer". The field's direction in the world is unknown, and indoors it wanders:
 
-    azimuth = c + wander,   c constant and unknown at first
-                            wander Gauss-Markov over metres and seconds
+    azimuth = c + disturbance,   c constant and unknown at first
+                            disturbance Gauss-Markov over metres and seconds
 
 The bearing of R_WB (m_B - h), with the sensor's hard iron h, measures it; h is Gauss-Markov, too. A
 field of unusual size or dip for the place has less weight, as does one that the device has
@@ -32,8 +32,8 @@ from stario.sequences.accuracy.chi_square import chi2_quantile
 from stario.sequences.inspection.magnetic import HELD_CHANGE
 from stario.sequences.sequence import FloatArray
 
-WANDER_METRES, WANDER_SECONDS = 5.0, 60.0
-"""Distance [m] and time [s] over which the wander decorrelates: the reach of a beam or a
+DISTURBANCE_METRES, DISTURBANCE_SECONDS = 5.0, 60.0
+"""Distance [m] and time [s] over which the disturbance decorrelates: the reach of a beam or a
 radiator, and the duration of other changes."""
 
 HARD_IRON_SIGMA, HARD_IRON_SECONDS = 10.0, 60.0
@@ -42,7 +42,7 @@ it decorrelates [s]: phones calibrate their magnetometer anew as they are carrie
 once (IPIN 2023, Trial01_1), so that what it was a minute ago tells little."""
 
 BEARING_SIGMA = 0.3
-"""White noise of one bearing [rad] where the wander's sigma is at its largest, elsewhere in
+"""White noise of one bearing [rad] where the disturbance's sigma is at its largest, elsewhere in
 proportion: steel within a step's length, late samples while it turns."""
 
 _FIRST_AZIMUTH_SIGMA = math.pi
@@ -70,13 +70,13 @@ _PERIOD = 0.5
 _NEW_PLACE, _NEW_TURN = 0.3, 0.2
 """Distance [m] or rotation [rad] since the last bearing from which on the next one is used."""
 
-WANDER_SIGMA, _MIN_WANDER_SIGMA = 0.4, 0.1
-"""Sigma of the wander, the azimuth about its mean, at most and at least [rad]: buildings turn it by
-5 to 30 degrees."""
+DISTURBANCE_SIGMA, _MIN_DISTURBANCE_SIGMA = 0.4, 0.1
+"""Sigma of the disturbance, the azimuth about its mean, at most and at least [rad]: buildings turn
+it by 5 to 30 degrees."""
 
-_WANDER_PER_SPREAD = 2.0
-"""Sigma of the wander per unit of `MagneticReference.spread` [rad]: 1 to 2 by the true attitude of
-OxIOD, RIDI, KIPD and tyrex."""
+_DISTURBANCE_PER_SPREAD = 2.0
+"""Sigma of the disturbance per unit of `MagneticReference.spread` [rad]: 1 to 2 by the true
+attitude of OxIOD, RIDI, KIPD and tyrex."""
 
 _FIRST_SPREAD, _FIRST_COUNT = 0.2, 20
 """Spread as in a building, and the number of bearings that it counts as."""
@@ -119,9 +119,11 @@ class MagneticReference:
     pose: tuple[FloatArray, FloatArray] | None = None
 
     @property
-    def wander_sigma(self) -> float:
+    def disturbance_sigma(self) -> float:
         """Sigma of the azimuth about its mean [rad]: it varies as size and dip do."""
-        return min(max(_WANDER_PER_SPREAD * self.spread, _MIN_WANDER_SIGMA), WANDER_SIGMA)
+        return min(
+            max(_DISTURBANCE_PER_SPREAD * self.spread, _MIN_DISTURBANCE_SIGMA), DISTURBANCE_SIGMA
+        )
 
     def unusual(self, size: float, dip: float) -> float:
         """Return how far a field's size [uT] and dip [rad] are from usual; 1 doubles a variance."""
@@ -193,7 +195,7 @@ def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> 
     yaw = yaw_twist(s.R_WB)
     if s.field is None or reference.count < _MIN_NORTH_COUNT or not math.isfinite(yaw):
         return None
-    c, P = s.field_row, s.P_actual
+    c, P = s.field_row, s.P_reported
     variance = P[2, 2] + P[c, c] - 2.0 * P[2, c]
     turn = math.pi / 2.0 - declination - s.field.azimuth
     sigma = math.sqrt(max(variance, 0.0) + NORTH_SIGMA**2)
@@ -203,7 +205,7 @@ def north_fix(s: EkfState, reference: MagneticReference, declination: float) -> 
 def with_field(s: EkfState, m_B: FloatArray) -> EkfState:
     """Return the state with an unknown azimuth, initialised by the first field (3,) [uT]."""
     x, y, _ = s.R_WB @ m_B
-    variances = [_FIRST_AZIMUTH_SIGMA**2, WANDER_SIGMA**2, *[HARD_IRON_SIGMA**2] * 3]
+    variances = [_FIRST_AZIMUTH_SIGMA**2, DISTURBANCE_SIGMA**2, *[HARD_IRON_SIGMA**2] * 3]
     n = s.field_row
     P = np.zeros((2, n + len(variances), n + len(variances)))
     P[:, :n, :n], P[:, n:, n:] = s.covariances, np.diag(variances)
@@ -218,13 +220,13 @@ def propagated_field(s: EkfState, seconds: float, sigma: float) -> EkfState:
     assert s.field is not None  # set by `with_field`
     metres = seconds * math.hypot(s.v_W[0], s.v_W[1])
     row = s.field_row + 1
-    wander = math.exp(-metres / WANDER_METRES - seconds / WANDER_SECONDS)
+    moved = math.exp(-metres / DISTURBANCE_METRES - seconds / DISTURBANCE_SECONDS)
     iron = math.exp(-seconds / HARD_IRON_SECONDS)
-    kept = np.array([wander, iron, iron, iron])
+    kept = np.array([moved, iron, iron, iron])
     sigmas = np.array([sigma, *[HARD_IRON_SIGMA] * 3])
     P = gauss_markov(s.covariances, slice(row, row + 4), kept, sigmas)
-    wander_iron = kept * np.array([s.field.wander, *s.field.hard_iron_B])
-    field = changed(s.field, wander=float(wander_iron[0]), hard_iron_B=wander_iron[1:])
+    disturbance, hard_iron_B = moved * s.field.disturbance, iron * s.field.hard_iron_B
+    field = changed(s.field, disturbance=disturbance, hard_iron_B=hard_iron_B)
     return changed(s, covariances=P, field=field)
 
 
@@ -238,7 +240,7 @@ def update_bearing(
     if s.field is None:
         s = with_field(s, m_B)
     elif math.isfinite(reference.time):
-        s = propagated_field(s, now - reference.time, reference.wander_sigma)
+        s = propagated_field(s, now - reference.time, reference.disturbance_sigma)
     assert s.field is not None
     m_W = s.R_WB @ (m_B - s.field.hard_iron_B)
     horizontal = math.hypot(m_W[0], m_W[1])
@@ -253,7 +255,7 @@ def update_bearing(
     held = reference.is_held(measured)
     reference = reference.updated(now, size, dip, reference.travelled(s) and not held)
     reference = changed(reference, measured=measured)
-    sigma = BEARING_SIGMA * reference.wander_sigma / WANDER_SIGMA
+    sigma = BEARING_SIGMA * reference.disturbance_sigma / DISTURBANCE_SIGMA
     variance = sigma**2 * (1.0 + reference.unusual(size, dip) ** 2)
     variance *= _HELD_FACTOR if held else 1.0
     return *ekf.update_bearing(s, m_B, variance, chi2_quantile(_GATE, 1)), reference

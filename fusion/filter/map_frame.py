@@ -18,7 +18,7 @@ from numpy.linalg import norm
 from stario.fusion.filter import ekf
 from stario.fusion.filter.ekf import Updated
 from stario.fusion.filter.ekf_state import EkfState
-from stario.fusion.filter.frame_transform import FrameTransform, MapFrameState, unoriented_stretch
+from stario.fusion.filter.frame_transform import FrameTransform, MapFrameState, unknown_yaw
 from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import POSITION
 from stario.fusion.filter.kalman import UpdateResult
@@ -83,10 +83,10 @@ class Mapped(NamedTuple):
 def first_frame(prior: PriorPose | None) -> MapFrameState:
     """Return the frame of a track that starts with a prior on its first pose, or without."""
     if prior is None:
-        return MapFrameState(placed=False, oriented=False, arbitrary_yaw=True)
-    oriented = prior.yaw_sigma <= MAX_PRIOR_YAW_SIGMA
+        return MapFrameState(position_known=False, yaw_known=False, yaw_offset_unknown=True)
+    yaw_known = prior.yaw_sigma <= MAX_PRIOR_YAW_SIGMA
     variance = 2.0 * prior.position_sigma**2
-    return MapFrameState(True, oriented, pivot=prior.p_W, pivot_variance=variance)
+    return MapFrameState(True, yaw_known, pivot=prior.p_W, pivot_variance=variance)
 
 
 def update_with(fix: Fix, m: Mapped, f: FilterConfig) -> tuple[Mapped, UpdateResult]:
@@ -94,7 +94,7 @@ def update_with(fix: Fix, m: Mapped, f: FilterConfig) -> tuple[Mapped, UpdateRes
     places = False
     if fix.kind == "position":
         places, m = _needs_placing(fix, m)
-    if not places and m.frame.oriented:
+    if not places and m.frame.yaw_known:
         return _updated(fix, m, f)
     if places:
         m, transform = _placed(fix, m)
@@ -120,23 +120,23 @@ def update_with(fix: Fix, m: Mapped, f: FilterConfig) -> tuple[Mapped, UpdateRes
 def after_gap(m: Mapped) -> MapFrameState:
     """If a gap has lost the yaw, let later fixes place and turn the track from here on."""
     now, s = m.ekf.nav_state(), m.frame
-    variance = now.covariance[2, 2] - (0.0 if s.oriented else s.yaw_variance)
-    if not (s.placed or s.oriented) or variance <= MAX_PRIOR_YAW_SIGMA**2:
+    variance = now.covariance[2, 2] - (0.0 if s.yaw_known else s.yaw_variance)
+    if not (s.position_known or s.yaw_known) or variance <= MAX_PRIOR_YAW_SIGMA**2:
         return s
-    since = now.time if s.placed else s.since  # an unplaced track stays in one piece
-    unoriented = s.unoriented
-    if not s.oriented:
-        unoriented = (*unoriented, unoriented_stretch(s.pivot, s.since, now.time))
+    since = now.time if s.position_known else s.since  # an unplaced track stays in one piece
+    earlier_unknown_yaws = s.earlier_unknown_yaws
+    if not s.yaw_known:
+        earlier_unknown_yaws = (*earlier_unknown_yaws, unknown_yaw(s.pivot, s.since, now.time))
     return MapFrameState(
-        placed=False,
-        oriented=False,
+        position_known=False,
+        yaw_known=False,
         transforms=s.transforms,
         pivot=now.p_W,
         since=since,
-        unoriented=unoriented,
+        earlier_unknown_yaws=earlier_unknown_yaws,
         jumps=s.jumps,
         # The magnetic field may tell the turn in the gap, but not a yaw never known before.
-        arbitrary_yaw=s.arbitrary_yaw and not s.oriented,
+        yaw_offset_unknown=s.yaw_offset_unknown and not s.yaw_known,
     )
 
 
@@ -147,8 +147,8 @@ def _needs_placing(fix: Fix, m: Mapped) -> tuple[bool, Mapped]:
     first may have been bad, which later ones reveal.
     """
     frame = m.frame
-    if not frame.placed or frame.oriented:
-        return not frame.placed, m
+    if not frame.position_known or frame.yaw_known:
+        return not frame.position_known, m
     if _SIGMA_RATIO**2 * float(np.trace(fix.covariance[:2, :2])) < frame.pivot_variance:
         return True, m
     now, pivot = m.ekf.nav_state(), frame.pivot
@@ -171,7 +171,7 @@ def _placed(fix: Fix, m: Mapped) -> tuple[Mapped, FrameTransform]:
         np.eye(3),
         shift,
         now.p_W + shift,
-        placed=True,
+        is_shift=True,
         since=m.frame.since,
         drift=float(P[2, 2]),
         by_yaw=P[POSITION, 2] / P[2, 2],
@@ -180,7 +180,7 @@ def _placed(fix: Fix, m: Mapped) -> tuple[Mapped, FrameTransform]:
     variance = np.trace((fix.covariance + now.position_covariance)[:axes, :axes])
     sigma = min(_INFLATION_RATIO * math.sqrt(variance), _MAX_SIGMA)
     shifted = m.ekf.transformed(np.eye(3), transform.shift).with_position_inflated(sigma, axes)
-    return Mapped(shifted, changed(m.frame, placed=True)), transform
+    return Mapped(shifted, changed(m.frame, position_known=True)), transform
 
 
 def _with_alignment_begun(fix: Fix, m: Mapped) -> Mapped:
@@ -213,10 +213,10 @@ def _oriented(fix: Fix, m: Mapped) -> tuple[Mapped, FrameTransform | None]:
     turned = m.ekf.transformed(R, transform.shift).with_yaw_inflated(pivot, inflation)
     frame = changed(
         m.frame,
-        oriented=True,
-        transforms=(*m.frame.transforms, *m.frame.unoriented),
+        yaw_known=True,
+        transforms=(*m.frame.transforms, *m.frame.earlier_unknown_yaws),
         alignment=PlanarAlignment(),
-        unoriented=(),
+        earlier_unknown_yaws=(),
     )
     return Mapped(turned, frame), transform
 
@@ -267,8 +267,10 @@ def _with_position(fix: Fix, before: Mapped, gate: float) -> tuple[Mapped, Updat
     after, result = _measured(moved, fix, gate)
     jumps = m.frame.jumps + 1
     m = Mapped(after, changed(m.frame, outlier_residuals=(), jumps=jumps, since_jump=0))
-    if since_jump <= _POSITIONS_APART and m.frame.oriented:
+    if since_jump <= _POSITIONS_APART and m.frame.yaw_known:
         # Its direction has proved to be wrong: let later fixes turn the track from here on.
-        m = m.with_frame(oriented=False, since=fix.time, arbitrary_yaw=True, since_jump=math.inf)
+        m = m.with_frame(
+            yaw_known=False, since=fix.time, yaw_offset_unknown=True, since_jump=math.inf
+        )
         m = _with_alignment_begun(fix, m)
     return m, result

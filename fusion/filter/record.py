@@ -16,9 +16,9 @@ from stario.fusion.filter.gained import Gained
 from stario.fusion.filter.height import resting_in_lift, yielding
 from stario.fusion.filter.kalman import UpdateResult
 from stario.fusion.filter.zero_velocity import ZeroVelocity
+from stario.fusion.imu.inference import WindowDisplacement
 from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.imu.preintegration import Segment
-from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.values.fixes import Accepted, Fix
 from stario.fusion.values.health import Health
 from stario.fusion.values.state import Innovations, NavState, changed
@@ -36,7 +36,7 @@ class Record(NamedTuple):
     """Predicted displacement of the window ending here; None if no window ends, or at rest."""
     outcome: UpdateResult | None
     """Outcome of the update with it; None without one."""
-    revoked: tuple[float, ...]
+    rejected_later: tuple[float, ...]
     """Times of earlier displacements that were false after all [s] (README.md, "Gates")."""
     zero_velocity: ZeroVelocity | None
     """Measurement at rest; None if the device moved or the measurement was rejected."""
@@ -44,7 +44,7 @@ class Record(NamedTuple):
     """What a magnetic bearing told about attitude and bias; None without one."""
     fixes: list[Accepted]
     """Fixes applied, in order."""
-    undirected: list[Fix]
+    without_yaw: list[Fix]
     """Fixes refused because the track's direction in the map was not known yet."""
     estimate: Estimate
     """The estimate at the end."""

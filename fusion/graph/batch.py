@@ -70,13 +70,13 @@ def smooth(
     first = _inflated(local[0], prior, frame.transforms)
     builder = GraphBuilder(config, first)
     records = _with_climbs(records)
-    revoked = {time for record in records for time in record.revoked}
+    rejected_later = {time for record in records for time in record.rejected_later}
     for record, state in zip(records, local[1:], strict=True):
         # Neither is inflated as by the filter: the graph weights outliers by the whole track.
         # By the end the direction may be known that the filter had to wait for.
-        fixes = [*(accepted.fix for accepted in record.fixes), *record.undirected]
+        fixes = [*(accepted.fix for accepted in record.fixes), *record.without_yaw]
         placed = [fix.shifted(-origin) for fix in fixes if frame.holds(fix)]
-        valid = record.displacement is not None and record.interval.stop not in revoked
+        valid = record.displacement is not None and record.interval.stop not in rejected_later
         builder.step(record, record.offered if valid else None, placed, state)
     builder.close(local[-1])
     graph = builder.graph
@@ -145,10 +145,10 @@ def _inflated(first: NavState, prior: NavState, transforms: Sequence[FrameTransf
     to_last = frame_rotation(first.R_WB @ prior.R_WB.T)
     covariance = to_last @ prior.covariance @ to_last.T
     for transform in transforms:
-        if transform.placed:
+        if transform.is_shift:
             placed = np.diag(transform.position_covariance) > 0.0  # by a height, too, or without
             covariance[POSITION, POSITION] += np.diag(_UNKNOWN_POSITION**2 * placed)
-    if not all(transform.placed for transform in transforms):
+    if not all(transform.is_shift for transform in transforms):
         covariance[2, 2] += UNKNOWN_YAW**2
     return replace(first, covariance=covariance)
 

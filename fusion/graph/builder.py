@@ -12,7 +12,7 @@ from stario.fusion.filter.initial import tilt_sigma
 from stario.fusion.filter.record import Record
 from stario.fusion.filter.zero_velocity import ZeroVelocity
 from stario.fusion.graph.factors import (
-    Coasting,
+    ConstantVelocity,
     Displacement,
     GyroBias,
     Height,
@@ -26,9 +26,9 @@ from stario.fusion.graph.keyframes import KeyframeGraph
 from stario.fusion.graph.term import Term
 from stario.fusion.imu.barometer import HeightSample
 from stario.fusion.imu.gap import gap_covariance, gap_rotation, yaw_variance
+from stario.fusion.imu.inference import WindowDisplacement
 from stario.fusion.imu.intervals import SAME_TIME, ImuInterval, split_at
 from stario.fusion.imu.preintegration import Segment, segment_of
-from stario.fusion.imu.stateful import WindowDisplacement
 from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.fixes import Fix
 from stario.fusion.values.state import NavState
@@ -205,7 +205,7 @@ class GraphBuilder:
             t, zero = gap.duration, np.zeros(3)
             covariance = gap_covariance(t, yaw_variance(t, gap), zero, self._config)[2:, 2:]
             rotation = gap_rotation(gap.table, t, graph.states[before].b_g)
-            graph.add(Coasting((before, graph.last), covariance, t, rotation), gated=False)
+            graph.add(ConstantVelocity((before, graph.last), covariance, t, rotation), gated=False)
             assert gap.levelled is not None  # it comes with the end of every gap
             variance = tilt_sigma(gap.levelled, self._config) ** 2
             graph.add(Tilt((graph.last,), variance * np.eye(3), gap.levelled.up_B), gated=False)

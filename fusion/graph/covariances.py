@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from stario.fusion.filter.estimates import Estimate, plain_covariances
-from stario.fusion.filter.jacobians import ACTUAL, ASSUMED, symmetric
+from stario.fusion.filter.jacobians import GAIN, REPORTED, symmetric
 from stario.fusion.values.state import NavState, changed
 from stario.sequences.sequence import FloatArray
 
@@ -81,7 +81,7 @@ def root_information(covariance: FloatArray) -> FloatArray:
     return np.asarray((axes / roots).T / sigma)
 
 
-def with_actual_covariances(
+def with_reported_covariances(
     states: Sequence[NavState], estimates: Sequence[Estimate], turns: FloatArray | None = None
 ) -> list[NavState]:
     """Return a graph's states, whose measurements are the filter's, with covariances as they are.
@@ -98,7 +98,7 @@ def with_actual_covariances(
         turns: (N, 15, 15) rotations from the filter's frame to that of the states; None if they are
             the same.
     """
-    P, Q = (plain_covariances(estimates, which) for which in (ASSUMED, ACTUAL))
+    P, Q = (plain_covariances(estimates, which) for which in (GAIN, REPORTED))
     sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
     scale = sigma[:, :, None] * sigma[:, None, :]
     root, inverse_root = _roots(P / scale)

@@ -297,7 +297,7 @@ class Bearing(Term):
 
 
 @dataclass(frozen=True, eq=False)
-class Coasting(Term):
+class ConstantVelocity(Term):
     """Constant velocity and biases across a gap without samples, apart from a turn.
 
     The pedestrian turns about the vertical by psi, the yaw of R_j (R_i R_ij)^T, and the velocity

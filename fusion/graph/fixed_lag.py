@@ -14,12 +14,12 @@ import numpy as np
 from stario.fusion.filter.ekf import initialised, propagate
 from stario.fusion.filter.estimates import nav_states
 from stario.fusion.filter.estimator_state import EstimatorState
-from stario.fusion.filter.frame_transform import with_undirected
+from stario.fusion.filter.frame_transform import with_unknown_yaws
 from stario.fusion.filter.gained import Gained
-from stario.fusion.filter.jacobians import ASSUMED
+from stario.fusion.filter.jacobians import GAIN
 from stario.fusion.filter.record import Record
 from stario.fusion.graph.builder import GraphBuilder
-from stario.fusion.graph.covariances import with_actual_covariances
+from stario.fusion.graph.covariances import with_reported_covariances
 from stario.fusion.graph.factors import Bearing, GyroBias
 from stario.fusion.graph.term import IndeterminateError
 from stario.fusion.values.config import NavigatorConfig
@@ -52,7 +52,7 @@ class FixedLag:
 
     def _begin(self, filtered: EstimatorState, count: int) -> None:
         """Begin from the filter's state, `count` intervals since the start or a gap."""
-        first = nav_states([filtered.estimate()], ASSUMED)[0]
+        first = nav_states([filtered.estimate()], GAIN)[0]
         local = first.shifted(-first.p_W)
         self._origin_W = first.p_W  # of the graph; see `EkfState`
         self.builder = GraphBuilder(self._config, local, count, streaming=True)
@@ -73,8 +73,8 @@ class FixedLag:
         """Return the newest state, given the filter's."""
         ahead = self._ahead.estimate(filtered.in_gap, self._frame[0])
         state = nav_states([ahead])[0].shifted(self._origin_W)
-        states = with_actual_covariances([state], [filtered.estimate()])
-        return with_undirected(states, filtered.map_frame.undirected)[0]
+        states = with_reported_covariances([state], [filtered.estimate()])
+        return with_unknown_yaws(states, filtered.map_frame.unknown_yaws)[0]
 
     def step(self, filtered: EstimatorState, record: Record) -> None:
         """Follow the filter through an interval.
@@ -85,7 +85,7 @@ class FixedLag:
         """
         builder = self.builder
         self._narrow_prior(filtered.bias_prior.variance)
-        if self._is_stale(filtered) or record.interval.gap or record.revoked:
+        if self._is_stale(filtered) or record.interval.gap or record.rejected_later:
             self._begin(filtered, 0 if record.interval.gap else builder.count + 1)
             return
         yielded = record.at_rate(record.climb_rate)

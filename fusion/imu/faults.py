@@ -34,7 +34,10 @@ import numpy as np
 from stario.fusion.imu.intervals import NO_FLAGS, Flags, Sample
 from stario.sequences.clean_samples import MIN_RATE, replace_spikes
 from stario.sequences.errors import InputError
-from stario.sequences.inspection.constant_values import shaken, tilting
+from stario.sequences.inspection.constant_values import (
+    contradicts_constant_accel,
+    contradicts_constant_gyro,
+)
 from stario.sequences.sequence import BoolArray, FloatArray
 from stario.sequences.time_order import MAX_IMU_GAP
 
@@ -151,7 +154,11 @@ class FrozenSensorDetector:
             return "both"
         gyro, accel = self._gyro, self._accel
         # Both, whatever the first says: each has to know when its values change.
-        for sensor, same, moves in ((gyro, same_gyro, shaken), (accel, same_accel, tilting)):
+        pairs = (
+            (gyro, same_gyro, contradicts_constant_gyro),
+            (accel, same_accel, contradicts_constant_accel),
+        )
+        for sensor, same, moves in pairs:
             if same:
                 sensor.add(last, sample, moves)
             else:

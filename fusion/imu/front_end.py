@@ -28,6 +28,7 @@ from stario.fusion.imu.faults import (
     OutlierDetector,
 )
 from stario.fusion.imu.gap import gap_rotation
+from stario.fusion.imu.inference import WindowBuffer
 from stario.fusion.imu.intervals import (
     NO_FLAGS,
     Flags,
@@ -36,7 +37,6 @@ from stario.fusion.imu.intervals import (
     Start,
     interpolated_sample,
 )
-from stario.fusion.imu.stateful import WindowBuffer
 from stario.fusion.imu.units import SensorCheck, warn_of_field
 from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.health import Health

@@ -59,7 +59,7 @@ def yaw_variance(seconds: float, gap: ImuInterval) -> float:
     rate = YAW_RATE
     if gap.duration <= INTERPOLATED:
         rate = min(rate, YAW_GROWTH * seconds)
-    return min(gap.levelled.liveliness * rate * seconds, UNKNOWN_YAW) ** 2
+    return min(gap.levelled.motion_intensity * rate * seconds, UNKNOWN_YAW) ** 2
 
 
 def gap_covariance(

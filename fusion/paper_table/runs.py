@@ -34,7 +34,7 @@ from stario.fusion.evaluation.pedestrian import (
     piece_of,
 )
 from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude, true_poses
-from stario.fusion.imu.stateful import Predictor
+from stario.fusion.imu.inference import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.paper_table.sets import ALL, FIRST, DataSet
 from stario.fusion.paper_table.training import (

@@ -148,7 +148,7 @@ def mix_sources(
     for name, share, members in sources:
         if not members:
             continue
-        lively = [_liveliness(s) if id(s) in real else 1.0 for s in members]
+        lively = [_motion_intensity(s) if id(s) in real else 1.0 for s in members]
         starts = [max(0, len(s) - reach + 1) for s in members]
         whole = sum(v * n for v, n in zip(lively, starts, strict=True)) / WINDOW_RATE
         streams += members
@@ -222,7 +222,7 @@ def _length(streams: Sequence[Stream]) -> str:
     return f"{seconds / 60.0:.0f} min" if seconds >= 120.0 else f"{seconds:.0f} s"
 
 
-def _liveliness(stream: WorldStream) -> float:
+def _motion_intensity(stream: WorldStream) -> float:
     """Return the root mean square linear acceleration [m/s^2]: errors are large where it is."""
     linear = stream.imu_W[::10, 3:] - np.array([0.0, 0.0, STANDARD_GRAVITY], np.float32)
     return rms(linear)

@@ -84,7 +84,7 @@ class GravityStart:
         return np.asarray(self.R_WB[2])
 
     @property
-    def liveliness(self) -> float:
+    def motion_intensity(self) -> float:
         """Factor on the tilt's sigma of a moving device: 1 up to 1 rad/s, then as the rate.
 
         On 1,784 seconds of OxIOD, TUM-VI, RIDI, KIPD, rfbr and tyrex the tilt's error per axis is
@@ -159,7 +159,7 @@ class LevelledAttitude:
     def __init__(self, start: GravityStart) -> None:
         self.R_NB = start.R_WB
         self.b_g = np.zeros(3)
-        tilt, bias = (start.liveliness * _TILT_SIGMA) ** 2, BIAS_SIGMA**2
+        tilt, bias = (start.motion_intensity * _TILT_SIGMA) ** 2, BIAS_SIGMA**2
         # Covariance of theta about N's axes, R = (I + [theta]x) R^, and of the bias error.
         self._P = np.diag([tilt, tilt, 0.0, bias, bias, bias])
 
@@ -185,7 +185,7 @@ class LevelledAttitude:
         R_NB = self.R_NB @ turn
         self.R_NB = tilt_aligning(R_NB @ start.up_B).as_matrix() @ R_NB
         self._P[:3], self._P[:, :3] = 0.0, 0.0
-        self._P[:2, :2] = (start.liveliness * _TILT_SIGMA) ** 2 * np.eye(2)
+        self._P[:2, :2] = (start.motion_intensity * _TILT_SIGMA) ** 2 * np.eye(2)
 
     def _levelled(
         self, attitudes: FloatArray, time: FloatArray, accel: FloatArray, rate_error: float

@@ -65,8 +65,8 @@ def stuck_findings(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> lis
     """Report a sensor that repeats while the other moves; `check_units` refuses a dead one."""
     found = []
     for sensor, values, other, moves in (
-        ("gyroscope", gyro, "accelerometer", shaken),
-        ("accelerometer", accel, "gyroscope", tilting),
+        ("gyroscope", gyro, "accelerometer", contradicts_constant_gyro),
+        ("accelerometer", accel, "gyroscope", contradicts_constant_accel),
     ):
         repeated = np.asarray(~np.diff(values, axis=0).any(axis=1))
         stuck = [
@@ -98,15 +98,15 @@ def check_not_dead(name: str, time: FloatArray, gyro: FloatArray, accel: FloatAr
     Raises:
         InputError: one's are.
     """
-    if not np.diff(gyro, axis=0).any() and shaken(time, gyro, accel):
+    if not np.diff(gyro, axis=0).any() and contradicts_constant_gyro(time, gyro, accel):
         found = "values that never change while the accelerometer's do"
         raise InputError(f"{name}: gyroscope", found, "angular rates", _REMEDY)
-    if not np.diff(accel, axis=0).any() and tilting(time, gyro, accel):
+    if not np.diff(accel, axis=0).any() and contradicts_constant_accel(time, gyro, accel):
         found = "values that never change while the gyroscope tilts them"
         raise InputError(f"{name}: accelerometer", found, "specific forces", _REMEDY)
 
 
-def shaken(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
+def contradicts_constant_gyro(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
     """Return whether a force (n, 3) contradicts both rest and steady rotation at the first rate.
 
     In steady rotation the force is constant, in the device's axes (moving in a circle) or in the
@@ -116,7 +116,7 @@ def shaken(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
     return min(scatter(accel), scatter(turned)) > _SHAKEN_M_S2
 
 
-def tilting(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
+def contradicts_constant_accel(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> bool:
     """Return whether the rate (n, 3) perpendicular to the force varies.
 
     A constant force rules that out; one of zero, which has no direction, any rate that varies.

@@ -22,10 +22,10 @@ from stario.fusion.filter.correlated_errors import ACCEL_SHARE, displacement_err
 from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
 from stario.fusion.filter.estimates import Estimate
 from stario.fusion.filter.initial import PriorPose
-from stario.fusion.filter.jacobians import ACTUAL, CORE
+from stario.fusion.filter.jacobians import CORE, REPORTED
 from stario.fusion.filter.record import innovations_of
+from stario.fusion.imu.inference import WindowDisplacement, slope_variance
 from stario.fusion.imu.intervals import ImuInterval
-from stario.fusion.imu.stateful import WindowDisplacement, slope_variance
 from stario.fusion.recording import Progress, cut_recording, silent
 from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.lie import log_se23, yaw_rotation
@@ -218,7 +218,7 @@ def _errors(
     now: Estimate, walk: Trajectory, k: int, b_g: FloatArray, b_a: FloatArray
 ) -> tuple[float, float, float]:
     """Return the NEES, the squared yaw error and the yaw's variance at sample k."""
-    X, P = now.X, now.covariances[ACTUAL]
+    X, P = now.X, now.covariances[REPORTED]
     assert walk.velocity_W is not None  # those of simulated walks are known
     R = walk.attitude_WB[k].as_matrix() @ X[:, :3].T
     pose = log_se23(R, walk.velocity_W[k] - R @ X[:, 3], walk.position_W[k] - R @ X[:, 4])

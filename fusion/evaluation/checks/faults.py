@@ -22,7 +22,7 @@ from stario.fusion.backends import BackendName
 from stario.fusion.evaluation.compare import TRACK_OF
 from stario.fusion.evaluation.scores import Column, joined, rows_of, scored
 from stario.fusion.evaluation.tracks import true_poses
-from stario.fusion.imu.stateful import Predictor, WindowDisplacement
+from stario.fusion.imu.inference import Predictor, WindowDisplacement
 from stario.fusion.navigator import Navigator
 from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.values.config import FilterConfig, NavigatorConfig

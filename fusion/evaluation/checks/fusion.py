@@ -47,7 +47,7 @@ from stario.fusion.evaluation.tracks import network_track, true_poses
 from stario.fusion.filter import estimator
 from stario.fusion.filter.record import innovations_of
 from stario.fusion.graph.fixed_lag import FixedLag
-from stario.fusion.imu.stateful import Predictor
+from stario.fusion.imu.inference import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.recording import PreprocessedRecording
 from stario.fusion.values.config import NavigatorConfig

@@ -20,7 +20,7 @@ from stario.fusion.evaluation.displacement_error import fit_yaw_and_position, kn
 from stario.fusion.evaluation.scores import Column, by_track, geometric_mean, joined, scored, table
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.direction import Complex
-from stario.fusion.imu.stateful import Predictor
+from stario.fusion.imu.inference import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.state import Track

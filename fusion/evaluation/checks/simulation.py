@@ -17,7 +17,7 @@ from stario.fusion.evaluation.compare import Metrics, measure
 from stario.fusion.evaluation.known_positions import length_ratio, true_path
 from stario.fusion.evaluation.scores import Column, scored, table
 from stario.fusion.evaluation.tracks import network_track
-from stario.fusion.imu.stateful import Predictor
+from stario.fusion.imu.inference import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.values.config import NavigatorConfig
 from stario.sequences.arrays import even_grid, generator, interpolated, rms

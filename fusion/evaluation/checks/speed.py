@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from stario.fusion.evaluation.compare import demonstration
-from stario.fusion.imu.stateful import Predictor
+from stario.fusion.imu.inference import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.values.config import FilterConfig, NavigatorConfig
 from stario.fusion.values.state import Track

@@ -14,7 +14,7 @@ from stario.fusion.evaluation.scores import wide
 from stario.fusion.filter.alternative import AlternativeHypothesis, Hypotheses
 from stario.fusion.filter.displacements import update_with
 from stario.fusion.filter.innovations import InnovationStatistics
-from stario.fusion.imu.stateful import WindowDisplacement
+from stario.fusion.imu.inference import WindowDisplacement
 from stario.fusion.values.config import FilterConfig, NavigatorConfig
 from stario.fusion.values.state import NavState
 from stario.sequences.noise import ImuNoise
@@ -131,13 +131,13 @@ def hypotheses(time: float = 10.0) -> Hypotheses:
 def test_a_displacement_that_fits_only_the_alternative_adopts_it():
     pair = hypotheses()
     for fits, fits_filter in ((False, False), (False, True), (True, True)):
-        pair, revoked = pair.judged(fits, fits_filter)
-        assert revoked == ()
+        pair, rejected_later = pair.judged(fits, fits_filter)
+        assert rejected_later == ()
     assert pair.alternative is not None
     assert pair.ekf.b_a[0] == 0.0
     # The displacements without which it was made were false.
-    pair, revoked = pair.judged(True, fits_filter=False)
-    assert revoked == (10.0, 10.5)
+    pair, rejected_later = pair.judged(True, fits_filter=False)
+    assert rejected_later == (10.0, 10.5)
     assert pair.alternative is None
     assert pair.ekf.b_a[0] == 1.0
 
@@ -146,11 +146,11 @@ def test_the_alternative_is_dropped_when_both_fit_or_when_it_is_too_old():
     pair = hypotheses()
     for _ in range(4):
         assert pair.alternative is not None
-        pair, revoked = pair.judged(True, fits_filter=True)
-        assert revoked == ()
+        pair, rejected_later = pair.judged(True, fits_filter=True)
+        assert rejected_later == ()
     assert pair.alternative is None
-    aged, revoked = hypotheses(16.5).judged(False, fits_filter=True)
-    assert revoked == ()
+    aged, rejected_later = hypotheses(16.5).judged(False, fits_filter=True)
+    assert rejected_later == ()
     assert aged.alternative is None
     assert aged.ekf.b_a[0] == 0.0
 

@@ -21,7 +21,7 @@ from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.innovations import MAX_LEVEL, MIN_LEVEL, InnovationStatistics
 from stario.fusion.filter.kalman import UpdateResult
 from stario.fusion.filter.map_frame import Mapped
-from stario.fusion.graph.covariances import with_actual_covariances
+from stario.fusion.graph.covariances import with_reported_covariances
 from stario.fusion.imu.preintegration import preintegrate
 from stario.fusion.recording import cut_recording
 from stario.fusion.values.config import FilterConfig
@@ -255,7 +255,7 @@ def test_no_measurement_estimates_them():
         lambda: ekf.update_yaw(0.0, 0.1),
     ):
         update()
-        np.testing.assert_allclose(np.diag(ekf.state.P_actual)[rows], 1.0, rtol=1e-9)
+        np.testing.assert_allclose(np.diag(ekf.state.P_reported)[rows], 1.0, rtol=1e-9)
         assert not ekf.P[rows].any()
 
 
@@ -282,14 +282,14 @@ def test_a_graph_in_a_turned_frame_gets_the_filters_covariance_turned():
     rng = np.random.default_rng(3)
     P, Q = (random_covariance(rng) for _ in range(2))
     A = frame_rotation(about_z(1.1).as_matrix())
-    (state,) = with_actual_covariances([nav_state(A @ P @ A.T)], [estimate(P, Q)], A[None])
+    (state,) = with_reported_covariances([nav_state(A @ P @ A.T)], [estimate(P, Q)], A[None])
     np.testing.assert_allclose(state.covariance, A @ Q @ A.T, atol=1e-8 * np.abs(Q).max())
 
 
 def test_a_graph_as_certain_as_the_filter_gets_the_filters_covariance():
     rng = np.random.default_rng(2)
     P, Q, smaller = (random_covariance(rng) for _ in range(3))
-    (state,) = with_actual_covariances([nav_state(P)], [estimate(P, Q)])
+    (state,) = with_reported_covariances([nav_state(P)], [estimate(P, Q)])
     np.testing.assert_allclose(state.covariance, Q, atol=1e-8 * np.abs(Q).max())
-    (unchanged,) = with_actual_covariances([nav_state(smaller)], [estimate(P, P)])
+    (unchanged,) = with_reported_covariances([nav_state(smaller)], [estimate(P, P)])
     np.testing.assert_allclose(unchanged.covariance, smaller, atol=1e-8 * smaller.max())

@@ -37,7 +37,7 @@ def test_a_wider_prior_adds_as_much_to_an_error_that_is_larger_than_assumed():
     root = 1e-3 * np.random.default_rng(0).normal(size=ekf.P.shape)
     ekf.covariances = np.stack([ekf.P, ekf.P + root @ root.T])
     ekf.state = with_prior_replaced(ekf.state, 1e-6, 1e-4)
-    np.testing.assert_allclose(ekf.state.P_actual - ekf.P, root @ root.T, atol=1e-10)
+    np.testing.assert_allclose(ekf.state.P_reported - ekf.P, root @ root.T, atol=1e-10)
 
 
 def test_a_bias_that_has_wandered_beyond_its_prior_keeps_a_valid_covariance():
@@ -60,7 +60,7 @@ def converged(data: float, sigma: float, prior: GyroBiasPrior | None = None) -> 
     for _ in range(200):
         share = prior.variance / (prior.variance + sigma**2)
         b_g, P = np.array([data, 0.0, 0.0]) * share, share * sigma**2 * np.eye(3)
-        prior = prior.updated(b_g, P, wander=0.0)
+        prior = prior.updated(b_g, P, walked=0.0)
     return float(np.sqrt(prior.variance))
 
 

@@ -13,7 +13,7 @@ from stario.fusion.evaluation.scores import values
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.height import with_height, yielding
 from stario.fusion.imu.barometer import HeightSample
-from stario.fusion.imu.stateful import WindowDisplacement
+from stario.fusion.imu.inference import WindowDisplacement
 from stario.fusion.report.panels import motion_panels
 from stario.fusion.report.series import track_series
 from stario.sequences.attitude.so3 import exp_so3
@@ -69,7 +69,7 @@ def test_jacobian_agrees_with_finite_differences():
     at_rest = with_height(s, sample())[1]
     H = -(np.array(moved)[:, 0] - at_rest.residual[0]) / step
     H[s.considered_rows] = 0.0
-    expected = np.sqrt(H @ s.P_actual @ H + 0.1**2)
+    expected = np.sqrt(H @ s.P_reported @ H + 0.1**2)
     assert at_rest.sigma[0] == pytest.approx(expected, rel=1e-5)
 
 

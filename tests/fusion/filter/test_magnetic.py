@@ -14,9 +14,9 @@ from stario.fusion import Navigator, NavState, PriorPose
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import bearing_jacobian
 from stario.fusion.filter.magnetic import (
+    DISTURBANCE_SIGMA,
     HARD_IRON_SECONDS,
     HARD_IRON_SIGMA,
-    WANDER_SIGMA,
     MagneticReference,
     propagated_field,
     update_bearing,
@@ -86,9 +86,10 @@ def test_a_field_that_varies_along_the_path_has_a_wandering_azimuth() -> None:
         for k in range(120):
             size, dip = 45.0 * (1.0 + spread * rng.normal()), 1.0 + spread * rng.normal()
             reference = reference.updated(0.5 * k, size, dip, travelled)
-        wander[place] = reference.wander_sigma
+        wander[place] = reference.disturbance_sigma
     assert wander["quiet"] < 0.15
-    assert wander["steel"] == wander["table"] == WANDER_SIGMA  # one spot tells nothing of others
+    # One spot tells nothing of others.
+    assert wander["steel"] == wander["table"] == DISTURBANCE_SIGMA
 
 
 def with_iron(s: EkfState, iron_B: np.ndarray, sigma: float):
@@ -160,7 +161,7 @@ def test_a_field_that_the_device_carries_on_tells_nothing_of_the_place():
             size = 1.0 + noise * rng.normal()
             s, _, reference = update_bearing(s, reference, s.R_WB.T @ FIELD_W * size)
             reference = replace(reference, pose=(s.R_WB, s.p_W))
-        wander.append(reference.wander_sigma)
+        wander.append(reference.disturbance_sigma)
     assert wander[0] < 0.3 < wander[1]
 
 
@@ -220,7 +221,7 @@ def test_bearings_determine_the_gyroscope_bias(biased_walk, oracle, biased_track
 
 def test_what_a_magnetometers_calibration_was_is_forgotten_within_minutes():
     known = with_iron(state(), np.array([20.0, -25.0, 10.0]), sigma=1.0)
-    later = propagated_field(known, 3.0 * HARD_IRON_SECONDS, WANDER_SIGMA)
+    later = propagated_field(known, 3.0 * HARD_IRON_SECONDS, DISTURBANCE_SIGMA)
     row = later.field_row + 2
     assert np.abs(later.field.hard_iron_B).max() < 2.0
     assert math.sqrt(later.P[row, row]) == pytest.approx(HARD_IRON_SIGMA, rel=0.01)

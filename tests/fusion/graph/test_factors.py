@@ -9,7 +9,7 @@ from gtsam.symbol_shorthand import B, V, X
 
 from stario.fusion.graph.factors import (
     Bearing,
-    Coasting,
+    ConstantVelocity,
     Displacement,
     GyroBias,
     Position,
@@ -55,7 +55,7 @@ def terms(rng: np.random.Generator, values: Any) -> list[Term]:
         Prior.white(0, (state, next_state), rng.normal(size=(20, 30)), rng.normal(size=20)),
         Prior.white(0, (state,), rng.normal(size=(9, 15)), rng.normal(size=9)),
         Bearing((0,), np.eye(1), state.R_WB, rng.normal(size=3), rng.normal(size=6), 0.7),
-        Coasting((0, 1), np.eye(13), 1.7, exp_so3(rng.normal(0.0, 0.3, 3))),
+        ConstantVelocity((0, 1), np.eye(13), 1.7, exp_so3(rng.normal(0.0, 0.3, 3))),
         Tilt((0,), EYE, np.array([0.6, 0.0, 0.8])),
         SamePlace((0, 1), EYE),
     ]
@@ -106,7 +106,7 @@ def test_in_a_gap_velocity_and_biases_are_constant_and_a_turn_is_any_turn(yaw):
     values.update(X(1), gtsam.Pose3(gtsam.Rot3(turn @ tilted), a.p_W + 3.0 * v))
     values.update(V(1), v)
     values.update(B(1), gtsam.imuBias.ConstantBias(a.b_a, a.b_g))
-    residual, _ = Coasting((0, 1), np.eye(13), 3.0, R_ij).linearise(values)
+    residual, _ = ConstantVelocity((0, 1), np.eye(13), 3.0, R_ij).linearise(values)
     np.testing.assert_allclose(residual, [-yaw, *np.zeros(12)], atol=1e-10)
 
 
@@ -114,7 +114,7 @@ def test_motion_in_a_gap_observes_no_turn_but_its_own():
     """Not even where the residual is far from zero, as in a first round."""
     values = random_values(np.random.default_rng(7))
     a, b = (KeyframeState.of(values, k) for k in (0, 1))
-    _, blocks = Coasting((0, 1), np.eye(13), 1.7, EYE).linearise(values)
+    _, blocks = ConstantVelocity((0, 1), np.eye(13), 1.7, EYE).linearise(values)
     H, up = dict(blocks), np.array([0.0, 0.0, 1.0])
 
     def of_turn(k, s, about):

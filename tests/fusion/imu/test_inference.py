@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stario.fusion.imu.direction import Direction, direction, weighted_force
-from stario.fusion.imu.stateful import StatefulInference
+from stario.fusion.imu.inference import StatefulInference
 from stario.fusion.navigator import Navigator
 from stario.fusion.recording import cut_recording
 from stario.fusion.values.config import FilterConfig, NavigatorConfig
