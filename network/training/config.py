@@ -144,6 +144,7 @@ class TrainingConfig:
             value = getattr(self, name)
             if not (isinstance(value, int) and value >= least):
                 raise ConfigError(name, repr(value), f"an integer of {least} or more")
+        check_number(self, "seed", 0, 2**31 - 1)  # torch adds rank and step
         for name in _SHARES:
             check_number(self, name, 0.0, 1.0)
         check_number(self, "rate", 1e-8, 1.0)

@@ -158,6 +158,7 @@ def test_sigma_does_not_affect_the_gradient_of_the_mean():
         ({"attitude": "guessed"}, "attitude"),
         ({"architecture": "Star"}, "architecture"),
         ({"seed": -1}, "seed"),
+        ({"seed": 2**70}, "seed"),
         ({"dropout": "no"}, "dropout"),
         ({"augmentation": {"speeds": 3}}, "augmentation.speeds"),
         *(
