@@ -12,10 +12,10 @@ from stario.fusion.evaluation.tracks import inertial_track as inertial_track
 from stario.fusion.evaluation.tracks import network_track as network_track
 from stario.fusion.filter.initial import PriorPose as PriorPose
 from stario.fusion.filter.kalman import UpdateResult as UpdateResult
-from stario.fusion.imu.preintegration import Segment as Segment
-from stario.fusion.imu.preintegration import preintegrate as preintegrate
 from stario.fusion.imu.inference import Predictor as Predictor
 from stario.fusion.imu.inference import WindowDisplacement as WindowDisplacement
+from stario.fusion.imu.preintegration import Segment as Segment
+from stario.fusion.imu.preintegration import preintegrate as preintegrate
 from stario.fusion.live.run import LiveServer as LiveServer
 from stario.fusion.navigator import Navigator as Navigator
 from stario.fusion.recording import PreprocessedRecording as PreprocessedRecording
