@@ -16,7 +16,7 @@ from stario.sequences.auxiliary import Timed
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_path, unused_name
 from stario.sequences.lazy import optional_package
-from stario.sequences.readers.archive import POSITIONS_OPTIONAL, SATELLITES_OPTIONAL, SUFFIXES
+from stario.sequences.readers.archive import PARTS, SUFFIXES, Layout, track_layout
 from stario.sequences.sequence import FloatArray, ImuSequence
 
 _log = logging.getLogger(__name__)
@@ -56,56 +56,31 @@ def write_archive(path: Path | str, sequences: Iterable[ImuSequence]) -> list[st
 
 
 def _write(group: Any, sequence: ImuSequence) -> None:
-    satellites = {name: name for name in ("latlon_deg", *SATELLITES_OPTIONAL)}
-    columns = {
-        "imu/t": sequence.time,
-        "imu/gyro": sequence.gyro,
-        "imu/accel": sequence.accel,
-        **_known("mag", sequence.magnetometer, field="field"),
-        **_known("attitude", sequence.device_attitude, quat_xyzw="attitude_WB"),
-        **_known("pressure", sequence.barometer, hPa="pressure_hPa"),
-        **_known("satellites", sequence.satellites, **satellites),
-        **_known(
-            "truth",
-            sequence.truth,
-            p="position_W",
-            quat_xyzw="attitude_WB",
-            velocity="velocity_W",
-            position_covariance="position_covariance_W",
-            valid="valid",
-        ),
-        **_positions(sequence),
-    }
+    track, layouts = sequence.positions, dict(PARTS)
+    if track is not None and track.kind == "positions" and sequence.truth is not None:
+        _log.warning("%s: positions alongside true poses are not written", sequence.name)
+    elif track is not None:
+        flat = track.kind == "waypoints" and track.position_W.shape[1] == 2
+        layouts["positions"] = track_layout(track.kind, "xy" if flat else "p")
+    columns = {"imu/t": sequence.time, "imu/gyro": sequence.gyro, "imu/accel": sequence.accel}
+    for attribute, layout in layouts.items():
+        if layout is not None and (part := getattr(sequence, attribute)) is not None:
+            columns |= _columns(layout, part)
     for name, values in columns.items():
         group.create_dataset(name, data=values, **(_COMPRESSION if len(values) else {}))
     for key, value in sequence.attributes.items():
         group.attrs[key] = value
 
 
-def _positions(sequence: ImuSequence) -> dict[str, FloatArray]:
-    track = sequence.positions
-    if track is None:
-        return {}
-    stem, place = "truth", "p"
-    if track.kind == "waypoints":
-        stem, place = "waypoints", "xy" if track.position_W.shape[1] == 2 else "p"
-    elif sequence.truth is not None:
-        _log.warning("%s: positions alongside true poses are not written", sequence.name)
-        return {}
-    names = {name: name for name in (*POSITIONS_OPTIONAL, "valid")}
-    return _known(stem, track, **{place: "position_W"}, **names)
-
-
-def _known(stem: str, part: Timed | None, **names: str) -> dict[str, FloatArray]:
-    """Return the time and the known attributes of a part by their datasets' names.
+def _columns(layout: Layout, part: Timed) -> dict[str, FloatArray]:
+    """Return the known attributes of a part by their datasets' names.
 
     Flags are left out if all are True, which is what a reader takes for granted.
     """
-    if part is None:
-        return {}
-    columns = {f"{stem}/t": part.time}
-    for name, attribute in names.items():
+    columns = {}
+    for name, attribute in ({"t": "time"} | layout.needed | layout.optional).items():
         value = getattr(part, attribute)
         if value is not None and not (attribute == "valid" and value.all()):
-            columns[f"{stem}/{name}"] = value.as_quat() if attribute == "attitude_WB" else value
+            value = value.as_quat() if attribute == "attitude_WB" else value
+            columns[f"{layout.stem}/{name}"] = value
     return columns

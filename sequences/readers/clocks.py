@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -15,7 +16,7 @@ from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.phones.sensor_words import XSENS_CLOCK
 from stario.sequences.readers.text import IntArray, seconds
-from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray, ImuSequence
+from stario.sequences.sequence import MAX_TRUTH_GAP, FloatArray, ImuSequence
 from stario.sequences.time_order import MAX_IMU_GAP, disorder, increasing_mask
 from stario.sequences.units import FILETIME_1970, FILETIME_NS, TIME_UNITS
 
@@ -97,7 +98,7 @@ def resample_to_gyro(
     Raises:
         ReadError: the two sensors do not overlap in time, or the accelerometer's rate is too low.
     """
-    accel = _sorted_samples(path, names[1], accel)
+    accel = _sorted_samples(path, names[1], accel, _rate(gyro.stamps_ns))
     gyro_ns, accel_ns = gyro.stamps_ns, accel.stamps_ns
     kept = (gyro_ns >= accel_ns[0]) & (gyro_ns <= accel_ns[-1])
     if not kept.any():
@@ -125,7 +126,7 @@ def resample_to_gyro(
     return gyro_ns[kept], gyro.values[kept], force
 
 
-def _sorted_samples(path: Path, name: str, samples: Samples) -> Samples:
+def _sorted_samples(path: Path, name: str, samples: Samples, other_rate: float) -> Samples:
     """Return a sensor's samples by increasing time, one at each, for interpolation.
 
     Rows late by milliseconds are sorted. Those of a clock that was set back are dropped: sorted,
@@ -145,26 +146,25 @@ def _sorted_samples(path: Path, name: str, samples: Samples) -> Samples:
     stamps_ns, values = stamps_ns[order], values[order]
     fresh = np.append(True, np.diff(stamps_ns) > 0)
     differing = np.append(True, np.diff(values, axis=0).any(axis=1))
-    _warn_of_few_times(path, name, stamps_ns[fresh], fresh | differing)
-    return Samples(stamps_ns[fresh], values[fresh])
-
-
-def _warn_of_few_times(path: Path, name: str, stamps_ns: IntArray, samples: BoolArray) -> None:
-    """Warn if several samples share each of the times (M,), or these are too far apart."""
-    if len(stamps_ns) < 2:
-        return
-    shared = float(samples.sum()) / len(stamps_ns)
-    rate = 1e9 / float(np.median(np.diff(stamps_ns)))
+    shared, rate = float((fresh | differing).sum()) / int(fresh.sum()), _rate(stamps_ns[fresh])
     if shared >= SHARED_TIMES:
         _log.warning(
             "%s: %s: found %.3g samples on average at each time, of which one is used, expected a "
             "time for each: export them unrounded, and not in batches", path, name, shared,
         )  # fmt: skip
-    elif rate < MIN_RATE:
+    elif rate < min(MIN_RATE, other_rate):  # a recording of that rate is refused later
         _log.warning(
             "%s: %s: found %.3g samples/s, expected 50 to 1000: set the app to 50 Hz or more",
             path, name, rate,
         )  # fmt: skip
+    return Samples(stamps_ns[fresh], values[fresh])
+
+
+def _rate(stamps_ns: IntArray) -> float:
+    """Return the median rate [Hz] of times [ns], infinite for a single one."""
+    steps = np.diff(stamps_ns)
+    steps = steps[steps > 0]
+    return 1e9 / float(np.median(steps)) if len(steps) else math.inf
 
 
 def _refuse_counts_and_dates(file: Path, title: str, time: FloatArray) -> None:

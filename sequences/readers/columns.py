@@ -130,8 +130,9 @@ def read_header(path: Path, lines: list[str]) -> Header:
         raise ReadError(path, "header", "only comments", HEADER)
     line, number = lines[index], index + 1
     if not _names_columns(line):
-        found = repr(line.strip()[:60])
-        raise ReadError(path, f"line {number}, header", found, HEADER, "put it above the rows")
+        found = f"{line.strip()[:60]!r}, which names no axis of a sensor"
+        fix = "write titles above the rows; if it is in another format, omit `--format csv`"
+        raise ReadError(path, f"line {number}", found, f"titles, {HEADER}", fix)
     titles, below = _titles(line), lines[number] if number < len(lines) else ""
     with_units = with_units_below(titles, below.split(_separator(line)))
     columns = _columns(path, number, with_units or titles)

@@ -83,7 +83,7 @@ GOOD = [HEADER, f"0,{ROW}", f"0.01,{ROW}", f"0.02,{ROW}"]
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        (GOOD[1:], "line 1, header: found '0,0.1,0.2"),
+        (GOOD[1:], "line 1: found '0,0.1,0.2"),
         ([HEADER.replace("gz", "yaw"), *GOOD[1:]], "header: found no gz, expected t [s],gx"),
         ([HEADER.replace("gx [rad/s]", "gx [rpm]"), *GOOD[1:]], "gx: found unit 'rpm', expected"),
         ([HEADER.replace("t [s]", "t [min]"), *GOOD[1:]], "t: found unit 'min', expected s, ms"),
