@@ -100,6 +100,7 @@ def rotations(
     quat: FloatArray,
     order: str = "wxyz",
     numbers: IntArray | None = None,
+    row: str = "row",
 ) -> Rotation:
     """Return rotations from unit quaternions.
 
@@ -109,6 +110,7 @@ def rotations(
         quat: (N, 4) quaternions.
         order: order of their components, `wxyz` or `xyzw`.
         numbers: (N,) numbers of the rows, for errors; from 1 if None.
+        row: what these count, for errors.
 
     Raises:
         ReadError: a component is not finite or a norm differs from 1 by more than a percent; the
@@ -118,7 +120,7 @@ def rotations(
     bad = ~(np.abs(norm - 1.0) <= NORM_TOLERANCE)
     if bad.any():
         k = int(np.argmax(bad))
-        where = f"row {k + 1 if numbers is None else numbers[k]}, {field}"
+        where = f"{row} {k + 1 if numbers is None else numbers[k]}, {field}"
         raise ReadError(
             path, where, f"norm {norm[k]:.4g}", "a unit quaternion", "cut the recording there"
         )

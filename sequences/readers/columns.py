@@ -19,6 +19,7 @@ from stario.sequences.readers.phones.sensor_words import (
     is_uncalibrated,
     sensor_of,
 )
+from stario.sequences.readers.text import Column
 from stario.sequences.units import (
     ACCEL_UNITS,
     GYRO_UNITS,
@@ -102,15 +103,6 @@ _FEWEST_UNITS = 3
 """Number of cells that make a row of units: those of one sensor."""
 
 _CELL = re.compile(r"\s*[\"']?\s*(?P<name>[^\[\(\"']*?)\s*(?:[\[\(](?P<unit>[^\]\)]*)[\]\)])?\W*$")
-
-
-@dataclass(frozen=True)
-class Column:
-    """A quantity's position in a row, its title, and its unit in the tables' spelling, if any."""
-
-    index: int
-    title: str = ""
-    unit: str = ""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ import numpy as np
 from stario.sequences.arrays import number_in
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.checked import checked
-from stario.sequences.readers.columns import Column
 from stario.sequences.readers.lines import is_row, read_lines
 from stario.sequences.readers.phones.files import (
     is_complete,
@@ -30,7 +29,7 @@ from stario.sequences.readers.phones.files import (
 from stario.sequences.readers.phones.sensor_layout import clock_of
 from stario.sequences.readers.phones.sensor_words import sensor_of, words_of
 from stario.sequences.readers.table_head import TableHead, table_heads
-from stario.sequences.readers.text import IntArray
+from stario.sequences.readers.text import Column, IntArray
 
 _log = logging.getLogger(__name__)
 

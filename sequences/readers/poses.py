@@ -123,7 +123,7 @@ def _read_poses(file: Path) -> list[_Poses]:
         return []
     columns = 13 if head.rows.shape[1] >= 13 else 8
     table = head.read(columns)
-    stamps = table.stamps_ns(0, time_unit(file, table.values[:, 0]))
+    stamps = table.stamps_ns(time_unit(file, table.values[:, 0]))
     numbers = table.values[:, 1:]
     if columns == 13:
         matrices = numbers.reshape(-1, 3, 4)

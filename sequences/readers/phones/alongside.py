@@ -31,12 +31,11 @@ from stario.sequences.readers.checked import (
     satellites,
 )
 from stario.sequences.readers.clocks import unit_within
-from stario.sequences.readers.columns import Column
 from stario.sequences.readers.phones.files import text_files
 from stario.sequences.readers.phones.sensor_layout import clock_of
 from stario.sequences.readers.phones.sensor_words import is_time, sensor_of, unit_of, words_of
 from stario.sequences.readers.table_head import TableHead, table_heads
-from stario.sequences.readers.text import IntArray, Table, seconds
+from stario.sequences.readers.text import Column, IntArray, Table, seconds
 from stario.sequences.sequence import Barometer, BoolArray, FloatArray, PositionTrack, Satellites
 from stario.sequences.time_order import increasing_mask
 from stario.sequences.units import TIME_UNITS, unit_named
@@ -123,7 +122,7 @@ class _Columns:
         unit = TIME_UNITS.get(self.clock.unit)
         if unit is None and len(rows) > 1:
             unit = unit_within(table.path, table.values[rows, 0], start_ns, stop_ns)
-        time = seconds(table.stamps_ns(self.clock.index, unit or 10**9, rows), start_ns)
+        time = seconds(table.stamps_ns(unit or 10**9, rows), start_ns)
         stop = float(stop_ns - start_ns) * 1e-9
         inside = (time >= 0.0) & (time <= stop)
         # A single one may be the last known before the start.
@@ -199,8 +198,7 @@ def _read_alongside(
 def _pressure(columns: _Columns, recording: Recording) -> Barometer | None:
     table, place = columns.read(), columns.places["pressure"]
     rows, time = columns.within(table, np.isfinite(table.values[:, 1]), recording)
-    title = place.title or f"column {place.index + 1}"
-    return barometer(table.path, title, time, table.values[rows, 1], place.unit)
+    return barometer(table.path, place.name, time, table.values[rows, 1], place.unit)
 
 
 def _pressure_in(head: TableHead, is_sensors: bool) -> dict[str, Column]:
@@ -315,7 +313,7 @@ def reference_points(recording: Recording) -> PositionTrack | None:
             continue
         table = head.read(3)
         unit = unit_within(file, table.values[:, 0], recording.start_ns, recording.stop_ns)
-        time = seconds(table.stamps_ns(0, unit), recording.start_ns)
+        time = seconds(table.stamps_ns(unit), recording.start_ns)
         kept = increasing_mask(time)
         return PositionTrack(time[kept], table.values[kept, 1:3], "waypoints")
     return None

@@ -57,7 +57,7 @@ def logged_attitude(files: PhoneFiles, gyro: Samples) -> tuple[IntArray, Rotatio
     try:
         rows = table.head.read([table.clock, *table.quaternion])
         unit_ns = time_unit(table.file, rows.values[:, 0], table.clock.unit)
-        stamps = rows.stamps_ns(table.clock.index, unit_ns)
+        stamps = rows.stamps_ns(unit_ns)
     except ReadError:  # attitude is optional
         return None
     return agreeing_attitude(stamps, rows.values[:, 1:], gyro, table.quaternion[0].title != "")

@@ -34,7 +34,7 @@ def read_samples(table: SensorTable, sensor: Sensor) -> Samples:
     if axes is None:
         raise ReadError(table.file, "header", "no x, y and z", f"the axes of the {sensor}")
     places, clock = table.axes[axes], table.clocks.get(axes, table.clock)
-    titles = ", ".join(p.title or f"column {p.index + 1}" for p in places)
+    titles = ", ".join(place.name for place in places)
     rows = table.head.read([clock, *places, *table.biases])
     refuse_several_devices(rows, table.head.titles, places[0].index)
     kept = _complete_rows(table.file, sensor, titles, rows.values[:, 1:])
@@ -49,7 +49,7 @@ def read_samples(table: SensorTable, sensor: Sensor) -> Samples:
         unit_ns, assumed = time_unit(table.file, time, clock.unit), ""
     else:
         unit_ns, assumed = inferred_unit(table.file, clock.title or "time", time)
-    return Samples(rows.stamps_ns(clock.index, unit_ns, kept), values, named.unit, assumed)
+    return Samples(rows.stamps_ns(unit_ns, kept), values, named.unit, assumed)
 
 
 def _complete_rows(file: Path, sensor: Sensor, titles: str, values: FloatArray) -> IntArray:

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 
-from stario.sequences.readers.columns import Column
 from stario.sequences.readers.phones.sensor_words import (
     Sensor,
     axis_of,
@@ -30,6 +29,7 @@ from stario.sequences.readers.phones.sensor_words import (
     unit_of,
 )
 from stario.sequences.readers.table_head import TableHead, table_heads
+from stario.sequences.readers.text import Column
 from stario.sequences.sequence import FloatArray
 
 Axes = tuple[Column, Column, Column]

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import finite_rows, rotations
 from stario.sequences.readers.lines import first_line, read_json, read_lines
-from stario.sequences.readers.text import RowFormat, read_table, seconds
+from stario.sequences.readers.text import Column, RowFormat, read_table, seconds
 from stario.sequences.sequence import FloatArray
 
 MAGNETIC = "magnetic"
@@ -92,12 +92,13 @@ def read_columns(
         if MAGNETIC not in names and set(some) <= set(header):
             names[MAGNETIC] = some
     used = [clock[0], *(name for some in names.values() for name in some)]
-    table = read_table(path, [header.index(name) for name in used], RowFormat(skip=1))
+    places = [Column(header.index(name), name) for name in used]
+    table = read_table(path, places, RowFormat(skip=1))
     columns = dict(zip(used, table.values.T, strict=True))
     arrays = {stem: np.column_stack([columns[n] for n in some]) for stem, some in names.items()}
     arrays[clock[0]] = columns[clock[0]]
     fields = Fields(path, arrays, [MAGNETIC], table.line_numbers[0])
-    stamps = table.stamps_ns(table.columns[0], clock[1], fields.rows)
+    stamps = table.stamps_ns(clock[1], fields.rows)
     return seconds(stamps, stamps[0]), fields
 
 

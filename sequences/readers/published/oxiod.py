@@ -107,7 +107,7 @@ def _sensor_rows(path: Path) -> tuple[ImuSequence, np.int64 | None]:
 
 
 def _stamps_ns(table: Table) -> IntArray:
-    return table.stamps_ns(0, time_unit(table.path, table.values[:, 0]))
+    return table.stamps_ns(time_unit(table.path, table.values[:, 0]))
 
 
 def capture_file(path: Path) -> Path | None:

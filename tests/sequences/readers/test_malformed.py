@@ -104,7 +104,7 @@ def test_a_damaged_csv_with_named_columns_is_refused(tmp_path, walks, which, qua
     csv = csv_of(path)
     good = csv.read_text()
     change(csv, 40, "acce_y", "high")
-    assert_refused(path, "line 42, column ", "found 'high', expected a number")
+    assert_refused(path, "line 42, acce_y", "found 'high', expected a number")
     csv.write_text(good)
     change(csv, 20, "acce_y", "nan")
     for axis in "wxyz":
