@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stario.sequences.arrays import check_choice
-from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_folder, atomic_write
 from stario.sequences.inspection.checks import MIN_SECONDS, check_units
 from stario.sequences.readers.archive import SUFFIXES as ARCHIVE_SUFFIXES
+from stario.sequences.readers.archive import write_archive
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import kind_of_positions
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack

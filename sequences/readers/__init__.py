@@ -7,8 +7,9 @@ be called from outside, and those that raise anything else, say so. Recognising 
 from __future__ import annotations
 
 import os
+import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -28,11 +29,23 @@ from stario.sequences.readers.bag import is_bag, read_bag
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import is_generic_csv, read_generic_csv
 from stario.sequences.readers.joined import is_joined, is_untimed, unpack_joined
-from stario.sequences.readers.lines import may_be_read
-from stario.sequences.readers.lists import is_list, list_entries
+from stario.sequences.readers.lines import (
+    first_line,
+    first_lines,
+    is_row,
+    may_be_read,
+    numbers_in,
+    read_lines,
+)
 from stario.sequences.readers.phones.event_lines import is_event_lines, read_event_lines
-from stario.sequences.readers.phones.phone import is_phone, is_wide, read_phone, read_wide
-from stario.sequences.readers.published.advio import is_advio, read_advio
+from stario.sequences.readers.phones.phone import (
+    is_advio,
+    is_phone,
+    is_wide,
+    read_advio,
+    read_phone,
+    read_wide,
+)
 from stario.sequences.readers.published.euroc import is_euroc, read_euroc
 from stario.sequences.readers.published.oxiod import is_oxiod, read_oxiod
 from stario.sequences.readers.published.ridi import is_imunet, is_ridi, read_imunet, read_ridi
@@ -131,6 +144,12 @@ _SUFFIXES = (
     *(".bag", ".mcap", ".db3", ".hdf5", ".h5"),
 )
 """Suffixes of files that may be a recording by themselves."""
+
+
+_LIST_SUFFIXES = (".txt", ".list", ".lst")
+_HEAD_LINES = 20
+_OXIOD_FORMS = ("syn", "raw")
+_FILTER = re.compile(r"\s+(?P<key>[A-Za-z]\w*)=(?P<value>\"[^\"]*\"|[^\s\",]+)\s*$")
 
 
 def read_recording(path: str | Path, format: str = "auto", **options: str) -> ImuSequence:
@@ -273,6 +292,68 @@ def _listed(
                 raise
             on_error(error)
     return _with_attributes(list(dict.fromkeys(found)), where)
+
+
+def is_list(path: Path) -> bool:
+    """Return whether a file may be a list: a text suffix and no row of numbers in its first lines.
+
+    A line with a single number may be a name, as in TLIO's lists.
+    """
+    if path.suffix.lower() not in _LIST_SUFFIXES or first_line(path, comments=True) is None:
+        return False
+    lines = first_lines(path, _HEAD_LINES)
+    return all(len(numbers_in(line, mark)) < 2 for line in lines for mark in (",", ";", None))
+
+
+def list_entries(path: Path) -> Iterator[tuple[Path, AttributeFilter] | ReadError]:
+    """Yield the paths that a list names, each with the filter of its recordings, or a line's error.
+
+    Names are relative to the list's folder or a folder in it. If that folder holds no folders, they
+    may also be relative to its parent or a folder in that. `data1/imu3.csv` is also found as
+    `data1/syn/imu3.csv` (OxIOD).
+    """
+    numbered = enumerate(read_lines(path), 1)
+    entries = [(k, *_parsed(x.split("#")[0])) for k, x in numbered if is_row(x)]
+    if not entries:
+        raise ReadError(path, "list", "no entry", "names of recordings")
+    folder = path.parent
+    bases = [folder, *(_folders(folder) or [folder.parent, *_folders(folder.parent)])]
+    if len(entries) > _HEAD_LINES and not any(_located(bases, name) for _, name, _ in entries):
+        found = f"{len(entries)} lines without an existing name, such as {entries[0][1]:.60}"
+        raise ReadError(path, "list", found, "a recording, or a list of them")
+    for number, name, where in entries:
+        line = f"line {number}"
+        if not name:
+            fix = "delete the line"
+            yield ReadError(path, line, "an empty entry", "a recording's name", fix)
+        elif (located := _located(bases, name)) is None:
+            fix = "remove the line or fetch the recording"
+            found_name = f"{name!r}, which does not exist"
+            yield ReadError(path, line, found_name, "the name of a recording", fix)
+        else:
+            yield located, where
+
+
+def _parsed(text: str) -> tuple[str, AttributeFilter]:
+    """Return the name in a line, and the `key=value` filters at its end."""
+    where: dict[str, list[str]] = {}
+    while match := _FILTER.search(text):
+        where.setdefault(match["key"], []).insert(0, match["value"].strip('"'))
+        text = text[: match.start()]
+    return text.split(",")[0].strip(), where
+
+
+def _folders(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+
+
+def _located(bases: list[Path], name: str) -> Path | None:
+    if not name:
+        return None
+    path = Path(name)
+    forms = [path, *(path.parent / form / path.name for form in _OXIOD_FORMS)]
+    candidates = (base / form for base in bases for form in forms)
+    return next((found for found in candidates if split_name(found)[0].exists()), None)
 
 
 def _is_recording(path: Path) -> bool:

@@ -6,11 +6,13 @@ truth: `truth/{t,p,quat_xyzw}` (poses), `truth/{t,p}` (positions) or `waypoints/
 Units are s, rad/s, m/s^2, uT and m; all clocks of a recording have the same zero. Its attributes
 record who carried which device where. Poses may come with
 `truth/{velocity,position_covariance,valid}`, positions with `sigma`, `latlon_deg` and `floor`.
+Numbers are written unchanged, in double precision and compressed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import logging
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from functools import partial
@@ -20,7 +22,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from stario.sequences.arrays import checked_array, checked_valid, first_of, numbers, some_times
+from stario.sequences.auxiliary import Timed
 from stario.sequences.errors import InputError, ReadError, StarioError
+from stario.sequences.files import atomic_path, unused_name
 from stario.sequences.lazy import optional_package
 from stario.sequences.readers.checked import OPTIONAL, captured_rotations, pose_mask
 from stario.sequences.readers.lines import first_bytes
@@ -35,6 +39,8 @@ from stario.sequences.sequence import (
     Trajectory,
 )
 
+_log = logging.getLogger(__name__)
+
 SUFFIXES = (".h5", ".hdf5")
 
 AttributeFilter = Mapping[str, Sequence[str]]
@@ -42,6 +48,7 @@ AttributeFilter = Mapping[str, Sequence[str]]
 
 _RONIN = "data.hdf5"
 _EXPECTED = "an intact HDF5 archive"
+_COMPRESSION = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 
 DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, AttributeError)
@@ -303,3 +310,65 @@ def opened_hdf5(path: Path, expected: str) -> Iterator[Any]:
         locked = isinstance(error, BlockingIOError) or "already open for write" in found
         fix = "close it in the program that writes it" if locked else "is the download complete?"
         raise ReadError(path, "content", found, expected, fix) from error
+
+
+def write_archive(path: Path | str, sequences: Iterable[ImuSequence]) -> list[str]:
+    """Write recordings into one archive, atomically; an existing file is replaced.
+
+    Args:
+        path: the archive file, `.h5` or `.hdf5`.
+        sequences: recordings, consumed one by one, so that they need not fit into memory together.
+
+    Returns:
+        The names under which they are stored: their own, with `-2`, `-3`, ... appended if a name
+        is taken, and with `-` instead of a slash.
+
+    Raises:
+        InputError: the file's name has another suffix, its folder does not exist, there is no
+            recording, or h5py is not installed.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError("path", str(path), f"a file name ending in {' or '.join(SUFFIXES)}")
+    h5py = optional_package("h5py", "readers")
+    names: list[str] = []
+    with atomic_path(path) as temporary:
+        with h5py.File(temporary, "x") as file:
+            for sequence in sequences:
+                name = sequence.name.replace("/", "-") or "recording"
+                names.append(unused_name(name, file))
+                _write(file.create_group(names[-1]), sequence)
+        if not names:
+            raise InputError(str(path), "no recording", "at least one recording")
+    return names
+
+
+def _write(group: Any, sequence: ImuSequence) -> None:
+    track, layouts = sequence.positions, dict(PARTS)
+    if track is not None and track.kind == "positions" and sequence.truth is not None:
+        _log.warning("%s: positions alongside true poses are not written", sequence.name)
+    elif track is not None:
+        flat = track.kind == "waypoints" and track.position_W.shape[1] == 2
+        layouts["positions"] = track_layout(track.kind, "xy" if flat else "p")
+    columns = {"imu/t": sequence.time, "imu/gyro": sequence.gyro, "imu/accel": sequence.accel}
+    for attribute, layout in layouts.items():
+        if layout is not None and (part := getattr(sequence, attribute)) is not None:
+            columns |= _columns(layout, part)
+    for name, values in columns.items():
+        group.create_dataset(name, data=values, **(_COMPRESSION if len(values) else {}))
+    for key, value in sequence.attributes.items():
+        group.attrs[key] = value
+
+
+def _columns(layout: Layout, part: Timed) -> dict[str, FloatArray]:
+    """Return the known attributes of a part by their datasets' names.
+
+    Flags are left out if all are True, which is what a reader takes for granted.
+    """
+    columns = {}
+    for name, attribute in ({"t": "time"} | layout.needed | layout.optional).items():
+        value = getattr(part, attribute)
+        if value is not None and not (attribute == "valid" and value.all()):
+            value = value.as_quat() if attribute == "attitude_WB" else value
+            columns[f"{layout.stem}/{name}"] = value
+    return columns

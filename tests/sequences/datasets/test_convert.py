@@ -8,11 +8,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.sequences import Barometer, DeviceAttitude, Magnetometer, Satellites, find_recordings
-from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.datasets.convert import convert
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_folder
 from stario.sequences.readers import read_recording
+from stario.sequences.readers.archive import write_archive
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, PositionTrack, Trajectory
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import generate_walk

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from stario.sequences.datasets import cache_files
-from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.datasets.batch import Skipped
 from stario.sequences.datasets.cache_files import cache_folder, code_files, recording_files
 from stario.sequences.datasets.stream_cache import cached, recorded
 from stario.sequences.readers import find_recordings, read_recording, write_csv
+from stario.sequences.readers.archive import write_archive
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import generate_walk

@@ -7,8 +7,7 @@ import pytest
 from recorded import DATA
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers import find_recordings, read_recording, write_csv
-from stario.sequences.readers.lists import is_list
+from stario.sequences.readers import find_recordings, is_list, read_recording, write_csv
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
 
