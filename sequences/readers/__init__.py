@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -277,21 +277,50 @@ def _below(path: Path) -> list[Path]:
 def _listed(
     path: Path, on_error: Callable[[ReadError], None] | None, where: AttributeFilter | None
 ) -> list[Path]:
-    """Return a list's recordings, each once; a nested list is an error: it could be a cycle."""
+    """Return the recordings that a list names, each once.
+
+    Names are relative to the list's folder or a folder in it. If that folder holds no folders, they
+    may also be relative to its parent or a folder in that. `data1/imu3.csv` is also found as
+    `data1/syn/imu3.csv` (OxIOD). An archive's name may be followed by a filter, as for
+    `find_recordings`: `file.h5 person=dan place="building 2"`. Blanks around a name, a `,type`
+    after it and comments from `#` on are ignored.
+    """
+    numbered = enumerate(read_lines(path), 1)
+    entries = [(k, *_parsed(x.split("#")[0])) for k, x in numbered if is_row(x)]
+    if not entries:
+        raise ReadError(path, "list", "no entry", "names of recordings")
+    folder = path.parent
+    bases = [folder, *(_folders(folder) or [folder.parent, *_folders(folder.parent)])]
+    located = [_located(bases, name) for _, name, _ in entries]
+    if len(entries) > _HEAD_LINES and not any(located):
+        text = f"{len(entries)} lines without an existing name, such as {entries[0][1]:.60}"
+        raise ReadError(path, "list", text, "a recording, or a list of them")
     found: list[Path] = []
-    for entry in list_entries(path):
+    for (number, name, of_entry), inside in zip(entries, located, strict=True):
         try:
-            if isinstance(entry, ReadError):
-                raise entry
-            inside, of_entry = entry
-            if not _is_recording(inside) and is_list(inside):
-                raise ReadError(path, "list", f"another list, {inside.name}", "recordings")
-            found += find_recordings(inside, where=of_entry)
+            found += find_recordings(_entry(path, number, name, inside), where=of_entry)
         except ReadError as error:
             if on_error is None:
                 raise
             on_error(error)
     return _with_attributes(list(dict.fromkeys(found)), where)
+
+
+def _entry(path: Path, number: int, name: str, located: Path | None) -> Path:
+    """Return where a list's entry is.
+
+    An empty one is an error, because the data sets' own readers take it for the folder itself, as
+    is a nested list: it could be a cycle.
+    """
+    line = f"line {number}"
+    if not name:
+        raise ReadError(path, line, "an empty entry", "a recording's name", "delete the line")
+    if located is None:
+        found, fix = f"{name!r}, which does not exist", "remove the line or fetch the recording"
+        raise ReadError(path, line, found, "the name of a recording", fix)
+    if not _is_recording(located) and is_list(located):
+        raise ReadError(path, "list", f"another list, {located.name}", "recordings")
+    return located
 
 
 def is_list(path: Path) -> bool:
@@ -303,35 +332,6 @@ def is_list(path: Path) -> bool:
         return False
     lines = first_lines(path, _HEAD_LINES)
     return all(len(numbers_in(line, mark)) < 2 for line in lines for mark in (",", ";", None))
-
-
-def list_entries(path: Path) -> Iterator[tuple[Path, AttributeFilter] | ReadError]:
-    """Yield the paths that a list names, each with the filter of its recordings, or a line's error.
-
-    Names are relative to the list's folder or a folder in it. If that folder holds no folders, they
-    may also be relative to its parent or a folder in that. `data1/imu3.csv` is also found as
-    `data1/syn/imu3.csv` (OxIOD).
-    """
-    numbered = enumerate(read_lines(path), 1)
-    entries = [(k, *_parsed(x.split("#")[0])) for k, x in numbered if is_row(x)]
-    if not entries:
-        raise ReadError(path, "list", "no entry", "names of recordings")
-    folder = path.parent
-    bases = [folder, *(_folders(folder) or [folder.parent, *_folders(folder.parent)])]
-    if len(entries) > _HEAD_LINES and not any(_located(bases, name) for _, name, _ in entries):
-        found = f"{len(entries)} lines without an existing name, such as {entries[0][1]:.60}"
-        raise ReadError(path, "list", found, "a recording, or a list of them")
-    for number, name, where in entries:
-        line = f"line {number}"
-        if not name:
-            fix = "delete the line"
-            yield ReadError(path, line, "an empty entry", "a recording's name", fix)
-        elif (located := _located(bases, name)) is None:
-            fix = "remove the line or fetch the recording"
-            found_name = f"{name!r}, which does not exist"
-            yield ReadError(path, line, found_name, "the name of a recording", fix)
-        else:
-            yield located, where
 
 
 def _parsed(text: str) -> tuple[str, AttributeFilter]:

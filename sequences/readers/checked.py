@@ -71,22 +71,11 @@ _LARGEST_DEGREES = 90.0, 180.0
 """Largest latitude and longitude."""
 
 
-def checked(path: Path, field: str, values: FloatArray) -> FloatArray:
-    """Return values (N,) or (N, K) if all are finite."""
-    good = np.isfinite(values).reshape(len(values), -1).all(axis=1)
-    if not good.all():
-        k = int(np.argmin(good))
-        found = "nan" if np.isnan(values[k]).any() else "inf"
-        where = f"row {k + 1}, {field}"
-        raise ReadError(path, where, found, "finite numbers", "cut the recording there")
-    return values
-
-
-def finite_rows(path: Path, field: str, values: FloatArray) -> IntArray:
+def finite_rows(path: Path, field: str, values: FloatArray, all_of_them: bool = False) -> IntArray:
     """Return the rows of values (N,) or (N, K) that are finite, and warn of the others."""
     rows = np.flatnonzero(np.isfinite(values).reshape(len(values), -1).all(axis=1))
     if lost := len(values) - len(rows):
-        if lost > len(values) / 2:
+        if all_of_them or lost > len(values) / 2:
             found = f"{lost} of {len(values)} rows that are not finite"
             raise ReadError(path, field, found, "finite numbers")
         count = len(values)
@@ -292,10 +281,3 @@ def satellites(
         stated[name] = np.where(stated[name] >= 0.0, stated[name], np.nan)
     told = {name: values for name, values in stated.items() if np.isfinite(values).any()}
     return Satellites(time[kept], latlon_deg[kept], **told)
-
-
-def satellite_columns(reported: Satellites) -> tuple[list[str], FloatArray]:
-    """Return names and values (N, K) of a generic CSV's columns for what a receiver reported."""
-    known = {name: getattr(reported, attribute) for name, attribute in OPTIONAL.items()}
-    known = {name: values for name, values in known.items() if values is not None}
-    return ["lat", "lon", *known], np.column_stack([reported.latlon_deg, *known.values()])

@@ -15,7 +15,7 @@ from stario.sequences.clean_samples import MAX_RATE, MIN_RATE, SHARED_TIMES
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.phones.sensor_words import XSENS_CLOCK
-from stario.sequences.readers.text import IntArray, seconds
+from stario.sequences.readers.text import Column, IntArray, seconds
 from stario.sequences.sequence import MAX_TRUTH_GAP, FloatArray, ImuSequence
 from stario.sequences.time_order import MAX_IMU_GAP, disorder, increasing_mask
 from stario.sequences.units import FILETIME_1970, FILETIME_NS, TIME_UNITS
@@ -221,15 +221,17 @@ def source_words(source: str, unit: str) -> str:
     return f"{source}, times taken as {unit}" if unit else source
 
 
-def inferred_unit(
-    file: Path, title: str, time: FloatArray, or_seconds: bool = False
+def clock_unit(
+    file: Path, clock: Column, time: FloatArray, or_seconds: bool = False
 ) -> tuple[int, str]:
-    """Return the unit [ns] of times (N,) that name none, and its name if another is possible.
+    """Return the unit [ns] of a clock's times (N,), and its name if another is possible.
 
-    Counts of rows and dates without separators are refused: either would pass for times. Times
-    at a rate of no unit are refused too, or taken as seconds unless those are after 2100.
+    Without a unit, counts of rows and dates without separators are refused: either would pass for
+    times. Those at a rate of no unit are too, or taken as seconds unless that is after 2100.
     """
-    _refuse_counts_and_dates(file, title, time)
+    if clock.unit:
+        return time_unit(file, time, clock.unit), ""
+    _refuse_counts_and_dates(file, clock.title or "time", time)
     first = float(time[:1].sum())
     try:
         unit_ns = time_unit(file, time)

@@ -45,7 +45,7 @@ from stario.sequences.readers.checked import (
 )
 from stario.sequences.readers.clocks import (
     Samples,
-    inferred_unit,
+    clock_unit,
     resample_to_gyro,
     source_words,
 )
@@ -95,7 +95,6 @@ from stario.sequences.units import (
     ACCEL_UNITS,
     GYRO_UNITS,
     MAGNETIC_UNITS,
-    TIME_UNITS,
 )
 
 _log = logging.getLogger(__name__)
@@ -188,10 +187,7 @@ def _read_rows(path: Path) -> _Rows:
     finite = table.values[np.isfinite(table.values[:, 0]), 0]
     if row_format.dated:
         clock = replace(clock, unit="s")
-    if clock.unit:
-        unit_ns, assumed = unit_factor(path, clock, TIME_UNITS), ""
-    else:
-        unit_ns, assumed = inferred_unit(path, clock.title, finite, or_seconds=True)
+    unit_ns, assumed = clock_unit(path, clock, finite, or_seconds=True)
     time = table.seconds(unit_ns, int(np.argmax(is_imu)))
     values = dict(zip(names[1:], table.values[:, 1:].T, strict=True))
     return _Rows(path, columns, values, time, is_imu, table.line_numbers, assumed)

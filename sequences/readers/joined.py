@@ -18,7 +18,7 @@ import numpy as np
 
 from stario.sequences.arrays import number_in
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers.checked import checked
+from stario.sequences.readers.checked import finite_rows
 from stario.sequences.readers.lines import is_row, read_lines
 from stario.sequences.readers.phones.files import (
     is_complete,
@@ -129,7 +129,7 @@ def _with_clock(head: TableHead) -> list[str]:
     columns = _clock_columns(head)
     used, titles = list(columns.values()), _titles(head)
     values = head.read([Column(k) for k in used]).values
-    checked(head.file, ", ".join(titles[k] for k in used), values)
+    finite_rows(head.file, ", ".join(titles[k] for k in used), values, all_of_them=True)
     stamps = _stamps_ns(dict(zip(columns, values.T.astype(np.int64), strict=True)))
     return _rewritten(head, "time [ns]", map(str, stamps.tolist()), set(used))
 

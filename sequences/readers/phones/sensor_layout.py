@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.clocks import Samples, inferred_unit, time_unit
+from stario.sequences.readers.clocks import Samples, clock_unit
 from stario.sequences.readers.columns import unit_factor
 from stario.sequences.readers.phones.sensor_words import (
     SENSORS,
@@ -333,10 +333,7 @@ def read_samples(table: SensorTable, sensor: Sensor) -> Samples:
     values = unit_factor(table.file, named, SENSORS[sensor].units) * values
     sound = _sound_samples(table.file, sensor, titles, values)
     kept, time, values = kept[sound], time[sound], values[sound]
-    if clock.unit:
-        unit_ns, assumed = time_unit(table.file, time, clock.unit), ""
-    else:
-        unit_ns, assumed = inferred_unit(table.file, clock.title or "time", time)
+    unit_ns, assumed = clock_unit(table.file, clock, time)
     return Samples(rows.stamps_ns(unit_ns, kept), values, named.unit, assumed)
 
 

@@ -86,7 +86,7 @@ GOOD = [HEADER, f"0,{ROW}", f"0.01,{ROW}", f"0.02,{ROW}"]
         (GOOD[1:], "line 1: found '0,0.1,0.2"),
         ([HEADER.replace("gz", "yaw"), *GOOD[1:]], "header: found no gz, expected t [s],gx"),
         ([HEADER.replace("gx [rad/s]", "gx [rpm]"), *GOOD[1:]], "gx: found unit 'rpm', expected"),
-        ([HEADER.replace("t [s]", "t [min]"), *GOOD[1:]], "t: found unit 'min', expected s, ms"),
+        ([HEADER.replace("t [s]", "t [min]"), *GOOD[1:]], "time: found unit 'min', expected s, ms"),
         ([HEADER.replace("ax [m/s^2]", "ax [deg/s]"), *GOOD[1:]], "ax: found unit 'deg/s'"),
         ([HEADER + ",wx", *GOOD[1:]], "line 1, gx: found both wx and gx"),
         ([HEADER + ",px,py,pz,qx", *GOOD[1:]], "found no qy, qz, qw"),
