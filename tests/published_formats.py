@@ -232,7 +232,9 @@ def tlio(folder: Path, walk: ImuSequence, order: str = "xyzw") -> Written:
     ]  # fmt: skip
     description = {"columns_name(width)": columns, "num_rows": len(walk)}
     (folder / "imu0_resampled_description.json").write_text(json.dumps(description))
-    expected = replace(cut(walk, slice(None)), name=folder.name, magnetometer=None)
+    expected = cut(walk, slice(None))
+    known = replace(expected.truth, velocity_W=truth.velocity_W)
+    expected = replace(expected, name=folder.name, magnetometer=None, truth=known)
     return Written(folder, expected)
 
 
@@ -270,7 +272,8 @@ def tlio_raw(
     }  # fmt: skip
     (folder / "calibration.json").write_text(json.dumps(calibration))
     rows = slice(None, None, every)
-    known = trajectory(Path(), truth.time[rows], truth.position_W[rows], truth.attitude_WB[rows])
+    known = trajectory(Path(), *(x[rows] for x in (
+        truth.time, truth.position_W, truth.attitude_WB, truth.velocity_W)))  # fmt: skip
     expected = replace(walk, name=folder.name, truth=known)
     return Written(folder / "imu_samples_0.csv", expected)
 
