@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from alike import assert_same_samples
+from alike import assert_same_samples, assert_upright
 from phone_exports import EXPORTS, Y_UP, export
 from phone_files import ZYX, field, gravity, ns, save
 from recorded import DATA
@@ -218,7 +218,4 @@ def test_the_apps_own_files_contain_gravity_and_the_expected_truth(name):
     logged = ("shopping_mall_eight", "pyojinkim_android", "senslogs_tyrex")
     assert (read.device_attitude is not None) == any(part in name for part in logged)
     if read.truth is not None:
-        known = read.truth.at(read.time[::10])
-        up = known.attitude_WB.apply(read.accel[::10])[known.valid].mean(axis=0)
-        assert np.linalg.norm(up[:2]) < 0.5
-        assert up[2] == pytest.approx(9.8, abs=0.3)
+        assert_upright(read, 3.0)
