@@ -93,11 +93,7 @@ def stuck_findings(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> lis
 
 
 def check_not_dead(name: str, time: FloatArray, gyro: FloatArray, accel: FloatArray) -> None:
-    """Check that no sensor's values, (n, 3), are constant while the other shows motion.
-
-    Raises:
-        InputError: one's are.
-    """
+    """Raise InputError if a sensor's values (n, 3) are constant while the other shows motion."""
     if not np.diff(gyro, axis=0).any() and shaken(time, gyro, accel):
         found = "values that never change while the accelerometer's do"
         raise InputError(f"{name}: gyroscope", found, "angular rates", _REMEDY)

@@ -56,13 +56,9 @@ DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, A
 
 
 class Layout(NamedTuple):
-    """How a part of a recording is kept.
+    """How a part of a recording is kept: its group, its class, and attributes by dataset.
 
-    Attributes:
-        stem: group of its datasets, of which `t` holds the times.
-        kind: function that makes the part of them.
-        needed: its attributes by the names of the other datasets.
-        optional: those that may lack.
+    The dataset `t` holds its times; `optional` ones may lack.
     """
 
     stem: str
@@ -291,13 +287,7 @@ def is_hdf5(path: Path) -> bool:
 def opened_hdf5(path: Path, expected: str) -> Iterator[Any]:
     """Open a file for reading; damage or other content found in the block becomes a ReadError.
 
-    Args:
-        path: the file.
-        expected: what the file should be, for the error.
-
-    Raises:
-        ReadError: the file or what the block reads from it is damaged.
-        MissingPackageError: h5py is not installed.
+    It says what was `expected`. MissingPackageError if h5py is not installed.
     """
     h5py = optional_package("h5py", "readers")
     try:

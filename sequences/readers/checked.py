@@ -91,19 +91,9 @@ def rotations(
     numbers: IntArray | None = None,
     row: str = "row",
 ) -> Rotation:
-    """Return rotations from unit quaternions.
+    """Return rotations from unit quaternions (N, 4) in an order, `wxyz` or `xyzw`.
 
-    Args:
-        path: the file, for errors.
-        field: name of the quaternions, for errors.
-        quat: (N, 4) quaternions.
-        order: order of their components, `wxyz` or `xyzw`.
-        numbers: (N,) numbers of the rows, for errors; from 1 if None.
-        row: what these count, for errors.
-
-    Raises:
-        ReadError: a component is not finite or a norm differs from 1 by more than a percent; the
-            error names the field and its row.
+    The error of another names its field and row, by its number (N,), or its index from 1.
     """
     norm = np.linalg.norm(quat, axis=1)
     bad = ~(np.abs(norm - 1.0) <= NORM_TOLERANCE)
@@ -129,13 +119,10 @@ def captured_rotations(quat_xyzw: FloatArray) -> tuple[Rotation, BoolArray]:
 def magnetometer(
     time: FloatArray, field: FloatArray | None, held: bool = True
 ) -> Magnetometer | None:
-    """Return the finite, non-zero samples of a magnetometer whose times advance; None if none.
+    """Return a magnetometer's finite, non-zero samples at times that advance; None if none.
 
-    Args:
-        time: (N,) sample times [s].
-        field: (N, 3) magnetic field [uT], if there is one.
-        held: whether to skip repeated values if more than a third are repeated: some apps write
-            the last reading at the IMU's rate.
+    If more than a third of the values (N, 3) repeat the last one, those are `held` ones and
+    skipped: some apps write the last reading at the IMU's rate.
     """
     if field is None:
         return None
@@ -185,14 +172,8 @@ def barometer(
 ) -> Barometer | None:
     """Return the pressure in hPa at the times that advance; None if there is none.
 
-    None too, with a warning, if the values are no pressure in any unit: a barometer is optional.
-
-    Args:
-        path: the file, for messages.
-        title: title of its column, for messages.
-        time: (N,) [s].
-        values: (N,) pressure; NaN, zero or negative where there is none.
-        unit: its unit in the tables' spelling; empty to tell it by the size.
+    None too, with a warning, if the values (N,) are no pressure in any unit: a barometer is
+    optional. They are NaN, zero or negative where there is none; their size tells a missing unit.
     """
     kept = np.isfinite(time) & np.isfinite(values) & (values > 0.0)
     kept[kept] = increasing_mask(time[kept])
@@ -232,10 +213,7 @@ def _expected() -> tuple[str, str]:
 
 
 def known_places(latlon_deg: FloatArray) -> BoolArray:
-    """Return which of the latitudes and longitudes (N, 2) are a place: not NaN, nor zeros.
-
-    Some apps write zeros until there is a position.
-    """
+    """Return which latitudes and longitudes (N, 2) are a place, unlike zeros until the first."""
     return np.asarray((np.abs(latlon_deg) <= _LARGEST_DEGREES).all(axis=1) & latlon_deg.any(axis=1))
 
 
@@ -262,13 +240,10 @@ def in_degrees(path: Path, latlon_deg: FloatArray) -> FloatArray:
 def satellites(
     time: FloatArray, latlon_deg: FloatArray, rest: Mapping[str, FloatArray]
 ) -> Satellites | None:
-    """Return the known places whose times advance; None if there is none.
+    """Return the known places (N, 2) [deg] whose times advance; None if there is none.
 
-    Args:
-        time: (N,) [s].
-        latlon_deg: (N, 2) latitude and longitude [deg].
-        rest: (N,) those of the attributes of `OPTIONAL` that the file has. Phones write a negative
-            accuracy, speed or bearing, or an accuracy of 0, where they know none: it becomes NaN.
+    The `rest` are those of the attributes of `OPTIONAL` that the file has. Phones write a negative
+    accuracy, speed or bearing, or an accuracy of 0, where they know none: it becomes NaN.
     """
     kept = known_places(latlon_deg) & np.isfinite(time)
     kept[kept] = increasing_mask(time[kept])

@@ -87,16 +87,10 @@ def resample_to_gyro(
     accel: Samples,
     names: tuple[str, str] = ("gyroscope", "accelerometer"),
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Interpolate the accelerometer to the gyroscope's samples in their common time span.
+    """Return times [ns], gyroscope and accelerometer, interpolated to it in their common time span.
 
     Samples in an accelerometer gap of more than 0.1 s are skipped, since the force there is
     unknown. Both clocks have one origin; `names` are for messages if they are other sensors'.
-
-    Returns:
-        Time stamps (K,) [ns], gyroscope (K, 3) and accelerometer (K, 3).
-
-    Raises:
-        ReadError: the two sensors do not overlap in time, or the accelerometer's rate is too low.
     """
     accel = _sorted_samples(path, names[1], accel, _rate(gyro.stamps_ns))
     gyro_ns, accel_ns = gyro.stamps_ns, accel.stamps_ns
@@ -196,10 +190,9 @@ def _is_date(digits: str) -> bool:
 
 
 def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.int64) -> int:
-    """Return the time unit [ns] with which most times (N,) lie within a recording.
+    """Return the time unit [ns] with which most times (N,) lie within a recording on one clock.
 
-    For rows too rare for `time_unit`; the recording is from `start_ns` to `stop_ns` on the same
-    clock, and rows may precede or follow it by a minute.
+    For rows too rare for `time_unit`; they may precede or follow it by a minute.
     """
     start, stop = float(start_ns) * 1e-9 - _MARGIN_S, float(stop_ns) * 1e-9 + _MARGIN_S
     # Times from zero fit finer units as well, but all at the start.
@@ -248,9 +241,6 @@ def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:
     """Return the unit of times (N,) [ns], inferred from the rate if none is named.
 
     Samples that share a rounded time are spread over the time to the next one.
-
-    Raises:
-        ReadError: the unit is unknown, or no unit gives a plausible sample rate.
     """
     if unit in TIME_UNITS:
         return TIME_UNITS[unit]

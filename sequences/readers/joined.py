@@ -81,12 +81,9 @@ def is_untimed(path: Path) -> bool:
 
 
 def unpack_joined(path: Path, folder: Path, rate: str = "") -> None:
-    """Write the table with its times into a folder.
+    """Write the table with its times, or those of a rate [samples/s], into a folder.
 
-    `rate` is that of a recording without times [samples/s]; empty if it has some.
-
-    Raises:
-        InputError: the rate is not a number above zero.
+    InputError: the rate is not a number above zero.
     """
     if path.is_dir():
         lines = _joined_files(path, rate)

@@ -96,8 +96,7 @@ def with_pose(
 ) -> ImuSequence:
     """Return a recording without truth with the best of the pose files as such, if one agrees.
 
-    Its first sample is at `start_ns` on the poses' clock [ns]; `orders` of the attitude are
-    tried, fewer where a data set specifies it.
+    Its first sample is at `start_ns` on the poses' clock [ns]; `orders` of the attitude are tried.
     """
     candidates = [poses for file in files for poses in _read_poses(file) if poses.order in orders]
     fits = [fit for poses in candidates if (fit := _fitted(sequence, start_ns, poses)) is not None]
@@ -236,12 +235,9 @@ def _posed(sequence: ImuSequence, fit: _Fit) -> ImuSequence:
 def accel_axes(sequence: ImuSequence, truth: Trajectory) -> ImuSequence:
     """Rotate the accelerometer to the gyroscope's axes if it was logged in others.
 
-    Rotated by the true attitude, the specific force averages to gravity. If it does not, but does
-    in another right-handed axis order (some phones log it so), that order is used, with a warning.
-
-    Args:
-        sequence: the recording.
-        truth: poses of the recording, in a world with y or z up.
+    Rotated by the true attitude, in a world with y or z up, the specific force averages to gravity.
+    If it does not, but does in another right-handed axis order (some phones log it so), that order
+    is used, with a warning.
     """
     finite = np.isfinite(sequence.time) & np.isfinite(sequence.accel).all(axis=1)
     times, first = np.unique(sequence.time[finite], return_index=True)

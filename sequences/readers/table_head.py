@@ -138,10 +138,7 @@ def _titles_at(above: list[str], delimiter: str | None) -> list[str]:
 
 
 def first_row(lines: list[str], least: int = 4) -> RowFormat | None:
-    """Return how rows are written, from the first one of `least` numbers; None without one.
-
-    There must be no blank line.
-    """
+    """Return how rows are written, by the first of `least` numbers, if any; no line is blank."""
     for k, line in enumerate(lines):
         if line.lstrip().startswith("#"):
             continue

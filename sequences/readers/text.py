@@ -106,11 +106,9 @@ class Table:
         return [row[column].strip() if column < len(row) else "" for row in cells]
 
     def stamps_ns(self, unit_ns: int = 1, kept: IntArray | None = None) -> IntArray:
-        """Return the times (N,) as integer nanoseconds, which float64 cannot hold exactly.
+        """Return the times (N,), or those of `kept` rows, in integer nanoseconds.
 
-        Args:
-            unit_ns: their unit [ns].
-            kept: rows to return the times of; all if None.
+        Their unit is `unit_ns`; float64 cannot hold them exactly.
         """
         since_1970 = FILETIME_1970 if unit_ns == FILETIME_NS else 0
         times = self._times(range(len(self.rows)) if kept is None else kept.tolist(), finite=True)
@@ -154,16 +152,9 @@ def read_table(
     row_format: RowFormat = RowFormat(),
     killed: bool = False,
 ) -> Table:
-    """Read columns of numbers; `nan` and empty cells become NaN.
+    """Read columns of numbers, their count or places; `nan` and empty cells become NaN.
 
-    Args:
-        path: the file.
-        columns: number of columns to return, or the places of those to return.
-        row_format: how the rows are written.
-        killed: whether to skip a last row that is cut short because the recorder was killed.
-
-    Raises:
-        ReadError: a row is cut short or holds something that is not a number.
+    A last row that is cut short, because the recorder was `killed`, is then skipped.
     """
     places = [Column(k) for k in range(columns)] if isinstance(columns, int) else columns
     rows, mark = row_format.rows(path), row_format.delimiter

@@ -73,11 +73,10 @@ def device_attitude(
 def agreeing_attitude(
     stamps: IntArray, quaternion: FloatArray, gyro: Samples, named: bool = True
 ) -> tuple[IntArray, Rotation] | None:
-    """Return the reading of an attitude that best fits the gyroscope, or None if none fits.
+    """Return the reading of quaternions (N, 4) that best fits the gyroscope, or None if none fits.
 
-    Quaternions (N, 4) are x, y, z and w at times (N,) [ns] on the gyroscope's clock; unless their
-    order is `named`, w, x, y and z is tried as well. Those that are not unit quaternions are
-    skipped: K times [ns] and rotations, body to a world with z up, are returned.
+    They are x, y, z and w at times (N,) [ns] on its clock; unless their order is `named`, w, x, y
+    and z is tried as well. Those that are not unit quaternions are skipped.
     """
     good = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) < NORM_TOLERANCE
     stamps, quaternion = stamps[good], quaternion[good]

@@ -140,10 +140,7 @@ def _wide_poses(path: Path, files: PhoneFiles) -> list[Path]:
 
 
 def is_phone(path: Path) -> bool:
-    """Return whether a folder holds one recording, or a file is the gyroscope file of one of many.
-
-    Never raises.
-    """
+    """Return whether a folder is one recording, or a file the gyroscope's of one; never raises."""
     if path.is_dir():
         return len(phone_recordings(path)) == 1
     if not path.is_file() or "gyr" not in path.name.lower():
@@ -195,10 +192,9 @@ def assemble_recording(
     orders: Collection[str] = ("xyzw", "wxyz", "matrix"),
     core_motion: bool = False,
 ) -> ImuSequence:
-    """Assemble the recording of a set of files and of poses alongside them.
+    """Assemble a recording of files and of poses alongside them, in one of some `orders`.
 
-    `orders` are as for `with_pose`; `core_motion` says that an iPhone wrote the files: values in g
-    have Apple's sign.
+    `core_motion` says that an iPhone wrote the files: values in g have Apple's sign.
     """
     folder = files.gyro.parent
     for file in files.unread:

@@ -259,10 +259,7 @@ def _order(column: FloatArray) -> float:
 
 
 def _by_rows(head: TableHead) -> SensorTable | None:
-    """Return the layout of rows (N, K) without titles, or whose titles name no clock.
-
-    Time is first or fourth, and grows.
-    """
+    """Return the layout of rows whose titles name no clock: time is first or fourth, and grows."""
     rows, named = head.rows, _named_axes(head.titles)
     width = rows.shape[1]
     places = [(time, start) for time, start in ((0, 1), (3, 0)) if time < width]
@@ -311,10 +308,7 @@ def _is_clock(column: FloatArray, time: FloatArray) -> bool:
 
 
 def read_samples(table: SensorTable, sensor: Sensor) -> Samples:
-    """Read a sensor's samples in the columns that name it, or in those of a file that names none.
-
-    They are in rad/s, m/s^2 or uT if the file names a unit.
-    """
+    """Read a sensor's samples, in rad/s, m/s^2 or uT if the file names a unit."""
     if table.conflict:
         fix = "keep the columns of one"
         raise ReadError(table.file, "header", f"several IMUs ({table.conflict})", "one", fix)

@@ -21,11 +21,7 @@ MAGNETIC = "magnetic"
 class Fields:
     """Arrays (N,) or (N, K) of a file by name, without rows with a value that is not finite.
 
-    Args:
-        path: the file.
-        arrays: the arrays.
-        optional: names of those that may be missing, or hold NaN.
-        first_row: number of the first row, for errors.
+    Those that are optional may be missing, or hold NaN; errors count rows from `first_row`.
     """
 
     def __init__(
@@ -77,9 +73,9 @@ def read_columns(
 ) -> tuple[FloatArray, Fields]:
     """Return the times since the first row [s] and the columns of a CSV with a header.
 
-    The `clock` is the name and the unit [ns] of the column of times. Columns are named by a stem
-    and axes: those of `{"acce": "xyz"}` are `acce_x`, ... The first of the `magnetic` stems that is
-    present becomes the optional `MAGNETIC`.
+    The `clock` is the name and the unit [ns] of the times. Columns are named by a stem and axes:
+    those of `{"acce": "xyz"}` are `acce_x`, ... The first of the `magnetic` stems that is present
+    becomes the optional `MAGNETIC`.
     """
     header = header_names(path)
     if header == [""]:
