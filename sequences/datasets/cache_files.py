@@ -31,7 +31,6 @@ _UNUSED_S = 30 * 86_400.0
 _UNRELATED = (
     "accuracy/",
     "drawing/",
-    "inspection/gyro_axes.py",
     "inspection/magnetic.py",
     "inspection/report.py",
     "inspection/stillness.py",

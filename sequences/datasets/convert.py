@@ -120,9 +120,7 @@ def write_euroc(path: Path, sequence: ImuSequence) -> list[Path]:
     truth = sequence.truth
     times = [sequence.time] if truth is None else [sequence.time, truth.time[truth.valid]]
     first = min(float(part.min()) for part in times if len(part))
-    tables = {
-        "imu0": (_IMU_HEADER, sequence.time, np.hstack([sequence.gyro, sequence.accel])),
-    }
+    tables = {"imu0": (_IMU_HEADER, sequence.time, np.hstack([sequence.gyro, sequence.accel]))}
     if truth is not None and truth.valid.any():
         header, columns = _POSE_HEADER, [truth.position_W, truth.quat_xyzw[:, [3, 0, 1, 2]]]
         if truth.velocity_W is not None:

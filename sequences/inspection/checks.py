@@ -180,12 +180,7 @@ def _check_content(sequence: ImuSequence) -> None:
 
 
 def check_gyro(
-    name: str,
-    time: FloatArray,
-    gyro: FloatArray,
-    accel: FloatArray,
-    pieces: list[slice],
-    fix: str,
+    name: str, time: FloatArray, gyro: FloatArray, accel: FloatArray, pieces: list[slice], fix: str
 ) -> tuple[float, float, list[Finding]]:
     """Check the rotations (N, 3) [rad/s] against the accelerometer (N, 3) [m/s^2].
 

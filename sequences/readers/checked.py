@@ -40,12 +40,7 @@ _LARGEST_STEP_HPA = 0.3
 """Median step between different neighbours of anything but pressure; of barometers it is below 0.1,
 and 0.2 in a lift at 1 Hz. Altitudes in metres taken for hPa have larger ones."""
 
-OPTIONAL = {
-    "alt": "altitude_m",
-    "acc": "radius_m",
-    "speed": "speed_m_s",
-    "bearing": "bearing_deg",
-}
+OPTIONAL = {"alt": "altitude_m", "acc": "radius_m", "speed": "speed_m_s", "bearing": "bearing_deg"}
 """Optional attributes of `Satellites` by their columns in a generic CSV."""
 
 DEGREES = {"deg": 1.0, "": 1.0, "°": 1.0}

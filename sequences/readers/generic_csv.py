@@ -43,12 +43,7 @@ from stario.sequences.readers.checked import (
     rotations,
     satellites,
 )
-from stario.sequences.readers.clocks import (
-    Samples,
-    clock_unit,
-    resample_to_gyro,
-    source_words,
-)
+from stario.sequences.readers.clocks import Samples, clock_unit, resample_to_gyro, source_words
 from stario.sequences.readers.columns import (
     IMU,
     PRESSURE,
@@ -91,11 +86,7 @@ from stario.sequences.sequence import (
     Trajectory,
 )
 from stario.sequences.time_order import increasing_mask
-from stario.sequences.units import (
-    ACCEL_UNITS,
-    GYRO_UNITS,
-    MAGNETIC_UNITS,
-)
+from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS
 
 _log = logging.getLogger(__name__)
 

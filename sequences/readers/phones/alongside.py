@@ -47,7 +47,7 @@ Kind = TypeVar("Kind")
 _PRESSURE_FILES = {"barometer", "barometers", "baro", "bar", "pressure", "pres"}
 _SATELLITE_FILES = {"location", "locations", "gps", "gnss"}
 _POINT_FILES = {
-    *("ref", "reference", "references", "waypoints", "waypoint", "checkpoints", "landmarks"),
+    *("ref", "reference", "references", "waypoints", "waypoint", "checkpoints", "landmarks")
 }
 """Words of which the name of such a file has one."""
 

@@ -85,27 +85,22 @@ def test_what_is_not_in_an_archive_is_refused_with_what_is(tmp_path):
     ("field", "values", "error"),
     [
         ("imu/gyro", np.zeros((49, 3)), r"gyro: found shape \(49, 3\), expected \(50, 3\)"),
-        ("imu/t", np.zeros((50, 1)), r"time: found shape \(50, 1\), expected \(N,\)"),
-        ("imu/accel", 9.81, r"accel: found shape \(\), expected \(50, 3\)"),
         ("imu/t", [b"now"] * 50, r"imu/t: found .*, expected an array of numbers"),
         ("mag/field", np.ones((9, 3)), r"magnetic field: found shape \(9, 3\), expected \(10, 3"),
-        ("mag/t", [], r"mag/t: found shape \(0,\), expected \(N,\) with at least one"),
         ("truth/quat_xyzw", np.ones((50, 3)), r"found shape \(50, 3\), expected \(50, 4\)"),
         ("truth/valid", np.ones(9, dtype=bool), r"valid: found shape \(9,\), expected \(50,\)"),
         ("truth/p", np.full((50, 3), np.nan), "position_W: found a value that is not finite"),
         ("truth/quat_xyzw", np.full((50, 4), np.nan), "row 1, truth/quat_xyzw: .* in truth/valid"),
-        ("waypoints/xy", np.ones((2, 4)), r"positions: found shape \(2, 4\), expected \(2, 3\)"),
     ],
 )
 def test_a_dataset_of_another_shape_or_type_is_named(tmp_path, field, values, error):
     path = _archive(tmp_path / "walks.h5")
-    name = "c" if field.startswith("waypoints") else "a"
     with h5py.File(path, "a") as file:
-        if field in file[name]:
-            del file[name][field]
-        file[name][field] = values
-    with pytest.raises(ReadError, match=rf"walks\.h5:{name}: .*{error}"):
-        read_recording(f"{path}:{name}")
+        if field in file["a"]:
+            del file["a"][field]
+        file["a"][field] = values
+    with pytest.raises(ReadError, match=rf"walks\.h5:a: .*{error}"):
+        read_recording(f"{path}:a")
 
 
 def test_other_groups_and_attributes_are_passed_over(tmp_path):

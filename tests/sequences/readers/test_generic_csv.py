@@ -8,9 +8,7 @@ from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers import write_csv
 from stario.sequences.readers.columns import HEADER, TRUTH_HEADER
 from stario.sequences.readers.generic_csv import read_generic_csv
-from stario.sequences.sequence import (
-    ImuSequence,
-)
+from stario.sequences.sequence import ImuSequence
 from stario.sequences.units import with_units
 
 

@@ -4,15 +4,9 @@ import numpy as np
 import pytest
 from alike import assert_same_samples
 from csv_lines import write_lines
-from phone_exports import export
-from phone_files import ns, save
+from phone_exports import export, ns, save
 
-from stario.sequences import (
-    InputError,
-    check_units,
-    read_recording,
-    with_conventions,
-)
+from stario.sequences import InputError, check_units, read_recording, with_conventions
 
 
 def test_a_recording_has_a_one_line_summary(walk, tmp_path):

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from alike import assert_same_samples
 from csv_lines import write_lines
-from phone_exports import Walk, write
-from phone_files import field
+from phone_exports import Walk, field, write
 
 from stario.sequences import ImuSequence, ReadError, find_recordings, read_recording
 

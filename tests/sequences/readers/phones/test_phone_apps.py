@@ -7,16 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from alike import assert_same_samples, assert_upright
-from phone_exports import EXPORTS, Y_UP, export
-from phone_files import ZYX, field, gravity, ns, save
+from phone_exports import EXPORTS, Y_UP, ZYX, export, field, gravity, ns, save
 from recorded import DATA
 from scipy.spatial.transform import Rotation
 
-from stario.sequences import (
-    ReadError,
-    find_recordings,
-    read_recording,
-)
+from stario.sequences import ReadError, find_recordings, read_recording
 from stario.sequences.conventions import with_axes, with_gravity
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk

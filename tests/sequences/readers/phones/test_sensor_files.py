@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from phone_files import save
+from phone_exports import save
 
 from stario.sequences import (
     ImuSequence,

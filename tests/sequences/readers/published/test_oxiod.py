@@ -35,12 +35,7 @@ def apple_rows(walk: ImuSequence, stamps: list[int] | list[str]) -> list[str]:
 
 
 def capture_rows(
-    walk: ImuSequence,
-    every: int,
-    start: int,
-    unit_ns: int,
-    ahead: float,
-    frame: bool = True,
+    walk: ImuSequence, every: int, start: int, unit_ns: int, ahead: float, frame: bool = True
 ) -> list[str]:
     """Every `every`-th row of the truth, stamped by a clock `ahead` seconds ahead."""
     rows = slice(300, -200, every)
