@@ -1,9 +1,10 @@
 """Inspection of a recording: its properties and problems, before anything is computed from it.
 
-Without ground truth the gyroscope's axes and signs are compared with the accelerometer's. Averaged over a second, the specific force of a carried device is close to gravity. When the device
-tilts, gravity turns in its axes as the gyroscope says. Rotated by it into a frame that does not
-turn, the averages of successive seconds agree; with other axes or signs they differ by about as
-much as they do in the device's axes. A wrong sign of the whole accelerometer changes neither.
+Without ground truth the gyroscope's axes and signs are compared with the accelerometer's. Averaged
+over a second, the specific force of a carried device is close to gravity. When the device tilts,
+gravity turns in its axes as the gyroscope says. Rotated by it into a frame that does not turn, the
+averages of successive seconds agree; with other axes or signs they differ by about as much as they
+do in the device's axes. A wrong sign of the whole accelerometer changes neither.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences import Barometer, DeviceAttitude, Magnetometer, Satellites, find_recordings
 from stario.sequences.datasets.convert import convert
 from stario.sequences.errors import InputError
+from stario.sequences.files import atomic_folder
 from stario.sequences.readers import read_recording
 from stario.sequences.readers.archive import write_archive
 from stario.sequences.sequence import STANDARD_GRAVITY, PositionTrack, Trajectory
@@ -133,6 +134,17 @@ def test_what_cannot_be_converted_is_refused_with_the_reason(walk, tmp_path):
     with pytest.raises(InputError, match="file, which would be lost"):
         convert(walk, tmp_path / "full")
     assert [p.name for p in (tmp_path / "full").iterdir()] == ["file"]
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path):
+    def fail(folder):
+        (folder / "half").touch()
+        assert not (tmp_path / "whole").exists()
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError), atomic_folder(tmp_path / "whole") as folder:
+        fail(folder)
+    assert not list(tmp_path.iterdir())
 
 
 def test_truth_that_starts_before_the_imu_keeps_its_offset(tmp_path):
