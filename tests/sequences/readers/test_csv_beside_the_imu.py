@@ -120,7 +120,7 @@ def tracks(draw: st.DrawFn) -> PositionTrack:
     return PositionTrack(time, place, "waypoints" if sparse else "positions", sigma=sigma)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     st.fixed_dictionaries({
         "barometer": st.none() | barometers(),
