@@ -323,6 +323,34 @@ EXPORTS: dict[str, Export] = {
     "titles_in_a_comment": lambda f, w: write(
         f, ("imu.txt", "# time acc_@ gyr_@", w.t, w.a, w.w)
     ),
+    # Ticks of 100 us, where Xsens' DOTs count microseconds.
+    "xsens": lambda f, w: write(
+        f, ("MT_0.txt", "// Update Rate: 100.0Hz\nPacketCounter\tSampleTimeFine\tAcc_*\tGyr_*",
+            w.ms, w.us // 100, w.a, w.w),
+    ),
+    "xsens_utc": lambda f, w: write(  # without a date; the hour turns over
+        f, ("MT_0.csv", "UTC_Nano,UTC_Minute,UTC_Second,Gyr_*,Acc_*", w.ns % 10**9,
+            (3595 + (w.ns // 10**9 - w.ns[0] // 10**9)) // 60 % 60,
+            (3595 + (w.ns // 10**9 - w.ns[0] // 10**9)) % 60, w.w, w.a),
+    ),
+    "seconds_and_nanoseconds": lambda f, w: write(
+        f, ("a.csv", "sec,nanosec,gyro_@,accel_@", w.ns // 10**9, w.ns % 10**9, w.w, w.a)
+    ),
+    "ros2_topic_echo": lambda f, w: write(
+        f, ("echo.csv", ",", w.ns // 10**9, w.ns % 10**9, w.all("imu_link", 0, 0, 0, 1),
+            w.all(*[0.0] * 9), w.w, w.all(*[0.0] * 9), w.a, w.all(*[0.0] * 9)),
+    ),
+    "times_in_a_file": lambda f, w: write(
+        f, *alike("{}.csv", "x,y,z", **{"gyro-0": w.w, "accel-0": w.a}),
+        ("time.csv", "time (sec)", w.t),
+    ),
+    "timestamps_in_a_file": lambda f, w: write(
+        f, *alike("{}.csv", "x,y,z", gyr=w.w, acc=w.a), ("timestamps.csv", "time (sec)", w.t)
+    ),
+    "german": lambda f, w: write(
+        f, ("Beschleunigungssensor.csv", "Zeit (s),Beschleunigung @", w.t, w.a),
+        ("Gyroskop.csv", "Zeit (s),Drehrate @", w.t, w.w),
+    ),
     "quoted_titles_with_commas": lambda f, w: write(
         f, ("a.csv", ",".join(['"Time, s"', *(f'"{name} {axis}, {unit}"' for name, unit in (
             ("Acc", "g"), ("Gyro", "deg/s")) for axis in "XYZ")]), w.t, w.a_g, w.w_deg),

@@ -82,22 +82,6 @@ def test_the_rotation_vector_of_a_trace_is_the_devices_attitude(code, walk, tmp_
     assert (read_recording(tmp_path / "trace.txt").device_attitude is None) == (code == "AHRS")
 
 
-@pytest.mark.parametrize("per_second", [10**4, 10**6])  # MT devices and DOTs
-def test_the_clock_of_xsens_is_in_ticks_or_microseconds(tmp_path, per_second):
-    names = [f"{name}_{axis}" for name in ("Acc", "Gyr") for axis in "XYZ"]
-    rows = [f"{k}\t{10**5 + k * per_second // 100}\t0\t0\t9.8\t0\t0\t0" for k in range(200)]
-    path = tmp_path / "MT_0.txt"
-    lines = [
-        "// Update Rate: 100.0Hz",
-        "\t".join(["PacketCounter", "SampleTimeFine", *names]),
-        *rows,
-    ]
-    write_lines(path, *lines)
-    read = read_recording(path)
-    assert read.rate == pytest.approx(100.0)
-    assert read.duration == pytest.approx(1.99)
-
-
 def test_a_file_in_g_is_named_by_its_own_name_and_read_without_advice_on_options(tmp_path, caplog):
     """`check_units` asks for the options, and only if they were not given."""
     names = [
