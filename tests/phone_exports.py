@@ -72,6 +72,11 @@ class Walk:
         self.measures_field = False
 
     @property
+    def rotation_vector(self) -> FloatArray:
+        """x, y and z of a quaternion whose w is not negative."""
+        return np.asarray(self.q_xyzw[:, :3] * np.sign(self.q_xyzw[:, 3:]))
+
+    @property
     def m(self) -> FloatArray:
         self.measures_field = True
         return field(self.walk)
@@ -127,7 +132,30 @@ _ANDROSENSOR = "ACCELEROMETER * (m/s²);GYROSCOPE * (rad/s);MAGNETIC FIELD * (μ
 _WATCH = "time,seconds_elapsed,rotationRate*,gravity*,acceleration*,"
 _WATCH += "quaternionX,quaternionY,quaternionZ,quaternionW"
 
+
+def by_rows(names: str, header: str = "", form: str = "{:.4f}") -> Export:
+    """A table whose rows name their sensors: gyroscope, accelerometer and magnetometer."""
+    sep = ";" if ";" in header else ","
+
+    def write_file(folder: Path, w: Walk) -> None:
+        sensors = list(zip(names.split(), (w.w, w.a, w.m), strict=True))
+        lines = [
+            sep.join([form.format(t), name, *map(repr, values[k].tolist())])
+            for k, t in enumerate(w.t.tolist())
+            for name, values in sensors
+        ]
+        (folder / "own.csv").write_text("\n".join([header, *lines] if header else lines) + "\n")
+
+    return write_file
+
+
+_ANDROID = "android.sensor.gyroscope android.sensor.accelerometer android.sensor.magnetic_field"
+
 EXPORTS: dict[str, Export] = {
+    "rows_by_sensor": by_rows("gyroscope accelerometer magnetometer", "time,sensor,x,y,z"),
+    "rows_by_short_names": by_rows("GYR ACC MAG", "timestamp;sensor_name;v_x;v_y;v_z"),
+    "rows_without_titles": by_rows(_ANDROID),
+    "rows_with_times_of_day": by_rows("gyro acc mag", "Clock time,sensor,x,y,z", "12:00:{:07.4f}"),
     "sensor_logger": lambda f, w: write(
         f, *zyx(w, TotalAcceleration=w.a, Accelerometer=w.lin, Gyroscope=w.w,
                 GyroscopeUncalibrated=w.w + 1.0, Magnetometer=w.m,
@@ -452,7 +480,8 @@ def zip_in_a_zip(folder: Path, w: Walk) -> None:
 def trace(folder: Path, w: Walk) -> None:
     """Lines by type, with waypoints; one line break is missing."""
     lines = ["#\tstartTime:1560828400000"]
-    sensors = {"ACCELEROMETER": w.a, "GYROSCOPE": w.w, "MAGNETIC_FIELD": w.m}
+    sensors = {"ACCELEROMETER": w.a, "GYROSCOPE": w.w, "MAGNETIC_FIELD": w.m,
+               "ROTATION_VECTOR": w.rotation_vector}  # fmt: skip
     for k, stamp in enumerate((1_560_828_400_000 + w.ms).tolist()):
         for kind, values in sensors.items():
             lines.append("\t".join([str(stamp), f"TYPE_{kind}", *map(str, values[k]), "3"]))
@@ -468,6 +497,8 @@ def get_sensor_data(folder: Path, w: Walk) -> None:
     for k, t in enumerate(w.t.tolist()):
         for code, values in sensors.items():
             lines.append(";".join([code, f"{t + 5.0:.3f}", f"{t:.4f}", *map(str, values[k]), "3"]))
+        vector = ";".join(map(str, w.rotation_vector[k]))
+        lines.append(f"AHRS;{t + 5.0:.3f};{t:.4f};1;2;3;{vector};3")
     for t in (5.5, 6.5):
         lines.append(f"PRES;{t};{t + 900.0};{1013.0 + 0.01 * t};3")
         lines.append(f"GNSS;{t + 0.25};1690000000.0;40.0;-3.0;{t};90.0;4.5;1.25;9;0")

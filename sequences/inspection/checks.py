@@ -19,8 +19,7 @@ from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.clean_samples import clean_samples, unbroken, without_spikes
 from stario.sequences.errors import InputError
 from stario.sequences.findings import Finding, warn
-from stario.sequences.inspection.constant_values import check_not_dead
-from stario.sequences.inspection.samples import LARGE_M_S2, check_time, limit_words
+from stario.sequences.inspection.samples import LARGE_M_S2, check_not_dead, check_time, limit_words
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 from stario.sequences.truth.fit import TruthFit, fit_truth
 from stario.sequences.truth.positions import fit_positions

@@ -21,10 +21,14 @@ from stario.sequences.clean_samples import clean_samples, finite_samples, unbrok
 from stario.sequences.errors import InputError
 from stario.sequences.findings import Assessment, Finding, verdict
 from stario.sequences.inspection.checks import unit_findings
-from stario.sequences.inspection.constant_values import dead_axes
 from stario.sequences.inspection.magnetic import assess_magnetometer
 from stario.sequences.inspection.outside_sensors import assess_barometer, assess_satellites
-from stario.sequences.inspection.samples import clock_findings, sample_findings, without_times_ahead
+from stario.sequences.inspection.samples import (
+    clock_findings,
+    dead_axes,
+    sample_findings,
+    without_times_ahead,
+)
 from stario.sequences.inspection.stillness import Rest, find_rest
 from stario.sequences.sequence import GAP_STEPS, STANDARD_GRAVITY, FloatArray, ImuSequence
 from stario.sequences.truth.fit import TruthFit

@@ -49,11 +49,13 @@ def test_a_linear_acceleration_of_about_one_is_not_mistaken_for_gravity_in_g(wal
     np.testing.assert_allclose(read.accel, gravity(walk) + steady, atol=1e-8)
 
 
-@pytest.mark.parametrize("app", ["sensor_logger_attitude", "senslogs_ios"])
+@pytest.mark.parametrize(
+    "app", ["sensor_logger_attitude", "senslogs_ios", "trace", "get_sensor_data"]
+)
 def test_the_phones_own_attitude_is_read_too(app, walk, tmp_path):
     """With quaternions in either order and direction, as determined by the gyroscope."""
     export(app, tmp_path / "s", walk)
-    read = read_recording(tmp_path / "s")
+    read = read_recording(*find_recordings(tmp_path / "s"))
     np.testing.assert_allclose(read.device_attitude.time, walk.time, atol=1e-3)
     error = (read.device_attitude.attitude_WB * walk.truth.attitude_WB.inv()).magnitude()
     assert error.max() < 1e-6
