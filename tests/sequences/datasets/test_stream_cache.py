@@ -15,10 +15,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stario.sequences.datasets import cache_files
+from stario.sequences.datasets import stream_cache
 from stario.sequences.datasets.batch import Skipped
-from stario.sequences.datasets.cache_files import cache_folder, code_files, recording_files
-from stario.sequences.datasets.stream_cache import cached, recorded
+from stario.sequences.datasets.stream_cache import (
+    cache_folder,
+    cached,
+    code_files,
+    recorded,
+    recording_files,
+)
 from stario.sequences.readers import find_recordings, read_recording, write_csv
 from stario.sequences.readers.archive import write_archive
 from stario.sequences.sequence import ImuSequence
@@ -119,7 +124,7 @@ def test_changed_content_options_or_code_change_the_key(recording, tmp_path, mon
     os.utime(recording, ns=(0, 0))
     streams_of(recording, folder, read)
     assert read.calls == 4
-    monkeypatch.setattr(cache_files, "_code", lambda: "later")
+    monkeypatch.setattr(stream_cache, "_code", lambda: "later")
     streams_of(recording, folder, read)
     assert read.calls == 5
 
@@ -322,7 +327,7 @@ def test_figures_and_metrics_are_not_and_nothing_in_the_code_imports_them():
     assert not {"drawing/plots.py", "accuracy/metrics.py", "inspection/report.py"} & names
     unused = "|".join(
         re.escape(part.removesuffix(".py").rstrip("/").replace("/", "."))
-        for part in cache_files._UNRELATED
+        for part in stream_cache._UNRELATED
     )
     for file in code_files():
         assert not re.search(rf"stario\.sequences\.({unused})\b", file.read_text("utf-8")), file
