@@ -67,16 +67,14 @@ class Layout(NamedTuple):
     optional: dict[str, str]
 
 
+_OF_POSES = ("velocity", "position_covariance")
+
 PARTS: dict[str, Layout | None] = {
     "truth": Layout(
         "truth",
         Trajectory,
         {"p": "position_W", "quat_xyzw": "attitude_WB"},
-        {
-            "velocity": "velocity_W",
-            "position_covariance": "position_covariance_W",
-            "valid": "valid",
-        },
+        {name: f"{name}_W" for name in _OF_POSES} | {"valid": "valid"},
     ),
     "magnetometer": Layout("mag", Magnetometer, {"field": "field"}, {}),
     "device_attitude": Layout("attitude", DeviceAttitude, {"quat_xyzw": "attitude_WB"}, {}),

@@ -90,15 +90,13 @@ def rotations(
 
     The error of another names its field and row, by its number (N,), or its index from 1.
     """
-    norm = np.linalg.norm(quat, axis=1)
-    bad = ~(np.abs(norm - 1.0) <= NORM_TOLERANCE)
-    if bad.any():
-        k = int(np.argmax(bad))
+    found, known = captured_rotations(quat if order == "xyzw" else quat[:, [1, 2, 3, 0]])
+    if not known.all():
+        k = int(np.argmin(known))
         where = f"{row} {k + 1 if numbers is None else numbers[k]}, {field}"
-        raise ReadError(
-            path, where, f"norm {norm[k]:.4g}", "a unit quaternion", "cut the recording there"
-        )
-    return Rotation.from_quat(quat if order == "xyzw" else quat[:, [1, 2, 3, 0]])
+        norm, fix = f"norm {np.linalg.norm(quat[k]):.4g}", "cut the recording there"
+        raise ReadError(path, where, norm, "a unit quaternion", fix)
+    return found
 
 
 def captured_rotations(quat_xyzw: FloatArray) -> tuple[Rotation, BoolArray]:
