@@ -375,6 +375,16 @@ EXPORTS: dict[str, Export] = {
     "timestamps_in_a_file": lambda f, w: write(
         f, *alike("{}.csv", "x,y,z", gyr=w.w, acc=w.a), ("timestamps.csv", "time (sec)", w.t)
     ),
+    # Clocks of unknown names, before the values, with a column between, behind them.
+    "unknown_clock": lambda f, w: write(
+        f, ("Gyroscope.csv", "Uhrzeit,z (deg/s),y (deg/s),x (deg/s)", w.t, w.w_deg[:, ::-1]),
+        ("Accelerometer.csv", "ts,accuracy,z (m/s^2),y (m/s^2),x (m/s^2)", w.t, w.all(3),
+         w.a[:, ::-1]),
+    ),
+    "unknown_clock_behind": lambda f, w: write(
+        f, ("Gyroscope.csv", "z (deg/s),y (deg/s),x (deg/s),ticks", w.w_deg[:, ::-1], w.t),
+        ("Accelerometer.csv", "z (m/s^2),y (m/s^2),x (m/s^2),ticks", w.a[:, ::-1], w.t),
+    ),
     "german": lambda f, w: write(
         f, ("Beschleunigungssensor.csv", "Zeit (s),Beschleunigung @", w.t, w.a),
         ("Gyroskop.csv", "Zeit (s),Drehrate @", w.t, w.w),
