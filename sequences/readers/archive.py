@@ -69,7 +69,7 @@ class Layout(NamedTuple):
 
 _OF_POSES = ("velocity", "position_covariance")
 
-PARTS: dict[str, Layout | None] = {
+PARTS = {
     "truth": Layout(
         "truth",
         Trajectory,
@@ -219,11 +219,13 @@ def read_archive(path: Path) -> ImuSequence:
 
 
 def _sequence(path: Path, name: str, group: Any) -> ImuSequence:
-    posed = "truth/quat_xyzw" in group
-    layouts = PARTS if posed else PARTS | {"truth": None, "positions": track_layout("positions")}
+    layouts = dict(PARTS)
+    if "truth/quat_xyzw" not in group:
+        del layouts["truth"]
+        layouts["positions"] = track_layout("positions")
     if "waypoints" in group:
         place = "xy" if "waypoints/xy" in group else "p"
-        layouts = layouts | {"positions": track_layout("waypoints", place)}
+        layouts["positions"] = track_layout("waypoints", place)
     time, gyro, accel = (_numbers(group, f"imu/{field}") for field in ("t", "gyro", "accel"))
     return ImuSequence(
         name,
@@ -235,7 +237,7 @@ def _sequence(path: Path, name: str, group: Any) -> ImuSequence:
         **{
             attribute: _part(path, group, layout)
             for attribute, layout in layouts.items()
-            if layout is not None and layout.stem in group
+            if layout.stem in group
         },
     )
 
@@ -340,7 +342,7 @@ def _write(group: Any, sequence: ImuSequence) -> None:
         layouts["positions"] = track_layout(track.kind, "xy" if flat else "p")
     columns = {"imu/t": sequence.time, "imu/gyro": sequence.gyro, "imu/accel": sequence.accel}
     for attribute, layout in layouts.items():
-        if layout is not None and (part := getattr(sequence, attribute)) is not None:
+        if (part := getattr(sequence, attribute)) is not None:
             columns |= _columns(layout, part)
     for name, values in columns.items():
         group.create_dataset(name, data=values, **(_COMPRESSION if len(values) else {}))
