@@ -39,13 +39,15 @@ def test_a_position_without_its_accuracy_is_none(tmp_path, cells, times, error):
         np.testing.assert_allclose(known.time, times)
 
 
-def test_an_accuracy_next_to_poses_is_ignored(tmp_path, walk):
-    write_csv(tmp_path / "walk.csv", walk)
+def test_an_accuracy_next_to_poses_is_ignored_and_a_magnetometer_is_not(tmp_path, walk):
+    field = Magnetometer(walk.time[2:900:7] + 0.001, walk.accel[2:900:7])
+    write_csv(tmp_path / "walk.csv", replace(walk, magnetometer=field))
     header, *rows = (tmp_path / "walk.csv").read_text().splitlines()
     write_lines(tmp_path / "sp.csv", f"{header},sp", *(f"{row},3.0" for row in rows))
     found = read_recording(tmp_path / "sp.csv")
-    assert found.truth is not None
+    assert len(found.truth) == len(walk)
     assert found.positions is None
+    assert_same(found.magnetometer, field)
 
 
 def test_waypoints_listed_below_the_samples_may_be_in_any_order(tmp_path):
