@@ -27,7 +27,7 @@ from stario.sequences.arrays import check_type
 from stario.sequences.errors import InputError
 from stario.sequences.findings import warn
 from stario.sequences.inspection.checks import check_units
-from stario.sequences.inspection.constant_values import dead_axes
+from stario.sequences.inspection.samples import dead_axes
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack, Satellites
 from stario.sequences.time_order import MAX_IMU_GAP
 from stario.sequences.windows import WINDOW_SECONDS

@@ -1,11 +1,39 @@
 """Comparison of a recording with the one that was written, and of its truth with its gyroscope."""
 
+from collections.abc import Collection
+from dataclasses import fields, is_dataclass
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences import ImuSequence, Trajectory
 from stario.sequences.arrays import interpolated
 from stario.sequences.sequence import FloatArray
+
+
+def assert_same(found: object, given: object, atol: float = 0.0, but: Collection[str] = ()) -> None:
+    """Assert that two recordings, or parts of them, hold the same `but` for some attributes."""
+    assert type(found) is type(given)
+    for name in {field.name for field in fields(given)} - {*but}:
+        one, other = (getattr(part, name) for part in (found, given))
+        assert (one is None) == (other is None), name
+        if is_dataclass(other):
+            assert_same(one, other, atol)
+        elif isinstance(other, Rotation):
+            assert max_angle(one, other) < max(atol, 1e-7), name
+        elif isinstance(other, np.ndarray):
+            np.testing.assert_allclose(one, other, rtol=0.0, atol=atol, err_msg=name)
+        else:
+            assert one == other, name
+
+
+def assert_upright(recording: ImuSequence, degrees: float, tolerance: float = 0.3) -> None:
+    """Assert that the mean force, rotated by the true attitude, is gravity and points up."""
+    truth = recording.truth.at(np.unique(recording.time))
+    accel = interpolated(truth.time, recording.time, recording.accel)
+    up = truth.attitude_WB[truth.valid].apply(accel[truth.valid]).mean(axis=0)
+    assert np.degrees(np.arctan2(np.hypot(*up[:2]), up[2])) < degrees
+    assert abs(np.linalg.norm(up) - 9.8) < tolerance
 
 
 def assert_same_samples(read: ImuSequence, walk: ImuSequence) -> None:

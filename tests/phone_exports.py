@@ -14,13 +14,47 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from phone_files import ZYX, field, gravity, ns, save
 from scipy.spatial.transform import Rotation
 
 from stario.sequences import ImuSequence
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray
 
+FIELD_W = [18.0, 5.0, -43.0]
+START_NS = 1_718_030_736_872_695_300
+ZYX = "time,seconds_elapsed,z,y,x"
 Y_UP = Rotation.from_euler("x", -90.0, degrees=True)
+
+
+def in_body(walk: ImuSequence, vector_W: list[float]) -> FloatArray:
+    return np.asarray(walk.truth.attitude_WB.apply(vector_W, inverse=True))
+
+
+def field(walk: ImuSequence) -> FloatArray:
+    return in_body(walk, FIELD_W)
+
+
+def gravity(walk: ImuSequence) -> FloatArray:
+    return in_body(walk, [0.0, 0.0, STANDARD_GRAVITY])
+
+
+def ns(walk: ImuSequence) -> list[int]:
+    return [START_NS + round(t * 1e9) for t in walk.time.tolist()]
+
+
+def save(path: Path, header: str, *columns: object, sep: str = ",", decimal: str = ".") -> None:
+    parts = [np.asarray(c).reshape(len(np.asarray(c)), -1).tolist() for c in columns]
+    rows = [
+        sep.join(str(x).replace(".", decimal) for part in row for x in part)
+        for row in zip(*parts, strict=True)
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join([header, *rows] if header else rows) + "\n", encoding="utf-8")
+
+
+def save_zyx(folder: Path, walk: ImuSequence, **sensors: FloatArray) -> None:
+    """Write one file for each sensor as Sensor Logger does, columns z, y, x."""
+    for name, values in sensors.items():
+        save(folder / f"{name}.csv", ZYX, ns(walk), walk.time, values[:, ::-1])
 
 
 class Walk:
@@ -36,6 +70,11 @@ class Walk:
         self.ns, self.ms = np.array(ns(walk)), np.round(1e3 * self.t).astype(int)
         self.us, self.none = 1_000_000 + np.round(1e6 * self.t).astype(int), np.zeros_like(self.a)
         self.measures_field = False
+
+    @property
+    def rotation_vector(self) -> FloatArray:
+        """x, y and z of a quaternion whose w is not negative."""
+        return np.asarray(self.q_xyzw[:, :3] * np.sign(self.q_xyzw[:, 3:]))
 
     @property
     def m(self) -> FloatArray:
@@ -93,7 +132,30 @@ _ANDROSENSOR = "ACCELEROMETER * (m/s²);GYROSCOPE * (rad/s);MAGNETIC FIELD * (μ
 _WATCH = "time,seconds_elapsed,rotationRate*,gravity*,acceleration*,"
 _WATCH += "quaternionX,quaternionY,quaternionZ,quaternionW"
 
+
+def by_rows(names: str, header: str = "", form: str = "{:.4f}") -> Export:
+    """A table whose rows name their sensors: gyroscope, accelerometer and magnetometer."""
+    sep = ";" if ";" in header else ","
+
+    def write_file(folder: Path, w: Walk) -> None:
+        sensors = list(zip(names.split(), (w.w, w.a, w.m), strict=True))
+        lines = [
+            sep.join([form.format(t), name, *map(repr, values[k].tolist())])
+            for k, t in enumerate(w.t.tolist())
+            for name, values in sensors
+        ]
+        (folder / "own.csv").write_text("\n".join([header, *lines] if header else lines) + "\n")
+
+    return write_file
+
+
+_ANDROID = "android.sensor.gyroscope android.sensor.accelerometer android.sensor.magnetic_field"
+
 EXPORTS: dict[str, Export] = {
+    "rows_by_sensor": by_rows("gyroscope accelerometer magnetometer", "time,sensor,x,y,z"),
+    "rows_by_short_names": by_rows("GYR ACC MAG", "timestamp;sensor_name;v_x;v_y;v_z"),
+    "rows_without_titles": by_rows(_ANDROID),
+    "rows_with_times_of_day": by_rows("gyro acc mag", "Clock time,sensor,x,y,z", "12:00:{:07.4f}"),
     "sensor_logger": lambda f, w: write(
         f, *zyx(w, TotalAcceleration=w.a, Accelerometer=w.lin, Gyroscope=w.w,
                 GyroscopeUncalibrated=w.w + 1.0, Magnetometer=w.m,
@@ -289,6 +351,44 @@ EXPORTS: dict[str, Export] = {
     "titles_in_a_comment": lambda f, w: write(
         f, ("imu.txt", "# time acc_@ gyr_@", w.t, w.a, w.w)
     ),
+    # Ticks of 100 us, where Xsens' DOTs count microseconds.
+    "xsens": lambda f, w: write(
+        f, ("MT_0.txt", "// Update Rate: 100.0Hz\nPacketCounter\tSampleTimeFine\tAcc_*\tGyr_*",
+            w.ms, w.us // 100, w.a, w.w),
+    ),
+    "xsens_utc": lambda f, w: write(  # without a date; the hour turns over
+        f, ("MT_0.csv", "UTC_Nano,UTC_Minute,UTC_Second,Gyr_*,Acc_*", w.ns % 10**9,
+            (3595 + (w.ns // 10**9 - w.ns[0] // 10**9)) // 60 % 60,
+            (3595 + (w.ns // 10**9 - w.ns[0] // 10**9)) % 60, w.w, w.a),
+    ),
+    "seconds_and_nanoseconds": lambda f, w: write(
+        f, ("a.csv", "sec,nanosec,gyro_@,accel_@", w.ns // 10**9, w.ns % 10**9, w.w, w.a)
+    ),
+    "ros2_topic_echo": lambda f, w: write(
+        f, ("echo.csv", ",", w.ns // 10**9, w.ns % 10**9, w.all("imu_link", 0, 0, 0, 1),
+            w.all(*[0.0] * 9), w.w, w.all(*[0.0] * 9), w.a, w.all(*[0.0] * 9)),
+    ),
+    "times_in_a_file": lambda f, w: write(
+        f, *alike("{}.csv", "x,y,z", **{"gyro-0": w.w, "accel-0": w.a}),
+        ("time.csv", "time (sec)", w.t),
+    ),
+    "timestamps_in_a_file": lambda f, w: write(
+        f, *alike("{}.csv", "x,y,z", gyr=w.w, acc=w.a), ("timestamps.csv", "time (sec)", w.t)
+    ),
+    # Clocks of unknown names, before the values, with a column between, behind them.
+    "unknown_clock": lambda f, w: write(
+        f, ("Gyroscope.csv", "Uhrzeit,z (deg/s),y (deg/s),x (deg/s)", w.t, w.w_deg[:, ::-1]),
+        ("Accelerometer.csv", "ts,accuracy,z (m/s^2),y (m/s^2),x (m/s^2)", w.t, w.all(3),
+         w.a[:, ::-1]),
+    ),
+    "unknown_clock_behind": lambda f, w: write(
+        f, ("Gyroscope.csv", "z (deg/s),y (deg/s),x (deg/s),ticks", w.w_deg[:, ::-1], w.t),
+        ("Accelerometer.csv", "z (m/s^2),y (m/s^2),x (m/s^2),ticks", w.a[:, ::-1], w.t),
+    ),
+    "german": lambda f, w: write(
+        f, ("Beschleunigungssensor.csv", "Zeit (s),Beschleunigung @", w.t, w.a),
+        ("Gyroskop.csv", "Zeit (s),Drehrate @", w.t, w.w),
+    ),
     "quoted_titles_with_commas": lambda f, w: write(
         f, ("a.csv", ",".join(['"Time, s"', *(f'"{name} {axis}, {unit}"' for name, unit in (
             ("Acc", "g"), ("Gyro", "deg/s")) for axis in "XYZ")]), w.t, w.a_g, w.w_deg),
@@ -390,7 +490,8 @@ def zip_in_a_zip(folder: Path, w: Walk) -> None:
 def trace(folder: Path, w: Walk) -> None:
     """Lines by type, with waypoints; one line break is missing."""
     lines = ["#\tstartTime:1560828400000"]
-    sensors = {"ACCELEROMETER": w.a, "GYROSCOPE": w.w, "MAGNETIC_FIELD": w.m}
+    sensors = {"ACCELEROMETER": w.a, "GYROSCOPE": w.w, "MAGNETIC_FIELD": w.m,
+               "ROTATION_VECTOR": w.rotation_vector}  # fmt: skip
     for k, stamp in enumerate((1_560_828_400_000 + w.ms).tolist()):
         for kind, values in sensors.items():
             lines.append("\t".join([str(stamp), f"TYPE_{kind}", *map(str, values[k]), "3"]))
@@ -406,6 +507,8 @@ def get_sensor_data(folder: Path, w: Walk) -> None:
     for k, t in enumerate(w.t.tolist()):
         for code, values in sensors.items():
             lines.append(";".join([code, f"{t + 5.0:.3f}", f"{t:.4f}", *map(str, values[k]), "3"]))
+        vector = ";".join(map(str, w.rotation_vector[k]))
+        lines.append(f"AHRS;{t + 5.0:.3f};{t:.4f};1;2;3;{vector};3")
     for t in (5.5, 6.5):
         lines.append(f"PRES;{t};{t + 900.0};{1013.0 + 0.01 * t};3")
         lines.append(f"GNSS;{t + 0.25};1690000000.0;40.0;-3.0;{t};90.0;4.5;1.25;9;0")

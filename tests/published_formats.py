@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -232,7 +233,9 @@ def tlio(folder: Path, walk: ImuSequence, order: str = "xyzw") -> Written:
     ]  # fmt: skip
     description = {"columns_name(width)": columns, "num_rows": len(walk)}
     (folder / "imu0_resampled_description.json").write_text(json.dumps(description))
-    expected = replace(cut(walk, slice(None)), name=folder.name, magnetometer=None)
+    expected = cut(walk, slice(None))
+    known = replace(expected.truth, velocity_W=truth.velocity_W)
+    expected = replace(expected, name=folder.name, magnetometer=None, truth=known)
     return Written(folder, expected)
 
 
@@ -270,7 +273,8 @@ def tlio_raw(
     }  # fmt: skip
     (folder / "calibration.json").write_text(json.dumps(calibration))
     rows = slice(None, None, every)
-    known = trajectory(Path(), truth.time[rows], truth.position_W[rows], truth.attitude_WB[rows])
+    known = trajectory(Path(), *(x[rows] for x in (
+        truth.time, truth.position_W, truth.attitude_WB, truth.velocity_W)))  # fmt: skip
     expected = replace(walk, name=folder.name, truth=known)
     return Written(folder / "imu_samples_0.csv", expected)
 
@@ -292,6 +296,7 @@ def android(folder: Path, walk: ImuSequence) -> Written:
 def bag_writer(version: str) -> Writer:
     def write(folder: Path, walk: ImuSequence) -> Written:
         folder.mkdir(parents=True, exist_ok=True)
+        walk = walk.slice(0.0, 6.0)
         path = bag(folder / "walk", walk, version)
         return Written(path, replace(cut(walk, slice(None)), name="walk"))
 
@@ -322,70 +327,60 @@ def bag(
     else:
         plugin = StoragePlugin.MCAP if version == "mcap" else StoragePlugin.SQLITE3
         writer = Writer2(path, version=9, storage_plugin=plugin)
-    truth, kinds, field = walk.truth, store.types, field_of(walk)
+    topics = {topic: "sensor_msgs/msg/Imu" for topic in imu_topics}
+    topics |= dict([*pose_topics, *other_topics])
+    fields = field_of(walk)
     with writer:
         joined = {
             topic: (kind, writer.add_connection(topic, kind, typestore=store))
-            for topic, kind in [
-                *((t, "sensor_msgs/msg/Imu") for t in imu_topics),
-                *pose_topics,
-                *other_topics,
-            ]
+            for topic, kind in topics.items()
         }
         for k, stamp in enumerate(stamps_ns(walk.time)):
+            seconds, rest = divmod(stamp, 10**9)
+            header = {"stamp": {"sec": seconds, "nanosec": rest}, "frame_id": "base"}
             for kind, connection in joined.values():
-                header = ros_header(kinds, stamp, ros1)
-                values = (walk.gyro[k], walk.accel[k], truth.position_W[k], truth.quat_xyzw[k])
-                message = other_message(kinds, kind, header, k, field[k]) or ros_message(
-                    kinds, kind, header, *map(np.ndarray.tolist, values)
-                )
+                values = ros_values(kind, walk, k, fields[k])
+                message = ros_message(store, kind, {"header": header, **values})
                 writer.write(connection, stamp, pack(message, kind))
     return path
 
 
-def ros_header(kinds: dict[str, type], stamp: int, ros1: bool) -> object:
-    time = kinds["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
-    header = kinds["std_msgs/msg/Header"]
-    return header(0, time, "base") if ros1 else header(time, "base")
+def ros_values(kind: str, walk: ImuSequence, k: int, field: FloatArray) -> dict[str, Any]:
+    """Fields of the kth message of a type, by name."""
+
+    def named(values: FloatArray) -> dict[str, float]:
+        return dict(zip("xyzw", values.tolist(), strict=False))
+
+    truth = walk.truth
+    place, attitude = named(truth.position_W[k]), named(truth.quat_xyzw[k])
+    pose = {"position": place, "orientation": attitude}
+    gyro, accel = named(walk.gyro[k]), named(walk.accel[k])
+    position = {"latitude": 48.0, "longitude": 11.0 + 1e-5 * k, "altitude": 500.0}
+    return {
+        "Imu": {"orientation": attitude, "angular_velocity": gyro, "linear_acceleration": accel},
+        "PoseStamped": {"pose": pose},
+        "TransformStamped": {"transform": {"translation": place, "rotation": attitude}},
+        "PoseWithCovarianceStamped": {"pose": {"pose": pose}},
+        "Odometry": {"pose": {"pose": pose}},
+        "MagneticField": {"magnetic_field": named(1e-6 * field)},
+        "FluidPressure": {"fluid_pressure": 101_325.0 - k},
+        "NavSatFix": {**position, "position_covariance": np.diag([9.0, 9.0, 25.0]).ravel()},
+    }[kind.rsplit("/", 1)[1]]
 
 
-def other_message(
-    kinds: dict[str, type], kind: str, header: object, k: int, field: FloatArray
-) -> object | None:
-    """Return the kth message of a magnetometer, barometer or receiver; None for another kind."""
-    if kind == "sensor_msgs/msg/MagneticField":
-        tesla = kinds["geometry_msgs/msg/Vector3"](*(1e-6 * field))
-        return kinds[kind](header, tesla, np.zeros(9))
-    if kind == "sensor_msgs/msg/FluidPressure":
-        return kinds[kind](header, 101_325.0 - k, 0.0)
-    if kind == "sensor_msgs/msg/NavSatFix":
-        status = kinds["sensor_msgs/msg/NavSatStatus"](0, 1)
-        covariance = np.diag([9.0, 9.0, 25.0]).ravel()
-        return kinds[kind](header, status, 48.0, 11.0 + 1e-5 * k, 500.0, covariance, 2)
-    return None
+def ros_message(store: Any, kind: str, values: dict[str, Any]) -> object:
+    """A message with zeros in all fields that are not given."""
+    from rosbags.interfaces import Nodetype
 
-
-def ros_message(
-    kinds: dict[str, type], kind: str, header: object, gyro: list[float], accel: list[float],
-    position: list[float], quat: list[float],
-) -> object:  # fmt: skip
-    xyz = kinds["geometry_msgs/msg/Vector3"]
-    quaternion = kinds["geometry_msgs/msg/Quaternion"](*quat)
-    nine, many = np.zeros(9), np.zeros(36)
-    if kind == "sensor_msgs/msg/Imu":
-        return kinds[kind](header, quaternion, nine, xyz(*gyro), nine, xyz(*accel), nine)
-    if kind == "geometry_msgs/msg/TransformStamped":
-        transform = kinds["geometry_msgs/msg/Transform"](xyz(*position), quaternion)
-        return kinds[kind](header, "imu", transform)
-    pose = kinds["geometry_msgs/msg/Pose"](kinds["geometry_msgs/msg/Point"](*position), quaternion)
-    if kind == "geometry_msgs/msg/PoseStamped":
-        return kinds[kind](header, pose)
-    pose = kinds["geometry_msgs/msg/PoseWithCovariance"](pose, many)
-    if kind == "geometry_msgs/msg/PoseWithCovarianceStamped":
-        return kinds[kind](header, pose)
-    twist = kinds["geometry_msgs/msg/Twist"](xyz(0.0, 0.0, 0.0), xyz(0.0, 0.0, 0.0))
-    twist = kinds["geometry_msgs/msg/TwistWithCovariance"](twist, many)
-    return kinds[kind](header, "imu", pose, twist)
+    fields: dict[str, object] = {}
+    for name, (node, of) in store.fielddefs[kind][1]:
+        if node == Nodetype.NAME:
+            fields[name] = ros_message(store, of, values.get(name, {}))
+        elif node == Nodetype.ARRAY:
+            fields[name] = values.get(name, np.zeros(of[1]))
+        else:
+            fields[name] = values.get(name, "" if of[0] == "string" else 0)
+    return store.types[kind](**fields)
 
 
 WRITERS: dict[str, tuple[str, float, Writer]] = {

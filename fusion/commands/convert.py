@@ -31,9 +31,9 @@ def convert(
     overwrite: options.Overwrite = False,
 ) -> None:
     """Convert recordings to a CSV, the EuRoC layout or an archive; warn about what they lose."""
-    from stario.sequences.datasets.archive_writer import write_archive
     from stario.sequences.datasets.convert import convert as convert_sequence
     from stario.sequences.datasets.convert import layout_of
+    from stario.sequences.readers.archive import write_archive
 
     if len(paths) < 2:
         raise InputError("convert", str(paths[0]), "IN... OUT", "also name the output")

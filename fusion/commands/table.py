@@ -61,7 +61,7 @@ def table(
     from stario.network.architectures import ARCHITECTURES
     from stario.network.training.splits import learned_from
     from stario.sequences.datasets.batch import Skipped
-    from stario.sequences.datasets.cache_files import cache_folder
+    from stario.sequences.datasets.stream_cache import cache_folder
     from stario.sequences.settings import read_settings
 
     if data is None:

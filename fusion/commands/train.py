@@ -106,7 +106,7 @@ def train(
     from stario.network.training.parallel import is_leader
     from stario.network.training.splits import warn_of_learned
     from stario.network.training.train import train as train_network
-    from stario.sequences.datasets.cache_files import cache_folder
+    from stario.sequences.datasets.stream_cache import cache_folder
     from stario.sequences.datasets.stream_cache import recorded as recorded_streams
 
     if recorded_only and generated:

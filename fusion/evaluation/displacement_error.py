@@ -31,7 +31,7 @@ from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.errors import InputError
 from stario.sequences.findings import warn
 from stario.sequences.inspection.checks import check_units
-from stario.sequences.inspection.constant_values import dead_axes
+from stario.sequences.inspection.samples import dead_axes
 from stario.sequences.legs import gaps_and_jumps
 from stario.sequences.levelled_stream import (
     TICK_SECONDS,

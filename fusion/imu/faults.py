@@ -9,7 +9,7 @@ Stopped sensors: no real sensor repeats its numbers for long, since noise change
 Six numbers that repeat for a tenth of a second come from sensors that have stopped, unless the
 device may be at rest. One sensor alone: loggers repeat samples of a slow one, and a coarse one at
 rest measures the same numbers for minutes. So its values must repeat for half a second in which the
-other one shows motion that they rule out, by the rules of `sequences.inspection.constant_values`.
+other one shows motion that they rule out, by the rules of `sequences.inspection.samples`.
 From then on it counts as stopped until its values change. Samples of a stopped sensor are dropped,
 so that they are treated as a gap. A sensor whose values have never changed is dead (`units`). Three
 zeros of an accelerometer are no measurement at all, not even of a free fall, which has noise.
@@ -34,7 +34,7 @@ import numpy as np
 from stario.fusion.imu.intervals import NO_FLAGS, Flags, Sample
 from stario.sequences.clean_samples import MIN_RATE, replace_spikes
 from stario.sequences.errors import InputError
-from stario.sequences.inspection.constant_values import (
+from stario.sequences.inspection.samples import (
     contradicts_constant_accel,
     contradicts_constant_gyro,
 )

@@ -17,7 +17,7 @@ from stario.sequences.clean_samples import MAX_RATE, MIN_RATE
 from stario.sequences.errors import InputError
 from stario.sequences.findings import warn
 from stario.sequences.inspection.checks import check_gyro, downward
-from stario.sequences.inspection.constant_values import check_not_dead
+from stario.sequences.inspection.samples import check_not_dead
 from stario.sequences.sequence import FloatArray
 from stario.sequences.units import magnetic_advice
 

@@ -26,8 +26,7 @@ from stario.network.training.history import EpochReport, History
 from stario.network.training.made import cached_walks
 from stario.network.training.train import train
 from stario.sequences.datasets.batch import Skipped
-from stario.sequences.datasets.cache_files import recording_stamps
-from stario.sequences.datasets.stream_cache import recorded
+from stario.sequences.datasets.stream_cache import recorded, recording_stamps
 from stario.sequences.files import write_json
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.windows import WINDOW_SAMPLES, Attitude

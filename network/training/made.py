@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from stario.network.training.data import RecordingStreams
-from stario.sequences.datasets.cache_files import recording_stamps
-from stario.sequences.datasets.stream_cache import cached
+from stario.sequences.datasets.stream_cache import cached, recording_stamps
 from stario.sequences.errors import InputError
 from stario.sequences.readers.archive import archive_attributes
 from stario.sequences.sequence import ImuSequence

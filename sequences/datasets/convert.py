@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stario.sequences.arrays import check_choice
-from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.errors import InputError
 from stario.sequences.files import atomic_folder, atomic_write
 from stario.sequences.inspection.checks import MIN_SECONDS, check_units
 from stario.sequences.readers.archive import SUFFIXES as ARCHIVE_SUFFIXES
+from stario.sequences.readers.archive import write_archive
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import kind_of_positions
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
@@ -120,9 +120,7 @@ def write_euroc(path: Path, sequence: ImuSequence) -> list[Path]:
     truth = sequence.truth
     times = [sequence.time] if truth is None else [sequence.time, truth.time[truth.valid]]
     first = min(float(part.min()) for part in times if len(part))
-    tables = {
-        "imu0": (_IMU_HEADER, sequence.time, np.hstack([sequence.gyro, sequence.accel])),
-    }
+    tables = {"imu0": (_IMU_HEADER, sequence.time, np.hstack([sequence.gyro, sequence.accel]))}
     if truth is not None and truth.valid.any():
         header, columns = _POSE_HEADER, [truth.position_W, truth.quat_xyzw[:, [3, 0, 1, 2]]]
         if truth.velocity_W is not None:

@@ -5,15 +5,25 @@ the numbers of all of them, which are memory-mapped, so that they need no memory
 only when it is complete: a killed writer leaves nothing that would be read, and if two write at
 once, the second replaces the first's file by the same content. The folder may be deleted at any
 time.
+
+A file's name begins with a digest of the code that its content depends on. The rest depends on a
+key: for a recording, its path, the names, sizes and modification times of its files, and the
+options it is read with. Hashing the files' bytes instead would read 100 hours of recordings, and
+the images next to some of them, at every start; it would detect only one more case: a file replaced
+by one of the same size and modification time.
 """
 
 from __future__ import annotations
 
+import hashlib
+import importlib.resources
 import json
 import logging
+import os
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +32,13 @@ import safetensors.numpy
 from numpy.typing import NDArray
 
 from stario.sequences.datasets.batch import Skipped, each, skipped
-from stario.sequences.datasets.cache_files import cache_file, recording_file, remove_unused
 from stario.sequences.errors import InputError, StarioError
 from stario.sequences.files import atomic_write, remove_abandoned
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.legs import LegStream, leg_streams
+from stario.sequences.readers import FORMATS
 from stario.sequences.readers.archive import split_name
+from stario.sequences.readers.published.oxiod import capture_file
 from stario.sequences.sequence import ImuSequence, low_rate_message
 from stario.sequences.truth.problems import check_truth
 from stario.sequences.windows import Attitude, WorldStream, world_streams
@@ -43,6 +54,20 @@ _ABANDONED_S = 3600.0
 
 _OPEN_FILES = 10_240
 """Number of open files to ask for where a system states no limit; macOS allows no more."""
+
+_SUFFIX = ".streams"
+
+_UNUSED_S = 30 * 86_400.0
+"""Time after which a file of other code that nobody has read is removed [s]."""
+
+_UNRELATED = (
+    "accuracy/",
+    "drawing/",
+    "inspection/magnetic.py",
+    "inspection/report.py",
+    "inspection/stillness.py",
+)
+"""Parts of this package that nothing in the cache depends on."""
 
 
 def recorded(
@@ -96,7 +121,7 @@ def cached(
 
     The key has plain values that determine the result, except for this package's code.
     """
-    file = cache_file(folder, key)
+    file = _cache_file(folder, key)
     streams = _kept(file, build)
     return (_opened(file) or build()) if streams is None else streams
 
@@ -111,7 +136,8 @@ def _stored(
     """Return a recording's cache file, or its streams if that cannot be written."""
     if not split_name(path)[0].exists():
         return _streams(read(path), attitude)
-    file = recording_file(folder, path, {**options, "attitude": attitude})
+    files, options = recording_stamps(path), {**options, "attitude": attitude}
+    file = _cache_file(folder, {"path": str(path.resolve()), "files": files, "options": options})
     streams = _kept(file, lambda: _streams(read(path), attitude))
     return file if streams is None else streams
 
@@ -160,7 +186,7 @@ def _written(file: Path, streams: Sequence[Stream]) -> bool:
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         remove_abandoned(file.parent, _ABANDONED_S, file.name)
-        remove_unused(file.parent)
+        _remove_unused(file.parent)
         with atomic_write(file, "wb") as target:
             target.write(content)
     except (OSError, InputError) as error:
@@ -200,3 +226,80 @@ def _stream(known: dict[str, Any], arrays: dict[str, Any]) -> Stream:
     if known["kind"] == _POSES:
         return WorldStream(known["name"], **arrays)
     return LegStream(**known, **arrays)
+
+
+def cache_folder() -> Path:
+    """Return the folder `STARIO_CACHE`, else `stario` in `XDG_CACHE_HOME`, else in `~/.cache`."""
+    if named := os.environ.get("STARIO_CACHE"):
+        return Path(named)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stario"
+
+
+def _cache_file(folder: Path, key: Mapping[str, object]) -> Path:
+    """Return the file of a key: plain values that determine its content, besides this code."""
+    text = json.dumps(key, sort_keys=True, default=str)
+    digest = hashlib.blake2b(text.encode(), digest_size=20).hexdigest()
+    return folder / f"{_code()}-{digest}{_SUFFIX}"
+
+
+def recording_stamps(path: Path) -> list[tuple[str, int, int]]:
+    """Return name, size and modification time [ns] of a recording's files: they tell changes."""
+    return [
+        (str(file), stat.st_size, stat.st_mtime_ns)
+        for file in recording_files(path)
+        for stat in (file.stat(),)
+    ]
+
+
+def _remove_unused(folder: Path) -> None:
+    """Remove files that other code has written and that have not been read for 30 days."""
+    for file in folder.iterdir():
+        if file.suffix == _SUFFIX and not file.name.startswith(_code()):
+            with suppress(OSError):  # another process has removed it, or has it open on Windows
+                stat = file.stat()
+                if time.time() - max(stat.st_atime, stat.st_mtime) > _UNUSED_S:
+                    file.unlink()
+
+
+def recording_files(path: Path) -> list[Path]:
+    """Return the files that a recording is read from, and possibly others next to them."""
+    path, member = split_name(path)
+    if member is not None:
+        return [path]
+    while path != path.parent and _is_recording(path.parent, path.parent.stat().st_mtime_ns):
+        path = path.parent  # imu0/data.csv belongs to the folder that also holds its truth
+    if path.is_dir():
+        return sorted(p for p in path.rglob("*") if p.is_file())
+    if any(FORMATS[name].recognises(path) for name in ("phone", "wide")):
+        return sorted(p for p in path.parent.iterdir() if p.is_file())  # other sensors, poses
+    if not FORMATS["oxiod"].recognises(path):
+        return [path]
+    number = "".join(filter(str.isdigit, path.stem))
+    siblings = (p for p in path.parent.iterdir() if p.suffix == path.suffix and p.is_file())
+    same_number = {p for p in siblings if "".join(filter(str.isdigit, p.stem)) == number}
+    return sorted(same_number | set(filter(None, [capture_file(path)])))
+
+
+@cache
+def _is_recording(folder: Path, changed_ns: int) -> bool:
+    """Return whether a folder is a recording; cached, as it may hold thousands of files."""
+    return any(known.recognises(folder) for known in FORMATS.values())
+
+
+@cache
+def _code() -> str:
+    """Return a digest of the code, so that files of other versions are not reused."""
+    digest = hashlib.blake2b(digest_size=6)
+    for file in code_files():
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def code_files() -> list[Path]:
+    """Return the source files that the cache depends on: readers, levelling, simulation, ..."""
+    folder = Path(str(importlib.resources.files("stario.sequences")))
+    return sorted(
+        file
+        for file in folder.rglob("*.py")
+        if not file.relative_to(folder).as_posix().startswith(_UNRELATED)
+    )

@@ -19,8 +19,7 @@ from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.clean_samples import clean_samples, unbroken, without_spikes
 from stario.sequences.errors import InputError
 from stario.sequences.findings import Finding, warn
-from stario.sequences.inspection.constant_values import check_not_dead
-from stario.sequences.inspection.samples import LARGE_M_S2, check_time, limit_words
+from stario.sequences.inspection.samples import LARGE_M_S2, check_not_dead, check_time, limit_words
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 from stario.sequences.truth.fit import TruthFit, fit_truth
 from stario.sequences.truth.positions import fit_positions
@@ -180,29 +179,15 @@ def _check_content(sequence: ImuSequence) -> None:
 
 
 def check_gyro(
-    name: str,
-    time: FloatArray,
-    gyro: FloatArray,
-    accel: FloatArray,
-    pieces: list[slice],
-    fix: str,
+    name: str, time: FloatArray, gyro: FloatArray, accel: FloatArray, pieces: list[slice], fix: str
 ) -> tuple[float, float, list[Finding]]:
-    """Check the gyroscope's rotations against the accelerometer.
+    """Check the rotations (N, 3) [rad/s] against the accelerometer (N, 3) [m/s^2].
 
-    Args:
-        name: name of the recording.
-        time: (N,) [s].
-        gyro: (N, 3) [rad/s].
-        accel: (N, 3) [m/s^2].
-        pieces: unbroken stretches to average the force over.
-        fix: what to do if it is in deg/s.
-
-    Returns:
-        Median magnitude of the force, and of its average over a piece [m/s^2]; a finding if the
-        accelerometer cannot tell the gyroscope's unit.
+    The force is averaged over unbroken `pieces`. Its median magnitude and that of its average over
+    a piece [m/s^2] are returned, and a finding if it cannot tell the gyroscope's unit.
 
     Raises:
-        InputError: the gyroscope cannot be in rad/s.
+        InputError: the gyroscope cannot be in rad/s; `fix` is what to do if it is in deg/s.
     """
     force = float(np.median(np.linalg.norm(accel, axis=1)))
     if abs(force / STANDARD_GRAVITY - 1.0) > _SHAKEN_OFF_GRAVITY:
@@ -327,9 +312,8 @@ def _check_direction(sequence: ImuSequence, time: FloatArray, accel: FloatArray)
 def _downward(sequence: ImuSequence, fit: TruthFit | None) -> InputError:
     """Return the error for a force that points down under the true attitude.
 
-    Either the accelerometer has the opposite sign, or the truth's world has z down. The positions
-    decide: rotated by the attitude, the accelerometer then measures their acceleration or its
-    opposite.
+    The accelerometer has the opposite sign, or the truth's world has z down: its positions' own
+    acceleration, or the opposite, is what the accelerometer measures.
     """
     sign = "pass `--accel-sign apple` or write `ax [-m/s^2]` (or `[-g]`) in the CSV's header"
     sign = _UNIT_NAMED if "sign" in sequence.converted else sign

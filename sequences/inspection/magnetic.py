@@ -254,14 +254,10 @@ def _held(time: FloatArray, field: FloatArray) -> float:
 
 
 def _steadiness(time: FloatArray, level: FloatArray) -> tuple[float, float]:
-    """Return the RMS deviation of the bearing from a line [rad] and the line's slope [rad/s].
+    """Return the RMS deviation of a bearing from a line [rad] and the line's slope [rad/s].
 
-    Both are medians over windows of a minute. The line is fitted to means over a second, so that a
-    sample near a magnet does not add a full turn.
-
-    Args:
-        time: (N,) [s].
-        level: (N, 2) horizontal field.
+    Both are medians over windows of a minute of the level field (N, 2). The line is fitted to means
+    over a second, so that a sample near a magnet does not add a full turn.
     """
     count = samples_in(1.0, time)
     field = level[:, 0] + 1j * level[:, 1]

@@ -43,10 +43,7 @@ _SHORTEST_S = 1.0
 def scatter_bound(count: float, seconds: float, factor: float) -> float:
     """Return the largest sum of squares about the mean of white noise of density `factor`.
 
-    Args:
-        count: number of samples, each in three axes.
-        seconds: time that the samples span [s].
-        factor: factor on the sensor's noise density.
+    It is that of `count` samples, each in three axes, that span some seconds.
     """
     return factor**2 * count / seconds * chi2_quantile(_PROBABILITY, 3.0 * (count - 1.0))
 

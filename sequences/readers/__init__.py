@@ -7,6 +7,7 @@ be called from outside, and those that raise anything else, say so. Recognising 
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -28,11 +29,23 @@ from stario.sequences.readers.bag import is_bag, read_bag
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import is_generic_csv, read_generic_csv
 from stario.sequences.readers.joined import is_joined, is_untimed, unpack_joined
-from stario.sequences.readers.lines import may_be_read
-from stario.sequences.readers.lists import is_list, list_entries
+from stario.sequences.readers.lines import (
+    first_line,
+    first_lines,
+    is_row,
+    may_be_read,
+    numbers_in,
+    read_lines,
+)
 from stario.sequences.readers.phones.event_lines import is_event_lines, read_event_lines
-from stario.sequences.readers.phones.phone import is_phone, is_wide, read_phone, read_wide
-from stario.sequences.readers.published.advio import is_advio, read_advio
+from stario.sequences.readers.phones.phone import (
+    is_advio,
+    is_phone,
+    is_wide,
+    read_advio,
+    read_phone,
+    read_wide,
+)
 from stario.sequences.readers.published.euroc import is_euroc, read_euroc
 from stario.sequences.readers.published.oxiod import is_oxiod, read_oxiod
 from stario.sequences.readers.published.ridi import is_imunet, is_ridi, read_imunet, read_ridi
@@ -131,6 +144,12 @@ _SUFFIXES = (
     *(".bag", ".mcap", ".db3", ".hdf5", ".h5"),
 )
 """Suffixes of files that may be a recording by themselves."""
+
+
+_LIST_SUFFIXES = (".txt", ".list", ".lst")
+_HEAD_LINES = 20
+_OXIOD_FORMS = ("syn", "raw")
+_FILTER = re.compile(r"\s+(?P<key>[A-Za-z]\w*)=(?P<value>\"[^\"]*\"|[^\s\",]+)\s*$")
 
 
 def read_recording(path: str | Path, format: str = "auto", **options: str) -> ImuSequence:
@@ -258,21 +277,83 @@ def _below(path: Path) -> list[Path]:
 def _listed(
     path: Path, on_error: Callable[[ReadError], None] | None, where: AttributeFilter | None
 ) -> list[Path]:
-    """Return a list's recordings, each once; a nested list is an error: it could be a cycle."""
+    """Return the recordings that a list names, each once.
+
+    Names are relative to the list's folder or a folder in it. If that folder holds no folders, they
+    may also be relative to its parent or a folder in that. `data1/imu3.csv` is also found as
+    `data1/syn/imu3.csv` (OxIOD). An archive's name may be followed by a filter, as for
+    `find_recordings`: `file.h5 person=dan place="building 2"`. Blanks around a name, a `,type`
+    after it and comments from `#` on are ignored.
+    """
+    numbered = enumerate(read_lines(path), 1)
+    entries = [(k, *_parsed(x.split("#")[0])) for k, x in numbered if is_row(x)]
+    if not entries:
+        raise ReadError(path, "list", "no entry", "names of recordings")
+    folder = path.parent
+    bases = [folder, *(_folders(folder) or [folder.parent, *_folders(folder.parent)])]
+    located = [_located(bases, name) for _, name, _ in entries]
+    if len(entries) > _HEAD_LINES and not any(located):
+        text = f"{len(entries)} lines without an existing name, such as {entries[0][1]:.60}"
+        raise ReadError(path, "list", text, "a recording, or a list of them")
     found: list[Path] = []
-    for entry in list_entries(path):
+    for (number, name, of_entry), inside in zip(entries, located, strict=True):
         try:
-            if isinstance(entry, ReadError):
-                raise entry
-            inside, of_entry = entry
-            if not _is_recording(inside) and is_list(inside):
-                raise ReadError(path, "list", f"another list, {inside.name}", "recordings")
-            found += find_recordings(inside, where=of_entry)
+            found += find_recordings(_entry(path, number, name, inside), where=of_entry)
         except ReadError as error:
             if on_error is None:
                 raise
             on_error(error)
     return _with_attributes(list(dict.fromkeys(found)), where)
+
+
+def _entry(path: Path, number: int, name: str, located: Path | None) -> Path:
+    """Return where a list's entry is.
+
+    An empty one is an error, because the data sets' own readers take it for the folder itself, as
+    is a nested list: it could be a cycle.
+    """
+    line = f"line {number}"
+    if not name:
+        raise ReadError(path, line, "an empty entry", "a recording's name", "delete the line")
+    if located is None:
+        found, fix = f"{name!r}, which does not exist", "remove the line or fetch the recording"
+        raise ReadError(path, line, found, "the name of a recording", fix)
+    if not _is_recording(located) and is_list(located):
+        raise ReadError(path, "list", f"another list, {located.name}", "recordings")
+    return located
+
+
+def is_list(path: Path) -> bool:
+    """Return whether a file may be a list: a text suffix and no row of numbers in its first lines.
+
+    A line with a single number may be a name, as in TLIO's lists.
+    """
+    if path.suffix.lower() not in _LIST_SUFFIXES or first_line(path, comments=True) is None:
+        return False
+    lines = first_lines(path, _HEAD_LINES)
+    return all(len(numbers_in(line, mark)) < 2 for line in lines for mark in (",", ";", None))
+
+
+def _parsed(text: str) -> tuple[str, AttributeFilter]:
+    """Return the name in a line, and the `key=value` filters at its end."""
+    where: dict[str, list[str]] = {}
+    while match := _FILTER.search(text):
+        where.setdefault(match["key"], []).insert(0, match["value"].strip('"'))
+        text = text[: match.start()]
+    return text.split(",")[0].strip(), where
+
+
+def _folders(folder: Path) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
+
+
+def _located(bases: list[Path], name: str) -> Path | None:
+    if not name:
+        return None
+    path = Path(name)
+    forms = [path, *(path.parent / form / path.name for form in _OXIOD_FORMS)]
+    candidates = (base / form for base in bases for form in forms)
+    return next((found for found in candidates if split_name(found)[0].exists()), None)
 
 
 def _is_recording(path: Path) -> bool:

@@ -6,23 +6,27 @@ truth: `truth/{t,p,quat_xyzw}` (poses), `truth/{t,p}` (positions) or `waypoints/
 Units are s, rad/s, m/s^2, uT and m; all clocks of a recording have the same zero. Its attributes
 record who carried which device where. Poses may come with
 `truth/{velocity,position_covariance,valid}`, positions with `sigma`, `latlon_deg` and `floor`.
+Numbers are written unchanged, in double precision and compressed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import logging
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from stario.sequences.arrays import first_of
-from stario.sequences.errors import ReadError, StarioError
+from stario.sequences.arrays import checked_array, checked_valid, first_of, numbers, some_times
+from stario.sequences.auxiliary import Timed
+from stario.sequences.errors import InputError, ReadError, StarioError
+from stario.sequences.files import atomic_path, unused_name
 from stario.sequences.lazy import optional_package
-from stario.sequences.readers.checked import OPTIONAL, checked, pose_mask, rotations
+from stario.sequences.readers.checked import OPTIONAL, captured_rotations, pose_mask
 from stario.sequences.readers.lines import first_bytes
 from stario.sequences.sequence import (
     Barometer,
@@ -34,7 +38,8 @@ from stario.sequences.sequence import (
     Satellites,
     Trajectory,
 )
-from stario.sequences.time_order import increasing_mask
+
+_log = logging.getLogger(__name__)
 
 SUFFIXES = (".h5", ".hdf5")
 
@@ -43,14 +48,52 @@ AttributeFilter = Mapping[str, Sequence[str]]
 
 _RONIN = "data.hdf5"
 _EXPECTED = "an intact HDF5 archive"
-_OF_POSES = {"velocity": (3,), "position_covariance": (3, 3)}
-POSITIONS_OPTIONAL = ("sigma", "latlon_deg", "floor")
-SATELLITES_OPTIONAL = tuple(OPTIONAL.values())
-
+_COMPRESSION = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 
 DAMAGED = (OSError, RuntimeError, KeyError, ValueError, TypeError, IndexError, AttributeError)
 """Exceptions of h5py and NumPy for a damaged file, or for one with other content."""
+
+
+class Layout(NamedTuple):
+    """How a part of a recording is kept: its group, its class, and attributes by dataset.
+
+    The dataset `t` holds its times; `optional` ones may lack.
+    """
+
+    stem: str
+    kind: Callable[..., Any]
+    needed: dict[str, str]
+    optional: dict[str, str]
+
+
+_OF_POSES = ("velocity", "position_covariance")
+
+PARTS = {
+    "truth": Layout(
+        "truth",
+        Trajectory,
+        {"p": "position_W", "quat_xyzw": "attitude_WB"},
+        {name: f"{name}_W" for name in _OF_POSES} | {"valid": "valid"},
+    ),
+    "magnetometer": Layout("mag", Magnetometer, {"field": "field"}, {}),
+    "device_attitude": Layout("attitude", DeviceAttitude, {"quat_xyzw": "attitude_WB"}, {}),
+    "barometer": Layout("pressure", Barometer, {"hPa": "pressure_hPa"}, {}),
+    "satellites": Layout(
+        "satellites",
+        Satellites,
+        {"latlon_deg": "latlon_deg"},
+        {name: name for name in OPTIONAL.values()},
+    ),
+}
+"""Parts by the attribute of a recording; `track_layout` has its positions."""
+
+
+def track_layout(kind: Literal["positions", "waypoints"], place: str = "p") -> Layout:
+    """Return the layout of positions, in the dataset `place`, without attitude."""
+    optional = {name: name for name in ("sigma", "latlon_deg", "floor", "valid")}
+    stem = "truth" if kind == "positions" else "waypoints"
+    return Layout(stem, partial(PositionTrack, kind=kind), {place: "position_W"}, optional)
 
 
 def split_name(path: Path) -> tuple[Path, str | None]:
@@ -169,118 +212,61 @@ def read_archive(path: Path) -> ImuSequence:
         if name not in file:
             known = ", ".join(names[:3])
             raise ReadError(file_path, "recording", repr(name), f"a name in it, such as {known}")
-        return _sequence(path, name, file[name])
+        try:
+            return _sequence(path, name, file[name])
+        except InputError as error:
+            raise ReadError(path, error.field, error.found, error.expected, error.fix) from None
 
 
 def _sequence(path: Path, name: str, group: Any) -> ImuSequence:
-    part = partial(_part, path, group)
-    time = _column(path, group, "imu/t", finite=False)
-    truth, positions = _truth(path, group)
-    field, pressure = part("mag", {"field": [(3,)]}), part("pressure", {"hPa": [()]})
-    own = part("attitude", {"quat_xyzw": [(4,)]})
-    reported = part("satellites", {"latlon_deg": [(2,)]}, dict.fromkeys(SATELLITES_OPTIONAL, ()))
-    if own is not None:
-        own["attitude_WB"] = rotations(path, "attitude/quat_xyzw", own.pop("quat_xyzw"), "xyzw")
+    layouts = dict(PARTS)
+    if "truth/quat_xyzw" not in group:
+        del layouts["truth"]
+        layouts["positions"] = track_layout("positions")
+    if "waypoints" in group:
+        place = "xy" if "waypoints/xy" in group else "p"
+        layouts["positions"] = track_layout("waypoints", place)
+    time, gyro, accel = (_numbers(group, f"imu/{field}") for field in ("t", "gyro", "accel"))
     return ImuSequence(
-        name=name,
-        time=time,
-        gyro=_column(path, group, "imu/gyro", (len(time), 3), finite=False),
-        accel=_column(path, group, "imu/accel", (len(time), 3), finite=False),
-        truth=truth,
+        name,
+        time,
+        gyro,
+        accel,
         converted=frozenset({"gyro", "accel", "sign"}),
-        magnetometer=Magnetometer(**field) if field else None,
-        positions=positions,
-        device_attitude=DeviceAttitude(**own) if own else None,
-        barometer=Barometer(*pressure.values()) if pressure else None,
-        satellites=Satellites(**reported) if reported else None,
         attributes=_attributes(group),
+        **{
+            attribute: _part(path, group, layout)
+            for attribute, layout in layouts.items()
+            if layout.stem in group
+        },
     )
 
 
-def _part(
-    path: Path,
-    group: Any,
-    stem: str,
-    required: Mapping[str, Sequence[tuple[int, ...]]],
-    optional: Mapping[str, tuple[int, ...]] | None = None,
-    known: bool = False,
-) -> dict[str, Any] | None:
-    """Return the times that increase and the columns of a part by name; None without it.
-
-    A row of a `required` column may have any of some shapes; `optional` columns may lack, and hold
-    NaN. In a truth (`known`), others may hold NaN too where "valid" is False.
-    """
-    if stem not in group:
-        return None
-    time = _column(path, group, f"{stem}/t")
-    columns: dict[str, Any] = {"time": time}
-    valid = np.ones(len(time), dtype=np.bool_)
-    if known and f"{stem}/valid" in group:
-        valid = np.asarray(_column(path, group, f"{stem}/valid", time.shape), dtype=np.bool_)
-    for name, rows in required.items():
-        shapes = [(len(time), *row) for row in rows]
-        values = _column(path, group, f"{stem}/{name}", *shapes, finite=not known)
-        if (bad := valid & ~np.isfinite(values.reshape(len(time), -1)).all(axis=1)).any():
-            where, fix = f"row {int(np.argmax(bad)) + 1}, {stem}/{name}", f"{stem}/valid"
-            found = "a value that is not finite"
-            raise ReadError(path, where, found, "finite numbers", f"write False there in {fix}")
-        columns[name] = values
-    for name, row in (optional or {}).items():
-        if f"{stem}/{name}" in group:
-            shape = len(time), *row
-            columns[name] = _column(path, group, f"{stem}/{name}", shape, finite=False)
-    keep = pose_mask(path, time) if known else increasing_mask(time)
-    columns |= {"valid": valid} if known else {}
-    return {name: values[keep] for name, values in columns.items()}
+def _part(path: Path, group: Any, layout: Layout) -> Any:
+    """Return a part of a recording, its rows at times that increase."""
+    optional = {n: a for n, a in layout.optional.items() if f"{layout.stem}/{n}" in group}
+    rows: dict[str, Any] = {
+        attribute: _numbers(group, f"{layout.stem}/{name}")
+        for name, attribute in ({"t": "time"} | layout.needed | optional).items()
+    }
+    time = some_times(f"{layout.stem}/t", rows["time"])
+    if "attitude_WB" in rows:
+        field = f"{layout.stem}/quat_xyzw"
+        quat_xyzw = checked_array(field, rows["attitude_WB"], (len(time), 4), where=False)
+        rows["attitude_WB"], known = captured_rotations(quat_xyzw)
+        valid = checked_valid(f"{layout.stem}/valid", rows.get("valid", np.empty(0)), time)
+        if (bad := valid & ~known).any():
+            where = f"row {int(np.argmax(bad)) + 1}, {field}"
+            raise InputError(where, "no unit quaternion", f"one, or False in {layout.stem}/valid")
+    if not (keep := pose_mask(path, time)).all():
+        rows = {attribute: values[keep] for attribute, values in rows.items()}
+    return layout.kind(**rows)
 
 
-def _truth(path: Path, group: Any) -> tuple[Trajectory | None, PositionTrack | None]:
-    """Return the poses, and the positions or waypoints."""
-    place = "xy" if "waypoints/xy" in group else "p"
-    positions = _positions(path, group, "waypoints", "waypoints", place)
-    if "truth/quat_xyzw" not in group:
-        return None, _positions(path, group, "truth", "positions", "p") or positions
-    poses = _part(
-        path, group, "truth", {"quat_xyzw": [(4,)], "p": [(3,)]},
-        _OF_POSES, known=True,
-    )  # fmt: skip
-    assert poses is not None
-    # Invalid rows may hold anything, but each must become a rotation.
-    quat = poses.pop("quat_xyzw")
-    quat = np.where(np.isfinite(quat).all(axis=1)[:, None], quat, [0.0, 0.0, 0.0, 1.0])
-    attitude_WB = rotations(path, "truth/quat_xyzw", quat, "xyzw")
-    named = {f"{name}_W": poses.pop(name) for name in _OF_POSES if name in poses}
-    truth = Trajectory(position_W=poses.pop("p"), attitude_WB=attitude_WB, **poses, **named)
-    return truth, positions
-
-
-def _positions(
-    path: Path, group: Any, stem: str, kind: Literal["positions", "waypoints"], place: str
-) -> PositionTrack | None:
-    optional = {name: (2,) if name == "latlon_deg" else () for name in POSITIONS_OPTIONAL}
-    found = _part(path, group, stem, {place: [(2,), (3,)]}, optional, known=True)
-    return PositionTrack(position_W=found.pop(place), kind=kind, **found) if found else None
-
-
-def _column(
-    path: Path, group: Any, field: str, *shapes: tuple[int, ...], finite: bool = True
-) -> FloatArray:
-    """Return a dataset as numbers of one of some shapes, (N,) with any N > 0 without shapes.
-
-    IMU samples may be NaN, which the health report counts.
-    """
-    if field not in group:
-        raise ReadError(path, field, "no such dataset", "an array of numbers")
-    dataset = group[field]
-    if not hasattr(dataset, "dtype"):
-        raise ReadError(path, field, "a group", "a dataset of numbers")
-    if dataset.dtype.kind not in "fiub":
-        raise ReadError(path, field, f"values of type {dataset.dtype}", "an array of numbers")
-    if not (dataset.shape in shapes if shapes else dataset.ndim == 1 and dataset.size):
-        expected = " or ".join(map(str, shapes)) or "(N,) with at least one"
-        raise ReadError(path, field, f"shape {dataset.shape}", expected)
-    values: FloatArray = np.asarray(dataset[:], dtype=np.float64)
-    return checked(path, field, values) if finite else values
+def _numbers(group: Any, field: str) -> FloatArray:
+    if not hasattr(dataset := group.get(field), "dtype"):
+        raise InputError(field, "no such dataset", "an array of numbers")
+    return numbers(field, dataset[()])
 
 
 def _plain(value: Any) -> str | float:
@@ -301,13 +287,7 @@ def is_hdf5(path: Path) -> bool:
 def opened_hdf5(path: Path, expected: str) -> Iterator[Any]:
     """Open a file for reading; damage or other content found in the block becomes a ReadError.
 
-    Args:
-        path: the file.
-        expected: what the file should be, for the error.
-
-    Raises:
-        ReadError: the file or what the block reads from it is damaged.
-        MissingPackageError: h5py is not installed.
+    It says what was `expected`. MissingPackageError if h5py is not installed.
     """
     h5py = optional_package("h5py", "readers")
     try:
@@ -320,3 +300,65 @@ def opened_hdf5(path: Path, expected: str) -> Iterator[Any]:
         locked = isinstance(error, BlockingIOError) or "already open for write" in found
         fix = "close it in the program that writes it" if locked else "is the download complete?"
         raise ReadError(path, "content", found, expected, fix) from error
+
+
+def write_archive(path: Path | str, sequences: Iterable[ImuSequence]) -> list[str]:
+    """Write recordings into one archive, atomically; an existing file is replaced.
+
+    Args:
+        path: the archive file, `.h5` or `.hdf5`.
+        sequences: recordings, consumed one by one, so that they need not fit into memory together.
+
+    Returns:
+        The names under which they are stored: their own, with `-2`, `-3`, ... appended if a name
+        is taken, and with `-` instead of a slash.
+
+    Raises:
+        InputError: the file's name has another suffix, its folder does not exist, there is no
+            recording, or h5py is not installed.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError("path", str(path), f"a file name ending in {' or '.join(SUFFIXES)}")
+    h5py = optional_package("h5py", "readers")
+    names: list[str] = []
+    with atomic_path(path) as temporary:
+        with h5py.File(temporary, "x") as file:
+            for sequence in sequences:
+                name = sequence.name.replace("/", "-") or "recording"
+                names.append(unused_name(name, file))
+                _write(file.create_group(names[-1]), sequence)
+        if not names:
+            raise InputError(str(path), "no recording", "at least one recording")
+    return names
+
+
+def _write(group: Any, sequence: ImuSequence) -> None:
+    track, layouts = sequence.positions, dict(PARTS)
+    if track is not None and track.kind == "positions" and sequence.truth is not None:
+        _log.warning("%s: positions alongside true poses are not written", sequence.name)
+    elif track is not None:
+        flat = track.kind == "waypoints" and track.position_W.shape[1] == 2
+        layouts["positions"] = track_layout(track.kind, "xy" if flat else "p")
+    columns = {"imu/t": sequence.time, "imu/gyro": sequence.gyro, "imu/accel": sequence.accel}
+    for attribute, layout in layouts.items():
+        if (part := getattr(sequence, attribute)) is not None:
+            columns |= _columns(layout, part)
+    for name, values in columns.items():
+        group.create_dataset(name, data=values, **(_COMPRESSION if len(values) else {}))
+    for key, value in sequence.attributes.items():
+        group.attrs[key] = value
+
+
+def _columns(layout: Layout, part: Timed) -> dict[str, FloatArray]:
+    """Return the known attributes of a part by their datasets' names.
+
+    Flags are left out if all are True, which is what a reader takes for granted.
+    """
+    columns = {}
+    for name, attribute in ({"t": "time"} | layout.needed | layout.optional).items():
+        value = getattr(part, attribute)
+        if value is not None and not (attribute == "valid" and value.all()):
+            value = value.as_quat() if attribute == "attitude_WB" else value
+            columns[f"{layout.stem}/{name}"] = value
+    return columns

@@ -40,12 +40,7 @@ _LARGEST_STEP_HPA = 0.3
 """Median step between different neighbours of anything but pressure; of barometers it is below 0.1,
 and 0.2 in a lift at 1 Hz. Altitudes in metres taken for hPa have larger ones."""
 
-OPTIONAL = {
-    "alt": "altitude_m",
-    "acc": "radius_m",
-    "speed": "speed_m_s",
-    "bearing": "bearing_deg",
-}
+OPTIONAL = {"alt": "altitude_m", "acc": "radius_m", "speed": "speed_m_s", "bearing": "bearing_deg"}
 """Optional attributes of `Satellites` by their columns in a generic CSV."""
 
 DEGREES = {"deg": 1.0, "": 1.0, "°": 1.0}
@@ -71,22 +66,11 @@ _LARGEST_DEGREES = 90.0, 180.0
 """Largest latitude and longitude."""
 
 
-def checked(path: Path, field: str, values: FloatArray) -> FloatArray:
-    """Return values (N,) or (N, K) if all are finite."""
-    good = np.isfinite(values).reshape(len(values), -1).all(axis=1)
-    if not good.all():
-        k = int(np.argmin(good))
-        found = "nan" if np.isnan(values[k]).any() else "inf"
-        where = f"row {k + 1}, {field}"
-        raise ReadError(path, where, found, "finite numbers", "cut the recording there")
-    return values
-
-
-def finite_rows(path: Path, field: str, values: FloatArray) -> IntArray:
+def finite_rows(path: Path, field: str, values: FloatArray, all_of_them: bool = False) -> IntArray:
     """Return the rows of values (N,) or (N, K) that are finite, and warn of the others."""
     rows = np.flatnonzero(np.isfinite(values).reshape(len(values), -1).all(axis=1))
     if lost := len(values) - len(rows):
-        if lost > len(values) / 2:
+        if all_of_them or lost > len(values) / 2:
             found = f"{lost} of {len(values)} rows that are not finite"
             raise ReadError(path, field, found, "finite numbers")
         count = len(values)
@@ -100,29 +84,19 @@ def rotations(
     quat: FloatArray,
     order: str = "wxyz",
     numbers: IntArray | None = None,
+    row: str = "row",
 ) -> Rotation:
-    """Return rotations from unit quaternions.
+    """Return rotations from unit quaternions (N, 4) in an order, `wxyz` or `xyzw`.
 
-    Args:
-        path: the file, for errors.
-        field: name of the quaternions, for errors.
-        quat: (N, 4) quaternions.
-        order: order of their components, `wxyz` or `xyzw`.
-        numbers: (N,) numbers of the rows, for errors; from 1 if None.
-
-    Raises:
-        ReadError: a component is not finite or a norm differs from 1 by more than a percent; the
-            error names the field and its row.
+    The error of another names its field and row, by its number (N,), or its index from 1.
     """
-    norm = np.linalg.norm(quat, axis=1)
-    bad = ~(np.abs(norm - 1.0) <= NORM_TOLERANCE)
-    if bad.any():
-        k = int(np.argmax(bad))
-        where = f"row {k + 1 if numbers is None else numbers[k]}, {field}"
-        raise ReadError(
-            path, where, f"norm {norm[k]:.4g}", "a unit quaternion", "cut the recording there"
-        )
-    return Rotation.from_quat(quat if order == "xyzw" else quat[:, [1, 2, 3, 0]])
+    found, known = captured_rotations(quat if order == "xyzw" else quat[:, [1, 2, 3, 0]])
+    if not known.all():
+        k = int(np.argmin(known))
+        where = f"{row} {k + 1 if numbers is None else numbers[k]}, {field}"
+        norm, fix = f"norm {np.linalg.norm(quat[k]):.4g}", "cut the recording there"
+        raise ReadError(path, where, norm, "a unit quaternion", fix)
+    return found
 
 
 def captured_rotations(quat_xyzw: FloatArray) -> tuple[Rotation, BoolArray]:
@@ -138,13 +112,10 @@ def captured_rotations(quat_xyzw: FloatArray) -> tuple[Rotation, BoolArray]:
 def magnetometer(
     time: FloatArray, field: FloatArray | None, held: bool = True
 ) -> Magnetometer | None:
-    """Return the finite, non-zero samples of a magnetometer whose times advance; None if none.
+    """Return a magnetometer's finite, non-zero samples at times that advance; None if none.
 
-    Args:
-        time: (N,) sample times [s].
-        field: (N, 3) magnetic field [uT], if there is one.
-        held: whether to skip repeated values if more than a third are repeated: some apps write
-            the last reading at the IMU's rate.
+    If more than a third of the values (N, 3) repeat the last one, those are `held` ones and
+    skipped: some apps write the last reading at the IMU's rate.
     """
     if field is None:
         return None
@@ -194,14 +165,8 @@ def barometer(
 ) -> Barometer | None:
     """Return the pressure in hPa at the times that advance; None if there is none.
 
-    None too, with a warning, if the values are no pressure in any unit: a barometer is optional.
-
-    Args:
-        path: the file, for messages.
-        title: title of its column, for messages.
-        time: (N,) [s].
-        values: (N,) pressure; NaN, zero or negative where there is none.
-        unit: its unit in the tables' spelling; empty to tell it by the size.
+    None too, with a warning, if the values (N,) are no pressure in any unit: a barometer is
+    optional. They are NaN, zero or negative where there is none; their size tells a missing unit.
     """
     kept = np.isfinite(time) & np.isfinite(values) & (values > 0.0)
     kept[kept] = increasing_mask(time[kept])
@@ -241,10 +206,7 @@ def _expected() -> tuple[str, str]:
 
 
 def known_places(latlon_deg: FloatArray) -> BoolArray:
-    """Return which of the latitudes and longitudes (N, 2) are a place: not NaN, nor zeros.
-
-    Some apps write zeros until there is a position.
-    """
+    """Return which latitudes and longitudes (N, 2) are a place, unlike zeros until the first."""
     return np.asarray((np.abs(latlon_deg) <= _LARGEST_DEGREES).all(axis=1) & latlon_deg.any(axis=1))
 
 
@@ -271,13 +233,10 @@ def in_degrees(path: Path, latlon_deg: FloatArray) -> FloatArray:
 def satellites(
     time: FloatArray, latlon_deg: FloatArray, rest: Mapping[str, FloatArray]
 ) -> Satellites | None:
-    """Return the known places whose times advance; None if there is none.
+    """Return the known places (N, 2) [deg] whose times advance; None if there is none.
 
-    Args:
-        time: (N,) [s].
-        latlon_deg: (N, 2) latitude and longitude [deg].
-        rest: (N,) those of the attributes of `OPTIONAL` that the file has. Phones write a negative
-            accuracy, speed or bearing, or an accuracy of 0, where they know none: it becomes NaN.
+    The `rest` are those of the attributes of `OPTIONAL` that the file has. Phones write a negative
+    accuracy, speed or bearing, or an accuracy of 0, where they know none: it becomes NaN.
     """
     kept = known_places(latlon_deg) & np.isfinite(time)
     kept[kept] = increasing_mask(time[kept])
@@ -290,10 +249,3 @@ def satellites(
         stated[name] = np.where(stated[name] >= 0.0, stated[name], np.nan)
     told = {name: values for name, values in stated.items() if np.isfinite(values).any()}
     return Satellites(time[kept], latlon_deg[kept], **told)
-
-
-def satellite_columns(reported: Satellites) -> tuple[list[str], FloatArray]:
-    """Return names and values (N, K) of a generic CSV's columns for what a receiver reported."""
-    known = {name: getattr(reported, attribute) for name, attribute in OPTIONAL.items()}
-    known = {name: values for name, values in known.items() if values is not None}
-    return ["lat", "lon", *known], np.column_stack([reported.latlon_deg, *known.values()])

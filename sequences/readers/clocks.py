@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -14,8 +15,8 @@ from stario.sequences.clean_samples import MAX_RATE, MIN_RATE, SHARED_TIMES
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.phones.sensor_words import XSENS_CLOCK
-from stario.sequences.readers.text import IntArray, seconds
-from stario.sequences.sequence import MAX_TRUTH_GAP, BoolArray, FloatArray, ImuSequence
+from stario.sequences.readers.text import Column, IntArray, seconds
+from stario.sequences.sequence import MAX_TRUTH_GAP, FloatArray, ImuSequence
 from stario.sequences.time_order import MAX_IMU_GAP, disorder, increasing_mask
 from stario.sequences.units import FILETIME_1970, FILETIME_NS, TIME_UNITS
 
@@ -86,18 +87,12 @@ def resample_to_gyro(
     accel: Samples,
     names: tuple[str, str] = ("gyroscope", "accelerometer"),
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Interpolate the accelerometer to the gyroscope's samples in their common time span.
+    """Return times [ns], gyroscope and accelerometer, interpolated to it in their common time span.
 
     Samples in an accelerometer gap of more than 0.1 s are skipped, since the force there is
     unknown. Both clocks have one origin; `names` are for messages if they are other sensors'.
-
-    Returns:
-        Time stamps (K,) [ns], gyroscope (K, 3) and accelerometer (K, 3).
-
-    Raises:
-        ReadError: the two sensors do not overlap in time, or the accelerometer's rate is too low.
     """
-    accel = _sorted_samples(path, names[1], accel)
+    accel = _sorted_samples(path, names[1], accel, _rate(gyro.stamps_ns))
     gyro_ns, accel_ns = gyro.stamps_ns, accel.stamps_ns
     kept = (gyro_ns >= accel_ns[0]) & (gyro_ns <= accel_ns[-1])
     if not kept.any():
@@ -125,7 +120,7 @@ def resample_to_gyro(
     return gyro_ns[kept], gyro.values[kept], force
 
 
-def _sorted_samples(path: Path, name: str, samples: Samples) -> Samples:
+def _sorted_samples(path: Path, name: str, samples: Samples, other_rate: float) -> Samples:
     """Return a sensor's samples by increasing time, one at each, for interpolation.
 
     Rows late by milliseconds are sorted. Those of a clock that was set back are dropped: sorted,
@@ -145,26 +140,25 @@ def _sorted_samples(path: Path, name: str, samples: Samples) -> Samples:
     stamps_ns, values = stamps_ns[order], values[order]
     fresh = np.append(True, np.diff(stamps_ns) > 0)
     differing = np.append(True, np.diff(values, axis=0).any(axis=1))
-    _warn_of_few_times(path, name, stamps_ns[fresh], fresh | differing)
-    return Samples(stamps_ns[fresh], values[fresh])
-
-
-def _warn_of_few_times(path: Path, name: str, stamps_ns: IntArray, samples: BoolArray) -> None:
-    """Warn if several samples share each of the times (M,), or these are too far apart."""
-    if len(stamps_ns) < 2:
-        return
-    shared = float(samples.sum()) / len(stamps_ns)
-    rate = 1e9 / float(np.median(np.diff(stamps_ns)))
+    shared, rate = float((fresh | differing).sum()) / int(fresh.sum()), _rate(stamps_ns[fresh])
     if shared >= SHARED_TIMES:
         _log.warning(
             "%s: %s: found %.3g samples on average at each time, of which one is used, expected a "
             "time for each: export them unrounded, and not in batches", path, name, shared,
         )  # fmt: skip
-    elif rate < MIN_RATE:
+    elif rate < min(MIN_RATE, other_rate):  # a recording of that rate is refused later
         _log.warning(
             "%s: %s: found %.3g samples/s, expected 50 to 1000: set the app to 50 Hz or more",
             path, name, rate,
         )  # fmt: skip
+    return Samples(stamps_ns[fresh], values[fresh])
+
+
+def _rate(stamps_ns: IntArray) -> float:
+    """Return the median rate [Hz] of times [ns], infinite for a single one."""
+    steps = np.diff(stamps_ns)
+    steps = steps[steps > 0]
+    return 1e9 / float(np.median(steps)) if len(steps) else math.inf
 
 
 def _refuse_counts_and_dates(file: Path, title: str, time: FloatArray) -> None:
@@ -196,10 +190,9 @@ def _is_date(digits: str) -> bool:
 
 
 def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.int64) -> int:
-    """Return the time unit [ns] with which most times (N,) lie within a recording.
+    """Return the time unit [ns] with which most times (N,) lie within a recording on one clock.
 
-    For rows too rare for `time_unit`; the recording is from `start_ns` to `stop_ns` on the same
-    clock, and rows may precede or follow it by a minute.
+    For rows too rare for `time_unit`; they may precede or follow it by a minute.
     """
     start, stop = float(start_ns) * 1e-9 - _MARGIN_S, float(stop_ns) * 1e-9 + _MARGIN_S
     # Times from zero fit finer units as well, but all at the start.
@@ -221,15 +214,17 @@ def source_words(source: str, unit: str) -> str:
     return f"{source}, times taken as {unit}" if unit else source
 
 
-def inferred_unit(
-    file: Path, title: str, time: FloatArray, or_seconds: bool = False
+def clock_unit(
+    file: Path, clock: Column, time: FloatArray, or_seconds: bool = False
 ) -> tuple[int, str]:
-    """Return the unit [ns] of times (N,) that name none, and its name if another is possible.
+    """Return the unit [ns] of a clock's times (N,), and its name if another is possible.
 
-    Counts of rows and dates without separators are refused: either would pass for times. Times
-    at a rate of no unit are refused too, or taken as seconds unless those are after 2100.
+    Without a unit, counts of rows and dates without separators are refused: either would pass for
+    times. Those at a rate of no unit are too, or taken as seconds unless that is after 2100.
     """
-    _refuse_counts_and_dates(file, title, time)
+    if clock.unit:
+        return time_unit(file, time, clock.unit), ""
+    _refuse_counts_and_dates(file, clock.title or "time", time)
     first = float(time[:1].sum())
     try:
         unit_ns = time_unit(file, time)
@@ -246,9 +241,6 @@ def time_unit(file: Path, time: FloatArray, unit: str = "") -> int:
     """Return the unit of times (N,) [ns], inferred from the rate if none is named.
 
     Samples that share a rounded time are spread over the time to the next one.
-
-    Raises:
-        ReadError: the unit is unknown, or no unit gives a plausible sample rate.
     """
     if unit in TIME_UNITS:
         return TIME_UNITS[unit]

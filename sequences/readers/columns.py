@@ -19,6 +19,7 @@ from stario.sequences.readers.phones.sensor_words import (
     is_uncalibrated,
     sensor_of,
 )
+from stario.sequences.readers.text import Column
 from stario.sequences.units import (
     ACCEL_UNITS,
     GYRO_UNITS,
@@ -105,15 +106,6 @@ _CELL = re.compile(r"\s*[\"']?\s*(?P<name>[^\[\(\"']*?)\s*(?:[\[\(](?P<unit>[^\]
 
 
 @dataclass(frozen=True)
-class Column:
-    """A quantity's position in a row, its title, and its unit in the tables' spelling, if any."""
-
-    index: int
-    title: str = ""
-    unit: str = ""
-
-
-@dataclass(frozen=True)
 class Header:
     """Lines up to the header's end, cell separator, titles, columns by canonical name."""
 
@@ -130,8 +122,9 @@ def read_header(path: Path, lines: list[str]) -> Header:
         raise ReadError(path, "header", "only comments", HEADER)
     line, number = lines[index], index + 1
     if not _names_columns(line):
-        found = repr(line.strip()[:60])
-        raise ReadError(path, f"line {number}, header", found, HEADER, "put it above the rows")
+        found = f"{line.strip()[:60]!r}, which names no axis of a sensor"
+        fix = "write titles above the rows; if it is in another format, omit `--format csv`"
+        raise ReadError(path, f"line {number}", found, f"titles, {HEADER}", fix)
     titles, below = _titles(line), lines[number] if number < len(lines) else ""
     with_units = with_units_below(titles, below.split(_separator(line)))
     columns = _columns(path, number, with_units or titles)

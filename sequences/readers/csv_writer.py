@@ -9,7 +9,7 @@ import numpy as np
 
 from stario.sequences.arrays import check_type
 from stario.sequences.files import atomic_write
-from stario.sequences.readers.checked import satellite_columns
+from stario.sequences.readers.checked import OPTIONAL
 from stario.sequences.readers.columns import (
     HEADER,
     IMU,
@@ -34,7 +34,7 @@ def write_csv(path: Path | str, sequence: ImuSequence) -> None:
         InputError: the folder does not exist, or `sequence` has the wrong type.
     """
     check_type("sequence", sequence, ImuSequence, "call write_csv(path, sequence)")
-    truth, field, known = sequence.truth, sequence.magnetometer, sequence.positions
+    truth, field, track = sequence.truth, sequence.magnetometer, sequence.positions
     header, rows = HEADER, _Written(sequence)
     if field is not None:
         header += f",{MAGNETIC_HEADER}"
@@ -43,18 +43,20 @@ def write_csv(path: Path | str, sequence: ImuSequence) -> None:
         header += f",{TRUTH_HEADER}"
         poses = np.column_stack([truth.position_W, truth.quat_xyzw])
         rows.add(truth.time[truth.valid], poses[truth.valid])
-    elif known is not None:
-        header += "," + ",".join(TRUTH_HEADER.split(",")[: known.position_W.shape[1]])
-        header += "" if known.sigma is None else f",{SIGMA_HEADER}"
-        columns = [known.position_W] if known.sigma is None else [known.position_W, known.sigma]
-        rows.add(known.time[known.valid], np.column_stack(columns)[known.valid])
+    elif track is not None:
+        header += "," + ",".join(TRUTH_HEADER.split(",")[: track.position_W.shape[1]])
+        header += "" if track.sigma is None else f",{SIGMA_HEADER}"
+        columns = [track.position_W] if track.sigma is None else [track.position_W, track.sigma]
+        rows.add(track.time[track.valid], np.column_stack(columns)[track.valid])
     if sequence.barometer is not None:
         header += f",{PRESSURE_HEADER}"
         rows.add(sequence.barometer.time, sequence.barometer.pressure_hPa[:, None])
     if sequence.satellites is not None:
-        names, values = satellite_columns(sequence.satellites)
-        header += "," + ",".join(SATELLITE_HEADER[name] for name in names)
-        rows.add(sequence.satellites.time, values)
+        reported = sequence.satellites
+        known = {name: getattr(reported, attribute) for name, attribute in OPTIONAL.items()}
+        known = {name: values for name, values in known.items() if values is not None}
+        header += "," + ",".join(SATELLITE_HEADER[name] for name in ("lat", "lon", *known))
+        rows.add(reported.time, np.column_stack([reported.latlon_deg, *known.values()]))
     with atomic_write(path) as file:
         file.write("\n".join([header, *rows.merged()]) + "\n")
 

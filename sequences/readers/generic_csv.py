@@ -27,29 +27,23 @@ A sample written as `nan` stays NaN; other columns are ignored.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import (
     OPTIONAL,
     barometer,
     in_degrees,
     magnetometer,
+    rotations,
     satellites,
 )
-from stario.sequences.readers.clocks import (
-    Samples,
-    inferred_unit,
-    resample_to_gyro,
-    source_words,
-)
+from stario.sequences.readers.clocks import Samples, clock_unit, resample_to_gyro, source_words
 from stario.sequences.readers.columns import (
     IMU,
     PRESSURE,
@@ -59,7 +53,6 @@ from stario.sequences.readers.columns import (
     SATELLITE_HEADER,
     SIGMA,
     TRUTH,
-    Column,
     Header,
     named_columns,
     read_header,
@@ -74,7 +67,15 @@ from stario.sequences.readers.lines import (
     with_seconds,
 )
 from stario.sequences.readers.table_head import refuse_several_devices
-from stario.sequences.readers.text import RowFormat, Table, is_missing, read_table, seconds
+from stario.sequences.readers.text import (
+    Column,
+    IntArray,
+    RowFormat,
+    Table,
+    is_missing,
+    read_table,
+    seconds,
+)
 from stario.sequences.sequence import (
     Barometer,
     BoolArray,
@@ -85,12 +86,7 @@ from stario.sequences.sequence import (
     Trajectory,
 )
 from stario.sequences.time_order import increasing_mask
-from stario.sequences.units import (
-    ACCEL_UNITS,
-    GYRO_UNITS,
-    MAGNETIC_UNITS,
-    TIME_UNITS,
-)
+from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS
 
 _log = logging.getLogger(__name__)
 
@@ -153,7 +149,7 @@ class _Rows:
     values: dict[str, FloatArray]
     time: FloatArray
     is_imu: BoolArray
-    line_numbers: Sequence[int]
+    line_numbers: IntArray
     assumed_unit: str
 
     def vectors(self, letter: str, known: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
@@ -171,9 +167,9 @@ def _read_rows(path: Path) -> _Rows:
     cells = _first_cells(path, lines, header, decimal)
     dated = with_seconds(cells[clock.index : clock.index + 1])
     row_format = RowFormat(header.lines, separator, decimal, dated != cells[clock.index :][:1])
-    names = ["t", *(name for name in QUANTITIES if name in columns)]
-    table = _table(path, header, names, row_format)
-    names = names[: table.values.shape[1]]
+    wanted = {name: columns[name] for name in ("t", *QUANTITIES) if name in columns}
+    table = _table(path, wanted, row_format)
+    names = list(wanted)[: len(table.columns)]
     _warn_of_wide_rows(table, header)
     refuse_several_devices(table, header.titles, columns["gx"].index)
     is_imu = _imu_rows(table, [names.index(name) for name in IMU])
@@ -182,26 +178,22 @@ def _read_rows(path: Path) -> _Rows:
     finite = table.values[np.isfinite(table.values[:, 0]), 0]
     if row_format.dated:
         clock = replace(clock, unit="s")
-    if clock.unit:
-        unit_ns, assumed = unit_factor(path, clock, TIME_UNITS), ""
-    else:
-        unit_ns, assumed = inferred_unit(path, clock.title, finite, or_seconds=True)
-    time = table.seconds(clock.index, clock.title, unit_ns, int(np.argmax(is_imu)))
+    unit_ns, assumed = clock_unit(path, clock, finite, or_seconds=True)
+    time = table.seconds(unit_ns, int(np.argmax(is_imu)))
     values = dict(zip(names[1:], table.values[:, 1:].T, strict=True))
     return _Rows(path, columns, values, time, is_imu, table.line_numbers, assumed)
 
 
-def _table(path: Path, header: Header, names: list[str], row_format: RowFormat) -> Table:
+def _table(path: Path, wanted: dict[str, Column], row_format: RowFormat) -> Table:
     """Return columns; without the rare ones, the last, where these hold something else."""
-    places = [header.columns[name] for name in names]
-    used, titles = [place.index for place in places], [place.title for place in places]
+    cut = ends_within_a_row(path, row_format.delimiter)
     try:
-        cut = ends_within_a_row(path, header.separator)
-        return read_table(path, used, row_format, titles, killed=cut)
+        return read_table(path, list(wanted.values()), row_format, killed=cut)
     except ReadError as error:
-        if not set(RARE) & set(names):
+        common = [place for name, place in wanted.items() if name not in RARE]
+        if len(common) == len(wanted):
             raise
-        table = _table(path, header, [name for name in names if name not in RARE], row_format)
+        table = read_table(path, common, row_format, killed=cut)
         _log.warning("pressure and satellites skipped: %s", error)
         return table
 
@@ -235,7 +227,7 @@ def _imu_rows(table: Table, imu: list[int]) -> BoolArray:
     """Return the mask (N,) of IMU samples: rows whose IMU cells are not all blank."""
     is_imu = np.ones(len(table.values), dtype=np.bool_)
     if len(empty := np.flatnonzero(np.isnan(table.values[:, imu]).all(axis=1))):
-        texts = [table.cells(table.columns[k]) for k in imu]
+        texts = [table.cells(table.columns[k].index) for k in imu]
         is_imu[empty] = [not all(is_missing(text[k]) for text in texts) for k in empty.tolist()]
     return is_imu
 
@@ -329,20 +321,13 @@ def _ground_truth(rows: _Rows) -> tuple[Trajectory | None, PositionTrack | None]
         return None, None
     time, values = rows.time[kept], values[kept]
 
-    def refusal(bad: BoolArray, field: str, found: str, expected: str, fix: str = "") -> ReadError:
-        where = f"line {rows.line_numbers[kept[np.argmax(bad)]]}, {field}"
-        return ReadError(rows.path, where, found, expected, fix)
-
+    lines = rows.line_numbers[kept]
     if not has_attitude:
         sigma = values[:, -1] if SIGMA in names else None
         if sigma is not None and sigma.min() <= 0.0:
-            found = f"{sigma.min():g}"
-            raise refusal(sigma == sigma.min(), SIGMA, found, "a standard deviation above 0 m")
+            where = f"line {lines[np.argmin(sigma)]}, {SIGMA}"
+            raise ReadError(rows.path, where, f"{sigma.min():g}", "a standard deviation above 0 m")
         place = values if sigma is None else values[:, :-1]
         return None, PositionTrack(time, place, kind_of_positions(time), sigma=sigma)
-    norm = np.linalg.norm(values[:, 3:], axis=1)
-    bad = np.abs(norm - 1.0) > NORM_TOLERANCE
-    if bad.any():
-        found, fix = f"norm {norm[np.argmax(bad)]:.4g}", "leave the row's truth blank"
-        raise refusal(bad, "qx qy qz qw", found, "a unit quaternion", fix)
-    return Trajectory(time, values[:, :3], Rotation.from_quat(values[:, 3:])), None
+    attitude_WB = rotations(rows.path, "qx qy qz qw", values[:, 3:], "xyzw", lines, "line")
+    return Trajectory(time, values[:, :3], attitude_WB), None

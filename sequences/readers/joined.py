@@ -18,8 +18,7 @@ import numpy as np
 
 from stario.sequences.arrays import number_in
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers.checked import checked
-from stario.sequences.readers.columns import Column
+from stario.sequences.readers.checked import finite_rows
 from stario.sequences.readers.lines import is_row, read_lines
 from stario.sequences.readers.phones.files import (
     is_complete,
@@ -30,7 +29,7 @@ from stario.sequences.readers.phones.files import (
 from stario.sequences.readers.phones.sensor_layout import clock_of
 from stario.sequences.readers.phones.sensor_words import sensor_of, words_of
 from stario.sequences.readers.table_head import TableHead, table_heads
-from stario.sequences.readers.text import IntArray
+from stario.sequences.readers.text import Column, IntArray
 
 _log = logging.getLogger(__name__)
 
@@ -82,12 +81,9 @@ def is_untimed(path: Path) -> bool:
 
 
 def unpack_joined(path: Path, folder: Path, rate: str = "") -> None:
-    """Write the table with its times into a folder.
+    """Write the table with its times, or those of a rate [samples/s], into a folder.
 
-    `rate` is that of a recording without times [samples/s]; empty if it has some.
-
-    Raises:
-        InputError: the rate is not a number above zero.
+    InputError: the rate is not a number above zero.
     """
     if path.is_dir():
         lines = _joined_files(path, rate)
@@ -130,7 +126,7 @@ def _with_clock(head: TableHead) -> list[str]:
     columns = _clock_columns(head)
     used, titles = list(columns.values()), _titles(head)
     values = head.read([Column(k) for k in used]).values
-    checked(head.file, ", ".join(titles[k] for k in used), values)
+    finite_rows(head.file, ", ".join(titles[k] for k in used), values, all_of_them=True)
     stamps = _stamps_ns(dict(zip(columns, values.T.astype(np.int64), strict=True)))
     return _rewritten(head, "time [ns]", map(str, stamps.tolist()), set(used))
 

@@ -47,11 +47,7 @@ _COUNT = re.compile(r"\d:\d\d:\d\d:(\d+)")
 
 
 def read_lines(path: Path) -> list[str]:
-    """Return the lines of a text file.
-
-    Raises:
-        ReadError: the file is missing, empty or not text.
-    """
+    """Return the lines of a text file; ReadError if it is missing, empty or not text."""
     try:
         with opened(path) as file:
             content = file.read()
@@ -69,11 +65,7 @@ def read_lines(path: Path) -> list[str]:
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a JSON file.
-
-    Raises:
-        ReadError: the file is missing or not JSON.
-    """
+    """Return the content of a JSON file; ReadError if it is missing or not JSON."""
     try:
         return json.loads(opened_text(path))
     except FileNotFoundError:
@@ -250,11 +242,7 @@ def with_seconds(lines: Iterable[str]) -> list[str]:
 
 @lru_cache(maxsize=4096)  # the samples within a second share it
 def _whole_seconds(date: str | None, clock: str, half: str | None, zone: str | None) -> int:
-    """Return the seconds since 1970, or without a date since a midnight.
-
-    Raises:
-        ValueError: there is no such time.
-    """
+    """Return the seconds since 1970, or without a date since a midnight; ValueError for no time."""
     hour, minute, second = map(int, clock.split(":"))
     if half:
         hour = hour % 12 + 12 * (half.lower() == "pm")

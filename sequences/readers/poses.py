@@ -3,7 +3,7 @@
 Rows are time, position xyz [m] and a quaternion, or the upper three rows of a pose matrix (ARKit).
 Files differ in the body they describe (camera, display, sensor), in the quaternion's order, which
 some headers name wrongly, and in the world's vertical (y for ARCore and ARKit). Each file and order
-is compared with the gyroscope (`stario.sequences.truth.alignment`), and the best is used. Its
+is compared with the gyroscope (`stario.sequences.attitude.alignment`), and the best is used. Its
 constant rotation relative to the IMU's axes is removed, and its world is levelled with the mean
 specific force. If several agree, the one with the smallest rotation is the sensor's own.
 """
@@ -19,9 +19,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import interpolated
+from stario.sequences.attitude.alignment import BodyAlignment, align_tracked_body, clock_offset
 from stario.sequences.attitude.levelling import MIN_GRAVITY_FORCE
 from stario.sequences.attitude.rotations import NORM_TOLERANCE, tilt_aligning
 from stario.sequences.clean_samples import clean_samples
+from stario.sequences.conventions import axes_named
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.clocks import time_unit
 from stario.sequences.readers.phones.sensor_words import words_of
@@ -29,8 +31,6 @@ from stario.sequences.readers.table_head import table_heads
 from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.time_order import increasing_mask
-from stario.sequences.truth.alignment import BodyAlignment, align_tracked_body, clock_offset
-from stario.sequences.truth.positions import accel_axes
 
 _log = logging.getLogger(__name__)
 
@@ -48,6 +48,12 @@ _DOWN = 0.985
 _SQUARE_RAD = np.deg2rad(15.0)
 """Rotations relative to the IMU that are closer than this to right angles are rounded to them:
 cameras and displays are mounted along a phone's edges, and the rest is estimation error."""
+
+_GRAVITY_KEPT = 0.9
+"""Minimum ratio of the mean force along the vertical to its mean magnitude if axes are right."""
+
+_BETTER, _SHARPER = 0.2, 0.02
+"""Margins by which another axis order must exceed the logged and the next best in that ratio."""
 
 _SAME_AXES_RAD = np.deg2rad(1.0)
 _SAME_CLOCK_S = 0.1
@@ -90,8 +96,7 @@ def with_pose(
 ) -> ImuSequence:
     """Return a recording without truth with the best of the pose files as such, if one agrees.
 
-    Its first sample is at `start_ns` on the poses' clock [ns]; `orders` of the attitude are
-    tried, fewer where a data set specifies it.
+    Its first sample is at `start_ns` on the poses' clock [ns]; `orders` of the attitude are tried.
     """
     candidates = [poses for file in files for poses in _read_poses(file) if poses.order in orders]
     fits = [fit for poses in candidates if (fit := _fitted(sequence, start_ns, poses)) is not None]
@@ -117,7 +122,7 @@ def _read_poses(file: Path) -> list[_Poses]:
         return []
     columns = 13 if head.rows.shape[1] >= 13 else 8
     table = head.read(columns)
-    stamps = table.stamps_ns(0, time_unit(file, table.values[:, 0]))
+    stamps = table.stamps_ns(time_unit(file, table.values[:, 0]))
     numbers = table.values[:, 1:]
     if columns == 13:
         matrices = numbers.reshape(-1, 3, 4)
@@ -225,3 +230,35 @@ def _posed(sequence: ImuSequence, fit: _Fit) -> ImuSequence:
     except InputError as error:
         raise ReadError(poses.file, "poses", str(error), "finite numbers") from None
     return replace(sequence, truth=truth)
+
+
+def accel_axes(sequence: ImuSequence, truth: Trajectory) -> ImuSequence:
+    """Rotate the accelerometer to the gyroscope's axes if it was logged in others.
+
+    Rotated by the true attitude, in a world with y or z up, the specific force averages to gravity.
+    If it does not, but does in another right-handed axis order (some phones log it so), that order
+    is used, with a warning.
+    """
+    finite = np.isfinite(sequence.time) & np.isfinite(sequence.accel).all(axis=1)
+    times, first = np.unique(sequence.time[finite], return_index=True)
+    accel = sequence.accel[finite][first]
+    pose = truth.at(times)
+    if not pose.valid.any():
+        return sequence
+    R_WB, force = pose.attitude_WB[pose.valid], accel[pose.valid]
+    size = float(np.linalg.norm(force, axis=1).mean())
+    turns = Rotation.create_group("O")
+    up = np.array([R_WB.apply(turn.apply(force)).mean(axis=0) for turn in turns]) / size
+    kept = up[:, 1:].max(axis=1)
+    same = int(np.argmin(turns.magnitude()))
+    best, second = np.argsort(kept)[[-1, -2]]
+    if np.abs(up[same, 1:]).max() > _GRAVITY_KEPT:  # perhaps upside down: Apple's sign
+        return sequence
+    if kept[best] < max(_GRAVITY_KEPT, kept[same] + _BETTER, kept[second] + _SHARPER):
+        return sequence
+    R = turns[best]
+    _log.warning(
+        "%s: the accelerometer's axes are not the gyroscope's: its %s is used as x,y,z",
+        sequence.name, axes_named(R.as_matrix()),
+    )  # fmt: skip
+    return replace(sequence, accel=R.apply(sequence.accel))

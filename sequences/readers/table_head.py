@@ -16,10 +16,10 @@ import numpy as np
 
 from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.columns import Column, with_units_below
+from stario.sequences.readers.columns import with_units_below
 from stario.sequences.readers.lines import decimal_mark, head_lines, unquoted, with_seconds
 from stario.sequences.readers.phones.sensor_words import axis_of, is_time, words_of
-from stario.sequences.readers.text import RowFormat, Table, is_missing, read_table
+from stario.sequences.readers.text import Column, RowFormat, Table, is_missing, read_table
 from stario.sequences.sequence import FloatArray
 
 _SEPARATORS = (";", "\t", ",", None)
@@ -62,9 +62,8 @@ class TableHead:
     dates: frozenset[int] = frozenset()
 
     def read(self, columns: int | Sequence[Column]) -> Table:
-        """Read columns, given their number or places, without a last row that is cut short."""
-        wanted = columns if isinstance(columns, int) else [place.index for place in columns]
-        return read_table(self.file, wanted, self.row_format, killed=True)
+        """Read columns, the clock first, without a last row that is cut short."""
+        return read_table(self.file, columns, self.row_format, killed=True)
 
     def clock(self, column: Column) -> Column:
         """Return a clock's column with its unit, seconds if it holds dates."""
@@ -139,10 +138,7 @@ def _titles_at(above: list[str], delimiter: str | None) -> list[str]:
 
 
 def first_row(lines: list[str], least: int = 4) -> RowFormat | None:
-    """Return how rows are written, from the first one of `least` numbers; None without one.
-
-    There must be no blank line.
-    """
+    """Return how rows are written, by the first of `least` numbers, if any; no line is blank."""
     for k, line in enumerate(lines):
         if line.lstrip().startswith("#"):
             continue

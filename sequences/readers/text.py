@@ -63,27 +63,41 @@ class RowFormat:
 
 
 @dataclass(frozen=True)
+class Column:
+    """A column's index, its title, and the unit in that in the tables' spelling, if any."""
+
+    index: int
+    title: str = ""
+    unit: str = ""
+
+    @property
+    def name(self) -> str:
+        """Name for messages."""
+        return self.title or f"column {self.index + 1}"
+
+
+@dataclass(frozen=True)
 class Table:
-    """Columns of a file as numbers.
+    """Columns of a file as numbers, the first of them times.
 
     Attributes:
         path: the file.
         row_format: how it is written.
-        columns: indices of the columns in the file.
+        columns: places of the columns in the file.
         values: (N, K) their numbers; `nan` and empty cells are NaN.
         rows: the rows as text.
     """
 
     path: Path
     row_format: RowFormat
-    columns: list[int]
+    columns: Sequence[Column]
     values: FloatArray
     rows: list[Row]
 
     @property
-    def line_numbers(self) -> list[int]:
-        """Number of each row's line."""
-        return [number for number, _ in self.rows]
+    def line_numbers(self) -> IntArray:
+        """Number (N,) of each row's line."""
+        return np.array([number for number, _ in self.rows])
 
     def cells(self, column: int) -> list[str]:
         """Return the text of a column of the file, empty in rows that are too short."""
@@ -91,19 +105,13 @@ class Table:
         cells = (line.split(mark, column + 1) for _, line in self.rows)
         return [row[column].strip() if column < len(row) else "" for row in cells]
 
-    def stamps_ns(
-        self, column: int = 0, unit_ns: int = 1, kept: IntArray | None = None
-    ) -> IntArray:
-        """Return a column of times (N,) as integer nanoseconds, which float64 cannot hold exactly.
+    def stamps_ns(self, unit_ns: int = 1, kept: IntArray | None = None) -> IntArray:
+        """Return the times (N,), or those of `kept` rows, in integer nanoseconds.
 
-        Args:
-            column: index of the column in the file.
-            unit_ns: its unit [ns].
-            kept: rows to return the times of; all if None.
+        Their unit is `unit_ns`; float64 cannot hold them exactly.
         """
-        rows = range(len(self.rows)) if kept is None else kept.tolist()
         since_1970 = FILETIME_1970 if unit_ns == FILETIME_NS else 0
-        times = self._times(column, "time", rows, finite=True)
+        times = self._times(range(len(self.rows)) if kept is None else kept.tolist(), finite=True)
         try:
             stamps = [round((time - since_1970) * unit_ns) for time in times]
             return np.array(stamps, dtype=np.int64)
@@ -112,28 +120,27 @@ class Table:
             fix = "is its unit the one that the header names?"
             raise ReadError(self.path, "time", found, "at most 9.2e18 ns", fix) from None
 
-    def seconds(self, column: int, title: str, unit_ns: int, origin: int) -> FloatArray:
-        """Return a column of times (N,) as seconds since those of a row, exactly as written.
+    def seconds(self, unit_ns: int, origin: int) -> FloatArray:
+        """Return the times (N,) as seconds since those of a row, exactly as written.
 
         Args:
-            column: index of the column in the file.
-            title: its title, for errors.
-            unit_ns: its unit [ns].
+            unit_ns: their unit [ns].
             origin: the row; if it has no time, the first one below that has.
         """
-        times = self._times(column, title, range(len(self.rows)), finite=False)
+        times = self._times(range(len(self.rows)), finite=False)
         start = next((time for time in times[origin:] if time.is_finite()), Decimal(0))
         return np.array([float((time - start) * unit_ns / 10**9) for time in times])
 
-    def _times(self, column: int, title: str, rows: Iterable[int], finite: bool) -> list[Decimal]:
-        cells, times = self.cells(column), list[Decimal]()
+    def _times(self, rows: Iterable[int], finite: bool) -> list[Decimal]:
+        clock, times = self.columns[0], list[Decimal]()
+        cells = self.cells(clock.index)
         for row in rows:
             try:
                 time = Decimal(cells[row])
             except InvalidOperation:
                 time = None
             if time is None or (finite and not time.is_finite()):
-                where = f"line {self.line_numbers[row]}, {title}"
+                where = f"line {self.rows[row][0]}, {clock.title or 'time'}"
                 raise ReadError(self.path, where, repr(cells[row]), "a time")
             times.append(time)
         return times
@@ -141,30 +148,20 @@ class Table:
 
 def read_table(
     path: Path,
-    columns: int | list[int],
+    columns: int | Sequence[Column],
     row_format: RowFormat = RowFormat(),
-    titles: Sequence[str] = (),
     killed: bool = False,
 ) -> Table:
-    """Read columns of numbers; `nan` and empty cells become NaN.
+    """Read columns of numbers, their count or places; `nan` and empty cells become NaN.
 
-    Args:
-        path: the file.
-        columns: number of columns to return, or the indices of those to return.
-        row_format: how the rows are written.
-        titles: titles of these columns, for errors.
-        killed: whether to skip a last row that is cut short because the recorder was killed.
-
-    Raises:
-        ReadError: a row is cut short or holds something that is not a number.
+    A last row that is cut short, because the recorder was `killed`, is then skipped.
     """
-    wanted = list(range(columns)) if isinstance(columns, int) else columns
+    places = [Column(k) for k in range(columns)] if isinstance(columns, int) else columns
     rows, mark = row_format.rows(path), row_format.delimiter
-    titles = titles or [f"column {k + 1}" for k in wanted]
     if killed and len(rows) > 1:
         cut = ends_within_a_row(path, mark)
         try:
-            _numbers_in_row(path, row_format, rows[-1], wanted, titles)
+            _numbers_in_row(path, rows[-1], mark, places)
         except ReadError:
             cut = True
         if cut:
@@ -173,32 +170,33 @@ def read_table(
             )
     try:  # several times as fast, but it neither knows blank cells nor explains what is wrong
         lines = [line for _, line in rows]
-        values = np.loadtxt(lines, delimiter=mark, usecols=wanted, comments=None, ndmin=2)
+        used = [place.index for place in places]
+        values = np.loadtxt(lines, delimiter=mark, usecols=used, comments=None, ndmin=2)
     except ValueError:
-        values = np.array([_numbers_in_row(path, row_format, row, wanted, titles) for row in rows])
-    return Table(path, row_format, wanted, values, rows)
+        values = np.array([_numbers_in_row(path, row, mark, places) for row in rows])
+    return Table(path, row_format, places, values, rows)
 
 
 def _numbers_in_row(
-    path: Path, row_format: RowFormat, row: Row, wanted: list[int], titles: Sequence[str]
+    path: Path, row: Row, mark: str | None, places: Sequence[Column]
 ) -> list[float]:
     """Return the numbers in some columns of a row, NaN where a cell holds none."""
-    number, cells = row[0], row[1].split(row_format.delimiter)
-    if len(cells) <= max(wanted):
+    (number, line), most = row, max(place.index for place in places)
+    cells = line.split(mark)
+    if len(cells) <= most:
         fix = "is the file cut short?"
         if len(cells) == 1:
             fix = "separate the values as in the other lines, or remove the line"
-        found = f"{len(cells)} values"
-        raise ReadError(path, f"line {number}", found, f"{max(wanted) + 1}", fix)
+        raise ReadError(path, f"line {number}", f"{len(cells)} values", f"{most + 1}", fix)
     numbers = []
-    for column, title in zip(wanted, titles, strict=True):
-        cell = cells[column]
+    for place in places:
+        cell = cells[place.index]
         try:
             numbers.append(float(cell or "nan"))
         except ValueError:
             if not is_missing(cell):
                 fix = "write a decimal point" if "," in cell else ""
-                where = f"line {number}, {title}"
+                where = f"line {number}, {place.name}"
                 raise ReadError(path, where, repr(cell.strip()), "a number", fix) from None
             numbers.append(float("nan"))
     return numbers

@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import check_type
-from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.files import atomic_write
-from stario.sequences.readers.text import RowFormat, read_table
+from stario.sequences.readers.checked import rotations
+from stario.sequences.readers.text import Column, RowFormat, read_table
 from stario.sequences.sequence import Trajectory
 
 _REMEDY = "pass track.trajectory, or Track.from_states(states).trajectory"
@@ -50,7 +49,8 @@ def read_tum(path: Path | str) -> Trajectory:
         if (cells := len(line.split())) != count:
             expected = f"{count}: {' '.join(_FIELDS)}"
             raise ReadError(path, f"line {number}", f"{cells} values", expected)
-    rows = read_table(path, count, row_format, _FIELDS).values
+    places = [Column(k, title) for k, title in enumerate(_FIELDS)]
+    rows = read_table(path, places, row_format).values
 
     def refusal(k: int, field: str, found: str, expected: str) -> ReadError:
         return ReadError(path, f"line {numbered[k][0]}, {field}", found, expected)
@@ -62,8 +62,6 @@ def read_tum(path: Path | str) -> Trajectory:
         k = int(np.argmin(later))
         found = f"{rows[k + 1, 0]!s} after {rows[k, 0]!s}"
         raise refusal(k + 1, "t", found, "strictly increasing seconds")
-    norm = np.linalg.norm(rows[:, 4:], axis=1)
-    if (off := np.abs(norm - 1.0) > NORM_TOLERANCE).any():
-        k = int(np.argmax(off))
-        raise refusal(k, "qx qy qz qw", f"norm {norm[k]:.4g}", "a unit quaternion")
-    return Trajectory(rows[:, 0], rows[:, 1:4], Rotation.from_quat(rows[:, 4:]))
+    lines = np.array([number for number, _ in numbered])
+    attitude_WB = rotations(path, "qx qy qz qw", rows[:, 4:], "xyzw", lines, "line")
+    return Trajectory(rows[:, 0], rows[:, 1:4], attitude_WB)

@@ -65,10 +65,7 @@ def unrecognised(path: Path, inside: list[Path], known: str) -> ReadError:
 
 
 def _incomplete(path: Path) -> ReadError | None:
-    """Return the error of a folder or file that lacks a gyroscope or an accelerometer.
-
-    None if it has both, or neither sensors nor files that are named like them.
-    """
+    """Return the error of a folder or file that lacks gyroscope or accelerometer, else None."""
     groups = groups_of(path) if path.is_dir() else []
     unread = [file for group in groups for file in group.unread]
     present = sensors_in(path)

@@ -1,7 +1,8 @@
 """Fit of a recording's ground truth to its IMU: time offset, axes, tilted world, drift of yaw.
 
 Both measure the same rotations, so the offset of their clocks and the constant rotation between
-their axes follow from gyroscope and differentiated attitude (`stario.sequences.truth.alignment`).
+their axes follow from gyroscope and differentiated attitude
+(`stario.sequences.attitude.alignment`).
 
 Then the yaw's drift has two causes. Rotated by the true attitude, a gyroscope with a scale error s
 and a constant bias b in its axes turns by psi about the vertical, which drifts from the true turn:
@@ -25,7 +26,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import even_grid, interpolated, trapezoids
+from stario.sequences.attitude.alignment import BodyAlignment, align_tracked_body, clock_offset
 from stario.sequences.attitude.levelling import BIAS_SIGMA
+from stario.sequences.attitude.mounts import Rotations
 from stario.sequences.attitude.rotations import GyroIntegral
 from stario.sequences.attitude.stacks import composed
 from stario.sequences.clean_samples import (
@@ -38,8 +41,6 @@ from stario.sequences.conventions import SAME_AXES, axes_matrix, axes_named
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence
 from stario.sequences.time_order import MAX_IMU_GAP
-from stario.sequences.truth.alignment import BodyAlignment, align_tracked_body, clock_offset
-from stario.sequences.truth.mounts import Rotations
 
 MAX_OFFSET_S = 5.0
 """Largest time offset searched, in either direction [s]."""

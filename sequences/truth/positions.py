@@ -11,13 +11,10 @@ is left must agree in every axis, whichever axis of the world is vertical. With 
 the bounce of a step and averages the noise of positions; the lever arm between IMU and tracked
 point, a clock error of a few hundredths of a second and noise reduce the correlation, but turn or
 mirror nothing.
-
-Accelerometers that were logged in other axes than the gyroscope are corrected by gravity alone.
 """
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import dataclass, replace
 
@@ -26,7 +23,6 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import correlation, even_grid, integral, interpolated
 from stario.sequences.clean_samples import compared_samples
-from stario.sequences.conventions import axes_named
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 from stario.sequences.time_order import MAX_IMU_GAP
 
@@ -39,14 +35,6 @@ _MIN_MOTION = 0.12
 
 _OUTLIER = 3.0
 """Factor on the 98th percentile above which a row is left out: a jump of the positions."""
-
-_log = logging.getLogger(__name__)
-
-_GRAVITY_KEPT = 0.9
-"""Minimum ratio of the mean force along the vertical to its mean magnitude if axes are right."""
-
-_BETTER, _SHARPER = 0.2, 0.02
-"""Margins by which another axis order must exceed the logged and the next best in that ratio."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,38 +138,3 @@ def _second_difference(ticks: FloatArray, time: FloatArray, values: FloatArray) 
 def _inliers(rows: FloatArray) -> BoolArray:
     size = np.linalg.norm(rows - np.median(rows, axis=0), axis=1)
     return np.asarray(size <= _OUTLIER * np.percentile(size, 98))
-
-
-def accel_axes(sequence: ImuSequence, truth: Trajectory) -> ImuSequence:
-    """Rotate the accelerometer to the gyroscope's axes if it was logged in others.
-
-    Rotated by the true attitude, the specific force averages to gravity. If it does not, but does
-    in another right-handed axis order (some phones log it so), that order is used, with a warning.
-
-    Args:
-        sequence: the recording.
-        truth: poses of the recording, in a world with y or z up.
-    """
-    finite = np.isfinite(sequence.time) & np.isfinite(sequence.accel).all(axis=1)
-    times, first = np.unique(sequence.time[finite], return_index=True)
-    accel = sequence.accel[finite][first]
-    pose = truth.at(times)
-    if not pose.valid.any():
-        return sequence
-    R_WB, force = pose.attitude_WB[pose.valid], accel[pose.valid]
-    size = float(np.linalg.norm(force, axis=1).mean())
-    turns = Rotation.create_group("O")
-    up = np.array([R_WB.apply(turn.apply(force)).mean(axis=0) for turn in turns]) / size
-    kept = up[:, 1:].max(axis=1)
-    same = int(np.argmin(turns.magnitude()))
-    best, second = np.argsort(kept)[[-1, -2]]
-    if np.abs(up[same, 1:]).max() > _GRAVITY_KEPT:  # perhaps upside down: Apple's sign
-        return sequence
-    if kept[best] < max(_GRAVITY_KEPT, kept[same] + _BETTER, kept[second] + _SHARPER):
-        return sequence
-    R = turns[best]
-    _log.warning(
-        "%s: the accelerometer's axes are not the gyroscope's: its %s is used as x,y,z",
-        sequence.name, axes_named(R.as_matrix()),
-    )  # fmt: skip
-    return replace(sequence, accel=R.apply(sequence.accel))

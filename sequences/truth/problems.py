@@ -15,6 +15,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from stario.sequences.arrays import check_type, rms, runs, scatter
+from stario.sequences.attitude.mounts import MIN_FIT_S
 from stario.sequences.clean_samples import usable
 from stario.sequences.errors import InputError
 from stario.sequences.findings import Assessment, Finding, warn
@@ -34,7 +35,6 @@ from stario.sequences.truth.findings import (
     truth_finding,
 )
 from stario.sequences.truth.fit import TruthFit, fit_truth, yaw_drift
-from stario.sequences.truth.mounts import MIN_FIT_S
 from stario.sequences.truth.positions import PositionFit, fit_positions
 
 _AGREEING = 0.85

@@ -31,12 +31,11 @@ from stario.sequences.readers.checked import (
     satellites,
 )
 from stario.sequences.readers.clocks import unit_within
-from stario.sequences.readers.columns import Column
 from stario.sequences.readers.phones.files import text_files
 from stario.sequences.readers.phones.sensor_layout import clock_of
 from stario.sequences.readers.phones.sensor_words import is_time, sensor_of, unit_of, words_of
 from stario.sequences.readers.table_head import TableHead, table_heads
-from stario.sequences.readers.text import IntArray, Table, seconds
+from stario.sequences.readers.text import Column, IntArray, Table, seconds
 from stario.sequences.sequence import Barometer, BoolArray, FloatArray, PositionTrack, Satellites
 from stario.sequences.time_order import increasing_mask
 from stario.sequences.units import TIME_UNITS, unit_named
@@ -48,7 +47,7 @@ Kind = TypeVar("Kind")
 _PRESSURE_FILES = {"barometer", "barometers", "baro", "bar", "pressure", "pres"}
 _SATELLITE_FILES = {"location", "locations", "gps", "gnss"}
 _POINT_FILES = {
-    *("ref", "reference", "references", "waypoints", "waypoint", "checkpoints", "landmarks"),
+    *("ref", "reference", "references", "waypoints", "waypoint", "checkpoints", "landmarks")
 }
 """Words of which the name of such a file has one."""
 
@@ -94,24 +93,15 @@ class Recording:
 
 @dataclass(frozen=True)
 class _Columns:
-    """Columns of a table by quantity, and its clock; `held` if rows repeat the last values."""
+    """A table with its clock and columns by quantity; `held` if rows repeat the last values."""
 
-    head: TableHead
-    clock: Column
+    table: Table
     places: dict[str, Column]
     held: bool
 
-    def read(self) -> Table:
-        """Read the clock and the columns, in their order."""
-        return self.head.read([self.clock, *self.places.values()])
-
-    def within(
-        self, table: Table, known: BoolArray, recording: Recording
-    ) -> tuple[IntArray, FloatArray]:
-        """Return the rows (N,) of `known` ones that hold something new within a recording.
-
-        Their times [s] are returned as well.
-        """
+    def within(self, known: BoolArray, recording: Recording) -> tuple[IntArray, FloatArray]:
+        """Return which `known` rows hold something new within a recording, and their times [s]."""
+        table = self.table
         if self.held:
             values = table.values[:, 1:]
             same = (values[1:] == values[:-1]) | np.isnan(values[1:]) & np.isnan(values[:-1])
@@ -120,10 +110,10 @@ class _Columns:
         if not len(rows):
             return rows, np.zeros(0)
         start_ns, stop_ns = recording.start_ns, recording.stop_ns
-        unit = TIME_UNITS.get(self.clock.unit)
+        unit = TIME_UNITS.get(table.columns[0].unit)
         if unit is None and len(rows) > 1:
             unit = unit_within(table.path, table.values[rows, 0], start_ns, stop_ns)
-        time = seconds(table.stamps_ns(self.clock.index, unit or 10**9, rows), start_ns)
+        time = seconds(table.stamps_ns(unit or 10**9, rows), start_ns)
         stop = float(stop_ns - start_ns) * 1e-9
         inside = (time >= 0.0) & (time <= stop)
         # A single one may be the last known before the start.
@@ -135,28 +125,37 @@ class _Columns:
         return rows[inside], time[inside]
 
 
-def _tables_alongside(
+def _read_alongside(
     recording: Recording,
+    words: str,
     names: set[str],
-    least: int,
     places_in: Callable[[TableHead, bool], dict[str, Column]],
-) -> Iterator[_Columns]:
-    """Yield the tables that hold some quantities, the sensors' own first; never raises.
+    read: Callable[[_Columns, Recording], Kind | None],
+) -> Iterator[Kind]:
+    """Yield what is read from a recording's tables, its own first; none is worth the recording.
 
-    Rows have at least `least` numbers, other files' names one of the words `names`. `places_in`
-    returns the columns in a table, given also whether it is the sensors'; none if it lacks them.
+    Other files' names have one of the words `names`. `places_in` returns a table's columns, given
+    also whether it is the sensors'; none if it lacks them.
     """
     for file in (recording.sensors, *_files_named(recording, names)):
         own = file == recording.sensors
-        for head in table_heads(file, least):
+        for head in table_heads(file, least=2):
             if len(head.rows) < 2 or not (places := places_in(head, own)):
                 continue
             clock = clock_of(head.titles, head.rows)
             if clock is None and all(place.index for place in places.values()):
                 clock = clock_of(["time"], head.rows[:, :1])  # the first column, if it grows
-            if clock is not None:
-                yield _Columns(head, head.clock(clock), places, held=own)
+            if clock is None:
+                continue
+            try:
+                table = head.read([head.clock(clock), *places.values()])
+                found = read(_Columns(table, places, held=own), recording)
+            except ReadError as error:
+                _log.warning("%s skipped: %s", words, error)
                 break
+            if found is not None:
+                yield found
+            break
 
 
 def _files_named(recording: Recording, names: set[str]) -> list[Path]:
@@ -175,32 +174,14 @@ def _files_named(recording: Recording, names: set[str]) -> list[Path]:
 
 def recorded_pressure(recording: Recording) -> Barometer | None:
     """Return the pressure next to a recording's sensors; None if there is none that can be used."""
-    tables = _tables_alongside(recording, _PRESSURE_FILES, 2, _pressure_in)
-    return next(_read_alongside("pressure", _pressure, tables, recording), None)
-
-
-def _read_alongside(
-    words: str,
-    read: Callable[[_Columns, Recording], Kind | None],
-    tables: Iterator[_Columns],
-    recording: Recording,
-) -> Iterator[Kind]:
-    """Yield what is read from tables, none of which is worth the recording."""
-    for columns in tables:
-        try:
-            found = read(columns, recording)
-        except ReadError as error:
-            _log.warning("%s skipped: %s", words, error)
-            continue
-        if found is not None:
-            yield found
+    found = _read_alongside(recording, "pressure", _PRESSURE_FILES, _pressure_in, _pressure)
+    return next(found, None)
 
 
 def _pressure(columns: _Columns, recording: Recording) -> Barometer | None:
-    table, place = columns.read(), columns.places["pressure"]
-    rows, time = columns.within(table, np.isfinite(table.values[:, 1]), recording)
-    title = place.title or f"column {place.index + 1}"
-    return barometer(table.path, title, time, table.values[rows, 1], place.unit)
+    table, place = columns.table, columns.places["pressure"]
+    rows, time = columns.within(np.isfinite(table.values[:, 1]), recording)
+    return barometer(table.path, place.name, time, table.values[rows, 1], place.unit)
 
 
 def _pressure_in(head: TableHead, is_sensors: bool) -> dict[str, Column]:
@@ -226,8 +207,8 @@ def _pressure_unit(title: str) -> str:
 
 def reported_positions(recording: Recording) -> Iterator[Satellites]:
     """Yield the satellite positions next to a recording's sensors, the best file's first."""
-    tables = _tables_alongside(recording, _SATELLITE_FILES, 3, _satellites_in)
-    return _read_alongside("satellite positions", _satellites, tables, recording)
+    words = "satellite positions"
+    return _read_alongside(recording, words, _SATELLITE_FILES, _satellites_in, _satellites)
 
 
 def _satellites_in(head: TableHead, is_sensors: bool) -> dict[str, Column]:
@@ -260,13 +241,13 @@ def _place_of(words: set[str]) -> str:
 
 
 def _satellites(columns: _Columns, recording: Recording) -> Satellites | None:
-    table, places = columns.read(), columns.places
+    table, places = columns.table, columns.places
     for title in (places["latitude"].title, places["longitude"].title):
         if unit_of(title).startswith("rad"):
             raise ReadError(table.path, "latitude, longitude", title, "degrees")
     values = table.values[:, 1:]
     latlon_deg = in_degrees(table.path, values[:, :2])
-    rows, time = columns.within(table, known_places(latlon_deg), recording)
+    rows, time = columns.within(known_places(latlon_deg), recording)
     rest = {
         name: UNITS[name][place.unit] * values[rows, k]
         for k, (name, place) in enumerate(places.items())
@@ -315,7 +296,7 @@ def reference_points(recording: Recording) -> PositionTrack | None:
             continue
         table = head.read(3)
         unit = unit_within(file, table.values[:, 0], recording.start_ns, recording.stop_ns)
-        time = seconds(table.stamps_ns(0, unit), recording.start_ns)
+        time = seconds(table.stamps_ns(unit), recording.start_ns)
         kept = increasing_mask(time)
         return PositionTrack(time[kept], table.values[kept, 1:3], "waypoints")
     return None

@@ -57,7 +57,7 @@ def logged_attitude(files: PhoneFiles, gyro: Samples) -> tuple[IntArray, Rotatio
     try:
         rows = table.head.read([table.clock, *table.quaternion])
         unit_ns = time_unit(table.file, rows.values[:, 0], table.clock.unit)
-        stamps = rows.stamps_ns(table.clock.index, unit_ns)
+        stamps = rows.stamps_ns(unit_ns)
     except ReadError:  # attitude is optional
         return None
     return agreeing_attitude(stamps, rows.values[:, 1:], gyro, table.quaternion[0].title != "")
@@ -73,11 +73,10 @@ def device_attitude(
 def agreeing_attitude(
     stamps: IntArray, quaternion: FloatArray, gyro: Samples, named: bool = True
 ) -> tuple[IntArray, Rotation] | None:
-    """Return the reading of an attitude that best fits the gyroscope, or None if none fits.
+    """Return the reading of quaternions (N, 4) that best fits the gyroscope, or None if none fits.
 
-    Quaternions (N, 4) are x, y, z and w at times (N,) [ns] on the gyroscope's clock; unless their
-    order is `named`, w, x, y and z is tried as well. Those that are not unit quaternions are
-    skipped: K times [ns] and rotations, body to a world with z up, are returned.
+    They are x, y, z and w at times (N,) [ns] on its clock; unless their order is `named`, w, x, y
+    and z is tried as well. Those that are not unit quaternions are skipped.
     """
     good = np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) < NORM_TOLERANCE
     stamps, quaternion = stamps[good], quaternion[good]

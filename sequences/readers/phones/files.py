@@ -58,12 +58,9 @@ _BY_FILE = {
 
 @dataclass
 class PhoneFiles:
-    """A recording's files by sensor, the preferred variant first.
+    """A recording's files by sensor, the best variant first; their names share the words `key`.
 
-    Attributes:
-        key: words that the files' names share.
-        tables: the files of each sensor.
-        unread: files of gyroscope or accelerometer that would be preferred, but hold no samples.
+    Unread are files of gyroscope or accelerometer that would be preferred, but hold no samples.
     """
 
     key: str

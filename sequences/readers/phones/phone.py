@@ -12,6 +12,12 @@ lacks gravity and there is a file of gravity, that is added. Apple's acceleromet
 opposite of specific force, in g, see `attitude`. A pose that an ARCore or ARKit logger wrote
 alongside is the ground truth, see `poses`; pressure, satellite positions and reference points are
 those of `alongside`.
+
+ADVIO (Cortés et al., ECCV 2018) is `<name>/iphone/*.csv` with `ground-truth/pose.csv` alongside.
+Rows without headers are time [s] and values; the gyroscope in rad/s, the magnetometer in uT, the
+accelerometer in m/s^2 or, in some copies, in g with Apple's sign. Poses are time, position [m] and
+quaternion, w first, in a world with y up; `iphone/arkit.csv` has ARKit's, used if there is no
+ground truth.
 """
 
 from __future__ import annotations
@@ -51,8 +57,7 @@ from stario.sequences.readers.phones.files import (
     is_complete,
     phone_recordings,
 )
-from stario.sequences.readers.phones.samples import read_samples
-from stario.sequences.readers.phones.sensor_layout import sensor_table
+from stario.sequences.readers.phones.sensor_layout import read_samples, sensor_table
 from stario.sequences.readers.phones.sensor_words import (
     Sensor,
     is_sensor_word,
@@ -64,6 +69,8 @@ from stario.sequences.readers.text import IntArray, seconds
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Magnetometer
 
 _log = logging.getLogger(__name__)
+
+_ADVIO, _ADVIO_POSES = "iphone", ("ground-truth/pose.csv", "iphone/arkit.csv")
 
 _GRAVITY_REMOVED = 5.0
 """Median force [m/s^2] below which gravity was removed."""
@@ -133,15 +140,33 @@ def _wide_poses(path: Path, files: PhoneFiles) -> list[Path]:
 
 
 def is_phone(path: Path) -> bool:
-    """Return whether a folder holds one recording, or a file is the gyroscope file of one of many.
-
-    Never raises.
-    """
+    """Return whether a folder is one recording, or a file the gyroscope's of one; never raises."""
     if path.is_dir():
         return len(phone_recordings(path)) == 1
     if not path.is_file() or "gyr" not in path.name.lower():
         return False
     return any(files.gyro == path for files in phone_recordings(path.parent))
+
+
+def read_advio(path: Path) -> ImuSequence:
+    """Read a recording from its folder."""
+    files = _advio_files(path)
+    if files is None:
+        raise ReadError(path, _ADVIO, "no gyro.csv and accelerometer.csv", "an ADVIO recording")
+    poses = [path / name for name in _ADVIO_POSES if (path / name).is_file()][:1]
+    name = path.resolve().name
+    return assemble_recording(name, files, poses, orders=("wxyz",), core_motion=True)
+
+
+def is_advio(path: Path) -> bool:
+    """Return whether a folder holds a phone's files in `iphone` and one of the pose files."""
+    return any((path / name).is_file() for name in _ADVIO_POSES) and _advio_files(path) is not None
+
+
+def _advio_files(path: Path) -> PhoneFiles | None:
+    folder = path / _ADVIO
+    found = phone_recordings(folder) if folder.is_dir() else []
+    return next((files for files in found if not files.key), None)
 
 
 def _chosen(path: Path) -> PhoneFiles:
@@ -167,10 +192,9 @@ def assemble_recording(
     orders: Collection[str] = ("xyzw", "wxyz", "matrix"),
     core_motion: bool = False,
 ) -> ImuSequence:
-    """Assemble the recording of a set of files and of poses alongside them.
+    """Assemble a recording of files and of poses alongside them, in one of some `orders`.
 
-    `orders` are as for `with_pose`; `core_motion` says that an iPhone wrote the files: values in g
-    have Apple's sign.
+    `core_motion` says that an iPhone wrote the files: values in g have Apple's sign.
     """
     folder = files.gyro.parent
     for file in files.unread:

@@ -13,13 +13,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from stario.sequences.units import (
-    ACCEL_UNITS,
-    GYRO_UNITS,
-    MAGNETIC_UNITS,
-    TIME_UNITS,
-    unit_named,
-)
+from stario.sequences.units import ACCEL_UNITS, GYRO_UNITS, MAGNETIC_UNITS, TIME_UNITS, unit_named
 
 Sensor = Literal["accel", "gyro", "mag", "gravity", "linear", "attitude"]
 

@@ -37,7 +37,7 @@ def read_euroc(path: Path) -> ImuSequence:
         raise ReadError(path, "mav0/imu0/data.csv", "no such file", expected, "unpack all of it")
     _check_titles(imu)
     table = read_table(imu, columns=7)
-    stamps = table.stamps_ns(0, _unit_ns(imu))
+    stamps = table.stamps_ns(_unit_ns(imu))
     truth_files = (imu.parent.parent / folder / "data.csv" for folder in TRUTH_FOLDERS)
     truth_file = next((file for file in truth_files if file.is_file()), None)
     return ImuSequence(
@@ -91,7 +91,7 @@ def _truth(path: Path, start_ns: np.int64) -> Trajectory:
     estimated = path.parent.name.startswith("state_groundtruth")
     columns = 11 if estimated and (first_line(path) or "").count(",") >= 10 else 8
     rows = read_table(path, columns=columns)
-    table, time = rows.values, seconds(rows.stamps_ns(0, _unit_ns(path)), start_ns)
+    table, time = rows.values, seconds(rows.stamps_ns(_unit_ns(path)), start_ns)
     keep = pose_mask(path, time)
     table, time = table[keep], time[keep]
     attitude_WB, valid = captured_rotations(table[:, [5, 6, 7, 4]])

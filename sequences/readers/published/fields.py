@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import finite_rows, rotations
 from stario.sequences.readers.lines import first_line, read_json, read_lines
-from stario.sequences.readers.text import RowFormat, read_table, seconds
+from stario.sequences.readers.text import Column, RowFormat, read_table, seconds
 from stario.sequences.sequence import FloatArray
 
 MAGNETIC = "magnetic"
@@ -21,11 +21,7 @@ MAGNETIC = "magnetic"
 class Fields:
     """Arrays (N,) or (N, K) of a file by name, without rows with a value that is not finite.
 
-    Args:
-        path: the file.
-        arrays: the arrays.
-        optional: names of those that may be missing, or hold NaN.
-        first_row: number of the first row, for errors.
+    Those that are optional may be missing, or hold NaN; errors count rows from `first_row`.
     """
 
     def __init__(
@@ -77,9 +73,9 @@ def read_columns(
 ) -> tuple[FloatArray, Fields]:
     """Return the times since the first row [s] and the columns of a CSV with a header.
 
-    The `clock` is the name and the unit [ns] of the column of times. Columns are named by a stem
-    and axes: those of `{"acce": "xyz"}` are `acce_x`, ... The first of the `magnetic` stems that is
-    present becomes the optional `MAGNETIC`.
+    The `clock` is the name and the unit [ns] of the times. Columns are named by a stem and axes:
+    those of `{"acce": "xyz"}` are `acce_x`, ... The first of the `magnetic` stems that is present
+    becomes the optional `MAGNETIC`.
     """
     header = header_names(path)
     if header == [""]:
@@ -92,12 +88,13 @@ def read_columns(
         if MAGNETIC not in names and set(some) <= set(header):
             names[MAGNETIC] = some
     used = [clock[0], *(name for some in names.values() for name in some)]
-    table = read_table(path, [header.index(name) for name in used], RowFormat(skip=1))
+    places = [Column(header.index(name), name) for name in used]
+    table = read_table(path, places, RowFormat(skip=1))
     columns = dict(zip(used, table.values.T, strict=True))
     arrays = {stem: np.column_stack([columns[n] for n in some]) for stem, some in names.items()}
     arrays[clock[0]] = columns[clock[0]]
     fields = Fields(path, arrays, [MAGNETIC], table.line_numbers[0])
-    stamps = table.stamps_ns(table.columns[0], clock[1], fields.rows)
+    stamps = table.stamps_ns(clock[1], fields.rows)
     return seconds(stamps, stamps[0]), fields
 
 

@@ -13,7 +13,7 @@ phone's clock by matching the rotation in both. The Nexus 5 of `multi devices` w
 `raw`: time, a code (1 accelerometer [m/s^2], 2 magnetometer [uT], 4 gyroscope [rad/s]) and xyz.
 
 The phone is rotated relative to the tracked body, the capture has glitches and flips, and its world
-is not quite level: see `stario.sequences.truth.alignment`.
+is not quite level: see `stario.sequences.attitude.alignment`.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ import numpy as np
 from scipy.ndimage import binary_dilation, median_filter
 
 from stario.sequences.arrays import samples_in
+from stario.sequences.attitude.alignment import align_tracked_body, clock_offset
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.checked import captured_rotations, magnetometer
 from stario.sequences.readers.clocks import Samples, joined_sequence, time_unit
 from stario.sequences.readers.lines import first_lines, first_numbers, numbers_in
 from stario.sequences.readers.text import IntArray, Table, read_table, seconds
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
-from stario.sequences.truth.alignment import align_tracked_body, clock_offset
 
 RATE = 100.0
 _log = logging.getLogger(__name__)
@@ -107,7 +107,7 @@ def _sensor_rows(path: Path) -> tuple[ImuSequence, np.int64 | None]:
 
 
 def _stamps_ns(table: Table) -> IntArray:
-    return table.stamps_ns(0, time_unit(table.path, table.values[:, 0]))
+    return table.stamps_ns(time_unit(table.path, table.values[:, 0]))
 
 
 def capture_file(path: Path) -> Path | None:

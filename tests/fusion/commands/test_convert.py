@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.readers import find_recordings
+from stario.sequences.readers.archive import write_archive
 from stario.sequences.readers.generic_csv import read_generic_csv
 from stario.sequences.readers.tum import read_tum
 from stario.sequences.sequence import PositionTrack

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stario.sequences.datasets.archive_writer import write_archive
+from stario.sequences.readers.archive import write_archive
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
 from stario.sequences.sequence import PositionTrack

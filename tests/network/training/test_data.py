@@ -15,9 +15,9 @@ from stario.network.training.data import (
     split_off,
 )
 from stario.network.training.made import virtual_recordings
-from stario.sequences.datasets.archive_writer import write_archive
 from stario.sequences.datasets.batch import Skipped
 from stario.sequences.errors import ConfigError, InputError
+from stario.sequences.readers.archive import write_archive
 from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk

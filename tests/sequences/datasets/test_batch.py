@@ -73,19 +73,6 @@ def test_several_jobs_run_in_separate_processes():
 
 
 ROW = "t,gx,gy,gz,ax,ay,az\n0.0,0.1,0.2,0.3,1.0,2.0,9.0\n"
-PHONE = ",".join(["1.5e11", *["0.1"] * 6, "0,0,-1", *["0.1"] * 6]) + "\n"
-
-
-def ronin(root: Path, *names: str) -> None:
-    for name in names:
-        (root / name).mkdir(parents=True)
-        (root / name / "data.hdf5").touch()
-
-
-def phone(path: Path) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(PHONE)
-    return path
 
 
 def test_the_papers_split_is_by_recording_and_reproducible_by_seed():
@@ -102,9 +89,12 @@ def test_the_papers_split_is_by_recording_and_reproducible_by_seed():
 
 
 def test_a_list_may_mix_formats_folders_and_duplicates(tmp_path):
-    ronin(tmp_path, "a000_1")
+    imu = tmp_path / "handheld/data1/syn/imu1.csv"
+    for folder in (tmp_path / "a000_1", imu.parent):
+        folder.mkdir(parents=True)
+    (tmp_path / "a000_1/data.hdf5").touch()
+    imu.write_text(",".join(["1.5e11", *["0.1"] * 6, "0,0,-1", *["0.1"] * 6]) + "\n")
     (tmp_path / "own.csv").write_text(ROW)
-    imu = phone(tmp_path / "handheld/data1/syn/imu1.csv")
     (tmp_path / "mine.txt").write_text("a000_1\nown.csv\nhandheld\nown.csv\n")
     found = find_recordings(tmp_path / "mine.txt")
     assert found == [tmp_path / "a000_1", tmp_path / "own.csv", imu]

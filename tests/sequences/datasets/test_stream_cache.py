@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +15,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stario.sequences.datasets import cache_files
-from stario.sequences.datasets.archive_writer import write_archive
+from stario.sequences.datasets import stream_cache
 from stario.sequences.datasets.batch import Skipped
-from stario.sequences.datasets.cache_files import cache_folder, code_files, recording_files
-from stario.sequences.datasets.stream_cache import cached, recorded
+from stario.sequences.datasets.stream_cache import (
+    cache_folder,
+    cached,
+    code_files,
+    recorded,
+    recording_files,
+)
 from stario.sequences.readers import find_recordings, read_recording, write_csv
+from stario.sequences.readers.archive import write_archive
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import generate_walk
@@ -49,7 +55,9 @@ def recording(tmp_path):
     return path
 
 
-def streams_of(path: Path, folder: Path, read: Reader, **options: object) -> list[WorldStream]:
+def streams_of(
+    path: Path, folder: Path, read: Callable[[Path], ImuSequence], **options: object
+) -> list[WorldStream]:
     (streams,) = recorded([path], read, options, folder)
     assert not isinstance(streams, Skipped)
     return streams
@@ -86,24 +94,21 @@ def test_cached_streams_equal_built_streams(recording, tmp_path):
     assert read.calls == 1
 
 
-def test_a_cached_recording_keeps_a_single_file_open(recording, tmp_path):
-    """Each map does, and a training set has more recordings than a process may open files."""
-    streams_of(recording, tmp_path / "cache", Reader())
-    streams = streams_of(recording, tmp_path / "cache", Reader())
-    assert len({id(map_of(array)) for s in streams for array in (s.imu_W, s.position_W)}) == 1
-
-
 def test_more_recordings_are_mapped_than_a_process_may_open_files(recording, tmp_path):
+    """Each map keeps a file open; a recording has a single one."""
     resource = pytest.importorskip("resource")
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     lowest = os.dup(0)  # descriptors are numbered from below
     os.close(lowest)
     resource.setrlimit(resource.RLIMIT_NOFILE, (lowest + 20, limits[1]))
     try:
-        kept = [streams_of(recording, tmp_path / "cache", Reader(), number=k) for k in range(24)]
+        kept = [
+            streams_of(recording, tmp_path / "cache", lambda _: WALK, number=k) for k in range(24)
+        ]
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, limits)
     assert all(is_mapped(s.imu_W) for streams in kept for s in streams)
+    assert all(map_of(s.imu_W) is map_of(s.position_W) for streams in kept for s in streams)
 
 
 def test_changed_content_options_or_code_change_the_key(recording, tmp_path, monkeypatch):
@@ -119,7 +124,7 @@ def test_changed_content_options_or_code_change_the_key(recording, tmp_path, mon
     os.utime(recording, ns=(0, 0))
     streams_of(recording, folder, read)
     assert read.calls == 4
-    monkeypatch.setattr(cache_files, "_code", lambda: "later")
+    monkeypatch.setattr(stream_cache, "_code", lambda: "later")
     streams_of(recording, folder, read)
     assert read.calls == 5
 
@@ -306,23 +311,15 @@ def test_the_cache_folder_is_set_by_environment_variables(monkeypatch, tmp_path)
     assert cache_folder() == Path.home() / ".cache" / "stario"
 
 
-def test_readers_levelling_windows_and_simulation_are_part_of_the_code():
-    names = {"/".join(file.parts[-2:]) for file in code_files()}
-    assert {
-        "sequences/windows.py",
-        "readers/generic_csv.py",
-        "attitude/levelling.py",
-        "simulation/imu.py",
-    } <= names
-
-
-def test_figures_and_metrics_are_not_and_nothing_in_the_code_imports_them():
+def test_the_code_is_all_that_windows_depend_on_and_no_more():
     """A changed figure must not cost the windows of 100 hours of recordings."""
     names = {"/".join(file.parts[-2:]) for file in code_files()}
+    assert {"sequences/windows.py", "readers/generic_csv.py", "attitude/levelling.py"} <= names
+    assert "simulation/imu.py" in names
     assert not {"drawing/plots.py", "accuracy/metrics.py", "inspection/report.py"} & names
     unused = "|".join(
         re.escape(part.removesuffix(".py").rstrip("/").replace("/", "."))
-        for part in cache_files._UNRELATED
+        for part in stream_cache._UNRELATED
     )
     for file in code_files():
         assert not re.search(rf"stario\.sequences\.({unused})\b", file.read_text("utf-8")), file

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from stario.sequences.simulation.walks import WalkStyle, generate_walk
 IRON = (15.0, -6.0, 9.0)
 
 
+@cache
 def walk(magnetic_field: MagneticField) -> ImuSequence:
     style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.5, 0.4))
     track = generate_walk(9, 60.0, style=style)

@@ -201,10 +201,12 @@ def test_the_figure_shows_rest_gaps_and_the_rotation_of_the_truth(walk):
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
-@pytest.mark.parametrize("name", ["tumvi/dataset-room1_512_16", "oxiod/trolley/data2/syn/imu4.csv"])
+@pytest.mark.parametrize(
+    "name", ["tumvi/dataset-room1_512_16", "euroc/V1_02_medium", "oxiod/trolley/data2/syn/imu4.csv"]
+)
 def test_real_recordings_have_no_problems(name):
     found = inspect_recording(read_recording(DATA / name))
     assert found.findings == ()
     assert found.fit.correlation > 0.95
     assert abs(found.fit.time_offset) < 0.01
-    assert np.degrees(found.fit.misalignment) < 2.0
+    assert np.degrees(found.fit.misalignment) < 2.5

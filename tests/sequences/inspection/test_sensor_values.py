@@ -9,11 +9,7 @@ from scipy.spatial.transform import Rotation
 from told import UP, refusal, told
 
 from stario.sequences.inspection.checks import check_units
-from stario.sequences.inspection.constant_values import (
-    dead_axes,
-    stuck_findings,
-)
-from stario.sequences.inspection.samples import sample_findings
+from stario.sequences.inspection.samples import dead_axes, sample_findings, stuck_findings
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk

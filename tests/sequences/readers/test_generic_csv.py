@@ -1,5 +1,4 @@
 import logging
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,11 +8,7 @@ from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers import write_csv
 from stario.sequences.readers.columns import HEADER, TRUTH_HEADER
 from stario.sequences.readers.generic_csv import read_generic_csv
-from stario.sequences.sequence import (
-    ImuSequence,
-    Magnetometer,
-    PositionTrack,
-)
+from stario.sequences.sequence import ImuSequence
 from stario.sequences.units import with_units
 
 
@@ -83,10 +78,10 @@ GOOD = [HEADER, f"0,{ROW}", f"0.01,{ROW}", f"0.02,{ROW}"]
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        (GOOD[1:], "line 1, header: found '0,0.1,0.2"),
+        (GOOD[1:], "line 1: found '0,0.1,0.2"),
         ([HEADER.replace("gz", "yaw"), *GOOD[1:]], "header: found no gz, expected t [s],gx"),
         ([HEADER.replace("gx [rad/s]", "gx [rpm]"), *GOOD[1:]], "gx: found unit 'rpm', expected"),
-        ([HEADER.replace("t [s]", "t [min]"), *GOOD[1:]], "t: found unit 'min', expected s, ms"),
+        ([HEADER.replace("t [s]", "t [min]"), *GOOD[1:]], "time: found unit 'min', expected s, ms"),
         ([HEADER.replace("ax [m/s^2]", "ax [deg/s]"), *GOOD[1:]], "ax: found unit 'deg/s'"),
         ([HEADER + ",wx", *GOOD[1:]], "line 1, gx: found both wx and gx"),
         ([HEADER + ",px,py,pz,qx", *GOOD[1:]], "found no qy, qz, qw"),
@@ -185,22 +180,3 @@ def test_column_order_is_free_and_unknown_columns_are_ignored(tmp_path, caplog):
     assert read.time.tolist() == [0.0, 0.01]
     assert np.allclose(read.gyro, [0.1, 0.2, 0.3])
     assert np.allclose(read.accel, [1.0, 2.0, 9.0])
-
-
-def test_a_magnetometer_is_read_back_beside_the_truth(tmp_path, walk):
-    time = np.concatenate([walk.time[2:40:3], walk.time[40:900:7] + 0.001])
-    field = np.random.default_rng(2).normal(0.0, 30.0, (len(time), 3))
-    write_csv(tmp_path / "walk.csv", replace(walk, magnetometer=Magnetometer(time, field)))
-    read = read_generic_csv(tmp_path / "walk.csv")
-    assert np.array_equal(read.magnetometer.time, time)
-    assert np.array_equal(read.magnetometer.field, field)
-    assert len(read.truth) == len(walk)
-
-
-def test_positions_seconds_apart_are_waypoints(tmp_path, walk):
-    time = np.arange(walk.time[0] + 0.3, walk.time[-1], 4.0)
-    known = PositionTrack(time, walk.truth.at(time).position_W[:, :2], "waypoints")
-    write_csv(tmp_path / "walk.csv", replace(walk, truth=None, positions=known))
-    found = read_generic_csv(tmp_path / "walk.csv")
-    assert found.truth is None
-    assert found.positions.kind == "waypoints"

@@ -5,7 +5,7 @@ import os
 import numpy as np
 import published_formats as formats
 import pytest
-from phone_files import save
+from phone_exports import save
 
 from stario.sequences import ReadError, find_recordings, read_recording
 from stario.sequences.datasets.convert import write_euroc

@@ -139,7 +139,7 @@ def close(read: FloatArray, written: FloatArray) -> None:
 def test_a_table_is_read_back(names, tmp_path_factory):
     folder = tmp_path_factory.mktemp("tables")
 
-    @settings(max_examples=50, deadline=None)
+    @settings(max_examples=40, deadline=None)
     @given(texts(names))
     def check(text):
         path = text.write(folder / "own.csv")

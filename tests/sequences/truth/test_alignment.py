@@ -7,15 +7,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import samples_in
+from stario.sequences.attitude.alignment import align_tracked_body, clock_offset
+from stario.sequences.attitude.mounts import heading_turn
 from stario.sequences.attitude.rotations import cumulative_rotations
 from stario.sequences.conventions import axes_matrix
 from stario.sequences.errors import InputError
+from stario.sequences.readers.poses import accel_axes
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
-from stario.sequences.truth.alignment import align_tracked_body, clock_offset
-from stario.sequences.truth.mounts import heading_turn
-from stario.sequences.truth.positions import accel_axes
 
 MOUNT_VB = Rotation.from_euler("zyx", [172.0, 3.0, -4.0], degrees=True)
 LEVER_B = np.array([0.02, -0.1, 0.01])

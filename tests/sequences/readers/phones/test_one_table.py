@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from alike import assert_same_samples
 from csv_lines import write_lines
-from phone_exports import Walk, write
-from phone_files import field
+from phone_exports import Walk, export, write
 
 from stario.sequences import ImuSequence, ReadError, find_recordings, read_recording
 
@@ -120,61 +119,42 @@ def test_devices_of_rows_without_imu_samples_do_not_count(walk, tmp_path):
 # --- rows that name their sensor -------------------------------------------------------------
 
 
-def rows_of(walk: ImuSequence, names: str, separator: str = ",") -> list[str]:
-    sensors = list(zip(names.split(), (walk.gyro, walk.accel, field(walk)), strict=True))
-    return [
-        separator.join([f"{t:.4f}", name, *map(repr, values[k].tolist())])
-        for k, t in enumerate(walk.time.tolist())
-        for name, values in sensors
-    ]
+def rows_of(walk: ImuSequence, folder: Path) -> tuple[str, list[str]]:
+    export("rows_by_sensor", folder, walk)
+    titles, *rows = (folder / "own.csv").read_text().splitlines()
+    return titles, rows
 
 
-ANDROID = " ".join(f"android.sensor.{n}" for n in ("gyroscope", "accelerometer", "magnetic_field"))
-
-
-@pytest.mark.parametrize(
-    ("header", "names"),
-    [
-        ("time,sensor,x,y,z", "gyroscope accelerometer magnetometer"),
-        ("timestamp;sensor_name;v_x;v_y;v_z", "GYR ACC MAG"),
-        ("", ANDROID),
-    ],
-)
-def test_rows_are_sorted_by_their_sensor(names, header, walk, tmp_path):
-    rows = rows_of(walk, names, ";" if ";" in header else ",")
-    path = write_lines(tmp_path / "own.csv", *([header, *rows] if header else rows))
-    assert find_recordings(tmp_path) == [path]
-    read = read_recording(path)
+def test_a_table_of_rows_by_sensor_is_one_recording(walk, tmp_path):
+    rows_of(walk, tmp_path)
+    assert find_recordings(tmp_path) == [tmp_path / "own.csv"]
+    read = read_recording(tmp_path / "own.csv")
     assert read.name == "own"
     assert "the sensor named in each row" in read.summary()
-    assert_same_samples(read, walk)
-    np.testing.assert_allclose(read.magnetometer.field, field(walk), atol=1e-9)
 
 
 @pytest.mark.parametrize(
     "change",
     [
         lambda rows: sorted(rows, key=lambda row: row.split(",")[1]),  # one sensor after the other
-        lambda rows: [f"12:00:{float(row.split(',')[0]):07.4f},{row.split(',', 1)[1]}"
-                      for row in rows],
-        lambda rows: [row.replace("gyro", ("gyro (1)", "gyro-1-")[k // 3 % 2])
+        lambda rows: [row.replace("gyroscope", ("gyro (1)", "gyro-1-")[k // 3 % 2])
                       for k, row in enumerate(rows)],
     ],
-    ids=["sorted", "times of day", "two spellings"],
+    ids=["sorted", "two spellings"],
 )  # fmt: skip
-def test_rows_by_sensor_may_be_in_any_order_spelling_and_clock(change, walk, tmp_path):
-    rows = change(rows_of(walk, "gyro acc mag"))
-    path = write_lines(tmp_path / "own.csv", "Clock time,sensor,x,y,z", *rows)
+def test_rows_by_sensor_may_be_in_any_order_and_spelling(change, walk, tmp_path):
+    titles, rows = rows_of(walk, tmp_path)
+    path = write_lines(tmp_path / "own.csv", titles, *change(rows))
     assert_same_samples(read_recording(path), walk)
 
 
 def test_messages_name_the_file_and_the_sensor(walk, tmp_path, caplog):
-    rows = rows_of(walk, "GYR ACC MAG")
-    path = write_lines(tmp_path / "own.csv", "time,sensor,x,y,z", *rows)
+    titles, rows = rows_of(walk, tmp_path)
+    path = tmp_path / "own.csv"
     with caplog.at_level(logging.INFO):
         read_recording(path)
-    assert f"{path}/GYR.csv: its times name no unit" in caplog.text
+    assert f"{path}/gyroscope.csv: its times name no unit" in caplog.text
     assert "stario-" not in caplog.text
-    write_lines(path, "time,sensor,x,y,z", *(row for row in rows if "ACC" in row))
+    write_lines(path, titles, *(row for row in rows if "acc" in row))
     with pytest.raises(ReadError, match=r"own\.csv: sensors: found only accel"):
         read_recording(path)

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from phone_exports import export
-from phone_files import START_NS, save
+from phone_exports import START_NS, export, save
 from recorded import DATA
 
 from stario.sequences import read_recording

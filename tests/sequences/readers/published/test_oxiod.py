@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import published_formats as formats
 import pytest
-from alike import assert_same_poses, turned_and_measured
+from alike import assert_same_poses, assert_upright, turned_and_measured
 from recorded import DATA
 from scipy.spatial.transform import Rotation
 
@@ -35,12 +35,7 @@ def apple_rows(walk: ImuSequence, stamps: list[int] | list[str]) -> list[str]:
 
 
 def capture_rows(
-    walk: ImuSequence,
-    every: int,
-    start: int,
-    unit_ns: int,
-    ahead: float,
-    frame: bool = True,
+    walk: ImuSequence, every: int, start: int, unit_ns: int, ahead: float, frame: bool = True
 ) -> list[str]:
     """Every `every`-th row of the truth, stamped by a clock `ahead` seconds ahead."""
     rows = slice(300, -200, every)
@@ -247,11 +242,7 @@ def assert_consistent(path: Path) -> None:
     assert truth.valid.mean() > 0.97
     steps = np.linalg.norm(np.diff(truth.position_W, axis=0), axis=1)
     assert steps[truth.valid[:-1] & truth.valid[1:]].max() < 0.05  # 5 m/s
-    inside = sequence.time < truth.time[-1]
-    pose = truth.at(sequence.time[inside])
-    force = pose.attitude_WB.apply(sequence.accel[inside])[pose.valid].mean(axis=0)
-    assert np.degrees(np.arctan2(np.hypot(*force[:2]), force[2])) < 0.1
-    assert np.linalg.norm(force) == pytest.approx(9.8, abs=0.15)
+    assert_upright(sequence, 0.1, 0.15)
     field = sequence.magnetometer
     inside = (field.time >= truth.time[0]) & (field.time <= truth.time[-1])
     pose = truth.at(field.time[inside])

@@ -1,6 +1,6 @@
 """The mount of a tracked body on the IMU, piece by piece between its flips, and about the vertical.
 
-Frames and equation: `stario.sequences.truth.alignment`.
+Frames and equation: `stario.sequences.attitude.alignment`.
 
 On a trolley a device rotates about the vertical only, and rotation vectors along one axis do not
 determine the mount's rotation about that axis. The accelerometer does: the horizontal acceleration

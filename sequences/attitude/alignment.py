@@ -21,11 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import correlation, interpolated, peak_offset, samples_in
 from stario.sequences.attitude.levelling import MIN_GRAVITY_FORCE
-from stario.sequences.attitude.rotations import GyroIntegral, tilt_aligning
-from stario.sequences.attitude.stacks import composed
-from stario.sequences.errors import InputError
-from stario.sequences.sequence import BoolArray, FloatArray
-from stario.sequences.truth.mounts import (
+from stario.sequences.attitude.mounts import (
     MIN_FIT_S,
     Piece,
     Rotations,
@@ -34,6 +30,10 @@ from stario.sequences.truth.mounts import (
     heading_turn,
     pieces_between_jumps,
 )
+from stario.sequences.attitude.rotations import GyroIntegral, tilt_aligning
+from stario.sequences.attitude.stacks import composed
+from stario.sequences.errors import InputError
+from stario.sequences.sequence import BoolArray, FloatArray
 
 _LAG_STEP_S = 0.0025
 _MAX_LAG_S, _REMAINING_LAG_S = 0.15, 0.04
