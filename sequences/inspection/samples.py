@@ -260,8 +260,8 @@ def stuck_findings(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> lis
     """Report a sensor that repeats while the other moves; `check_units` refuses a dead one."""
     found = []
     for sensor, values, other, moves in (
-        ("gyroscope", gyro, "accelerometer", shaken),
-        ("accelerometer", accel, "gyroscope", tilting),
+        ("gyroscope", gyro, "accelerometer", contradicts_constant_gyro),
+        ("accelerometer", accel, "gyroscope", contradicts_constant_accel),
     ):
         repeated = np.asarray(~np.diff(values, axis=0).any(axis=1))
         stuck = [
