@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from stario.fusion.evaluation import bootstrap
-from stario.fusion.evaluation.bootstrap import Interval, block_rows, paired_ratio
+from stario.fusion.evaluation.bootstrap import Interval, paired_ratio
 from stario.fusion.evaluation.displacement_error import (
     FIGURES,
     HORIZONS,
@@ -80,9 +80,6 @@ _TITLES = {
     "nis_filtered": ("filtered NIS", ".2f"),
 }
 """Titles and formats of the figures of a benchmark."""
-
-
-_NO_BLOCKS = block_rows([], set="", group="", recording="", network="", seed=0, metric="")
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,17 +212,16 @@ def alone_on(
     named = labels(path, sequence.attributes, groups[path])
     group, others = named["group"], {key: n for key, n in named.items() if key != "group"}
     unit = {"set": named["set"], "group": group, "recording": str(path)}
-    figures, blocks = {}, [_NO_BLOCKS]
+    figures, blocks = {}, []
     for name in weights:
         network = model(name, group)
-        errors = recording_errors(sequence, [piece_of(network, stream) for stream in streams])
+        pieces = [piece_of(network, stream) for stream in streams]
+        figures[name], errors = recording_errors(sequence, pieces)
         if filtered and not isinstance(network, PedestrianDeadReckoning):
             nis = Navigator(network, backend="ekf").run(sequence).nis
-            errors.figures["nis_filtered"] = nis or np.nan
-        figures[name] = {"path_m": errors.path_m, **errors.figures}
-        for horizon, sums in errors.blocks.items():
-            metric = f"rms_{horizon}s_m"
-            blocks.append(block_rows(sums, **unit, network=name, seed=0, metric=metric))
+            figures[name]["nis_filtered"] = nis or np.nan
+        block = errors.groupby("metric").cumcount()
+        blocks.append(errors.assign(**unit, network=name, seed=0, block=block))
     return scored(str(path), figures, group, **others, truth=kind), joined(blocks)
 
 

@@ -18,9 +18,11 @@ from itertools import product
 from pathlib import Path
 from time import process_time
 
+import pandas as pd
+
 from stario.fusion.evaluation.compare import TRACK_TITLES
 from stario.fusion.evaluation.displacement_error import (
-    block_sums,
+    BLOCK_SECONDS,
     known_truth,
     recording_errors,
     usable_streams,
@@ -196,15 +198,16 @@ def _recording(
     sequence = read(path)
     streams, (kind, _) = usable_streams(sequence), known_truth(sequence)
     warn_of_truth(sequence)
-    alone = recording_errors(sequence, [piece_of(model, stream) for stream in streams])
-    blocks = {"10": alone.blocks["10"].tolist()} if "10" in alone.blocks else {}
+    figures, errors = recording_errors(sequence, [piece_of(model, stream) for stream in streams])
+    within_10s = errors[errors["metric"] == "rms_10s_m"]
+    blocks = {} if within_10s.empty else {"10": within_10s[["squares", "count"]].values.tolist()}
     row: dict[str, object] = {
         "path": str(path),
         "group": groups[path],
         "recording": sequence.name,
         "kind": kind,
-        "path_m": alone.path_m,
-        "figures": alone.figures,
+        "path_m": figures.pop("path_m"),
+        "figures": figures,
         "blocks": blocks,
         "tracks": {},
     }
@@ -214,10 +217,11 @@ def _recording(
         track = pedestrian_track(sequence).trajectory
         row["tracks"] = {OWN_ATTITUDE: _errors_of(track, true_poses(sequence))}
         return row, {}
-    row["tracks"], errors = _protocol_errors(model, sequence)
-    time, squares = errors.estimate.time, (errors.position_W[:, :2] ** 2).sum(axis=1)
-    blocks["ate"] = block_sums(time - time[0], squares).tolist()
-    xy = {"track": errors.estimate.position_W[:, :2], "truth": errors.truth.position_W[:, :2]}
+    row["tracks"], poses = _protocol_errors(model, sequence)
+    time, squares = poses.estimate.time, (poses.position_W[:, :2] ** 2).sum(axis=1)
+    by_block = pd.Series(squares).groupby((time - time[0]) // BLOCK_SECONDS)
+    blocks["ate"] = by_block.agg(["sum", "count"]).values.tolist()
+    xy = {"track": poses.estimate.position_W[:, :2], "truth": poses.truth.position_W[:, :2]}
     return row, {"time": time, **xy}
 
 

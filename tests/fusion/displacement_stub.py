@@ -4,13 +4,10 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.displacement_error import (
-    RecordingErrors,
-    recording_errors,
-    usable_streams,
-)
+from stario.fusion.evaluation.displacement_error import recording_errors, usable_streams
 from stario.fusion.evaluation.pedestrian import Model, piece_of
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.levelled_stream import LevelledStream
@@ -51,7 +48,8 @@ class Stub:
         return self.displacement_H[first : self.served], covariance
 
 
-def errors_of(recording: ImuSequence, model: Model) -> RecordingErrors:
+def errors_of(recording: ImuSequence, model: Model) -> tuple[dict[str, float], pd.DataFrame]:
+    """Figures, and blocks of squared errors."""
     return recording_errors(recording, [piece_of(model, s) for s in streams_of(recording)])
 
 
