@@ -47,6 +47,7 @@ def compare(
     """
     from stario.fusion.evaluation.compare import TRACKS, compare_recordings, demonstration
     from stario.fusion.evaluation.results import check_folder, metrics_dict, write_comparison
+    from stario.fusion.evaluation.scores import joined
     from stario.fusion.values.fix_file import read_fixes
     from stario.sequences.arrays import check_choice
     from stario.sequences.datasets.batch import without_skipped
@@ -85,8 +86,8 @@ def compare(
         if not paths:
             command = "stario" if shutil.which("stario") else sys.argv[0]  # in no PATH: its own
             lines.append(f"next: {command} run FILE --report, with a phone's recording")
-        records = {found.sequence.name: found.as_dict() for found in comparisons}
-        common.print_result(as_json, metrics_dict(records, comparisons[0].words), "\n".join(lines))
+        scores = joined(found.scores for found in comparisons)
+        common.print_result(as_json, metrics_dict(scores, comparisons[0].words), "\n".join(lines))
     common.exit_if_skipped(skipped)
 
 

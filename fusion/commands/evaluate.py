@@ -123,14 +123,15 @@ def _tracks(
     """Return the table of recordings, whose tracks are written one by one, and those skipped."""
     from stario.fusion.evaluation.compare import compare_recordings
     from stario.fusion.evaluation.results import write_recording, write_summary
-    from stario.fusion.evaluation.text import scores_of, summary, summary_table
+    from stario.fusion.evaluation.scores import joined
+    from stario.fusion.evaluation.text import summary, summary_table
     from stario.sequences.datasets.batch import without_skipped
 
     settings, network = estimating.settings(), estimating.network()
     model = estimating.for_processes(network, jobs)
     origin = common.origin_of(files, reading, estimating, network)
     skipped: list[Skipped] = []
-    scores = []
+    found = []
     with common.progress_bar("evaluate", 100 * len(files)) as progress:
         outcomes = compare_recordings(
             files, model, settings, reading.read, jobs, truth_needed=True, progress=progress
@@ -138,11 +139,11 @@ def _tracks(
         for comparison in without_skipped(outcomes, skipped):
             if out is not None:
                 write_recording(out, comparison)
-            scores.append(scores_of(comparison))
-    if not scores:
+            found.append(comparison.scores)
+    if not found:
         return None, skipped
-    records = {each.name: each.record for each in scores}
-    write = partial(write_summary, records=records, config=settings, origin=origin)
+    scores = joined(found)
+    write = partial(write_summary, scores=scores, config=settings, origin=origin)
     return _Found(summary(scores), summary_table(scores), write), skipped
 
 

@@ -9,12 +9,15 @@ from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from stario.fusion.evaluation.known_positions import (
     MIN_POSITIONS,
     fitted_georeference,
     position_error,
 )
 from stario.fusion.evaluation.pedestrian import pedestrian_track
+from stario.fusion.evaluation.scores import scored
 from stario.fusion.evaluation.tracks import (
     inertial_track,
     network_track,
@@ -185,11 +188,15 @@ class Comparison:
             return None
         return evaluate_track(self.track.trajectory, truth, alignment="none").path_m
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the recording's entry in `metrics.json`."""
-        unknown: Metrics = dict.fromkeys(METRICS)
-        tracks = {name: self.metrics.get(name, unknown) for name in TRACKS}
-        return {"duration_s": self.sequence.duration, "path_m": self.path_m, "tracks": tracks}
+    @property
+    def scores(self) -> pd.DataFrame:
+        """The figures as rows of `scores`: those of the recording, and of all tracks, by name.
+
+        The recording's are those of a track "truth": `duration_s` and `path_m`.
+        """
+        of_recording: Metrics = {"duration_s": self.sequence.duration, "path_m": self.path_m}
+        tracks = {name: self.metrics.get(name, dict.fromkeys(METRICS)) for name in TRACKS}
+        return scored(self.sequence.name, {"truth": of_recording, **tracks})
 
     def aligned(self) -> dict[str, Trajectory]:
         """Return trajectories for figures, aligned with the truth if there is one."""

@@ -13,9 +13,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+import pandas as pd
+
 from stario.fusion.evaluation.compare import METRIC_WORDS, RECORDING_WORDS, TRACKS, Comparison
 from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.evaluation.map_files import on_map, write_geojson, write_gpx
+from stario.fusion.evaluation.scores import by_name, joined
 from stario.fusion.values.config import NavigatorConfig
 from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.plan import plan_view
@@ -93,8 +96,8 @@ def write_comparison(
 
     Other recordings' folders stay. Raises what `write_results` does.
     """
-    records = {found.sequence.name: found.as_dict() for found in comparisons}
-    files = dict(_settings(metrics_dict(records, comparisons[0].words), config, origin))
+    metrics = metrics_dict(joined(found.scores for found in comparisons), comparisons[0].words)
+    files = dict(_settings(metrics, config, origin))
     for found in comparisons:
         inner = _recording(found, also)
         files |= {f"{found.sequence.name}/{name}": write for name, write in inner.items()}
@@ -102,13 +105,10 @@ def write_comparison(
 
 
 def write_summary(
-    folder: Path,
-    records: Mapping[str, object],
-    config: NavigatorConfig,
-    origin: Mapping[str, object],
+    folder: Path, scores: pd.DataFrame, config: NavigatorConfig, origin: Mapping[str, object]
 ) -> None:
     """Write `metrics.json`, `config.json` and `run.json` of recordings; raises as `write_run`."""
-    write_results(folder, _settings(metrics_dict(records), config, origin))
+    write_results(folder, _settings(metrics_dict(scores), config, origin))
 
 
 def write_recording(folder: Path, found: Comparison) -> None:
@@ -117,10 +117,14 @@ def write_recording(folder: Path, found: Comparison) -> None:
 
 
 def metrics_dict(
-    records: Mapping[str, object], words: Mapping[str, str] = METRIC_WORDS
+    scores: pd.DataFrame, words: Mapping[str, str] = METRIC_WORDS
 ) -> dict[str, object]:
-    """Return the content of `metrics.json` from the entries of recordings (`as_dict`), by name."""
-    return {"recordings": records, "conventions": {**RECORDING_WORDS, **words}}
+    """Return the content of `metrics.json` from the `scores` of comparisons."""
+    recordings = {}
+    for name, found in scores.groupby("recording", sort=False):
+        tracks = by_name(found, "track")
+        recordings[name] = {**tracks.pop("truth"), "tracks": tracks}
+    return {"recordings": recordings, "conventions": {**RECORDING_WORDS, **words}}
 
 
 def figure_files(figures: Mapping[str, Figure]) -> Files:

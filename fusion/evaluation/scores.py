@@ -54,6 +54,12 @@ def records(scores: pd.DataFrame) -> list[dict[str, Any]]:
     return found
 
 
+def by_name(scores: pd.DataFrame, label: str) -> dict[str, dict[str, float]]:
+    """Return the values by a label, such as the track, and by metric."""
+    found = scores.groupby(label, sort=False)
+    return {str(n): dict(zip(part["metric"], part["value"], strict=True)) for n, part in found}
+
+
 def parts(
     scores: pd.DataFrame, by: str = "group", whole: str | None = "all"
 ) -> list[tuple[str, pd.DataFrame]]:

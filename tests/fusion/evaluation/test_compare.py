@@ -18,7 +18,8 @@ from stario.fusion.evaluation.compare import (
     measure,
 )
 from stario.fusion.evaluation.results import write_comparison, write_run
-from stario.fusion.evaluation.text import scores_of, summary, summary_table
+from stario.fusion.evaluation.scores import joined, values
+from stario.fusion.evaluation.text import summary, summary_table
 from stario.fusion.values.config import FilterConfig, NavigatorConfig
 from stario.fusion.values.fixes import position_fix
 from stario.sequences.accuracy.metrics import evaluate_track
@@ -234,13 +235,14 @@ def test_truth_shorter_than_a_window_loses_only_the_true_attitude_track(walk, mo
 
 def test_a_recording_with_little_truth_counts_in_no_median(walk, model, compared):
     little = compare(model, replace(walk, truth=walk.truth.slice(3.0, 8.0)), CONFIG)
-    whole, part = scores_of(compared), scores_of(little)
-    assert part.coverage == pytest.approx(0.25, abs=0.02)
-    assert summary([whole, part])["over_recordings"] == summary([whole])["over_recordings"]
-    table = summary_table([whole, part])
-    assert f"{walk.name} (truth of 25%)" in table
+    whole, part = compared.scores, little.scores.assign(recording="little")
+    both = joined([whole, part])
+    assert values(part, "coverage").min() == pytest.approx(0.25, abs=0.02)
+    assert summary(both)["over_recordings"] == summary(whole)["over_recordings"]
+    table = summary_table(both)
+    assert "little (truth of 25%)" in table
     assert "median and mean without recordings whose truth covers less than 50%" in table
-    assert "truth of" not in summary_table([whole])
+    assert "truth of" not in summary_table(whole)
 
 
 @pytest.mark.parametrize("late", [True, False])
@@ -258,16 +260,17 @@ def test_a_truth_that_cannot_be_compared_leaves_the_tracks(walk, model, caplog, 
 def test_summary_has_median_and_mean_over_recordings(compared, walk):
     ekf = compared.metrics["track"]
     ate = ekf["ate_m"]
-    scores = [
-        scores_of(replace(compared, metrics=compared.metrics | {"track": ekf | {"ate_m": error}}))
-        for error in (ate, 3.0, 8.0)
-    ]
+    others = (
+        replace(compared, metrics=compared.metrics | {"track": ekf | {"ate_m": error}}).scores
+        for error in (3.0, 8.0)
+    )
+    scores = joined([compared.scores, *(one.assign(recording=k) for k, one in enumerate(others))])
     over_recordings = summary(scores)["over_recordings"]["track"]["ate_m"]
     assert over_recordings["median"] == pytest.approx(3.0)
     assert over_recordings["mean"] == pytest.approx((ate + 11.0) / 3.0)
     table = summary_table(scores)
     lines = table.splitlines()
-    assert [line.split()[0] for line in lines[1:6]] == [walk.name] * 3 + ["median", "mean"]
+    assert [line.split()[0] for line in lines[1:6]] == [walk.name, "0", "1", "median", "mean"]
     fitted = compared.metrics["track"]["ate_fit_m"]
     assert f"3.00 ({fitted:.2f})" in lines[4]
     assert "in x and y only" in table
