@@ -14,15 +14,10 @@ from typing import Annotated
 import typer
 
 from stario.fusion.commands import checks, options
-from stario.fusion.commands.compare import compare
-from stario.fusion.commands.convert import convert
-from stario.fusion.commands.evaluate import evaluate
-from stario.fusion.commands.export import export
-from stario.fusion.commands.inspect import inspect
-from stario.fusion.commands.live import live
-from stario.fusion.commands.run import run
-from stario.fusion.commands.simulate import simulate
-from stario.fusion.commands.train import train
+from stario.fusion.commands.compare import compare, evaluate
+from stario.fusion.commands.convert import convert, simulate
+from stario.fusion.commands.run import inspect, live, run
+from stario.fusion.commands.train import export, train
 from stario.sequences.errors import StarioError
 from stario.sequences.findings import FINDINGS
 

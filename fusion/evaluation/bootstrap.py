@@ -64,7 +64,7 @@ def paired_ratio(blocks: pd.DataFrame, ours: str, theirs: str) -> Interval | Non
     """
     pair = blocks[blocks["network"].isin([ours, theirs])]
     total = pair.groupby([*_UNITS, "network", "seed"])["squares"].transform("sum")
-    found = ranks(pair[total > 0.0], theirs).set_index("network")["ratio"]
+    found = _ranked(pair[total > 0.0], theirs).set_index("network")["ratio"]
     return found.get(ours) if theirs in found else None
 
 
@@ -76,6 +76,13 @@ def ranks(blocks: pd.DataFrame, against: str) -> pd.DataFrame:
         and `rank_high`, and the `ratio` of its error to that of `against`, an `Interval`; None for
         `against` itself or without it. No rows if no recording is common to all.
     """
+    found = _ranked(blocks, against)
+    found.loc[found["network"] == against, "ratio"] = None
+    return found
+
+
+def _ranked(blocks: pd.DataFrame, against: str) -> pd.DataFrame:
+    """Return the columns of `ranks`, also with the ratio of a network to itself."""
     table = blocks.set_index([*_UNITS, "block", "network", "seed"])[["squares", "count"]]
     runs = table.unstack(["network", "seed"], sort=False).dropna()
     if runs.empty:
@@ -86,20 +93,13 @@ def ranks(blocks: pd.DataFrame, against: str) -> pd.DataFrame:
     by_name = logs.T.groupby(level="network", sort=False).mean()  # (N, 1 + R), first the whole
     places = by_name.rank(method="first").astype(int).to_numpy()
     low, high = np.percentile(places[:, 1:], _BOUNDS, axis=1, method="nearest")
-    ratios = {
-        name: _interval((logs - by_name.loc[against]).to_numpy(), len(runs))
-        for name, logs in by_name.iterrows()
-        if against in by_name.index and name != against
-    }
-    return pd.DataFrame(
-        {
-            "network": by_name.index,
-            "rank": places[:, 0],
-            "rank_low": low,
-            "rank_high": high,
-            "ratio": [ratios.get(name) for name in by_name.index],
-        }
-    )
+    base = by_name.loc[against] if against in by_name.index else None
+    ratios = [
+        None if base is None else _interval((errors - base).to_numpy(), len(runs))
+        for _, errors in by_name.iterrows()
+    ]
+    columns = {"network": by_name.index, "rank": places[:, 0], "rank_low": low, "rank_high": high}
+    return pd.DataFrame({**columns, "ratio": ratios})
 
 
 def _interval(differences: FloatArray, blocks: int) -> Interval:

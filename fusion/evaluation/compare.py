@@ -15,6 +15,7 @@ from stario.fusion.evaluation.known_positions import (
     MIN_POSITIONS,
     fitted_georeference,
     position_error,
+    recording_verdict,
 )
 from stario.fusion.evaluation.pedestrian import pedestrian_track
 from stario.fusion.evaluation.scores import scored
@@ -24,7 +25,6 @@ from stario.fusion.evaluation.tracks import (
     network_track_true_attitude,
     true_poses,
 )
-from stario.fusion.evaluation.verdict import recording_verdict
 from stario.fusion.imu.stateful import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.place import compared_with, used_words
@@ -71,9 +71,6 @@ TRACK_TITLES = {
     "track": "track",
 }
 """Titles of the columns of tracks."""
-
-TRACK_OF = {"ekf": "filtered", "graph": "track"}
-"""Name of the track that a back end makes of a recording."""
 
 DEMONSTRATION_SEED = 2**31 + 49
 """Seed of the bundled demonstration: training seeds are below 2^31 and exclude this walk. 49 is the
@@ -254,6 +251,12 @@ def compare(
         except InputError as error:
             log.warning("no track %s: %s", name, error)
     return measured(sequence, tracks, config.place)
+
+
+def navigators(model: Predictor, config: NavigatorConfig, graph: bool) -> dict[str, Navigator]:
+    """Return the filter, and perhaps the graph, by the names of the tracks they make."""
+    filtered = {"filtered": Navigator(model, config, backend="ekf")}
+    return filtered | ({"track": Navigator(model, config, backend="graph")} if graph else {})
 
 
 def measured(

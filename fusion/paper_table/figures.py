@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from stario.fusion.evaluation.results import figure_files, write_results
-from stario.fusion.evaluation.scores import Spread, values
+from stario.fusion.evaluation.scores import over_seeds, values
 from stario.fusion.paper_table.runs import PROTOCOLS, TRUE_ATTITUDE
 from stario.sequences.drawing.figures import INK, apply_style, new_figure, split_at_gaps
 from stario.sequences.sequence import FloatArray
@@ -54,7 +54,7 @@ def write_figures(
 ) -> None:
     """Write the figures of the networks whose parameters are given; raises as `write_results`.
 
-    Scores have the labels `network` and `seed`.
+    Scores have the labels `network` and `seed`, and PDE in %.
     """
     colours = {name: _COLOURS[k % len(_COLOURS)] for k, name in enumerate(parameters)}
     figures = {
@@ -73,9 +73,9 @@ def _ate_against_parameters(
     fig = new_figure(8.0, 5.5, "Mean ATE against parameters, true attitude")
     axes = fig.subplots()
     millions = {name: count / 1e6 for name, count in parameters.items()}
+    means = over_seeds(scores).xs((TRUE_ATTITUDE, "ate_m"), level=("track", "metric"))
     for k, name in enumerate(millions):
-        column = Spread("", "ate_m", where={"network": name, "track": TRUE_ATTITUDE})
-        mean, spread = column.mean_and_spread(scores)
+        mean, spread = means.loc[name, ["mean", "std"]]
         axes.errorbar(
             millions[name], mean, yerr=spread, fmt=_MARKERS[k % len(_MARKERS)], ms=9, capsize=4,
             color=colours[name], label=name,
@@ -120,7 +120,7 @@ def pde_boxes(scores: pd.DataFrame, colours: Mapping[str, str]) -> Figure:
     fig = new_figure(4.0 + 3.0 * len(PROTOCOLS), 5.0, "Position drift at the end, per recording")
     panels = fig.subplots(1, len(PROTOCOLS), sharey=True)
     for axes, (track, words) in zip(panels, PROTOCOLS.items(), strict=True):
-        drift = [100.0 * values(scores, "pde", network=name, track=track) for name in colours]
+        drift = [values(scores, "pde", network=name, track=track) for name in colours]
         boxes = axes.boxplot(drift, widths=0.6, patch_artist=True, showfliers=False)
         for k, colour in enumerate(colours.values()):
             boxes["boxes"][k].set(facecolor=colour, alpha=0.35, edgecolor=colour)

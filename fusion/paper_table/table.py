@@ -13,7 +13,7 @@ import pandas as pd
 
 from stario.fusion.evaluation.bootstrap import Interval, block_rows, ranks
 from stario.fusion.evaluation.pedestrian import NAME as PDR
-from stario.fusion.evaluation.scores import Spread, joined, scored
+from stario.fusion.evaluation.scores import joined, over_seeds, scored
 from stario.fusion.paper_table.figures import Sample, write_figures
 from stario.fusion.paper_table.runs import FILTERED, OWN_ATTITUDE, TRUE_ATTITUDE, Run, read_run
 from stario.fusion.paper_table.sets import DataSet, published, set_of
@@ -31,27 +31,23 @@ Completed = Sequence[Mapping[str, Any]]
 """Results (`read_run`) of a set's runs."""
 
 
-def _column(title: str, track: str, name: str, scale: float = 1.0) -> Spread:
-    where = {"track": track}
-    return Spread(title, name, ".3f", where=where, standard_error=True, scale=scale)
-
-
 COLUMNS = {
-    "ate": _column("ATE [m]", TRUE_ATTITUDE, "ate_m"),
-    "rte": _column("RTE [m]", TRUE_ATTITUDE, "rte_m"),
-    "pde": _column("PDE [%]", TRUE_ATTITUDE, "pde", 100.0),
-    "own_ate": _column("own attitude: ATE [m]", OWN_ATTITUDE, "ate_m"),
-    "own_rte": _column("own attitude: RTE [m]", OWN_ATTITUDE, "rte_m"),
-    "filtered_ate": _column("filtered: ATE [m]", FILTERED, "ate_m"),
-    "filtered_rte": _column("filtered: RTE [m]", FILTERED, "rte_m"),
-    "waypoints_m": _column("waypoints [m]", "waypoints", "ate_fit_m"),
-    "waypoints_percent": _column("waypoints [%]", "waypoints", "ate_fit_percent"),
-    "waypoints_length": _column("length ratio", "waypoints", "length_ratio"),
-    "positions_percent": _column("positions, 20 s [%]", "positions", "stretch_percent"),
-    "training_error": _column("training error", "trained", "training_error_m2"),
-    "validation_error": _column("validation error", "trained", "validation_error_m2"),
+    "ate": ("ATE [m]", TRUE_ATTITUDE, "ate_m"),
+    "rte": ("RTE [m]", TRUE_ATTITUDE, "rte_m"),
+    "pde": ("PDE [%]", TRUE_ATTITUDE, "pde"),
+    "own_ate": ("own attitude: ATE [m]", OWN_ATTITUDE, "ate_m"),
+    "own_rte": ("own attitude: RTE [m]", OWN_ATTITUDE, "rte_m"),
+    "filtered_ate": ("filtered: ATE [m]", FILTERED, "ate_m"),
+    "filtered_rte": ("filtered: RTE [m]", FILTERED, "rte_m"),
+    "waypoints_m": ("waypoints [m]", "waypoints", "ate_fit_m"),
+    "waypoints_percent": ("waypoints [%]", "waypoints", "ate_fit_percent"),
+    "waypoints_length": ("length ratio", "waypoints", "length_ratio"),
+    "positions_percent": ("positions, 20 s [%]", "positions", "stretch_percent"),
+    "training_error": ("training error", "trained", "training_error_m2"),
+    "validation_error": ("validation error", "trained", "validation_error_m2"),
 }
-"""Columns of the table, in order; a column without any value on a set is omitted there."""
+"""Title, track and metric of the table's columns, in order; one without any value on a set is
+omitted there."""
 
 _MEASURES = {
     "ate": "position error under the paper's protocol",
@@ -67,7 +63,7 @@ class SetTable:
 
     Attributes:
         dataset: name, recordings and split.
-        scores: errors of every run, with labels `path`, `network` and `seed`; figures of the
+        scores: errors of every run, PDE in %, with labels `path`, `network`, `seed`; figures of the
             network alone are those of a track that is called by the kind of truth, errors of the
             training those of a track "trained".
         rows: networks, in order, with their `seeds`, the number of test recordings that given
@@ -124,10 +120,11 @@ def set_table(
     names = [content["network"] for content in completed]
     test = {entry.path for entry in dataset.test}
     scores = _scores(completed)
+    means = over_seeds(scores)
     rows = pd.DataFrame(
         {"network": name, "seeds": sorted(c["seed"] for c in completed if c["network"] == name)}
         | {"learned": len(test & learned.get(name, set()))}
-        | _means(scores[scores["network"] == name])
+        | _means(means, name)
         for name in sorted(set(names), key=[PDR, *ARCHITECTURES, *names].index)
     )
     failures = [
@@ -146,11 +143,10 @@ def set_table(
     )
 
 
-def _means(scores: pd.DataFrame) -> dict[str, float | None]:
-    found: dict[str, float | None] = {}
-    for key, column in COLUMNS.items():
-        found[key], found[f"{key}_sem"] = column.mean_and_spread(scores)
-    return found
+def _means(means: pd.DataFrame, network: str) -> dict[str, float]:
+    found = means.reindex([(network, track, metric) for _, track, metric in COLUMNS.values()])
+    errors = zip((f"{key}_sem" for key in COLUMNS), found["sem"], strict=True)
+    return dict(zip(COLUMNS, found["mean"], strict=True)) | dict(errors)
 
 
 def _scores(completed: Completed) -> pd.DataFrame:
@@ -165,7 +161,9 @@ def _scores(completed: Completed) -> pd.DataFrame:
         if trained := content.get("trained"):
             errors = {key: trained[key] for key in ("training_error_m2", "validation_error_m2")}
             found.append(scored("", {"trained": errors}, **labels | {"path": ""}))
-    return joined(found)
+    table = joined(found)
+    table.loc[table["metric"] == "pde", "value"] *= 100.0
+    return table
 
 
 def _blocks(completed: Completed, measure: str, dataset: DataSet) -> pd.DataFrame:
@@ -299,11 +297,10 @@ def table_text(
 
 def _set_text(table: SetTable) -> str:
     dataset, known = table.dataset, table.rows[[*COLUMNS]].notna().any()
-    columns = [column for key, column in COLUMNS.items() if known[key]]
-    titles = ["network", *(column.title for column in columns), "seeds", "rank"]
+    columns = [key for key in COLUMNS if known[key]]
+    titles = ["network", *(COLUMNS[key][0] for key in columns), "seeds", "rank"]
     lines = [[*titles, f"error / {REFERENCE_NETWORK}'s", "paper: ATE, RTE [m]"]]
     for row in table.rows.to_dict("records"):
-        part = table.scores[table.scores["network"] == row["network"]]
         rank, ratio, errors = "-", "-", "-"
         if not np.isnan(row["rank"]):
             rank = "{rank:.0f} [{rank_low:.0f}, {rank_high:.0f}]".format(**row)
@@ -311,7 +308,7 @@ def _set_text(table: SetTable) -> str:
             ratio = f"{row['ratio']:.2f}"
         if paper := published(dataset.name, row["network"]):
             errors = "{:.3f}, {:.3f}".format(*paper)
-        cells = [column.text(part) for column in columns]
+        cells = [_mean(row[key], row[f"{key}_sem"]) for key in columns]
         title = _title(row, table.tested)
         lines.append([title, *cells, str(len(row["seeds"])), rank, ratio, errors])
     return "\n".join(
@@ -328,6 +325,10 @@ def _set_text(table: SetTable) -> str:
               if table.skipped else []),
         ]
     )  # fmt: skip
+
+
+def _mean(mean: float, error: float) -> str:
+    return figure(mean) if np.isnan(error) else f"{figure(mean)} +- {figure(error)}"
 
 
 def _title(row: Mapping[str, Any], tested: int) -> str:

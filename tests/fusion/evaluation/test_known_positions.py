@@ -18,8 +18,8 @@ from stario.fusion.evaluation.known_positions import (
     position_error,
     position_error_words,
     position_findings,
+    recording_verdict,
 )
-from stario.fusion.evaluation.verdict import recording_verdict
 from stario.network import load_model
 from stario.sequences import Trajectory, read_recording
 from stario.sequences.findings import Finding
