@@ -46,9 +46,6 @@ log = logging.getLogger(__name__)
 _ATTRIBUTES = ("person", "device", "place", "carry")
 """Attributes of a recording that it can be grouped by, besides its set and group."""
 
-POOLED = "all"
-"""Name of the row over all sets, equally weighted; a group may have this name, too."""
-
 _UNKNOWN = "unknown"
 """Label of a recording whose person, device, place or carry is not known."""
 
@@ -120,7 +117,7 @@ class Benchmark:
         in those of ours the `RATIOS` of errors to theirs, as `Interval`s where there are any. For
         waypoints, the residuals replace the 10 s errors.
         """
-        found = parts(wide(self.scores), self.by, POOLED)
+        found = parts(wide(self.scores), self.by)
         return pd.DataFrame(
             row
             for k, (name, part) in enumerate(found)

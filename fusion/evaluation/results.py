@@ -38,8 +38,8 @@ except ImportError:  # Windows
 Files = Mapping[str, Callable[[Path], object]]
 """Functions that write the files of a set of results, by their paths within its folder."""
 
-Writers = Mapping[str, Callable[[Path, Comparison], object]]
-"""Functions that write a recording's further files, by the files' names."""
+Writers = Mapping[str, Callable[..., object]]
+"""Functions of a path and a comparison, `found`, that write further files, by their names."""
 
 _FIGURES = ("plan.png", "error.png", "innovations.png", "report.html")
 _TRACKS = tuple(f"{track}{suffix}" for track, suffix in product(TRACKS, (".tum", ".npz")))
@@ -80,7 +80,7 @@ def write_run(
         "health.json": partial(write_json, obj=asdict(health) if health else None),
         **_figures(run),
         **_on_map(run),
-        **_further(run, also),
+        **{name: partial(write, found=run) for name, write in also.items()},
     }
     return write_results(folder, files)
 
@@ -140,14 +140,8 @@ def _settings(metrics: object, config: NavigatorConfig, origin: Mapping[str, obj
 def _recording(found: Comparison, also: Writers = MappingProxyType({})) -> Files:
     truth = found.sequence.truth
     known = {} if truth is None else {"truth.tum": partial(write_tum, trajectory=truth)}
-    return {**_tracks(found), **known, **_figures(found), **_further(found, also)}
-
-
-def _further(found: Comparison, also: Writers) -> Files:
-    def bound(write: Callable[[Path, Comparison], object]) -> Callable[[Path], object]:
-        return lambda path: write(path, found)
-
-    return {name: bound(write) for name, write in also.items()}
+    further = {name: partial(write, found=found) for name, write in also.items()}
+    return {**_tracks(found), **known, **_figures(found), **further}
 
 
 def _tracks(found: Comparison) -> Files:

@@ -19,6 +19,9 @@ from stario.sequences.sequence import FloatArray
 
 COLUMNS = ("recording", "group", "track", "metric", "value")
 
+POOLED = "all"
+"""Name of the row over all groups; a group may have this name, too."""
+
 Figures = Mapping[str, float | None]
 """Figures of a track by metric; None where unknown."""
 
@@ -60,12 +63,10 @@ def by_name(scores: pd.DataFrame, label: str) -> dict[str, dict[str, float]]:
     return {str(n): dict(zip(part["metric"], part["value"], strict=True)) for n, part in found}
 
 
-def parts(
-    scores: pd.DataFrame, by: str = "group", whole: str | None = "all"
-) -> list[tuple[str, pd.DataFrame]]:
-    """Return the groups, sorted by name; then all rows, called `whole`, if there are several."""
+def parts(scores: pd.DataFrame, by: str = "group") -> list[tuple[str, pd.DataFrame]]:
+    """Return the groups, sorted by name; then all rows, `POOLED`, if there are several."""
     found = [(str(name), part) for name, part in scores.groupby(by)]
-    return [*found, (whole, scores)] if whole and len(found) > 1 else found
+    return [*found, (POOLED, scores)] if len(found) > 1 else found
 
 
 def by_track(scores: pd.DataFrame) -> list[tuple[tuple[str, str], pd.DataFrame]]:

@@ -19,7 +19,6 @@ from stario.fusion.evaluation.displacement_error import (
     known_truth,
 )
 from stario.fusion.evaluation.groups import (
-    POOLED,
     RATIOS,
     Benchmark,
     alone_on,
@@ -30,7 +29,7 @@ from stario.fusion.evaluation.groups import (
     write_benchmark,
 )
 from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
-from stario.fusion.evaluation.scores import values
+from stario.fusion.evaluation.scores import POOLED, values
 from stario.sequences.errors import InputError
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import ImuSequence, PositionTrack, is_gap

@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 
 from stario.fusion.evaluation.bootstrap import Interval, block_rows, paired_ratio, ranks
-from stario.fusion.evaluation.groups import POOLED, verdict
-from stario.fusion.evaluation.scores import joined
+from stario.fusion.evaluation.groups import verdict
+from stario.fusion.evaluation.scores import POOLED, joined
 
 Errors = dict[tuple[str, str, str], np.ndarray]
 """Squared errors (B,), one of each block, by set, group and recording."""
