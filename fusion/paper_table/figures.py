@@ -37,7 +37,7 @@ class Sample:
     """Tracks of one recording with the true attitude, aligned with the truth.
 
     Attributes:
-        recording: name of the recording.
+        recording: path of the recording.
         time: times (N,) [s].
         truth: true horizontal positions (N, 2) [m].
         tracks: those of each network (N, 2) [m].
@@ -169,7 +169,7 @@ def _draw_sample(
         axes.plot(track[:, 0], track[:, 1], color=colours[name], lw=1.2, label=label)
         axes.plot(*track[-1], "s", color=colours[name], ms=6, mec="white")
     axes.plot(*sample.truth[0], "o", mfc="white", mec=INK, ms=8)
-    axes.set_title(sample.recording, loc="left", fontsize=10)
+    axes.set_title(Path(sample.recording).name, loc="left", fontsize=10)
     axes.set(xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal", adjustable="datalim")
     axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.12))

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from stario.fusion.evaluation.bootstrap import Interval, block_rows, ranks
+from stario.fusion.evaluation.bootstrap import Interval, ranks
 from stario.fusion.evaluation.pedestrian import NAME as PDR
 from stario.fusion.evaluation.scores import joined, over_seeds, scored
 from stario.fusion.paper_table.figures import Sample, write_figures
 from stario.fusion.paper_table.runs import FILTERED, OWN_ATTITUDE, TRUE_ATTITUDE, Run, read_run
-from stario.fusion.paper_table.sets import DataSet, published, set_of
+from stario.fusion.paper_table.sets import DataSet, published
 from stario.network.architectures import ARCHITECTURES
 from stario.network.runtime.survey import BATCHES, ModelRow, survey
 from stario.network.training.config import TrainingConfig
@@ -51,8 +51,8 @@ omitted there."""
 
 _MEASURES = {
     "ate": "position error under the paper's protocol",
-    "10": "displacement error over 10 s along the own attitude (waypoint residuals where there are "
-    "waypoints)",
+    "rms_10s_m": "displacement error over 10 s along the own attitude (waypoint residuals where "
+    "there are waypoints)",
 }
 """Errors that networks may be ranked by, in words."""
 
@@ -63,9 +63,8 @@ class SetTable:
 
     Attributes:
         dataset: name, recordings and split.
-        scores: errors of every run, PDE in %, with labels `path`, `network`, `seed`; figures of the
-            network alone are those of a track that is called by the kind of truth, errors of the
-            training those of a track "trained".
+        scores: errors of every run, as of `test_scores`, PDE in %; those of the training are those
+            of a track "trained".
         rows: networks, in order, with their `seeds`, the number of test recordings that given
             weights were trained on (`learned`), mean and standard error over seeds of each of
             `COLUMNS` ("ate", "ate_sem"; NaN if unknown), and the columns of `bootstrap.ranks`.
@@ -114,13 +113,15 @@ def set_table(
     dataset: DataSet, completed: Completed, learned: Mapping[str, frozenset[Path]]
 ) -> SetTable:
     """Return a set's table, given the recordings that packaged weights have `learned`, by name."""
-    recordings = [one for content in completed for one in content["recordings"]]
-    measure = "ate" if all(one["kind"] == "poses" for one in recordings) else "10"
-    tested = completed[0]["recordings"]
-    names = [content["network"] for content in completed]
-    test = {entry.path for entry in dataset.test}
     scores = _scores(completed)
+    paths = scores[scores["metric"] == "path_m"]
+    measure = "ate" if set(paths["track"]) <= {"poses"} else "rms_10s_m"
+    names = [content["network"] for content in completed]
+    tested = paths.drop_duplicates("recording")
+    test = {entry.path for entry in dataset.test}
     means = over_seeds(scores)
+    blocks = joined(pd.DataFrame(content["blocks"]) for content in completed)
+    ranked = ranks(blocks[blocks["metric"] == measure], REFERENCE_NETWORK)
     rows = pd.DataFrame(
         {"network": name, "seeds": sorted(c["seed"] for c in completed if c["network"] == name)}
         | {"learned": len(test & learned.get(name, set()))}
@@ -135,9 +136,9 @@ def set_table(
     return SetTable(
         dataset,
         scores,
-        rows.merge(ranks(_blocks(completed, measure, dataset), REFERENCE_NETWORK), "left"),
+        rows.merge(ranked, "left"),
         len(tested),
-        float(sum(one["path_m"] for one in tested)),
+        float(tested["value"].sum()),
         _MEASURES[measure],
         list(dict.fromkeys(f"{failure['item']}: {failure['reason']}" for failure in failures)),
     )
@@ -150,38 +151,16 @@ def _means(means: pd.DataFrame, network: str) -> dict[str, float]:
 
 
 def _scores(completed: Completed) -> pd.DataFrame:
-    found = [scored("", {}, path="", network="", seed=0)]
-    names = [content["network"] for content in completed]
-    for content in sorted(completed, key=lambda content: names.index(content["network"])):
-        labels: dict[str, Any] = {key: content[key] for key in ("network", "seed")}
-        for one in content["recordings"]:
-            figures = {**one["tracks"], one["kind"]: one["figures"]}
-            labels["path"] = one["path"]
-            found.append(scored(one["recording"], figures, one["group"], **labels))
+    found = []
+    for content in completed:
+        found.append(pd.DataFrame(content["scores"]))
         if trained := content.get("trained"):
             errors = {key: trained[key] for key in ("training_error_m2", "validation_error_m2")}
-            found.append(scored("", {"trained": errors}, **labels | {"path": ""}))
-    table = joined(found)
+            run = {key: content[key] for key in ("network", "seed")}
+            found.append(scored("", {"trained": errors}, **run))
+    table = joined(found).astype({"value": float})
     table.loc[table["metric"] == "pde", "value"] *= 100.0
     return table
-
-
-def _blocks(completed: Completed, measure: str, dataset: DataSet) -> pd.DataFrame:
-    """Return the blocks of squared errors of networks that have some with every seed."""
-    units = {str(e.path): {"set": set_of(e), "group": e.group} for e in dataset.test}
-    found, without = [block_rows([], set="", group="", recording="", network="", seed=0)], set()
-    for content in completed:
-        run = {key: content[key] for key in ("network", "seed")}
-        known = {
-            one["path"]: one["blocks"][measure]
-            for one in content["recordings"]
-            if one["blocks"].get(measure)
-        }
-        if not known:
-            without.add(content["network"])
-        found += [block_rows(b, **units[path], recording=path, **run) for path, b in known.items()]
-    table = joined(found)
-    return table[~table["network"].isin(without)]
 
 
 def work_of(tables: Iterable[Completed]) -> pd.DataFrame:
@@ -265,12 +244,10 @@ def _samples(completed: Completed) -> list[Sample]:
     samples: dict[str, Sample] = {}
     for content in completed:
         chosen = content["network"] in ARCHITECTURES and content["seed"] == 0
-        for one in content["recordings"] if chosen else ():
-            if drawn := one.get("drawn"):
-                time, truth, track = (np.array(drawn[key]) for key in ("time", "truth", "track"))
-                new = Sample(one["recording"], time, truth, {})
-                sample = samples.setdefault(one["recording"], new)
-                sample.tracks[content["network"]] = track
+        for recording, drawn in content["drawn"].items() if chosen else ():
+            time, truth, track = (np.array(drawn[key]) for key in ("time", "truth", "track"))
+            sample = samples.setdefault(recording, Sample(recording, time, truth, {}))
+            sample.tracks[content["network"]] = track
     return list(samples.values())
 
 

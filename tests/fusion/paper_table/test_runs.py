@@ -9,13 +9,24 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
 from stario.fusion.commands.cli import app
+from stario.fusion.evaluation.scores import values
 from stario.fusion.paper_table import runs as runs_module
 from stario.fusion.paper_table import training
-from stario.fusion.paper_table.runs import LEADING, Run, backend, complete, complete_run, table_runs
+from stario.fusion.paper_table.runs import (
+    LEADING,
+    PROTOCOLS,
+    TRUE_ATTITUDE,
+    Run,
+    backend,
+    complete,
+    complete_run,
+    table_runs,
+)
 from stario.fusion.paper_table.sets import DataSet, folder_set
 from stario.fusion.paper_table.table import completed_runs, set_table
 from stario.fusion.paper_table.training import ReaderConfig, run_recipe
@@ -99,17 +110,19 @@ def test_a_killed_run_resumes_and_gives_the_same_model(dataset, reading, tmp_pat
 
 
 def assert_complete(folder: Path) -> None:
-    names = {"errors.json", "log.json", "model.json", "model.safetensors", "trained.json"}
+    names = {"scores.json", "log.json", "model.json", "model.safetensors", "trained.json"}
     assert {path.name for path in folder.glob("[!.]*")} == names
     trained = json.loads((folder / "trained.json").read_text())
     assert trained["steps"] == 1
     assert min(trained["windows_per_s"], trained["seconds"]) > 0.0
-    [one] = json.loads((folder / "errors.json").read_text())["recordings"]
-    assert len({len(values) for values in one["drawn"].values()}) == 1
-    assert set(one["tracks"]) == {"network_true_attitude", "network", "filtered"}
-    total, count = map(sum, zip(*one["blocks"]["ate"], strict=True))
-    ate = one["tracks"]["network_true_attitude"]["ate_m"]
-    assert ate == pytest.approx((total / count / 2) ** 0.5)
+    content = json.loads((folder / "scores.json").read_text())
+    [drawn] = content["drawn"].values()
+    assert len({len(values) for values in drawn.values()}) == 1
+    scores, blocks = (pd.DataFrame(content[name]) for name in ("scores", "blocks"))
+    assert set(scores["track"]) == {"poses", *PROTOCOLS}
+    total, count = blocks.loc[blocks["metric"] == "ate", ["squares", "count"]].sum()
+    ate = values(scores, "ate_m", track=TRUE_ATTITUDE)
+    assert ate == pytest.approx([(total / count / 2) ** 0.5])
 
 
 @pytest.mark.usefixtures("narrow_network")
@@ -127,7 +140,7 @@ def test_filled_runs_are_kept_and_only_new_networks_and_seeds_are_trained(
     first = [run(dataset, steps=1), Run(dataset, "pdr", 0, None)]
     assert list(complete(first, tmp_path, reading)) == first
     assert_complete(tmp_path / "own/StarIO/1-steps/seed-0")
-    errors = first[0].folder(tmp_path) / "errors.json"
+    errors = first[0].folder(tmp_path) / "scores.json"
     written = errors.stat().st_mtime_ns
     more = [*first, run(dataset, "StarIO without MSGCU", steps=1), run(dataset, seed=1, steps=1)]
     assert list(complete(more, tmp_path, reading)) == more
@@ -136,10 +149,9 @@ def test_filled_runs_are_kept_and_only_new_networks_and_seeds_are_trained(
     table = set_table(dataset, completed_runs(more, tmp_path)["own"], {})
     pdr, other, ours = table.as_dict()["rows"]
     assert (pdr["network"], other["network"]) == ("pdr", "StarIO without MSGCU")
-    values = table.scores.query("network == 'StarIO' and track == 'network_true_attitude'")
-    values = values[values["metric"] == "ate_m"]["value"].to_list()
-    assert ours["ate"] == pytest.approx(sum(values) / 2)
-    assert ours["ate_sem"] == pytest.approx(abs(values[0] - values[1]) / 2)  # deviation / sqrt(2)
+    ate = values(table.scores, "ate_m", network="StarIO", track=TRUE_ATTITUDE)
+    assert ours["ate"] == pytest.approx(ate.mean())
+    assert ours["ate_sem"] == pytest.approx(abs(ate[0] - ate[1]) / 2)  # deviation / sqrt(2)
     assert np.isnan(other["ate_sem"])
     assert np.isnan(pdr["ate"])
     assert pdr["own_ate"] > 0.0
@@ -153,7 +165,7 @@ def test_runs_of_another_recipe_are_refused_and_other_step_counts_are_separate(
     done = run(dataset, steps=1)
     complete_run(done, tmp_path, reading)
     other = Run(dataset, "StarIO", 0, run_recipe({**RECIPE, "rate": 1e-2}, "StarIO", 0, 1))
-    with pytest.raises(ConfigError, match=r"errors\.json.*another recipe"):
+    with pytest.raises(ConfigError, match=r"scores\.json.*another recipe"):
         complete_run(other, tmp_path, reading)
     [outcome] = complete([other], tmp_path, reading)
     assert isinstance(outcome, Skipped)

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from recorded import DATA
 
+from stario.fusion.evaluation.bootstrap import block_rows
+from stario.fusion.evaluation.scores import joined, scored
 from stario.fusion.paper_table import sets, training
 from stario.fusion.paper_table.figures import pde_boxes
 from stario.fusion.paper_table.sets import ALL, FIRST, DataSet, development_sets, published
@@ -99,18 +101,17 @@ def content(
     ate_m: float, network: str = "StarIO", seed: int = 0, seconds: float = 0.0
 ) -> Mapping[str, Any]:
     """Results on both recordings, the second without a drift."""
-    tracks = [
-        {"network_true_attitude": {"ate_m": ate_m, "rte_m": 2.0, "pde": pde}}
-        for pde in (0.03, None)
+    labels = {"network": network, "seed": seed}
+    names = [str(entry.path) for entry in TESTED]
+    scores = [
+        scored(name, {"network_true_attitude": errors, "poses": {"path_m": 50.0}}, "ridi", **labels)
+        for name, pde in zip(names, (0.03, None), strict=True)
+        for errors in [{"ate_m": ate_m, "rte_m": 2.0, "pde": pde}]
     ]
-    recordings = [
-        {"recording": entry.path.name, "path": str(entry.path), "group": "ridi", "kind": "poses"}
-        | {"path_m": 50.0, "figures": {}}
-        | {"tracks": found, "blocks": {"ate": [[ate_m**2, 1.0]]}}
-        for entry, found in zip(TESTED, tracks, strict=True)
-    ]
-    run = {"network": network, "seed": seed, "seconds": seconds}
-    return {**run, "recordings": recordings, "skipped": []}
+    unit = {"set": "ridi", "group": "ridi", "metric": "ate", **labels}
+    blocks = [block_rows([[ate_m**2, 1.0]], recording=name, **unit) for name in names]
+    tables = {"scores": joined(scores), "blocks": joined(blocks)}
+    return {**labels, **tables, "drawn": {}, "seconds": seconds, "skipped": []}
 
 
 def trained(ate_m: float, seed: int) -> Mapping[str, Any]:
