@@ -321,9 +321,8 @@ def _stretches(at: _AtTicks) -> _Errors:
         track, truth = at.track[part], at.truth[part]
         path = float(np.abs(np.diff(truth[::_LEG])).sum())
         if path >= 5.0:  # else stationary: there is no path to relate errors to
-            seconds = TICK_SECONDS * (start + np.arange(span + 1))
-            error = np.abs(fit_yaw_and_position(track, truth) - truth)
-            yield "stretch_percent", seconds, 100.0 * error / path
+            percent = 100.0 * np.abs(fit_yaw_and_position(track, truth) - truth) / path
+            yield "stretch_percent", np.full_like(percent, TICK_SECONDS * start), percent
 
 
 def _nis(piece: Piece, start: np.ndarray, true_N: Complex) -> FloatArray:

@@ -146,8 +146,8 @@ def set_table(
 
 def _means(means: pd.DataFrame, network: str) -> dict[str, float]:
     found = means.reindex([(network, track, metric) for _, track, metric in COLUMNS.values()])
-    errors = zip((f"{key}_sem" for key in COLUMNS), found["sem"], strict=True)
-    return dict(zip(COLUMNS, found["mean"], strict=True)) | dict(errors)
+    rows = zip(COLUMNS, found["mean"], found["sem"], strict=True)
+    return {k: v for key, mean, error in rows for k, v in ((key, mean), (f"{key}_sem", error))}
 
 
 def _scores(completed: Completed) -> pd.DataFrame:
