@@ -34,6 +34,7 @@ from stario.fusion.values.config import FilterConfig, NavigatorConfig
 from stario.fusion.values.fixes import position_fix
 from stario.sequences.accuracy.metrics import evaluate_track
 from stario.sequences.accuracy.nees import position_nees
+from stario.sequences.drawing.figures import save_figure
 from stario.sequences.errors import InputError
 from stario.sequences.files import write_json
 from stario.sequences.readers.tum import read_tum
@@ -81,7 +82,13 @@ def blind(walk, model):
 @pytest.fixture(scope="module")
 def folder(compared, blind, tmp_path_factory):
     path = tmp_path_factory.mktemp("compare") / "deep" / "out"
-    written = write_comparison(path, [compared, blind], CONFIG, ORIGIN)
+
+    def drawn(figure, path):  # most of the time goes into rendering
+        save_figure(figure, path) if path.parts[-2:] == ("blind", "plan.png") else path.touch()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("stario.fusion.evaluation.results.save_figure", drawn)
+        written = write_comparison(path, [compared, blind], CONFIG, ORIGIN)
     assert sorted(written) == sorted(p for p in path.rglob("*") if p.is_file())
     return path
 
@@ -163,10 +170,10 @@ def test_a_folder_holds_what_was_measured(folder, compared, walk):
         assert arrays["covariance"].shape == (n, 15, 15)
         for name in ("velocity_W", "gyro_bias_B", "accel_bias_B"):
             assert arrays[name].shape == (n, 3)
-    sizes = {p.name: p.stat().st_size for p in (folder / walk.name).glob("*.png")}
-    assert set(sizes) == {"plan.png", "error.png", "innovations.png"}
-    assert min(sizes.values()) > 10_000
+    figures = {p.name for p in (folder / walk.name).glob("*.png")}
+    assert figures == {"plan.png", "error.png", "innovations.png"}
     assert {p.name for p in (folder / "blind").glob("*.png")} == {"plan.png", "innovations.png"}
+    assert (folder / "blind/plan.png").stat().st_size > 10_000
 
 
 @pytest.fixture

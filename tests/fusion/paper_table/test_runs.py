@@ -35,7 +35,6 @@ from stario.sequences.datasets.batch import Skipped
 from stario.sequences.errors import ConfigError, InputError, WeightsError
 from stario.sequences.readers import read_recording
 from stario.sequences.readers.csv_writer import write_csv
-from stario.sequences.sequence import PositionTrack
 
 RECIPE: dict[str, object] = {"batch": 6, "device": "cpu", "attitude": "true"}
 
@@ -55,36 +54,6 @@ def reading(tmp_path_factory):
 
 def run(dataset: DataSet, network: str = "StarIO", seed: int = 0, steps: int = 4) -> Run:
     return Run(dataset, network, seed, run_recipe(RECIPE, network, seed, steps))
-
-
-def test_without_recorded_poses_the_legs_alone_select_the_weights(
-    dataset, make_walk, tmp_path, monkeypatch
-):
-    chosen = []
-
-    def trained(recipe, data, validation, *rest, **options):
-        chosen.append(validation.simulated)
-        raise InputError("stop", "enough", "no training")
-
-    def waypoints(path):
-        walk = read_recording(path)
-        time = walk.truth.time[0] + np.arange(0.5, 16.0, 3.0)
-        track = PositionTrack(time, walk.truth.at(time).position_W[:, :2], "waypoints")
-        return replace(walk, truth=None, positions=track)
-
-    long = [tmp_path / f"walk{seed}.csv" for seed in range(3)]
-    for seed, path in enumerate(long):
-        write_csv(path, make_walk(seed=seed, seconds=16.0))
-    monkeypatch.setattr(training, "train", trained)
-    monkeypatch.setattr(training, "cached_walks", lambda *arguments, **rest: [])
-    recipe = run_recipe(RECIPE, "StarIO", 0, 1)
-    for files, read in ((long, waypoints), (long, read_recording)):
-        alone = replace(dataset, training=tuple(files[:1]), validation=tuple(files[1:]))
-        with pytest.raises(InputError, match="stop"):
-            training.train_run(
-                alone, recipe, tmp_path, ReaderConfig(read, {}, tmp_path / read.__name__)
-            )
-    assert chosen == [True, False]
 
 
 @pytest.mark.usefixtures("narrow_network")

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.files import write_json
 from stario.sequences.readers import read_recording
 from stario.sequences.readers.csv_writer import write_csv
+from stario.sequences.sequence import PositionTrack
 
 needs_data = pytest.mark.skipif(not (DATA / "archives").exists(), reason=f"no data in {DATA}")
 
@@ -161,45 +162,54 @@ def test_published_figures_are_found_by_set_and_network():
     assert published("tyrex", "StarIO") is None
 
 
-@pytest.fixture
-def dataset(make_walk, tmp_path):
-    files = [tmp_path / f"{name}.csv" for name in "abc"]
+@pytest.fixture(scope="module")
+def dataset(make_walk, tmp_path_factory):
+    files = [tmp_path_factory.mktemp("walks") / f"{name}.csv" for name in "abc"]
     for seed, path in enumerate(files):
-        write_csv(path, make_walk(seed=seed, seconds=8.0))
+        write_csv(path, make_walk(seed=seed, seconds=16.0))
     return DataSet("own", tuple(files[:2]), (files[2],), (), "")
 
 
 @pytest.fixture
-def weights(monkeypatch):
-    """Replace training by a log with three epochs; holds the weight of each stream."""
-    found = {}
+def train(monkeypatch, dataset, tmp_path):
+    """Train in name only, with a log of three epochs; return also the data of both parts."""
 
-    def trained(recipe, data, validation, folder, **rest):
-        pairs = zip(data.streams, data.weights, strict=True)
-        found.update((stream.name, weight * len(stream)) for stream, weight in pairs)
+    def logged(recipe, data, validation, folder, **rest):
+        given.extend([data, validation])
         errors = (0.5, 0.1), (0.4, float("nan")), (0.3, 0.2)
-        write_json(
-            folder / "log.json",
-            [asdict(EpochReport(k, *pair, {})) for k, pair in enumerate(errors, 1)],
-        )
+        reports = [asdict(EpochReport(k, *pair, {})) for k, pair in enumerate(errors, 1)]
+        write_json(folder / "log.json", reports)
 
-    monkeypatch.setattr(training, "train", trained)
-    return found
+    def run(read=read_recording, **values):
+        given.clear()
+        recipe = run_recipe({"likelihood_from": 0.0, "epochs": 3, **values}, "StarIO", 0, None)
+        reading = ReaderConfig(read, {}, tmp_path / read.__name__)
+        return train_run(dataset, recipe, tmp_path, reading), *given
+
+    given: list[Any] = []
+    monkeypatch.setattr(training, "train", logged)
+    return run
 
 
-def trained_cell(dataset: DataSet, folder: Path, **values: object) -> dict[str, object]:
-    recipe = run_recipe({"likelihood_from": 0.0, "epochs": 3, **values}, "StarIO", 0, None)
-    return train_run(dataset, recipe, folder, ReaderConfig(read_recording, {}, folder / "cache"))
-
-
-def test_the_validation_error_is_that_of_the_epoch_whose_weights_are_kept(
-    dataset, weights, tmp_path
-):
-    done = trained_cell(dataset, tmp_path)
+def test_the_validation_error_is_that_of_the_epoch_whose_weights_are_kept(train):
+    done, _, _ = train()
     assert (done["training_error_m2"], done["validation_error_m2"]) == (0.3, 0.1)
 
 
-def test_the_shares_of_the_recipe_are_used(dataset, weights, tmp_path):
-    trained_cell(dataset, tmp_path, shares={"a.csv": 0.9}, augmentation={"speeds": [1.0, 1.0]})
+def test_the_shares_of_the_recipe_are_used(train):
+    _, data, _ = train(shares={"a.csv": 0.9}, augmentation={"speeds": [1.0, 1.0]})
+    pairs = zip(data.streams, data.weights, strict=True)
+    weights = {stream.name: weight * len(stream) for stream, weight in pairs}
     shares = np.array([weights["a"], weights["b"]]) / sum(weights.values())
     assert shares == pytest.approx([0.9, 0.1], abs=0.01)
+
+
+def test_without_recorded_poses_the_legs_alone_select_the_weights(train, monkeypatch):
+    def waypoints(path):
+        walk = read_recording(path)
+        time = walk.truth.time[0] + np.arange(0.5, 16.0, 3.0)
+        track = PositionTrack(time, walk.truth.at(time).position_W[:, :2], "waypoints")
+        return replace(walk, truth=None, positions=track)
+
+    monkeypatch.setattr(training, "cached_walks", lambda *arguments, **rest: [])
+    assert [train(read)[2].simulated for read in (waypoints, read_recording)] == [True, False]
