@@ -16,13 +16,6 @@ from stario.sequences.simulation.moments import MOMENTS
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_compare_prints_json_and_writes_the_same(stario, recording, tmp_path):
-    done = stario("compare", recording, "--out", "out", "--json")
-    assert done.code == 0
-    assert json.loads(done.out) == json.loads((tmp_path / "out/metrics.json").read_text())
-
-
-@pytest.mark.usefixtures("no_figures")
 def test_compare_sets_the_track_against_dead_reckoning(stario, recording):
     done = stario("compare", recording, "--out", "out")
     assert done.err == ""
@@ -35,6 +28,7 @@ def test_compare_sets_the_track_against_dead_reckoning(stario, recording):
         seen,
     )
     assert files.startswith("figures and tracks: out/walk/plan.png")
+    assert "root mean square" not in done.out
     assert {path.stem for path in Path("out/walk").glob("*.tum")} == {
         *("track", "dead_reckoning", "truth"),
     }
@@ -46,11 +40,6 @@ def test_compare_prints_a_table_of_further_tracks_and_explains_on_request(stario
     rows = [line.split()[0] for line in done.out.splitlines()]
     assert [row for row in rows if row in TRACKS] == list(TRACKS)
     assert "root mean square of the position error's norm" in done.out
-    two = stario("compare", recording, "--tracks", "filtered")
-    assert "root mean square" not in two.out
-    assert {row for line in two.out.splitlines() if (row := line.split()[0]) in TRACKS} == {
-        *("track", "filtered", "dead_reckoning"),
-    }
     stario("compare", recording, "--tracks", "ekf").assert_one_line_error("--tracks", "filtered")
 
 
@@ -76,20 +65,20 @@ def test_check_gaps_reports_how_far_missing_samples_move_the_end(stario, recordi
 
 def test_check_moments_reports_what_a_bad_moment_costs(stario, recording, monkeypatch):
     checks = "stario.fusion.evaluation.checks.moments"
-    monkeypatch.setattr(f"{checks}.MOMENTS", MOMENTS[-1:])
+    monkeypatch.setattr(f"{checks}.MOMENTS", MOMENTS[:1])
     monkeypatch.setattr(f"{checks}.PLACES", {"middle": 0.5})
     done = stario("check", "moments", recording, "--graph", "--json")
     assert done.code == 0
     found = json.loads(done.out)
     assert [(one["recording"], one["group"], one["track"]) for one in found] == [
-        ("walk", "lift, middle", track) for track in ("filtered", "track")
+        ("walk", "shake 10 s, middle", track) for track in ("filtered", "track")
     ]
     assert all(one["error_with"] > 0.0 for one in found)
     monkeypatch.setattr(f"{checks}.CARRIES", ("bag",))
     simulated = "stario.fusion.evaluation.checks.simulation.simulated_walk"
     monkeypatch.setattr(simulated, lambda carry, seed: read_generic_csv(recording))
     shown = stario("check", "moments")
-    assert "lift, middle" in shown.out
+    assert "shake 10 s, middle" in shown.out
     stario("check", "moments", "--axes", "y,-x,z").assert_one_line_error("--axes", "simulated")
 
 

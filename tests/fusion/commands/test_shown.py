@@ -48,7 +48,8 @@ def test_compare_writes_a_report_of_what_is_known_next_to_the_tracks(
 ):
     write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
     tracks = ("--report", "--tracks", "network")
-    assert stario("compare", recording, "--out", "told", *tracks).code == 0
+    printed = stario("compare", recording, "--out", "told", *tracks, "--json").out
+    assert json.loads(printed) == json.loads((tmp_path / "told/metrics.json").read_text())
     told = stario("compare", "blind.csv", "--out", "told", *tracks).out
     assert "ATE" not in told
     assert "NIS" in told

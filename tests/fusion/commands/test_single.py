@@ -89,10 +89,8 @@ def test_the_installed_command_has_the_same_exit_codes(tmp_path):
     if not command.exists():
         pytest.skip("stario is not installed next to this Python")
 
-    def code(*arguments):
-        return subprocess.run([command, *arguments], capture_output=True, cwd=tmp_path).returncode
-
-    assert [code("--help"), code("convert", "one.csv")] == [0, 1]
+    done = subprocess.run([command, "convert", "one.csv"], capture_output=True, cwd=tmp_path)
+    assert done.returncode == 1
 
 
 def test_a_bug_is_not_reported_as_an_error_of_the_user(stario, monkeypatch, recording):
