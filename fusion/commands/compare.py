@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -16,6 +16,8 @@ from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from stario.fusion.evaluation.compare import Comparison
     from stario.fusion.evaluation.pedestrian import Model
     from stario.sequences.datasets.batch import Skipped
@@ -241,20 +243,14 @@ def _groups(
     as_json: bool,
 ) -> list[Skipped]:
     """Print and write the table of groups; return the recordings that were skipped."""
-    from stario.fusion.evaluation.groups import alone_on, benchmark, write_benchmark
+    from stario.fusion.evaluation.groups import benchmark, write_benchmark
 
     weights = list(dict.fromkeys([ours, theirs or ours]))
     for name in weights:
         if _GROUP not in name and _SET not in name:
             _for_group(name, "")  # fail on unloadable weights before preparing anything
-    work = partial(
-        alone_on,
-        groups=groups,
-        model=_for_group,
-        weights=weights,
-        read=reading.read,
-        filtered=filtered,
-    )
+    judged = {"model": _for_group, "weights": weights, "filtered": filtered}
+    work = partial(_alone, reading=reading, groups=groups, **judged)
     found, skipped = common.each_used("evaluate", work, groups, jobs)
     if found:
         table = benchmark(found, by, ours, theirs)
@@ -262,6 +258,15 @@ def _groups(
             write_benchmark(out, table)
         common.print_result(as_json, table.as_dict(), table.text())
     return skipped
+
+
+def _alone(
+    path: Path, reading: options.Reading, groups: Mapping[Path, str], **judged: Any
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return what `alone_on` does of a path; further processes know it by its name."""
+    from stario.fusion.evaluation.groups import alone_on
+
+    return alone_on(reading.read(path), path, groups[path], **judged)
 
 
 def _for_group(name: str, group: str) -> Model:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
@@ -126,7 +126,7 @@ def simulate(
         help="Motion capture to carry the device: a BVH file, or a clip of an HDF5 file, "
         "FILE.h5:CLIP. Default: a generated walk.",
     ),
-    imu: str = typer.Option("phone", help="Sensor model: phone, good or perfect."),
+    imu: Literal["phone", "good", "perfect"] = typer.Option("phone", help="Sensor model."),
     magnetometer: bool = options.flag(
         False, "--magnetometer", help="Also simulate a magnetometer inside a building."
     ),
@@ -141,7 +141,6 @@ def simulate(
     as_json: options.Json = False,
 ) -> None:
     """Write a simulated walk, or a device on motion capture, with its truth as a CSV recording."""
-    from stario.sequences.arrays import check_choice
     from stario.sequences.readers.csv_writer import write_csv
     from stario.sequences.simulation.house import simulate_house
     from stario.sequences.simulation.imu import GOOD_IMU, PERFECT_IMU, PHONE_IMU, simulate_imu
@@ -152,8 +151,7 @@ def simulate(
         fix = "use `stario convert` for other formats and folders"
         raise InputError("path", str(path), "a file name ending in .csv", fix)
     common.check_new("path", path, overwrite)
-    sensors = {"phone": PHONE_IMU, "good": GOOD_IMU, "perfect": PERFECT_IMU}
-    errors = sensors[check_choice("--imu", imu, sensors)]
+    errors = {"phone": PHONE_IMU, "good": GOOD_IMU, "perfect": PERFECT_IMU}[imu]
     name, stays = path.stem, []
     if body is not None:
         options.refuse(context, "with --body", "use without", "seconds", "magnetometer", "floors")

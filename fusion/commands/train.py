@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
@@ -51,10 +51,10 @@ def train(
         help="Folder of the development recordings: train on all that the package lists except "
         "the test recordings; select and calibrate on those of its list `holdout`.",
     ),
-    learn_from: str = typer.Option(
+    learn_from: Literal["all", "open", "few"] = typer.Option(
         "all",
-        help="With --data: all, open (those whose licence allows any use) or few (the eight "
-        "recordings of the paper's comparison).",
+        help="With --data: all, those whose licence allows any use, or the eight recordings of "
+        "the paper's comparison.",
     ),
     leave_out: list[str] | None = typer.Option(
         None,
@@ -189,15 +189,13 @@ def packaged_lists(
     few.
 
     Raises:
-        InputError: a list or group does not exist.
+        InputError: a group does not exist.
     """
     from stario.network.training.splits import read_packaged_list, without_holdout
-    from stario.sequences.arrays import check_choice
     from stario.sequences.datasets.splits import hold_out_group
 
     if data is None:
         return [], []
-    check_choice("--learn-from", name, ("all", "open", "few"))
     everything = (
         read_packaged_list("training", data) + read_packaged_list("validation", data)
         if name == "few"

@@ -194,28 +194,27 @@ def verdict(rows: pd.DataFrame) -> str:
 
 
 def alone_on(
+    sequence: ImuSequence,
     path: Path,
-    groups: Mapping[Path, str],
+    group: str,
     model: Callable[[str, str], Model],
     weights: Collection[str],
-    read: Callable[[Path], ImuSequence],
     filtered: bool = False,
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Score networks alone on a recording; return rows of a benchmark's scores and of its blocks.
 
     Args:
-        path: path of the recording.
-        groups: group of each recording, by path; empty for the name of the set.
+        sequence: the recording.
+        path: its path.
+        group: its group in a list; empty for that of its person or set.
         model: function that returns the network by the name of its weights for a group: networks
             differ between groups if each group was held out of training in turn.
         weights: names of the weights.
-        read: function that reads a path.
         filtered: whether the filter is run for its mean NIS, which is slow.
     """
-    sequence = read(path)
     streams, (kind, _) = usable_streams(sequence), known_truth(sequence)
     warn_of_truth(sequence)
-    named = labels(path, sequence.attributes, groups[path])
+    named = labels(path, sequence.attributes, group)
     group, others = named["group"], {key: n for key, n in named.items() if key != "group"}
     unit = {"set": named["set"], "group": group, "recording": str(path)}
     figures, blocks = {}, []

@@ -202,22 +202,24 @@ def _recording(
     groups: Mapping[Path, str],
 ) -> tuple[pd.DataFrame, pd.DataFrame, Drawn]:
     sequence = read(path)
-    found, blocks = alone_on(path, groups, lambda *_: model, [network], lambda _: sequence)
+    found, blocks = alone_on(sequence, path, groups[path], lambda *_: model, [network])
     found = found.assign(track=found["truth"], network=network)
     scores, drawn = [found[[*COLUMNS, "network"]]], {}
     if sequence.truth is not None:
-        unit = {key: found[key].iloc[0] for key in ("set", "group", "recording")}
+        unit = {key: found[key].iloc[0] for key in ("set", "group", "recording", "network")}
         tracks, poses = _protocol_errors(model, sequence)
         scores.append(scored(str(path), tracks, unit["group"], network=network))
         if poses is not None:
-            time, squares = poses.estimate.time, (poses.position_W[:, :2] ** 2).sum(axis=1)
-            sums = pd.Series(squares).groupby((time - time[0]) // BLOCK_SECONDS)
-            labels = {**unit, "network": network, "seed": 0, "metric": "ate"}
-            ate = block_rows(sums.agg(["sum", "count"]).to_numpy(), **labels)
-            blocks = joined([blocks, ate])
-            xy = {"track": poses.estimate.position_W[:, :2], "truth": poses.truth.position_W[:, :2]}
-            drawn = {"time": time, **xy}
+            blocks = joined([blocks, _position_blocks(poses, **unit)])
+            estimate, truth = (each.position_W[:, :2] for each in (poses.estimate, poses.truth))
+            drawn = {"time": poses.estimate.time, "track": estimate, "truth": truth}
     return joined(scores), blocks, drawn
+
+
+def _position_blocks(poses: PoseErrors, **labels: str) -> pd.DataFrame:
+    since, squares = poses.estimate.time - poses.estimate.time[0], poses.position_W[:, :2] ** 2
+    sums = pd.Series(squares.sum(axis=1)).groupby(since // BLOCK_SECONDS).agg(["sum", "count"])
+    return block_rows(sums.to_numpy(), seed=0, metric="ate", **labels)
 
 
 def _protocol_errors(

@@ -71,6 +71,7 @@ def test_help_shows_a_commands_own_options_first_and_names_every_format():
         ["train", "--epochs", "0"],
         ["evaluate", "walk.csv", "--by", "mood"],
         ["check", "fixes", "walk.csv", "--backend", "ukf"],
+        ["simulate", "a.csv", "--imu", "tactical"],
     ],
 )
 def test_wrong_usage_exits_with_code_2(stario, arguments):

@@ -77,7 +77,6 @@ def test_a_broken_file_is_named_in_one_line(stario, tmp_path, content, words):
         (["convert", "RECORDING", "a.h5", "--to", "csv"], ["a.h5", "csv"]),
         (["convert", "RECORDING", "a.csv", "--to", "euroc"], ["a.csv", "euroc"]),
         (["simulate", "a.csv", "--carry", "drone"], ["carry", "drone"]),
-        (["simulate", "a.csv", "--imu", "tactical"], ["--imu", "tactical"]),
         (["train", "--config", "missing.json"], ["missing.json"]),
         (["train"], ["PATH", "--data"]),
         (["train", "--data", ".", "--where", "person=dan"], ["--where: found use with --data"]),

@@ -197,13 +197,13 @@ def judged(
     paths = {Path(name): (groups or {}).get(name, "") for name in recordings}
     found = [
         alone_on(
+            recordings[str(path)],
             path,
-            paths,
+            group,
             lambda name, group: models[name](group),
             models,
-            lambda path: recordings[str(path)],
         )
-        for path in paths
+        for path, group in paths.items()
     ]
     return benchmark(found, by, *models)
 
