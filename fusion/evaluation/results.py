@@ -156,10 +156,10 @@ def _on_map(run: Comparison) -> Files:
     """Return the main track's files for maps, if it is known where on the earth it lies."""
     if run.georeference is None:
         return {}
-    found, name = on_map(run.track, run.georeference), run.sequence.name
+    parts, name = on_map(run.track, run.georeference), run.sequence.name
     return {
-        "track.geojson": partial(write_geojson, name=name, found=found),
-        "track.gpx": partial(write_gpx, name=name, found=found),
+        "track.geojson": partial(write_geojson, name=name, parts=parts),
+        "track.gpx": partial(write_gpx, name=name, parts=parts),
     }
 
 
