@@ -14,8 +14,15 @@ import pandas as pd
 from stario.fusion.evaluation.bootstrap import Interval, ranks
 from stario.fusion.evaluation.pedestrian import NAME as PDR
 from stario.fusion.evaluation.scores import joined, over_seeds, scored
-from stario.fusion.paper_table.figures import Sample, write_figures
-from stario.fusion.paper_table.runs import FILTERED, OWN_ATTITUDE, TRUE_ATTITUDE, Run, read_run
+from stario.fusion.paper_table.figures import write_figures
+from stario.fusion.paper_table.runs import (
+    FILTERED,
+    OWN_ATTITUDE,
+    TRUE_ATTITUDE,
+    Drawn,
+    Run,
+    read_run,
+)
 from stario.fusion.paper_table.sets import DataSet, published
 from stario.network.architectures import ARCHITECTURES
 from stario.network.runtime.survey import BATCHES, ModelRow, survey
@@ -239,16 +246,15 @@ def write_results(
     return text
 
 
-def _samples(completed: Completed) -> list[Sample]:
+def _samples(completed: Completed) -> dict[str, dict[str, Drawn]]:
     """Return the tracks to draw, of networks trained with the first seed."""
-    samples: dict[str, Sample] = {}
+    samples: dict[str, dict[str, Drawn]] = {}
     for content in completed:
         chosen = content["network"] in ARCHITECTURES and content["seed"] == 0
         for recording, drawn in content["drawn"].items() if chosen else ():
-            time, truth, track = (np.array(drawn[key]) for key in ("time", "truth", "track"))
-            sample = samples.setdefault(recording, Sample(recording, time, truth, {}))
-            sample.tracks[content["network"]] = track
-    return list(samples.values())
+            arrays = {key: np.array(values) for key, values in drawn.items()}
+            samples.setdefault(recording, {})[content["network"]] = arrays
+    return samples
 
 
 def table_text(
