@@ -249,7 +249,7 @@ def _groups(
     for name in weights:
         if _GROUP not in name and _SET not in name:
             _for_group(name, "")  # fail on unloadable weights before preparing anything
-    judged = {"model": _for_group, "weights": weights, "filtered": filtered}
+    judged: dict[str, Any] = {"model": _for_group, "weights": weights, "filtered": filtered}
     work = partial(_alone, reading=reading, groups=groups, **judged)
     found, skipped = common.each_used("evaluate", work, groups, jobs)
     if found:
