@@ -38,7 +38,14 @@ from stario.sequences.levelled_stream import (
     LevelledStream,
     levelled_streams,
 )
-from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, PositionTrack, is_gap
+from stario.sequences.sequence import (
+    BoolArray,
+    FloatArray,
+    ImuSequence,
+    PositionTrack,
+    Trajectory,
+    is_gap,
+)
 
 HORIZONS = (1, 10, 30)
 """Spans [s] over which displacements are compared."""
@@ -198,7 +205,11 @@ def recording_errors(
     for k, piece in enumerate(pieces):
         weighted = weighted_force(piece.stream.windows())
         total_direction += direction(weighted, piece.displacement_N, TICKS_PER_SECOND)
-        of_kind = _waypoints(piece, known) if kind == "waypoints" else _positions(piece, sequence)
+        of_kind = (
+            _waypoints(piece, known)
+            if kind == "waypoints"
+            else _positions(piece, known, sequence.truth)
+        )
         rows += [(metric, k, seconds, errors) for metric, seconds, errors in of_kind]
     table = pd.DataFrame(rows, columns=["metric", "piece", "second", "error"])
     table = table.explode(["second", "error"]).astype({"second": float, "error": float})
@@ -228,9 +239,8 @@ def _blocks(errors: pd.DataFrame) -> pd.DataFrame:
     return errors.groupby(by)["squares"].agg(squares="sum", count="count").reset_index("metric")
 
 
-def _positions(piece: Piece, sequence: ImuSequence) -> _Errors:
+def _positions(piece: Piece, known: PositionTrack, poses: Trajectory | None) -> _Errors:
     """Yield the errors at known positions; poses also tell the yaw at each tick."""
-    (_, known), poses = known_truth(sequence), sequence.truth
     track = piece.track()
     ticks = piece.stream.ticks[: len(track)]
     if poses is None:
