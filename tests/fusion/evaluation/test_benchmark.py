@@ -4,19 +4,23 @@ import csv
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
-from displacement_stub import Stub, errors_of, horizontal_path, streams_of, with_waypoints
 from recorded import DATA
+from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.displacement_error import (
     _AtTicks,
     _interpolated,
     _stretches,
     known_truth,
+    recording_errors,
+    usable_streams,
 )
 from stario.fusion.evaluation.groups import (
     RATIOS,
@@ -28,13 +32,60 @@ from stario.fusion.evaluation.groups import (
     verdict,
     write_benchmark,
 )
-from stario.fusion.evaluation.pedestrian import PedestrianDeadReckoning
+from stario.fusion.evaluation.pedestrian import Model, PedestrianDeadReckoning, piece_of
 from stario.fusion.evaluation.scores import POOLED, values
+from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.errors import InputError
+from stario.sequences.levelled_stream import LevelledStream
 from stario.sequences.readers import read_recording
 from stario.sequences.sequence import ImuSequence, PositionTrack, is_gap
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
+
+streams_of = cache(usable_streams)
+
+
+def with_waypoints(walk: ImuSequence, every: float = 8.0) -> ImuSequence:
+    truth = walk.truth
+    time = np.arange(1.0, 70.0, every)
+    xy = truth.at(time).position_W[:, :2]
+    return replace(walk, truth=None, positions=PositionTrack(time, xy, "waypoints"))
+
+
+def yaw_WN(walk: ImuSequence, stream: LevelledStream) -> np.ndarray:
+    """Yaw (K,) that rotates N to the true world at each tick."""
+    attitude_WB = walk.truth.at(stream.ticks).attitude_WB
+    return yaw_of(attitude_WB * Rotation.from_matrix(stream.R_NB).inv())
+
+
+class Stub:
+    """Predictor of the true displacements of successive windows, scaled and rotated."""
+
+    def __init__(self, walk: ImuSequence, scale: float = 1.0, yaw: float = 0.0) -> None:
+        [stream] = streams_of(walk)
+        known = walk.truth.at(stream.ticks).position_W[:, :2] @ [1.0, 1j]
+        steps = np.exp(-1j * yaw_WN(walk, stream)[:-2]) * (known[2:] - known[:-2])
+        steps = scale * np.exp(1j * yaw) * steps[: stream.window_count]
+        steps = np.pad(steps, (0, stream.window_count - len(steps)), "edge")
+        steps = np.exp(-1j * stream.headings) * steps  # in the windows' frames
+        self.displacement_H = np.stack([steps.real, steps.imag, 0.0 * steps.real], axis=1)
+        self.served = 0
+
+    def predict(self, windows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        first, self.served = self.served, self.served + len(windows)
+        covariance = np.broadcast_to(0.01 * np.eye(3), (len(windows), 3, 3))
+        return self.displacement_H[first : self.served], covariance
+
+
+def errors_of(recording: ImuSequence, model: Model) -> tuple[dict[str, float], pd.DataFrame]:
+    """Figures, and blocks of squared errors."""
+    return recording_errors(recording, [piece_of(model, s) for s in streams_of(recording)])
+
+
+def horizontal_path(walk: ImuSequence) -> float:
+    truth = walk.truth
+    return replace(truth, position_W=truth.position_W * [1.0, 1.0, 0.0]).path_length()
+
 
 STYLE = WalkStyle(carry="trolley")  # without sway, which windows that overlap smooth
 
