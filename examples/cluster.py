@@ -13,29 +13,30 @@ import tempfile
 from pathlib import Path
 
 import joblib
+import pandas as pd
 from distributed import Client, LocalCluster
 
-from stario.fusion import Scores, compare_recordings, scores_of, summary_table
+from stario.fusion import compare_recordings, summary_table
 from stario.sequences import Skipped, generate_walk, simulate_imu, write_csv
 
 
-def evaluate(paths: list[Path], client: Client) -> tuple[list[Scores], list[Skipped]]:
-    """Return the recordings' figures, in their order, and the recordings that were skipped."""
+def evaluate(paths: list[Path], client: Client) -> tuple[pd.DataFrame, list[Skipped]]:
+    """Return the recordings' scores, in their order, and the recordings that were skipped."""
     scores, skipped = [], []
     with joblib.parallel_config(backend="dask", client=client):
         for outcome in compare_recordings(paths, "default", truth_needed=True):
             if isinstance(outcome, Skipped):
                 skipped.append(outcome)
             else:
-                scores.append(scores_of(outcome))
-    return scores, skipped
+                scores.append(outcome.scores)
+    return pd.concat(scores), skipped
 
 
-def main(folder: Path, seconds: float = 20.0) -> tuple[list[Scores], list[Skipped], set[str]]:
+def main(folder: Path, seconds: float = 20.0) -> tuple[pd.DataFrame, list[Skipped], set[str]]:
     """Simulate four recordings, corrupt one, and evaluate them on two workers.
 
     Returns:
-        Figures, skipped recordings, and the workers that computed something.
+        Scores, skipped recordings, and the workers that computed something.
     """
     paths = [folder / f"walk-{seed}.csv" for seed in range(4)]
     for seed, path in enumerate(paths):

@@ -8,8 +8,8 @@ Configure: `NavigatorConfig`, `FilterConfig`, `GraphConfig`, `PlaceConfig`, `rea
 
 Fixes from outside: `Fix`, `FixOutcome`, `position_fix`, `velocity_fix`, `yaw_fix`, `read_fixes`.
 
-Compare tracks: `compare`, `Comparison`, `compare_recordings`, `Scores`, `scores_of`,
-`summary_table`, `network_track`, `inertial_track`, `demonstration`.
+Compare tracks: `compare`, `Comparison`, `compare_recordings`, `summary_table`, `network_track`,
+`inertial_track`, `demonstration`.
 
 Parts on their own: `UpdateResult`, `preintegrate`, `Segment`, `Predictor`,
 `PreprocessedRecording`, `WindowDisplacement`.

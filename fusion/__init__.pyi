@@ -5,8 +5,6 @@ from stario.fusion.evaluation.compare import Comparison as Comparison
 from stario.fusion.evaluation.compare import compare as compare
 from stario.fusion.evaluation.compare import compare_recordings as compare_recordings
 from stario.fusion.evaluation.compare import demonstration as demonstration
-from stario.fusion.evaluation.text import Scores as Scores
-from stario.fusion.evaluation.text import scores_of as scores_of
 from stario.fusion.evaluation.text import summary_table as summary_table
 from stario.fusion.evaluation.tracks import inertial_track as inertial_track
 from stario.fusion.evaluation.tracks import network_track as network_track

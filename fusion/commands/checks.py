@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, get_args
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -16,7 +16,6 @@ from stario.fusion.commands.table import table
 if TYPE_CHECKING:
     import pandas as pd
 
-    from stario.fusion.backends import BackendName
     from stario.fusion.imu.inference import Predictor
     from stario.fusion.values.config import NavigatorConfig
     from stario.sequences.datasets.batch import Skipped
@@ -36,11 +35,8 @@ def _of_recordings(
     by: str = "",
 ) -> Found:
     """Score each recording, as one of its group if they are grouped by a label."""
-    from stario.fusion.evaluation.groups import By, labels
-    from stario.sequences.arrays import check_choice
+    from stario.fusion.evaluation.groups import labels
 
-    if by:
-        check_choice("--by", by, get_args(By))
     model, settings = estimating.network(), estimating.settings()
 
     def of_named(path: Path, sequence: ImuSequence) -> pd.DataFrame:
@@ -194,17 +190,14 @@ def fixes(
     estimating: options.Estimator,
     every: float = typer.Option(5.0, min=0.1, help="Interval between fixes in s."),
     sigma: float = typer.Option(0.3, min=0.001, help="Fix sigma per axis \\[m]."),
-    backend: str = typer.Option("ekf", help="Estimator: ekf or graph."),
+    backend: Literal["ekf", "graph"] = typer.Option("ekf", help="Estimator."),
     by: options.By = "set",
     as_json: options.Json = False,
 ) -> None:
     """Supply periodic true positions; check that position and yaw errors match their sigmas."""
-    from stario.fusion.backends import BackendName
     from stario.fusion.evaluation.checks.fusion import fixes_table, track_with_fixes
-    from stario.sequences.arrays import check_choice
 
-    chosen: BackendName = check_choice("--backend", backend, get_args(BackendName))
-    score = partial(track_with_fixes, every=every, sigma=sigma, backend=chosen)
+    score = partial(track_with_fixes, every=every, sigma=sigma, backend=backend)
     _print(_of_recordings(reading, estimating, paths, score, by), fixes_table, as_json)
 
 
@@ -265,7 +258,7 @@ def moments(
     from stario.fusion.evaluation.checks.moments import CARRIES, moment_costs, moment_table
     from stario.fusion.evaluation.checks.simulation import simulated_walk
 
-    score = partial(moment_costs, backends=_backends(graph), seed=seed)
+    score = partial(moment_costs, graph=graph, seed=seed)
     if paths:
         found = _of_recordings(reading, estimating, paths, score)
     else:
@@ -305,10 +298,6 @@ def simulation(
 
     more, skipped = common.map_recordings("simulation", reading, paths or [], recorded)
     _print((found + more, skipped), check.motion_table, as_json)
-
-
-def _backends(graph: bool) -> tuple[BackendName, ...]:
-    return ("ekf", "graph") if graph else ("ekf",)
 
 
 COMMANDS = (

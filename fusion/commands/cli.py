@@ -9,20 +9,16 @@ from __future__ import annotations
 import logging
 import sys
 from collections import deque
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
 
 from stario.fusion.commands import checks, options
-from stario.fusion.commands.compare import compare
-from stario.fusion.commands.convert import convert
-from stario.fusion.commands.evaluate import evaluate
-from stario.fusion.commands.export import export
-from stario.fusion.commands.inspect import inspect
-from stario.fusion.commands.live import live
-from stario.fusion.commands.run import run
-from stario.fusion.commands.simulate import simulate
-from stario.fusion.commands.train import train
+from stario.fusion.commands.compare import compare, evaluate
+from stario.fusion.commands.convert import convert, simulate
+from stario.fusion.commands.run import inspect, live, run
+from stario.fusion.commands.train import export, train
 from stario.sequences.errors import StarioError
 from stario.sequences.findings import FINDINGS
 
@@ -59,28 +55,27 @@ for command in checks.COMMANDS:
 app.add_typer(check, name="check")
 
 
-class _Once(logging.Filter):
-    """Filter that passes each message once: a command may look at a recording several times.
+def _once() -> Callable[[logging.LogRecord], bool]:
+    """Return a filter that passes each message once: a command may look at a recording repeatedly.
 
     It remembers the newest thousand: a server that runs for months may see any number.
     """
+    seen: deque[str] = deque(maxlen=1000)
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._seen: deque[str] = deque(maxlen=1000)
-
-    def filter(self, record: logging.LogRecord) -> bool:
+    def passes(record: logging.LogRecord) -> bool:
         text = record.getMessage()
-        new = text not in self._seen
-        if new:
-            self._seen.append(text)
-        return new
+        if text in seen:
+            return False
+        seen.append(text)
+        return True
+
+    return passes
 
 
 def main() -> None:
     """Entry point of the `stario` command."""
     shown = logging.StreamHandler(sys.stderr)
-    shown.addFilter(_Once())
+    shown.addFilter(_once())
     if {"run", "compare", "inspect"} & set(sys.argv[1:2]):  # these print the verdict on findings
         shown.addFilter(lambda record: record.name != FINDINGS)
     logging.basicConfig(level=logging.WARNING, format="stario: %(message)s", handlers=[shown])

@@ -19,7 +19,6 @@ from stario.fusion.commands import options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
-    from stario.fusion.evaluation.compare import Comparison
     from stario.fusion.evaluation.results import Writers
     from stario.fusion.recording import Progress
     from stario.network.model import DisplacementModel
@@ -113,7 +112,7 @@ def further_files(report: bool, tiles: str = "", view: bool = False) -> Writers:
     """Return what writes the report and the viewer's file, if their packages are there."""
     from stario.sequences.lazy import optional_package
 
-    also: dict[str, Callable[[Path, Comparison], object]] = {}
+    also: dict[str, Callable[..., object]] = {}
     if report:
         optional_package("plotly", "report")
         from stario.fusion.report.page import write_report

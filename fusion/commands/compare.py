@@ -1,13 +1,14 @@
-"""`stario compare`: tracks of each recording side by side."""
+"""`stario compare` and `evaluate`: tracks side by side, and accuracy over many recordings."""
 
 from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -15,8 +16,15 @@ from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from stario.fusion.evaluation.compare import Comparison
+    from stario.fusion.evaluation.pedestrian import Model
+    from stario.sequences.datasets.batch import Skipped
+    from stario.sequences.datasets.splits import ListEntry
     from stario.sequences.sequence import ImuSequence
+
+_GROUP, _SET = "{group}", "{set}"
 
 _SHOWN = ("track", "dead_reckoning")
 """Tracks without `--tracks`: what StarIO gives, and what one would have without it."""
@@ -47,6 +55,7 @@ def compare(
     """
     from stario.fusion.evaluation.compare import TRACKS, compare_recordings, demonstration
     from stario.fusion.evaluation.results import check_folder, metrics_dict, write_comparison
+    from stario.fusion.evaluation.scores import joined
     from stario.fusion.values.fix_file import read_fixes
     from stario.sequences.arrays import check_choice
     from stario.sequences.datasets.batch import without_skipped
@@ -85,8 +94,8 @@ def compare(
         if not paths:
             command = "stario" if shutil.which("stario") else sys.argv[0]  # in no PATH: its own
             lines.append(f"next: {command} run FILE --report, with a phone's recording")
-        records = {found.sequence.name: found.as_dict() for found in comparisons}
-        common.print_result(as_json, metrics_dict(records, comparisons[0].words), "\n".join(lines))
+        scores = joined(found.scores for found in comparisons)
+        common.print_result(as_json, metrics_dict(scores, comparisons[0].words), "\n".join(lines))
     common.exit_if_skipped(skipped)
 
 
@@ -102,3 +111,170 @@ def _lines(found: Comparison, as_table: bool) -> list[str]:
     line = f"{found.sequence.name}: StarIO's track: {words}; dead reckoning: {distance(far)}"
     table = [track_table(found)] if as_table else []
     return [line, *table, *(finding.line() for finding in found.verdict)]
+
+
+@options.expanded
+def evaluate(
+    context: typer.Context,
+    reading: options.Reading,
+    estimating: options.Estimator,
+    paths: options.OptionalPaths = None,
+    data: options.Data = None,
+    split: str = typer.Option(
+        "test",
+        help="With --data: test, validation, training, holdout, all, open, or a list file "
+        "with lines of name, group.",
+    ),
+    by: options.Grouping | None = typer.Option(
+        None,
+        help="Evaluate the network alone by groups. Ground truth may be poses, positions or "
+        "waypoints.",
+    ),
+    against: str | None = typer.Option(
+        None,
+        help="With --by: weights to compare with, or pdr (pedestrian dead reckoning without a "
+        "network), by paired error ratios with 95 % intervals. {group} or {set} in a weights "
+        "name stands for each recording's group, or its first word: leave-one-out.",
+    ),
+    filtered: bool = options.flag(
+        False, "--filtered", help="With --by: also report the filter's mean NIS; slow."
+    ),
+    jobs: options.Jobs = 1,
+    out: options.EvaluateOut = None,
+    as_json: options.Json = False,
+) -> None:
+    """Evaluate accuracy and consistency over recordings with ground truth: medians and means."""
+    from stario.fusion.evaluation.results import check_folder
+    from stario.network.training.splits import warn_of_learned
+
+    if out is not None:
+        check_folder(out)
+    _refuse_unused(context, by, bool(paths), data)
+    listed, skipped = _listed(reading, paths or [], data, split)
+    files = [entry.path for entry in listed]
+    if data is not None:
+        warn_of_learned([estimating.model, against or ""], files, data)
+    if by is not None:
+        groups = {entry.path: entry.group for entry in listed}
+        weights = estimating.model, against
+        skipped += _groups(groups, reading, by, *weights, filtered, jobs, out, as_json)
+    else:
+        skipped += _tracks(files, reading, estimating, jobs, out, as_json)
+    common.exit_if_skipped(skipped)
+
+
+def _refuse_unused(context: typer.Context, by: str | None, named: bool, data: Path | None) -> None:
+    """Refuse options that the chosen recordings and kind of evaluation do not use."""
+    if named:
+        options.refuse(context, "with PATH", "one of the two", "data")
+    if data is None:
+        options.refuse(context, "without --data", "use with --data", "split")
+    else:
+        options.refuse(context, "with --data", "use with PATH: name the archive", "where")
+    if by is None:
+        options.refuse(
+            context, "without --by", "a grouping, such as --by set", "against", "filtered"
+        )
+    else:
+        alone = "use without: the network alone is judged"
+        options.refuse(context, "with --by", alone, "config", "magnetometer", "declination")
+
+
+def _listed(
+    reading: options.Reading, paths: list[Path], data: Path | None, split: str
+) -> tuple[list[ListEntry], list[Skipped]]:
+    """Return the named recordings, or else those of the split, and the skipped paths."""
+    from stario.network.training.splits import read_packaged_list
+    from stario.sequences.datasets.splits import ListEntry
+
+    if paths:
+        files, skipped = reading.recordings(paths)
+        return [ListEntry(path, "") for path in files], skipped
+    if data is None:
+        raise InputError("PATH", "none", "recordings", "name some, or pass --data for a split")
+    return read_packaged_list(split, data), []
+
+
+def _tracks(
+    files: list[Path],
+    reading: options.Reading,
+    estimating: options.Estimator,
+    jobs: int,
+    out: Path | None,
+    as_json: bool,
+) -> list[Skipped]:
+    """Print the table of recordings, whose tracks are written one by one; return those skipped."""
+    from stario.fusion.evaluation.compare import compare_recordings
+    from stario.fusion.evaluation.results import write_recording, write_summary
+    from stario.fusion.evaluation.scores import joined
+    from stario.fusion.evaluation.text import summary, summary_table
+    from stario.sequences.datasets.batch import without_skipped
+
+    settings, network = estimating.settings(), estimating.network()
+    model = estimating.for_processes(network, jobs)
+    origin = common.origin_of(files, reading, estimating, network)
+    skipped: list[Skipped] = []
+    found = []
+    with common.progress_bar("evaluate", 100 * len(files)) as progress:
+        outcomes = compare_recordings(
+            files, model, settings, reading.read, jobs, truth_needed=True, progress=progress
+        )
+        for comparison in without_skipped(outcomes, skipped):
+            if out is not None:
+                write_recording(out, comparison)
+            found.append(comparison.scores)
+    if found:
+        scores = joined(found)
+        if out is not None:
+            write_summary(out, scores, settings, origin)
+        common.print_result(as_json, summary(scores), summary_table(scores))
+    return skipped
+
+
+def _groups(
+    groups: Mapping[Path, str],
+    reading: options.Reading,
+    by: options.Grouping,
+    ours: str,
+    theirs: str | None,
+    filtered: bool,
+    jobs: int,
+    out: Path | None,
+    as_json: bool,
+) -> list[Skipped]:
+    """Print and write the table of groups; return the recordings that were skipped."""
+    from stario.fusion.evaluation.groups import benchmark, write_benchmark
+
+    weights = list(dict.fromkeys([ours, theirs or ours]))
+    for name in weights:
+        if _GROUP not in name and _SET not in name:
+            _for_group(name, "")  # fail on unloadable weights before preparing anything
+    judged: dict[str, Any] = {"model": _for_group, "weights": weights, "filtered": filtered}
+    work = partial(_alone, reading=reading, groups=groups, **judged)
+    found, skipped = common.each_used("evaluate", work, groups, jobs)
+    if found:
+        table = benchmark(found, by, ours, theirs)
+        if out is not None:
+            write_benchmark(out, table)
+        common.print_result(as_json, table.as_dict(), table.text())
+    return skipped
+
+
+def _alone(
+    path: Path, reading: options.Reading, groups: Mapping[Path, str], **judged: Any
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return what `alone_on` does of a path; further processes know it by its name."""
+    from stario.fusion.evaluation.groups import alone_on
+
+    return alone_on(reading.read(path), path, groups[path], **judged)
+
+
+def _for_group(name: str, group: str) -> Model:
+    """Load weights by name; `{group}` in it stands for the group, with underscores for blanks.
+
+    `{set}` stands for the group's first word.
+    """
+    from stario.fusion.evaluation.pedestrian import model_named
+
+    name = name.replace(_SET, group.partition(" ")[0])
+    return model_named(name.replace(_GROUP, group.replace(" ", "_")))

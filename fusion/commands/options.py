@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -51,9 +51,8 @@ Fixes = Annotated[
         "velocity \\[m/s] or yaw \\[rad] (in x), and their sigmas."
     ),
 ]
-By = Annotated[
-    str, typer.Option(help="Group by set, or by an attribute such as person, device or carry.")
-]
+Grouping = Literal["set", "group", "person", "device", "place", "carry"]
+By = Annotated[Grouping, typer.Option(help="What recordings are grouped by.")]
 Jobs = Annotated[int, typer.Option(min=1, help="Number of processes that share the recordings.")]
 Report = Annotated[
     bool, flag("--report", help="Also write report.html: map, time slider, plots, health.")

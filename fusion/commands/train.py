@@ -1,11 +1,11 @@
-"""`stario train`: train a network on recordings and simulated walks."""
+"""`stario train` and `export`: networks trained, and for other runtimes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
@@ -51,10 +51,10 @@ def train(
         help="Folder of the development recordings: train on all that the package lists except "
         "the test recordings; select and calibrate on those of its list `holdout`.",
     ),
-    learn_from: str = typer.Option(
+    learn_from: Literal["all", "open", "few"] = typer.Option(
         "all",
-        help="With --data: all, open (those whose licence allows any use) or few (the eight "
-        "recordings of the paper's comparison).",
+        help="With --data: all, those whose licence allows any use, or the eight recordings of "
+        "the paper's comparison.",
     ),
     leave_out: list[str] | None = typer.Option(
         None,
@@ -189,15 +189,13 @@ def packaged_lists(
     few.
 
     Raises:
-        InputError: a list or group does not exist.
+        InputError: a group does not exist.
     """
     from stario.network.training.splits import read_packaged_list, without_holdout
-    from stario.sequences.arrays import check_choice
     from stario.sequences.datasets.splits import hold_out_group
 
     if data is None:
         return [], []
-    check_choice("--learn-from", name, ("all", "open", "few"))
     everything = (
         read_packaged_list("training", data) + read_packaged_list("validation", data)
         if name == "few"
@@ -316,3 +314,25 @@ def _recipe(
             "omit --model, or name weights of that network",
         )
     return recipe
+
+
+def export(
+    model: str = typer.Option(
+        "default",
+        help="Network: a name from `stario check models`, default, or weights with their card.",
+    ),
+    runs: Path = typer.Option(
+        Path("runs"), help="Folder of training runs in which named networks are found."
+    ),
+    out: Path | None = typer.Option(None, help="File to write. Default: ./NETWORK.onnx"),
+) -> None:
+    """Export a network with its calibration as ONNX; `--model FILE.onnx` then runs it anywhere."""
+    from stario.network.model import load_model, weights_named
+    from stario.network.runtime.export import export_onnx
+
+    loaded = load_model(weights_named(model, runs))
+    path = out or Path(f"{loaded.name}.onnx")
+    if path.suffix != ".onnx":
+        raise InputError("--out", str(path), "a name ending in .onnx")
+    export_onnx(loaded, path)
+    typer.echo(str(path))

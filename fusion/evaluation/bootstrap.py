@@ -64,10 +64,8 @@ def paired_ratio(blocks: pd.DataFrame, ours: str, theirs: str) -> Interval | Non
     """
     pair = blocks[blocks["network"].isin([ours, theirs])]
     total = pair.groupby([*_UNITS, "network", "seed"])["squares"].transform("sum")
-    drawn = _Draws.of(pair[total > 0.0])
-    if drawn is None or not {ours, theirs} <= set(drawn.names):
-        return None
-    return drawn.ratio(ours, theirs)
+    found = _ranked(pair[total > 0.0], theirs).set_index("network")["ratio"]
+    return found.get(ours) if theirs in found else None
 
 
 def ranks(blocks: pd.DataFrame, against: str) -> pd.DataFrame:
@@ -78,56 +76,38 @@ def ranks(blocks: pd.DataFrame, against: str) -> pd.DataFrame:
         and `rank_high`, and the `ratio` of its error to that of `against`, an `Interval`; None for
         `against` itself or without it. No rows if no recording is common to all.
     """
-    drawn = _Draws.of(blocks)
-    rows = [] if drawn is None else _ranked(drawn, against)
-    return pd.DataFrame(rows, columns=["network", "rank", "rank_low", "rank_high", "ratio"])
+    found = _ranked(blocks, against)
+    found.loc[found["network"] == against, "ratio"] = None
+    return found
 
 
-def _ranked(drawn: _Draws, against: str) -> list[tuple[object, ...]]:
-    places = drawn.replicates.argsort(axis=0).argsort(axis=0) + 1
-    bounds = np.percentile(places, _BOUNDS, axis=1, method="nearest")
-    order = drawn.scores.argsort().argsort() + 1
-    compared = set(drawn.names) - {against} if against in drawn.names else set()
-    ratios = [drawn.ratio(name, against) if name in compared else None for name in drawn.names]
-    return list(zip(drawn.names, order, *bounds, ratios, strict=True))
+def _ranked(blocks: pd.DataFrame, against: str) -> pd.DataFrame:
+    """Return the columns of `ranks`, also with the ratio of a network to itself."""
+    table = blocks.set_index([*_UNITS, "block", "network", "seed"])[["squares", "count"]]
+    runs = table.unstack(["network", "seed"], sort=False).dropna()
+    if runs.empty:
+        return pd.DataFrame(columns=["network", "rank", "rank_low", "rank_high", "ratio"])
+    rng = np.random.default_rng(0)
+    of_sets = [_of_set(part, rng) for _, part in runs.groupby("set", sort=False)]
+    logs = pd.DataFrame(np.mean(of_sets, axis=0), columns=runs["squares"].columns)
+    by_name = logs.T.groupby(level="network", sort=False).mean()  # (N, 1 + R), first the whole
+    places = by_name.rank(method="first").astype(int).to_numpy()
+    low, high = np.percentile(places[:, 1:], _BOUNDS, axis=1, method="nearest")
+    base = by_name.loc[against] if against in by_name.index else None
+    ratios = [
+        None if base is None else _interval((errors - base).to_numpy(), len(runs))
+        for _, errors in by_name.iterrows()
+    ]
+    columns = {"network": by_name.index, "rank": places[:, 0], "rank_low": low, "rank_high": high}
+    return pd.DataFrame({**columns, "ratio": ratios})
 
 
-@dataclass(frozen=True, eq=False)
-class _Draws:
-    """Mean log errors (N,) of networks, those of every replicate (N, R), and the blocks' number."""
-
-    names: list[str]
-    scores: FloatArray
-    replicates: FloatArray
-    blocks: int
-
-    @classmethod
-    def of(cls, blocks: pd.DataFrame) -> _Draws | None:
-        """Draw from the recordings common to all networks; None if there are none."""
-        index = [*_UNITS, "block"]
-        table = blocks.set_index([*index, "network", "seed"])[["squares", "count"]]
-        runs = table.unstack(["network", "seed"], sort=False).dropna()
-        if runs.empty:
-            return None
-        rng = np.random.default_rng(0)
-        columns = runs["squares"].columns
-        found = np.mean(
-            [_of_set(part, rng) for _, part in runs.groupby("set", sort=False)], axis=0
-        )  # (1 + R, runs)
-        names = list(dict.fromkeys(columns.get_level_values("network")))
-        by_name = np.stack(
-            [found[:, columns.get_level_values("network") == name].mean(axis=1) for name in names]
-        )
-        return cls(names, by_name[:, 0], by_name[:, 1:], len(runs))
-
-    def ratio(self, name: str, against: str) -> Interval:
-        k, other = self.names.index(name), self.names.index(against)
-        ratio = float(np.exp(self.scores[k] - self.scores[other]))
-        if self.blocks < _MIN_BLOCKS:
-            return Interval(ratio, math.nan, math.nan)
-        differences = self.replicates[k] - self.replicates[other]
-        low, high = np.exp(np.percentile(differences, _BOUNDS)).tolist()
-        return Interval(ratio, low, high)
+def _interval(differences: FloatArray, blocks: int) -> Interval:
+    """Return the ratio from differences (1 + R,) of mean log errors, those of all blocks first."""
+    bounds = [math.nan, math.nan]
+    if blocks >= _MIN_BLOCKS:
+        bounds = np.exp(np.percentile(differences[1:], _BOUNDS)).tolist()
+    return Interval(math.exp(differences[0]), *bounds)
 
 
 def _of_set(part: pd.DataFrame, rng: np.random.Generator) -> FloatArray:

@@ -9,19 +9,22 @@ from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from stario.fusion.evaluation.known_positions import (
     MIN_POSITIONS,
     fitted_georeference,
     position_error,
+    recording_verdict,
 )
 from stario.fusion.evaluation.pedestrian import pedestrian_track
+from stario.fusion.evaluation.scores import scored
 from stario.fusion.evaluation.tracks import (
     inertial_track,
     network_track,
     network_track_true_attitude,
     true_poses,
 )
-from stario.fusion.evaluation.verdict import recording_verdict
 from stario.fusion.imu.inference import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.place import compared_with, used_words
@@ -68,9 +71,6 @@ TRACK_TITLES = {
     "track": "track",
 }
 """Titles of the columns of tracks."""
-
-TRACK_OF = {"ekf": "filtered", "graph": "track"}
-"""Name of the track that a back end makes of a recording."""
 
 DEMONSTRATION_SEED = 2**31 + 49
 """Seed of the bundled demonstration: training seeds are below 2^31 and exclude this walk. 49 is the
@@ -185,11 +185,15 @@ class Comparison:
             return None
         return evaluate_track(self.track.trajectory, truth, alignment="none").path_m
 
-    def as_dict(self) -> dict[str, object]:
-        """Return the recording's entry in `metrics.json`."""
-        unknown: Metrics = dict.fromkeys(METRICS)
-        tracks = {name: self.metrics.get(name, unknown) for name in TRACKS}
-        return {"duration_s": self.sequence.duration, "path_m": self.path_m, "tracks": tracks}
+    @property
+    def scores(self) -> pd.DataFrame:
+        """The figures as rows of `scores`: those of the recording, and of all tracks, by name.
+
+        The recording's are those of a track "truth": `duration_s` and `path_m`.
+        """
+        of_recording: Metrics = {"duration_s": self.sequence.duration, "path_m": self.path_m}
+        tracks = {name: self.metrics.get(name, dict.fromkeys(METRICS)) for name in TRACKS}
+        return scored(self.sequence.name, {"truth": of_recording, **tracks})
 
     def aligned(self) -> dict[str, Trajectory]:
         """Return trajectories for figures, aligned with the truth if there is one."""
@@ -247,6 +251,12 @@ def compare(
         except InputError as error:
             log.warning("no track %s: %s", name, error)
     return measured(sequence, tracks, config.place)
+
+
+def navigators(model: Predictor, config: NavigatorConfig, graph: bool) -> dict[str, Navigator]:
+    """Return the filter, and perhaps the graph, by the names of the tracks they make."""
+    filtered = {"filtered": Navigator(model, config, backend="ekf")}
+    return filtered | ({"track": Navigator(model, config, backend="graph")} if graph else {})
 
 
 def measured(

@@ -16,12 +16,11 @@ between two ticks of the track is the mean over the windows that cover them.
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -39,7 +38,14 @@ from stario.sequences.levelled_stream import (
     LevelledStream,
     levelled_streams,
 )
-from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, PositionTrack, is_gap
+from stario.sequences.sequence import (
+    BoolArray,
+    FloatArray,
+    ImuSequence,
+    PositionTrack,
+    Trajectory,
+    is_gap,
+)
 
 HORIZONS = (1, 10, 30)
 """Spans [s] over which displacements are compared."""
@@ -128,22 +134,6 @@ def predicted(model: Predictor, stream: LevelledStream) -> Piece:
     return Piece(stream, *network.predict(stream.windows(), stream.headings))
 
 
-class RecordingErrors(NamedTuple):
-    """Errors of one network on one recording.
-
-    Attributes:
-        path_m: length of the true path that was compared [m]; 0 if the device hardly moved: errors
-            at rest are related to nothing, and would count in means of ratios like those of a walk.
-        figures: figures by name, see `FIGURES`.
-        blocks: (B, 2) arrays by horizon ("1", "10", "30" s): sum of squared errors [m^2] and number
-            of errors in each block of 30 s. For waypoints, their residuals are listed under "10".
-    """
-
-    path_m: float
-    figures: dict[str, float]
-    blocks: dict[str, FloatArray]
-
-
 class _AtTicks(NamedTuple):
     """Track and truth (n,) at the ticks of a piece, and the truth's breaks (n,) before each."""
 
@@ -174,25 +164,9 @@ class _AtTicks(NamedTuple):
         return turn
 
 
-@dataclass(eq=False)
-class _Errors:
-    """Squared errors by measure, and lengths [m] of truth and track, over a recording's pieces."""
-
-    squares: dict[str, list[FloatArray]] = field(default_factory=lambda: defaultdict(list))
-    blocks: dict[str, list[FloatArray]] = field(default_factory=lambda: defaultdict(list))
-    path: float = 0.0
-    length: float = 0.0
-
-    def add(self, measure: str, errors: FloatArray) -> None:
-        self.squares[measure].append(errors[np.isfinite(errors)] ** 2)
-
-    def add_lengths(self, truth: Complex, track: Complex) -> None:
-        self.path += float(np.abs(truth).sum())
-        self.length += float(np.abs(track).sum())
-
-    def rms(self, measure: str) -> float:
-        squares = np.concatenate([*self.squares[measure], []])
-        return float(np.sqrt(squares.mean())) if len(squares) else float("nan")
+_Errors = Iterator[tuple[str, FloatArray, FloatArray]]
+"""Figure, seconds since the piece's first tick (n,) and errors (n,); those of "path" and "length"
+are the lengths [m] of legs of truth and track."""
 
 
 def known_truth(sequence: ImuSequence) -> tuple[str, PositionTrack]:
@@ -211,45 +185,63 @@ def known_truth(sequence: ImuSequence) -> tuple[str, PositionTrack]:
     return kind, PositionTrack(time, position_W, "positions")
 
 
-def recording_errors(sequence: ImuSequence, pieces: Sequence[Piece]) -> RecordingErrors:
+def recording_errors(
+    sequence: ImuSequence, pieces: Sequence[Piece]
+) -> tuple[dict[str, float], pd.DataFrame]:
     """Compute the errors of a network's displacements in each piece of a recording.
+
+    Returns:
+        The length `path_m` of the true path that was compared [m], and `FIGURES`. It is 0, and they
+        are unknown, if the device hardly moved: errors at rest are related to nothing, and would
+        count in means of ratios like those of a walk.
+        Blocks of 30 s of each `metric` "rms_1s_m" to "rms_30s_m": sum of the squared errors,
+        `squares` [m^2], and their `count`. For waypoints, their residuals replace the 10 s errors.
 
     Raises:
         InputError: as for `known_truth`.
     """
     kind, known = known_truth(sequence)
-    errors, paths, total_direction = _Errors(), [], Direction()
-    for piece in pieces:
-        before = errors.path
-        if kind == "waypoints":
-            _waypoints(piece, known, errors)
-        else:
-            _positions(piece, known, sequence, errors)
-        paths.append(errors.path - before)
+    total_direction, rows = Direction(), []
+    for k, piece in enumerate(pieces):
         weighted = weighted_force(piece.stream.windows())
         total_direction += direction(weighted, piece.displacement_N, TICKS_PER_SECOND)
-    if errors.path < _MIN_PATH_M:
-        return RecordingErrors(0.0, dict.fromkeys(FIGURES, float("nan")), {})
-    fitted = errors.rms("fit")
-    usual_path = float(np.square(paths).sum()) / errors.path  # of a piece, weighted by lengths
+        of_kind = (
+            _waypoints(piece, known)
+            if kind == "waypoints"
+            else _positions(piece, known, sequence.truth)
+        )
+        rows += [(metric, k, seconds, errors) for metric, seconds, errors in of_kind]
+    table = pd.DataFrame(rows, columns=["metric", "piece", "second", "error"])
+    table = table.explode(["second", "error"]).astype({"second": float, "error": float})
+    table["squares"] = table["error"] ** 2
+    by_metric = table.groupby("metric")
+    paths = table[table["metric"] == "path"].groupby("piece")["error"].sum()
+    path = float(paths.sum())
+    if path < _MIN_PATH_M:
+        return {"path_m": 0.0, **dict.fromkeys(FIGURES, np.nan)}, _blocks(table[:0])
+    rms = np.sqrt(by_metric["squares"].mean())
+    usual_path = float((paths**2).sum()) / path  # of a piece, weighted by lengths
     figures = {
-        "ate_fit_m": fitted,
-        "ate_fit_percent": 100.0 * fitted / usual_path,
-        "ate_first_m": errors.rms("first"),
-        "length_ratio": errors.length / errors.path,
-        **{f"rms_{h}s_m": errors.rms(str(h)) for h in HORIZONS},
-        "stretch_percent": 100.0 * errors.rms("stretch"),
+        "path_m": path,
+        **{name: rms.get(name, np.nan) for name in FIGURES},
+        "ate_fit_percent": 100.0 * rms.get("ate_fit_m", np.nan) / usual_path,
+        "length_ratio": by_metric["error"].sum()["length"] / path,
         "direction_deg": abs(np.degrees(total_direction.turn)),
-        "nis": errors.rms("nis") ** 2,
-        "nis_filtered": float("nan"),
+        "nis": rms.get("nis", np.nan) ** 2,
     }
-    blocks = {name: np.concatenate(parts) for name, parts in errors.blocks.items()}
-    return RecordingErrors(errors.path, figures, blocks)
+    if kind == "waypoints":
+        table["metric"] = table["metric"].replace("ate_fit_m", "rms_10s_m")
+    return figures, _blocks(table[table["metric"].str.startswith("rms")])
 
 
-def _positions(piece: Piece, known: PositionTrack, sequence: ImuSequence, errors: _Errors) -> None:
-    """Add the errors at known positions; poses also tell the yaw at each tick."""
-    track, poses = piece.track(), sequence.truth
+def _blocks(errors: pd.DataFrame) -> pd.DataFrame:
+    by = ["metric", "piece", errors["second"] // BLOCK_SECONDS]
+    return errors.groupby(by)["squares"].agg(squares="sum", count="count").reset_index("metric")
+
+
+def _positions(piece: Piece, known: PositionTrack, poses: Trajectory | None) -> _Errors:
+    """Yield the errors at known positions; poses also tell the yaw at each tick."""
+    track = piece.track()
     ticks = piece.stream.ticks[: len(track)]
     if poses is None:
         bad = gaps_and_jumps(known.time, known.position_W)
@@ -264,11 +256,11 @@ def _positions(piece: Piece, known: PositionTrack, sequence: ImuSequence, errors
         yaw_WN = yaw_of(poses.at(ticks).attitude_WB * levelled.inv())
         turn = np.where(finite, np.exp(1j * yaw_WN), np.nan)
         turns = dict.fromkeys(HORIZONS, turn)
-        track, truth = track[finite], at.truth[finite]
-        errors.add("fit", np.abs(fit_yaw_and_position(track, truth) - truth))
+        seconds, track, truth = ticks[finite] - ticks[0], track[finite], at.truth[finite]
+        yield "ate_fit_m", seconds, np.abs(fit_yaw_and_position(track, truth) - truth)
         placed = truth[0] + turn[finite][0] * (track - track[0])
-        errors.add("first", np.abs(placed - truth))
-    _along_the_path(at, piece, turns, errors)
+        yield "ate_first_m", seconds, np.abs(placed - truth)
+    yield from _along_the_path(at, piece, turns)
 
 
 def _interpolated(
@@ -284,29 +276,27 @@ def _interpolated(
     return np.where(inside, xy, complex(np.nan, np.nan)), breaks
 
 
-def _along_the_path(
-    at: _AtTicks, piece: Piece, turns: Mapping[int, Complex], errors: _Errors
-) -> None:
-    """Add the errors over all horizons, given exp(i yaw) from N to W at each tick for each."""
+def _along_the_path(at: _AtTicks, piece: Piece, turns: Mapping[int, Complex]) -> _Errors:
+    """Yield the errors over all horizons, given exp(i yaw) from N to W at each tick for each."""
     estimated, true, start = at.displacements(2)
     legs = start % _LEG == 0
-    errors.add_lengths(true[legs], estimated[legs])
+    yield "path", TICK_SECONDS * start[legs], np.abs(true[legs])
+    yield "length", TICK_SECONDS * start[legs], np.abs(estimated[legs])
     for horizon in HORIZONS:
         estimated, true, start = at.displacements(horizon)
         turn = turns[horizon][start]
         known = np.isfinite(turn)
+        seconds = TICK_SECONDS * start[known]
         if horizon == 1:  # the windows themselves
             estimated = piece.windows[start]
-            _nis(piece, start[known], np.conj(turn[known]) * true[known], errors)
+            yield "nis", seconds, _nis(piece, start[known], np.conj(turn[known]) * true[known])
         apart = np.abs(turn * estimated - true)[known]
         if len(apart) >= _MIN_DISPLACEMENTS:
-            errors.add(str(horizon), apart)
-            seconds = np.asarray(TICK_SECONDS * start[known])
-            errors.blocks[str(horizon)].append(block_sums(seconds, apart**2))
-    _stretches(at, errors)
+            yield f"rms_{horizon}s_m", seconds, apart
+    yield from _stretches(at)
 
 
-def _waypoints(piece: Piece, known: PositionTrack, errors: _Errors) -> None:
+def _waypoints(piece: Piece, known: PositionTrack) -> _Errors:
     track = piece.track()
     ticks = piece.stream.ticks[: len(track)]
     inside = (known.time >= ticks[0]) & (known.time <= ticks[-1])
@@ -314,17 +304,10 @@ def _waypoints(piece: Piece, known: PositionTrack, errors: _Errors) -> None:
     if len(time) < 3:
         return
     estimated = np.interp(time, ticks, track.real) + 1j * np.interp(time, ticks, track.imag)
-    residuals = np.abs(fit_yaw_and_position(estimated, truth) - truth)
-    errors.add("fit", residuals)
-    errors.add_lengths(np.diff(truth), np.diff(estimated))
-    errors.blocks["10"].append(block_sums(time - ticks[0], residuals**2))
-
-
-def block_sums(seconds: FloatArray, squares: FloatArray) -> FloatArray:
-    """Return (B, 2): sum of squares (n,) and their number, for every block of 30 s with any."""
-    block = np.floor(seconds / BLOCK_SECONDS).astype(int)
-    rows = np.stack([np.bincount(block, squares), np.bincount(block)], axis=1)
-    return np.asarray(rows[rows[:, 1] > 0])
+    seconds = time - ticks[0]
+    yield "ate_fit_m", seconds, np.abs(fit_yaw_and_position(estimated, truth) - truth)
+    yield "path", seconds[1:], np.abs(np.diff(truth))
+    yield "length", seconds[1:], np.abs(np.diff(estimated))
 
 
 def planar(position: NDArray[np.floating[Any]]) -> Complex:
@@ -339,8 +322,8 @@ def fit_yaw_and_position(track: Complex, truth: Complex) -> Complex:
     return np.asarray(target + np.exp(1j * np.angle(turn)) * (track - centre))
 
 
-def _stretches(at: _AtTicks, errors: _Errors) -> None:
-    """Add position errors relative to the path [1] after fitting each half-overlapping stretch."""
+def _stretches(at: _AtTicks) -> _Errors:
+    """Yield position errors in % of the path after fitting each half-overlapping stretch."""
     span = round(STRETCH_SECONDS / TICK_SECONDS)
     unbroken = at.unbroken(span)
     for start in span // 2 * np.flatnonzero(unbroken[:: span // 2]):
@@ -348,13 +331,14 @@ def _stretches(at: _AtTicks, errors: _Errors) -> None:
         track, truth = at.track[part], at.truth[part]
         path = float(np.abs(np.diff(truth[::_LEG])).sum())
         if path >= 5.0:  # else stationary: there is no path to relate errors to
-            errors.add("stretch", np.abs(fit_yaw_and_position(track, truth) - truth) / path)
+            percent = 100.0 * np.abs(fit_yaw_and_position(track, truth) - truth) / path
+            yield "stretch_percent", np.full_like(percent, TICK_SECONDS * start), percent
 
 
-def _nis(piece: Piece, start: np.ndarray, true_N: Complex, errors: _Errors) -> None:
-    """Add the NIS of the horizontal error, scaled from two axes to three."""
+def _nis(piece: Piece, start: np.ndarray, true_N: Complex) -> FloatArray:
+    """Return the root of the NIS (n,) of the horizontal error, scaled from two axes to three."""
     error = piece.windows[start] - true_N
     vector = np.stack([error.real, error.imag], axis=1)
     covariance = piece.covariance_N[start, :2, :2]
     nis = np.einsum("ni,ni->n", vector, np.linalg.solve(covariance, vector[..., None])[..., 0])
-    errors.add("nis", np.sqrt(1.5 * nis))
+    return np.asarray(np.sqrt(1.5 * nis))

@@ -6,18 +6,19 @@ intervals.
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from stario.fusion.evaluation import bootstrap
-from stario.fusion.evaluation.bootstrap import Interval, block_rows, paired_ratio
+from stario.fusion.evaluation.bootstrap import Interval, paired_ratio
 from stario.fusion.evaluation.displacement_error import (
     FIGURES,
     HORIZONS,
@@ -26,19 +27,24 @@ from stario.fusion.evaluation.displacement_error import (
     usable_streams,
 )
 from stario.fusion.evaluation.pedestrian import Model, PedestrianDeadReckoning, piece_of
+from stario.fusion.evaluation.results import Files, figure_files, write_results
 from stario.fusion.evaluation.scores import joined, parts, records, scored, values, wide
 from stario.fusion.navigator import Navigator
+from stario.sequences.drawing.figures import BLUE, INK, apply_style, new_figure
 from stario.sequences.drawing.text_table import aligned, figure
+from stario.sequences.files import json_text, write_json, write_rows
 from stario.sequences.readers.archive import split_name
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.truth.problems import warn_of_truth
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 log = logging.getLogger(__name__)
 
-By = Literal["set", "group", "person", "device", "place", "carry"]
-
-POOLED = "all"
-"""Name of the row over all sets, equally weighted; a group may have this name, too."""
+_ATTRIBUTES = ("person", "device", "place", "carry")
+"""Attributes of a recording that it can be grouped by, besides its set and group."""
 
 _UNKNOWN = "unknown"
 """Label of a recording whose person, device, place or carry is not known."""
@@ -82,9 +88,6 @@ _TITLES = {
 """Titles and formats of the figures of a benchmark."""
 
 
-_NO_BLOCKS = block_rows([], set="", group="", recording="", network="", seed=0, metric="")
-
-
 @dataclass(frozen=True, eq=False)
 class Benchmark:
     """Networks compared by groups of recordings.
@@ -100,7 +103,7 @@ class Benchmark:
 
     scores: pd.DataFrame
     blocks: pd.DataFrame
-    by: By
+    by: str
     ours: str
     theirs: str | None
 
@@ -114,7 +117,7 @@ class Benchmark:
         in those of ours the `RATIOS` of errors to theirs, as `Interval`s where there are any. For
         waypoints, the residuals replace the 10 s errors.
         """
-        found = parts(wide(self.scores), self.by, POOLED)
+        found = parts(wide(self.scores), self.by)
         return pd.DataFrame(
             row
             for k, (name, part) in enumerate(found)
@@ -191,46 +194,47 @@ def verdict(rows: pd.DataFrame) -> str:
 
 
 def alone_on(
+    sequence: ImuSequence,
     path: Path,
-    groups: Mapping[Path, str],
+    group: str,
     model: Callable[[str, str], Model],
     weights: Collection[str],
-    read: Callable[[Path], ImuSequence],
     filtered: bool = False,
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Score networks alone on a recording; return rows of a benchmark's scores and of its blocks.
 
     Args:
-        path: path of the recording.
-        groups: group of each recording, by path; empty for the name of the set.
+        sequence: the recording.
+        path: its path.
+        group: its group in a list; empty for that of its person or set.
         model: function that returns the network by the name of its weights for a group: networks
             differ between groups if each group was held out of training in turn.
         weights: names of the weights.
-        read: function that reads a path.
         filtered: whether the filter is run for its mean NIS, which is slow.
     """
-    sequence = read(path)
     streams, (kind, _) = usable_streams(sequence), known_truth(sequence)
     warn_of_truth(sequence)
-    named = labels(path, sequence.attributes, groups[path])
+    named = labels(path, sequence.attributes, group)
     group, others = named["group"], {key: n for key, n in named.items() if key != "group"}
     unit = {"set": named["set"], "group": group, "recording": str(path)}
-    figures, blocks = {}, [_NO_BLOCKS]
+    figures, blocks = {}, []
     for name in weights:
         network = model(name, group)
-        errors = recording_errors(sequence, [piece_of(network, stream) for stream in streams])
+        pieces = [piece_of(network, stream) for stream in streams]
+        figures[name], errors = recording_errors(sequence, pieces)
         if filtered and not isinstance(network, PedestrianDeadReckoning):
             nis = Navigator(network, backend="ekf").run(sequence).nis
-            errors.figures["nis_filtered"] = nis or np.nan
-        figures[name] = {"path_m": errors.path_m, **errors.figures}
-        for horizon, sums in errors.blocks.items():
-            metric = f"rms_{horizon}s_m"
-            blocks.append(block_rows(sums, **unit, network=name, seed=0, metric=metric))
+            figures[name]["nis_filtered"] = nis or np.nan
+        block = errors.groupby("metric").cumcount()
+        blocks.append(errors.assign(**unit, network=name, seed=0, block=block))
     return scored(str(path), figures, group, **others, truth=kind), joined(blocks)
 
 
 def benchmark(
-    found: Sequence[tuple[pd.DataFrame, pd.DataFrame]], by: By, ours: str, theirs: str | None = None
+    found: Sequence[tuple[pd.DataFrame, pd.DataFrame]],
+    by: str,
+    ours: str,
+    theirs: str | None = None,
 ) -> Benchmark:
     """Return the benchmark of the recordings that `alone_on` scored; at least one."""
     scores, blocks = zip(*found, strict=True)
@@ -259,6 +263,93 @@ def labels(path: Path, attributes: Mapping[str, object], group: str = "") -> dic
     above = file.absolute().parent.name
     folder = "oxiod" if above == "syn" else above
     set_name = group.split(" ")[0] if group else file.stem if member else folder
-    known = {key: str(attributes.get(key) or _UNKNOWN) for key in get_args(By)[2:]}
+    known = {key: str(attributes.get(key) or _UNKNOWN) for key in _ATTRIBUTES}
     of_person = set_name if known["person"] == _UNKNOWN else f"{set_name} {known['person']}"
     return {"set": set_name, "group": group or of_person, **known}
+
+
+def write_benchmark(folder: Path, found: Benchmark) -> None:
+    """Write `groups.csv`, `recordings.csv`, `groups.json` and `groups.png` into a folder.
+
+    Raises what `write_results` does.
+    """
+    content = found.as_dict()
+    flat = json.loads(json_text(content["groups"]))  # ratios become tables, unknown values None
+    groups = pd.json_normalize(flat, sep="_").drop(columns=[*RATIOS], errors="ignore")
+    files: Files = {
+        "groups.csv": partial(groups.to_csv, index=False),
+        "recordings.csv": partial(write_rows, rows=records(found.scores)),
+        "groups.json": partial(write_json, obj=content),
+        **figure_files({"groups.png": groups_figure(found)}),
+    }
+    write_results(folder, files)
+
+
+_BEFORE, _AFTER = "#8C8C8C", BLUE
+
+_PANELS = (
+    (
+        "error after a yaw fit [% of the path]\n(position truth: within 20 s)",
+        ("ate_fit_percent", "stretch_percent"),
+    ),
+    ("length of the track\nover that of the truth", ("length_ratio",)),
+)
+
+
+def groups_figure(found: Benchmark) -> Figure:
+    """Draw a line for each group: medians of both weights, paired ratio with its interval."""
+    rows, theirs = found.rows, found.theirs
+    shown = rows[rows["role"] == "ours"]
+    groups = rows[~rows["pooled"]].set_index("weights")
+    fig = new_figure(12.0 if theirs else 9.0, 1.8 + 0.55 * len(shown), "")
+    panels = fig.subplots(1, 3 if theirs else 2, sharey=True)
+    for axes, (title, keys) in zip(panels, _PANELS, strict=False):
+        known = groups[list(keys)].bfill(axis=1).iloc[:, 0]
+        _draw_medians(axes, known[[found.ours]], known[[theirs]] if theirs else None)
+        axes.set_title(title, loc="left", fontsize=10)
+    panels[0].set_xlim(left=0.0)
+    panels[1].axvline(1.0, color=INK, lw=1.0)
+    if theirs:
+        _draw_ratios(panels[2], shown["ratio_10s"].to_list())
+    else:
+        shown = shown[~shown["pooled"]]
+    names = [f"{row['group']} ({row['recordings']})" for row in shown.to_dict("records")]
+    panels[0].set_yticks(range(len(names)), names)
+    panels[0].set_ylim(len(names) - 0.5, -0.5)
+    handles, labels = panels[0].get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+    return fig
+
+
+def _draw_medians(axes: Axes, ours: pd.Series[float], theirs: pd.Series[float] | None) -> None:
+    """Draw the medians of each group, of weights by which the series are named."""
+    label = str(ours.index[0])
+    if theirs is not None:
+        for k, ends in enumerate(zip(theirs, ours, strict=True)):
+            axes.plot(ends, [k, k], color="#CCCCCC", lw=3.0, zorder=1)
+        axes.plot(theirs, range(len(theirs)), "o", color=_BEFORE, ms=8,
+                  label=f"before: {theirs.index[0]}")  # fmt: skip
+        label = f"after: {label}"
+    axes.plot(ours, range(len(ours)), "o", color=_AFTER, ms=8, label=label)
+    for k, value in enumerate(ours):
+        axes.annotate(f"{value:.2f}", (value, k), (0, 8), textcoords="offset points",
+                      ha="center", fontsize=8, color=_AFTER)  # fmt: skip
+    axes.margins(x=0.12)
+    apply_style(axes)
+
+
+def _draw_ratios(axes: Axes, ratios: list[Interval | None]) -> None:
+    known = {k: r for k, r in enumerate(ratios) if isinstance(r, Interval)}
+    for k, ratio in known.items():
+        axes.plot([ratio.low, ratio.high], [k, k], color=_AFTER, lw=2.0)
+        axes.plot(ratio.ratio, k, "o", color=_AFTER, ms=8)
+    axes.axvline(1.0, color=INK, lw=1.0)
+    axes.set_xscale("log")
+    limits = [x for r in known.values() for x in (r.low, r.ratio, r.high) if np.isfinite(x)]
+    ticks = [t for t in (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)
+             if min([0.7, *limits]) <= t <= max([1.5, *limits])]  # fmt: skip
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.set_xticks([], minor=True)
+    title = "error over 10 s, after / before, 95 % interval\n(waypoints: residuals)"
+    axes.set_title(title, loc="left", fontsize=10)
+    apply_style(axes)

@@ -1,4 +1,7 @@
-"""Comparison of a track with positions known without attitude: waypoints or satellite fixes."""
+"""Comparison of a track with positions known without attitude: waypoints or satellite fixes.
+
+What they contradict is part of the one verdict on a recording and its track.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +11,13 @@ import numpy as np
 
 from stario.fusion.evaluation.displacement_error import fit_yaw_and_position, known_truth, planar
 from stario.fusion.imu.direction import Complex
-from stario.fusion.report.health import TURNED_RAD
+from stario.fusion.report.health import TURNED_RAD, health_findings
 from stario.fusion.values.state import Track
 from stario.sequences.accuracy.metrics import align, pose_errors
 from stario.sequences.arrays import even_grid, interpolated, rms, scatter
-from stario.sequences.findings import Finding
+from stario.sequences.findings import Finding, verdict
 from stario.sequences.geodesy import Georeference
+from stario.sequences.inspection.report import Inspection, inspect_recording
 from stario.sequences.legs import jumps
 from stario.sequences.sequence import (
     MAX_TRUTH_GAP,
@@ -46,6 +50,15 @@ _APART_M = 3.0
 
 _SIGMAS = 3.0
 """Error in standard deviations, both over the whole track, that contradicts the track."""
+
+_LEARNABLE = {
+    "network_contradicts",
+    "network_sigma",
+    "network_direction",
+    "track_scale",
+    "track_error",
+}
+"""Codes of contradictions that weights trained on the recording's truth may resolve."""
 
 
 def true_path(sequence: ImuSequence) -> float:
@@ -171,6 +184,29 @@ def position_error_words(track: Track, known: PositionTrack) -> str:
     if len(found := jumps(known)):
         words += f", but jump by up to {found.max():.0f} m"
     return words
+
+
+def recording_verdict(
+    sequence: ImuSequence, track: Track | None, found: Inspection | None = None, train: str = ""
+) -> list[Finding]:
+    """Return the verdict on a recording from inspection, the run's health and known positions.
+
+    Args:
+        sequence: the recording.
+        track: its main track; None if it is refused.
+        found: its inspection, if there is one already.
+        train: command that trains weights on it, offered where its truth could teach them.
+    """
+    findings = [*(found or inspect_recording(sequence)).findings]
+    if track is not None:
+        findings += health_findings(track.health) if track.health else ()
+        findings += position_findings(track, sequence)
+    spoilt = any(finding.spoils_truth for finding in findings)
+    learnable = any(f.code in _LEARNABLE and f.level == "warning" for f in findings)
+    if train and sequence.truth is not None and learnable and not spoilt:
+        text = "Its truth can teach the weights this motion."
+        findings.append(Finding("train", text, f"Run `{train}`.", level="note"))
+    return verdict(findings)
 
 
 def position_findings(track: Track, sequence: ImuSequence) -> list[Finding]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -24,28 +23,14 @@ _UNIX_TIME = (3e8, 4e9)
 _NAMESPACE = "https://github.com/stario-nav/stario"
 
 
-@dataclass(frozen=True, eq=False)
-class MapTrack:
-    """A track on the map, about a point per second.
+def on_map(track: Track, georeference: Georeference) -> list[FloatArray]:
+    """Place a track on the map, whose frame lies at `georeference`, about a point per second.
 
-    Attributes:
-        rows: (N, 6) time [s], latitude and longitude [deg], height above the map's zero and
-            standard deviations of position (in the direction of the largest) and height [m], zero
-            where unknown; a row of NaN in each gap.
-        altitude_m: altitude of the map's zero, NaN where unknown.
+    Returns:
+        Stretches (n, 7) between gaps: time [s], latitude and longitude [deg], height above the
+        map's zero [m], altitude [m], NaN where unknown, and standard deviations of position (in the
+        direction of the largest) and height [m], zero where unknown.
     """
-
-    rows: FloatArray
-    altitude_m: float
-
-    @property
-    def parts(self) -> list[FloatArray]:
-        """The stretches (n, 6) between gaps."""
-        return split_at_nan(self.rows)
-
-
-def on_map(track: Track, georeference: Georeference) -> MapTrack:
-    """Place a track on the map, whose frame lies at `georeference`."""
     trajectory = track.trajectory
     latlon = georeference.latlon_deg(trajectory.position_W)
     sigma = np.zeros((len(trajectory), 2))
@@ -58,20 +43,20 @@ def on_map(track: Track, georeference: Georeference) -> MapTrack:
     rows = np.unique(np.searchsorted(trajectory.time, ticks))
     rows = rows[trajectory.valid[rows]]
     _, split = split_at_gaps(trajectory.time[rows], columns[rows], max_gap=2.0)
-    return MapTrack(split, georeference.altitude_m)
+    zero = georeference.altitude_m
+    return [np.insert(part, 4, zero + part[:, 3], axis=1) for part in split_at_nan(split)]
 
 
-def write_geojson(path: Path, name: str, found: MapTrack) -> Path:
-    """Write a track as GeoJSON: the line, its start and its end.
+def write_geojson(path: Path, name: str, parts: list[FloatArray]) -> Path:
+    """Write a track, as of `on_map`, as GeoJSON: the line, its start and its end.
 
     The line's properties hold lists, one value per point: seconds of the recording's clock, height
     above the map's zero and standard deviations [m].
     """
-    parts = found.parts
-    lines = [_coordinates(part, found.altitude_m) for part in parts]
+    lines = [_coordinates(part) for part in parts]
     columns = np.vstack(parts).T
     properties: dict[str, object] = {"name": name}
-    names = {"time_s": 0, "height_m": 3, "sigma_m": 4, "height_sigma_m": 5}
+    names = {"time_s": 0, "height_m": 3, "sigma_m": 5, "height_sigma_m": 6}
     properties |= {key: columns[k].round(3).tolist() for key, k in names.items()}
     line: dict[str, Any] = {"type": "MultiLineString", "coordinates": lines}
     if len(lines) == 1:
@@ -90,44 +75,41 @@ def _feature(geometry: dict[str, Any], properties: dict[str, Any]) -> dict[str, 
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
-def _coordinates(part: FloatArray, altitude_m: float) -> list[list[float]]:
+def _coordinates(part: FloatArray) -> list[list[float]]:
     """Return longitude, latitude and, if known, altitude; a line has two points at least."""
-    digits = np.column_stack([part[:, [2, 1]].round(8), (part[:, 3] + altitude_m).round(2)])
-    if np.isnan(altitude_m):
-        digits = digits[:, :2]
-    listed: list[list[float]] = digits.tolist()
+    digits = np.column_stack([part[:, [2, 1]].round(8), part[:, 4].round(2)])
+    listed: list[list[float]] = digits[:, : 2 if np.isnan(part[0, 4]) else 3].tolist()
     return listed if len(listed) > 1 else 2 * listed
 
 
-def write_gpx(path: Path, name: str, found: MapTrack) -> Path:
-    """Write a track as GPX, with a segment for each stretch between gaps.
+def write_gpx(path: Path, name: str, parts: list[FloatArray]) -> Path:
+    """Write a track, as of `on_map`, as GPX, with a segment for each stretch between gaps.
 
     Points have times if the recording's clock counts seconds since 1970. Their elevation is above
     the map's zero if its altitude is unknown; standard deviations [m] are in `extensions`.
     """
     from gpxpy.gpx import GPX, GPXTrack, GPXTrackSegment
 
-    above = "above the start" if np.isnan(found.altitude_m) else "as the receiver counts altitudes"
+    above = "above the start" if np.isnan(parts[0][0, 4]) else "as the receiver counts altitudes"
     gpx, track = GPX(), GPXTrack(name, f"Estimated by StarIO; elevation {above}.")
     gpx.creator = "StarIO"
     gpx.nsmap["stario"] = _NAMESPACE
-    track.segments = [GPXTrackSegment(list(_points(p, found.altitude_m))) for p in found.parts]
+    track.segments = [GPXTrackSegment(list(_points(part))) for part in parts]
     gpx.tracks.append(track)
     with atomic_write(path) as file:
         file.write(gpx.to_xml(version="1.1"))
     return path
 
 
-def _points(part: FloatArray, altitude_m: float) -> Iterator[Any]:
+def _points(part: FloatArray) -> Iterator[Any]:
     from gpxpy.gpx import GPXTrackPoint
 
-    zero = 0.0 if np.isnan(altitude_m) else altitude_m
-    for time, latitude, longitude, height, *sigmas in part.tolist():
+    for time, latitude, longitude, height, altitude, *sigmas in part.tolist():
         known = _UNIX_TIME[0] < time < _UNIX_TIME[1]
         point = GPXTrackPoint(
             round(latitude, 8),
             round(longitude, 8),
-            round(zero + height, 2),
+            round(height if np.isnan(altitude) else altitude, 2),
             datetime.fromtimestamp(time, UTC) if known else None,
         )
         for tag, sigma in zip(("sigma", "height_sigma"), sigmas, strict=True):

@@ -13,9 +13,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+import pandas as pd
+
 from stario.fusion.evaluation.compare import METRIC_WORDS, RECORDING_WORDS, TRACKS, Comparison
 from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.evaluation.map_files import on_map, write_geojson, write_gpx
+from stario.fusion.evaluation.scores import by_name, joined
 from stario.fusion.values.config import NavigatorConfig
 from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.plan import plan_view
@@ -35,8 +38,8 @@ except ImportError:  # Windows
 Files = Mapping[str, Callable[[Path], object]]
 """Functions that write the files of a set of results, by their paths within its folder."""
 
-Writers = Mapping[str, Callable[[Path, Comparison], object]]
-"""Functions that write a recording's further files, by the files' names."""
+Writers = Mapping[str, Callable[..., object]]
+"""Functions of a path and a comparison, `found`, that write further files, by their names."""
 
 _FIGURES = ("plan.png", "error.png", "innovations.png", "report.html")
 _TRACKS = tuple(f"{track}{suffix}" for track, suffix in product(TRACKS, (".tum", ".npz")))
@@ -77,7 +80,7 @@ def write_run(
         "health.json": partial(write_json, obj=asdict(health) if health else None),
         **_figures(run),
         **_on_map(run),
-        **_further(run, also),
+        **{name: partial(write, found=run) for name, write in also.items()},
     }
     return write_results(folder, files)
 
@@ -93,8 +96,8 @@ def write_comparison(
 
     Other recordings' folders stay. Raises what `write_results` does.
     """
-    records = {found.sequence.name: found.as_dict() for found in comparisons}
-    files = dict(_settings(metrics_dict(records, comparisons[0].words), config, origin))
+    metrics = metrics_dict(joined(found.scores for found in comparisons), comparisons[0].words)
+    files = dict(_settings(metrics, config, origin))
     for found in comparisons:
         inner = _recording(found, also)
         files |= {f"{found.sequence.name}/{name}": write for name, write in inner.items()}
@@ -102,13 +105,10 @@ def write_comparison(
 
 
 def write_summary(
-    folder: Path,
-    records: Mapping[str, object],
-    config: NavigatorConfig,
-    origin: Mapping[str, object],
+    folder: Path, scores: pd.DataFrame, config: NavigatorConfig, origin: Mapping[str, object]
 ) -> None:
     """Write `metrics.json`, `config.json` and `run.json` of recordings; raises as `write_run`."""
-    write_results(folder, _settings(metrics_dict(records), config, origin))
+    write_results(folder, _settings(metrics_dict(scores), config, origin))
 
 
 def write_recording(folder: Path, found: Comparison) -> None:
@@ -117,10 +117,14 @@ def write_recording(folder: Path, found: Comparison) -> None:
 
 
 def metrics_dict(
-    records: Mapping[str, object], words: Mapping[str, str] = METRIC_WORDS
+    scores: pd.DataFrame, words: Mapping[str, str] = METRIC_WORDS
 ) -> dict[str, object]:
-    """Return the content of `metrics.json` from the entries of recordings (`as_dict`), by name."""
-    return {"recordings": records, "conventions": {**RECORDING_WORDS, **words}}
+    """Return the content of `metrics.json` from the `scores` of comparisons."""
+    recordings = {}
+    for name, found in scores.groupby("recording", sort=False):
+        tracks = by_name(found, "track")
+        recordings[name] = {**tracks.pop("truth"), "tracks": tracks}
+    return {"recordings": recordings, "conventions": {**RECORDING_WORDS, **words}}
 
 
 def figure_files(figures: Mapping[str, Figure]) -> Files:
@@ -136,14 +140,8 @@ def _settings(metrics: object, config: NavigatorConfig, origin: Mapping[str, obj
 def _recording(found: Comparison, also: Writers = MappingProxyType({})) -> Files:
     truth = found.sequence.truth
     known = {} if truth is None else {"truth.tum": partial(write_tum, trajectory=truth)}
-    return {**_tracks(found), **known, **_figures(found), **_further(found, also)}
-
-
-def _further(found: Comparison, also: Writers) -> Files:
-    def bound(write: Callable[[Path, Comparison], object]) -> Callable[[Path], object]:
-        return lambda path: write(path, found)
-
-    return {name: bound(write) for name, write in also.items()}
+    further = {name: partial(write, found=found) for name, write in also.items()}
+    return {**_tracks(found), **known, **_figures(found), **further}
 
 
 def _tracks(found: Comparison) -> Files:
@@ -158,10 +156,10 @@ def _on_map(run: Comparison) -> Files:
     """Return the main track's files for maps, if it is known where on the earth it lies."""
     if run.georeference is None:
         return {}
-    found, name = on_map(run.track, run.georeference), run.sequence.name
+    parts, name = on_map(run.track, run.georeference), run.sequence.name
     return {
-        "track.geojson": partial(write_geojson, name=name, found=found),
-        "track.gpx": partial(write_gpx, name=name, found=found),
+        "track.geojson": partial(write_geojson, name=name, parts=parts),
+        "track.gpx": partial(write_gpx, name=name, parts=parts),
     }
 
 

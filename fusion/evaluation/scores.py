@@ -19,6 +19,9 @@ from stario.sequences.sequence import FloatArray
 
 COLUMNS = ("recording", "group", "track", "metric", "value")
 
+POOLED = "all"
+"""Name of the row over all groups; a group may have this name, too."""
+
 Figures = Mapping[str, float | None]
 """Figures of a track by metric; None where unknown."""
 
@@ -54,12 +57,16 @@ def records(scores: pd.DataFrame) -> list[dict[str, Any]]:
     return found
 
 
-def parts(
-    scores: pd.DataFrame, by: str = "group", whole: str | None = "all"
-) -> list[tuple[str, pd.DataFrame]]:
-    """Return the groups, sorted by name; then all rows, called `whole`, if there are several."""
+def by_name(scores: pd.DataFrame, label: str) -> dict[str, dict[str, float]]:
+    """Return the values by a label, such as the track, and by metric."""
+    found = scores.groupby(label, sort=False)
+    return {str(n): dict(zip(part["metric"], part["value"], strict=True)) for n, part in found}
+
+
+def parts(scores: pd.DataFrame, by: str = "group") -> list[tuple[str, pd.DataFrame]]:
+    """Return the groups, sorted by name; then all rows, `POOLED`, if there are several."""
     found = [(str(name), part) for name, part in scores.groupby(by)]
-    return [*found, (whole, scores)] if whole and len(found) > 1 else found
+    return [*found, (POOLED, scores)] if len(found) > 1 else found
 
 
 def by_track(scores: pd.DataFrame) -> list[tuple[tuple[str, str], pd.DataFrame]]:
@@ -108,41 +115,14 @@ class Column:
         return figure(self.value(scores), self.form)
 
 
-@dataclass(frozen=True)
-class Spread(Column):
-    """A column of means over recordings, and their deviation over weights or seeds.
+def over_seeds(scores: pd.DataFrame) -> pd.DataFrame:
+    """Return `mean`, deviation (`std`) and standard error (`sem`) over the seeds of networks.
 
-    Attributes:
-        by: label of the weights or seeds, which are averaged with equal weights.
-        standard_error: whether the deviation is that of the mean.
-        scale: factor of the values.
+    They are of means over recordings, by network, track and metric; those of one seed are NaN.
     """
-
-    by: str = "seed"
-    standard_error: bool = False
-    scale: float = 1.0
-
-    def mean_and_spread(self, scores: pd.DataFrame) -> tuple[float, float | None]:
-        """Return mean and deviation; NaN if no value is known, None with a single one to average.
-
-        At rest, for example, there is no share of the path.
-        """
-        found = [values(part, self.metric, **self.where) for _, part in scores.groupby(self.by)]
-        means = [self.scale * known.mean() for known in found if len(known)]
-        if not means:
-            return math.nan, None
-        if len(means) == 1:
-            return float(means[0]), None
-        deviation = float(np.std(means, ddof=1))
-        if self.standard_error:
-            deviation /= math.sqrt(len(means))
-        return float(np.mean(means)), deviation
-
-    def text(self, scores: pd.DataFrame) -> str:
-        """Return mean and deviation as text, "-" if no value is known."""
-        mean, deviation = self.mean_and_spread(scores)
-        shown = figure(mean, self.form)
-        return shown if deviation is None else f"{shown} +- {figure(deviation, self.form)}"
+    labels = ["network", "track", "metric"]
+    by_seed = scores.groupby([*labels, "seed"], sort=False)["value"].mean().dropna()
+    return by_seed.groupby(labels, sort=False).agg(["mean", "std", "sem"])
 
 
 def geometric_mean(known: FloatArray) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,7 +24,7 @@ from stario.fusion.evaluation.compare import (
 )
 from stario.fusion.evaluation.known_positions import position_error_words
 from stario.fusion.evaluation.results import metrics_dict
-from stario.fusion.evaluation.scores import Column, joined, rows_of, scored, values
+from stario.fusion.evaluation.scores import Column, rows_of
 from stario.sequences.arrays import check_type
 from stario.sequences.drawing.figures import distance
 from stario.sequences.drawing.text_table import aligned, figure
@@ -164,68 +164,40 @@ _MIN_COVERAGE = 0.5
 and means."""
 
 
-@dataclass(frozen=True)
-class Scores:
-    """Figures of one recording, kept after a comparison's arrays are released.
-
-    Attributes:
-        name: name of the recording.
-        record: its entry in `metrics.json`.
-    """
-
-    name: str
-    record: dict[str, Any]
-
-    @property
-    def table(self) -> pd.DataFrame:
-        """The figures as rows of recording, group, track, metric and value."""
-        return scored(self.name, self.record["tracks"])
-
-    @property
-    def coverage(self) -> float:
-        """Smallest share of a track at which the truth is known; 1 without truth."""
-        return float(min(values(self.table, "coverage"), default=1.0))
-
-
-def scores_of(comparison: Comparison) -> Scores:
-    """Return the figures of a comparison."""
-    return Scores(comparison.sequence.name, comparison.as_dict())
-
-
-def summary(recordings: Sequence[Scores]) -> dict[str, object]:
+def summary(scores: pd.DataFrame) -> dict[str, object]:
     """Return figures of every recording, with medians and means over them, as plain values.
 
     Medians and means leave out recordings whose truth is known for less than half of the track.
     """
-    counted = _counted(recordings)
-    over = {
-        track: {
-            metric: {"median": float(np.median(known)), "mean": float(np.mean(known))}
-            for metric in METRICS
-            if not metric.startswith("seconds_")
-            and len(known := values(counted, metric, track=track))
-        }
-        for track in TRACKS
-    }
-    return metrics_dict({r.name: r.record for r in recordings}) | {"over_recordings": over}
+    known = _counted(scores).dropna()
+    known = known[known["metric"].isin([m for m in METRICS if not m.startswith("seconds_")])]
+    over = known.groupby(["track", "metric"], sort=False)["value"].agg(["median", "mean"])
+    means: dict[str, dict[str, object]] = {track: {} for track in TRACKS}
+    for (track, metric), row in over.iterrows():
+        means[track][metric] = row.to_dict()
+    return metrics_dict(scores) | {"over_recordings": means}
 
 
-def summary_table(recordings: Sequence[Scores]) -> str:
+def summary_table(scores: pd.DataFrame) -> str:
     """Return the summary as text: horizontal ATE of each track, consistency of the back ends.
 
+    Args:
+        scores: the `Comparison.scores` of several recordings, concatenated.
+
     Raises:
-        InputError: a recording's figures are of another type.
+        InputError: they are of another type.
     """
-    parts = []
-    for one in recordings:
-        check_type("recordings", one, Scores, "scores_of(comparison) returns one")
-        known = f" (truth of {one.coverage:.0%})" if one.coverage < FULL_COVERAGE else ""
-        parts.append((one.name + known, one.table))
-    rows, counted = rows_of(parts, _columns(np.mean), ""), _counted(recordings)
+    check_type("scores", scores, pd.DataFrame, "pandas.concat of `Comparison.scores` returns one")
+    coverage, parts = _coverage(scores), []
+    for name, part in scores.groupby("recording", sort=False):
+        share = coverage.get(name, 1.0)
+        known = f" (truth of {share:.0%})" if share < FULL_COVERAGE else ""
+        parts.append((f"{name}{known}", part))
+    rows, counted = rows_of(parts, _columns(np.mean), ""), _counted(scores)
     for name, over in (("median", np.median), ("mean", np.mean)):
         rows += rows_of([(name, counted)], _columns(over), "")[1:]
     lines = aligned(rows)
-    if any(one.coverage < _MIN_COVERAGE for one in recordings):
+    if (coverage < _MIN_COVERAGE).any():
         least = f"{_MIN_COVERAGE:.0%}"
         lines.append(f"median and mean without recordings whose truth covers less than {least};")
     words = METRIC_WORDS
@@ -241,7 +213,12 @@ def summary_table(recordings: Sequence[Scores]) -> str:
     )
 
 
-def _counted(recordings: Sequence[Scores]) -> pd.DataFrame:
+def _coverage(scores: pd.DataFrame) -> pd.Series[float]:
+    """Return the smallest share of a track at which the truth is known, by recording."""
+    return scores[scores["metric"] == "coverage"].groupby("recording")["value"].min()
+
+
+def _counted(scores: pd.DataFrame) -> pd.DataFrame:
     """Return the figures of the recordings that count in medians and means."""
-    counted = [one.table for one in recordings if one.coverage >= _MIN_COVERAGE]
-    return joined([scored("", {}), *counted])
+    coverage = _coverage(scores)
+    return scores[~scores["recording"].isin(coverage.index[coverage < _MIN_COVERAGE])]

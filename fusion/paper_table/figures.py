@@ -6,7 +6,6 @@ Drawn without pyplot, like those of `stario.sequences.drawing.plots`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,10 +13,9 @@ import numpy as np
 import pandas as pd
 
 from stario.fusion.evaluation.results import figure_files, write_results
-from stario.fusion.evaluation.scores import Spread, values
-from stario.fusion.paper_table.runs import PROTOCOLS, TRUE_ATTITUDE
+from stario.fusion.evaluation.scores import over_seeds, values
+from stario.fusion.paper_table.runs import PROTOCOLS, TRUE_ATTITUDE, Drawn
 from stario.sequences.drawing.figures import INK, apply_style, new_figure, split_at_gaps
-from stario.sequences.sequence import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,29 +30,16 @@ _MARKERS = "osD^vP"
 _BASELINE = "R-ResNet"
 
 
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """Tracks of one recording with the true attitude, aligned with the truth.
-
-    Attributes:
-        recording: name of the recording.
-        time: times (N,) [s].
-        truth: true horizontal positions (N, 2) [m].
-        tracks: those of each network (N, 2) [m].
-    """
-
-    recording: str
-    time: FloatArray
-    truth: FloatArray
-    tracks: dict[str, FloatArray]
+Samples = Mapping[str, Mapping[str, Drawn]]
+"""Tracks of networks with the true attitude, aligned with the truth, by the recording's path."""
 
 
 def write_figures(
-    folder: Path, scores: pd.DataFrame, parameters: Mapping[str, int], samples: list[Sample]
+    folder: Path, scores: pd.DataFrame, parameters: Mapping[str, int], samples: Samples
 ) -> None:
     """Write the figures of the networks whose parameters are given; raises as `write_results`.
 
-    Scores have the labels `network` and `seed`.
+    Scores have the labels `network` and `seed`, and PDE in %.
     """
     colours = {name: _COLOURS[k % len(_COLOURS)] for k, name in enumerate(parameters)}
     figures = {
@@ -73,9 +58,9 @@ def _ate_against_parameters(
     fig = new_figure(8.0, 5.5, "Mean ATE against parameters, true attitude")
     axes = fig.subplots()
     millions = {name: count / 1e6 for name, count in parameters.items()}
+    means = over_seeds(scores).xs((TRUE_ATTITUDE, "ate_m"), level=("track", "metric"))
     for k, name in enumerate(millions):
-        column = Spread("", "ate_m", where={"network": name, "track": TRUE_ATTITUDE})
-        mean, spread = column.mean_and_spread(scores)
+        mean, spread = means.loc[name, ["mean", "std"]]
         axes.errorbar(
             millions[name], mean, yerr=spread, fmt=_MARKERS[k % len(_MARKERS)], ms=9, capsize=4,
             color=colours[name], label=name,
@@ -120,7 +105,7 @@ def pde_boxes(scores: pd.DataFrame, colours: Mapping[str, str]) -> Figure:
     fig = new_figure(4.0 + 3.0 * len(PROTOCOLS), 5.0, "Position drift at the end, per recording")
     panels = fig.subplots(1, len(PROTOCOLS), sharey=True)
     for axes, (track, words) in zip(panels, PROTOCOLS.items(), strict=True):
-        drift = [100.0 * values(scores, "pde", network=name, track=track) for name in colours]
+        drift = [values(scores, "pde", network=name, track=track) for name in colours]
         boxes = axes.boxplot(drift, widths=0.6, patch_artist=True, showfliers=False)
         for k, colour in enumerate(colours.values()):
             boxes["boxes"][k].set(facecolor=colour, alpha=0.35, edgecolor=colour)
@@ -134,9 +119,7 @@ def pde_boxes(scores: pd.DataFrame, colours: Mapping[str, str]) -> Figure:
     return fig
 
 
-def _trajectories(
-    scores: pd.DataFrame, samples: list[Sample], colours: Mapping[str, str]
-) -> Figure:
+def _trajectories(scores: pd.DataFrame, samples: Samples, colours: Mapping[str, str]) -> Figure:
     """Draw tracks of StarIO networks and R-ResNet; without it, of the first four networks."""
     columns = min(2, len(samples))
     rows = -(-len(samples) // columns)
@@ -144,32 +127,32 @@ def _trajectories(
         5.5 * columns, 5.2 * rows, "Tracks with true attitude, aligned by the first pose"
     )
     panels = np.ravel(fig.subplots(rows, columns, squeeze=False))
-    for axes, sample in zip(panels, samples, strict=False):
-        _draw_sample(axes, sample, scores[scores["recording"] == sample.recording], colours)
+    for axes, (recording, tracks) in zip(panels, samples.items(), strict=False):
+        _draw_sample(axes, tracks, scores[scores["recording"] == recording], colours)
+        axes.set_title(Path(recording).name, loc="left", fontsize=10)
     for axes in panels[len(samples) :]:
         axes.remove()
     return fig
 
 
 def _draw_sample(
-    axes: Axes, sample: Sample, scores: pd.DataFrame, colours: Mapping[str, str]
+    axes: Axes, tracks: Mapping[str, Drawn], scores: pd.DataFrame, colours: Mapping[str, str]
 ) -> None:
-    _, path = split_at_gaps(sample.time, sample.truth)
+    names, first = list(tracks), next(iter(tracks.values()))
+    _, path = split_at_gaps(first["time"], first["truth"])
     axes.plot(path[:, 0], path[:, 1], color="black", lw=2.0, label="truth")
-    axes.plot(*sample.truth[-1], "s", color="black", ms=6, mec="white", zorder=3)
-    names = list(sample.tracks)
+    axes.plot(*path[-1], "s", color="black", ms=6, mec="white", zorder=3)
     if _BASELINE in names:
         stario = [name for name in names if name.startswith("StarIO")]
         names = [_BASELINE, *(stario or [n for n in names if n != _BASELINE])]
     for name in names[:4]:
-        track, where = sample.tracks[name], {"network": name, "track": TRUE_ATTITUDE}
+        track, where = tracks[name]["track"], {"network": name, "track": TRUE_ATTITUDE}
         found = (values(scores, metric, **where) for metric in ("ate_m", "rte_m"))
         ate, rte = (error[0] if len(error) else np.nan for error in found)
         label = f"{name}: ATE {ate:.2f} m, RTE {rte:.2f} m"  # of the first seed, which is drawn
         axes.plot(track[:, 0], track[:, 1], color=colours[name], lw=1.2, label=label)
         axes.plot(*track[-1], "s", color=colours[name], ms=6, mec="white")
-    axes.plot(*sample.truth[0], "o", mfc="white", mec=INK, ms=8)
-    axes.set_title(sample.recording, loc="left", fontsize=10)
+    axes.plot(*path[0], "o", mfc="white", mec=INK, ms=8)
     axes.set(xlabel="x [m]", ylabel="y [m]")
     axes.set_aspect("equal", adjustable="datalim")
     axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.12))

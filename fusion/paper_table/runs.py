@@ -1,7 +1,7 @@
 """Runs of the table: a network trained and tested on a data set with a seed, kept as files.
 
 `<out>/<set>/<network>/<n>-steps/seed-<n>/` holds the model and `trained.json` once training is
-done, then `errors.json`. Repeating a run adds only what is missing.
+done, then `scores.json`. Repeating a run adds only what is missing.
 """
 
 from __future__ import annotations
@@ -18,23 +18,21 @@ from itertools import product
 from pathlib import Path
 from time import process_time
 
+import pandas as pd
+
+from stario.fusion.evaluation.bootstrap import block_rows
 from stario.fusion.evaluation.compare import TRACK_TITLES
-from stario.fusion.evaluation.displacement_error import (
-    block_sums,
-    known_truth,
-    recording_errors,
-    usable_streams,
-)
+from stario.fusion.evaluation.displacement_error import BLOCK_SECONDS
+from stario.fusion.evaluation.groups import alone_on
 from stario.fusion.evaluation.pedestrian import NAME as PDR
 from stario.fusion.evaluation.pedestrian import (
     Model,
     PedestrianDeadReckoning,
     model_named,
     pedestrian_track,
-    piece_of,
 )
+from stario.fusion.evaluation.scores import COLUMNS, joined, scored
 from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude, true_poses
-from stario.fusion.imu.inference import Predictor
 from stario.fusion.navigator import Navigator
 from stario.fusion.paper_table.sets import ALL, FIRST, DataSet
 from stario.fusion.paper_table.training import (
@@ -51,12 +49,10 @@ from stario.network.training.config import TrainingConfig
 from stario.sequences.accuracy.metrics import PoseErrors, align, evaluate_track, pose_errors
 from stario.sequences.arrays import check_choice
 from stario.sequences.datasets.batch import Skipped, each, without_skipped
-from stario.sequences.datasets.splits import ListEntry
 from stario.sequences.errors import ConfigError, InputError, ReadError
 from stario.sequences.files import write_json
 from stario.sequences.lazy import optional_package
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
-from stario.sequences.truth.problems import warn_of_truth
 
 LEADING = ("StarIO", "R-ResNet", "DeepILS", "StarIO without MSGCU")
 """Networks that are completed first, and with several seeds."""
@@ -65,6 +61,9 @@ TRUE_ATTITUDE, OWN_ATTITUDE, FILTERED = "network_true_attitude", "network", "fil
 
 PROTOCOLS = {name: TRACK_TITLES[name] for name in (TRUE_ATTITUDE, OWN_ATTITUDE, FILTERED)}
 """Tracks of a network and their titles; the first is that of the papers' protocol."""
+
+Drawn = dict[str, FloatArray]
+"""Time (N,) [s] of a track, horizontal positions `track` and `truth` (N, 2) [m]."""
 
 MAX_DRAWN = 4
 """Number of recordings whose tracks are kept for a figure."""
@@ -130,7 +129,7 @@ def complete_run(run: Run, out: Path, reading: ReaderConfig) -> Run:
         InputError: the network cannot be trained.
     """
     folder = run.folder(out)
-    if _read_if_done(run, folder / "errors.json") is not None:
+    if _read_if_done(run, folder / "scores.json") is not None:
         return run
     folder.mkdir(parents=True, exist_ok=True)
     if run.recipe is not None and _read_if_done(run, folder / "trained.json") is None:
@@ -139,93 +138,100 @@ def complete_run(run: Run, out: Path, reading: ReaderConfig) -> Run:
         for spare in TEMPORARY_FILES:
             (folder / spare).unlink(missing_ok=True)
     began = process_time()
-    found, skipped = test_errors(_model(run, folder), run.dataset.test, reading)
+    scores, blocks, drawn, skipped = test_scores(run, _model(run, folder), reading)
     content = {
         "cell": run.digest,
         "network": run.network,
         "seed": run.seed,
         "seconds": process_time() - began,
-        "recordings": found,
+        "scores": scores.to_dict("list"),
+        "blocks": blocks.to_dict("list"),
+        "drawn": drawn,
         "skipped": [asdict(failure) for failure in skipped],
     }
-    write_json(folder / "errors.json", content)
+    write_json(folder / "scores.json", content)
     return run
 
 
 def read_run(run: Run, out: Path) -> dict[str, object] | None:
-    """Return the content of a run's `errors.json` and `trained.json`; None if it is not completed.
+    """Return the content of a run's `scores.json` and `trained.json`; None if it is not completed.
 
     Raises:
         ConfigError: it was completed with another recipe, other weights or other recordings.
     """
     folder = run.folder(out)
-    content = _read_if_done(run, folder / "errors.json")
+    content = _read_if_done(run, folder / "scores.json")
     if content is None or run.recipe is None:
         return content
     return content | {"trained": _read(folder / "trained.json")}
 
 
-def test_errors(
-    model: Model, test: Sequence[ListEntry], reading: ReaderConfig
-) -> tuple[list[dict[str, object]], list[Skipped]]:
-    """Return the errors on every recording, and the recordings that were skipped.
+def test_scores(
+    run: Run, model: Model, reading: ReaderConfig
+) -> tuple[pd.DataFrame, pd.DataFrame, dict[str, Drawn], list[Skipped]]:
+    """Return the errors on every test recording, and the recordings that were skipped.
 
     Returns:
-        Plain values for each recording: `recording`, `path`, `group`, `kind` of truth, `path_m`;
-        `tracks` with ATE, RTE and PDE by track; `figures` as in `displacement_error.FIGURES`;
-        `blocks` of 30 s, [sum of squares, count], of the position error under the paper's protocol
-        ("ate") and of the displacement error over 10 s ("10"); for the first recordings with poses
-        `drawn`, the track with the true attitude: time (N,) [s], horizontal positions `track` and
-        `truth` (N, 2) [m].
+        Scores with the labels `network` and `seed`, recordings named by their paths: figures of the
+        network alone are those of a track that is called by the kind of truth; ATE, RTE and PDE are
+        those of `PROTOCOLS`.
+        Blocks of 30 s as of `alone_on`, and with the metric "ate" of the position error under the
+        paper's protocol.
+        For the first recordings with poses, what is drawn of the track with the true attitude.
     """
-    found: list[dict[str, object]] = []
-    left_out: list[Skipped] = []
-    drawn = 0
-    groups = {entry.path: entry.group for entry in test}
-    outcomes = each(partial(_recording, model=model, read=reading.read, groups=groups), groups, 1)
-    for row, track in without_skipped(outcomes, left_out):
-        if track and drawn < MAX_DRAWN:
-            row["drawn"], drawn = track, drawn + 1
-        found.append(row)
-    return found, left_out
+    groups = {entry.path: entry.group for entry in run.dataset.test}
+    work = partial(_recording, network=run.network, model=model, read=reading.read, groups=groups)
+    skipped: list[Skipped] = []
+    scores = [scored("", {}, network="")]
+    blocks = [block_rows([], set="", group="", recording="", network="", seed=0, metric="")]
+    drawn: dict[str, Drawn] = {}
+    for figures, squares, track in without_skipped(each(work, groups, 1), skipped):
+        scores.append(figures)
+        blocks.append(squares)
+        if track and len(drawn) < MAX_DRAWN:
+            drawn[figures["recording"].iloc[0]] = track
+    tables = (joined(tables).assign(seed=run.seed) for tables in (scores, blocks))
+    return *tables, drawn, skipped
 
 
 def _recording(
-    path: Path, model: Model, read: Callable[[Path], ImuSequence], groups: Mapping[Path, str]
-) -> tuple[dict[str, object], dict[str, FloatArray]]:
+    path: Path,
+    network: str,
+    model: Model,
+    read: Callable[[Path], ImuSequence],
+    groups: Mapping[Path, str],
+) -> tuple[pd.DataFrame, pd.DataFrame, Drawn]:
     sequence = read(path)
-    streams, (kind, _) = usable_streams(sequence), known_truth(sequence)
-    warn_of_truth(sequence)
-    alone = recording_errors(sequence, [piece_of(model, stream) for stream in streams])
-    blocks = {"10": alone.blocks["10"].tolist()} if "10" in alone.blocks else {}
-    row: dict[str, object] = {
-        "path": str(path),
-        "group": groups[path],
-        "recording": sequence.name,
-        "kind": kind,
-        "path_m": alone.path_m,
-        "figures": alone.figures,
-        "blocks": blocks,
-        "tracks": {},
-    }
-    if kind != "poses":
-        return row, {}
-    if isinstance(model, PedestrianDeadReckoning):
-        track = pedestrian_track(sequence).trajectory
-        row["tracks"] = {OWN_ATTITUDE: _errors_of(track, true_poses(sequence))}
-        return row, {}
-    row["tracks"], errors = _protocol_errors(model, sequence)
-    time, squares = errors.estimate.time, (errors.position_W[:, :2] ** 2).sum(axis=1)
-    blocks["ate"] = block_sums(time - time[0], squares).tolist()
-    xy = {"track": errors.estimate.position_W[:, :2], "truth": errors.truth.position_W[:, :2]}
-    return row, {"time": time, **xy}
+    found, blocks = alone_on(sequence, path, groups[path], lambda *_: model, [network])
+    found = found.assign(track=found["truth"], network=network)
+    scores, drawn = [found[[*COLUMNS, "network"]]], {}
+    if sequence.truth is not None:
+        unit = {key: found[key].iloc[0] for key in ("set", "group", "recording", "network")}
+        tracks, poses = _protocol_errors(model, sequence)
+        scores.append(scored(str(path), tracks, unit["group"], network=network))
+        if poses is not None:
+            blocks = joined([blocks, _position_blocks(poses, **unit)])
+            estimate, truth = (each.position_W[:, :2] for each in (poses.estimate, poses.truth))
+            drawn = {"time": poses.estimate.time, "track": estimate, "truth": truth}
+    return joined(scores), blocks, drawn
+
+
+def _position_blocks(poses: PoseErrors, **labels: str) -> pd.DataFrame:
+    since, squares = poses.estimate.time - poses.estimate.time[0], poses.position_W[:, :2] ** 2
+    sums = pd.Series(squares.sum(axis=1)).groupby(since // BLOCK_SECONDS).agg(["sum", "count"])
+    return block_rows(sums.to_numpy(), seed=0, metric="ate", **labels)
 
 
 def _protocol_errors(
-    model: Predictor, sequence: ImuSequence
-) -> tuple[dict[str, dict[str, float]], PoseErrors]:
-    """Return the errors of the tracks of `PROTOCOLS`, and those of the poses of the first."""
+    model: Model, sequence: ImuSequence
+) -> tuple[dict[str, dict[str, float]], PoseErrors | None]:
+    """Return the errors of the tracks of `PROTOCOLS`, and those of the poses of the first.
+
+    Steps have the own attitude only.
+    """
     truth = true_poses(sequence)
+    if isinstance(model, PedestrianDeadReckoning):
+        return {OWN_ATTITUDE: _errors_of(pedestrian_track(sequence).trajectory, truth)}, None
     navigator = Navigator(model, backend="ekf")
     preprocessed = navigator.observe(sequence)
     tracks = {

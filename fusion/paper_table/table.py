@@ -11,12 +11,19 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from stario.fusion.evaluation.bootstrap import Interval, block_rows, ranks
+from stario.fusion.evaluation.bootstrap import Interval, ranks
 from stario.fusion.evaluation.pedestrian import NAME as PDR
-from stario.fusion.evaluation.scores import Spread, joined, scored
-from stario.fusion.paper_table.figures import Sample, write_figures
-from stario.fusion.paper_table.runs import FILTERED, OWN_ATTITUDE, TRUE_ATTITUDE, Run, read_run
-from stario.fusion.paper_table.sets import DataSet, published, set_of
+from stario.fusion.evaluation.scores import joined, over_seeds, scored
+from stario.fusion.paper_table.figures import write_figures
+from stario.fusion.paper_table.runs import (
+    FILTERED,
+    OWN_ATTITUDE,
+    TRUE_ATTITUDE,
+    Drawn,
+    Run,
+    read_run,
+)
+from stario.fusion.paper_table.sets import DataSet, published
 from stario.network.architectures import ARCHITECTURES
 from stario.network.runtime.survey import BATCHES, ModelRow, survey
 from stario.network.training.config import TrainingConfig
@@ -31,32 +38,28 @@ Completed = Sequence[Mapping[str, Any]]
 """Results (`read_run`) of a set's runs."""
 
 
-def _column(title: str, track: str, name: str, scale: float = 1.0) -> Spread:
-    where = {"track": track}
-    return Spread(title, name, ".3f", where=where, standard_error=True, scale=scale)
-
-
 COLUMNS = {
-    "ate": _column("ATE [m]", TRUE_ATTITUDE, "ate_m"),
-    "rte": _column("RTE [m]", TRUE_ATTITUDE, "rte_m"),
-    "pde": _column("PDE [%]", TRUE_ATTITUDE, "pde", 100.0),
-    "own_ate": _column("own attitude: ATE [m]", OWN_ATTITUDE, "ate_m"),
-    "own_rte": _column("own attitude: RTE [m]", OWN_ATTITUDE, "rte_m"),
-    "filtered_ate": _column("filtered: ATE [m]", FILTERED, "ate_m"),
-    "filtered_rte": _column("filtered: RTE [m]", FILTERED, "rte_m"),
-    "waypoints_m": _column("waypoints [m]", "waypoints", "ate_fit_m"),
-    "waypoints_percent": _column("waypoints [%]", "waypoints", "ate_fit_percent"),
-    "waypoints_length": _column("length ratio", "waypoints", "length_ratio"),
-    "positions_percent": _column("positions, 20 s [%]", "positions", "stretch_percent"),
-    "training_error": _column("training error", "trained", "training_error_m2"),
-    "validation_error": _column("validation error", "trained", "validation_error_m2"),
+    "ate": ("ATE [m]", TRUE_ATTITUDE, "ate_m"),
+    "rte": ("RTE [m]", TRUE_ATTITUDE, "rte_m"),
+    "pde": ("PDE [%]", TRUE_ATTITUDE, "pde"),
+    "own_ate": ("own attitude: ATE [m]", OWN_ATTITUDE, "ate_m"),
+    "own_rte": ("own attitude: RTE [m]", OWN_ATTITUDE, "rte_m"),
+    "filtered_ate": ("filtered: ATE [m]", FILTERED, "ate_m"),
+    "filtered_rte": ("filtered: RTE [m]", FILTERED, "rte_m"),
+    "waypoints_m": ("waypoints [m]", "waypoints", "ate_fit_m"),
+    "waypoints_percent": ("waypoints [%]", "waypoints", "ate_fit_percent"),
+    "waypoints_length": ("length ratio", "waypoints", "length_ratio"),
+    "positions_percent": ("positions, 20 s [%]", "positions", "stretch_percent"),
+    "training_error": ("training error", "trained", "training_error_m2"),
+    "validation_error": ("validation error", "trained", "validation_error_m2"),
 }
-"""Columns of the table, in order; a column without any value on a set is omitted there."""
+"""Title, track and metric of the table's columns, in order; one without any value on a set is
+omitted there."""
 
 _MEASURES = {
     "ate": "position error under the paper's protocol",
-    "10": "displacement error over 10 s along the own attitude (waypoint residuals where there are "
-    "waypoints)",
+    "rms_10s_m": "displacement error over 10 s along the own attitude (waypoint residuals where "
+    "there are waypoints)",
 }
 """Errors that networks may be ranked by, in words."""
 
@@ -67,9 +70,8 @@ class SetTable:
 
     Attributes:
         dataset: name, recordings and split.
-        scores: errors of every run, with labels `path`, `network` and `seed`; figures of the
-            network alone are those of a track that is called by the kind of truth, errors of the
-            training those of a track "trained".
+        scores: errors of every run, as of `test_scores`, PDE in %; those of the training are those
+            of a track "trained".
         rows: networks, in order, with their `seeds`, the number of test recordings that given
             weights were trained on (`learned`), mean and standard error over seeds of each of
             `COLUMNS` ("ate", "ate_sem"; NaN if unknown), and the columns of `bootstrap.ranks`.
@@ -118,16 +120,19 @@ def set_table(
     dataset: DataSet, completed: Completed, learned: Mapping[str, frozenset[Path]]
 ) -> SetTable:
     """Return a set's table, given the recordings that packaged weights have `learned`, by name."""
-    recordings = [one for content in completed for one in content["recordings"]]
-    measure = "ate" if all(one["kind"] == "poses" for one in recordings) else "10"
-    tested = completed[0]["recordings"]
-    names = [content["network"] for content in completed]
-    test = {entry.path for entry in dataset.test}
     scores = _scores(completed)
+    paths = scores[scores["metric"] == "path_m"]
+    measure = "ate" if set(paths["track"]) <= {"poses"} else "rms_10s_m"
+    names = [content["network"] for content in completed]
+    tested = paths.drop_duplicates("recording")
+    test = {entry.path for entry in dataset.test}
+    means = over_seeds(scores)
+    blocks = joined(pd.DataFrame(content["blocks"]) for content in completed)
+    ranked = ranks(blocks[blocks["metric"] == measure], REFERENCE_NETWORK)
     rows = pd.DataFrame(
         {"network": name, "seeds": sorted(c["seed"] for c in completed if c["network"] == name)}
         | {"learned": len(test & learned.get(name, set()))}
-        | _means(scores[scores["network"] == name])
+        | _means(means, name)
         for name in sorted(set(names), key=[PDR, *ARCHITECTURES, *names].index)
     )
     failures = [
@@ -138,52 +143,31 @@ def set_table(
     return SetTable(
         dataset,
         scores,
-        rows.merge(ranks(_blocks(completed, measure, dataset), REFERENCE_NETWORK), "left"),
+        rows.merge(ranked, "left"),
         len(tested),
-        float(sum(one["path_m"] for one in tested)),
+        float(tested["value"].sum()),
         _MEASURES[measure],
         list(dict.fromkeys(f"{failure['item']}: {failure['reason']}" for failure in failures)),
     )
 
 
-def _means(scores: pd.DataFrame) -> dict[str, float | None]:
-    found: dict[str, float | None] = {}
-    for key, column in COLUMNS.items():
-        found[key], found[f"{key}_sem"] = column.mean_and_spread(scores)
-    return found
+def _means(means: pd.DataFrame, network: str) -> dict[str, float]:
+    found = means.reindex([(network, track, metric) for _, track, metric in COLUMNS.values()])
+    rows = zip(COLUMNS, found["mean"], found["sem"], strict=True)
+    return {k: v for key, mean, error in rows for k, v in ((key, mean), (f"{key}_sem", error))}
 
 
 def _scores(completed: Completed) -> pd.DataFrame:
-    found = [scored("", {}, path="", network="", seed=0)]
-    names = [content["network"] for content in completed]
-    for content in sorted(completed, key=lambda content: names.index(content["network"])):
-        labels: dict[str, Any] = {key: content[key] for key in ("network", "seed")}
-        for one in content["recordings"]:
-            figures = {**one["tracks"], one["kind"]: one["figures"]}
-            labels["path"] = one["path"]
-            found.append(scored(one["recording"], figures, one["group"], **labels))
+    found = []
+    for content in completed:
+        found.append(pd.DataFrame(content["scores"]))
         if trained := content.get("trained"):
             errors = {key: trained[key] for key in ("training_error_m2", "validation_error_m2")}
-            found.append(scored("", {"trained": errors}, **labels | {"path": ""}))
-    return joined(found)
-
-
-def _blocks(completed: Completed, measure: str, dataset: DataSet) -> pd.DataFrame:
-    """Return the blocks of squared errors of networks that have some with every seed."""
-    units = {str(e.path): {"set": set_of(e), "group": e.group} for e in dataset.test}
-    found, without = [block_rows([], set="", group="", recording="", network="", seed=0)], set()
-    for content in completed:
-        run = {key: content[key] for key in ("network", "seed")}
-        known = {
-            one["path"]: one["blocks"][measure]
-            for one in content["recordings"]
-            if one["blocks"].get(measure)
-        }
-        if not known:
-            without.add(content["network"])
-        found += [block_rows(b, **units[path], recording=path, **run) for path, b in known.items()]
-    table = joined(found)
-    return table[~table["network"].isin(without)]
+            run = {key: content[key] for key in ("network", "seed")}
+            found.append(scored("", {"trained": errors}, **run))
+    table = joined(found).astype({"value": float})
+    table.loc[table["metric"] == "pde", "value"] *= 100.0
+    return table
 
 
 def work_of(tables: Iterable[Completed]) -> pd.DataFrame:
@@ -262,18 +246,15 @@ def write_results(
     return text
 
 
-def _samples(completed: Completed) -> list[Sample]:
+def _samples(completed: Completed) -> dict[str, dict[str, Drawn]]:
     """Return the tracks to draw, of networks trained with the first seed."""
-    samples: dict[str, Sample] = {}
+    samples: dict[str, dict[str, Drawn]] = {}
     for content in completed:
         chosen = content["network"] in ARCHITECTURES and content["seed"] == 0
-        for one in content["recordings"] if chosen else ():
-            if drawn := one.get("drawn"):
-                time, truth, track = (np.array(drawn[key]) for key in ("time", "truth", "track"))
-                new = Sample(one["recording"], time, truth, {})
-                sample = samples.setdefault(one["recording"], new)
-                sample.tracks[content["network"]] = track
-    return list(samples.values())
+        for recording, drawn in content["drawn"].items() if chosen else ():
+            arrays = {key: np.array(values) for key, values in drawn.items()}
+            samples.setdefault(recording, {})[content["network"]] = arrays
+    return samples
 
 
 def table_text(
@@ -299,11 +280,10 @@ def table_text(
 
 def _set_text(table: SetTable) -> str:
     dataset, known = table.dataset, table.rows[[*COLUMNS]].notna().any()
-    columns = [column for key, column in COLUMNS.items() if known[key]]
-    titles = ["network", *(column.title for column in columns), "seeds", "rank"]
+    columns = [key for key in COLUMNS if known[key]]
+    titles = ["network", *(COLUMNS[key][0] for key in columns), "seeds", "rank"]
     lines = [[*titles, f"error / {REFERENCE_NETWORK}'s", "paper: ATE, RTE [m]"]]
     for row in table.rows.to_dict("records"):
-        part = table.scores[table.scores["network"] == row["network"]]
         rank, ratio, errors = "-", "-", "-"
         if not np.isnan(row["rank"]):
             rank = "{rank:.0f} [{rank_low:.0f}, {rank_high:.0f}]".format(**row)
@@ -311,7 +291,7 @@ def _set_text(table: SetTable) -> str:
             ratio = f"{row['ratio']:.2f}"
         if paper := published(dataset.name, row["network"]):
             errors = "{:.3f}, {:.3f}".format(*paper)
-        cells = [column.text(part) for column in columns]
+        cells = [_mean(row[key], row[f"{key}_sem"]) for key in columns]
         title = _title(row, table.tested)
         lines.append([title, *cells, str(len(row["seeds"])), rank, ratio, errors])
     return "\n".join(
@@ -328,6 +308,10 @@ def _set_text(table: SetTable) -> str:
               if table.skipped else []),
         ]
     )  # fmt: skip
+
+
+def _mean(mean: float, error: float) -> str:
+    return figure(mean) if np.isnan(error) else f"{figure(mean)} +- {figure(error)}"
 
 
 def _title(row: Mapping[str, Any], tested: int) -> str:

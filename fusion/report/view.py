@@ -29,12 +29,12 @@ _BLUE, _BLACK = (0, 114, 178), (0, 0, 0)
 _AXIS_COLOURS = ((0, 114, 178), (213, 94, 0), (0, 158, 115))
 
 
-def write_view(path: Path, run: Comparison) -> Path:
+def write_view(path: Path, found: Comparison) -> Path:
     """Write a run as a rerun file.
 
     Args:
         path: file to write, ending in .rrd; its folder must exist.
-        run: the recording, with its sensors and ground truth, and its track.
+        found: the recording, with its sensors and ground truth, and its track.
 
     Returns:
         The path.
@@ -42,7 +42,7 @@ def write_view(path: Path, run: Comparison) -> Path:
     Raises:
         InputError: the file cannot be written.
     """
-    sequence, track, aligned = run.sequence, run.track, run.aligned()["track"]
+    sequence, track, aligned = found.sequence, found.track, found.aligned()["track"]
     stream = rr.RecordingStream("stario", recording_id=None)
     try:
         stream.save(path)

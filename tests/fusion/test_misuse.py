@@ -50,7 +50,7 @@ LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
         (lambda model: compare("walk.csv", model, NavigatorConfig()), "sequence.*read_recording"),
         (lambda model: network_track("walk.csv"), "preprocessed.*observe"),
         (lambda model: inertial_track("walk.csv"), "preprocessed.*observe"),
-        (lambda model: summary_table(["walk"]), "recordings.*scores_of"),
+        (lambda model: summary_table(["walk"]), "scores.*concat"),
         (lambda model: next(compare_recordings("walk.csv", model)), "paths.*find_recordings"),
         (lambda model: FilterConfig(gate="0.9"), "gate"),
         (lambda model: FilterConfig(magnetometer="no"), "magnetometer"),

@@ -11,15 +11,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import get_args
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.backends import BackendName
-from stario.fusion.evaluation.compare import TRACK_OF
+from stario.fusion.evaluation.compare import navigators
 from stario.fusion.evaluation.scores import Column, joined, rows_of, scored
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.imu.inference import Predictor, WindowDisplacement
@@ -185,10 +183,10 @@ def run_faults(
     config: NavigatorConfig,
     model: Predictor | None = None,
     seed: int = 0,
-    backends: Sequence[BackendName] = get_args(BackendName),
+    graph: bool = True,
     only: Sequence[Fault] | None = None,
 ) -> pd.DataFrame:
-    """Score a recording with each fault, the rows' group, by the track of each back end.
+    """Score a recording with each fault, the rows' group, by the track of filter and graph.
 
     Figures: absolute trajectory error [m] without and with the fault (`error_without`,
     `error_with`); distance from the truth at the end (`end_error`) and its reported standard
@@ -212,8 +210,7 @@ def run_faults(
 
     found: list[pd.DataFrame] = []
     whole = observed(sequence)
-    for backend in backends:
-        navigator = Navigator(predictor, config, backend=backend)
+    for name, navigator in navigators(predictor, config, graph).items():
         without = evaluate_track(navigator.track(whole).trajectory, truth).ate_m
         for fault in faults(sequence.duration) if only is None else only:
             rng, preprocessed = np.random.default_rng(seed), whole
@@ -230,9 +227,7 @@ def run_faults(
                 assert track.health is not None
                 figures, words = _figures(track, truth), reported(track.health)
             figures = {"error_without": without, **figures}
-            found.append(
-                scored(sequence.name, {TRACK_OF[backend]: figures}, fault.name, reported=words)
-            )
+            found.append(scored(sequence.name, {name: figures}, fault.name, reported=words))
     return joined(found)
 
 

@@ -30,7 +30,7 @@ from stario.fusion.evaluation.checks.faults import (
     matched_config,
     with_true_displacements,
 )
-from stario.fusion.evaluation.compare import TRACK_OF, Metrics, measure
+from stario.fusion.evaluation.compare import Metrics, measure, navigators
 from stario.fusion.evaluation.displacement_error import known_truth
 from stario.fusion.evaluation.known_positions import MIN_POSITIONS, position_error, true_path
 from stario.fusion.evaluation.scores import (
@@ -140,12 +140,10 @@ def _gains(
         found = f"fewer than {MIN_POSITIONS} within the track"
         raise InputError(f"{sequence.name}: positions", found, f"{MIN_POSITIONS} or more")
     figures: dict[str, Metrics] = {"network": {"error_m": alone}}
-    backends: tuple[BackendName, ...] = ("ekf", "graph") if graph else ("ekf",)
-    for name in backends:
+    for name, navigator in navigators(DummyPredictor(), config, graph).items():
         began = process_time()
-        track = Navigator(DummyPredictor(), config, backend=name).track(preprocessed)
-        seconds = process_time() - began
-        figures[TRACK_OF[name]] = _gain(track, sequence, path, alone, seconds)
+        track = navigator.track(preprocessed)
+        figures[name] = _gain(track, sequence, path, alone, process_time() - began)
     if graph:
         track, times = _streamed(preprocessed, config)
         stream = _gain(track, sequence, path, alone, float(times.sum()))
@@ -293,7 +291,8 @@ def track_with_fixes(
         "yaw_nees": float((yaw**2 / P[:, 2, 2]).mean()),
         "yaw_covered": float((np.abs(yaw) < SIGMA_BOUND * np.sqrt(P[:, 2, 2])).mean()),
     }
-    return scored(sequence.name, {TRACK_OF[backend]: figures})
+    name = "filtered" if backend == "ekf" else "track"
+    return scored(sequence.name, {name: figures})
 
 
 def true_fixes(truth: Trajectory, every: float, sigma: float, seed: int) -> list[Fix]:

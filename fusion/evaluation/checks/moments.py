@@ -8,20 +8,17 @@ to the estimator, and of both together, which adds what the track lost within th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.backends import BackendName
-from stario.fusion.evaluation.compare import TRACK_OF
+from stario.fusion.evaluation.compare import navigators
 from stario.fusion.evaluation.displacement_error import fit_yaw_and_position, known_truth, planar
 from stario.fusion.evaluation.scores import Column, by_track, geometric_mean, joined, scored, table
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.direction import Complex
 from stario.fusion.imu.inference import Predictor
-from stario.fusion.navigator import Navigator
 from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.state import Track
 from stario.sequences.arrays import interpolated
@@ -72,7 +69,7 @@ def moment_costs(
     model: Predictor,
     sequence: ImuSequence,
     config: NavigatorConfig,
-    backends: Sequence[BackendName] = ("ekf",),
+    graph: bool = False,
     seed: int = 0,
 ) -> pd.DataFrame:
     """Score a recording without and with each moment and place, the rows' group, by track.
@@ -85,19 +82,19 @@ def moment_costs(
         InputError: it has no ground truth, or cannot be run.
     """
     sequence = _with_truth(sequence)
-    navigators = {name: Navigator(model, config, backend=name) for name in backends}
-    first = navigators[backends[0]]
+    estimators = navigators(model, config, graph)
+    first = estimators["filtered"]
     observed = first.observe(sequence)
     poses = sequence.truth or network_track(observed).trajectory
-    without = {name: each.track(observed) for name, each in navigators.items()}
+    without = {name: each.track(observed) for name, each in estimators.items()}
     found = []
     for moment in MOMENTS:
         for place, share in PLACES.items():
             inserted = insert_moment(sequence, poses, moment, share, seed)
             observed = first.observe(inserted.sequence)
             figures = {
-                TRACK_OF[name]: _cost(sequence, inserted, without[name], navigator.track(observed))
-                for name, navigator in navigators.items()
+                name: _cost(sequence, inserted, without[name], each.track(observed))
+                for name, each in estimators.items()
             }
             found.append(scored(sequence.name, figures, f"{moment.name}, {place}"))
     return joined(found)

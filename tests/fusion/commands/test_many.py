@@ -2,25 +2,17 @@
 
 import json
 import re
-import shutil
 from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from stario.fusion.commands import evaluate, options
+from stario.fusion.commands import compare, options
 from stario.fusion.evaluation.compare import TRACKS
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
 from stario.sequences.simulation.moments import MOMENTS
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_compare_prints_json_and_writes_the_same(stario, recording, tmp_path):
-    done = stario("compare", recording, "--out", "out", "--json")
-    assert done.code == 0
-    assert json.loads(done.out) == json.loads((tmp_path / "out/metrics.json").read_text())
 
 
 @pytest.mark.usefixtures("no_figures")
@@ -36,6 +28,7 @@ def test_compare_sets_the_track_against_dead_reckoning(stario, recording):
         seen,
     )
     assert files.startswith("figures and tracks: out/walk/plan.png")
+    assert "root mean square" not in done.out
     assert {path.stem for path in Path("out/walk").glob("*.tum")} == {
         *("track", "dead_reckoning", "truth"),
     }
@@ -47,11 +40,6 @@ def test_compare_prints_a_table_of_further_tracks_and_explains_on_request(stario
     rows = [line.split()[0] for line in done.out.splitlines()]
     assert [row for row in rows if row in TRACKS] == list(TRACKS)
     assert "root mean square of the position error's norm" in done.out
-    two = stario("compare", recording, "--tracks", "filtered")
-    assert "root mean square" not in two.out
-    assert {row for line in two.out.splitlines() if (row := line.split()[0]) in TRACKS} == {
-        *("track", "filtered", "dead_reckoning"),
-    }
     stario("compare", recording, "--tracks", "ekf").assert_one_line_error("--tracks", "filtered")
 
 
@@ -64,9 +52,6 @@ def test_check_fusion_compares_the_fusion_with_its_network(stario, recording, tm
     first, second = (one for one in scores if one["track"] == "network")
     assert [first["recording"], second["recording"]] == ["walk", "walk-2"]
     assert first["error_m"] == second["error_m"] > 0.0
-    refused = stario("check", "fusion", recording, "--by", "colour")
-    assert refused.code == 1
-    assert "carry" in refused.err
 
 
 def test_check_gaps_reports_how_far_missing_samples_move_the_end(stario, recording, monkeypatch):
@@ -76,27 +61,24 @@ def test_check_gaps_reports_how_far_missing_samples_move_the_end(stario, recordi
     found = json.loads(done.out)
     assert len(found) == 2
     assert all(one["recording"] == "walk" and one["metres"] >= 0.0 for one in found)
-    shown = stario("check", "gaps", recording)
-    assert "walk" not in shown.err
-    assert "within 1% and 3 deg" in shown.out
 
 
 def test_check_moments_reports_what_a_bad_moment_costs(stario, recording, monkeypatch):
     checks = "stario.fusion.evaluation.checks.moments"
-    monkeypatch.setattr(f"{checks}.MOMENTS", MOMENTS[-1:])
+    monkeypatch.setattr(f"{checks}.MOMENTS", MOMENTS[:1])
     monkeypatch.setattr(f"{checks}.PLACES", {"middle": 0.5})
     done = stario("check", "moments", recording, "--graph", "--json")
     assert done.code == 0
     found = json.loads(done.out)
     assert [(one["recording"], one["group"], one["track"]) for one in found] == [
-        ("walk", "lift, middle", track) for track in ("filtered", "track")
+        ("walk", "shake 10 s, middle", track) for track in ("filtered", "track")
     ]
     assert all(one["error_with"] > 0.0 for one in found)
     monkeypatch.setattr(f"{checks}.CARRIES", ("bag",))
     simulated = "stario.fusion.evaluation.checks.simulation.simulated_walk"
     monkeypatch.setattr(simulated, lambda carry, seed: read_generic_csv(recording))
     shown = stario("check", "moments")
-    assert "lift, middle" in shown.out
+    assert "shake 10 s, middle" in shown.out
     stario("check", "moments", "--axes", "y,-x,z").assert_one_line_error("--axes", "simulated")
 
 
@@ -106,25 +88,6 @@ def test_check_fixes_evaluates_tracks_with_fixes(stario, recording):
     (found,) = json.loads(done.out)
     assert found["recording"] == "walk"
     assert 0.0 < found["position_rms"] < 1.0
-    shown = stario("check", "fixes", recording, "--every", "2")
-    assert "yaw NEES" in shown.out
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_truth_that_covers_only_a_part_is_reported(stario, recording, tmp_path):
-    walk = read_generic_csv(recording)
-    write_csv(tmp_path / "part.csv", replace(walk, truth=walk.truth.slice(0.0, 6.0)))
-    done = stario("run", "part.csv", "--out", "out")
-    assert "; the truth covers 50% of it" in done.out
-
-
-@pytest.mark.usefixtures("no_figures")
-@pytest.mark.parametrize("command", ["run", "compare"])
-def test_figures_of_several_recordings_are_explained_once(stario, recording, tmp_path, command):
-    shutil.copy(recording, tmp_path / "again.csv")
-    done = stario(command, recording, "again.csv", "--out", "out", "--explain")
-    assert done.out.count("\nfitted [m]: ATE after") == 1
-    assert done.out.count("m rms from the truth") == 2
 
 
 def test_many_recordings_skipped_for_one_reason_take_one_line(stario, recording, tmp_path):
@@ -142,8 +105,6 @@ def test_evaluate_prints_medians_and_needs_truth(stario, recording, tmp_path):
     done = stario("evaluate", recording)
     assert done.code == 0
     assert [line.split()[0] for line in done.out.splitlines()[1:4]] == ["walk", "median", "mean"]
-    done = stario("evaluate", recording, "--json")
-    assert json.loads(done.out)["over_recordings"]["track"]["ate_m"]["median"] > 0.0
     write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
     stario("evaluate", "blind.csv").assert_one_line_error("truth")
 
@@ -164,6 +125,7 @@ def test_a_batch_continues_after_failures_and_reports_them(stario, recording, tm
     assert done.code == 1
     figures = json.loads(done.out)
     assert set(figures["recordings"]) == {"walk", "walk-2"}
+    assert figures["over_recordings"]["track"]["ate_m"]["median"] > 0.0
     assert json.loads((tmp_path / "out/metrics.json").read_text())["recordings"].keys() == {
         "walk", "walk-2"
     }  # fmt: skip
@@ -204,14 +166,6 @@ def test_every_option_that_changes_what_is_read_is_part_of_the_key_of_a_cache():
         assert (other.as_read() == usual.as_read()) == (name == "where")
 
 
-@pytest.mark.usefixtures("no_figures")
-def test_run_writes_the_filters_track_on_request(stario, recording, tmp_path):
-    done = stario("run", recording, "--filtered", "--out", "out", "--json")
-    assert json.loads(done.out)["filtered"]["ate_m"] > 0.0
-    times = [np.load(tmp_path / "out" / f"{name}.npz")["time"] for name in ("track", "filtered")]
-    np.testing.assert_array_equal(*times)
-
-
 def test_check_fusion_compares_filter_and_graphs_on_simulated_walks(stario):
     done = stario("check", "fusion", "--walks", "1", "--seconds", "10", "--graph", "--json")
     assert done.code == 0
@@ -224,6 +178,6 @@ def test_set_in_the_name_of_weights_is_the_first_word_of_a_group(monkeypatch):
     loaded = []
     monkeypatch.setattr("stario.fusion.evaluation.pedestrian.model_named", loaded.append)
 
-    evaluate._for_group("runs/{set}/{group}.safetensors", "ridi dan")
+    compare._for_group("runs/{set}/{group}.safetensors", "ridi dan")
 
     assert loaded == ["runs/ridi/ridi_dan.safetensors"]

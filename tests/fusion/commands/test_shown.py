@@ -1,10 +1,12 @@
 """`run --report`, `run --view`, `compare --report` and `live` as users call them."""
 
+import json
 import logging
 import socket
 import sys
 from itertools import count
 
+import numpy as np
 import pytest
 from phone_exports import export
 
@@ -15,11 +17,13 @@ from stario.sequences.readers.generic_csv import read_generic_csv
 TRACK_LABELS = ("dead reckoning (IMU alone)", "network alone", "StarIO", "truth")
 
 
-def test_run_writes_a_report_only_on_request(stario, recording, tmp_path, no_figures):
-    assert stario("run", recording, "--out", "plain").code == 0
-    assert not (tmp_path / "plain/report.html").exists()
-    done = stario("run", recording, "--out", "told", "--report", "--filtered")
-    assert done.code == 0
+def test_run_writes_a_report_and_the_filters_track_on_request(
+    stario, recording, tmp_path, no_figures
+):
+    done = stario("run", recording, "--out", "told", "--report", "--filtered", "--json")
+    assert json.loads(done.out)["filtered"]["ate_m"] > 0.0
+    times = [np.load(tmp_path / "told" / f"{name}.npz")["time"] for name in ("track", "filtered")]
+    np.testing.assert_array_equal(*times)
     text = (tmp_path / "told/report.html").read_text()
     assert "<h1>walk</h1>" in text
     assert "filter, as in a stream" in text
@@ -44,7 +48,8 @@ def test_compare_writes_a_report_of_what_is_known_next_to_the_tracks(
 ):
     write_csv(tmp_path / "blind.csv", read_generic_csv(recording).without_truth())
     tracks = ("--report", "--tracks", "network")
-    assert stario("compare", recording, "--out", "told", *tracks).code == 0
+    printed = stario("compare", recording, "--out", "told", *tracks, "--json").out
+    assert json.loads(printed) == json.loads((tmp_path / "told/metrics.json").read_text())
     told = stario("compare", "blind.csv", "--out", "told", *tracks).out
     assert "ATE" not in told
     assert "NIS" in told

@@ -69,6 +69,9 @@ def test_help_shows_a_commands_own_options_first_and_names_every_format():
         ["run"],
         ["simulate", "a.csv", "--seconds", "0"],
         ["train", "--epochs", "0"],
+        ["evaluate", "walk.csv", "--by", "mood"],
+        ["check", "fixes", "walk.csv", "--backend", "ukf"],
+        ["simulate", "a.csv", "--imu", "tactical"],
     ],
 )
 def test_wrong_usage_exits_with_code_2(stario, arguments):
@@ -87,10 +90,8 @@ def test_the_installed_command_has_the_same_exit_codes(tmp_path):
     if not command.exists():
         pytest.skip("stario is not installed next to this Python")
 
-    def code(*arguments):
-        return subprocess.run([command, *arguments], capture_output=True, cwd=tmp_path).returncode
-
-    assert [code("--help"), code("convert", "one.csv")] == [0, 1]
+    done = subprocess.run([command, "convert", "one.csv"], capture_output=True, cwd=tmp_path)
+    assert done.returncode == 1
 
 
 def test_a_bug_is_not_reported_as_an_error_of_the_user(stario, monkeypatch, recording):
@@ -134,16 +135,14 @@ def test_run_inspect_and_report_give_one_verdict(stario, recording, tmp_path):
     walk = read_generic_csv(recording)
     truth = replace(walk.truth, position_W=3.0 * walk.truth.position_W)
     write_csv(tmp_path / "wrong.csv", replace(walk, truth=truth))
-    run, inspection = (
-        json.loads(stario(*words, "--json").out)["verdict"]
-        for words in (("run", "wrong.csv", "--report"), ("inspect", "wrong.csv"))
-    )
-    assert run == inspection
+    told = stario("run", "wrong.csv", "--report").out
+    verdict = json.loads(stario("inspect", "wrong.csv", "--json").out)["verdict"]
     page = (tmp_path / "runs/wrong/report.html").read_text()
-    assert all(html.escape(finding["text"]) in page for finding in run)
-    assert not any(finding["code"] == "nothing" for finding in run)
-    told = stario("run", "wrong.csv").out
-    assert all(told.count(finding["text"]) == 1 for finding in run)
+    assert verdict[0]["code"] != "nothing"
+    assert len(verdict) == sum(line.startswith(("! ", "  ")) for line in told.splitlines())
+    for finding in verdict:
+        assert told.count(finding["text"]) == 1
+        assert html.escape(finding["text"]) in page
 
 
 def write_fixes(path: Path, truth: Trajectory, yaw: float = 0.0, delay: float = 0.0) -> Path:
@@ -163,10 +162,9 @@ def test_a_track_with_fixes_is_aligned_by_least_squares_and_not_by_its_first_yaw
 ):
     truth = read_generic_csv(recording).truth
     assert truth is not None
-    for yaw in (0.0, 1.0):
-        fixes = write_fixes(tmp_path / "fixes.csv", truth, yaw)
-        done = stario("run", recording, "--fixes", fixes, "--out", "fixed", "--json")
-        assert json.loads(done.out)["track"]["ate_m"] < 0.3
+    fixes = write_fixes(tmp_path / "fixes.csv", truth, yaw=1.0)
+    done = stario("run", recording, "--fixes", fixes, "--out", "fixed", "--json")
+    assert json.loads(done.out)["track"]["ate_m"] < 0.3
     words = json.loads((tmp_path / "fixed/metrics.json").read_text())["conventions"]
     assert "least squares" in words["alignment"]
     done = stario("compare", recording, "--fixes", fixes, "--out", "compared", "--json")
@@ -187,8 +185,6 @@ def test_fixes_on_another_clock_are_refused(stario, recording, tmp_path):
 def test_run_tells_how_much_of_a_recording_it_tracked(stario, recording):
     """The sensors stop after 7 s of 12 and repeat their values."""
     head, *lines = recording.read_text().splitlines()
-    whole = stario("run", recording)
-    assert " m in 12.0 s, " in whole.out
     stopped = lines[700].split(",")[1:7]
     for k in range(701, len(lines)):
         cells = lines[k].split(",")
@@ -200,28 +196,23 @@ def test_run_tells_how_much_of_a_recording_it_tracked(stario, recording):
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_settings_are_read_from_a_file_and_saved(stario, recording, tmp_path):
+@pytest.mark.parametrize("command", ["run", "evaluate"])
+def test_a_folder_states_what_produced_its_results(stario, recording, tmp_path, command):
     (tmp_path / "slow.toml").write_text("[filter]\nupdate_rate = 2\n")
-    assert stario("run", recording, "--config", "slow.toml", "--out", "a").code == 0
-    assert read_config(tmp_path / "a/config.json") == read_config(tmp_path / "slow.toml")
-    assert json.loads((tmp_path / "a/health.json").read_text())["updates"] == 23
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_run_compare_and_evaluate_state_what_produced_their_results(stario, recording, tmp_path):
-    for command in ("run", "compare", "evaluate"):
-        done = stario(command, recording, "--axes", "x,y,z", "--accel-sign", "up", "--out", command)
-        assert done.code == 0, done.err
-        origin = json.loads((tmp_path / command / "run.json").read_text())
-        assert datetime.fromisoformat(origin.pop("date")).utcoffset() == timedelta()
-        assert origin == {
-            "stario": version("stario-nav"),
-            "model": "default",
-            "weights_sha256": load_model("default").card.sha256,
-            "inputs": [str(recording)],
-            "reading": {},
-            "fixes": None,
-        }
+    options = "--axes", "x,y,z", "--accel-sign", "up", "--config", "slow.toml"
+    done = stario(command, recording, *options, "--out", "out")
+    assert done.code == 0, done.err
+    assert read_config(tmp_path / "out/config.json") == read_config(tmp_path / "slow.toml")
+    origin = json.loads((tmp_path / "out/run.json").read_text())
+    assert datetime.fromisoformat(origin.pop("date")).utcoffset() == timedelta()
+    assert origin == {
+        "stario": version("stario-nav"),
+        "model": "default",
+        "weights_sha256": load_model("default").card.sha256,
+        "inputs": [str(recording)],
+        "reading": {},
+        "fixes": None,
+    }
 
 
 def test_what_produced_a_run_names_fixes_and_changed_reading_options(tmp_path):
@@ -233,17 +224,19 @@ def test_what_produced_a_run_names_fixes_and_changed_reading_options(tmp_path):
 
 
 @pytest.mark.usefixtures("no_figures")
-def test_run_accepts_a_folder_or_a_list(stario, recording, tmp_path):
+def test_run_accepts_a_folder_or_a_list_and_explains_figures_once(stario, recording, tmp_path):
     (tmp_path / "all").mkdir()
     for name in ("a", "b"):
         (tmp_path / "all" / f"{name}.csv").write_bytes(recording.read_bytes())
-    done = stario("run", "all", "--out", "out", "--json")
+    done = stario("run", "all", "--out", "out", "--explain")
     assert done.code == 0
-    assert [record["recording"] for record in json.loads(done.out)] == ["a", "b"]
+    assert done.out.count("\nfitted [m]: ATE after") == 1
+    assert done.out.count("m rms from the truth") == 2
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"a", "b"}
     (tmp_path / "list.txt").write_text("all/b.csv\nall/c.csv\n")
-    done = stario("run", "list.txt", "--out", "alone")
+    done = stario("run", "list.txt", "--out", "alone", "--json")
     assert done.code == 1
+    assert json.loads(done.out)["recording"] == "b"
     assert "skipped" in done.err
     assert "all/c.csv" in done.err
     assert (tmp_path / "alone/track.tum").exists()
@@ -253,7 +246,7 @@ def test_run_accepts_a_folder_or_a_list(stario, recording, tmp_path):
 
 
 @pytest.mark.usefixtures("no_figures")
-@pytest.mark.parametrize("command", ["run", "compare", "evaluate", "convert"])
+@pytest.mark.parametrize("command", ["run", "evaluate", "convert"])
 def test_every_command_accepts_units_axes_and_gravity(stario, recording, tmp_path, command):
     """Rates in degrees, Apple's user acceleration in g, axes rotated relative to the truth's."""
     walk = with_axes(read_generic_csv(recording), "-y,x,z")
@@ -272,13 +265,15 @@ def test_every_command_accepts_units_axes_and_gravity(stario, recording, tmp_pat
 # --- inspect -----------------------------------------------------------------------------------
 
 
-def test_inspect_names_the_option_that_helps(stario, recording, tmp_path):
+def test_inspect_names_the_option_that_helps(stario, recording, tmp_path, monkeypatch):
     walk = read_generic_csv(recording)
     write_csv(tmp_path / "g.csv", replace(walk, accel=walk.accel / 9.80665))
     done = stario("inspect", "g.csv", "--out", "out")
     assert done.code == 0
     assert "--accel-unit g" in done.out
     assert (tmp_path / "out/inspection.png").stat().st_size > 10_000
+    saved = "stario.sequences.drawing.figures.save_figure"  # rendering is slow
+    monkeypatch.setattr(saved, lambda figure, path: path.touch())
     corrected = json.loads(stario("inspect", "g.csv", "--accel-unit", "g", "--json").out)
     assert all(each["code"] != "refused" for each in corrected["verdict"])
     assert corrected == json.loads((tmp_path / "runs/g/inspection.json").read_text())
@@ -288,15 +283,17 @@ def test_inspect_names_the_option_that_helps(stario, recording, tmp_path):
 # --- on the map ------------------------------------------------------------------------------
 
 
-def test_run_writes_files_for_a_map_where_the_place_is_known(stario, recording, no_figures):
+@pytest.mark.usefixtures("no_figures")
+def test_run_writes_files_for_a_map_where_the_place_is_known(stario, recording, caplog):
     done = stario("run", recording, "--origin=-33.86,151.21,90", "--out", "r")
     assert done.code == 0, done.err
     line = json.loads(Path("r/track.geojson").read_text())["features"][0]
     assert line["geometry"]["coordinates"][0] == pytest.approx([151.21, -33.86], abs=1e-4)
     assert Path("r/track.gpx").read_text().startswith("<?xml")
     assert json.loads(Path("r/config.json").read_text())["place"]["origin"] == [-33.86, 151.21, 90]
-    assert stario("run", recording, "--out", "r").code == 0
+    assert stario("run", recording, "--satellites", "use", "--out", "r").code == 0
     assert not Path("r/track.gpx").exists()  # nothing places this run on the earth
+    assert "no satellite position is used" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -305,8 +302,3 @@ def test_run_writes_files_for_a_map_where_the_place_is_known(stario, recording, 
 )
 def test_a_wrong_place_is_one_line(stario, recording, option, value):
     stario("run", recording, option, value).assert_one_line_error(option)
-
-
-def test_a_recording_without_satellites_says_so(stario, recording, no_figures, caplog):
-    assert stario("run", recording, "--satellites", "use", "--out", "r").code == 0
-    assert "no satellite position is used" in caplog.text

@@ -13,26 +13,20 @@ from stario.sequences.readers.generic_csv import read_generic_csv
 from stario.sequences.sequence import PositionTrack
 
 
-@pytest.mark.parametrize(
-    ("field", "factor", "options", "truth"),
-    [
-        ("gyro", 180.0 / np.pi, ["--gyro-unit", "deg/s"], True),
-        ("gyro", 180.0 / np.pi, ["--gyro-unit", "deg/s"], False),
-        ("accel", 1.0 / 9.80665, ["--accel-unit", "g"], True),
-        ("accel", -1.0, ["--accel-sign", "apple"], True),
-    ],
-)
 @pytest.mark.usefixtures("no_figures")
-def test_a_wrong_unit_or_sign_is_refused_with_the_option_that_helps(
-    stario, recording, tmp_path, field, factor, options, truth
-):
+def test_a_wrong_unit_or_sign_is_refused_with_the_option_that_helps(stario, recording, tmp_path):
     sequence = read_generic_csv(recording)
-    sequence = sequence if truth else sequence.without_truth()
-    write_csv(tmp_path / "odd.csv", replace(sequence, **{field: factor * getattr(sequence, field)}))
-    stario("run", "odd.csv", "--out", "out").assert_one_line_error(" ".join(options))
-    assert not (tmp_path / "out").exists()
-    if truth:
-        assert stario("run", "odd.csv", "--out", "out", *options).code == 0
+    for field, factor, option, truth in (
+        ("gyro", 180.0 / np.pi, "--gyro-unit deg/s", sequence.truth),
+        ("gyro", 180.0 / np.pi, "--gyro-unit deg/s", None),
+        ("accel", 1.0 / 9.80665, "--accel-unit g", sequence.truth),
+        ("accel", -1.0, "--accel-sign apple", sequence.truth),
+    ):
+        odd = {field: factor * getattr(sequence, field)}
+        write_csv(tmp_path / "odd.csv", replace(sequence, truth=truth, **odd))
+        stario("run", "odd.csv", "--out", "out").assert_one_line_error(option)
+        assert not (tmp_path / "out").exists()
+    assert stario("run", "odd.csv", "--out", "out", *option.split()).code == 0
 
 
 @pytest.mark.parametrize(
@@ -53,14 +47,11 @@ def test_a_broken_file_is_named_in_one_line(stario, tmp_path, content, words):
     ("arguments", "words"),
     [
         (["run", "missing.csv"], ["missing.csv", "no such file"]),
-        (["compare", "missing"], ["missing", "no such file"]),
         (["evaluate", "--data", "missing"], ["missing", "--data"]),
         (["evaluate", "--data", ".", "--split", "practice"], ["split", "practice"]),
         (["evaluate"], ["PATH", "--data"]),
         (["evaluate", "--data", ".", "--where", "person=dan"], ["--where", "--data"]),
-        (["evaluate", "RECORDING", "--by", "mood"], ["--by", "mood"]),
         (["evaluate", "RECORDING", "--against", "default"], ["--against", "--by"]),
-        (["evaluate", "RECORDING", "--filtered"], ["--filtered", "--by"]),
         (["run", "RECORDING", "--format", "fax"], ["format", "fax"]),
         (["run", "RECORDING", "--gyro-unit", "rpm"], [".csv: --gyro-unit: found 'rpm'"]),
         (["inspect", "RECORDING", "--axes=x,y"], [".csv: --axes: found 'x,y'"]),
@@ -68,37 +59,26 @@ def test_a_broken_file_is_named_in_one_line(stario, tmp_path, content, words):
         (["run", "RECORDING", "--axes", "y,x,z"], ["axes", "left-handed"]),
         (["run", "RECORDING", "--gravity", "gone"], ["gravity", "gone"]),
         (["convert", "RECORDING", "a.csv", "--to", "fax"], ["layout", "fax"]),
-        (["convert", "missing.csv", "a.csv"], ["missing.csv", "no such file"]),
         (["convert", "RECORDING", "no/such/a.csv"], ["folder"]),
         (["convert", "RECORDING", "walk.txt"], [".txt", ".csv, .h5", "--to"]),
         (["live", "--port", "0", "--phyphox", "file:///etc/passwd"], ["phyphox"]),
-        (["check", "fixes", "RECORDING", "--backend", "ukf"], ["--backend: found 'ukf'"]),
         (["run", "RECORDING", "--out", "RECORDING"], ["found a file, expected a folder"]),
-        (["compare", "RECORDING", "--out", "RECORDING"], ["found a file, expected a folder"]),
-        (["evaluate", "RECORDING", "--out", "RECORDING"], ["found a file, expected a folder"]),
-        (["inspect", "RECORDING", "--out", "RECORDING"], ["found a file, expected a folder"]),
         (["live", "--out", "RECORDING"], ["found a file, expected a folder"]),
         (["train", "--start-from", "open", "--config", "no.json"], ["no.json: found no such"]),
-        (["run", "RECORDING", "--model", "missing.safetensors"], ["missing.safetensors"]),
         (
             ["run", "RECORDING", "--model", "nothere"],  # the error names the known weights
             ["nothere", "default, first-stage, open or walks-36min"],
         ),
-        (["run", "RECORDING", "--config", "missing.toml"], ["missing.toml"]),
         (["run", "RECORDING", "--config", "."], [".", "TOML or JSON"]),
         (["simulate", "no/such/folder.csv"], ["folder"]),
-        (["simulate", ".", "--seconds", "2"], ["folder"]),
         (["simulate", "a.csv", "--seconds", "1e9"], ["duration", "10000 s at 200 Hz"]),
         (["simulate", "a.csv", "--seconds", "2001", "--rate", "1000"], ["2000 s at 1000 Hz"]),
-        (["simulate", "a"], [".csv"]),
         (["simulate", "a.h5"], ["a.h5", ".csv", "convert"]),
         (["convert", "RECORDING", "a.h5", "--to", "csv"], ["a.h5", "csv"]),
         (["convert", "RECORDING", "a.csv", "--to", "euroc"], ["a.csv", "euroc"]),
         (["simulate", "a.csv", "--carry", "drone"], ["carry", "drone"]),
-        (["simulate", "a.csv", "--imu", "tactical"], ["--imu", "tactical"]),
         (["train", "--config", "missing.json"], ["missing.json"]),
         (["train"], ["PATH", "--data"]),
-        (["train", "missing.csv"], ["missing.csv", "no such file"]),
         (["train", "--data", ".", "--where", "person=dan"], ["--where: found use with --data"]),
         (["train", "--generated", "1", "--out", "RECORDING"], ["folder"]),
     ],
@@ -113,23 +93,18 @@ def test_invalid_arguments_give_a_one_line_error(stario, recording, arguments, w
     ("arguments", "words"),
     [
         ("compare --gyro-unit deg/s", "--gyro-unit without PATH"),
-        ("compare --where person=dan", "--where without PATH"),
         ("inspect RECORDING --format csv --where person=dan", "--where --format"),
         ("evaluate RECORDING --data .", "--data with PATH"),
         ("evaluate RECORDING --split validation", "--split without --data"),
         ("evaluate RECORDING --by set --no-magnetometer", "--no-magnetometer with --by"),
-        ("evaluate RECORDING --by set --config settings.toml", "--config with --by"),
         ("check fusion --model open", "--model simulated"),
-        ("check fusion --accel-unit g", "--accel-unit simulated"),
         ("check fusion --by carry", "--by simulated"),
         ("check fusion RECORDING --walks 3", "--walks recordings"),
-        ("check fusion RECORDING --seconds 30", "--seconds recordings"),
         ("check faults RECORDING --model open", "--model without --network"),
         ("check faults --no-magnetometer", "--no-magnetometer simulated"),
         ("check faults --axes y,-x,z", "--axes simulated"),
         ("check faults RECORDING --where person=dan", "--where one recording"),
         ("check table --out cells --set a=. --sets oxiod", "--sets without --data"),
-        ("check table --out cells --set a=. --per-group 3", "--per-group without --data"),
         ("run RECORDING --declination 5 --no-magnetometer", "--declination --no-magnetometer"),
         ("train RECORDING --recorded-only --generated 5", "--generated with --recorded-only"),
         ("train --generated 1 --gyro-unit deg/s", "--gyro-unit without recordings"),
@@ -148,16 +123,12 @@ def test_an_option_that_would_do_nothing_is_refused(stario, recording, tmp_path,
     ("command", "content", "named"),
     [
         ("compare", '{"filter": {"speed": 1}}', "filter.speed"),
-        ("evaluate", '{"gravity": 1.62}', "gravity"),
         ("run", "{", "settings.json"),
         ("train", '{"speed": 1}', "speed"),
-        ("train", "[1]", "settings.json"),
     ],
 )
-def test_an_invalid_setting_is_named_in_one_line(
-    stario, recording, tmp_path, command, content, named
-):
-    (tmp_path / "settings.json").write_text(content)
+def test_an_invalid_setting_is_named_in_one_line(stario, recording, command, content, named):
+    Path("settings.json").write_text(content)
     stario(command, recording, "--config", "settings.json").assert_one_line_error(named)
 
 
@@ -179,6 +150,7 @@ def test_no_file_is_overwritten_without_the_option(stario, recording, tmp_path):
     assert Path("two.h5").read_bytes() == before
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_a_declination_without_a_source_of_north_is_reported(stario, recording):
     done = stario("run", recording, "--declination", "-6", "--out", "north")
     assert done.code == 0

@@ -18,8 +18,8 @@ from stario.fusion.evaluation.known_positions import (
     position_error,
     position_error_words,
     position_findings,
+    recording_verdict,
 )
-from stario.fusion.evaluation.verdict import recording_verdict
 from stario.network import load_model
 from stario.sequences import Trajectory, read_recording
 from stario.sequences.findings import Finding
@@ -102,7 +102,7 @@ def case(name: str) -> dict[str, Finding]:
     path = CASES / name
     if not path.exists():
         pytest.skip(f"{path} is missing")
-    sequence = read_recording(path)
+    sequence = read_recording(path).slice(0.0, 60.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         track = Navigator(load_model("default")).run(sequence)

@@ -9,13 +9,24 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
 from stario.fusion.commands.cli import app
+from stario.fusion.evaluation.scores import values
 from stario.fusion.paper_table import runs as runs_module
 from stario.fusion.paper_table import training
-from stario.fusion.paper_table.runs import LEADING, Run, backend, complete, complete_run, table_runs
+from stario.fusion.paper_table.runs import (
+    LEADING,
+    PROTOCOLS,
+    TRUE_ATTITUDE,
+    Run,
+    backend,
+    complete,
+    complete_run,
+    table_runs,
+)
 from stario.fusion.paper_table.sets import DataSet, folder_set
 from stario.fusion.paper_table.table import completed_runs, set_table
 from stario.fusion.paper_table.training import ReaderConfig, run_recipe
@@ -24,7 +35,6 @@ from stario.sequences.datasets.batch import Skipped
 from stario.sequences.errors import ConfigError, InputError, WeightsError
 from stario.sequences.readers import read_recording
 from stario.sequences.readers.csv_writer import write_csv
-from stario.sequences.sequence import PositionTrack
 
 RECIPE: dict[str, object] = {"batch": 6, "device": "cpu", "attitude": "true"}
 
@@ -44,56 +54,6 @@ def reading(tmp_path_factory):
 
 def run(dataset: DataSet, network: str = "StarIO", seed: int = 0, steps: int = 4) -> Run:
     return Run(dataset, network, seed, run_recipe(RECIPE, network, seed, steps))
-
-
-@pytest.mark.usefixtures("narrow_network")
-def test_a_filled_run_writes_model_and_errors(dataset, reading, tmp_path):
-    done = run(dataset, steps=2)
-    complete_run(done, tmp_path, reading)
-    folder = tmp_path / "own/StarIO/2-steps/seed-0"
-    names = {"errors.json", "log.json", "model.json", "model.safetensors"}
-    assert {path.name for path in folder.glob("[!.]*")} == {*names, "trained.json"}
-    trained = json.loads((folder / "trained.json").read_text())
-    assert trained["steps"] == 2
-    assert trained["windows_per_s"] > 0.0
-    assert trained["seconds"] > 0.0
-    [one] = json.loads((folder / "errors.json").read_text())["recordings"]
-    assert len(one["drawn"]["track"]) == len(one["drawn"]["truth"]) == len(one["drawn"]["time"])
-    assert set(one["tracks"]) == {"network_true_attitude", "network", "filtered"}
-    total, count = map(sum, zip(*one["blocks"]["ate"], strict=True))
-    assert one["tracks"]["network_true_attitude"]["ate_m"] == pytest.approx(
-        (total / count / 2) ** 0.5
-    )
-
-
-def test_without_recorded_poses_the_legs_alone_select_the_weights(
-    dataset, make_walk, tmp_path, monkeypatch
-):
-    chosen = []
-
-    def trained(recipe, data, validation, *rest, **options):
-        chosen.append(validation.simulated)
-        raise InputError("stop", "enough", "no training")
-
-    def waypoints(path):
-        walk = read_recording(path)
-        time = walk.truth.time[0] + np.arange(0.5, 16.0, 3.0)
-        track = PositionTrack(time, walk.truth.at(time).position_W[:, :2], "waypoints")
-        return replace(walk, truth=None, positions=track)
-
-    long = [tmp_path / f"walk{seed}.csv" for seed in range(3)]
-    for seed, path in enumerate(long):
-        write_csv(path, make_walk(seed=seed, seconds=16.0))
-    monkeypatch.setattr(training, "train", trained)
-    monkeypatch.setattr(training, "cached_walks", lambda *arguments, **rest: [])
-    recipe = run_recipe(RECIPE, "StarIO", 0, 1)
-    for files, read in ((long, waypoints), (long, read_recording)):
-        alone = replace(dataset, training=tuple(files[:1]), validation=tuple(files[1:]))
-        with pytest.raises(InputError, match="stop"):
-            training.train_run(
-                alone, recipe, tmp_path, ReaderConfig(read, {}, tmp_path / read.__name__)
-            )
-    assert chosen == [True, False]
 
 
 @pytest.mark.usefixtures("narrow_network")
@@ -118,6 +78,22 @@ def test_a_killed_run_resumes_and_gives_the_same_model(dataset, reading, tmp_pat
     assert len(json.loads((folder / "log.json").read_text())) == 2
 
 
+def assert_complete(folder: Path) -> None:
+    names = {"scores.json", "log.json", "model.json", "model.safetensors", "trained.json"}
+    assert {path.name for path in folder.glob("[!.]*")} == names
+    trained = json.loads((folder / "trained.json").read_text())
+    assert trained["steps"] == 1
+    assert min(trained["windows_per_s"], trained["seconds"]) > 0.0
+    content = json.loads((folder / "scores.json").read_text())
+    [drawn] = content["drawn"].values()
+    assert len({len(values) for values in drawn.values()}) == 1
+    scores, blocks = (pd.DataFrame(content[name]) for name in ("scores", "blocks"))
+    assert set(scores["track"]) == {"poses", *PROTOCOLS}
+    total, count = blocks.loc[blocks["metric"] == "ate", ["squares", "count"]].sum()
+    ate = values(scores, "ate_m", track=TRUE_ATTITUDE)
+    assert ate == pytest.approx([(total / count / 2) ** 0.5])
+
+
 @pytest.mark.usefixtures("narrow_network")
 def test_filled_runs_are_kept_and_only_new_networks_and_seeds_are_trained(
     dataset, reading, tmp_path, monkeypatch
@@ -132,7 +108,8 @@ def test_filled_runs_are_kept_and_only_new_networks_and_seeds_are_trained(
     monkeypatch.setattr(runs_module, "train_run", counted)
     first = [run(dataset, steps=1), Run(dataset, "pdr", 0, None)]
     assert list(complete(first, tmp_path, reading)) == first
-    errors = first[0].folder(tmp_path) / "errors.json"
+    assert_complete(tmp_path / "own/StarIO/1-steps/seed-0")
+    errors = first[0].folder(tmp_path) / "scores.json"
     written = errors.stat().st_mtime_ns
     more = [*first, run(dataset, "StarIO without MSGCU", steps=1), run(dataset, seed=1, steps=1)]
     assert list(complete(more, tmp_path, reading)) == more
@@ -140,19 +117,10 @@ def test_filled_runs_are_kept_and_only_new_networks_and_seeds_are_trained(
     assert errors.stat().st_mtime_ns == written
     table = set_table(dataset, completed_runs(more, tmp_path)["own"], {})
     pdr, other, ours = table.as_dict()["rows"]
-    assert [row["network"] for row in (pdr, other, ours)] == [
-        "pdr",
-        "StarIO without MSGCU",
-        "StarIO",
-    ]
-    values = [
-        json.loads((one.folder(tmp_path) / "errors.json").read_text())["recordings"][0]["tracks"][
-            "network_true_attitude"
-        ]["ate_m"]
-        for one in (more[0], more[3])
-    ]
-    assert ours["ate"] == pytest.approx(sum(values) / 2)
-    assert ours["ate_sem"] == pytest.approx(abs(values[0] - values[1]) / 2)  # deviation / sqrt(2)
+    assert (pdr["network"], other["network"]) == ("pdr", "StarIO without MSGCU")
+    ate = values(table.scores, "ate_m", network="StarIO", track=TRUE_ATTITUDE)
+    assert ours["ate"] == pytest.approx(ate.mean())
+    assert ours["ate_sem"] == pytest.approx(abs(ate[0] - ate[1]) / 2)  # deviation / sqrt(2)
     assert np.isnan(other["ate_sem"])
     assert np.isnan(pdr["ate"])
     assert pdr["own_ate"] > 0.0
@@ -166,7 +134,7 @@ def test_runs_of_another_recipe_are_refused_and_other_step_counts_are_separate(
     done = run(dataset, steps=1)
     complete_run(done, tmp_path, reading)
     other = Run(dataset, "StarIO", 0, run_recipe({**RECIPE, "rate": 1e-2}, "StarIO", 0, 1))
-    with pytest.raises(ConfigError, match=r"errors\.json.*another recipe"):
+    with pytest.raises(ConfigError, match=r"scores\.json.*another recipe"):
         complete_run(other, tmp_path, reading)
     [outcome] = complete([other], tmp_path, reading)
     assert isinstance(outcome, Skipped)
@@ -232,22 +200,22 @@ def test_the_command_writes_tables_and_figures(dataset, tmp_path, monkeypatch):
     (tmp_path / "recipe.json").write_text(json.dumps(RECIPE))
     out = tmp_path / "out"
     arguments = ["--set", f"ronin={folder}", "--out", str(out), "--steps", "1", "--seeds", "1"]
-    arguments += ["--networks", "DeepILS,R-ResNet", "--config", str(tmp_path / "recipe.json")]
+    arguments += ["--networks", "DeepILS", "--config", str(tmp_path / "recipe.json")]
     done = CliRunner().invoke(app, ["check", "table", *arguments])
     assert done.exit_code == 0, done.output
     text = (out / "table.md").read_text()
     assert text in done.output
     for words in (
         "1 training steps of 6 windows",
-        "| R-ResNet |",
+        "| DeepILS |",
         "`pdr`",
-        "4.165, 3.724",
+        "4.374, 3.665",
         "core hours",
     ):
         assert words in text
     with (out / "table.csv").open() as file:
         assert [row["network"] for row in csv.DictReader(file)] == [
-            "pdr", "R-ResNet", "DeepILS", "default",
+            "pdr", "DeepILS", "default",
         ]  # fmt: skip
     content = json.loads((out / "table.json").read_text())["sets"]["ronin"]
     assert (content["training"], content["validation"], content["tested"]) == (2, 1, 1)

@@ -1,7 +1,8 @@
 """Splits of recordings, what a training passes on, and rows from known errors."""
 
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 from recorded import DATA
 
+from stario.fusion.evaluation.bootstrap import block_rows
+from stario.fusion.evaluation.scores import joined, scored
 from stario.fusion.paper_table import sets, training
 from stario.fusion.paper_table.figures import pde_boxes
 from stario.fusion.paper_table.sets import ALL, FIRST, DataSet, development_sets, published
@@ -24,6 +27,7 @@ from stario.sequences.errors import InputError
 from stario.sequences.files import write_json
 from stario.sequences.readers import read_recording
 from stario.sequences.readers.csv_writer import write_csv
+from stario.sequences.sequence import PositionTrack
 
 needs_data = pytest.mark.skipif(not (DATA / "archives").exists(), reason=f"no data in {DATA}")
 
@@ -39,30 +43,24 @@ def test_a_split_is_disjoint_complete_and_determined_by_the_seed():
     assert "seed 3" in first.words
 
 
-def test_two_phones_on_one_walk_are_in_the_same_part():
-    recordings = [
-        ListEntry(Path(f"kipd.h5:Walk{k}{p}"), "kipd") for k in range(9) for p in ("S9", "S20")
-    ]
-    for seed in range(5):
-        split = sets._split("kipd", recordings, seed)
-        for part in (split.training, split.validation, [one.path for one in split.test]):
-            walks = [path.name.removesuffix("S9").removesuffix("S20") for path in part]
-            assert all(walks.count(walk) == 2 for walk in walks)
+PHONES = [ListEntry(Path(f"kipd.h5:Walk{k}{p}"), "kipd") for k in range(9) for p in ("S9", "S20")]
 
 
-def test_two_phones_on_one_walk_are_validated_together(monkeypatch):
-    phones = [
-        ListEntry(Path(f"kipd.h5:Walk{k}{p}"), "kipd") for k in range(9) for p in ("S9", "S20")
-    ]
+def walks_of(part: Iterable[Path]) -> list[str]:
+    return [path.name.removesuffix("S9").removesuffix("S20") for path in part]
+
+
+def test_two_phones_on_one_walk_are_in_the_same_part(monkeypatch):
     held = [ListEntry(Path("ridi.h5:dan"), "ridi dan")]
-    parts = {"all": [*phones, *held], "test": [], "holdout": held}
+    parts = {"all": [*PHONES, *held], "test": [], "holdout": held}
     for module in (sets, splits):
         monkeypatch.setattr(module, "read_packaged_list", lambda name, data: parts[name])
-    for seed in range(9):
+    for seed in range(5):
+        split = sets._split("kipd", PHONES, seed)
+        for part in (split.training, split.validation, [one.path for one in split.test]):
+            assert set(Counter(walks_of(part)).values()) == {2}
         [together] = development_sets(Path(), seed, 2, [ALL])
-        names = [path.name.removesuffix("S9").removesuffix("S20") for path in together.validation]
-        assert len(names) == 2
-        assert len(set(names)) == 1
+        assert [*Counter(walks_of(together.validation)).values()] == [2]
 
 
 @needs_data
@@ -104,18 +102,17 @@ def content(
     ate_m: float, network: str = "StarIO", seed: int = 0, seconds: float = 0.0
 ) -> Mapping[str, Any]:
     """Results on both recordings, the second without a drift."""
-    tracks = [
-        {"network_true_attitude": {"ate_m": ate_m, "rte_m": 2.0, "pde": pde}}
-        for pde in (0.03, None)
+    labels = {"network": network, "seed": seed}
+    names = [str(entry.path) for entry in TESTED]
+    scores = [
+        scored(name, {"network_true_attitude": errors, "poses": {"path_m": 50.0}}, "ridi", **labels)
+        for name, pde in zip(names, (0.03, None), strict=True)
+        for errors in [{"ate_m": ate_m, "rte_m": 2.0, "pde": pde}]
     ]
-    recordings = [
-        {"recording": entry.path.name, "path": str(entry.path), "group": "ridi", "kind": "poses"}
-        | {"path_m": 50.0, "figures": {}}
-        | {"tracks": found, "blocks": {"ate": [[ate_m**2, 1.0]]}}
-        for entry, found in zip(TESTED, tracks, strict=True)
-    ]
-    run = {"network": network, "seed": seed, "seconds": seconds}
-    return {**run, "recordings": recordings, "skipped": []}
+    unit = {"set": "ridi", "group": "ridi", "metric": "ate", **labels}
+    blocks = [block_rows([[ate_m**2, 1.0]], recording=name, **unit) for name in names]
+    tables = {"scores": joined(scores), "blocks": joined(blocks)}
+    return {**labels, **tables, "drawn": {}, "seconds": seconds, "skipped": []}
 
 
 def trained(ate_m: float, seed: int) -> Mapping[str, Any]:
@@ -165,45 +162,54 @@ def test_published_figures_are_found_by_set_and_network():
     assert published("tyrex", "StarIO") is None
 
 
-@pytest.fixture
-def dataset(make_walk, tmp_path):
-    files = [tmp_path / f"{name}.csv" for name in "abc"]
+@pytest.fixture(scope="module")
+def dataset(make_walk, tmp_path_factory):
+    files = [tmp_path_factory.mktemp("walks") / f"{name}.csv" for name in "abc"]
     for seed, path in enumerate(files):
-        write_csv(path, make_walk(seed=seed, seconds=8.0))
+        write_csv(path, make_walk(seed=seed, seconds=16.0))
     return DataSet("own", tuple(files[:2]), (files[2],), (), "")
 
 
 @pytest.fixture
-def weights(monkeypatch):
-    """Replace training by a log with three epochs; holds the weight of each stream."""
-    found = {}
+def train(monkeypatch, dataset, tmp_path):
+    """Train in name only, with a log of three epochs; return also the data of both parts."""
 
-    def trained(recipe, data, validation, folder, **rest):
-        pairs = zip(data.streams, data.weights, strict=True)
-        found.update((stream.name, weight * len(stream)) for stream, weight in pairs)
+    def logged(recipe, data, validation, folder, **rest):
+        given.extend([data, validation])
         errors = (0.5, 0.1), (0.4, float("nan")), (0.3, 0.2)
-        write_json(
-            folder / "log.json",
-            [asdict(EpochReport(k, *pair, {})) for k, pair in enumerate(errors, 1)],
-        )
+        reports = [asdict(EpochReport(k, *pair, {})) for k, pair in enumerate(errors, 1)]
+        write_json(folder / "log.json", reports)
 
-    monkeypatch.setattr(training, "train", trained)
-    return found
+    def run(read=read_recording, **values):
+        given.clear()
+        recipe = run_recipe({"likelihood_from": 0.0, "epochs": 3, **values}, "StarIO", 0, None)
+        reading = ReaderConfig(read, {}, tmp_path / read.__name__)
+        return train_run(dataset, recipe, tmp_path, reading), *given
+
+    given: list[Any] = []
+    monkeypatch.setattr(training, "train", logged)
+    return run
 
 
-def trained_cell(dataset: DataSet, folder: Path, **values: object) -> dict[str, object]:
-    recipe = run_recipe({"likelihood_from": 0.0, "epochs": 3, **values}, "StarIO", 0, None)
-    return train_run(dataset, recipe, folder, ReaderConfig(read_recording, {}, folder / "cache"))
-
-
-def test_the_validation_error_is_that_of_the_epoch_whose_weights_are_kept(
-    dataset, weights, tmp_path
-):
-    done = trained_cell(dataset, tmp_path)
+def test_the_validation_error_is_that_of_the_epoch_whose_weights_are_kept(train):
+    done, _, _ = train()
     assert (done["training_error_m2"], done["validation_error_m2"]) == (0.3, 0.1)
 
 
-def test_the_shares_of_the_recipe_are_used(dataset, weights, tmp_path):
-    trained_cell(dataset, tmp_path, shares={"a.csv": 0.9}, augmentation={"speeds": [1.0, 1.0]})
+def test_the_shares_of_the_recipe_are_used(train):
+    _, data, _ = train(shares={"a.csv": 0.9}, augmentation={"speeds": [1.0, 1.0]})
+    pairs = zip(data.streams, data.weights, strict=True)
+    weights = {stream.name: weight * len(stream) for stream, weight in pairs}
     shares = np.array([weights["a"], weights["b"]]) / sum(weights.values())
     assert shares == pytest.approx([0.9, 0.1], abs=0.01)
+
+
+def test_without_recorded_poses_the_legs_alone_select_the_weights(train, monkeypatch):
+    def waypoints(path):
+        walk = read_recording(path)
+        time = walk.truth.time[0] + np.arange(0.5, 16.0, 3.0)
+        track = PositionTrack(time, walk.truth.at(time).position_W[:, :2], "waypoints")
+        return replace(walk, truth=None, positions=track)
+
+    monkeypatch.setattr(training, "cached_walks", lambda *arguments, **rest: [])
+    assert [train(read)[2].simulated for read in (waypoints, read_recording)] == [True, False]

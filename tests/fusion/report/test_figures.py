@@ -1,16 +1,23 @@
-"""Figures of the report, and the 3-D view."""
+"""Figures of the report, their curves and the map's tiles, and the 3-D view."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
+import plotly.graph_objects as go
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stario.fusion.report.background import add_place, check_tiles
 from stario.fusion.report.figures import map_figure
 from stario.fusion.report.panels import motion_panels
-from stario.fusion.report.series import MAX_POINTS, track_series
+from stario.fusion.report.series import MAX_POINTS, ellipse, track_series
+from stario.fusion.values.state import Track
+from stario.sequences.attitude.rotations import about_z
+from stario.sequences.errors import InputError
+from stario.sequences.geodesy import Georeference
 from stario.sequences.sequence import PositionTrack, Trajectory
 
 pytest.importorskip("plotly", reason="pip install '.[report]'")
@@ -159,3 +166,126 @@ def test_a_path_is_broken_in_a_gap(view):
     stream = Stream()
     view._log_path(stream, "world/track", path, (0, 0, 0))
     assert [len(strip) for strip in stream.strips] == [(time < 5.0).sum(), (time > 9.0).sum()]
+
+
+TIME = np.arange(0.0, 10.0, 0.1)
+_POSE = (0.01, 0.02, 0.03, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+SIGMA = np.array([*_POSE, 1e-3, 2e-3, 3e-3, 0.07, 0.08, 0.09])
+"""Of rotation, velocity, position and both biases."""
+
+
+def along_y(yaw: float = 0.0) -> Track:
+    """A track at 1.5 m/s along y."""
+    count = len(TIME)
+    covariance = np.tile(np.diag(SIGMA**2), (count, 1, 1))
+    covariance[:, 6, 7] = covariance[:, 7, 6] = 0.05
+    trajectory = Trajectory(
+        TIME,
+        np.outer(TIME, [0.0, 1.5, 0.0]),
+        about_z(np.full(count, yaw)),
+        np.tile([0.0, 1.5, 0.0], (count, 1)),
+        covariance[:, 6:9, 6:9],
+    )
+    b_g, b_a = np.full((count, 3), 0.01), np.full((count, 3), 0.2)
+    return Track(trajectory, b_g=b_g, b_a=b_a, covariance=covariance)
+
+
+def series_of(track: Track) -> pd.DataFrame:
+    return track_series(track.trajectory, 0.0, track)
+
+
+def test_columns_are_in_their_units_with_their_own_sigmas() -> None:
+    series = series_of(along_y(yaw=0.5))
+    for column, expected in {
+        "yaw": np.degrees(0.5),
+        "sigma yaw": np.degrees(0.03),
+        "speed": 1.5,
+        "sigma speed": 0.2,  # that of the velocity along the path
+        "sigma z": 0.6,
+        "xy": 0.05,
+        "gyro x": np.degrees(0.01),
+        "sigma gyro y": np.degrees(2e-3),
+        "accel z": 0.2,
+        "sigma accel z": 0.09,
+    }.items():
+        np.testing.assert_allclose(series[column], expected)
+
+
+def test_speed_of_positions_alone_is_their_rate() -> None:
+    positions = Trajectory(TIME, np.outer(TIME, [0.0, 1.5, 0.0]), Rotation.identity(len(TIME)))
+    np.testing.assert_allclose(track_series(positions, 0.0).speed, 1.5)
+
+
+def test_an_ellipse_is_where_the_mahalanobis_distance_is_three() -> None:
+    outline = ellipse(4.0, 1.5, 1.0)
+    weight = np.linalg.inv([[4.0, 1.5], [1.5, 1.0]])
+    np.testing.assert_allclose(np.einsum("ni,ij,nj->n", outline, weight, outline), 9.0)
+    np.testing.assert_allclose(outline[0], outline[-1], atol=1e-10)
+
+
+def test_yaws_on_both_sides_of_half_a_turn_are_drawn_next_to_each_other() -> None:
+    shown = {
+        name: track_series(along_y(np.radians(yaw)).trajectory, 0.0)
+        for name, yaw in (("track", 179.0), ("filtered", -179.0))
+    }
+    yaw = {trace.name: trace.y for trace in motion_panels(shown, None)[2].traces if trace.name}
+    np.testing.assert_allclose(
+        np.subtract(yaw["filter, as in a stream"], yaw["StarIO"]), 2.0, atol=1e-3
+    )
+
+
+def test_the_band_of_a_line_is_three_sigma_wide() -> None:
+    height = motion_panels({"track": series_of(along_y())}, None)[0]
+    band, line = height.traces
+    edge = np.asarray(band.y, dtype=float)
+    assert np.nanmax(edge) == pytest.approx(3.0 * 0.6)
+    assert np.nanmin(edge) == pytest.approx(-3.0 * 0.6)
+    assert not any(line.y)
+
+
+def turning(stop: float, offset: float) -> pd.DataFrame:
+    """A device that turns by six degrees a second until `stop` [s], its yaw off by `offset` deg."""
+    time = np.arange(0.0, stop, 0.1)
+    return pd.DataFrame({"yaw": 6.0 * time + offset}, time).assign(x=0.0, y=0.0, z=0.0, speed=0.0)
+
+
+@pytest.mark.parametrize("stop", [10.0, 120.0])
+@pytest.mark.parametrize("turns", [0, 2])
+def test_yaws_are_drawn_within_half_a_turn_of_the_truth_where_both_exist(
+    stop: float, turns: int
+) -> None:
+    track = turning(stop, 5.0 + 360.0 * turns)
+    panel = motion_panels({"track": track}, turning(120.0, 0.0))[-1]
+    drawn = next(trace for trace in panel.traces if trace.legendgroup == "track")
+    np.testing.assert_allclose(drawn.y, 6.0 * np.array(drawn.x) + 5.0, atol=1e-3)
+
+
+URL = "https://tiles.example/{z}/{x}/{y}.png"
+
+
+@pytest.mark.parametrize("size", [30.0, 400.0, 3000.0])
+def test_tiles_lie_side_by_side_and_cover_the_drawn_part(size: float) -> None:
+    """A tile's address tells its place: columns count eastwards from 180 degrees west."""
+    figure = go.Figure()
+    figure.update_xaxes(range=[-size, size])
+    figure.update_yaxes(range=[-0.2 * size, 0.2 * size])
+    add_place(figure, Georeference(51.4779, 0.001), URL)
+    images = figure.layout.images
+    assert 4 <= len(images) <= 100
+    left, top = min(i.x for i in images), max(i.y for i in images)
+    right, bottom = max(i.x + i.sizex for i in images), min(i.y - i.sizey for i in images)
+    assert left < -size
+    assert right > size
+    assert bottom < -size
+    assert top > size
+    area = sum(i.sizex * i.sizey for i in images)
+    assert area == pytest.approx((right - left) * (top - bottom), rel=0.03)
+    zoom, x, _ = map(int, images[0].source.removesuffix(".png").split("/")[-3:])
+    west = 360.0 * x / 2**zoom - 180.0
+    assert images[0].x == pytest.approx((west - 0.001) * 69_500.0, rel=0.01, abs=2.0)
+
+
+@pytest.mark.parametrize("url", ["tiles", "https://tiles.example/{z}/{x}.png", "file:///{z}{x}{y}"])
+def test_what_is_no_map_server_is_refused(url: str) -> None:
+    with pytest.raises(InputError, match="--tiles"):
+        check_tiles(url)

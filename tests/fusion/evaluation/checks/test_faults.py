@@ -18,14 +18,14 @@ from stario.fusion.evaluation.scores import wide
 from stario.fusion.navigator import Navigator
 from stario.sequences.errors import InputError
 
-SECONDS = 14.0
+SECONDS = 10.0
 SAMPLES = ("time", "gyro", "accel")
 
 
 @pytest.fixture(scope="module")
 def scores():
     sequence, config = matched_walk(SECONDS, seed=1)
-    return run_faults(sequence, config, backends=("ekf",))
+    return run_faults(sequence, config, graph=False)
 
 
 @pytest.fixture(scope="module")
@@ -59,19 +59,17 @@ def test_every_fault_but_none_modifies_samples_or_predictions_as_drawn_from_the_
 def test_a_refused_recording_is_a_row_of_the_table():
     in_degrees = Fault("rates in degrees", lambda s, _: replace(s, gyro=np.degrees(s.gyro)))
     sequence, config = matched_walk(SECONDS, seed=1)
-    found = run_faults(sequence, config, backends=("ekf",), only=[in_degrees, Fault("none")])
+    found = run_faults(sequence, config, graph=False, only=[in_degrees, Fault("none")])
     refused, unchanged = wide(found).itertuples()
     assert np.isnan(refused.error_with)
     assert unchanged.error_with == refused.error_without
     row = next(row for row in fault_table(found).splitlines() if "degrees" in row)
-    assert " - " in row
-    assert "refused: " in row
-    assert "deg/s" in row
+    assert all(words in row for words in (" - ", "refused: ", "deg/s"))
 
 
-@pytest.mark.parametrize(
-    ("fault", "words"),
-    [
+def test_every_fault_is_reported(results, scores):
+    lines = fault_table(scores).splitlines()
+    for fault, words in (
         ("gap of 3 s", "gap 3.0 s"),
         ("one NaN in time", "not_finite 1"),
         ("one NaN in gyro", "not_finite 1"),
@@ -82,20 +80,15 @@ def test_a_refused_recording_is_a_row_of_the_table():
         ("three wild timestamps", "future 3"),
         ("ten spikes", "spike 10"),
         ("accelerometer clipped", "saturated"),
-    ],
-)
-def test_every_fault_is_reported(results, scores, fault, words):
-    assert words in results[fault].reported
-    [line] = (line for line in fault_table(scores).splitlines() if line.startswith(fault))
-    assert words in line
+    ):
+        assert words in results[fault].reported
+        [line] = (line for line in lines if line.startswith(fault))
+        assert words in line
 
 
-@pytest.mark.parametrize(
-    "fault",
-    ["one NaN in gyro", "5% of samples dropped", "20% of samples dropped", "190 Hz", "500 Hz"],
-)
-def test_small_faults_add_little_error(results, fault):
-    assert results[fault].error_with < results[fault].error_without + 0.3
+def test_small_faults_add_little_error(results):
+    for fault in ("one NaN in gyro", "20% of samples dropped", "190 Hz", "500 Hz"):
+        assert results[fault].error_with < results[fault].error_without + 0.3
 
 
 def test_a_recording_without_truth_is_refused():

@@ -109,25 +109,19 @@ def test_the_yaw_error_is_that_since_the_start_next_to_the_sigma_of_yaw(walk, ma
     assert of(shorter, "yaw_sigma") == pytest.approx(np.sqrt(track.covariance[at_its_end, 2, 2]))
 
 
-def test_too_little_truth_is_refused(walk, still_model):
-    with pytest.raises(InputError, match="truth"):
-        fusion_gain(still_model, replace(walk, truth=None), CONFIG)
+def test_what_cannot_be_scored_is_refused(walk, still_model):
+    for score in (fusion_gain, track_with_fixes):
+        with pytest.raises(InputError, match="truth"):
+            score(still_model, walk.without_truth(), CONFIG)
+    with pytest.raises(InputError, match="fixes"):
+        track_with_fixes(still_model, walk, CONFIG, every=15.0)
     # A group's mean would be NaN with a single waypoint within the track.
     at_waypoints = PositionTrack(np.array([5.0, 500.0]), np.zeros((2, 2)), "waypoints")
     with pytest.raises(InputError, match="fewer than 2 within the track"):
         fusion_gain(still_model, replace(walk, truth=None, positions=at_waypoints), CONFIG)
-
-
-def test_true_fixes_keep_a_track_near_the_truth(walk, make_oracle):
-    oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
-    scores = track_with_fixes(oracle, walk, CONFIG, every=2.0, sigma=0.05)
-    [found] = wide(scores).itertuples()
-    assert found.applied > 0.8
-    assert found.position_rms < 0.3
-    assert found.yaw_covered == 1.0
-    row = fixes_table(scores.assign(group="walks")).splitlines()[1].split()
-    assert row[:2] == ["walks", "1"]
-    assert row[-1] == "100.0%"
+    force = np.tile([0.0, 0.0, 9.81], (len(walk), 1))
+    with pytest.raises(InputError, match="metre"):
+        end_shifts(still_model, replace(walk, gyro=0.0 * force, accel=force, truth=None), CONFIG)
 
 
 def test_errors_and_sigmas_are_those_of_the_second_half(walk, still_model, monkeypatch):
@@ -166,41 +160,32 @@ def test_errors_of_fixes_match_their_stated_sigma(walk):
     assert np.sqrt((error**2).mean()) == pytest.approx(0.2, rel=0.1)
 
 
-def test_missing_poses_and_too_few_fixes_are_refused(walk, still_model):
-    with pytest.raises(InputError, match="truth"):
-        track_with_fixes(still_model, replace(walk, truth=None), CONFIG)
-    with pytest.raises(InputError, match="fixes"):
-        track_with_fixes(still_model, walk, CONFIG, every=15.0)
-
-
 def test_truth_before_the_first_sample_gives_no_fixes(walk, make_oracle, caplog):
     time = walk.truth.time.copy()
     time[0] = walk.time[0] - 1.0
     earlier = replace(walk, truth=replace(walk.truth, time=time))
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
     scores = track_with_fixes(oracle, earlier, CONFIG, every=2.0, sigma=0.05)
+    [found] = wide(scores).itertuples()
     assert "before the start" not in caplog.text
-    assert values(scores, "applied") > 0.9
+    assert found.applied > 0.9
+    assert found.position_rms < 0.3
+    assert found.yaw_covered == 1.0
+    row = fixes_table(scores.assign(group="walks")).splitlines()[1].split()
+    assert (row[:2], row[-1]) == (["walks", "1"], "100.0%")
 
 
-def test_gaps_of_a_tenth_of_a_second_and_5_percent_loss_hardly_move_the_end(walk):
+def test_gaps_of_a_tenth_of_a_second_and_5_percent_loss_hardly_move_the_end(walk, monkeypatch):
+    monkeypatch.setattr(fusion, "INSTANTS", 2)
     found = wide(end_shifts(load_model("default"), walk, NavigatorConfig()))
-    assert len(found) == 7
     assert set(found["recording"]) == {walk.name}
     *gaps, dropped = found.itertuples()
-    assert [one.track for one in gaps[::5]] == ["gap at 2 s", "gap at 18 s"]  # of twenty
+    assert [one.track for one in gaps] == ["gap at 5 s", "gap at 15 s"]  # of twenty
     # On the short path of a simulated walk of 20 s, a turn at a gap has a large effect.
     assert max(one.metres for one in gaps) < 0.1
     assert max(one.degrees for one in gaps) < 15.0
     assert 0.0 < dropped.metres < 0.01
     assert dropped.degrees < 0.5
-
-
-def test_a_stationary_recording_is_refused(walk, still_model):
-    force = np.tile([0.0, 0.0, 9.81], (len(walk), 1))
-    still = replace(walk, gyro=0.0 * walk.gyro, accel=force, truth=None)
-    with pytest.raises(InputError, match="metre"):
-        end_shifts(still_model, still, NavigatorConfig())
 
 
 def test_a_shift_is_a_share_of_the_path_and_a_turn_in_degrees(still_model, walk, monkeypatch):

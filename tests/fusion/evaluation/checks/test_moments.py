@@ -93,7 +93,7 @@ def test_errors_are_those_of_each_part_and_of_both_as_one():
 def test_a_phone_laid_down_and_taken_up_costs_the_rest_little(walk, monkeypatch):
     monkeypatch.setattr(moments, "MOMENTS", (BY_NAME["table"],))
     monkeypatch.setattr(moments, "PLACES", {"middle": 0.5})
-    [found] = wide(moment_costs(load_model("default"), walk, NavigatorConfig())).itertuples()
+    [found] = wide(moment_costs(load_model(), walk, NavigatorConfig())).itertuples()
     assert (found.group, found.track) == ("table, middle", "filtered")
     assert 0.0 < found.error_with < 2.0 * found.error_without
     assert 0.0 < found.step_without < moments.MAX_STEP
