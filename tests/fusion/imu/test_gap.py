@@ -63,7 +63,7 @@ def test_the_yaw_is_kept_through_gaps_while_the_device_turns(
     make_walk, make_oracle, without, backend
 ):
     """A kept attitude would lose 20 degrees in each of these four gaps, and know as much."""
-    walk = swivelled(make_walk(3, 32.0), 1.0)
+    walk = swivelled(make_walk(3, 32.0, 50.0), 1.0)
     gone = (walk.time > 10.0) & (walk.time < 28.0) & (walk.time % 5.0 < 0.35)
     holed = without(walk, gone)
     track = Navigator(make_oracle(holed, walk.truth, GRAPH), GRAPH, backend=backend).run(holed)

@@ -159,7 +159,7 @@ def test_jumps_and_rides_of_a_track_make_no_legs():
     assert speed.max() <= 2.5
 
 
-@pytest.mark.parametrize(("every", "legs"), [(0.1, 28), (0.5, 28), (1.0, 28), (2.5, 22)])
+@pytest.mark.parametrize(("every", "legs"), [(0.1, 28), (1.0, 28), (2.5, 22)])
 def test_a_track_at_a_low_rate_has_legs_except_across_its_gaps(every, legs):
     recording = with_positions("positions", every)
     [whole] = leg_streams(recording)
