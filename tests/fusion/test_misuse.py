@@ -36,6 +36,7 @@ LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
         (lambda model: Navigator(model, config={}), "config"),
         (lambda model: Navigator(model, prior=(1, 2)), "prior"),
         (lambda model: Navigator(model, backend=["ekf"]), "backend"),
+        (lambda model: Navigator(model, backend="ukf"), "'ukf', expected one of ekf, graph"),
         (lambda model: Navigator("default"), "model"),
         (lambda model: Navigator(type(model)), "model"),
         (lambda model: Navigator(model, backend="ekf").run("walk.csv"), "sequence"),

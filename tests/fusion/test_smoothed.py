@@ -24,7 +24,7 @@ def errors_at(track: Trajectory, walk: ImuSequence) -> np.ndarray:
 @pytest.fixture(scope="module")
 def walks(make_walk, make_oracle):
     """Walks, each with a model that measures its displacements with white noise."""
-    made = [make_walk(seed, 24.0, 50.0, ERRORS) for seed in range(4)]
+    made = [make_walk(seed, 30.0, 50.0, ERRORS) for seed in range(5)]
     noise = {"noise": 0.1, "sigma": 0.1}
     return [
         (walk, make_oracle(walk, walk.truth, CONFIG, seed=k, **noise))

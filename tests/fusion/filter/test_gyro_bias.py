@@ -126,7 +126,7 @@ def test_the_track_changes_continuously_with_the_bias(make_walk, make_oracle):
     """A slightly larger bias widens the prior slightly: similar recordings end close together."""
     ends = []
     for size in (0.030, 0.0302):
-        walk = biased(make_walk(seed=2, seconds=20.0, rate=50.0), np.array([size, 0.0, 0.0]))
+        walk = biased(make_walk(seed=2, seconds=30.0, rate=50.0), np.array([size, 0.0, 0.0]))
         config = NavigatorConfig()
         track = Navigator(make_oracle(walk, walk.truth, config), config, backend="ekf").run(walk)
         ends.append(track.trajectory.position_W[-1])

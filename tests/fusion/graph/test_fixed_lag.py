@@ -256,8 +256,8 @@ def test_if_the_graph_fails_the_stream_continues_from_the_filter(walk, make_orac
 
 
 def test_after_a_long_gap_the_graph_restarts(make_walk, make_oracle, without):
-    walk = make_walk(1, 30.0, 50.0)
-    holed = without(walk, (walk.time > 6.0) & (walk.time < 24.0))
+    walk = make_walk(1, 80.0, 50.0)
+    holed = without(walk, (walk.time > 6.0) & (walk.time < 74.0))
     oracle = make_oracle(holed, walk.truth, CONFIG)
     navigator = lagged(oracle)
     for state in stream(navigator, holed):

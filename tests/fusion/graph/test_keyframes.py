@@ -25,9 +25,7 @@ from stario.fusion.values.lie import yaw_twist
 from stario.fusion.values.state import NavState
 from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.attitude.rotations import about_z, yaw_of
-from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.noise import ImuNoise
-from stario.sequences.settings import with_settings
 
 
 def graph(model: Any, config: NavigatorConfig = CONFIG, **more: Any) -> Navigator:
@@ -179,17 +177,6 @@ def test_a_gap_is_crossed_and_its_sigma_covers_the_error(walk, make_oracle, with
     start = walk.truth.position_W[0]
     error = np.linalg.norm(turn.apply(track.trajectory.position_W[-1]) + start - at_end.position_W)
     assert error < 4.0 * np.sqrt(np.trace(track.covariance[-1, 6:9, 6:9])) + 0.5
-
-
-def test_an_unknown_back_end_is_refused_by_name(still_model):
-    with pytest.raises(InputError, match="backend: found 'ukf', expected one of ekf, graph"):
-        Navigator(still_model, backend="ukf")
-
-
-@pytest.mark.parametrize("lag", [0.5, 100.0, float("nan")])
-def test_a_lag_out_of_bounds_is_refused(lag):
-    with pytest.raises(ConfigError, match=r"graph\.lag"):
-        with_settings(NavigatorConfig(), {"graph": {"lag": lag}})
 
 
 # --- fixes -----------------------------------------------------------------------------------

@@ -27,7 +27,13 @@ def test_networks_are_those_of_the_paper_by_its_own_counter(name):
     assert flops / 1e6 == pytest.approx(published.flops, rel=rest, abs=5e-4)
 
 
-@pytest.mark.parametrize("name", ARCHITECTURES)
+@pytest.mark.parametrize(
+    "name",
+    [  # an LSTM is counted step by step, which takes seconds
+        pytest.param(name, marks=pytest.mark.slow if name == "R-LSTM" else ())
+        for name in ARCHITECTURES
+    ],
+)
 def test_multiplications_are_almost_all_that_the_paper_counts(name):
     published = ARCHITECTURES[name]
     parameters, flops = table_counts(name)
