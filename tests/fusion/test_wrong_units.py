@@ -82,8 +82,7 @@ def after_a_still_start(walk: ImuSequence) -> ImuSequence:
 def test_a_stream_in_degrees_is_refused_once_the_device_turns(make_walk, still_model):
     right = after_a_still_start(make_walk(3, 16.0, carry="swinging"))
     navigator = Navigator(still_model)
-    for row in zip(right.time[:300], right.gyro[:300], right.accel[:300], strict=True):
-        navigator.push(*row)
+    stream(navigator, right.select(slice(300)))
     with pytest.raises(InputError, match=r"gyro: found rotations .*, expected rad/s; .*deg/s"):
         stream(navigator, replace(right, gyro=np.degrees(right.gyro)).slice(3.0, 36.0))
     assert navigator.state is None

@@ -136,7 +136,6 @@ def test_heights_follow_stairs_and_a_lift(house, house_track):
     true = house.sequence.truth.position_W[:, 2]
     assert np.ptp(true) > 11.0
     assert climb_error(house_track, house.sequence) < 1.0
-    assert house_track.filtered is not None
     assert climb_error(house_track.filtered, house.sequence) < 2.5  # a lift shows after a second
     error = house_track.trajectory.position_W[:, 2] - true[0]
     error -= house.sequence.truth.at(house_track.time).position_W[:, 2] - true[0]

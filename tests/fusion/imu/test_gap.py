@@ -152,14 +152,6 @@ def test_late_repeated_and_infinite_fields_are_refused():
     assert buffer.at(1.2) is None
 
 
-def test_fields_may_arrive_seconds_before_their_samples():
-    buffer = FieldBuffer()
-    for batch in range(5):
-        for k in range(60):
-            assert buffer.add(3.0 * batch + 0.05 * k, noisy(k), now=3.0 * batch - 0.01)
-        assert buffer.at(3.0 * batch + 0.12) is not None
-
-
 def test_a_block_of_fields_may_come_before_its_samples_and_what_does_not_fit_is_counted():
     buffer = FieldBuffer()
     kept = [buffer.add(0.01 * k, noisy(k), now=-0.01) for k in range(1200)]
