@@ -191,7 +191,7 @@ def test_training_with_legs_reduces_the_error_at_positions(tmp_path, monkeypatch
     streams = [stream.part(0, 4000) for stream in world_streams(WALK)]
     monkeypatch.setattr("stario.network.training.validation._STRETCHES", 6)
     config = TrainingConfig(
-        epochs=2, epoch_windows=192, batch=16, rate=5e-3, seed=2, warm_up=0.0,
+        epochs=3, epoch_windows=192, batch=16, rate=5e-3, seed=2, warm_up=0.0,
         likelihood_from=0.0, track_stretches=2, augmentation=PLAIN,
     )  # fmt: skip
     reports = []
