@@ -65,7 +65,7 @@ def test_a_pedestrian_starts_level_to_within_the_stated_sigma(carry):
 
 def test_levelling_bounds_the_tilt_error_of_a_bias_but_integration_does_not():
     levelled, integrated = [], []
-    for seed in range(3):
+    for seed in range(6):
         walk = simulated_walk(seed, 90.0, "handheld", PERFECT_IMU)
         truth = walk.truth.attitude_WB.as_matrix()
         gyro = walk.gyro + 0.005 * np.eye(3)[seed % 3]
