@@ -47,7 +47,6 @@ def assert_same_poses(
     truth: Trajectory, walk: ImuSequence, tolerance_deg: float, tolerance_m: float
 ) -> None:
     """Assert that the truth is the walk's, except for a turn of the world that levelling allows."""
-    assert walk.truth is not None
     given, pose = walk.truth, truth.at(walk.time)
     error = (given.attitude_WB * pose.attitude_WB.inv())[pose.valid]
     world = error.mean()

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tomllib
 import typing
+from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
 from zipfile import ZipFile
@@ -80,13 +81,19 @@ def test_sequences_import_neither_network_nor_fusion_and_network_not_fusion():
             assert not any(f"from {name}" in text or f"import {name}" in text for name in names)
 
 
+def _statements(body: list[ast.stmt]) -> Iterator[ast.stmt]:
+    """Statements that run, including those inside functions; expressions are not walked."""
+    for node in body:
+        yield node
+        typing_only = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        for part in ("body", "handlers", "orelse", "finalbody")[typing_only:]:
+            yield from _statements(getattr(node, part, []))
+
+
 def _modules_imported(path: Path) -> set[str]:
     """Modules of stario that a file imports at run time, including imports inside functions."""
-    tree, found = ast.parse(path.read_text()), set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
-            node.body = []
-    for node in ast.walk(tree):
+    found = set()
+    for node in _statements(ast.parse(path.read_text()).body):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("stario."):
             found |= {node.module, *(f"{node.module}.{name.name}" for name in node.names)}
     return found

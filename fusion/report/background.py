@@ -11,11 +11,11 @@ from urllib.parse import urlsplit
 import numpy as np
 import plotly.graph_objects as go
 
-from stario.fusion.report.panels import INK
 from stario.sequences.errors import InputError
 from stario.sequences.geodesy import Georeference
 from stario.sequences.sequence import FloatArray
 
+INK = "#222222"
 _EQUATOR_M = 40_075_016.7
 _TILES_ACROSS = 4
 """Largest number of tiles across the drawn part."""

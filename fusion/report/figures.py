@@ -12,8 +12,8 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from stario.fusion.filter.corrections import Correction
-from stario.fusion.report.background import add_place
-from stario.fusion.report.panels import FAINT, GRID, INK, MAIN, TRUTH, Panel, marks, scatter, style
+from stario.fusion.report.background import INK, add_place
+from stario.fusion.report.panels import FAINT, GRID, MAIN, TRUTH, Panel, marks, scatter, style
 from stario.fusion.report.series import ellipse
 from stario.sequences.arrays import evenly_spaced, interpolated
 from stario.sequences.drawing.figures import clock

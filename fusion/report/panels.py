@@ -11,6 +11,7 @@ import pandas as pd
 import plotly.graph_objects as go
 from numpy.typing import ArrayLike
 
+from stario.fusion.report.background import INK
 from stario.fusion.values.floors import FloorChange
 from stario.fusion.values.state import Innovations
 from stario.sequences.arrays import evenly_spaced, interpolated
@@ -25,7 +26,7 @@ from stario.sequences.drawing.figures import (
 )
 from stario.sequences.sequence import BoolArray, FloatArray
 
-INK, GRID, FAINT = "#222222", "#E3E6EA", "#767676"
+GRID, FAINT = "#E3E6EA", "#767676"
 MAIN, TRUTH = "track", "truth"
 """Names of the track that has bands and ellipses, and of the ground truth."""
 

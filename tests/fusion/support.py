@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from stario.fusion import Navigator, NavState, Track
+from stario.fusion import Navigator, NavState, PriorPose, Track
 from stario.fusion.values.config import FilterConfig, NavigatorConfig
 from stario.sequences.accuracy.metrics import Alignment, evaluate_track
 from stario.sequences.attitude.rotations import about_z
@@ -32,9 +32,20 @@ WHITE = NavigatorConfig(WHITE_NOISE, replace(FILTER, update_rate=1))
 
 
 def stream(navigator: Navigator, sequence: ImuSequence) -> list[NavState]:
-    rows = zip(sequence.time, sequence.gyro, sequence.accel, strict=True)
-    states = [navigator.push(*row) for row in rows]
+    """States of a stream of the IMU's samples and, at their times, of the magnetometer's."""
+    states, fields = [], sequence.magnetometer
+    waiting = list(zip(fields.time.tolist(), fields.field, strict=True)) if fields else []
+    for row in zip(sequence.time, sequence.gyro, sequence.accel, strict=True):
+        while waiting and waiting[0][0] <= row[0]:
+            navigator.push_magnetometer(*waiting.pop(0))
+        states.append(navigator.push(*row))
     return [state for state in states if state is not None]
+
+
+def true_start(walk: ImuSequence) -> PriorPose:
+    """The walk's first pose and velocity, as a prior."""
+    truth = walk.truth
+    return PriorPose(truth.attitude_WB[0].as_matrix(), truth.velocity_W[0], truth.position_W[0])
 
 
 def stream_deviation(states: list[NavState], track: Track) -> float:

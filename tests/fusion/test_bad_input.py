@@ -1,6 +1,7 @@
 """The navigator's handling of bad input, on simulated walks."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -99,11 +100,8 @@ def test_outliers_do_less_harm_than_without_a_gate(
     assert ate(gated, walk) < (0.5 if backend == "ekf" else 0.6) * ate(taken, walk)
 
 
-@pytest.mark.parametrize("length", [0.5, 3.0])
-def test_after_a_gap_speed_recovers_and_sigma_covers_the_error(
-    make_walk, make_oracle, without, length
-):
-    covered, speed_errors = [], []
+def test_after_a_gap_speed_recovers_and_sigma_covers_the_error(make_walk, make_oracle, without):
+    length, covered, speed_errors = 3.0, [], []
     for seed in range(2):
         walk = make_walk(seed, 20.0, 50.0)
         holed = without(walk, (walk.time > 8.0) & (walk.time < 8.0 + length))
@@ -175,7 +173,7 @@ def test_in_its_first_second_a_stream_has_a_health_report_but_no_state(walk, sti
 # --- time ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("wild", "count"), [(1e9, 3), (300.0, 1), (2.0, 3)])
+@pytest.mark.parametrize(("wild", "count"), [(1e9, 3), (2.0, 3)])
 def test_wild_timestamps_do_not_block_a_stream(walk, make_oracle, without, wild, count):
     walk = walk.slice(0.0, 15.0)
     time = walk.time.copy()
@@ -222,10 +220,9 @@ def turned_over(walk: ImuSequence, late: np.ndarray) -> ImuSequence:
     return replace(walk, gyro=gyro, accel=accel, truth=truth)
 
 
-@pytest.mark.parametrize("seconds", [60.0, 1e6])
-def test_after_a_long_gap_the_navigator_restarts_where_it_was(walk, make_oracle, seconds):
+def test_after_a_long_gap_the_navigator_restarts_where_it_was(walk, make_oracle):
     """The device is turned over in the gap: the first second after it determines the tilt again."""
-    walk = walk.slice(0.0, 17.0)
+    walk, seconds = walk.slice(0.0, 17.0), 1e6
     late = walk.time > 10.0
     turned, time = turned_over(walk, late), walk.time + seconds * late
     truth = replace(turned.truth, time=time)
@@ -245,12 +242,11 @@ def test_after_a_long_gap_the_navigator_restarts_where_it_was(walk, make_oracle,
     assert np.degrees(np.linalg.norm(up - true_up, axis=1)).mean() < 4.0
     sigma = np.sqrt(np.diag(track.covariance[-1]))
     assert sigma[2] > 1.0
-    assert sigma[6] > min(seconds, 9e3)
+    assert sigma[6] > 9e3
     assert np.isfinite(track.covariance).all()
 
 
-@both_backends
-@pytest.mark.parametrize("seconds", [0.3, 5.0])
+@pytest.mark.parametrize(("backend", "seconds"), [("ekf", 5.0), ("graph", 0.3)])
 def test_a_device_turned_over_in_a_gap_does_not_run_away(walk, make_oracle, backend, seconds):
     """As in a swinging hand: with its old tilt, gravity would be taken for motion."""
     gap = (walk.time > 10.0) & (walk.time < 10.0 + seconds)
@@ -320,3 +316,99 @@ def test_a_network_that_claims_to_be_exact_is_not_trusted(walk, make_oracle):
 def test_a_dead_axis_is_logged_once_per_run(walk, still_model, caplog):
     Navigator(still_model, backend="ekf").run(replace(walk, gyro=walk.gyro * [1.0, 1.0, 0.0]))
     assert caplog.text.count("its z axis never changes") == 1
+
+
+# --- a network that raises an error or predicts other shapes --------------------------------------
+
+
+class Failing:
+    """Raises an error instead of some predictions."""
+
+    def __init__(self, inner: Any, at: set[int]) -> None:
+        self.inner, self.at, self.calls = inner, at, 0
+
+    def predict(self, windows: Any) -> Any:
+        self.calls += 1
+        if self.calls in self.at:
+            raise RuntimeError("out of memory")
+        return self.inner.predict(windows)
+
+
+@pytest.mark.parametrize("backend", ["ekf", "graph"])
+def test_a_stream_continues_after_its_network_has_failed(walk, make_oracle, backend):
+    walk = walk.slice(0.0, 13.0)
+    oracle = make_oracle(walk, walk.truth, GRAPH)
+    expected = {state.time: state.p_W for state in stream(Navigator(oracle, GRAPH), walk)}
+    navigator = Navigator(Failing(oracle, {5, 6, 20}), GRAPH, backend=backend)
+    states, failures = [], 0
+    for sample in zip(walk.time, walk.gyro, walk.accel, strict=True):
+        try:
+            states.append(navigator.push(*sample))
+        except RuntimeError:
+            failures += 1
+    assert failures == 3
+    errors = [np.linalg.norm(s.p_W - expected[s.time]) for s in states if s is not None]
+    assert len(errors) == len(expected) - 3
+    assert max(errors) < 0.1
+
+
+def test_no_motion_is_lost_if_the_network_fails_within_a_hole(walk, make_oracle, without):
+    """The sample after a bridged hole completes two intervals, the first of which fails here."""
+    config = replace(GRAPH, filter=replace(GRAPH.filter, update_rate=10))
+    walk = walk.slice(0.0, 12.0)
+    holed = without(walk, (walk.time > 10.055) & (walk.time < 10.205))
+    samples = list(zip(holed.time, holed.gyro, holed.accel, strict=True))
+    oracle = make_oracle(holed, walk.truth, config)
+    whole = Navigator(Failing(oracle, set()), config)
+    calls = []
+    for sample in samples:
+        calls.append(whole.model.calls)
+        whole.push(*sample)
+    (k,) = np.flatnonzero(np.diff(calls) == 2)
+    navigator = Navigator(Failing(oracle, {calls[k] + 1}), config)
+    for sample in samples[:k]:
+        navigator.push(*sample)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        navigator.push(*samples[k])
+    for sample in samples[k + 1 :]:
+        navigator.push(*sample)
+    assert navigator.model.calls == whole.model.calls
+    assert navigator.state.time == whole.state.time
+    assert np.linalg.norm(navigator.state.p_W - whole.state.p_W) < 0.01
+
+
+def zeros(count: int) -> np.ndarray:
+    return np.zeros((count, 3))
+
+
+def variances(count: int) -> np.ndarray:
+    return np.tile(0.01 * np.eye(3), (count, 1, 1))
+
+
+@pytest.mark.parametrize(
+    ("predict", "named"),
+    [
+        (lambda n: None, "NoneType"),
+        (lambda n: zeros(n), "ndarray"),
+        (lambda n: (zeros(n), 0.01 * np.ones((n, 3))), r"covariances \(\d+, 3, 3\)"),
+        (lambda n: (zeros(n)[:, :2], variances(n)), r"displacements \(\d+, 3\)"),
+        (lambda n: (zeros(1), variances(1)), r"shapes \(1, 3\)"),  # would be every window's
+        (lambda n: (zeros(n), variances(n) + np.triu(np.ones((3, 3)), 1)), "asymmetric"),
+    ],
+)
+def test_predictions_of_other_shapes_are_refused(walk, predict, named):
+    class Custom:
+        def predict(self, windows):
+            return predict(len(windows))
+
+    with pytest.raises(InputError, match=f"model.*{named}"):
+        Navigator(Custom(), backend="ekf").run(walk.slice(0.0, 4.0))
+
+
+def test_predictions_may_be_lists(walk):
+    class Custom:
+        def predict(self, windows):
+            return zeros(len(windows)).tolist(), variances(len(windows)).tolist()
+
+    track = Navigator(Custom(), backend="ekf").run(walk.slice(0.0, 4.0))
+    assert track.health.updates > 0

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 from simulated import measured
-from support import GRAPH
+from support import GRAPH, stream
 
 from stario.fusion import (
     FilterConfig,
@@ -36,6 +36,7 @@ LEVEL = np.eye(3), np.zeros(3), np.zeros(3)
         (lambda model: Navigator(model, config={}), "config"),
         (lambda model: Navigator(model, prior=(1, 2)), "prior"),
         (lambda model: Navigator(model, backend=["ekf"]), "backend"),
+        (lambda model: Navigator(model, backend="ukf"), "'ukf', expected one of ekf, graph"),
         (lambda model: Navigator("default"), "model"),
         (lambda model: Navigator(type(model)), "model"),
         (lambda model: Navigator(model, backend="ekf").run("walk.csv"), "sequence"),
@@ -114,8 +115,7 @@ def test_the_graph_accepts_biases_without_random_walk():
 
 def test_a_snapshot_with_any_byte_changed_is_refused_or_restored(walk, still_model):
     navigator = Navigator(still_model)
-    for row in zip(walk.time[:150], walk.gyro[:150], walk.accel[:150], strict=True):
-        navigator.push(*row)
+    stream(navigator, walk.select(slice(150)))
     data = navigator.snapshot()
     rng = np.random.default_rng(0)
     for place in rng.integers(0, len(data), 60).tolist():

@@ -51,7 +51,7 @@ def test_recordings_of_every_format_run_with_a_bounded_error(model, name, worst_
 
 
 def test_stream_equals_batch_within_a_millimetre(model):
-    recording = stretch(TUMVI, 40.0)
+    recording = stretch(TUMVI, 15.0)
     track, navigator = Navigator(model, backend="ekf").run(recording), Navigator(model)
     states = stream(navigator, recording)
     assert len(states) == len(track.time) - navigator.config.filter.output_rate

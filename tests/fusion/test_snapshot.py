@@ -1,7 +1,10 @@
 """A stream that is stopped and continued elsewhere gives the same states as without a stop."""
 
+import gc
+import tracemalloc
 import zlib
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -28,7 +31,7 @@ def assert_same(ours: list[NavState], theirs: list[NavState]) -> None:
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
 
 
-@pytest.mark.parametrize("stop", [0.5, 1.0, 7.37, 12.2, 14.41])
+@pytest.mark.parametrize("stop", [0.5, 7.37, 12.2, 14.41])
 def test_a_restored_stream_continues_bit_for_bit(walk, make_oracle, without, stop):
     """Stopped in the first second, later, or next to a gap, with waiting and with late fixes."""
     holed = without(walk, (walk.time > 12.3) & (walk.time < 13.8))
@@ -54,7 +57,7 @@ def test_a_restored_stream_continues_bit_for_bit(walk, make_oracle, without, sto
     second.restore(data)
     for navigator in (whole, second):
         late_fix(navigator)
-    later = min(stop + 5.0, 20.1)
+    later = stop + 4.0
     assert_same(push(second, holed, stop, later), push(whole, holed, stop, later))
     assert second.health == whole.health
     assert second.health.fixes["value that is not finite"] == 1
@@ -178,3 +181,35 @@ def test_a_stream_is_silent_until_a_second_after_a_gap_and_a_snapshot_keeps_that
                 break
     assert state.time == pytest.approx(6.6, abs=0.02)
     np.testing.assert_allclose(other.p_W, state.p_W, atol=1e-9)
+
+
+# --- memory ---------------------------------------------------------------------------------------
+
+
+BYTES_PER_NUMBER = 16
+RATE = 50.0
+
+
+def memory_growth(navigator: Navigator, walk: ImuSequence, warm_up: float, seconds: float) -> int:
+    """Growth [bytes], from the half with less of it: caches fill once, leaks grow in both.
+
+    The recording's samples are pushed over and over.
+    """
+    rows = list(zip(walk.gyro.tolist(), walk.accel.tolist(), strict=True))
+    held = []
+    tracemalloc.start()
+    try:
+        for start, stop in pairwise([0.0, warm_up, warm_up + 0.5 * seconds, warm_up + seconds]):
+            for k in range(round(start * RATE), round(stop * RATE)):
+                navigator.push(k / RATE, *rows[k % len(rows)])
+            gc.collect()  # free lists are no growth
+            held.append(tracemalloc.get_traced_memory()[0])
+        return 2 * min(after - before for before, after in pairwise(held))
+    finally:
+        tracemalloc.stop()
+
+
+def test_the_memory_of_a_stream_does_not_grow(make_walk, still_model):
+    growth = memory_growth(Navigator(still_model), make_walk(1, 12.0, RATE), 8.0, 12.0)
+    # One number per sample.
+    assert growth < BYTES_PER_NUMBER * RATE * 12.0

@@ -164,7 +164,6 @@ def test_windows_that_are_none_are_refused(windows):
 def test_gradient_of_the_deviation_of_a_constant_is_finite():
     x = torch.full((2, 3, 5), 7.0, requires_grad=True)
     moments(x, dim=2)[1].sum().backward()
-    assert x.grad is not None
     assert torch.isfinite(x.grad).all()
 
 

@@ -7,15 +7,19 @@ import numpy as np
 import pytest
 from initial_ekf import Driven
 from support import stream
+from told import health_verdict
 
 from stario.fusion import Navigator
 from stario.fusion.evaluation.checks.faults import faults, matched_walk, run_faults
 from stario.fusion.evaluation.scores import wide
 from stario.fusion.filter.alternative import AlternativeHypothesis, Hypotheses
+from stario.fusion.filter.corrections import correction
 from stario.fusion.filter.displacements import update_with
 from stario.fusion.filter.innovations import InnovationStatistics
 from stario.fusion.imu.inference import WindowDisplacement
 from stario.fusion.values.config import FilterConfig, NavigatorConfig
+from stario.fusion.values.health import Health
+from stario.fusion.values.lie import about_vertical
 from stario.fusion.values.state import NavState
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import ImuSequence
@@ -39,28 +43,24 @@ def error_added(
 
 # Walks in which the filter followed the last false displacements and then gated the correct ones:
 # errors of 2.4, 2.9 and 3.4 m without the alternative.
-@pytest.mark.parametrize(
-    "seed", [pytest.param(5, marks=pytest.mark.slow), pytest.param(7, marks=pytest.mark.slow), 10]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [5, 7, 10])
 def test_five_seconds_of_false_displacements_leave_no_lasting_error(seed):
     assert error_added(BLOCK, *matched_walk(SECONDS, seed), seed) < 0.3
 
 
 # With the default noise, which trusts the accelerometer little: errors of 2.6 to 3.6 m if the
 # alternative drops the false displacements instead of taking a constant error from them.
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("seed", "backend", "limit"),
-    [
-        pytest.param(1, "ekf", 0.75, marks=pytest.mark.slow),
-        (2, "ekf", 0.75),
-        pytest.param(2, "graph", 0.35, marks=pytest.mark.slow),
-    ],
+    ("seed", "backend", "limit"), [(1, "ekf", 0.75), (2, "ekf", 0.75), (2, "graph", 0.35)]
 )
 def test_five_false_seconds_leave_no_lasting_error_with_the_default_noise(seed, backend, limit):
     sequence, _ = matched_walk(SECONDS, seed)
     assert error_added(BLOCK, sequence, NavigatorConfig(), seed, backend) < limit
 
 
+@pytest.mark.slow
 def test_the_last_false_displacement_does_not_spoil_the_alternative():
     """In this walk it fits the alternative, by then uncertain; both back ends were 3 m off."""
     sequence = simulate_imu(generate_walk(4, SECONDS), 200.0, PHONE_IMU, 4)
@@ -76,6 +76,7 @@ def test_a_stream_forgets_false_displacements_too(make_walk, make_oracle, backen
     assert np.linalg.norm(stream(navigator, walk)[-1].p_W - expected.p_W) < 1.0
 
 
+@pytest.mark.slow
 def test_single_false_displacements_do_not_widen_the_gyro_bias_prior():
     """The bias varies as much as its prior allows: taken as evidence, that cost 5.5 m."""
     sequence, config = matched_walk(SECONDS, seed=9)
@@ -105,9 +106,9 @@ CONFIG = NavigatorConfig(
 
 
 def test_a_snapshot_includes_the_alternative(make_walk, make_oracle):
-    walk = make_walk(1, 30.0)
+    walk = make_walk(1, 25.0, 50.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.02)
-    parts = [walk.slice(0.0, 22.0 - 1e-9), walk.slice(22.0, 30.0)]
+    parts = [walk.slice(0.0, 22.0 - 1e-9), walk.slice(22.0, 25.0)]
     model = OffByOneMetre(oracle, 38, 46)
     whole = Navigator(model, CONFIG)
     stream(whole, parts[0])
@@ -179,3 +180,36 @@ def test_an_uncertain_alternative_does_not_take_the_steady_error_for_right(error
     assert (alternative.outliers == (0.0,)) == fits
     # Less the offset, both displacements are zero.
     np.testing.assert_allclose(alternative.ekf.p_W, 0.0, atol=0.05)
+
+
+# --- corrections ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("turn", "shift", "recorded"),
+    [(0.0, 0.9, False), (0.0, 1.1, True), (0.15, 0.0, False), (0.2, 0.0, True)],
+)
+def test_a_step_beyond_a_metre_or_ten_degrees_is_a_correction(turn, shift, recorded):
+    before = Driven(slots=1).state
+    before = before.plus(np.zeros(len(before.P)))
+    after = before.transformed(about_vertical(turn), np.array([shift, 0.0, 0.0]))
+    found = correction(before, after, "rest")
+    assert (found is not None) == recorded
+    if found is not None:
+        np.testing.assert_allclose(found[1:3], [shift, turn], atol=1e-9)
+    assert correction(before, before, "rest") is None
+
+
+def test_a_good_walk_has_none(make_walk, make_oracle):
+    config = NavigatorConfig()
+    walk = make_walk(seed=3, seconds=20.0)
+    navigator = Navigator(make_oracle(walk, walk.truth, config, noise=0.03, sigma=0.03), config)
+    assert navigator.run(walk).health.corrections == []
+
+
+def test_a_track_with_a_large_correction_is_not_called_good():
+    health = Health(updates=100, mean_nis=3.0, corrections=[(93.2, 4.0, 0.5, "magnetic field")])
+    first = health_verdict(health)[0]
+    assert first.level == "warning"
+    assert "4.0 m" in first.text
+    assert "magnetic field" in first.text

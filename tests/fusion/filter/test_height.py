@@ -106,9 +106,10 @@ def test_moving_the_map_changes_nothing_that_pressure_tells(transform):
 
 @pytest.fixture(scope="module")
 def house():
-    """Two minutes: stairs to the first floor, and a lift to the fourth."""
+    """A minute: stairs to the first floor, and a lift to the fourth."""
     walk = simulate_house(9, 120.0, rate=50.0)
-    return replace(walk, sequence=replace(walk.sequence, magnetometer=None))
+    sequence = replace(walk.sequence, magnetometer=None).slice(45.0, 113.0)
+    return replace(walk, sequence=sequence)
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +136,6 @@ def test_heights_follow_stairs_and_a_lift(house, house_track):
     true = house.sequence.truth.position_W[:, 2]
     assert np.ptp(true) > 11.0
     assert climb_error(house_track, house.sequence) < 1.0
-    assert house_track.filtered is not None
     assert climb_error(house_track.filtered, house.sequence) < 2.5  # a lift shows after a second
     error = house_track.trajectory.position_W[:, 2] - true[0]
     error -= house.sequence.truth.at(house_track.time).position_W[:, 2] - true[0]
@@ -173,7 +173,7 @@ def test_the_report_draws_floors_along_the_height(house_track):
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
 def test_a_stream_has_the_heights_of_the_recording(house, level_oracle, house_track, backend):
-    sequence = house.sequence.slice(0.0, 45.0)
+    sequence = house.sequence.slice(45.0, 72.0)
     pressures = dict(zip(sequence.barometer.time, sequence.barometer.pressure_hPa, strict=True))
     times = list(pressures)
     stream = Navigator(level_oracle, CONFIG, backend=backend)
@@ -194,7 +194,7 @@ def test_a_stream_has_the_heights_of_the_recording(house, level_oracle, house_tr
     same = np.interp([s.time for s in states], expected.time, expected.trajectory.position_W[:, 2])
     tolerance = 1e-6 if backend == "ekf" else 0.6
     np.testing.assert_allclose(heights, same, atol=tolerance)
-    assert stream.health.pressures["applied"] > 75
+    assert stream.health.pressures["applied"] > 45
 
 
 def test_weather_and_doors_on_a_level_floor_are_worth_their_sigma(make_walk):
@@ -224,7 +224,7 @@ def test_pressures_in_other_units_are_refused(pressure, remedy, still_model):
 
 
 def test_late_and_broken_pressures_are_counted(make_walk, still_model):
-    walk = make_walk()
+    walk = make_walk(seconds=5.0)
     stream = Navigator(still_model)
     for row in np.column_stack([walk.time, walk.gyro, walk.accel])[:400].tolist():
         stream.push(row[0], row[1:4], row[4:7])
@@ -236,7 +236,7 @@ def test_late_and_broken_pressures_are_counted(make_walk, still_model):
 
 
 def test_a_barometer_on_another_clock_is_said_to_be_unused(make_walk, still_model):
-    walk = make_walk()
+    walk = make_walk(seconds=5.0)
     time = walk.time[::20] + 1.7e9
     other = Barometer(time, standard_pressure(np.zeros(len(time))))
     health = Navigator(still_model).run(replace(walk, barometer=other)).health

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from initial_ekf import Driven
 from support import GRAPH as CONFIG
-from support import stream_deviation
+from support import stream, stream_deviation
 from told import health_lines
 
 from stario.fusion import Navigator, NavState, PriorPose
@@ -22,12 +22,9 @@ from stario.fusion.filter.magnetic import (
     update_bearing,
     with_field,
 )
-from stario.fusion.navigator import Navigator as Stream
-from stario.fusion.values.config import FilterConfig
 from stario.fusion.values.fixes import position_fix
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.attitude.so3 import exp_so3
-from stario.sequences.errors import ConfigError
 from stario.sequences.sequence import ImuSequence, Magnetometer
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
 from stario.sequences.simulation.magnetometer import MagneticField
@@ -194,17 +191,6 @@ def last_yaw_error(states: list[NavState], sequence: ImuSequence) -> float:
     return abs(math.remainder(ends[1] - ends[0], 2.0 * math.pi))
 
 
-def pushed(navigator: Stream, sequence: ImuSequence) -> list[NavState]:
-    """States of a stream of both sensors."""
-    states, fields = [], sequence.magnetometer
-    waiting = list(zip(fields.time.tolist(), fields.field, strict=True)) if fields else []
-    for row in zip(sequence.time, sequence.gyro, sequence.accel, strict=True):
-        while waiting and waiting[0][0] <= row[0]:
-            navigator.push_magnetometer(*waiting.pop(0))
-        states.append(navigator.push(*row))
-    return [s for s in states if s is not None]
-
-
 def test_bearings_determine_the_gyroscope_bias(biased_walk, oracle, biased_track):
     """In a stream as in a batch; without it the error of the bias is larger."""
     track = biased_track
@@ -214,7 +200,7 @@ def test_bearings_determine_the_gyroscope_bias(biased_walk, oracle, biased_track
     assert track.health.bearings["applied"] > 200
     assert blind.health.bearings == {}
 
-    states = pushed(Stream(oracle, CONFIG), biased_walk.slice(0.0, 30.0))
+    states = stream(Navigator(oracle, CONFIG), biased_walk.slice(0.0, 16.0))
     assert stream_deviation(states, track) < 1e-6
     assert last_yaw_error(states, biased_walk) < math.radians(20.0)
 
@@ -229,9 +215,9 @@ def test_what_a_magnetometers_calibration_was_is_forgotten_within_minutes():
 
 def test_a_streams_graph_estimates_the_same_bias_as_its_filter(biased_walk, make_oracle):
     config = replace(CONFIG, filter=replace(CONFIG.filter, gyro_bias_sigma=1e-2))
-    walk = biased_walk.slice(0.0, 54.0)
+    walk = biased_walk.slice(0.0, 42.0)
     oracle = make_oracle(walk, walk.truth, config, noise=0.1, sigma=0.1)
-    graph = pushed(Stream(oracle, config, backend="graph"), walk)[-1]
+    graph = stream(Navigator(oracle, config, backend="graph"), walk)[-1]
     filtered, without_field = (
         Navigator(oracle, config, backend="ekf").run(replace(walk, magnetometer=field))
         for field in (walk.magnetometer, None)
@@ -243,17 +229,13 @@ def test_a_streams_graph_estimates_the_same_bias_as_its_filter(biased_walk, make
     assert blind > 1.1 * theirs
 
 
-@pytest.mark.parametrize(
-    "fault", ["axes swapped", pytest.param("axis mirrored", marks=pytest.mark.slow), "stopped"]
-)
+@pytest.mark.parametrize("fault", ["axes swapped", "stopped"])
 def test_a_field_that_contradicts_the_gyroscope_does_not_turn_the_track(
     biased_walk, oracle, biased_track, fault
 ):
     field, time = biased_walk.magnetometer.field.copy(), biased_walk.magnetometer.time
     if fault == "axes swapped":
         field = field[:, [1, 0, 2]]
-    elif fault == "axis mirrored":
-        field[:, 0] *= -1.0
     else:
         field[time > 25.0] = field[np.searchsorted(time, 25.0)]
     wrong = replace(biased_walk, magnetometer=Magnetometer(time, field))
@@ -275,10 +257,9 @@ def test_repeated_and_invalid_fields_are_dropped_and_counted(still_model):
     assert "magnetometer samples dropped: 2" in navigator.health.lines()
 
 
-@pytest.mark.parametrize("seconds", [-1e4, 1e4])
-def test_a_field_on_another_clock_is_reported(biased_walk, still_model, seconds):
+def test_a_field_on_another_clock_is_reported(biased_walk, still_model):
     walk = biased_walk.slice(0.0, 6.0)
-    field = replace(walk.magnetometer, time=walk.magnetometer.time + seconds)
+    field = replace(walk.magnetometer, time=walk.magnetometer.time + 1e4)
     health = (
         Navigator(still_model, CONFIG, backend="ekf").run(replace(walk, magnetometer=field)).health
     )
@@ -288,7 +269,7 @@ def test_a_field_on_another_clock_is_reported(biased_walk, still_model, seconds)
 
 @pytest.mark.parametrize(
     ("scale", "named"),
-    [(1e-6, "weak"), (1e-2, "weak"), (1e3, "strong")],  # T, gauss, nT
+    [(1e-2, "weak"), (1e3, "strong")],  # gauss, nT
 )
 def test_a_field_in_another_unit_is_named_as_such(biased_walk, make_oracle, scale, named):
     walk = biased_walk.slice(0.0, 6.0)
@@ -303,7 +284,7 @@ def test_a_field_in_another_unit_is_named_as_such(biased_walk, make_oracle, scal
 
 
 def test_a_disabled_magnetometer_has_no_effect(biased_walk, make_oracle):
-    short = biased_walk.slice(0.0, 10.0)
+    short = biased_walk.slice(0.0, 6.0)
     off = replace(CONFIG, filter=replace(CONFIG.filter, magnetometer=False))
     oracle = make_oracle(short, biased_walk.truth, CONFIG)
     blind = Navigator(oracle, CONFIG, backend="ekf").run(replace(short, magnetometer=None))
@@ -316,7 +297,7 @@ def test_a_declination_turns_the_track_to_true_north(biased_walk, make_oracle, b
     """The whole track from the first pose on; the azimuth of the field here is 39 degrees."""
     declination = math.pi / 2.0 - math.atan2(FIELD_W[1], FIELD_W[0])
     settings = replace(CONFIG, filter=replace(CONFIG.filter, declination=declination))
-    walk = biased_walk.slice(0.0, 40.0)
+    walk = biased_walk.slice(0.0, 20.0)
     oracle = make_oracle(walk, biased_walk.truth, settings, noise=0.05, sigma=0.05)
     track = Navigator(oracle, settings, backend=backend).run(walk)
     truth = walk.truth.at(track.time)
@@ -334,8 +315,8 @@ def test_a_declination_turns_the_track_to_true_north(biased_walk, make_oracle, b
 def test_the_field_does_not_tell_after_a_gap_a_yaw_that_was_unknown_before(
     biased_walk, make_oracle, without
 ):
-    whole = biased_walk.slice(0.0, 40.0)
-    walk = without(whole, (whole.time > 20.0) & (whole.time < 24.0))
+    whole = biased_walk.slice(0.0, 20.0)
+    walk = without(whole, (whole.time > 10.0) & (whole.time < 14.0))
     oracle = make_oracle(walk, biased_walk.truth, CONFIG)
     fix = position_fix(5.0, walk.truth.at(np.array([5.0])).position_W[0], np.eye(3))
     track = Navigator(oracle, CONFIG, backend="ekf").run(walk, fixes=[fix])
@@ -349,9 +330,3 @@ def test_north_is_not_applied_if_the_direction_is_known(biased_walk, make_oracle
     known = PriorPose(exp_so3(np.array([0.0, 0.0, 1.0])), np.zeros(3), np.zeros(3))
     track = Navigator(oracle, settings, prior=known, backend="ekf").run(walk)
     assert track.health.fixes == {}
-
-
-@pytest.mark.parametrize("declination", [4.0, math.nan, "east"])
-def test_a_declination_that_is_not_an_angle_is_refused(declination):
-    with pytest.raises(ConfigError, match="declination"):
-        FilterConfig(declination=declination)

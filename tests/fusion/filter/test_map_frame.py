@@ -9,8 +9,11 @@ from support import GRAPH as CONFIG
 from support import stream
 
 from stario.fusion import Navigator, NavState, PriorPose
+from stario.fusion.evaluation.checks.fusion import true_fixes
+from stario.fusion.filter.planar_alignment import PlanarAlignment
 from stario.fusion.values.fixes import Fix, position_fix, yaw_fix
 from stario.fusion.values.lie import yaw_twist
+from stario.sequences.accuracy.metrics import pose_errors
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence
 
@@ -40,10 +43,10 @@ def stream_with_fixes(navigator: Navigator, walk: ImuSequence, fixes: list[Fix])
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_fixes_far_from_the_maps_origin_are_as_accurate_as_near_ones(backend):
-    walk, _, oracle = measured(3, 10.0, CONFIG)
+    walk, _, oracle = measured(3, 8.0, CONFIG)
     found = []
     for shift in (np.zeros(3), MAP):
-        fixes = fixes_of(walk, np.arange(3.0, 9.5, 3.0), shift)
+        fixes = fixes_of(walk, (3.0, 6.0), shift)
         track = Navigator(oracle, CONFIG, backend=backend).run(walk, fixes=fixes)
         states = stream_with_fixes(Navigator(oracle, CONFIG, backend=backend), walk, fixes)
         assert track.health.fixes == {"applied": len(fixes)}
@@ -68,8 +71,7 @@ def test_a_fix_at_the_first_sample_places_the_first_state_too(make_walk, make_or
     np.testing.assert_allclose(np.diag(track.covariance[0, 6:9, 6:9]), 0.01, rtol=0.01)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("gap", [4.0, 15.0])
+@pytest.mark.parametrize(("backend", "gap"), [("ekf", 15.0), ("graph", 4.0)])
 def test_fixes_recover_the_yaw_after_a_gap_that_lost_it(backend, gap):
     """The pedestrian turns in the gap; the track before it stays where the fixes placed it."""
     walk, holed, oracle = measured(6, 50.0, CONFIG, gap=(20.0, 20.0 + gap))
@@ -87,10 +89,10 @@ def test_fixes_recover_the_yaw_after_a_gap_that_lost_it(backend, gap):
 
 def test_the_graph_uses_no_fix_that_the_filter_refused(make_walk, make_oracle):
     """The yaw of a device that hangs upside down is undefined."""
-    walk = make_walk(3, 8.0, mount_rotvec=(np.pi, 0.0, 0.0))
+    walk = make_walk(3, 4.0, mount_rotvec=(np.pi, 0.0, 0.0))
     oracle = make_oracle(walk, walk.truth, CONFIG)
     ends = []
-    for fixes in ([], [yaw_fix(6.03, 0.5, 0.01)]):
+    for fixes in ([], [yaw_fix(3.03, 0.5, 0.01)]):
         navigator = Navigator(oracle, CONFIG, backend="graph")
         for fix in fixes:
             navigator.update_yaw(fix.time, 0.5, 0.01)
@@ -123,7 +125,7 @@ class Climbing:
 
 def test_fixes_that_agree_prevail_over_an_overconfident_track(make_walk, make_oracle):
     """Otherwise it ends twenty metres too high, as each fix alone looks like an outlier."""
-    walk = make_walk(3, 60.0)
+    walk = make_walk(3, 60.0, 50.0)
     climbing = Climbing(make_oracle(walk, walk.truth, CONFIG, noise=0.02, sigma=0.02))
     fixes = fixes_of(walk, np.arange(3.0, 59.0, 2.0), np.zeros(3))
     track = Navigator(climbing, CONFIG, backend="ekf").run(walk, fixes=fixes)
@@ -134,9 +136,9 @@ def test_fixes_that_agree_prevail_over_an_overconfident_track(make_walk, make_or
 
 
 def test_neither_gaps_nor_fixes_make_a_streams_graph_grow(make_walk, make_oracle, without):
-    walk = make_walk(5, 15.0)
-    holed = without(walk, (walk.time > 5.0) & (walk.time % 3.0 < 0.3))
-    for recording, fixes in ((holed, []), (walk, fixes_of(walk, np.arange(3.0, 14.0, 0.1), MAP))):
+    walk = make_walk(5, 12.0, 50.0)
+    holed = without(walk, (walk.time > 3.0) & (walk.time % 3.0 < 0.3))
+    for recording, fixes in ((holed, []), (walk, fixes_of(walk, np.arange(3.0, 11.0, 0.1), MAP))):
         oracle = make_oracle(recording, walk.truth, CONFIG)
         navigator = Navigator(oracle, CONFIG, backend="graph")
         stream_with_fixes(navigator, recording, fixes)
@@ -152,12 +154,10 @@ def yaw_error(walk: ImuSequence, states: list[NavState]) -> tuple[np.ndarray, np
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize(
-    "off", [[200.0, 0.0, 0.0], pytest.param([0.0, -60.0, 0.0], marks=pytest.mark.slow)]
-)
-def test_a_wrong_first_position_does_not_turn_the_track(backend, off):
-    walk, _, oracle = measured(3, 28.0, CONFIG)
-    fixes = fixes_of(walk, np.arange(2.0, 27.0, 3.0), np.zeros(3))
+def test_a_wrong_first_position_does_not_turn_the_track(backend):
+    walk, _, oracle = measured(3, 20.0, CONFIG)
+    fixes = fixes_of(walk, np.arange(2.0, 19.0, 3.0), np.zeros(3))
+    off = [200.0, 0.0, 0.0]
     bad = position_fix(fixes[0].time, fixes[0].value + off, fixes[0].covariance)
     states = stream_with_fixes(Navigator(oracle, CONFIG, backend=backend), walk, [bad, *fixes[1:]])
     error, sigma = yaw_error(walk, states[-20:])
@@ -170,13 +170,13 @@ def test_a_wrong_first_position_does_not_turn_the_track(backend, off):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_positions_undo_a_yaw_that_pointed_backwards(backend):
-    walk, _, oracle = measured(3, 60.0, CONFIG)
+    walk, _, oracle = measured(3, 40.0, CONFIG)
     wrong = yaw_of(walk.truth.at(np.array([4.0])).attitude_WB)[0] + np.pi
-    right = [position_fix(t, true_at(walk, t), 0.09 * np.eye(3)) for t in np.arange(5.0, 58.0, 1.0)]
+    right = [position_fix(t, true_at(walk, t), 0.09 * np.eye(3)) for t in np.arange(5.0, 38.0, 1.0)]
     track = Navigator(oracle, CONFIG, backend=backend).run(
         walk, fixes=[yaw_fix(4.0, wrong, 0.1), *right]
     )
-    late = track.time > 40.0
+    late = track.time > 28.0
     truth = walk.truth.at(track.time[late])
     turned = yaw_of(track.trajectory.attitude_WB[late] * truth.attitude_WB.inv())
     sigma = np.sqrt(track.covariance[late, 2, 2])
@@ -255,3 +255,62 @@ def test_a_horizontal_position_is_kept_over_a_coarser_one_with_height():
     at = np.searchsorted(track.time, 1.5)
     assert np.linalg.norm(track.trajectory.position_W[at, :2] - start[:2]) < 0.5
     assert track.health.fixes == {"applied": 1, "yaw not known": 1}
+
+
+# --- the direction of a track from several positions together -------------------------------------
+
+
+def test_positions_too_close_to_give_a_direction_alone_give_it_together():
+    walk, _, oracle = measured(8, 45.0, CONFIG, noise=0.02)
+    farthest = np.linalg.norm(walk.truth.position_W[:, :2] - walk.truth.position_W[0, :2], axis=1)
+    sigma = 0.4 * float(farthest.max())
+    fixes = true_fixes(walk.truth, 1.0, sigma, seed=3)
+    track = Navigator(oracle, CONFIG, backend="ekf").run(walk, fixes=fixes)
+    counts = track.health.fixes
+    assert counts["yaw not known"] > 3
+    assert counts["applied"] > 5
+    yaw = pose_errors(track.trajectory, walk.truth).yaw[-1]
+    assert abs(yaw) < 3.0 * np.sqrt(track.covariance[-1, 2, 2])
+
+
+# --- the alignment -------------------------------------------------------------------------------
+
+
+def alignment_of(
+    rng: np.random.Generator, turn: float, count: int, sigma: float
+) -> PlanarAlignment:
+    """Alignment of a walk in a room, with independent noise in every fix."""
+    z = rng.uniform(-2.0, 2.0, count) + 1j * rng.uniform(-2.0, 2.0, count)
+    noise = rng.normal(0.0, sigma, count) + 1j * rng.normal(0.0, sigma, count)
+    fixed = np.exp(1j * turn) * z + (3.0 - 1.0j) + noise
+    positions = PlanarAlignment()
+    for a, b in zip(z, fixed, strict=True):
+        pair = np.array([a.real, a.imag]), np.array([b.real, b.imag])
+        positions = positions.with_position(*pair, sigma**2, 0.0)
+    return positions
+
+
+@pytest.mark.parametrize("count", [5, 20])
+def test_the_sigma_of_the_fitted_turn_is_consistent(count):
+    rng, errors = np.random.default_rng(0), []
+    for turn in rng.uniform(-np.pi, np.pi, 400):
+        found, sigma = alignment_of(rng, turn, count, 0.3).turn
+        errors.append(np.angle(np.exp(1j * (found - turn))) / sigma)
+    assert 0.8 < np.mean(np.square(errors)) < 1.3
+
+
+def test_fewer_than_two_places_give_no_direction():
+    assert PlanarAlignment().turn[1] == np.inf
+    here = PlanarAlignment()
+    for fix in np.random.default_rng(1).normal(0.0, 1.0, (50, 2)):
+        here = here.with_position(np.zeros(2), fix, 1.0, 0.0)
+    assert here.turn[1] > 10.0
+
+
+def test_positions_count_for_less_once_the_track_has_drifted():
+    steady = alignment_of(np.random.default_rng(2), 0.5, 8, 0.3)
+    last = np.array([1.0, 1.0]), np.array([2.0, 2.0])
+    kept, drifted = (steady.with_position(*last, 0.09, drift) for drift in (0.0, 5.0))
+    assert drifted.turn[1] > 2.0 * kept.turn[1]
+    # The eight before it now have the drift's variance as well.
+    assert drifted.sums[0] == pytest.approx(8.0 / (0.09 + 5.0) + 1.0 / 0.09)

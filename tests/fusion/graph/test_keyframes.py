@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from simulated import measured
 from support import GRAPH as CONFIG
-from support import stream
+from support import stream, true_start
 from told import health_lines
 
 from stario.fusion import Navigator, backends
@@ -25,9 +25,7 @@ from stario.fusion.values.lie import yaw_twist
 from stario.fusion.values.state import NavState
 from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.attitude.rotations import about_z, yaw_of
-from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.noise import ImuNoise
-from stario.sequences.settings import with_settings
 
 
 def graph(model: Any, config: NavigatorConfig = CONFIG, **more: Any) -> Navigator:
@@ -68,7 +66,7 @@ def test_the_track_follows_the_imu_between_keyframes(walk, make_oracle):
 
 def smooth_turned(filtered, *others):
     """Smooth from headings that are off by 6 rad in the end."""
-    turns = about_z([0.1 * (state.time - filtered[0].time) for state in filtered]).as_matrix()
+    turns = about_z([0.3 * (state.time - filtered[0].time) for state in filtered]).as_matrix()
     lost = [
         replace(state, R_WB=turn @ state.R_WB, v_W=turn @ state.v_W, p_W=turn @ state.p_W)
         for state, turn in zip(filtered, turns, strict=True)
@@ -79,7 +77,7 @@ def smooth_turned(filtered, *others):
 @pytest.mark.parametrize("full_steps", [50, 1])
 def test_the_track_does_not_depend_on_a_heading_that_the_filter_lost(monkeypatch, full_steps):
     """With full steps, and with small turns where these do not converge."""
-    walk, _, oracle = measured(3, 40.0, CONFIG)
+    walk, _, oracle = measured(3, 20.0, CONFIG)
     expected = graph(oracle).run(walk)
     monkeypatch.setattr(backends, "smooth", smooth_turned)
     monkeypatch.setattr(keyframes, "_FULL_STEPS", full_steps)
@@ -166,8 +164,9 @@ def test_the_graph_accepts_a_perfect_sensor(walk, make_oracle):
 # --- bad input -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("length", [0.3, 1.0, 3.0])
+@pytest.mark.parametrize("length", [0.3, 3.0])
 def test_a_gap_is_crossed_and_its_sigma_covers_the_error(walk, make_oracle, without, length):
+    walk = walk.slice(0.0, 14.0)
     holed = without(walk, (walk.time > 8.0) & (walk.time < 8.0 + length))
     track = graph(make_oracle(holed, walk.truth, CONFIG)).run(holed)
     assert track.time[~track.trajectory.valid] == pytest.approx([8.0 + length], abs=0.02)
@@ -180,17 +179,6 @@ def test_a_gap_is_crossed_and_its_sigma_covers_the_error(walk, make_oracle, with
     assert error < 4.0 * np.sqrt(np.trace(track.covariance[-1, 6:9, 6:9])) + 0.5
 
 
-def test_an_unknown_back_end_is_refused_by_name(still_model):
-    with pytest.raises(InputError, match="backend: found 'ukf', expected one of ekf, graph"):
-        Navigator(still_model, backend="ukf")
-
-
-@pytest.mark.parametrize("lag", [0.5, 100.0, float("nan")])
-def test_a_lag_out_of_bounds_is_refused(lag):
-    with pytest.raises(ConfigError, match=r"graph\.lag"):
-        with_settings(NavigatorConfig(), {"graph": {"lag": lag}})
-
-
 # --- fixes -----------------------------------------------------------------------------------
 
 
@@ -199,12 +187,9 @@ def test_a_position_fix_pulls_the_track_to_it_at_its_own_time(walk, make_oracle,
     """On a keyframe, between the filter's states, and on one of them."""
     walk = walk.slice(0.0, 15.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.1, sigma=0.1)
-    prior = PriorPose(
-        walk.truth.attitude_WB[0].as_matrix(), walk.truth.velocity_W[0], walk.truth.position_W[0]
-    )
     truth = walk.truth.at(np.array([time])).position_W[0]
     fix = position_fix(time, truth, 1e-4 * np.eye(3))
-    track = graph(oracle, prior=prior).run(walk, fixes=[fix])
+    track = graph(oracle, prior=true_start(walk)).run(walk, fixes=[fix])
     near = np.abs(track.time - time) < 0.11
     true = walk.truth.at(track.time[near]).position_W
     assert np.linalg.norm(track.trajectory.position_W[near] - true, axis=1).max() < 0.06
@@ -250,7 +235,7 @@ def test_a_heading_at_a_tilted_device_is_measured_at_the_tilt_that_the_graph_fin
 
 def test_contradicting_fixes_are_weighed_until_the_track_has_converged(make_walk, make_oracle):
     """Headings off by 86 degrees, as from another axis: accurate positions outweigh them."""
-    walk, rng = make_walk(7, 20.0), np.random.default_rng(0)
+    walk, rng = make_walk(7, 20.0, 50.0), np.random.default_rng(0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.05, sigma=0.05)
     times = np.arange(3.03, 19.0)
     places = walk.truth.at(times).position_W
@@ -263,15 +248,12 @@ def test_contradicting_fixes_are_weighed_until_the_track_has_converged(make_walk
     assert np.linalg.norm(track.trajectory.position_W[-1] - end) < 0.5
 
 
-@pytest.mark.parametrize("height_sigma", [pytest.param(1e3, marks=pytest.mark.slow), 1e6])
-def test_accurate_positions_with_an_unknown_height_need_no_fall_back(
-    walk, make_oracle, height_sigma
-):
+def test_accurate_positions_with_an_unknown_height_need_no_fall_back(walk, make_oracle):
     walk = walk.slice(0.0, 14.0)
     oracle = make_oracle(walk, walk.truth, CONFIG, noise=0.05, sigma=0.05)
     times = np.arange(2.03, 13.0)
     flat = walk.truth.at(times).position_W * [1.0, 1.0, 0.0]
-    covariance = np.diag([1e-4, 1e-4, height_sigma**2])
+    covariance = np.diag([1e-4, 1e-4, 1e12])
     fixes = [position_fix(t, p, covariance) for t, p in zip(times, flat, strict=True)]
     track = graph(oracle).run(walk, fixes=fixes)
     assert track.health.notes == []

@@ -63,7 +63,7 @@ def test_the_yaw_is_kept_through_gaps_while_the_device_turns(
     make_walk, make_oracle, without, backend
 ):
     """A kept attitude would lose 20 degrees in each of these four gaps, and know as much."""
-    walk = swivelled(make_walk(3, 32.0), 1.0)
+    walk = swivelled(make_walk(3, 32.0, 50.0), 1.0)
     gone = (walk.time > 10.0) & (walk.time < 28.0) & (walk.time % 5.0 < 0.35)
     holed = without(walk, gone)
     track = Navigator(make_oracle(holed, walk.truth, GRAPH), GRAPH, backend=backend).run(holed)
@@ -150,14 +150,6 @@ def test_late_repeated_and_infinite_fields_are_refused():
     assert not buffer.add(1.5, np.full(3, math.inf), now=1.5)
     assert buffer.at(1.05) is FIELD_B
     assert buffer.at(1.2) is None
-
-
-def test_fields_may_arrive_seconds_before_their_samples():
-    buffer = FieldBuffer()
-    for batch in range(5):
-        for k in range(60):
-            assert buffer.add(3.0 * batch + 0.05 * k, noisy(k), now=3.0 * batch - 0.01)
-        assert buffer.at(3.0 * batch + 0.12) is not None
 
 
 def test_a_block_of_fields_may_come_before_its_samples_and_what_does_not_fit_is_counted():

@@ -145,16 +145,6 @@ def test_transition_agrees_with_finite_differences():
     np.testing.assert_allclose(propagated(segment, *x).transition, numeric, atol=1e-6)
 
 
-def test_propagation_keeps_yaw_and_position_unobservable():
-    x = state()
-    segment = preintegrate(*samples(200), x[3], x[4], NOISE, GRAVITY)
-    unobservable = np.zeros((15, 4))
-    unobservable[2, 0] = 1.0
-    unobservable[6:9, 1:] = np.eye(3)
-    kept = propagated(segment, *x).transition @ unobservable
-    np.testing.assert_allclose(kept, unobservable, rtol=0.0, atol=1e-10)
-
-
 def test_noise_agrees_with_that_of_perturbed_samples():
     """Sum over each sample's noise and each step of the biases' walks, by finite differences."""
     R, v, p, b_g, b_a = state()

@@ -83,7 +83,7 @@ def test_a_hundred_silent_and_slow_connections_keep_no_push_out(serve, pushes, m
 
 
 def test_a_connection_without_a_whole_request_is_closed_in_time(serve, monkeypatch):
-    monkeypatch.setattr(run, "REQUEST_SECONDS", 0.5)
+    monkeypatch.setattr(run, "REQUEST_SECONDS", 0.2)
     server = serve()
     for sent in (b"", HEAD[:20], HEAD + b"{"):
         with socket.create_connection(("127.0.0.1", server.port), timeout=10.0) as client:
@@ -98,16 +98,6 @@ def test_a_stranger_keeps_no_connection(serve, monkeypatch):
     with socket.create_connection(("127.0.0.1", server.port), timeout=3.0) as client:
         client.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
         assert client.makefile("rb").read().startswith(b"HTTP/1.1 401")  # to its end
-
-
-def test_answers_are_not_delayed(serve):
-    server = serve()
-    with socket.create_connection(("127.0.0.1", server.port)) as client:
-        client.sendall(b"GET /page/live.css HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        client.recv(100)
-        [served] = server._server.server_state.connections
-        accepted = served.transport.get_extra_info("socket")
-        assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
 
 
 def test_a_push_waits_no_longer_for_a_missing_one_though_no_other_comes(serve, pushes):
@@ -156,13 +146,13 @@ def test_only_loopback_needs_no_token(tmp_path, new_navigator):
 
 
 def test_a_simulated_phone_walks_to_its_end(serve, walk):
-    server = serve(demo=walk.slice(0.0, 3.0))
+    server = serve(demo=walk.slice(0.0, 1.5))
     stop = time.monotonic() + 20.0
     while not (sessions := server.hub.sessions) or sessions["simulated phone"].running:
         assert time.monotonic() < stop
         time.sleep(0.05)
     track = sessions["simulated phone"].track
-    assert track.samples == len(walk.slice(0.0, 3.0)) == len(read_recording(track.path))
+    assert track.samples == len(walk.slice(0.0, 1.5)) == len(read_recording(track.path))
 
 
 NDJSON = {"content-type": "Application/X-NDJSON; charset=utf-8"}

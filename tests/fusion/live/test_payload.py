@@ -5,7 +5,7 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -102,6 +102,7 @@ def test_an_invalid_field_is_named(path, value, field):
         parse_push(changed(PUSH, path, value))
 
 
+@settings(max_examples=40)
 @given(st.binary() | json_values.map(lambda value: json.dumps(value).encode()))
 @example(b"[" * 100_000)
 @example(b"1" * 10_000)

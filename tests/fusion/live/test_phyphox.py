@@ -165,16 +165,6 @@ def test_a_cleared_experiment_is_followed_from_its_new_start(phone, fake, lost):
     assert after[-1].recording != before.recording
 
 
-def test_an_experiment_cleared_while_the_phone_was_away_begins_another_recording(phone, fake):
-    fake.count = 100
-    before = phone.fetch()
-    fake.clear()
-    fake.measuring, fake.count = True, 500
-    after = phone.fetch()
-    assert len(after.readings) == 1000
-    assert after.recording != before.recording
-
-
 @pytest.mark.parametrize("wrong", [float("inf"), 10**400, 1e300])
 def test_an_endless_time_neither_fails_nor_ends_the_stream(phone, fake, wrong):
     fake.count = 10

@@ -86,7 +86,7 @@ def test_zero_moves_the_drawn_origin_and_not_the_estimate(client, hub, pushes, n
 
 
 def test_tapped_fixes_move_and_rotate_the_whole_drawn_track(client, hub, pushes, new_navigator):
-    bodies = pushes()
+    bodies = pushes(seconds=17.0)
     send(client, bodies[:20])
     session = hub.sessions["phone"]
     shape = np.array(session.track.drawn.points)[:, 1:3]
@@ -94,7 +94,7 @@ def test_tapped_fixes_move_and_rotate_the_whole_drawn_track(client, hub, pushes,
     moved = np.array(session.track.drawn.points)[: len(shape), 1:3]
     np.testing.assert_allclose(session.track.drawn.points[-1][1:3], [50.0, -20.0], atol=0.2)
     np.testing.assert_allclose(moved - moved[0], shape - shape[0], atol=1e-4)
-    send(client, bodies[20:90])
+    send(client, bodies[20:75])
     walked = np.array(session.track.drawn.points[-1][1:3]) - [50.0, -20.0]
     assert np.linalg.norm(walked) > 5.0
     turned = [50.0 - walked[1], -20.0 + walked[0]]  # a quarter turn to the left
@@ -103,7 +103,7 @@ def test_tapped_fixes_move_and_rotate_the_whole_drawn_track(client, hub, pushes,
     start = np.array(session.track.drawn.points[len(shape) // 2][1:3])
     before = moved[len(shape) // 2] - [50.0, -20.0]
     np.testing.assert_allclose(start - [50.0, -20.0], [-before[1], before[0]], atol=0.6)
-    send(client, bodies[90:])
+    send(client, bodies[75:])
     np.testing.assert_allclose(ends(session), end_of_rerun(session, new_navigator()), atol=1e-3)
     assert session.status()["fixes"] == 2
 

@@ -146,16 +146,6 @@ def batches(pushes):
     return [parse_push(body) for body in pushes(seconds=9.0)]
 
 
-def test_a_gyroscope_that_stops_is_shown(session, batches):
-    for batch in batches[:15]:
-        session.take(batch, 1.7e9)
-    assert session.status()["problem"] == ""
-    for batch in batches[15:]:
-        others = [reading for reading in batch.readings if reading.sensor != GYRO]
-        session.take(replace(batch, readings=others), 1.7e9)
-    assert "no samples of gyroscope for 5 s" in session.status()["problem"]
-
-
 def test_a_gyroscope_in_another_unit_is_shown_though_the_track_begins_again(session, batches):
     shown = []
     for batch in batches:

@@ -78,7 +78,7 @@ def assert_same(state: NavState, track: Track, atol: float = 1e-9) -> None:
 # --- time ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("late", [-3.0, 0.3, 0.85])
+@pytest.mark.parametrize("late", [0.3, 0.85])
 def test_a_fix_is_applied_at_its_own_time_however_late(walk, make_oracle, late):
     model, fixes = make_oracle(walk, walk.truth, CONFIG), fixes_of(walk)
     track = Navigator(model, CONFIG, backend="ekf").run(walk, fixes=fixes)
@@ -105,12 +105,12 @@ def test_fixes_that_are_too_old_are_refused_and_counted(walk, model):
 
 def test_a_fix_one_window_late_is_not_too_late_by_rounding(walk, model):
     navigator, given = Navigator(model, CONFIG), 0
-    for row in zip(walk.time[:1250], walk.gyro, walk.accel, strict=False):
+    for row in zip(walk.time[:800], walk.gyro, walk.accel, strict=False):
         state = navigator.push(*row)
         if state is not None and state.time > walk.time[0] + 1.05:
             navigator.update_velocity(round(state.time - 1.0, 6), np.zeros(3), 1e6 * EYE)
             given += 1
-    assert given > 100
+    assert given > 50
     assert "too late" not in navigator.health.fixes
 
 
@@ -157,10 +157,10 @@ def test_an_interval_split_in_two_keeps_its_window_and_integrals(walk):
 # --- the map frame ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("turn", [0.0, -2.5])
-def test_two_positions_determine_the_position_and_direction_of_a_track(walk, model, turn):
+def test_two_positions_determine_the_position_and_direction_of_a_track(walk, model):
     """The map frame is turned and shifted relative to the walk's by any amount."""
-    R, shift = about_z(turn).as_matrix(), np.array([5e3, -2e4, 30.0])
+    turn, shift = -2.5, np.array([5e3, -2e4, 30.0])
+    R = about_z(turn).as_matrix()
     fixes = [
         position_fix(t, R @ truth_at(walk, t)[0] + shift, 1e-4 * EYE)
         for t in (4.0, 6.0, 28.0, 29.6)
@@ -176,6 +176,7 @@ def test_two_positions_determine_the_position_and_direction_of_a_track(walk, mod
     assert np.linalg.norm(np.diff(track.trajectory.position_W, axis=0), axis=1).max() < 0.4
 
 
+@pytest.mark.slow
 def test_the_covariance_in_the_map_frame_is_consistent(make_walk, make_oracle):
     position, yaw = [], []
     for seed in range(12):
@@ -237,14 +238,14 @@ def test_a_track_with_a_known_start_is_corrected_without_a_frame_change(walk, mo
 
 def test_positions_too_close_together_do_not_turn_the_map_frame(walk, model):
     fixes = [position_fix(t, truth_at(walk, t)[0], 9.0 * EYE) for t in (5.0, 6.0, 7.0)]
-    track = Navigator(model, CONFIG, backend="ekf").run(walk, fixes=fixes)
+    track = Navigator(model, CONFIG, backend="ekf").run(walk.slice(0.0, 8.0), fixes=fixes)
     assert track.health.fixes == {"applied": 1, "yaw not known": 2}
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
 def test_one_position_leaves_the_direction_in_the_map_unknown(walk, model, backend):
     """However the walk lies in the map, the error is within the sigma; the pivot is sure."""
-    fix, walk = position_fix(5.0, truth_at(walk, 5.0)[0], 0.01 * EYE), walk.slice(0.0, 15.0)
+    fix, walk = position_fix(5.0, truth_at(walk, 5.0)[0], 0.01 * EYE), walk.slice(0.0, 12.0)
     track = Navigator(model, CONFIG, backend=backend).run(walk, fixes=[fix])
     streamed = Navigator(model, CONFIG, backend=backend)
     apply_fix(streamed, fix)
@@ -309,10 +310,8 @@ def test_a_wrong_shape_raises_an_error_that_names_the_argument(model):
 
 
 def test_the_covariance_of_an_exact_fix_has_a_floor(walk, model):
-    p = truth_at(walk, 10.0)[0]
-    track = Navigator(model, CONFIG, backend="ekf").run(
-        walk, fixes=[position_fix(10.0, p, 1e-30 * EYE)]
-    )
+    fix = position_fix(10.0, truth_at(walk, 10.0)[0], 1e-30 * EYE)
+    track = Navigator(model, CONFIG, backend="ekf").run(walk.slice(0.0, 12.0), fixes=[fix])
     assert track.health.fixes == {"applied": 1}
     assert np.isfinite(track.covariance).all()
     assert np.linalg.eigvalsh(track.covariance).min() > -1e-9

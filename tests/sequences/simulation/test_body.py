@@ -114,7 +114,6 @@ def test_landing_feet_shake_a_pocket_more_than_a_hand():
 
 def test_seed_decides_everything():
     one, same, other = (virtual_imu(walker(), "bag", seed=k) for k in (1, 1, 2))
-
     assert np.array_equal(one.accel, same.accel)
     assert not np.allclose(one.accel, other.accel, atol=0.1)
 

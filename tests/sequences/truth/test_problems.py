@@ -148,7 +148,6 @@ def test_positions_are_not_compared_across_gaps(of):
 
 
 def test_a_shift_while_tracking_is_lost_is_not_a_jump(walk):
-    assert walk.truth is not None
     lost = replace(walk.truth, position_W=jumping(walk.truth))
     assert [found.code for found in truth_findings(replace(walk, truth=lost))] == ["truth_jumps"]
     blank = replace(lost, valid=np.abs(lost.time - LATE_S - 0.05) > 0.08)
@@ -161,7 +160,6 @@ def test_a_truth_too_short_to_compare_is_no_problem(walk):
 
 def test_only_poses_whose_attitude_repeats_as_well_are_lost(walk):
     still = moved(walk, lambda truth: 0.0 * truth.position_W)
-    assert still.truth is not None
     kept, _ = tracked_truth(still)
     assert kept.valid.sum() == len(kept) - 1  # but the first, which the others repeat
     frozen = replace(still.truth, attitude_WB=Rotation.identity(len(still.truth)))
