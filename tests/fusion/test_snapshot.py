@@ -213,3 +213,12 @@ def test_the_memory_of_a_stream_does_not_grow(make_walk, still_model):
     growth = memory_growth(Navigator(still_model), make_walk(1, 12.0, RATE), 8.0, 12.0)
     # One number per sample.
     assert growth < BYTES_PER_NUMBER * RATE * 12.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["ekf", "graph"])
+def test_the_memory_of_an_hours_stream_does_not_grow(make_walk, still_model, backend):
+    navigator = Navigator(still_model, backend=backend)
+    growth = memory_growth(navigator, make_walk(1, 30.0, RATE), 120.0, 3600.0)
+    # Half of one number per network update.
+    assert growth < 0.5 * BYTES_PER_NUMBER * 2.0 * 3600.0

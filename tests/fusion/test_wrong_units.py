@@ -118,3 +118,24 @@ def test_a_turn_within_gaps_is_not_taken_for_wrong_units(still_model):
     gyro = np.tile([2.0, 0.0, 0.0], (len(time), 1))
     samples = ImuSequence("turns", time[measured], gyro[measured], accel[measured])
     assert stream(Navigator(still_model), samples)[-1].time > 22.0
+
+
+def test_the_check_for_degrees_survives_a_snapshot(walk, still_model):
+    wrong = after_a_still_start(walk)
+    wrong = replace(wrong, gyro=np.degrees(wrong.gyro))
+
+    def refused_at(stop):
+        """Time at which the stream is refused if another navigator continues it at `stop`."""
+        navigator = Navigator(still_model)
+        for time, gyro, accel in zip(wrong.time, wrong.gyro, wrong.accel, strict=True):
+            if time == stop:
+                data, navigator = navigator.snapshot(), Navigator(still_model)
+                navigator.restore(data)
+            try:
+                navigator.push(time, gyro, accel)
+            except InputError:
+                return float(time)
+        return np.inf
+
+    whole = refused_at(np.nan)
+    assert refused_at(float(wrong.time[1710])) == whole < 26.0

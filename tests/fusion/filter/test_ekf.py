@@ -8,6 +8,8 @@ from scipy.spatial.transform import Rotation
 from se23 import exp_se23
 
 from stario.fusion.filter.correlated_errors import displacement_errors
+from stario.fusion.filter.ekf import clone
+from stario.fusion.filter.ekf import initialised as filter_state
 from stario.fusion.filter.estimates import plain_covariances
 from stario.fusion.filter.initial import VELOCITY_SIGMA, with_velocity_bounded
 from stario.fusion.filter.jacobians import (
@@ -455,3 +457,62 @@ def test_corrections_of_any_size_follow_the_exponential_map():
         after.state.clone_pose(0), before.state.clone_pose(0), (0.0, p), strict=True
     ):
         np.testing.assert_allclose(found, R @ old + shift, atol=1e-9)
+
+
+def test_invalid_initial_values_are_named():
+    zero, eye = np.zeros(3), np.eye(3)
+    ekf = Driven(2)
+    with pytest.raises(InputError, match="R_WB"):
+        ekf.initialise(NavState(0.0, 2 * eye, zero, zero, zero, zero, np.eye(15)))
+    with pytest.raises(InputError, match="v_W"):
+        ekf.initialise(NavState(0.0, eye, np.full(3, np.nan), zero, zero, zero, np.eye(15)))
+    with pytest.raises(InputError, match="covariance"):
+        ekf.initialise(NavState(0.0, eye, zero, zero, zero, zero, -np.eye(15)))
+    with pytest.raises(InputError, match="slots"):
+        filter_state(NavState(0.0, eye, zero, zero, zero, zero, np.eye(15)), -1)
+
+
+@pytest.mark.parametrize(
+    ("d", "covariance", "reason"),
+    [
+        ([np.nan, 0, 0], np.eye(3), "finite"),
+        ([0, 0, 0], np.full((3, 3), np.nan), "finite"),
+        ([0, 0, 0], np.diag([1.0, -1.0, 1.0]), "positive definite"),
+    ],
+)
+def test_invalid_measurements_are_refused(driven, d, covariance, reason):
+    P, p = driven.P.copy(), driven.state.p_W
+    result = driven.update_displacement(0, np.array(d), covariance, gate=7.8)
+    assert not result.accepted
+    assert reason in result.reason
+    np.testing.assert_array_equal(driven.P, P)
+    np.testing.assert_array_equal(driven.state.p_W, p)
+
+
+def test_a_released_slot_is_empty(driven):
+    driven.release(2)
+    with pytest.raises(InputError, match="slot"):
+        driven.state.clone_estimate(2)
+    first = 15 + 6 * 2
+    assert not driven.P[first : first + 6].any()
+    assert not driven.P[:, first : first + 6].any()
+    with pytest.raises(InputError, match="slot"):
+        driven.update_displacement(2, np.zeros(3), np.eye(3))
+    with pytest.raises(InputError, match="slot"):
+        driven.release(2)
+
+
+def test_cloning_without_a_free_slot_raises_an_error(driven):
+    with pytest.raises(InputError, match="release"):
+        clone(driven.state)
+
+
+@pytest.mark.slow
+def test_covariance_stays_positive_over_half_an_hour():
+    ekf = initialised(20)
+    for part in range(30):
+        drive(ekf, 1200, window=20, seed=part)
+        assert_symmetric_and_positive(ekf, 20)
+        for slot in range(20):
+            ekf.release(slot)
+    np.testing.assert_allclose(ekf.state.R_WB @ ekf.state.R_WB.T, np.eye(3), atol=1e-8)

@@ -22,9 +22,11 @@ from stario.fusion.filter.magnetic import (
     update_bearing,
     with_field,
 )
+from stario.fusion.values.config import FilterConfig
 from stario.fusion.values.fixes import position_fix
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.attitude.so3 import exp_so3
+from stario.sequences.errors import ConfigError
 from stario.sequences.sequence import ImuSequence, Magnetometer
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
 from stario.sequences.simulation.magnetometer import MagneticField
@@ -330,3 +332,9 @@ def test_north_is_not_applied_if_the_direction_is_known(biased_walk, make_oracle
     known = PriorPose(exp_so3(np.array([0.0, 0.0, 1.0])), np.zeros(3), np.zeros(3))
     track = Navigator(oracle, settings, prior=known, backend="ekf").run(walk)
     assert track.health.fixes == {}
+
+
+@pytest.mark.parametrize("declination", [4.0, math.nan, "east"])
+def test_a_declination_that_is_not_an_angle_is_refused(declination):
+    with pytest.raises(ConfigError, match="declination"):
+        FilterConfig(declination=declination)

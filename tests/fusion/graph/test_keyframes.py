@@ -25,7 +25,9 @@ from stario.fusion.values.lie import yaw_twist
 from stario.fusion.values.state import NavState
 from stario.sequences.accuracy.nees import position_nees
 from stario.sequences.attitude.rotations import about_z, yaw_of
+from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.noise import ImuNoise
+from stario.sequences.settings import with_settings
 
 
 def graph(model: Any, config: NavigatorConfig = CONFIG, **more: Any) -> Navigator:
@@ -281,3 +283,14 @@ def test_two_positions_place_and_turn_a_track_that_started_without_a_pose(make_w
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error)
     assert 0.05 < np.median(nees) < 2.4  # median of chi-square with 3 DoF: 2.4
     assert track.health.fixes["applied"] == 2
+
+
+@pytest.mark.parametrize("lag", [0.5, 100.0, float("nan")])
+def test_a_lag_out_of_bounds_is_refused(lag):
+    with pytest.raises(ConfigError, match=r"graph\.lag"):
+        with_settings(NavigatorConfig(), {"graph": {"lag": lag}})
+
+
+def test_an_unknown_back_end_is_refused_by_name(still_model):
+    with pytest.raises(InputError, match="backend: found 'ukf', expected one of ekf, graph"):
+        Navigator(still_model, backend="ukf")

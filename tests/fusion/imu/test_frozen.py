@@ -119,3 +119,15 @@ def test_a_wild_time_does_not_hide_a_sensor_that_has_stopped(walk):
     time = stopped.time.copy()
     time[820] = 1e9
     assert frozen_samples(time, stopped.gyro, stopped.accel) > 200
+
+
+@pytest.mark.parametrize("stop", [8.3, 10.0])
+def test_a_restored_stream_knows_what_has_stopped(walk, still_model, stop):
+    stopped = held(walk, "gyro", 8.0, 12.0)
+    whole, first, second = (Navigator(still_model) for _ in range(3))
+    stream(whole, stopped)
+    stream(first, stopped.slice(0.0, stop - 1e-9))
+    second.restore(first.snapshot())
+    stream(second, stopped.slice(stop, 20.1))
+    assert second.health == whole.health
+    assert second.health.samples["frozen"] > 200

@@ -174,3 +174,11 @@ def test_a_sensor_that_repeats_its_value_has_stopped():
     used = [buffer.add(0.1 * k, FIELD_B, now=0.1 * k) for k in range(20)]
     assert used == [True] * 6 + [False] * 14  # slow sensors are logged several times
     assert buffer.add(2.0, noisy(1), now=2.0)
+
+
+def test_fields_may_arrive_seconds_before_their_samples():
+    buffer = FieldBuffer()
+    for batch in range(5):
+        for k in range(60):
+            assert buffer.add(3.0 * batch + 0.05 * k, noisy(k), now=3.0 * batch - 0.01)
+        assert buffer.at(3.0 * batch + 0.12) is not None

@@ -267,3 +267,13 @@ def test_more_than_a_full_turn_in_a_segment_leaves_its_jacobians_bounded(turn):
     assert np.abs(end.transition).max() < 10.0
     assert np.abs(end.noise).max() < 100.0
     assert end.noise[0][2, 2] > 1.0  # the yaw is not known any more [rad^2]
+
+
+def test_propagation_keeps_yaw_and_position_unobservable():
+    x = state()
+    segment = preintegrate(*samples(200), x[3], x[4], NOISE, GRAVITY)
+    unobservable = np.zeros((15, 4))
+    unobservable[2, 0] = 1.0
+    unobservable[6:9, 1:] = np.eye(3)
+    kept = propagated(segment, *x).transition @ unobservable
+    np.testing.assert_allclose(kept, unobservable, rtol=0.0, atol=1e-10)

@@ -78,3 +78,20 @@ def test_an_old_or_repeated_place_neither_refuses_nor_divides_a_recording(client
     recording = read_recording(session.track.path)
     assert (len(recording), recording.duration) == (400, pytest.approx(3.99))
     assert len(recording.satellites.time) == 1
+
+
+def test_pressure_in_another_unit_is_told_and_the_track_goes_on(client, hub, pushes):
+    bodies = added(
+        pushes(seconds=4.0), "barometer", lambda t: {"pressure": 100 * pressure(t)["pressure"]}
+    )
+    send(client, bodies)
+    session = hub.sessions["phone"]
+    assert "convert from Pa to hPa" in session.status()["problem"]
+    assert session.track.drawn.points[-1][0] > 3.5
+
+
+@pytest.mark.parametrize("values", [{}, {"pressure": None}, {"pressure": "x"}, [1013.0]])
+def test_a_barometer_without_pressure_refuses_no_push(client, hub, pushes, values):
+    bodies = added(pushes(seconds=1.0), "barometer", lambda _: values)
+    assert all(answer.is_success for answer in send(client, bodies))
+    assert read_recording(hub.sessions["phone"].track.path).barometer is None

@@ -186,3 +186,13 @@ def test_a_body_of_too_many_devices_is_refused_before_any_is_taken(client, hub, 
     assert hub.sessions == {}
     answer = client.post("/data", content="\n".join(posted[:16]), headers=NDJSON)
     assert (answer.status_code, len(hub.sessions)) == (200, 16)
+
+
+def test_answers_are_not_delayed(serve):
+    server = serve()
+    with socket.create_connection(("127.0.0.1", server.port)) as client:
+        client.sendall(b"GET /page/live.css HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        client.recv(100)
+        [served] = server._server.server_state.connections
+        accepted = served.transport.get_extra_info("socket")
+        assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)

@@ -227,3 +227,11 @@ def test_a_reading_with_a_wild_time_is_dropped_alone(session, pushes, seconds):
     assert session.track.drawn is track
     assert session.status()["dropped"] == {"wrong time": 1}
     assert 798 <= session.track.samples <= 800
+
+
+def test_a_recording_that_begins_with_an_empty_push_begins_a_new_track(session, pushes):
+    empty = b'{"messageId": 0, "sessionId": "two", "deviceId": "phone", "payload": []}'
+    second = pushes(session="two", offset_ns=10**18 + 10**10, seconds=4.0)[1:]
+    take(session, [*pushes(seconds=3.0), empty, *second])
+    assert session.track.samples == 380
+    assert len(list(session.track.path.parent.glob("*.csv"))) == 2

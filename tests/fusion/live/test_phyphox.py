@@ -184,3 +184,13 @@ def test_a_paused_experiment_continues_as_another_recording(phone, fake):
     assert len(set(recordings[1:5])) == len(set(recordings[5:])) == 1
     assert recordings[4] != recordings[5]
     assert sum(len(batch.readings) for batch in batches) == 80
+
+
+def test_an_experiment_cleared_while_the_phone_was_away_begins_another_recording(phone, fake):
+    fake.count = 100
+    before = phone.fetch()
+    fake.clear()
+    fake.measuring, fake.count = True, 500
+    after = phone.fetch()
+    assert len(after.readings) == 1000
+    assert after.recording != before.recording

@@ -217,3 +217,13 @@ def test_an_unwritable_folder_is_shown(tmp_path, new_navigator, batches):
     with pytest.raises(InputError, match="a writable folder"):
         session.take(longer, 1.7e9)
     assert "a writable folder" in session.status()["problem"]
+
+
+def test_a_gyroscope_that_stops_is_shown(session, batches):
+    for batch in batches[:15]:
+        session.take(batch, 1.7e9)
+    assert session.status()["problem"] == ""
+    for batch in batches[15:]:
+        others = [reading for reading in batch.readings if reading.sensor != GYRO]
+        session.take(replace(batch, readings=others), 1.7e9)
+    assert "no samples of gyroscope for 5 s" in session.status()["problem"]

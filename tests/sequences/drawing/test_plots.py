@@ -325,3 +325,12 @@ def test_unknown_values_are_shown_as_a_dash():
         "0.000",
         "1.2",
     ]
+
+
+def test_colours_depend_on_the_track_name_only(truth, tracks):
+    all_axes = plan_view(tracks, truth, "").axes[0]
+    two_axes = plan_view({name: tracks[name] for name in ("track", "network")}, None, "").axes[0]
+    for label in ("StarIO", "network alone"):
+        assert line(all_axes, label).get_color() == line(two_axes, label).get_color()
+    shown = ("truth", "StarIO", "network alone", "dead reckoning")
+    assert len({line(all_axes, label).get_color() for label in shown}) == len(shown)
