@@ -505,14 +505,3 @@ def test_a_released_slot_is_empty(driven):
 def test_cloning_without_a_free_slot_raises_an_error(driven):
     with pytest.raises(InputError, match="release"):
         clone(driven.state)
-
-
-@pytest.mark.slow
-def test_covariance_stays_positive_over_half_an_hour():
-    ekf = initialised(20)
-    for part in range(30):
-        drive(ekf, 1200, window=20, seed=part)
-        assert_symmetric_and_positive(ekf, 20)
-        for slot in range(20):
-            ekf.release(slot)
-    np.testing.assert_allclose(ekf.state.R_WB @ ekf.state.R_WB.T, np.eye(3), atol=1e-8)
