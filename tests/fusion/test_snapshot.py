@@ -31,7 +31,7 @@ def assert_same(ours: list[NavState], theirs: list[NavState]) -> None:
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
 
 
-@pytest.mark.parametrize("stop", [0.5, 7.37, 12.2, 14.41])
+@pytest.mark.parametrize("stop", [0.5, 1.0, 7.37, 12.2, 14.41])
 def test_a_restored_stream_continues_bit_for_bit(walk, make_oracle, without, stop):
     """Stopped in the first second, later, or next to a gap, with waiting and with late fixes."""
     holed = without(walk, (walk.time > 12.3) & (walk.time < 13.8))

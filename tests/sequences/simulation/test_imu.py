@@ -12,7 +12,9 @@ from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import (
+    GOOD_IMU,
     PERFECT_IMU,
+    PHONE_IMU,
     ImuErrors,
     simulate_imu,
 )
@@ -112,6 +114,13 @@ def test_saturation_clips_the_samples():
     assert np.abs(free.gyro).max() > 1.5
     assert np.array_equal(clipped.gyro, np.clip(free.gyro, -1.0, 1.0))
     assert np.array_equal(clipped.accel, np.clip(free.accel, -9.0, 9.0))
+
+
+def test_presets_are_ordered_by_their_errors():
+    true = simulate_imu(waving(), errors=PERFECT_IMU)
+    off = [np.abs(simulate_imu(waving(), errors=e).gyro - true.gyro).mean() for e in (
+        GOOD_IMU, PHONE_IMU)]  # fmt: skip
+    assert 0.0 < off[0] < off[1] < 0.05
 
 
 @pytest.mark.parametrize("rate", [50.0, 200.0, 333.0])
