@@ -10,7 +10,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from stario.fusion.evaluation.checks.consistency import consistency, consistency_text, summary
+from stario.fusion.evaluation.checks.consistency import (
+    YAW_SIGMA,
+    consistency,
+    consistency_text,
+    summary,
+)
 from stario.fusion.values.config import FilterConfig, NavigatorConfig
 from stario.sequences.accuracy.nees import nees_bounds
 from stario.sequences.errors import InputError
@@ -54,9 +59,9 @@ def test_nees_of_five_minutes_is_within_its_bounds():
 
 @pytest.mark.slow
 def test_nees_of_a_quarter_of_an_hour_with_a_phone_is_within_its_bounds():
-    # Nothing observes yaw, whose sigma is then 1.3 rad. Later, errors near pi leave the chart.
+    # A hand's tilts show little of the bias about the vertical to gravity: yaw drifts.
     result = averages(PHONE, seconds=900.0)
-    assert 1.0 < result.yaw_sigma < 1.5
+    assert result.yaw_sigma > 1.2 * YAW_SIGMA
     assert 12.7 < result.nees < 17.5
     assert 0.5 < result.yaw < 1.7
 
