@@ -22,7 +22,6 @@ from stario.sequences.attitude.levelling import levelled_attitudes
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.clean_samples import clean_samples
 from stario.sequences.inspection.magnetic import assess_magnetometer
-from stario.sequences.inspection.samples import clock_findings
 from stario.sequences.simulation.imu import PERFECT_IMU
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
@@ -154,18 +153,3 @@ def test_a_magnetometer_next_to_magnets_is_not_usable():
     name = "archives/tyrex.h5:Thibaud_Nexus5_Dist_Texting"
     magnets = assess_magnetometer(read_recording(DATA / name))
     assert magnets.figures["verdict"] == "not usable"
-
-
-@pytest.mark.parametrize(
-    ("factor", "offset", "words"),
-    [(1e3, 0.0, "they seem to be in ms"), (1.0, 500.0, "use one clock for both")],
-)
-def test_a_magnetometer_at_other_times_than_the_samples_is_reported(factor, offset, words):
-    sequence = walk(MagneticField())
-    field = sequence.magnetometer
-    assert clock_findings(sequence) == []
-    elsewhere = replace(sequence, magnetometer=replace(field, time=factor * field.time + offset))
-    problems = [p for p in told(elsewhere) if "found times from" in p]
-    assert len(problems) == 1
-    assert problems[0].startswith("magnetometer: ")
-    assert problems[0].endswith(words)
