@@ -27,7 +27,7 @@ from stario.sequences.errors import InputError, ReadError, StarioError
 from stario.sequences.files import atomic_path, unused_name
 from stario.sequences.lazy import optional_package
 from stario.sequences.readers.checked import OPTIONAL, captured_rotations, pose_mask
-from stario.sequences.readers.lines import first_bytes
+from stario.sequences.readers.text import first_bytes
 from stario.sequences.sequence import (
     Barometer,
     DeviceAttitude,
@@ -114,12 +114,11 @@ def is_archive(path: Path) -> bool:
     """
     if path.suffix.lower() not in SUFFIXES or not is_hdf5(path):
         return False
-    h5py = optional_package("h5py", "readers")
     try:
-        with h5py.File(path) as file:
-            groups = (group for group in file.values() if isinstance(group, h5py.Group))
+        with opened_hdf5(path, _EXPECTED) as file:
+            groups = (group for group in file.values() if hasattr(group, "keys"))
             return any("imu/t" in group or "truth/t" in group for group in groups)
-    except DAMAGED:
+    except ReadError:
         return path.name != _RONIN
 
 

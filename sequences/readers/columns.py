@@ -12,14 +12,13 @@ from typing import TypeVar
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import DEGREES, OPTIONAL, UNITS
-from stario.sequences.readers.lines import first_lines
 from stario.sequences.readers.phones.sensor_words import (
     axis_of,
     is_time,
     is_uncalibrated,
     sensor_of,
 )
-from stario.sequences.readers.text import Column
+from stario.sequences.readers.text import Column, first_lines
 from stario.sequences.units import (
     ACCEL_UNITS,
     GYRO_UNITS,

@@ -1,27 +1,12 @@
 """A generic CSV: `t,gx,gy,gz,ax,ay,az` with units in the header and optional ground truth columns.
 
-The header names each column and its unit, `t [s],gx [rad/s],...,ax [m/s^2],...`, in any order and
-separated by commas, semicolons or tabs like the rows below it; comments (`#`) may precede it:
+The guide to formats (examples/guides/formats.md) says what users may write. The header names each
+column and its unit, in any order, or a row below it does; comments (`#`) may precede it. Units that
+are not named are rad/s, m/s^2, uT and, for time, the unit that gives a plausible sample rate. Times
+are read exactly and returned as seconds since the first IMU row.
 
-- numbers may have a decimal comma where that does not separate cells, or if they are quoted;
-- `t` in s, ms, us or ns, from any origin, or as dates or times of day, read exactly and returned
-  as seconds since the first IMU row; `gx,gy,gz` angular rate in rad/s or deg/s; `ax,ay,az` specific
-  force in m/s^2 or g (-m/s^2 or -g if the device reports gravity, as Apple's do). Units may be in a
-  row below the titles; those that are not named are rad/s, m/s^2 and, for time, the unit that gives
-  a plausible sample rate.
-- gyroscope and accelerometer may be in separate rows, with blank cells for the other.
-- `mx,my,mz` magnetic field in uT (or nT, mT, T, gauss), in separate rows or in those of the IMU;
-  blank, `NA` or `nan` where it was not sampled.
-- `p` pressure of the air in hPa (or Pa, kPa, inHg, ...), in the rows where it was read.
-- `lat,lon` [deg] a satellite receiver's position on WGS 84, in the rows where it was reported, with
-  `alt` [m], `acc` [m] (radius that holds 68 %), `speed` in m/s (or km/h, kn) and `bearing` [deg].
-- ground truth: `px,py,pz` [m] in a world with z up and `qx,qy,qz,qw`, body to world. A row may
-  leave it blank (truth at a lower rate), or gyroscope and accelerometer (truth at other times).
-- or only `px,py` or `px,py,pz`: waypoints (if their median interval is two seconds or more), or
-  a track of positions, for example from satellites; `sp` [m] may give their standard deviation
-  per axis, and rows without it then hold no position.
-
-A sample written as `nan` stays NaN; other columns are ignored.
+A sample written as `nan` stays NaN. Positions without attitude are waypoints if their median
+interval is two seconds or more, or else a track; a row may lack gyroscope and accelerometer.
 """
 
 from __future__ import annotations
@@ -58,23 +43,21 @@ from stario.sequences.readers.columns import (
     read_header,
     unit_factor,
 )
-from stario.sequences.readers.lines import (
-    decimal_mark,
-    ends_within_a_row,
-    is_row,
-    read_lines,
-    unquoted,
-    with_seconds,
-)
 from stario.sequences.readers.table_head import refuse_several_devices
 from stario.sequences.readers.text import (
     Column,
     IntArray,
     RowFormat,
     Table,
+    decimal_mark,
+    ends_within_a_row,
     is_missing,
+    is_row,
+    read_lines,
     read_table,
     seconds,
+    unquoted,
+    with_seconds,
 )
 from stario.sequences.sequence import (
     Barometer,

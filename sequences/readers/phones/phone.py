@@ -35,7 +35,6 @@ from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import Samples, resample_to_gyro, source_words
 from stario.sequences.readers.columns import IMU, POSITION, named_columns
-from stario.sequences.readers.lines import head_lines, may_be_read
 from stario.sequences.readers.phones.alongside import (
     Recording,
     as_known_positions,
@@ -65,7 +64,7 @@ from stario.sequences.readers.phones.sensor_words import (
     words_of,
 )
 from stario.sequences.readers.poses import pose_files, with_pose
-from stario.sequences.readers.text import IntArray, seconds
+from stario.sequences.readers.text import IntArray, head_lines, may_be_read, seconds
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Magnetometer
 
 _log = logging.getLogger(__name__)

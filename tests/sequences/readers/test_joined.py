@@ -36,8 +36,9 @@ def test_a_table_without_times_is_read_at_the_rate_given(tmp_path, walk):
     save(path, f"count,{SENSORS}", *columns)
     save(timed, f"time [s],{SENSORS}", *columns)
     assert_same_samples(read_recording(path, rate="200"), walk)
+    lacking = r"a\.csv: time: found no column of times .*; name one `t \[s\]`, .*`--rate 100`"
     for file, options, message in (
-        (path, {}, "--rate"),
+        (path, {}, lacking),
         (path, {"rate": "0"}, "samples per second"),
         (timed, {"rate": "200"}, r"the column time \[s\]"),
     ):
