@@ -22,15 +22,7 @@ import numpy as np
 
 from stario.sequences.errors import ReadError
 from stario.sequences.lazy import optional_package
-from stario.sequences.readers.checked import (
-    RADIUS_PER_SIGMA,
-    barometer,
-    finite_rows,
-    magnetometer,
-    rotations,
-    satellites,
-    trajectory,
-)
+from stario.sequences.readers import checked
 from stario.sequences.readers.clocks import Samples, resample_to_gyro
 from stario.sequences.readers.phones.attitude import agreeing_attitude, device_attitude
 from stario.sequences.readers.text import first_bytes, seconds
@@ -91,14 +83,14 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
     for kind, others in messages.items():
         time, values = others.seconds(start_ns), others.values
         if kind == _MAGNETIC:
-            parts["magnetometer"] = magnetometer(time, values[:, :3] * MAGNETIC_UNITS["T"])
+            parts["magnetometer"] = checked.magnetometer(time, values[:, :3] * MAGNETIC_UNITS["T"])
         elif kind == _PRESSURE:
-            parts["barometer"] = barometer(path, others.topic, time, values[:, 0], "Pa")
+            parts["barometer"] = checked.barometer(path, others.topic, time, values[:, 0], "Pa")
         elif kind == _SATELLITES:
             variance = 0.5 * (values[:, 3] + values[:, 7])  # zero if unknown
-            radius = RADIUS_PER_SIGMA * np.sqrt(np.maximum(variance, 0.0))
+            radius = checked.RADIUS_PER_SIGMA * np.sqrt(np.maximum(variance, 0.0))
             rest = {"altitude_m": values[:, 2], "radius_m": radius}
-            parts["satellites"] = satellites(time, values[:, :2], rest)
+            parts["satellites"] = checked.satellites(time, values[:, :2], rest)
         else:
             parts["truth"] = _truth(path, others, time)
     own = agreeing_attitude(imu.stamps_ns, imu.values[:, _ORIENTATION], gyro)
@@ -222,7 +214,7 @@ def _decoded(
 
 
 def _truth(path: Path, poses: _Messages, time: FloatArray) -> Trajectory:
-    rows = finite_rows(path, poses.topic, poses.values[:, :7])
+    rows = checked.finite_rows(path, poses.topic, poses.values[:, :7])
     quat = poses.values[rows, 3:7]
-    attitude_WB = rotations(path, f"{poses.topic}, quaternion", quat, "xyzw", rows)
-    return trajectory(path, time[rows], poses.values[rows, :3], attitude_WB)
+    attitude_WB = checked.rotations(path, f"{poses.topic}, quaternion", quat, "xyzw", rows)
+    return checked.trajectory(path, time[rows], poses.values[rows, :3], attitude_WB)

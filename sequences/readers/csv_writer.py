@@ -9,16 +9,7 @@ import numpy as np
 
 from stario.sequences.arrays import check_type
 from stario.sequences.files import atomic_write
-from stario.sequences.readers.checked import OPTIONAL
-from stario.sequences.readers.columns import (
-    HEADER,
-    IMU,
-    MAGNETIC_HEADER,
-    PRESSURE_HEADER,
-    SATELLITE_HEADER,
-    SIGMA_HEADER,
-    TRUTH_HEADER,
-)
+from stario.sequences.readers import checked, columns
 from stario.sequences.sequence import FloatArray, ImuSequence
 
 
@@ -26,36 +17,36 @@ def write_csv(path: Path | str, sequence: ImuSequence) -> None:
     """Write a recording so that `read_generic_csv` returns the same numbers; never a partial file.
 
     Samples of magnetometer and barometer, what a satellite receiver reported, and the truth's valid
-    poses or positions go into the IMU's rows where
-    their times are equal and into separate rows elsewhere; the truth's velocity and covariance
-    have no column. The reader counts time from the first IMU sample.
+    poses or positions go into the IMU's rows where their times are equal and into separate rows
+    elsewhere; the truth's velocity and covariance have no column. The reader counts time from the
+    first IMU sample.
 
     Raises:
         InputError: the folder does not exist, or `sequence` has the wrong type.
     """
     check_type("sequence", sequence, ImuSequence, "call write_csv(path, sequence)")
     truth, field, track = sequence.truth, sequence.magnetometer, sequence.positions
-    titles, parts = [HEADER], list[tuple[FloatArray, FloatArray]]()
+    titles, parts = [columns.HEADER], list[tuple[FloatArray, FloatArray]]()
     if field is not None:
-        titles.append(MAGNETIC_HEADER)
+        titles.append(columns.MAGNETIC_HEADER)
         parts.append((field.time, field.field))
     if truth is not None:
-        titles.append(TRUTH_HEADER)
+        titles.append(columns.TRUTH_HEADER)
         poses = np.column_stack([truth.position_W, truth.quat_xyzw])
         parts.append((truth.time[truth.valid], poses[truth.valid]))
     elif track is not None:
-        titles += TRUTH_HEADER.split(",")[: track.position_W.shape[1]]
-        titles += [] if track.sigma is None else [SIGMA_HEADER]
-        columns = [track.position_W, *([] if track.sigma is None else [track.sigma])]
-        parts.append((track.time[track.valid], np.column_stack(columns)[track.valid]))
+        titles += columns.TRUTH_HEADER.split(",")[: track.position_W.shape[1]]
+        titles += [] if track.sigma is None else [columns.SIGMA_HEADER]
+        values = [track.position_W, *([] if track.sigma is None else [track.sigma])]
+        parts.append((track.time[track.valid], np.column_stack(values)[track.valid]))
     if sequence.barometer is not None:
-        titles.append(PRESSURE_HEADER)
+        titles.append(columns.PRESSURE_HEADER)
         parts.append((sequence.barometer.time, sequence.barometer.pressure_hPa[:, None]))
     if sequence.satellites is not None:
         reported = sequence.satellites
-        known = {name: getattr(reported, attribute) for name, attribute in OPTIONAL.items()}
+        known = {name: getattr(reported, attribute) for name, attribute in checked.OPTIONAL.items()}
         known = {name: values for name, values in known.items() if values is not None}
-        titles += [SATELLITE_HEADER[name] for name in ("lat", "lon", *known)]
+        titles += [columns.SATELLITE_HEADER[name] for name in ("lat", "lon", *known)]
         parts.append((reported.time, np.column_stack([reported.latlon_deg, *known.values()])))
     with atomic_write(path) as file:
         file.write("\n".join([",".join(titles), *_rows(sequence, parts)]) + "\n")
@@ -74,7 +65,7 @@ def _rows(sequence: ImuSequence, parts: list[tuple[FloatArray, FloatArray]]) -> 
     own = sorted({t for time, _ in parts for t in time.tolist()} - set(place))
     place |= {t: k for k, t in enumerate(own, len(table))}
     rows = [",".join(map(repr, row)) for row in table.tolist()]
-    rows += [f"{t!r}{',' * len(IMU)}" for t in own]
+    rows += [f"{t!r}{',' * len(columns.IMU)}" for t in own]
     for time, values in parts:
         texts = (",".join("" if isnan(x) else repr(x) for x in row) for row in values.tolist())
         known = dict(zip([place[t] for t in time.tolist()], texts, strict=True))
