@@ -40,7 +40,7 @@ whose accelerometers end at 2 g; a sine has a ratio of 2.4."""
 
 _INSIDE = 0.25
 """Share of another sensor's samples or of known positions during the IMU's below which its clock is
-another. Surveys list waypoints before and after a recording: of six in ten in one of 269."""
+another. Surveys list waypoints before and after a recording too: six in ten of one in 269."""
 
 _CLOCKS = {
     "magnetometer": "field",

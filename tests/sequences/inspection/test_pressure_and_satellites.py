@@ -78,10 +78,8 @@ def test_a_door_is_a_step_and_stairs_or_a_lift_are_none():
     speed = np.zeros(600)
     speed[100:240] = 0.35  # stairs
     speed[400:480] = 1.0  # a lift
-    assert (
-        pressure(simulate_barometer(climbing(np.cumsum(0.1 * speed)), **CALM)).figures["steps"]
-        == []
-    )
+    lifted = pressure(simulate_barometer(climbing(np.cumsum(0.1 * speed)), **CALM))
+    assert lifted.figures["steps"] == []
 
 
 def test_a_jump_that_is_no_height_is_a_problem():

@@ -117,7 +117,7 @@ def test_a_good_recording_has_no_problems(walk):
     assert figures["truth"]["path_m"] == pytest.approx(walk.truth.path_length())
 
 
-def test_gaps_and_wrong_times_are_counted(walk):
+def test_gaps_and_wrong_times_are_counted(walk, caplog):
     keep = np.ones(len(walk), dtype=bool)
     keep[500:750] = keep[1200:1203] = False
     time = walk.time.copy()
@@ -125,6 +125,7 @@ def test_gaps_and_wrong_times_are_counted(walk):
     accel = walk.accel.copy()
     accel[300, 1] = np.nan
     found = inspect_recording(ImuSequence("dirty", time[keep], walk.gyro[keep], accel[keep]))
+    assert caplog.text.count("not finite or too large dropped: 1") == 2  # by units, for all others
     timing = found.figures
     lengths = {round(gap["start_s"], 2): round(gap["length_s"], 2) for gap in timing["gaps"]}
     assert lengths[4.99] == 2.51
