@@ -132,7 +132,7 @@ def _read_rows(path: Path) -> _Rows:
     dated = with_seconds(cells[clock.index : clock.index + 1])
     row_format = RowFormat(header.lines, separator, decimal, dated != cells[clock.index :][:1])
     wanted = {name: places[name] for name in ("t", *columns.QUANTITIES) if name in places}
-    table = _table(path, wanted, row_format)
+    table = _table(path, wanted, row_format, lines)
     names = list(wanted)[: len(table.columns)]
     _warn_of_wide_rows(table, header)
     refuse_several_devices(table, header.titles, places["gx"].index)
@@ -148,16 +148,16 @@ def _read_rows(path: Path) -> _Rows:
     return _Rows(path, places, values, time, is_imu, table.line_numbers, assumed)
 
 
-def _table(path: Path, wanted: dict[str, Column], row_format: RowFormat) -> Table:
+def _table(path: Path, wanted: dict[str, Column], row_format: RowFormat, lines: list[str]) -> Table:
     """Return columns; without the rare ones, the last, where these hold something else."""
     cut = ends_within_a_row(path, row_format.delimiter)
     try:
-        return read_table(path, list(wanted.values()), row_format, killed=cut)
+        return read_table(path, list(wanted.values()), row_format, cut, lines)
     except ReadError as error:
         common = [place for name, place in wanted.items() if name not in columns.RARE]
         if len(common) == len(wanted):
             raise
-        table = read_table(path, common, row_format, killed=cut)
+        table = read_table(path, common, row_format, cut, lines)
         _log.warning("pressure and satellites skipped: %s", error)
         return table
 

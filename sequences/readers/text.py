@@ -295,9 +295,9 @@ class RowFormat:
         """Return a line's cells without quotes, with decimal points."""
         return unquoted(line, self.delimiter, self.decimal).split(self.delimiter)
 
-    def rows(self, path: Path) -> list[Row]:
-        """Return the rows of a file, without quotes."""
-        lines = read_lines(path)
+    def rows(self, path: Path, lines: list[str] | None = None) -> list[Row]:
+        """Return the rows of a file, or of its lines if they are read already, without quotes."""
+        lines = lines or read_lines(path)
         if self.decimal != "." or any('"' in line for line in lines):
             lines = [unquoted(line, self.delimiter, self.decimal) for line in lines]
         lines = with_seconds(lines) if self.dated else lines
@@ -396,13 +396,15 @@ def read_table(
     columns: int | Sequence[Column],
     row_format: RowFormat = RowFormat(),
     killed: bool = False,
+    lines: list[str] | None = None,
 ) -> Table:
     """Read columns of numbers, their count or places; `nan` and empty cells become NaN.
 
-    A last row that is cut short, because the recorder was `killed`, is then skipped.
+    A last row that is cut short, because the recorder was `killed`, is then skipped. The file's
+    `lines` may be read already.
     """
     places = [Column(k) for k in range(columns)] if isinstance(columns, int) else columns
-    rows, mark = row_format.rows(path), row_format.delimiter
+    rows, mark = row_format.rows(path, lines), row_format.delimiter
     if killed and len(rows) > 1:
         cut = ends_within_a_row(path, mark)
         try:
