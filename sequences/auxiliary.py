@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Literal, Self, get_args
+from typing import Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,15 +20,48 @@ from stario.sequences.arrays import (
 )
 from stario.sequences.errors import InputError
 
+_ROW_SHAPES: dict[str, tuple[int, ...]] = {
+    **dict.fromkeys(("position_W", "velocity_W", "field"), (3,)),
+    "position_covariance_W": (3, 3),
+    "latlon_deg": (2,),
+    **dict.fromkeys(("pressure_hPa", "sigma", "floor"), ()),
+    **dict.fromkeys(("altitude_m", "radius_m", "speed_m_s", "bearing_deg"), ()),
+}
+"""Shape of a row of each array that is recorded alongside an IMU."""
+
+_MAY_BE_NAN = {"latlon_deg", "floor", "altitude_m", "radius_m", "speed_m_s", "bearing_deg"}
+"""Those that are unknown in some rows; the others are finite wherever a row is valid."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Timed:
     """Rows at increasing times.
 
-    Like `ImuSequence`, subclasses keep checked copies of their arguments: `vars(self).update`.
+    Like `ImuSequence`, subclasses keep checked copies of their arguments; `_OF` names them in
+    errors.
     """
 
+    _OF: ClassVar[str] = ""
+
     time: FloatArray
+
+    def __post_init__(self) -> None:
+        time = checked_time(f"{self._OF}time", self.time)
+        kept: dict[str, Any] = {"time": time}
+        where: BoolArray | bool = True
+        if "valid" in vars(self):
+            where = kept["valid"] = checked_valid(f"{self._OF}valid", vars(self)["valid"], time)
+        if "attitude_WB" in vars(self):
+            check_rotations(f"{self._OF}attitude_WB", vars(self)["attitude_WB"], time)
+        for name, value in vars(self).items():
+            if name in _ROW_SHAPES and value is not None:
+                shape = (len(time), *self._row_shape(name))
+                finite = False if name in _MAY_BE_NAN else where
+                kept[name] = checked_array(f"{self._OF}{name}", value, shape, finite)
+        vars(self).update(kept)
+
+    def _row_shape(self, name: str) -> tuple[int, ...]:
+        return _ROW_SHAPES[name]
 
     def __len__(self) -> int:
         return len(self.time)
@@ -84,21 +117,18 @@ class PositionTrack(Timed):
     latlon_deg: FloatArray | None = None
     floor: FloatArray | None = None
 
+    _OF = "positions' "
+
     def __post_init__(self) -> None:
         check_choice("positions' kind", self.kind, get_args(Kind))
-        time = checked_time("positions' time", self.time)
-        valid = checked_valid("positions' valid", self.valid, time)
-        columns = 2 if np.ndim(self.position_W) == 2 and np.shape(self.position_W)[1] == 2 else 3
-        shape = (len(time), columns)
-        position_W = checked_array("positions", self.position_W, shape, where=valid)
-        if self.sigma is not None:
-            sigma = checked_array("positions' sigma", self.sigma, time.shape, where=valid)
-            if sigma[valid].min(initial=math.inf) <= 0.0:
-                raise InputError("positions' sigma", f"{sigma[valid].min():g}", "above 0 m")
-            vars(self).update(sigma=sigma)
-        rest = {"latlon_deg": (len(time), 2), "floor": time.shape}
-        vars(self).update(_optional_arrays(self, "positions'", rest))
-        vars(self).update(time=time, position_W=position_W, valid=valid)
+        super().__post_init__()
+        least = math.inf if self.sigma is None else self.sigma[self.valid].min(initial=math.inf)
+        if least <= 0.0:
+            raise InputError("positions' sigma", f"{least:g}", "above 0 m")
+
+    def _row_shape(self, name: str) -> tuple[int, ...]:
+        flat = name == "position_W" and np.shape(self.position_W)[1:] == (2,)
+        return (2,) if flat else super()._row_shape(name)
 
     @property
     def typical_sigma(self) -> float | None:
@@ -122,10 +152,7 @@ class Magnetometer(Timed):
 
     field: FloatArray
 
-    def __post_init__(self) -> None:
-        time = checked_time("magnetometer's time", self.time)
-        field = checked_array("magnetic field", self.field, (len(time), 3))
-        vars(self).update(time=time, field=field)
+    _OF = "magnetometer's "
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -142,10 +169,7 @@ class Barometer(Timed):
 
     pressure_hPa: FloatArray
 
-    def __post_init__(self) -> None:
-        time = checked_time("barometer's time", self.time)
-        pressure_hPa = checked_array("pressure_hPa", self.pressure_hPa, time.shape)
-        vars(self).update(time=time, pressure_hPa=pressure_hPa)
+    _OF = "barometer's "
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -171,32 +195,19 @@ class Satellites(Timed):
     speed_m_s: FloatArray | None = None
     bearing_deg: FloatArray | None = None
 
+    _OF = "satellites' "
+
     def __post_init__(self) -> None:
-        time = checked_time("satellites' time", self.time)
-        latlon_deg = checked_array("satellites' latlon_deg", self.latlon_deg, (len(time), 2))
-        beyond = np.abs(latlon_deg) > [90.0, 360.0]
+        super().__post_init__()
+        beyond = ~(np.abs(self.latlon_deg) <= [90.0, 360.0])  # or NaN
         if beyond.any():
             row, column = np.argwhere(beyond)[0]
             raise InputError(
                 f"satellites' latlon_deg, row {row}",
-                f"{latlon_deg[row, column]:g}",
+                f"{self.latlon_deg[row, column]:g}",
                 "latitude within 90 and longitude within 360 degrees",
                 "give latitude first",
             )
-        rest = dict.fromkeys(("altitude_m", "radius_m", "speed_m_s", "bearing_deg"), time.shape)
-        vars(self).update(_optional_arrays(self, "satellites'", rest))
-        vars(self).update(time=time, latlon_deg=latlon_deg)
-
-
-def _optional_arrays(
-    owner: Timed, words: str, shapes: dict[str, tuple[int, ...]]
-) -> dict[str, FloatArray]:
-    """Return the attributes of `shapes` that are known, checked; they may hold NaN."""
-    return {
-        name: checked_array(f"{words} {name}", value, shape, where=False)
-        for name, shape in shapes.items()
-        if (value := getattr(owner, name)) is not None
-    }
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -213,7 +224,4 @@ class DeviceAttitude(Timed):
 
     attitude_WB: Rotation
 
-    def __post_init__(self) -> None:
-        time = checked_time("device attitude's time", self.time)
-        check_rotations("device attitude's attitude_WB", self.attitude_WB, time)
-        vars(self).update(time=time)
+    _OF = "device attitude's "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -60,6 +61,12 @@ def clean_samples(sequence: ImuSequence) -> tuple[FloatArray, FloatArray, FloatA
             fix = "most samples are not finite"
         raise InputError(f"{sequence.name}: rate", found, "50 Hz to 1 kHz", fix)
     return time, sequence.gyro[index], sequence.accel[index]
+
+
+def cleaned(sequence: ImuSequence) -> ImuSequence:
+    """Return a recording with the samples of `clean_samples` alone; raises what that does."""
+    time, gyro, accel = clean_samples(sequence)
+    return replace(sequence, time=time, gyro=gyro, accel=accel)
 
 
 def in_order(sequence: ImuSequence) -> ImuSequence:

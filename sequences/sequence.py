@@ -17,11 +17,8 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.arrays import BoolArray as BoolArray
 from stario.sequences.arrays import FloatArray as FloatArray
 from stario.sequences.arrays import (
-    check_rotations,
     check_type,
-    checked_array,
     checked_time,
-    checked_valid,
     interpolated,
     numbers,
     some_times,
@@ -74,17 +71,6 @@ class Trajectory(Timed):
     velocity_W: FloatArray | None = None
     position_covariance_W: FloatArray | None = None
     valid: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
-
-    def __post_init__(self) -> None:
-        time = checked_time("time", self.time)
-        valid = checked_valid("valid", self.valid, time)
-        check_rotations("attitude_WB", self.attitude_WB, time)
-        arrays = {
-            name: checked_array(name, value, (len(time), *shape), where=valid)
-            for name, shape in _TRAJECTORY_SHAPES.items()
-            if (value := getattr(self, name)) is not None
-        }
-        vars(self).update(arrays, time=time, valid=valid)
 
     @property
     def quat_xyzw(self) -> FloatArray:
@@ -159,13 +145,6 @@ class Trajectory(Timed):
         ticks = np.append(whole_seconds(t), t[-1])
         chords = np.diff(interpolated(ticks, t, self.position_W[known]), axis=0)
         return float(np.linalg.norm(chords, axis=1).sum())
-
-
-_TRAJECTORY_SHAPES: dict[str, tuple[int, ...]] = {
-    "position_W": (3,),
-    "velocity_W": (3,),
-    "position_covariance_W": (3, 3),
-}
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -23,7 +23,7 @@ import numpy as np
 from stario.fusion.values.fixes import KINDS, MAX_YAW, UNKNOWN_HEIGHT, Fix, make_fix
 from stario.fusion.values.lie import UNKNOWN_YAW
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers.lines import decimal_mark, read_lines
+from stario.sequences.readers.text import decimal_mark, read_lines
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.time_order import increasing_mask
 

@@ -16,7 +16,7 @@ from stario.sequences.readers.archive import SUFFIXES as ARCHIVE_SUFFIXES
 from stario.sequences.readers.archive import write_archive
 from stario.sequences.readers.csv_writer import write_csv
 from stario.sequences.readers.generic_csv import kind_of_positions
-from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
+from stario.sequences.sequence import FloatArray, ImuSequence
 
 log = logging.getLogger(__name__)
 
@@ -150,41 +150,32 @@ def _write_table(path: Path, header: str, stamps: NDArray[np.int64], values: Flo
         file.write("\n".join([header, *rows]) + "\n")
 
 
-def _lost_positions(positions: PositionTrack, beside_poses: bool) -> list[str]:
-    """Return what a CSV loses of known positions: its reader tells waypoints by their interval."""
-    kind, time = positions.kind, positions.time[positions.valid]
-    if beside_poses:
-        return [f"{kind} alongside true poses have no column in CSV"]
-    lost = []
-    if kind == "waypoints" and not (positions.floor is None and positions.latlon_deg is None):
-        lost.append("floors and coordinates of waypoints have no column in CSV: write .h5")
-    if len(time) < 2:
-        lost.append(f"a CSV needs two {kind}: write .h5")
-    elif kind != (read_as := kind_of_positions(time)):
-        lost.append(f"a CSV's reader takes {kind} at such intervals for {read_as}: write .h5")
-    return lost
-
-
 def _warn_about_losses(sequence: ImuSequence, layout: str) -> None:
     if layout == "archive":
         return
-    truth, lost = sequence.truth, []
-    if truth is not None and truth.velocity_W is not None and layout == "csv":
-        lost.append("the truth's velocity has no column in CSV")
-    if sequence.positions is not None and layout == "csv":
-        lost += _lost_positions(sequence.positions, truth is not None)
-    if truth is not None and truth.position_covariance_W is not None:
-        lost.append("the truth's covariance has no column")
-    if sequence.positions is not None and layout == "euroc":
-        kind = sequence.positions.kind
-        lost.append(f"{kind} have no file in the EuRoC layout: write .csv or .h5")
-    for words in ("magnetometer", "barometer", "satellites"):
-        if getattr(sequence, words) is not None and layout == "euroc":
-            verb = "have" if words.endswith("s") else "has"
-            lost.append(f"the {words} {verb} no file in the EuRoC layout: write .csv or .h5")
-    if sequence.device_attitude is not None:
-        lost.append("the device's own attitude has no column: write .h5")
-    if sequence.attributes:
-        lost.append("its attributes have no place: write .h5")
-    for words in lost:
-        log.warning("%s: %s", sequence.name, words)
+    truth, track, csv = sequence.truth, sequence.positions, layout == "csv"
+    kind = "" if track is None else track.kind
+    placed = track is not None and not (track.floor is None and track.latlon_deg is None)
+    lost = {
+        "the truth's velocity": csv and truth is not None and truth.velocity_W is not None,
+        "the truth's covariance": truth is not None and truth.position_covariance_W is not None,
+        f"{kind} alongside true poses": csv and truth is not None and track is not None,
+        "floors and coordinates of waypoints": csv and kind == "waypoints" and placed,
+        kind: not csv and track is not None,
+        **{
+            f"the {part}": not csv and getattr(sequence, part) is not None
+            for part in ("magnetometer", "barometer", "satellites")
+        },
+        "the device's own attitude": sequence.device_attitude is not None,
+        "its attributes": bool(sequence.attributes),
+    }
+    if words := ", ".join(part for part, is_lost in lost.items() if is_lost):
+        log.warning("%s: %s has no place for %s: write .h5", sequence.name, layout, words)
+    if track is None or truth is not None or not csv:
+        return
+    time = track.time[track.valid]
+    if len(time) < 2:
+        log.warning("%s: a CSV needs two %s: write .h5", sequence.name, kind)
+    elif kind != (read_as := kind_of_positions(time)):  # by their interval
+        words = "%s: a CSV's reader takes %s at such intervals for %s: write .h5"
+        log.warning(words, sequence.name, kind, read_as)

@@ -10,7 +10,7 @@ import numpy as np
 
 from stario.sequences.errors import InputError
 from stario.sequences.readers.archive import split_name
-from stario.sequences.readers.lines import read_lines
+from stario.sequences.readers.text import read_lines
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ do in the device's axes. A wrong sign of the whole accelerometer changes neither
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy as np
 
 from stario.sequences.arrays import check_type, samples_in
 from stario.sequences.attitude.rotations import integrated_gyro
-from stario.sequences.clean_samples import clean_samples, finite_samples, unbroken, usable
+from stario.sequences.clean_samples import clean_samples, cleaned, finite_samples, unbroken, usable
 from stario.sequences.errors import InputError
 from stario.sequences.findings import Assessment, Finding, verdict
 from stario.sequences.inspection.checks import unit_findings
@@ -96,20 +97,20 @@ def inspect_recording(sequence: ImuSequence) -> Inspection:
         raise InputError(f"{sequence.name}: samples", "no finite sample", "numbers")
     valid = finite & usable(sequence) if (finite & usable(sequence)).any() else finite
     findings, axes, refusal = sample_findings(sequence) + dead_axes(sequence), None, ""
+    clean, rest, magnetic = sequence, None, None
     try:
         findings += unit_findings(sequence)
-        axes = _compare_gyro_axes(sequence)
+        clean = cleaned(sequence)  # once: it counts in a warning what it drops
+        axes = _compare_gyro_axes(clean)
         findings += axes.findings
     except InputError as error:
         field = error.field.removeprefix(f"{sequence.name}: ")
         text = f"{field}: found {error.found}, expected {error.expected}"
         findings.append(Finding("refused", text, error.fix))
         refusal = error.fix or text
-    truth, fit = assess_truth(sequence, refusal)
-    try:
-        rest, magnetic = find_rest(sequence), assess_magnetometer(sequence)
-    except InputError:  # an invalid rate, which was reported
-        rest = magnetic = None
+    truth, fit = assess_truth(clean, refusal)
+    with suppress(InputError):  # an invalid rate, which was reported
+        rest, magnetic = find_rest(clean), assess_magnetometer(clean)
     sensors = {
         "magnetometer": magnetic,
         "barometer": assess_barometer(sequence.barometer),

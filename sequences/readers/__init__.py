@@ -11,12 +11,12 @@ import re
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 from stario.sequences.arrays import check_choice, shown
 from stario.sequences.clean_samples import in_order
 from stario.sequences.errors import InputError, ReadError
+from stario.sequences.readers import bag, generic_csv, unpacking
 from stario.sequences.readers.archive import (
     AttributeFilter,
     archive_members,
@@ -25,41 +25,16 @@ from stario.sequences.readers.archive import (
     read_archive,
     split_name,
 )
-from stario.sequences.readers.bag import is_bag, read_bag
 from stario.sequences.readers.csv_writer import write_csv
-from stario.sequences.readers.generic_csv import is_generic_csv, read_generic_csv
-from stario.sequences.readers.joined import is_joined, is_untimed, unpack_joined
-from stario.sequences.readers.lines import (
+from stario.sequences.readers.phones import event_lines, phone
+from stario.sequences.readers.published import euroc, oxiod, ridi, rnin, ronin, tlio
+from stario.sequences.readers.text import (
     first_line,
     first_lines,
     is_row,
     may_be_read,
     numbers_in,
     read_lines,
-)
-from stario.sequences.readers.phones.event_lines import is_event_lines, read_event_lines
-from stario.sequences.readers.phones.phone import (
-    is_advio,
-    is_phone,
-    is_wide,
-    read_advio,
-    read_phone,
-    read_wide,
-)
-from stario.sequences.readers.published.euroc import is_euroc, read_euroc
-from stario.sequences.readers.published.oxiod import is_oxiod, read_oxiod
-from stario.sequences.readers.published.ridi import is_imunet, is_ridi, read_imunet, read_ridi
-from stario.sequences.readers.published.rnin import is_rnin, read_rnin
-from stario.sequences.readers.published.ronin import is_ronin, read_ronin
-from stario.sequences.readers.published.tlio import is_tlio, read_tlio
-from stario.sequences.readers.unpacking import (
-    is_json_export,
-    is_long_form,
-    is_zip,
-    named_after,
-    unpack_json,
-    unpack_long_form,
-    unpack_zip,
 )
 from stario.sequences.readers.unrecognised import unrecognised
 from stario.sequences.sequence import ImuSequence
@@ -86,53 +61,53 @@ class Format:
     options: tuple[str, ...] = ()
 
 
-def _read_unpacked(
-    unpack: Callable[..., None], source: str, path: Path, **options: str
-) -> ImuSequence:
-    """Read the one recording that `unpack` writes of `path`; errors name `path` and its file.
+def _unpacked(unpack: Callable[..., None], source: str = "") -> Callable[..., ImuSequence]:
+    """Return a function that reads the one recording that `unpack` writes of a path.
 
-    An empty `source` is told by the files.
+    Its errors name the path and the file in it. An empty `source` is told by the files.
     """
-    with tempfile.TemporaryDirectory(prefix="stario-") as temporary:
-        folder = Path(temporary)
-        unpack(path, folder, **options)
-        inside = [folder] if _is_recording(folder) else sorted(_below(folder)) or [folder]
-        if len(inside) > 1:
-            names = ", ".join(str(one.relative_to(folder)) for one in inside[:4])
-            found = f"{len(inside)} recordings ({names})"
-            raise ReadError(
-                path, "content", found, "one", f"unpack the {path.suffix[1:].lower() or 'zip'}"
-            )
-        with named_after(path, folder):
-            sequence = read_recording(inside[0])
-    name = path.stem if inside == [folder] else sequence.name
-    return replace(sequence, name=name, source=source or sequence.source)
+
+    def read(path: Path, **options: str) -> ImuSequence:
+        with tempfile.TemporaryDirectory(prefix="stario-") as temporary:
+            folder = Path(temporary)
+            unpack(path, folder, **options)
+            inside = [folder] if _is_recording(folder) else sorted(_below(folder)) or [folder]
+            if len(inside) > 1:
+                names = ", ".join(str(one.relative_to(folder)) for one in inside[:4])
+                found = f"{len(inside)} recordings ({names})"
+                fix = f"unpack the {path.suffix[1:].lower() or 'zip'}"
+                raise ReadError(path, "content", found, "one", fix)
+            with unpacking.named_after(path, folder):
+                sequence = read_recording(inside[0])
+        name = path.stem if inside == [folder] else sequence.name
+        return replace(sequence, name=name, source=source or sequence.source)
+
+    return read
 
 
+_EVENTS = "logger with one line per event"
 _LONG = "logger with the sensor named in each row"
 
 FORMATS: dict[str, Format] = {
     "archive": Format(lambda path: is_archive(split_name(path)[0]), read_archive, "archive"),
-    "ronin": Format(is_ronin, read_ronin, "RoNIN"),
-    "ridi": Format(is_ridi, read_ridi, "RIDI"),
-    "imunet": Format(is_imunet, read_imunet, "IMUNet recorder"),
-    "rnin": Format(is_rnin, read_rnin, "RNIN"),
-    "tlio": Format(is_tlio, read_tlio, "TLIO"),
-    "bag": Format(is_bag, read_bag, "ROS bag", options=("imu_topic", "truth_topic")),
-    "euroc": Format(is_euroc, read_euroc, "EuRoC layout"),
-    "oxiod": Format(is_oxiod, read_oxiod, "OxIOD"),
-    "advio": Format(is_advio, read_advio, "ADVIO"),
-    "phone": Format(is_phone, read_phone, "phone"),
-    "joined": Format(is_joined, partial(_read_unpacked, unpack_joined, ""), "phone"),
-    "wide": Format(is_wide, read_wide, "phone"),
-    "events": Format(is_event_lines, read_event_lines, "logger with one line per event"),
-    "zip": Format(is_zip, partial(_read_unpacked, unpack_zip, ""), "zip"),
-    "json": Format(is_json_export, partial(_read_unpacked, unpack_json, ""), "Sensor Logger"),
-    "csv": Format(is_generic_csv, read_generic_csv, "generic CSV"),
-    "long": Format(is_long_form, partial(_read_unpacked, unpack_long_form, _LONG), "phone"),
-    "untimed": Format(
-        is_untimed, partial(_read_unpacked, unpack_joined, ""), "phone", options=("rate",)
-    ),
+    "ronin": Format(ronin.is_ronin, ronin.read_ronin, "RoNIN"),
+    "ridi": Format(ridi.is_ridi, ridi.read_ridi, "RIDI"),
+    "imunet": Format(ridi.is_imunet, ridi.read_imunet, "IMUNet recorder"),
+    "rnin": Format(rnin.is_rnin, rnin.read_rnin, "RNIN"),
+    "tlio": Format(tlio.is_tlio, tlio.read_tlio, "TLIO"),
+    "bag": Format(bag.is_bag, bag.read_bag, "ROS bag", ("imu_topic", "truth_topic")),
+    "euroc": Format(euroc.is_euroc, euroc.read_euroc, "EuRoC layout"),
+    "oxiod": Format(oxiod.is_oxiod, oxiod.read_oxiod, "OxIOD"),
+    "advio": Format(phone.is_advio, phone.read_advio, "ADVIO"),
+    "phone": Format(phone.is_phone, phone.read_phone, "phone"),
+    "joined": Format(unpacking.is_joined, _unpacked(unpacking.unpack_joined), "phone"),
+    "wide": Format(phone.is_wide, phone.read_wide, "phone"),
+    "events": Format(event_lines.is_event_lines, event_lines.read_event_lines, _EVENTS),
+    "zip": Format(unpacking.is_zip, _unpacked(unpacking.unpack_zip), "zip"),
+    "json": Format(unpacking.is_json_export, _unpacked(unpacking.unpack_json), "Sensor Logger"),
+    "csv": Format(generic_csv.is_generic_csv, generic_csv.read_generic_csv, "generic CSV"),
+    "long": Format(unpacking.is_long_form, _unpacked(unpacking.unpack_long_form, _LONG), "phone"),
+    "untimed": Format(unpacking.is_untimed, _unpacked(unpacking.unpack_joined), "phone", ("rate",)),
 }
 """Known formats by name, tried in this order, more specific ones first; `euroc` also covers TUM-VI,
 `ridi` also IMUNet's processed recordings. Files are found below a folder by `_SUFFIXES`."""

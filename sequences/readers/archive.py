@@ -1,12 +1,10 @@
 """StarIO's archive: an HDF5 file with a group per recording; `file.h5:name` names a recording.
 
-A group holds `imu/{t,gyro,accel}`, if known `mag/{t,field}`, `pressure/{t,hPa}` and
-`satellites/{t,latlon_deg,altitude_m,radius_m,speed_m_s,bearing_deg}`, and one of three kinds of
-truth: `truth/{t,p,quat_xyzw}` (poses), `truth/{t,p}` (positions) or `waypoints/{t,xy}` (or `p`).
-Units are s, rad/s, m/s^2, uT and m; all clocks of a recording have the same zero. Its attributes
-record who carried which device where. Poses may come with
-`truth/{velocity,position_covariance,valid}`, positions with `sigma`, `latlon_deg` and `floor`.
-Numbers are written unchanged, in double precision and compressed.
+A group holds the samples in `imu/{t,gyro,accel}`, the parts that `PARTS` lists and one of three
+kinds of truth: `truth/{t,p,quat_xyzw}` (poses), `truth/{t,p}` (positions) or `waypoints/{t,xy}` (or
+`p`); its attributes record who carried which device where. The guide to formats
+(examples/guides/formats.md) names all datasets and their units; all clocks of a recording have the
+same zero. Numbers are written unchanged, in double precision and compressed.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ from stario.sequences.errors import InputError, ReadError, StarioError
 from stario.sequences.files import atomic_path, unused_name
 from stario.sequences.lazy import optional_package
 from stario.sequences.readers.checked import OPTIONAL, captured_rotations, pose_mask
-from stario.sequences.readers.lines import first_bytes
+from stario.sequences.readers.text import first_bytes
 from stario.sequences.sequence import (
     Barometer,
     DeviceAttitude,
@@ -114,12 +112,11 @@ def is_archive(path: Path) -> bool:
     """
     if path.suffix.lower() not in SUFFIXES or not is_hdf5(path):
         return False
-    h5py = optional_package("h5py", "readers")
     try:
-        with h5py.File(path) as file:
-            groups = (group for group in file.values() if isinstance(group, h5py.Group))
+        with opened_hdf5(path, _EXPECTED) as file:
+            groups = (group for group in file.values() if hasattr(group, "keys"))
             return any("imu/t" in group or "truth/t" in group for group in groups)
-    except DAMAGED:
+    except ReadError:
         return path.name != _RONIN
 
 

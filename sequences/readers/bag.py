@@ -13,7 +13,7 @@ be those of the IMU in a world with z up; `stario inspect` reports if they are n
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -22,20 +22,11 @@ import numpy as np
 
 from stario.sequences.errors import ReadError
 from stario.sequences.lazy import optional_package
-from stario.sequences.readers.checked import (
-    RADIUS_PER_SIGMA,
-    barometer,
-    finite_rows,
-    magnetometer,
-    rotations,
-    satellites,
-    trajectory,
-)
+from stario.sequences.readers import checked
 from stario.sequences.readers.clocks import Samples, resample_to_gyro
-from stario.sequences.readers.lines import first_bytes
 from stario.sequences.readers.phones.attitude import agreeing_attitude, device_attitude
-from stario.sequences.readers.text import seconds
-from stario.sequences.sequence import ImuSequence, Satellites, Trajectory
+from stario.sequences.readers.text import first_bytes, seconds
+from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 from stario.sequences.units import MAGNETIC_UNITS
 
 _log = logging.getLogger(__name__)
@@ -88,35 +79,23 @@ def read_bag(path: Path, imu_topic: str = "", truth_topic: str = "") -> ImuSeque
     if (apart := messages.pop(_APART, None)) is not None:
         accel = Samples(apart.stamps_ns, apart.values[:, _ACCEL])
         stamps, rate, force = resample_to_gyro(path, gyro, accel)
-    field, pressure, places = (messages.pop(kind, None) for kind in _OTHERS)
-    poses = next(iter(messages.values()), None)
+    start_ns, parts = stamps[0], dict[str, Any]()
+    for kind, others in messages.items():
+        time, values = others.seconds(start_ns), others.values
+        if kind == _MAGNETIC:
+            parts["magnetometer"] = checked.magnetometer(time, values[:, :3] * MAGNETIC_UNITS["T"])
+        elif kind == _PRESSURE:
+            parts["barometer"] = checked.barometer(path, others.topic, time, values[:, 0], "Pa")
+        elif kind == _SATELLITES:
+            variance = 0.5 * (values[:, 3] + values[:, 7])  # zero if unknown
+            radius = checked.RADIUS_PER_SIGMA * np.sqrt(np.maximum(variance, 0.0))
+            rest = {"altitude_m": values[:, 2], "radius_m": radius}
+            parts["satellites"] = checked.satellites(time, values[:, :2], rest)
+        else:
+            parts["truth"] = _truth(path, others, time)
     own = agreeing_attitude(imu.stamps_ns, imu.values[:, _ORIENTATION], gyro)
-    start_ns = stamps[0]
-    sequence = ImuSequence(
-        name=path.resolve().stem,
-        time=seconds(stamps, start_ns),
-        gyro=rate,
-        accel=force,
-        truth=None if poses is None else _truth(path, poses, start_ns),
-        device_attitude=device_attitude(own, start_ns),
-        satellites=None if places is None else _satellites(places, start_ns),
-    )
-    if field is not None:
-        values = field.values[:, :3] * MAGNETIC_UNITS["T"]
-        sequence = replace(sequence, magnetometer=magnetometer(field.seconds(start_ns), values))
-    if pressure is not None:
-        time, values = pressure.seconds(start_ns), pressure.values[:, 0]
-        air = barometer(path, pressure.topic, time, values, "Pa")
-        sequence = replace(sequence, barometer=air)
-    return sequence
-
-
-def _satellites(places: _Messages, start_ns: np.int64) -> Satellites | None:
-    values = places.values
-    variance = 0.5 * (values[:, 3] + values[:, 7])  # zero if unknown
-    radius = RADIUS_PER_SIGMA * np.sqrt(np.maximum(variance, 0.0))
-    rest = {"altitude_m": values[:, 2], "radius_m": radius}
-    return satellites(places.seconds(start_ns), values[:, :2], rest)
+    attitude, time = device_attitude(own, start_ns), seconds(stamps, start_ns)
+    return ImuSequence(path.resolve().stem, time, rate, force, device_attitude=attitude, **parts)
 
 
 def is_bag(path: Path) -> bool:
@@ -234,9 +213,8 @@ def _decoded(
     return _Messages(stamps, values, topic=topic)
 
 
-def _truth(path: Path, poses: _Messages, start_ns: np.int64) -> Trajectory:
-    rows = finite_rows(path, poses.topic, poses.values[:, :7])
+def _truth(path: Path, poses: _Messages, time: FloatArray) -> Trajectory:
+    rows = checked.finite_rows(path, poses.topic, poses.values[:, :7])
     quat = poses.values[rows, 3:7]
-    attitude_WB = rotations(path, f"{poses.topic}, quaternion", quat, "xyzw", rows)
-    time = poses.seconds(start_ns)[rows]
-    return trajectory(path, time, poses.values[rows, :3], attitude_WB)
+    attitude_WB = checked.rotations(path, f"{poses.topic}, quaternion", quat, "xyzw", rows)
+    return checked.trajectory(path, time[rows], poses.values[rows, :3], attitude_WB)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,11 @@ _MARGIN_S = 60.0
 
 _DAY_NS, _EXCEL_DAYS = 86_400 * 10**9, (25_569.0, 73_050.0)
 """Unit of the dates of spreadsheets, and those of 1970 and 2100: days since the end of 1899."""
+
+_DATE = re.compile(
+    r"(19[7-9]|20\d)\d(0[1-9]|1[0-2])(0[1-9]|[12]\d|3[01])([01]\d|2[0-3])([0-5]\d){2}(\d{3})?"
+)
+"""Year, month, day, hour, minute, second and perhaps milliseconds without separators."""
 
 _LATEST_S = 4.1e9
 """Seconds from 1970 to 2100: a unit that makes times later is not theirs."""
@@ -175,18 +180,9 @@ def _refuse_counts_and_dates(file: Path, title: str, time: FloatArray) -> None:
         fix = f"name a column of times `t [s]`; if these are times, name their unit: `{title} [ms]`"
         raise ReadError(file, title, found, "times", fix)
     known = time[np.isfinite(time)]
-    if len(known) and all(_is_date(f"{one:.0f}") for one in known.tolist()):
+    if len(known) and all(_DATE.fullmatch(f"{one:.0f}") for one in known.tolist()):
         expected = "seconds, or dates such as 2024-05-01 12:00:59.990"
         raise ReadError(file, title, f"{time[0]:.0f}, a date without separators", expected)
-
-
-def _is_date(digits: str) -> bool:
-    """Return whether they are year, month, day, hour, minute and second, perhaps milliseconds."""
-    try:
-        year = datetime.strptime(digits[:14], "%Y%m%d%H%M%S").year
-    except ValueError:
-        return False
-    return len(digits) in (14, 17) and 1970 <= year < 2100
 
 
 def unit_within(file: Path, time: FloatArray, start_ns: np.int64, stop_ns: np.int64) -> int:

@@ -8,18 +8,16 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import DEGREES, OPTIONAL, UNITS
-from stario.sequences.readers.lines import first_lines
 from stario.sequences.readers.phones.sensor_words import (
     axis_of,
     is_time,
     is_uncalibrated,
     sensor_of,
 )
-from stario.sequences.readers.text import Column
+from stario.sequences.readers.text import Column, first_lines
 from stario.sequences.units import (
     ACCEL_UNITS,
     GYRO_UNITS,
@@ -45,8 +43,6 @@ PRESSURE_HEADER = "p [hPa]"
 """Optional pressure of the air."""
 
 _log = logging.getLogger(__name__)
-
-Factor = TypeVar("Factor")
 
 IMU = ("gx", "gy", "gz", "ax", "ay", "az")
 POSITION, QUAT = ("px", "py", "pz"), ("qx", "qy", "qz", "qw")
@@ -220,7 +216,7 @@ def _is_of_an_imu(title: str) -> bool:
     return sensor_of(axis[1]) in ("gyro", "accel")
 
 
-def unit_factor(path: Path, column: Column, known: Mapping[str, Factor]) -> Factor:
+def unit_factor(path: Path, column: Column, known: Mapping[str, float]) -> float:
     """Return the factor of a column's unit; the first of `known` if the header names none."""
     unit = column.unit or next(iter(known))
     if unit not in known:

@@ -1,27 +1,12 @@
 """A generic CSV: `t,gx,gy,gz,ax,ay,az` with units in the header and optional ground truth columns.
 
-The header names each column and its unit, `t [s],gx [rad/s],...,ax [m/s^2],...`, in any order and
-separated by commas, semicolons or tabs like the rows below it; comments (`#`) may precede it:
+The guide to formats (examples/guides/formats.md) says what users may write. The header names each
+column and its unit, in any order, or a row below it does; comments (`#`) may precede it. Units that
+are not named are rad/s, m/s^2, uT and, for time, the unit that gives a plausible sample rate. Times
+are read exactly and returned as seconds since the first IMU row.
 
-- numbers may have a decimal comma where that does not separate cells, or if they are quoted;
-- `t` in s, ms, us or ns, from any origin, or as dates or times of day, read exactly and returned
-  as seconds since the first IMU row; `gx,gy,gz` angular rate in rad/s or deg/s; `ax,ay,az` specific
-  force in m/s^2 or g (-m/s^2 or -g if the device reports gravity, as Apple's do). Units may be in a
-  row below the titles; those that are not named are rad/s, m/s^2 and, for time, the unit that gives
-  a plausible sample rate.
-- gyroscope and accelerometer may be in separate rows, with blank cells for the other.
-- `mx,my,mz` magnetic field in uT (or nT, mT, T, gauss), in separate rows or in those of the IMU;
-  blank, `NA` or `nan` where it was not sampled.
-- `p` pressure of the air in hPa (or Pa, kPa, inHg, ...), in the rows where it was read.
-- `lat,lon` [deg] a satellite receiver's position on WGS 84, in the rows where it was reported, with
-  `alt` [m], `acc` [m] (radius that holds 68 %), `speed` in m/s (or km/h, kn) and `bearing` [deg].
-- ground truth: `px,py,pz` [m] in a world with z up and `qx,qy,qz,qw`, body to world. A row may
-  leave it blank (truth at a lower rate), or gyroscope and accelerometer (truth at other times).
-- or only `px,py` or `px,py,pz`: waypoints (if their median interval is two seconds or more), or
-  a track of positions, for example from satellites; `sp` [m] may give their standard deviation
-  per axis, and rows without it then hold no position.
-
-A sample written as `nan` stays NaN; other columns are ignored.
+A sample written as `nan` stays NaN. Positions without attitude are waypoints if their median
+interval is two seconds or more, or else a track; a row may lack gyroscope and accelerometer.
 """
 
 from __future__ import annotations
@@ -35,46 +20,23 @@ from typing import Literal
 import numpy as np
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.checked import (
-    OPTIONAL,
-    barometer,
-    in_degrees,
-    magnetometer,
-    rotations,
-    satellites,
-)
+from stario.sequences.readers import checked, columns
 from stario.sequences.readers.clocks import Samples, clock_unit, resample_to_gyro, source_words
-from stario.sequences.readers.columns import (
-    IMU,
-    PRESSURE,
-    QUANTITIES,
-    RARE,
-    RARE_UNITS,
-    SATELLITE_HEADER,
-    SIGMA,
-    TRUTH,
-    Header,
-    named_columns,
-    read_header,
-    unit_factor,
-)
-from stario.sequences.readers.lines import (
-    decimal_mark,
-    ends_within_a_row,
-    is_row,
-    read_lines,
-    unquoted,
-    with_seconds,
-)
 from stario.sequences.readers.table_head import refuse_several_devices
 from stario.sequences.readers.text import (
     Column,
     IntArray,
     RowFormat,
     Table,
+    decimal_mark,
+    ends_within_a_row,
     is_missing,
+    is_row,
+    read_lines,
     read_table,
     seconds,
+    unquoted,
+    with_seconds,
 )
 from stario.sequences.sequence import (
     Barometer,
@@ -124,7 +86,7 @@ def read_generic_csv(path: Path) -> ImuSequence:
         accel=accel,
         truth=truth,
         positions=positions,
-        magnetometer=magnetometer(rows.time, field, held=False),
+        magnetometer=checked.magnetometer(rows.time, field, held=False),
         barometer=_barometer(rows),
         satellites=_satellites(rows),
         source=source_words("generic CSV", rows.assumed_unit),
@@ -134,7 +96,7 @@ def read_generic_csv(path: Path) -> ImuSequence:
 
 def is_generic_csv(path: Path) -> bool:
     """Return whether a file starts with a header that names IMU columns of this format."""
-    return bool(named_columns(path) & set(IMU))
+    return bool(columns.named_columns(path) & set(columns.IMU))
 
 
 @dataclass(frozen=True)
@@ -155,24 +117,26 @@ class _Rows:
     def vectors(self, letter: str, known: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
         """Return three columns (N, 3) in the first unit of `known`, and the factors (3,) to it."""
         names = [letter + axis for axis in "xyz"]
-        factors = np.array([unit_factor(self.path, self.columns[name], known) for name in names])
+        factors = np.array(
+            [columns.unit_factor(self.path, self.columns[name], known) for name in names]
+        )
         return np.stack([self.values[name] for name in names], axis=1) * factors, factors
 
 
 def _read_rows(path: Path) -> _Rows:
     lines = read_lines(path)
-    header = read_header(path, lines)
-    separator, columns, clock = header.separator, header.columns, header.columns["t"]
+    header = columns.read_header(path, lines)
+    separator, places, clock = header.separator, header.columns, header.columns["t"]
     decimal = decimal_mark(lines[header.lines :], separator)
     cells = _first_cells(path, lines, header, decimal)
     dated = with_seconds(cells[clock.index : clock.index + 1])
     row_format = RowFormat(header.lines, separator, decimal, dated != cells[clock.index :][:1])
-    wanted = {name: columns[name] for name in ("t", *QUANTITIES) if name in columns}
-    table = _table(path, wanted, row_format)
+    wanted = {name: places[name] for name in ("t", *columns.QUANTITIES) if name in places}
+    table = _table(path, wanted, row_format, lines)
     names = list(wanted)[: len(table.columns)]
     _warn_of_wide_rows(table, header)
-    refuse_several_devices(table, header.titles, columns["gx"].index)
-    is_imu = _imu_rows(table, [names.index(name) for name in IMU])
+    refuse_several_devices(table, header.titles, places["gx"].index)
+    is_imu = _imu_rows(table, [names.index(name) for name in columns.IMU])
     if not is_imu.any():
         raise ReadError(path, "gx", "no row with IMU samples", "numbers in every IMU column")
     finite = table.values[np.isfinite(table.values[:, 0]), 0]
@@ -181,24 +145,24 @@ def _read_rows(path: Path) -> _Rows:
     unit_ns, assumed = clock_unit(path, clock, finite, or_seconds=True)
     time = table.seconds(unit_ns, int(np.argmax(is_imu)))
     values = dict(zip(names[1:], table.values[:, 1:].T, strict=True))
-    return _Rows(path, columns, values, time, is_imu, table.line_numbers, assumed)
+    return _Rows(path, places, values, time, is_imu, table.line_numbers, assumed)
 
 
-def _table(path: Path, wanted: dict[str, Column], row_format: RowFormat) -> Table:
+def _table(path: Path, wanted: dict[str, Column], row_format: RowFormat, lines: list[str]) -> Table:
     """Return columns; without the rare ones, the last, where these hold something else."""
     cut = ends_within_a_row(path, row_format.delimiter)
     try:
-        return read_table(path, list(wanted.values()), row_format, killed=cut)
+        return read_table(path, list(wanted.values()), row_format, cut, lines)
     except ReadError as error:
-        common = [place for name, place in wanted.items() if name not in RARE]
+        common = [place for name, place in wanted.items() if name not in columns.RARE]
         if len(common) == len(wanted):
             raise
-        table = read_table(path, common, row_format, killed=cut)
+        table = read_table(path, common, row_format, cut, lines)
         _log.warning("pressure and satellites skipped: %s", error)
         return table
 
 
-def _first_cells(path: Path, lines: list[str], header: Header, decimal: str) -> list[str]:
+def _first_cells(path: Path, lines: list[str], header: columns.Header, decimal: str) -> list[str]:
     """Return the cells of the first row, checked to be no more than there are titles."""
     numbered = enumerate(lines[header.lines :], header.lines + 1)
     number, first = next(((k, line) for k, line in numbered if is_row(line)), (0, ""))
@@ -211,7 +175,7 @@ def _first_cells(path: Path, lines: list[str], header: Header, decimal: str) -> 
     return cells.split(header.separator)
 
 
-def _warn_of_wide_rows(table: Table, header: Header) -> None:
+def _warn_of_wide_rows(table: Table, header: columns.Header) -> None:
     """Say that rows hold more values than there are titles: two lines became one, for example."""
     mark, most = header.separator, len(header.titles) - 1
     wide = [number for number, line in table.rows if line.rstrip(f"{mark} ").count(mark) > most]
@@ -274,27 +238,27 @@ def _in_separate_rows(shared: BoolArray) -> bool:
 
 
 def _barometer(rows: _Rows) -> Barometer | None:
-    if PRESSURE not in rows.values:
+    if columns.PRESSURE not in rows.values:
         return None
-    column, values = rows.columns[PRESSURE], rows.values[PRESSURE]
-    return barometer(rows.path, column.title, rows.time, values, column.unit)
+    column, values = rows.columns[columns.PRESSURE], rows.values[columns.PRESSURE]
+    return checked.barometer(rows.path, column.title, rows.time, values, column.unit)
 
 
 def _satellites(rows: _Rows) -> Satellites | None:
     known = {
-        name: RARE_UNITS[name][rows.columns[name].unit] * rows.values[name]
-        for name in SATELLITE_HEADER
+        name: columns.RARE_UNITS[name][rows.columns[name].unit] * rows.values[name]
+        for name in columns.SATELLITE_HEADER
         if name in rows.values
     }
     if not known:
         return None
     try:
-        latlon_deg = in_degrees(rows.path, np.stack([known["lat"], known["lon"]], axis=1))
+        latlon_deg = checked.in_degrees(rows.path, np.stack([known["lat"], known["lon"]], axis=1))
     except ReadError as error:  # satellites are optional
         _log.warning("satellites skipped: %s", error)
         return None
-    rest = {attribute: known[name] for name, attribute in OPTIONAL.items() if name in known}
-    return satellites(rows.time, latlon_deg, rest)
+    rest = {attribute: known[name] for name, attribute in checked.OPTIONAL.items() if name in known}
+    return checked.satellites(rows.time, latlon_deg, rest)
 
 
 def kind_of_positions(time: FloatArray) -> Literal["positions", "waypoints"]:
@@ -305,7 +269,7 @@ def kind_of_positions(time: FloatArray) -> Literal["positions", "waypoints"]:
 
 def _ground_truth(rows: _Rows) -> tuple[Trajectory | None, PositionTrack | None]:
     """Return the poses, or else the positions; None if fewer than two rows hold them."""
-    names = [name for name in (*TRUTH, SIGMA) if name in rows.values]
+    names = [name for name in (*columns.TRUTH, columns.SIGMA) if name in rows.values]
     if not names:
         return None, None
     values = np.stack([rows.values[name] for name in names], axis=1)
@@ -323,11 +287,11 @@ def _ground_truth(rows: _Rows) -> tuple[Trajectory | None, PositionTrack | None]
 
     lines = rows.line_numbers[kept]
     if not has_attitude:
-        sigma = values[:, -1] if SIGMA in names else None
+        sigma = values[:, -1] if columns.SIGMA in names else None
         if sigma is not None and sigma.min() <= 0.0:
-            where = f"line {lines[np.argmin(sigma)]}, {SIGMA}"
+            where = f"line {lines[np.argmin(sigma)]}, {columns.SIGMA}"
             raise ReadError(rows.path, where, f"{sigma.min():g}", "a standard deviation above 0 m")
         place = values if sigma is None else values[:, :-1]
         return None, PositionTrack(time, place, kind_of_positions(time), sigma=sigma)
-    attitude_WB = rotations(rows.path, "qx qy qz qw", values[:, 3:], "xyzw", lines, "line")
+    attitude_WB = checked.rotations(rows.path, "qx qy qz qw", values[:, 3:], "xyzw", lines, "line")
     return Trajectory(time, values[:, :3], attitude_WB), None

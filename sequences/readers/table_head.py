@@ -17,9 +17,18 @@ import numpy as np
 from stario.sequences.arrays import number_in
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.columns import with_units_below
-from stario.sequences.readers.lines import decimal_mark, head_lines, unquoted, with_seconds
 from stario.sequences.readers.phones.sensor_words import axis_of, is_time, words_of
-from stario.sequences.readers.text import Column, RowFormat, Table, is_missing, read_table
+from stario.sequences.readers.text import (
+    Column,
+    RowFormat,
+    Table,
+    decimal_mark,
+    head_lines,
+    is_missing,
+    read_table,
+    unquoted,
+    with_seconds,
+)
 from stario.sequences.sequence import FloatArray
 
 _SEPARATORS = (";", "\t", ",", None)

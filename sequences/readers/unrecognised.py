@@ -7,7 +7,6 @@ from pathlib import Path
 from stario.sequences.arrays import first_of
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.columns import HEADER
-from stario.sequences.readers.lines import first_bytes, first_line, first_lines, may_be_read
 from stario.sequences.readers.phones.files import (
     NO_SAMPLES,
     SUFFIXES,
@@ -18,6 +17,7 @@ from stario.sequences.readers.phones.files import (
 )
 from stario.sequences.readers.phones.sensor_words import Sensor
 from stario.sequences.readers.poses import pose_files
+from stario.sequences.readers.text import first_bytes, first_line, first_lines, may_be_read
 from stario.sequences.readers.unpacking import is_echo
 
 _GYRO: tuple[Sensor, ...] = ("gyro",)

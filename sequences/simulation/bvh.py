@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
-from stario.sequences.readers.lines import read_lines
+from stario.sequences.readers.text import read_lines
 from stario.sequences.sequence import FloatArray
 
 

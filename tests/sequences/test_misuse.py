@@ -58,7 +58,7 @@ DATES = np.datetime64("2026-01-01") + (1e9 * TIME).astype("timedelta64[ns]")
         (lambda: PositionTrack(DATES, ROWS, "positions"), "positions' time", "np.timedelta64"),
         (lambda: PositionTrack(TIME, ROWS, "positions", sigma=TIME), "positions' sigma", "above 0"),
         (lambda: PositionTrack(TIME, ROWS, "positions", sigma=ROWS), "positions' sigma", "(200,)"),
-        (lambda: Magnetometer(TIME, "north"), "magnetic field", "an array of numbers"),
+        (lambda: Magnetometer(TIME, "north"), "magnetometer's field", "an array of numbers"),
         (lambda: Trajectory(TIME, ROWS, np.zeros((200, 4))), "attitude_WB", "Rotation.from_quat"),
         (lambda: Trajectory(TIME, ROWS, Rotation.identity()), "attitude_WB", "200 as time"),
         (lambda: with_conventions(SEQUENCE, axes=["y", "-x", "z"]), "axes", "such as y,-x,z"),

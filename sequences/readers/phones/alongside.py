@@ -20,16 +20,7 @@ import numpy as np
 
 from stario.sequences.errors import ReadError
 from stario.sequences.geodesy import east_north
-from stario.sequences.readers.checked import (
-    LARGEST_RADIUS,
-    RADIUS_PER_SIGMA,
-    UNITS,
-    USUAL_RADIUS,
-    barometer,
-    in_degrees,
-    known_places,
-    satellites,
-)
+from stario.sequences.readers import checked
 from stario.sequences.readers.clocks import unit_within
 from stario.sequences.readers.phones.files import text_files
 from stario.sequences.readers.phones.sensor_layout import clock_of
@@ -181,7 +172,7 @@ def recorded_pressure(recording: Recording) -> Barometer | None:
 def _pressure(columns: _Columns, recording: Recording) -> Barometer | None:
     table, place = columns.table, columns.places["pressure"]
     rows, time = columns.within(np.isfinite(table.values[:, 1]), recording)
-    return barometer(table.path, place.name, time, table.values[rows, 1], place.unit)
+    return checked.barometer(table.path, place.name, time, table.values[rows, 1], place.unit)
 
 
 def _pressure_in(head: TableHead, is_sensors: bool) -> dict[str, Column]:
@@ -246,14 +237,14 @@ def _satellites(columns: _Columns, recording: Recording) -> Satellites | None:
         if unit_of(title).startswith("rad"):
             raise ReadError(table.path, "latitude, longitude", title, "degrees")
     values = table.values[:, 1:]
-    latlon_deg = in_degrees(table.path, values[:, :2])
-    rows, time = columns.within(known_places(latlon_deg), recording)
+    latlon_deg = checked.in_degrees(table.path, values[:, :2])
+    rows, time = columns.within(checked.known_places(latlon_deg), recording)
     rest = {
-        name: UNITS[name][place.unit] * values[rows, k]
+        name: checked.UNITS[name][place.unit] * values[rows, k]
         for k, (name, place) in enumerate(places.items())
-        if place.unit in UNITS.get(name, ())
+        if place.unit in checked.UNITS.get(name, ())
     }
-    return satellites(time, latlon_deg[rows], rest)
+    return checked.satellites(time, latlon_deg[rows], rest)
 
 
 def as_known_positions(reported: Satellites) -> PositionTrack | None:
@@ -264,15 +255,15 @@ def as_known_positions(reported: Satellites) -> PositionTrack | None:
     """
     new = np.append(True, np.diff(reported.latlon_deg, axis=0).any(axis=1))
     reported = reported.select(new)
-    radius = np.full(len(reported), USUAL_RADIUS)
+    radius = np.full(len(reported), checked.USUAL_RADIUS)
     if reported.radius_m is not None:
-        radius = np.where(np.isfinite(reported.radius_m), reported.radius_m, USUAL_RADIUS)
-    valid = radius <= LARGEST_RADIUS
+        radius = np.where(np.isfinite(reported.radius_m), reported.radius_m, checked.USUAL_RADIUS)
+    valid = radius <= checked.LARGEST_RADIUS
     if valid.sum() < 2:
         if len(valid) > 1:
             _log.warning(
                 "satellite positions skipped: found %d of %d positions known to %g m, expected at "
-                "least two", valid.sum(), len(valid), LARGEST_RADIUS,
+                "least two", valid.sum(), len(valid), checked.LARGEST_RADIUS,
             )  # fmt: skip
         return None
     origin = int(np.argmax(valid))
@@ -282,7 +273,7 @@ def as_known_positions(reported: Satellites) -> PositionTrack | None:
         east_north(degrees)[1:],
         "positions",
         valid,
-        radius / RADIUS_PER_SIGMA,
+        radius / checked.RADIUS_PER_SIGMA,
         latlon_deg=reported.latlon_deg,
     )
 

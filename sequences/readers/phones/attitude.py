@@ -22,9 +22,8 @@ from stario.sequences.arrays import integral, interpolated
 from stario.sequences.attitude.rotations import NORM_TOLERANCE
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.clocks import Samples, time_unit
-from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.files import PhoneFiles
-from stario.sequences.readers.text import IntArray, seconds
+from stario.sequences.readers.text import IntArray, head_lines, seconds
 from stario.sequences.sequence import DeviceAttitude, FloatArray
 from stario.sequences.time_order import increasing_mask
 

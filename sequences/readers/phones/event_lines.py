@@ -20,6 +20,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -29,9 +30,8 @@ from stario.sequences.errors import ReadError
 from stario.sequences.geodesy import east_north
 from stario.sequences.readers.checked import barometer, finite_rows, satellites
 from stario.sequences.readers.clocks import Samples, joined_sequence
-from stario.sequences.readers.lines import head_lines, read_lines
 from stario.sequences.readers.phones.attitude import agreeing_attitude, device_attitude
-from stario.sequences.readers.text import IntArray
+from stario.sequences.readers.text import IntArray, head_lines, read_lines
 from stario.sequences.sequence import ImuSequence, PositionTrack
 from stario.sequences.time_order import increasing_mask
 
@@ -88,25 +88,21 @@ def read_event_lines(path: Path) -> ImuSequence:
     if not {"gyro", "accel"} <= set(sensors):
         found = ", ".join(sensors) or "no sensor"
         raise ReadError(path, "events", f"those of {found}", "those of gyro and accel")
-    pressure, reported = (sensors.get(name) for name in _RARE)
     sequence, start_ns = joined_sequence(
         path, path.stem, sensors["gyro"], sensors["accel"], sensors.get("mag")
     )
     attitude = _attitude(sensors["vectors"], sensors["gyro"]) if "vectors" in sensors else None
-    sequence = replace(
-        sequence,
-        device_attitude=device_attitude(attitude, start_ns),
-        positions=_waypoints(sensors, start_ns),
-    )
-    if pressure is not None:
+    own, parts = device_attitude(attitude, start_ns), dict[str, Any]()
+    if pressure := sensors.get("pressure"):
         time, values = pressure.seconds(start_ns), pressure.values[:, 0]
-        sequence = replace(sequence, barometer=barometer(path, "PRES", time, values))
-    if reported is not None:
+        parts["barometer"] = barometer(path, "PRES", time, values)
+    if reported := sensors.get("satellites"):
         names = ("altitude_m", "bearing_deg", "radius_m", "speed_m_s")
         rest = dict(zip(names, reported.values[:, 2:].T, strict=True))
-        places = satellites(reported.seconds(start_ns), reported.values[:, :2], rest)
-        sequence = replace(sequence, satellites=places)
-    return sequence
+        place = reported.values[:, :2]
+        parts["satellites"] = satellites(reported.seconds(start_ns), place, rest)
+    positions = _waypoints(sensors, start_ns)
+    return replace(sequence, device_attitude=own, positions=positions, **parts)
 
 
 def is_event_lines(path: Path) -> bool:

@@ -12,7 +12,6 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from stario.sequences.readers.lines import head_lines
 from stario.sequences.readers.phones.sensor_layout import SensorTable, sensor_table
 from stario.sequences.readers.phones.sensor_words import (
     Sensor,
@@ -22,6 +21,7 @@ from stario.sequences.readers.phones.sensor_words import (
     sensor_of,
     words_of,
 )
+from stario.sequences.readers.text import head_lines
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".log", ".dat")
 _MOTION = {"mot", "motion", "full"}

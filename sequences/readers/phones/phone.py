@@ -35,14 +35,7 @@ from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import magnetometer
 from stario.sequences.readers.clocks import Samples, resample_to_gyro, source_words
 from stario.sequences.readers.columns import IMU, POSITION, named_columns
-from stario.sequences.readers.lines import head_lines, may_be_read
-from stario.sequences.readers.phones.alongside import (
-    Recording,
-    as_known_positions,
-    recorded_pressure,
-    reference_points,
-    reported_positions,
-)
+from stario.sequences.readers.phones import alongside
 from stario.sequences.readers.phones.attitude import (
     accel_sign,
     device_attitude,
@@ -65,7 +58,7 @@ from stario.sequences.readers.phones.sensor_words import (
     words_of,
 )
 from stario.sequences.readers.poses import pose_files, with_pose
-from stario.sequences.readers.text import IntArray, seconds
+from stario.sequences.readers.text import IntArray, head_lines, may_be_read, seconds
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Magnetometer
 
 _log = logging.getLogger(__name__)
@@ -205,8 +198,8 @@ def assemble_recording(
     accel, converted, maybe_apple = _force(files, attitude, core_motion)
     stamps, rate, force = resample_to_gyro(folder, gyro, accel)
     converted["gyro"] = gyro.unit not in ("", "rad/s")
-    recording = Recording(files.gyro, files.key, stamps[0], stamps[-1])
-    reported = reported_positions(recording)
+    recording = alongside.Recording(files.gyro, files.key, stamps[0], stamps[-1])
+    reported = alongside.reported_positions(recording)
     first = next(reported, None)
     sequence = ImuSequence(
         name=name,
@@ -216,7 +209,7 @@ def assemble_recording(
         converted=frozenset(sensor for sensor, done in converted.items() if done),
         magnetometer=_magnetometer(files, stamps[0], stamps[-1]),
         device_attitude=device_attitude(attitude, stamps[0]),
-        barometer=recorded_pressure(recording),
+        barometer=alongside.recorded_pressure(recording),
         satellites=first,
         source="" if core_motion else source_words(app_of(files), gyro.assumed_time_unit),
         maybe_apple=maybe_apple,
@@ -224,9 +217,9 @@ def assemble_recording(
     sequence = with_pose(sequence, stamps[0], poses, orders)
     if sequence.truth is not None:
         return sequence
-    positions = reference_points(recording)
+    positions = alongside.reference_points(recording)
     if positions is None and first is not None:
-        tracks = map(as_known_positions, chain([first], reported))
+        tracks = map(alongside.as_known_positions, chain([first], reported))
         positions = next((track for track in tracks if track is not None), None)
     return replace(sequence, positions=positions)
 

@@ -17,9 +17,8 @@ import numpy as np
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import captured_rotations, pose_mask
 from stario.sequences.readers.columns import IMU, canonical_names
-from stario.sequences.readers.lines import first_line
 from stario.sequences.readers.phones.sensor_words import time_unit_of
-from stario.sequences.readers.text import read_table, seconds
+from stario.sequences.readers.text import first_line, read_table, seconds
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.units import TIME_UNITS
 

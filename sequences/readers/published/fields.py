@@ -11,8 +11,15 @@ from scipy.spatial.transform import Rotation
 
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import finite_rows, rotations
-from stario.sequences.readers.lines import first_line, read_json, read_lines
-from stario.sequences.readers.text import Column, RowFormat, read_table, seconds
+from stario.sequences.readers.text import (
+    Column,
+    RowFormat,
+    first_line,
+    read_json,
+    read_lines,
+    read_table,
+    seconds,
+)
 from stario.sequences.sequence import FloatArray
 
 MAGNETIC = "magnetic"

@@ -30,8 +30,15 @@ from stario.sequences.attitude.alignment import align_tracked_body, clock_offset
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.checked import captured_rotations, magnetometer
 from stario.sequences.readers.clocks import Samples, joined_sequence, time_unit
-from stario.sequences.readers.lines import first_lines, first_numbers, numbers_in
-from stario.sequences.readers.text import IntArray, Table, read_table, seconds
+from stario.sequences.readers.text import (
+    IntArray,
+    Table,
+    first_lines,
+    first_numbers,
+    numbers_in,
+    read_table,
+    seconds,
+)
 from stario.sequences.sequence import BoolArray, FloatArray, ImuSequence, Trajectory
 
 RATE = 100.0

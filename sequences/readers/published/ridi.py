@@ -30,10 +30,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.checked import finite_rows, magnetometer, rotations, trajectory
 from stario.sequences.readers.clocks import Samples, joined_sequence
-from stario.sequences.readers.lines import first_line
 from stario.sequences.readers.poses import pose_files, with_pose
 from stario.sequences.readers.published.fields import MAGNETIC, file_in, header_names, read_columns
-from stario.sequences.readers.text import RowFormat, read_table
+from stario.sequences.readers.text import RowFormat, first_line, read_table
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
 
 _log = logging.getLogger(__name__)

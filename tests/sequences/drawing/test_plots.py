@@ -319,12 +319,8 @@ def test_columns_are_as_wide_as_their_widest_cell_with_space_between_them():
 
 
 def test_unknown_values_are_shown_as_a_dash():
-    assert [figure(None), figure(float("nan")), figure(0.0), figure(1.25, ".1f")] == [
-        "-",
-        "-",
-        "0.000",
-        "1.2",
-    ]
+    assert [figure(value) for value in (None, float("nan"), 0.0)] == ["-", "-", "0.000"]
+    assert figure(1.25, ".1f") == "1.2"
 
 
 def test_colours_depend_on_the_track_name_only(truth, tracks):

@@ -11,8 +11,17 @@ from stario.sequences.drawing.plots import imu_overview
 from stario.sequences.errors import InputError
 from stario.sequences.files import json_text
 from stario.sequences.inspection.report import inspect_recording
+from stario.sequences.inspection.samples import clock_findings
 from stario.sequences.readers import read_recording
-from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, PositionTrack, Trajectory
+from stario.sequences.sequence import (
+    STANDARD_GRAVITY,
+    Barometer,
+    ImuSequence,
+    Magnetometer,
+    PositionTrack,
+    Satellites,
+    Trajectory,
+)
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
@@ -64,10 +73,28 @@ def test_jumps_of_satellite_positions_are_a_problem(walk):
     assert told(taps) == []  # no source of positions jumps there
 
 
-def test_positions_on_another_clock_are_a_problem(walk):
-    taps = PositionTrack(np.array([1000.0, 9000.0]), np.zeros((2, 2)), "waypoints")
-    problems = told(replace(walk, truth=None, positions=taps))
-    assert any("positions: found times from 1000 to 9000 s" in problem for problem in problems)
+@pytest.mark.parametrize("part", ["magnetometer", "barometer", "satellites", "positions"])
+@pytest.mark.parametrize(
+    ("factor", "offset", "words"),
+    [(1e3, 0.0, "they seem to be in ms"), (1.0, 500.0, "use one clock for both")],
+)
+def test_what_is_at_other_times_than_the_samples_is_reported(walk, part, factor, offset, words):
+    time, place = walk.time[::20], np.tile([48.0, 11.0], (len(walk.time[::20]), 1))
+    parts = {
+        "magnetometer": Magnetometer(time, np.ones((len(time), 3))),
+        "barometer": Barometer(time, np.full(len(time), 1013.0)),
+        "satellites": Satellites(time, place),
+        "positions": PositionTrack(time, place, "waypoints"),
+    }
+    whole = replace(walk, truth=None, **parts)
+    assert clock_findings(whole) == []
+    elsewhere = replace(parts[part], time=factor * time + offset)
+    wrong = replace(whole, **{part: elsewhere})
+    [found] = map(str, clock_findings(wrong))
+    assert found in told(wrong)
+    times = f"found times from {offset:.6g} to {factor * time[-1] + offset:.6g} s, expected most"
+    assert found.startswith(f"{part}: {times} during the samples, 0 to ")
+    assert found.endswith(words)
 
 
 @pytest.mark.parametrize("count", [0, 1])
@@ -90,7 +117,7 @@ def test_a_good_recording_has_no_problems(walk):
     assert figures["truth"]["path_m"] == pytest.approx(walk.truth.path_length())
 
 
-def test_gaps_and_wrong_times_are_counted(walk):
+def test_gaps_and_wrong_times_are_counted(walk, caplog):
     keep = np.ones(len(walk), dtype=bool)
     keep[500:750] = keep[1200:1203] = False
     time = walk.time.copy()
@@ -98,6 +125,7 @@ def test_gaps_and_wrong_times_are_counted(walk):
     accel = walk.accel.copy()
     accel[300, 1] = np.nan
     found = inspect_recording(ImuSequence("dirty", time[keep], walk.gyro[keep], accel[keep]))
+    assert caplog.text.count("not finite or too large dropped: 1") == 2  # by units, for all others
     timing = found.figures
     lengths = {round(gap["start_s"], 2): round(gap["length_s"], 2) for gap in timing["gaps"]}
     assert lengths[4.99] == 2.51

@@ -86,7 +86,7 @@ def test_what_is_not_in_an_archive_is_refused_with_what_is(tmp_path):
     [
         ("imu/gyro", np.zeros((49, 3)), r"gyro: found shape \(49, 3\), expected \(50, 3\)"),
         ("imu/t", [b"now"] * 50, r"imu/t: found .*, expected an array of numbers"),
-        ("mag/field", np.ones((9, 3)), r"magnetic field: found shape \(9, 3\), expected \(10, 3"),
+        ("mag/field", np.ones((9, 3)), r"s field: found shape \(9, 3\), expected \(10, 3\)"),
         ("truth/quat_xyzw", np.ones((50, 3)), r"found shape \(50, 3\), expected \(50, 4\)"),
         ("truth/valid", np.ones(9, dtype=bool), r"valid: found shape \(9,\), expected \(50,\)"),
         ("truth/p", np.full((50, 3), np.nan), "position_W: found a value that is not finite"),

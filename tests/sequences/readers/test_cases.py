@@ -104,9 +104,14 @@ def test_no_entrance_waits_for_a_pipe(tmp_path):
         os.mkfifo(tmp_path / name)
     with pytest.raises(StarioError):
         find_recordings(tmp_path)
-    for read in (read_recording, read_fixes, read_config):
-        with pytest.raises(StarioError, match=r"(?i)pipe or device"):
-            read(tmp_path / ("walk.toml" if read is read_config else "walk.csv"))
+    for read, name, words in (
+        (read_recording, "walk.csv", "found a pipe or device, expected a recording"),
+        (find_recordings, "walk.csv", "found a pipe or device, expected a recording"),
+        (read_fixes, "walk.csv", r"(?i)pipe or device"),
+        (read_config, "walk.toml", r"(?i)pipe or device"),
+    ):
+        with pytest.raises(StarioError, match=words):
+            read(tmp_path / name)
 
 
 def test_a_zip_of_very_many_files_is_refused_before_it_is_unpacked(tmp_path):

@@ -9,7 +9,7 @@ from csv_lines import write_lines
 
 from stario.sequences import ReadError, check_units, read_recording
 from stario.sequences.errors import InputError
-from stario.sequences.readers.lines import with_seconds
+from stario.sequences.readers.text import with_seconds
 
 NOON = datetime(2024, 5, 1, 12, 34, 56, 789000)
 LATE = datetime(2024, 12, 31, 23, 59, 59, 500000)

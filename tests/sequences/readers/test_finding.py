@@ -1,12 +1,10 @@
 """Recordings found below a path: what is one, what is a list of them, and what is passed over."""
 
-import os
 from pathlib import Path
 
 import pytest
 from recorded import DATA
 
-from stario.sequences.errors import ReadError
 from stario.sequences.readers import find_recordings, is_list, read_recording, write_csv
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import generate_walk
@@ -55,10 +53,3 @@ def test_recordings_named_by_letters_are_not_the_sensors_of_one(stem, tmp_path):
     found = [read_recording(path) for path in find_recordings(tmp_path)]
     assert [round(one.duration) for one in found] == [10, 11, 12, 13]
     assert all(one.source == "generic CSV" and one.magnetometer is None for one in found)
-
-
-@pytest.mark.parametrize("read", [read_recording, find_recordings])
-def test_a_pipe_is_refused_before_it_is_read(read, tmp_path):
-    os.mkfifo(tmp_path / "walk.csv")  # nobody writes to it: opening it would wait forever
-    with pytest.raises(ReadError, match="found a pipe or device, expected a recording"):
-        read(tmp_path / "walk.csv")

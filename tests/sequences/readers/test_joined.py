@@ -32,12 +32,16 @@ def test_a_file_of_times_has_as_many_as_the_sensors(tmp_path, walk):
 
 def test_a_table_without_times_is_read_at_the_rate_given(tmp_path, walk):
     columns = np.arange(len(walk)), walk.gyro, walk.accel
-    path, timed = tmp_path / "a.csv", tmp_path / "b.csv"
+    path, timed, counted = (tmp_path / f"{name}.csv" for name in ("a", "b", "MT"))
+    wide = ",".join(f"{name}_{axis}" for name in ("Gyr", "Acc") for axis in "XYZ")
     save(path, f"count,{SENSORS}", *columns)
     save(timed, f"time [s],{SENSORS}", *columns)
+    save(counted, f"// Update Rate: 100.0Hz\nPacketCounter,{wide}", *columns)
     assert_same_samples(read_recording(path, rate="200"), walk)
+    lacking = r"MT\.csv: time: found no column of times .*, expected one .*; name one `t \[s\]`"
     for file, options, message in (
         (path, {}, "--rate"),
+        (counted, {}, lacking),
         (path, {"rate": "0"}, "samples per second"),
         (timed, {"rate": "200"}, r"the column time \[s\]"),
     ):

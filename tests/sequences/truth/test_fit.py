@@ -15,8 +15,8 @@ from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
-from stario.sequences.truth.findings import fit_findings
 from stario.sequences.truth.fit import fit_truth, yaw_drift
+from stario.sequences.truth.problems import fit_findings
 
 
 def recorded_in(sequence: ImuSequence, axes: str) -> ImuSequence:

@@ -49,15 +49,6 @@ def test_a_count_of_rows_is_no_time(first, walk, tmp_path):
             read_recording(tmp_path / name)
 
 
-def test_sensors_without_a_time_are_refused_as_such(walk, tmp_path):
-    wide = ",".join(f"{name}_{axis}" for name in ("Gyr", "Acc") for axis in "XYZ")
-    columns = np.arange(len(walk)), walk.gyro, walk.accel
-    save(tmp_path / "MT.csv", f"// Update Rate: 100.0Hz\nPacketCounter,{wide}", *columns)
-    message = r"MT\.csv: time: found no column of times .*, expected one .*; name one `t \[s\]`"
-    with pytest.raises(ReadError, match=message):
-        read_recording(tmp_path / "MT.csv")
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
