@@ -192,6 +192,10 @@ def test_invalid_or_missing_logger_files_are_refused(tmp_path, walks):
     path = formats.android(tmp_path / "log", walks(200.0)).path
     gyro = path / "Gyroscope.csv"
     lines = gyro.read_text().splitlines()
+    gyro.write_text("\n".join([*lines[:50], lines[50].rsplit(",", 2)[0], *lines[51:]]))
+    assert_refused(path, "Gyroscope.csv: line 51: found 3 values, expected 5")
+    gyro.write_text("\n".join([*lines[:50], lines[50].rsplit(",", 2)[0]]))
+    assert len(read_recording(path)) == 49 - 15  # the app was killed; the accelerometer began later
     for wild in ("inf", "1e15"):
         gyro.write_text(
             "\n".join([lines[0], *(f"{x.rsplit(',', 1)[0]},{wild}" for x in lines[1:])])
