@@ -12,13 +12,13 @@ import typer
 
 from stario.fusion.commands import common, options
 from stario.fusion.commands.table import table
+from stario.sequences.datasets.batch import Skipped
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from stario.fusion.imu.inference import Predictor
     from stario.fusion.values.config import NavigatorConfig
-    from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
 
     Score = Callable[[Predictor, ImuSequence, NavigatorConfig], pd.DataFrame]
@@ -61,12 +61,12 @@ def _of_walks(
 
 def _print(found: Found, table: Callable[[pd.DataFrame], str], as_json: bool) -> None:
     """Print scores as a table or JSON, and exit with 1 if any recording was skipped."""
-    from stario.fusion.evaluation.scores import joined, records
+    from stario.fusion.evaluation.scores import joined
 
     tables, skipped = found
     if tables:
         scores = joined(tables)
-        common.print_result(as_json, records(scores), table(scores))
+        common.print_result(as_json, scores.to_dict("records"), table(scores))
     elif as_json:
         common.print_result(True, [])
     common.exit_if_skipped(skipped)
@@ -106,7 +106,6 @@ def faults(
 ) -> None:
     """Inject faults into a recording one at a time; print the resulting error and the report."""
     from stario.fusion.evaluation.checks.faults import fault_table, matched_walk, run_faults
-    from stario.fusion.evaluation.scores import records
 
     if not network:
         options.refuse(context, "without --network", "use with --network", "model")
@@ -122,7 +121,7 @@ def faults(
     scores = run_faults(sequence, settings, estimating.network() if network else None, seed)
     named = scores.rename(columns={"group": "fault", "track": "backend"})
     title = f"{sequence.name}: {sequence.duration:.1f} s"
-    common.print_result(as_json, records(named), f"{title}\n{fault_table(scores)}")
+    common.print_result(as_json, named.to_dict("records"), f"{title}\n{fault_table(scores)}")
 
 
 def consistency(

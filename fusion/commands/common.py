@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING, TypeVar
 import typer
 
 from stario.fusion.commands import options
+from stario.sequences.datasets.batch import Skipped, each, without_skipped
 from stario.sequences.errors import InputError
+from stario.sequences.lazy import optional_package
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.results import Writers
     from stario.fusion.recording import Progress
     from stario.network.model import DisplacementModel
-    from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
 
 Result = TypeVar("Result")
@@ -51,8 +52,6 @@ def each_used(
     title: str, work: Callable[[Path], Result], files: Collection[Path], jobs: int = 1
 ) -> tuple[list[Result], list[Skipped]]:
     """Apply `work` to each file, with a progress bar; return the results, and what was skipped."""
-    from stario.sequences.datasets.batch import each, without_skipped
-
     skipped: list[Skipped] = []
     outcomes = with_bar(title, each(work, files, jobs), len(files))
     return list(without_skipped(outcomes, skipped)), skipped
@@ -85,7 +84,6 @@ def process_each(
     allows only one recording is named by `single`.
     """
     from stario.fusion.evaluation.results import check_folder
-    from stario.sequences.datasets.batch import each, without_skipped
 
     files, skipped = reading.recordings(paths)
     if single and len(files) > 1:
@@ -110,8 +108,6 @@ def process_each(
 
 def further_files(report: bool, tiles: str = "", view: bool = False) -> Writers:
     """Return what writes the report and the viewer's file, if their packages are there."""
-    from stario.sequences.lazy import optional_package
-
     also: dict[str, Callable[..., object]] = {}
     if report:
         optional_package("plotly", "report")

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from stario.sequences.datasets.batch import Skipped, skipped
 from stario.sequences.errors import InputError, StarioError
 
 if TYPE_CHECKING:
     from stario.fusion.values.config import NavigatorConfig
     from stario.network.model import DisplacementModel
-    from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
 
 _reading = partial(typer.Option, rich_help_panel="Reading")
@@ -136,7 +136,6 @@ class Reading:
         One that is named twice, such as by its folder and a list, is returned once: it would count
         twice in training and in intervals.
         """
-        from stario.sequences.datasets.batch import skipped
         from stario.sequences.readers import find_recordings
 
         if self.format != "auto":  # a named format applies to the path itself
@@ -163,28 +162,19 @@ class Reading:
         Raises:
             InputError: it cannot be read; an option's invalid value is named by the option.
         """
+        from stario.sequences.conventions import with_conventions
+        from stario.sequences.readers import read_recording
+
+        names = ("imu_topic", "truth_topic", "rate")
+        given = {name: str(value) for name in names if (value := getattr(self, name)) is not None}
+        meant = self.gyro_unit, self.accel_unit, self.axes, self.gravity, self.accel_sign
         try:
-            return self._read(path)
+            return with_conventions(read_recording(path, self.format, **given), *meant)
         except InputError as error:
             if error.field not in self.as_read():
                 raise
             field = f"--{error.field.replace('_', '-')}"
             raise InputError(field, error.found, error.expected, error.fix) from None
-
-    def _read(self, path: Path) -> ImuSequence:
-        from stario.sequences.conventions import with_conventions
-        from stario.sequences.readers import read_recording
-
-        options = {
-            "imu_topic": self.imu_topic,
-            "truth_topic": self.truth_topic,
-            "rate": self.rate,
-        }
-        given = {name: str(value) for name, value in options.items() if value is not None}
-        sequence = read_recording(path, self.format, **given)
-        return with_conventions(
-            sequence, self.gyro_unit, self.accel_unit, self.axes, self.gravity, self.accel_sign
-        )
 
 
 @dataclass(frozen=True)
@@ -264,13 +254,16 @@ class Map:
         Raises:
             InputError: an option's value is none; it is named by the option.
         """
-        given: dict[str, object] = {name: v for name, v in asdict(self).items() if v}
-        if self.origin is not None:
-            given["origin"] = _numbers_in("--origin", self.origin)
+        given: dict[str, Any] = {name: value for name, value in asdict(self).items() if value}
         try:
-            return replace(config, place=replace(config.place, **given))  # type: ignore[arg-type]
+            if self.origin is not None:
+                given["origin"] = tuple(map(float, self.origin.split(",")))
+            return replace(config, place=replace(config.place, **given))
         except InputError as error:
             raise InputError(f"--{error.field}", error.found, error.expected) from None
+        except ValueError:
+            expected = "numbers separated by commas, as in 48.137,11.575"
+            raise InputError("--origin", repr(self.origin), expected) from None
 
 
 @dataclass(frozen=True)
@@ -284,15 +277,6 @@ class Place(Map):
     closed: Annotated[
         bool, _place(metavar="", help="The track ends where it began, to a metre.")
     ] = False
-
-
-def _numbers_in(option: str, text: str) -> tuple[float, ...]:
-    """Return the numbers of a comma-separated list."""
-    try:
-        return tuple(float(word) for word in text.split(","))
-    except ValueError:
-        expected = "numbers separated by commas, as in 48.137,11.575"
-        raise InputError(option, repr(text), expected) from None
 
 
 READING, ESTIMATING = (tuple(f.name for f in fields(group)) for group in (Reading, Estimator))

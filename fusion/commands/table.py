@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from stario.fusion.commands import common, options
+from stario.sequences.datasets.batch import Skipped
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -60,7 +61,6 @@ def table(
     from stario.fusion.paper_table.training import ReaderConfig
     from stario.network.architectures import ARCHITECTURES
     from stario.network.training.splits import learned_from
-    from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.stream_cache import cache_folder
     from stario.sequences.settings import read_settings
 

@@ -64,7 +64,7 @@ def paired_ratio(blocks: pd.DataFrame, ours: str, theirs: str) -> Interval | Non
     """
     pair = blocks[blocks["network"].isin([ours, theirs])]
     total = pair.groupby([*_UNITS, "network", "seed"])["squares"].transform("sum")
-    found = _ranked(pair[total > 0.0], theirs).set_index("network")["ratio"]
+    found = ranks(pair[total > 0.0], theirs).set_index("network")["ratio"]
     return found.get(ours) if theirs in found else None
 
 
@@ -73,16 +73,9 @@ def ranks(blocks: pd.DataFrame, against: str) -> pd.DataFrame:
 
     Returns:
         Each `network` with its `rank`, 1 for the smallest error, the interval's bounds `rank_low`
-        and `rank_high`, and the `ratio` of its error to that of `against`, an `Interval`; None for
-        `against` itself or without it. No rows if no recording is common to all.
+        and `rank_high`, and the `ratio` of its error to that of `against`, an `Interval`; None
+        without `against`. No rows if no recording is common to all.
     """
-    found = _ranked(blocks, against)
-    found.loc[found["network"] == against, "ratio"] = None
-    return found
-
-
-def _ranked(blocks: pd.DataFrame, against: str) -> pd.DataFrame:
-    """Return the columns of `ranks`, also with the ratio of a network to itself."""
     table = blocks.set_index([*_UNITS, "block", "network", "seed"])[["squares", "count"]]
     runs = table.unstack(["network", "seed"], sort=False).dropna()
     if runs.empty:

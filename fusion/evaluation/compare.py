@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
@@ -187,13 +188,11 @@ class Comparison:
 
     @property
     def scores(self) -> pd.DataFrame:
-        """The figures as rows of `scores`: those of the recording, and of all tracks, by name.
-
-        The recording's are those of a track "truth": `duration_s` and `path_m`.
-        """
-        of_recording: Metrics = {"duration_s": self.sequence.duration, "path_m": self.path_m}
+        """The figures of all `TRACKS` as rows of `scores`; `duration_s` and `path_m` in each."""
+        path_m = math.nan if self.path_m is None else self.path_m
         tracks = {name: self.metrics.get(name, dict.fromkeys(METRICS)) for name in TRACKS}
-        return scored(self.sequence.name, {"truth": of_recording, **tracks})
+        about = {"duration_s": self.sequence.duration, "path_m": path_m}
+        return scored(self.sequence.name, tracks, **about)
 
     def aligned(self) -> dict[str, Trajectory]:
         """Return trajectories for figures, aligned with the truth if there is one."""

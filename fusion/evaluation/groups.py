@@ -28,11 +28,10 @@ from stario.fusion.evaluation.displacement_error import (
 )
 from stario.fusion.evaluation.pedestrian import Model, PedestrianDeadReckoning, piece_of
 from stario.fusion.evaluation.results import Files, figure_files, write_results
-from stario.fusion.evaluation.scores import joined, parts, records, scored, values, wide
+from stario.fusion.evaluation.scores import Column, joined, parts, scored, table
 from stario.fusion.navigator import Navigator
 from stario.sequences.drawing.figures import BLUE, INK, apply_style, new_figure
-from stario.sequences.drawing.text_table import aligned, figure
-from stario.sequences.files import json_text, write_json, write_rows
+from stario.sequences.files import json_text, write_json
 from stario.sequences.readers.archive import split_name
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.truth.problems import warn_of_truth
@@ -72,20 +71,21 @@ WORDS: dict[str, str] = {
 }
 """Meaning of each figure."""
 
-_TITLES = {
-    "ate_fit_m": ("fit [m]", ".2f"),
-    "ate_fit_percent": ("fit [%]", ".2f"),
-    "ate_first_m": ("first [m]", ".2f"),
-    "stretch_percent": ("20 s [%]", ".2f"),
-    "length_ratio": ("length", ".3f"),
-    "rms_1s_m": ("1 s [m]", ".3f"),
-    "rms_10s_m": ("10 s [m]", ".2f"),
-    "rms_30s_m": ("30 s [m]", ".2f"),
-    "direction_deg": ("direction [deg]", ".0f"),
-    "nis": ("NIS", ".2f"),
-    "nis_filtered": ("filtered NIS", ".2f"),
-}
-"""Titles and formats of the figures of a benchmark."""
+_COLUMNS = (
+    Column("n", "recordings", ".0f"),
+    Column("km", "path_km"),
+    Column("fit [m]", "ate_fit_m"),
+    Column("fit [%]", "ate_fit_percent"),
+    Column("first [m]", "ate_first_m"),
+    Column("20 s [%]", "stretch_percent"),
+    Column("length", "length_ratio", ".3f"),
+    Column("1 s [m]", "rms_1s_m", ".3f"),
+    Column("10 s [m]", "rms_10s_m"),
+    Column("30 s [m]", "rms_30s_m"),
+    Column("direction [deg]", "direction_deg", ".0f"),
+    Column("NIS", "nis"),
+    Column("filtered NIS", "nis_filtered"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ class Benchmark:
         in those of ours the `RATIOS` of errors to theirs, as `Interval`s where there are any. For
         waypoints, the residuals replace the 10 s errors.
         """
-        found = parts(wide(self.scores), self.by)
+        found = parts(self.scores, self.by)
         return pd.DataFrame(
             row
             for k, (name, part) in enumerate(found)
@@ -150,25 +150,22 @@ class Benchmark:
             "theirs": self.theirs,
             "verdict": verdict(self.rows),
             "groups": self.rows.to_dict("records"),
-            "recordings": records(self.scores.rename(columns={"track": "weights"})),
+            "recordings": self.scores.rename(columns={"track": "weights"}).to_dict("records"),
             "words": WORDS,
         }
 
     def text(self) -> str:
         """Return for every group rows "theirs" and "ours", the ratios, the verdict, the words."""
         rows = self.rows.to_dict("records")
-        cells = [["", "", "n", "km", *(title for title, _ in _TITLES.values())]]
-        for row in rows:
-            known = [row["group"], row["role"], str(row["recordings"]), f"{row['path_km']:.2f}"]
-            cells.append([*known, *(figure(row[key], form) for key, (_, form) in _TITLES.items())])
-        head, *body = aligned(cells)
+        parts = (((row["group"], row["role"]), pd.DataFrame([row])) for row in rows)
+        head, *body = table(parts, _COLUMNS, ("", "")).splitlines()
         lines = [head]
         for line, row in zip(body, rows, strict=True):
             lines.append(line)
-            for key, metric in RATIOS.items():
+            for key in RATIOS:
                 if isinstance(row[key], Interval):
-                    title = _TITLES[metric][0].split(" [")[0]
-                    lines.append(f"{row['group']}: ratio over {title}: {row[key]:.3f}")
+                    seconds = key.removeprefix("ratio_").removesuffix("s")
+                    lines.append(f"{row['group']}: ratio over {seconds} s: {row[key]:.3f}")
         lines += [conclusion] if (conclusion := verdict(self.rows)) else []
         lines += [f"ours: {self.ours}", *([f"theirs: {self.theirs}"] if self.theirs else [])]
         return "\n".join([*lines, *(f"{key}: {words}." for key, words in WORDS.items())])
@@ -244,7 +241,7 @@ def benchmark(
 
 def _warn_of_not_compared(scores: Sequence[pd.DataFrame]) -> None:
     """Log one warning about all recordings in which nothing could be compared."""
-    still = [part["recording"].iloc[0] for part in scores if not values(part, "path_m").any()]
+    still = [part["recording"].iloc[0] for part in scores if not part["path_m"].any()]
     if len(still) > 1:
         message = "%d of %d recordings, the first %s: %s"
         log.warning(message, len(still), len(scores), still[0], _NOT_COMPARED)
@@ -278,7 +275,7 @@ def write_benchmark(folder: Path, found: Benchmark) -> None:
     groups = pd.json_normalize(flat, sep="_").drop(columns=[*RATIOS], errors="ignore")
     files: Files = {
         "groups.csv": partial(groups.to_csv, index=False),
-        "recordings.csv": partial(write_rows, rows=records(found.scores)),
+        "recordings.csv": partial(found.scores.to_csv, index=False, na_rep="nan"),
         "groups.json": partial(write_json, obj=content),
         **figure_files({"groups.png": groups_figure(found)}),
     }

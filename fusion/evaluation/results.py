@@ -15,10 +15,16 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from stario.fusion.evaluation.compare import METRIC_WORDS, RECORDING_WORDS, TRACKS, Comparison
+from stario.fusion.evaluation.compare import (
+    METRIC_WORDS,
+    METRICS,
+    RECORDING_WORDS,
+    TRACKS,
+    Comparison,
+)
 from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.evaluation.map_files import on_map, write_geojson, write_gpx
-from stario.fusion.evaluation.scores import by_name, joined
+from stario.fusion.evaluation.scores import joined
 from stario.fusion.values.config import NavigatorConfig
 from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.plan import plan_view
@@ -122,8 +128,8 @@ def metrics_dict(
     """Return the content of `metrics.json` from the `scores` of comparisons."""
     recordings = {}
     for name, found in scores.groupby("recording", sort=False):
-        tracks = by_name(found, "track")
-        recordings[name] = {**tracks.pop("truth"), "tracks": tracks}
+        about, tracks = found.iloc[0][[*RECORDING_WORDS]], found.set_index("track")[[*METRICS]]
+        recordings[name] = {**about, "tracks": tracks.to_dict("index")}
     return {"recordings": recordings, "conventions": {**RECORDING_WORDS, **words}}
 
 

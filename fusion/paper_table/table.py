@@ -13,7 +13,7 @@ import pandas as pd
 
 from stario.fusion.evaluation.bootstrap import Interval, ranks
 from stario.fusion.evaluation.pedestrian import NAME as PDR
-from stario.fusion.evaluation.scores import joined, over_seeds, scored
+from stario.fusion.evaluation.scores import LABELS, joined, over_seeds, scored
 from stario.fusion.paper_table.figures import write_figures
 from stario.fusion.paper_table.runs import (
     FILTERED,
@@ -29,7 +29,7 @@ from stario.network.runtime.survey import BATCHES, ModelRow, survey
 from stario.network.training.config import TrainingConfig
 from stario.sequences.accuracy.metrics import CONVENTIONS
 from stario.sequences.drawing.text_table import figure, markdown
-from stario.sequences.files import atomic_write, write_json, write_rows
+from stario.sequences.files import atomic_write, write_json
 
 REFERENCE_NETWORK = "StarIO"
 """Reference network that the others' errors are compared with."""
@@ -121,7 +121,7 @@ def set_table(
 ) -> SetTable:
     """Return a set's table, given the recordings that packaged weights have `learned`, by name."""
     scores = _scores(completed)
-    paths = scores[scores["metric"] == "path_m"]
+    paths = scores.dropna(subset="path_m")
     measure = "ate" if set(paths["track"]) <= {"poses"} else "rms_10s_m"
     names = [content["network"] for content in completed]
     tested = paths.drop_duplicates("recording")
@@ -129,6 +129,7 @@ def set_table(
     means = over_seeds(scores)
     blocks = joined(pd.DataFrame(content["blocks"]) for content in completed)
     ranked = ranks(blocks[blocks["metric"] == measure], REFERENCE_NETWORK)
+    ranked.loc[ranked["network"] == REFERENCE_NETWORK, "ratio"] = None
     rows = pd.DataFrame(
         {"network": name, "seeds": sorted(c["seed"] for c in completed if c["network"] == name)}
         | {"learned": len(test & learned.get(name, set()))}
@@ -145,7 +146,7 @@ def set_table(
         scores,
         rows.merge(ranked, "left"),
         len(tested),
-        float(tested["value"].sum()),
+        float(tested["path_m"].sum()),
         _MEASURES[measure],
         list(dict.fromkeys(f"{failure['item']}: {failure['reason']}" for failure in failures)),
     )
@@ -165,9 +166,10 @@ def _scores(completed: Completed) -> pd.DataFrame:
             errors = {key: trained[key] for key in ("training_error_m2", "validation_error_m2")}
             run = {key: content[key] for key in ("network", "seed")}
             found.append(scored("", {"trained": errors}, **run))
-    table = joined(found).astype({"value": float})
-    table.loc[table["metric"] == "pde", "value"] *= 100.0
-    return table
+    table = joined(found).set_index([*LABELS, "network", "seed"]).astype(float)
+    if "pde" in table:
+        table["pde"] *= 100.0
+    return table.reset_index()
 
 
 def work_of(tables: Iterable[Completed]) -> pd.DataFrame:
@@ -230,12 +232,10 @@ def write_results(
         "conventions": WORDS,
     }
     write_json(out / "table.json", content)
-    means = [
-        {"set": name, **row[["network", "rank", *COLUMNS]].dropna(), "seeds": len(row["seeds"])}
-        for name, table in tables.items()
-        for _, row in table.rows.iterrows()
-    ]
-    write_rows(out / "table.csv", means)
+    rows = pd.concat({name: table.rows for name, table in tables.items()}, names=["set"])
+    means = rows.assign(seeds=rows["seeds"].map(len))[["network", "rank", *COLUMNS, "seeds"]]
+    with atomic_write(out / "table.csv") as file:
+        means.dropna(axis=1, how="all").droplevel(1).to_csv(file)
     for name, table in tables.items() if drawn else ():
         scores = table.scores
         known = set(scores.loc[scores["track"] == TRUE_ATTITUDE, "network"])

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.compare import navigators
-from stario.fusion.evaluation.scores import Column, joined, rows_of, scored
+from stario.fusion.evaluation.scores import Column, joined, scored, table
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.imu.inference import Predictor, WindowDisplacement
 from stario.fusion.navigator import Navigator
@@ -29,7 +29,6 @@ from stario.fusion.values.state import Track
 from stario.sequences.accuracy.metrics import align, evaluate_track
 from stario.sequences.arrays import even_grid, interpolated
 from stario.sequences.attitude.rotations import about_z, yaw_of
-from stario.sequences.drawing.text_table import aligned
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -239,16 +238,11 @@ def fault_table(scores: pd.DataFrame) -> str:
         Column("end [m]", "end_error", ".3f"),
         Column("sigma [m]", "end_sigma", ".3f"),
     )
-    rows = list(scores.groupby(["group", "track"], sort=False))
-    lines = aligned(rows_of(rows, columns, "fault", "track"))
-    finite = Column("", "finite", over=np.min)
-    reports = [
-        ("" if finite.value(part) else "NOT FINITE, ") + part["reported"].iloc[0]
-        for _, part in rows
-    ]
-    return "\n".join(
-        f"{line}   {words}" for line, words in zip(lines, ["reported", *reports], strict=True)
-    )
+    rows = scores.groupby(["group", "track"], sort=False)
+    lines = table(rows, columns, ("fault", "track")).splitlines()
+    finite = np.where(scores["finite"] == 0.0, "NOT FINITE, ", "")
+    reports = ["reported", *(finite + scores["reported"])]
+    return "\n".join(f"{line}   {words}" for line, words in zip(lines, reports, strict=True))
 
 
 def reported(health: Health) -> str:

@@ -12,10 +12,11 @@ import math
 import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
+from scipy.stats import gmean
 
 from stario.fusion.evaluation.compare import navigators
 from stario.fusion.evaluation.displacement_error import fit_yaw_and_position, known_truth, planar
-from stario.fusion.evaluation.scores import Column, by_track, geometric_mean, joined, scored, table
+from stario.fusion.evaluation.scores import Column, by_track, joined, scored, table
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.direction import Complex
 from stario.fusion.imu.inference import Predictor
@@ -54,9 +55,9 @@ CARRIES = ("handheld", "pocket", "swinging", "bag")
 _COLUMNS = (
     Column("n", "step", ".0f", len),
     Column("without [m]", "error_without"),
-    Column("rest: mean", "ratio", over=geometric_mean),
+    Column("rest: mean", "ratio", over=gmean),
     Column("worst", "ratio", over=np.max),
-    Column("joined: mean", "joined_ratio", over=geometric_mean),
+    Column("joined: mean", "joined_ratio", over=gmean),
     Column("worst", "joined_ratio", over=np.max),
     Column(f"ratio < {MAX_RATIO:g}", "ratio", ".0%", lambda ratio: (ratio < MAX_RATIO).mean()),
     Column("step [m]", "step", ".1f", np.max),
@@ -102,7 +103,7 @@ def moment_costs(
 
 def moment_table(scores: pd.DataFrame) -> str:
     """Return a row for each moment, place and track: ratios of errors, largest corrections."""
-    step, turn = (Column("", f"{m}_without", over=np.max).value(scores) for m in ("step", "turn"))
+    step, turn = scores[["step_without", "turn_without"]].max()
     notes = [
         "without: median error [m] of the parts before and after, each fitted in yaw and position;",
         "ratio of that error with the moment to that without: geometric mean, worst; joined: both "

@@ -79,12 +79,12 @@ def test_a_killed_run_resumes_and_gives_the_same_model(dataset, reading, tmp_pat
 
 
 def assert_complete(folder: Path) -> None:
-    names = {"scores.json", "log.json", "model.json", "model.safetensors", "trained.json"}
+    names = {"tested.json", "log.json", "model.json", "model.safetensors", "trained.json"}
     assert {path.name for path in folder.glob("[!.]*")} == names
     trained = json.loads((folder / "trained.json").read_text())
     assert trained["steps"] == 1
     assert min(trained["windows_per_s"], trained["seconds"]) > 0.0
-    content = json.loads((folder / "scores.json").read_text())
+    content = json.loads((folder / "tested.json").read_text())
     [drawn] = content["drawn"].values()
     assert len({len(values) for values in drawn.values()}) == 1
     scores, blocks = (pd.DataFrame(content[name]) for name in ("scores", "blocks"))
@@ -109,7 +109,7 @@ def test_filled_runs_are_kept_and_only_new_networks_and_seeds_are_trained(
     first = [run(dataset, steps=1), Run(dataset, "pdr", 0, None)]
     assert list(complete(first, tmp_path, reading)) == first
     assert_complete(tmp_path / "own/StarIO/1-steps/seed-0")
-    errors = first[0].folder(tmp_path) / "scores.json"
+    errors = first[0].folder(tmp_path) / "tested.json"
     written = errors.stat().st_mtime_ns
     more = [*first, run(dataset, "StarIO without MSGCU", steps=1), run(dataset, seed=1, steps=1)]
     assert list(complete(more, tmp_path, reading)) == more
@@ -134,7 +134,7 @@ def test_runs_of_another_recipe_are_refused_and_other_step_counts_are_separate(
     done = run(dataset, steps=1)
     complete_run(done, tmp_path, reading)
     other = Run(dataset, "StarIO", 0, run_recipe({**RECIPE, "rate": 1e-2}, "StarIO", 0, 1))
-    with pytest.raises(ConfigError, match=r"scores\.json.*another recipe"):
+    with pytest.raises(ConfigError, match=r"tested\.json.*another recipe"):
         complete_run(other, tmp_path, reading)
     [outcome] = complete([other], tmp_path, reading)
     assert isinstance(outcome, Skipped)

@@ -150,7 +150,9 @@ def test_work_is_told_in_core_hours_and_windows_per_second():
     assert work.loc["StarIO"].tolist() == [14400.0, 3600.0, 200.0]
     times = {"torch": {"1": 1.0, "64": 0.5}}
     costs = [ModelRow("StarIO", 2_761_682, 24_854_000, times, 11.2)]
-    text = table_text([set_table(DATASET, completed, {})], costs, work, TrainingConfig())
+    table = set_table(DATASET, completed, {})
+    assert table.rows["ratio"].to_list() == [None]  # to itself
+    text = table_text([table], costs, work, TrainingConfig())
     assert "| StarIO | 2.762 (2.762) | 24.854 (25.122) | 11.2 | 1.00 | 0.50 | 5.00 | 200 |" in text
     assert "Total: 5.00 core hours, 4.00 for training and 1.00 for evaluation" in text
 
