@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import importlib.resources
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
 from stario.fusion.commands import common, options
-from stario.sequences.datasets.batch import Skipped
+from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def table(
     """
     from stario.fusion.evaluation.results import make_folder
     from stario.fusion.paper_table.runs import backend as on_backend
-    from stario.fusion.paper_table.runs import complete, table_runs
+    from stario.fusion.paper_table.runs import complete_run, table_runs
     from stario.fusion.paper_table.table import known_costs, write_results
     from stario.fusion.paper_table.training import ReaderConfig
     from stario.network.architectures import ARCHITECTURES
@@ -77,11 +78,11 @@ def table(
     learned = {} if data is None else learned_from(data)
     usual = options.Reading()
     reading = ReaderConfig(usual.read, usual.as_read(), cache or cache_folder())
-    skipped = []
+    work, skipped = partial(complete_run, out=out, reading=reading), []
+    if jobs is None and backend != "loky":
+        jobs = -1
     with on_backend(backend):
-        if jobs is None and backend != "loky":
-            jobs = -1
-        for done, outcome in enumerate(complete(runs, out, reading, jobs), 1):
+        for done, outcome in enumerate(each(work, runs, jobs), 1):
             run, status = str(outcome), "done"
             if isinstance(outcome, Skipped):
                 skipped.append(outcome)

@@ -123,6 +123,8 @@ def reference_rows(dataset: DataSet) -> tuple[str, ...]:
 def complete_run(run: Run, out: Path, reading: ReaderConfig) -> Run:
     """Train and evaluate a run, except for what is already done.
 
+    Every process that takes part must be able to write to `out`.
+
     Raises:
         ConfigError: existing results were made with another recipe, other weights or other
             recordings.
@@ -306,17 +308,6 @@ def table_runs(
             for name in leading if seed else names:
                 runs.append(Run(dataset, name, seed, run_recipe(recipe, name, seed, steps)))
     return runs
-
-
-def complete(
-    runs: Sequence[Run], out: Path, reading: ReaderConfig, jobs: int | None = 1
-) -> Iterator[Run | Skipped]:
-    """Do what is missing; yield each run once it is completed, or the reason why it is not.
-
-    Runs are started in their order; `out` must be writable by every process that takes part.
-    `jobs` is as for `stario.sequences.datasets.batch.each`.
-    """
-    return each(partial(complete_run, out=out, reading=reading), runs, jobs)
 
 
 @contextmanager

@@ -75,32 +75,18 @@ class SetTable:
         rows: networks, in order, with their `seeds`, the number of test recordings that given
             weights were trained on (`learned`), mean and standard error over seeds of each of
             `COLUMNS` ("ate", "ate_sem"; NaN if unknown), and the columns of `bootstrap.ranks`.
-        tested: number of tested recordings.
-        path_m: total length of their true paths [m].
-        measure: the error that networks are ranked by, in words.
-        skipped: reasons why recordings were skipped, each once.
+        about: the split in words, numbers of recordings, the length of the tested paths [m], the
+            error that networks are ranked by, and the reasons why recordings were skipped.
     """
 
     dataset: DataSet
     scores: pd.DataFrame
     rows: pd.DataFrame
-    tested: int
-    path_m: float
-    measure: str
-    skipped: list[str]
+    about: dict[str, Any]
 
     def as_dict(self) -> dict[str, object]:
         """Return the set's part of `table.json`."""
-        return {
-            "split": self.dataset.words,
-            "training": len(self.dataset.training),
-            "validation": len(self.dataset.validation),
-            "tested": self.tested,
-            "path_m": self.path_m,
-            "ranks_by": self.measure,
-            "rows": self.rows.to_dict("records"),
-            "skipped": self.skipped,
-        }
+        return self.about | {"rows": self.rows.to_dict("records")}
 
 
 def completed_runs(runs: Iterable[Run], out: Path) -> dict[str, list[Mapping[str, Any]]]:
@@ -141,15 +127,16 @@ def set_table(
         for content in completed
         for failure in [*content["skipped"], *content.get("trained", {}).get("skipped", [])]
     ]
-    return SetTable(
-        dataset,
-        scores,
-        rows.merge(ranked, "left"),
-        len(tested),
-        float(tested["path_m"].sum()),
-        _MEASURES[measure],
-        list(dict.fromkeys(f"{failure['item']}: {failure['reason']}" for failure in failures)),
-    )
+    about = {
+        "split": dataset.words,
+        "training": len(dataset.training),
+        "validation": len(dataset.validation),
+        "tested": len(tested),
+        "path_m": float(tested["path_m"].sum()),
+        "ranks_by": _MEASURES[measure],
+        "skipped": [*dict.fromkeys(f"{each['item']}: {each['reason']}" for each in failures)],
+    }
+    return SetTable(dataset, scores, rows.merge(ranked, "left"), about)
 
 
 def _means(means: pd.DataFrame, network: str) -> dict[str, float]:
@@ -279,7 +266,7 @@ def table_text(
 
 
 def _set_text(table: SetTable) -> str:
-    dataset, known = table.dataset, table.rows[[*COLUMNS]].notna().any()
+    about, known = table.about, table.rows[[*COLUMNS]].notna().any()
     columns = [key for key in COLUMNS if known[key]]
     titles = ["network", *(COLUMNS[key][0] for key in columns), "seeds", "rank"]
     lines = [[*titles, f"error / {REFERENCE_NETWORK}'s", "paper: ATE, RTE [m]"]]
@@ -289,25 +276,20 @@ def _set_text(table: SetTable) -> str:
             rank = "{rank:.0f} [{rank_low:.0f}, {rank_high:.0f}]".format(**row)
         if isinstance(row["ratio"], Interval):
             ratio = f"{row['ratio']:.2f}"
-        if paper := published(dataset.name, row["network"]):
+        if paper := published(table.dataset.name, row["network"]):
             errors = "{:.3f}, {:.3f}".format(*paper)
         cells = [_mean(row[key], row[f"{key}_sem"]) for key in columns]
-        title = _title(row, table.tested)
+        title = _title(row, about["tested"])
         lines.append([title, *cells, str(len(row["seeds"])), rank, ratio, errors])
-    return "\n".join(
-        [
-            f"### {dataset.title}",
-            "",
-            f"{len(dataset.training)} recordings for training, {len(dataset.validation)} for "
-            f"validation, {table.tested} for testing ({table.path_m:.0f} m); {dataset.words}. "
-            "Ranks and ratios are based on the geometric mean over recordings of the "
-            f"{table.measure}.",
-            "",
-            *markdown(lines),
-            *(["", f"Skipped: {len(table.skipped)} recordings, listed in `table.json`."]
-              if table.skipped else []),
-        ]
-    )  # fmt: skip
+    words = (
+        "{training} recordings for training, {validation} for validation, {tested} for testing "
+        "({path_m:.0f} m); {split}. Ranks and ratios are based on the geometric mean over "
+        "recordings of the {ranks_by}."
+    ).format(**about)
+    text = [f"### {table.dataset.title}", "", words, "", *markdown(lines)]
+    if skipped := about["skipped"]:
+        text += ["", f"Skipped: {len(skipped)} recordings, listed in `table.json`."]
+    return "\n".join(text)
 
 
 def _mean(mean: float, error: float) -> str:

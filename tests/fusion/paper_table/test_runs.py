@@ -23,7 +23,6 @@ from stario.fusion.paper_table.runs import (
     TRUE_ATTITUDE,
     Run,
     backend,
-    complete,
     complete_run,
     table_runs,
 )
@@ -31,7 +30,7 @@ from stario.fusion.paper_table.sets import DataSet, folder_set
 from stario.fusion.paper_table.table import completed_runs, set_table
 from stario.fusion.paper_table.training import ReaderConfig, run_recipe
 from stario.network.architectures import ARCHITECTURES
-from stario.sequences.datasets.batch import Skipped
+from stario.sequences.datasets.batch import each
 from stario.sequences.errors import ConfigError, InputError, WeightsError
 from stario.sequences.readers import read_recording
 from stario.sequences.readers.csv_writer import write_csv
@@ -106,13 +105,14 @@ def test_filled_runs_are_kept_and_only_new_networks_and_seeds_are_trained(
         return original(dataset, recipe, *rest)
 
     monkeypatch.setattr(runs_module, "train_run", counted)
+    work = partial(complete_run, out=tmp_path, reading=reading)
     first = [run(dataset, steps=1), Run(dataset, "pdr", 0, None)]
-    assert list(complete(first, tmp_path, reading)) == first
+    assert list(each(work, first)) == first
     assert_complete(tmp_path / "own/StarIO/1-steps/seed-0")
     errors = first[0].folder(tmp_path) / "tested.json"
     written = errors.stat().st_mtime_ns
     more = [*first, run(dataset, "StarIO without MSGCU", steps=1), run(dataset, seed=1, steps=1)]
-    assert list(complete(more, tmp_path, reading)) == more
+    assert list(each(work, more)) == more
     assert trained == ["StarIO 0", "StarIO without MSGCU 0", "StarIO 1"]
     assert errors.stat().st_mtime_ns == written
     table = set_table(dataset, completed_runs(more, tmp_path)["own"], {})
@@ -136,8 +136,6 @@ def test_runs_of_another_recipe_are_refused_and_other_step_counts_are_separate(
     other = Run(dataset, "StarIO", 0, run_recipe({**RECIPE, "rate": 1e-2}, "StarIO", 0, 1))
     with pytest.raises(ConfigError, match=r"tested\.json.*another recipe"):
         complete_run(other, tmp_path, reading)
-    [outcome] = complete([other], tmp_path, reading)
-    assert isinstance(outcome, Skipped)
     assert completed_runs([run(dataset, steps=2)], tmp_path) == {}
 
 
