@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -117,31 +117,26 @@ class Benchmark:
         in those of ours the `RATIOS` of errors to theirs, as `Interval`s where there are any. For
         waypoints, the residuals replace the 10 s errors.
         """
-        found = parts(self.scores, self.by)
-        return pd.DataFrame(
-            row
-            for k, (name, part) in enumerate(found)
-            for row in self._rows(name, part, 0 < k == len(found) - 1)
-        )
+        found, rows = parts(self.scores, self.by), []
+        for k, (name, part) in enumerate(found):
+            paths = part.loc[part["track"] == self.ours, "path_m"]
+            known = {"recordings": int((paths > 0.0).sum()), "path_km": paths.sum() / 1e3}
+            medians = part.groupby("track")[[*FIGURES]].median()
+            for role, weights in (("theirs", self.theirs), ("ours", self.ours)):
+                if weights:
+                    about = {"group": name, "pooled": 0 < k == len(found) - 1, "role": role}
+                    ratios = self._ratios(part) if role == "ours" else dict.fromkeys(RATIOS)
+                    figures = known | medians.loc[weights].to_dict() | ratios
+                    rows.append({**about, "weights": weights, **figures})
+        return pd.DataFrame(rows)
 
-    def _rows(self, name: str, part: pd.DataFrame, pooled: bool) -> list[dict[str, Any]]:
-        medians = part.groupby("track")[[*FIGURES]].median().to_dict("index")
+    def _ratios(self, part: pd.DataFrame) -> dict[str, Interval | None]:
         blocks = self.blocks[self.blocks["recording"].isin(part["recording"])]
-        ratios = {
-            key: self.theirs
-            and paired_ratio(blocks[blocks["metric"] == metric], self.ours, self.theirs)
-            for key, metric in RATIOS.items()
+        of = {key: blocks[blocks["metric"] == metric] for key, metric in RATIOS.items()}
+        return {
+            key: paired_ratio(errors, self.ours, self.theirs) if self.theirs else None
+            for key, errors in of.items()
         }
-        paths = part.loc[part["track"] == self.ours, "path_m"]
-        known = {"recordings": int((paths > 0.0).sum()), "path_km": paths.sum() / 1e3}
-        return [
-            {"group": name, "pooled": pooled, "role": role, "weights": weights}
-            | known
-            | medians[weights]
-            | (ratios if role == "ours" else dict.fromkeys(RATIOS))
-            for role, weights in (("theirs", self.theirs), ("ours", self.ours))
-            if weights
-        ]
 
     def as_dict(self) -> dict[str, object]:
         """Return the result as plain values, including the recordings."""
@@ -212,7 +207,7 @@ def alone_on(
     streams, (kind, _) = usable_streams(sequence), known_truth(sequence)
     warn_of_truth(sequence)
     named = labels(path, sequence.attributes, group)
-    group, others = named["group"], {key: n for key, n in named.items() if key != "group"}
+    group = named["group"]
     unit = {"set": named["set"], "group": group, "recording": str(path)}
     figures, blocks = {}, []
     for name in weights:
@@ -224,7 +219,7 @@ def alone_on(
             figures[name]["nis_filtered"] = nis or np.nan
         block = errors.groupby("metric").cumcount()
         blocks.append(errors.assign(**unit, network=name, seed=0, block=block))
-    return scored(str(path), figures, group, **others, truth=kind), joined(blocks)
+    return scored(str(path), figures, **named, truth=kind), joined(blocks)
 
 
 def benchmark(
@@ -233,20 +228,16 @@ def benchmark(
     ours: str,
     theirs: str | None = None,
 ) -> Benchmark:
-    """Return the benchmark of the recordings that `alone_on` scored; at least one."""
-    scores, blocks = zip(*found, strict=True)
-    _warn_of_not_compared(scores)
-    return Benchmark(joined(scores), joined(blocks), by, ours, theirs)
+    """Return the benchmark of the recordings that `alone_on` scored; at least one.
 
-
-def _warn_of_not_compared(scores: Sequence[pd.DataFrame]) -> None:
-    """Log one warning about all recordings in which nothing could be compared."""
-    still = [part["recording"].iloc[0] for part in scores if not part["path_m"].any()]
-    if len(still) > 1:
-        message = "%d of %d recordings, the first %s: %s"
-        log.warning(message, len(still), len(scores), still[0], _NOT_COMPARED)
-    elif still:
-        log.warning("%s: %s", still[0], _NOT_COMPARED)
+    Recordings in which nothing could be compared are named in one warning.
+    """
+    scores, blocks = map(joined, zip(*found, strict=True))
+    compared = scores.groupby("recording", sort=False)["path_m"].any()
+    if len(still := compared.index[~compared]):
+        several = f"{len(still)} of {len(compared)} recordings, the first "
+        log.warning("%s%s: %s", several if len(still) > 1 else "", still[0], _NOT_COMPARED)
+    return Benchmark(scores, blocks, by, ours, theirs)
 
 
 def labels(path: Path, attributes: Mapping[str, object], group: str = "") -> dict[str, str]:

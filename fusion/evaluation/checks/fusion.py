@@ -331,12 +331,12 @@ def end_shifts(model: Predictor, sequence: ImuSequence, config: NavigatorConfig)
     if path < _MIN_PATH:
         raise InputError(f"{sequence.name}: track", f"{path:.2f} m", "at least a metre")
     instants = (np.arange(INSTANTS) + 0.5) / INSTANTS * sequence.duration
-    faults = {f"gap at {instant:.0f} s": gap(float(instant), GAP_SECONDS) for instant in instants}
-    faults[f"{DROPPED:.0%} dropped"] = drops(DROPPED)
+    rng = np.random.default_rng(0)
+    faulty = {f"gap at {t:.0f} s": gap(sequence, rng, t, GAP_SECONDS) for t in instants.tolist()}
+    faulty[f"{DROPPED:.0%} dropped"] = drops(sequence, rng, DROPPED)
     figures = {}
-    for name, modify_samples in faults.items():
-        faulty = modify_samples(sequence, np.random.default_rng(0))
-        other = navigator.run(faulty).trajectory
+    for name, recording in faulty.items():
+        other = navigator.run(recording).trajectory
         shift = float(np.linalg.norm(whole.position_W[-1, :2] - other.position_W[-1, :2])) / path
         turn = (other.attitude_WB[-1] * whole.attitude_WB[-1].inv()).as_matrix()
         degrees = abs(math.degrees(yaw_twist(turn)))

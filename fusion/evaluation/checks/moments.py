@@ -75,6 +75,8 @@ def moment_costs(
 ) -> pd.DataFrame:
     """Score a recording without and with each moment and place, the rows' group, by track.
 
+    It begins at the first known position, and is cut if it is long.
+
     Figures: error of the rest [m], its parts fitted separately (`error_without`, `error_with`,
     their `ratio`) or as a whole (`joined_...`); largest correction of position [m] and attitude
     [deg] between two outputs (`step`, `turn`, whether both are `small`, and without the moment).
@@ -82,7 +84,10 @@ def moment_costs(
     Raises:
         InputError: it has no ground truth, or cannot be run.
     """
-    sequence = _with_truth(sequence)
+    _, known = known_truth(sequence)
+    earlier = 0.0 if sequence.truth is not None else _BEFORE_WAYPOINTS
+    start = max(float(sequence.time[0]), float(known.time[0]) - earlier)
+    sequence = sequence.slice(start, start + MAX_SECONDS)
     estimators = navigators(model, config, graph)
     first = estimators["filtered"]
     observed = first.observe(sequence)
@@ -114,20 +119,12 @@ def moment_table(scores: pd.DataFrame) -> str:
     return table(by_track(scores), _COLUMNS, ("moment", "track"), notes)
 
 
-def _with_truth(sequence: ImuSequence) -> ImuSequence:
-    """Return the recording from its first known position on, cut if it is long."""
-    _, known = known_truth(sequence)
-    earlier = 0.0 if sequence.truth is not None else _BEFORE_WAYPOINTS
-    start = max(float(sequence.time[0]), float(known.time[0]) - earlier)
-    return sequence.slice(start, start + MAX_SECONDS)
-
-
 def _cost(
     sequence: ImuSequence, inserted: Inserted, without: Track, track: Track
 ) -> dict[str, float]:
-    apart, as_one = _errors_of_rest(sequence, without, inserted.start, inserted.start)
-    with_it = inserted.sequence
-    apart_with, as_one_with = _errors_of_rest(with_it, track, inserted.start, inserted.stop)
+    with_it, start = inserted.sequence, inserted.start
+    apart, as_one = _errors_of_rest(sequence, without, start, start)
+    apart_with, as_one_with = _errors_of_rest(with_it, track, start, inserted.stop)
     step, turn = largest_correction(with_it, track)
     step_without, turn_without = largest_correction(sequence, without)
     return {
