@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import partial, wraps
 from pathlib import Path
@@ -299,29 +299,33 @@ def refuse(context: typer.Context, found: str, expected: str, *names: str) -> No
 
 def expanded(command: Callable[..., None]) -> Callable[..., None]:
     """Put the options of groups, data classes such as `Reading`, in place of a command's groups."""
-    parameters = _parameters(command)
-    groups: dict[str, Any] = {
-        p.name: p.annotation for p in parameters if is_dataclass(p.annotation)
-    }
-    options = [
-        option.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-        for parameter in parameters
-        for option in (_parameters(groups.get(parameter.name)) or [parameter])
-    ]
+    options = [*_options(command)]
 
     @wraps(command)
     def flat(**values: Any) -> None:
-        for name, group in groups.items():
-            values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
-        command(**values)
+        command(**_grouped(command, values))
 
     flat.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     flat.__annotations__ = {option.name: option.annotation for option in options}
     return flat
 
 
-def _parameters(what: Callable[..., Any] | None) -> list[inspect.Parameter]:
-    return [*inspect.signature(what, eval_str=True).parameters.values()] if what else []
+def _options(of: Callable[..., Any]) -> Iterator[inspect.Parameter]:
+    """Yield the options of a command or of a group, and those of the groups in it."""
+    for parameter in inspect.signature(of, eval_str=True).parameters.values():
+        if is_dataclass(group := parameter.annotation):
+            yield from _options(group)
+        else:
+            yield parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+
+
+def _grouped(of: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of a command or of a group from the values of all options."""
+    arguments = {}
+    for name, parameter in inspect.signature(of, eval_str=True).parameters.items():
+        group = parameter.annotation
+        arguments[name] = group(**_grouped(group, values)) if is_dataclass(group) else values[name]
+    return arguments
 
 
 def _attributes(words: Iterable[str]) -> dict[str, list[str]]:
