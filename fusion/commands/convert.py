@@ -97,10 +97,8 @@ def _read(
     """Yield each recording and append its name; add those that cannot be used to `skipped`."""
     from stario.sequences.datasets.convert import check_content
 
-    def checked(file: Path) -> ImuSequence:
-        return check_content(reading.read(file))
-
-    for sequence in without_skipped(each(checked, files, jobs=1), skipped):
+    outcomes = each(lambda file: check_content(reading.read(file)), files, jobs=1)
+    for sequence in without_skipped(outcomes, skipped):
         typer.echo(sequence.summary())
         names.append(sequence.name)
         yield sequence

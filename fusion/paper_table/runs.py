@@ -111,15 +111,6 @@ def _weights_sha256(name: str) -> str:
     return load_model(name).card.sha256
 
 
-def reference_rows(dataset: DataSet) -> tuple[str, ...]:
-    """Return the references that are compared with the networks trained on a set.
-
-    The default weights were trained on the groups that `ALL` holds out; the first-stage weights,
-    of the same architecture, were not.
-    """
-    return (PDR, "first-stage") if dataset.name == ALL else (PDR, "default")
-
-
 def complete_run(run: Run, out: Path, reading: ReaderConfig) -> Run:
     """Train and evaluate a run, except for what is already done.
 
@@ -135,12 +126,14 @@ def complete_run(run: Run, out: Path, reading: ReaderConfig) -> Run:
         return run
     folder.mkdir(parents=True, exist_ok=True)
     if run.recipe is not None and _read_if_done(run, folder / "trained.json") is None:
-        trained = train_run(run.dataset, run.recipe, folder, reading)
-        write_json(folder / "trained.json", {"cell": run.digest, **trained})
+        result = train_run(run.dataset, run.recipe, folder, reading)
+        write_json(folder / "trained.json", {"cell": run.digest, **result})
         for spare in TEMPORARY_FILES:
             (folder / spare).unlink(missing_ok=True)
     began = process_time()
-    scores, blocks, drawn, skipped = test_scores(run, _model(run, folder), reading)
+    trained = run.network in ARCHITECTURES
+    model = load_model(folder / "model.safetensors") if trained else model_named(run.network)
+    scores, blocks, drawn, skipped = test_scores(run, model, reading)
     content = {
         "cell": run.digest,
         "network": run.network,
@@ -250,12 +243,6 @@ def _errors_of(track: Trajectory, truth: Trajectory) -> dict[str, float]:
     return {"ate_m": result.ate_m, "rte_m": result.rte_m, "pde": result.pde}
 
 
-def _model(run: Run, folder: Path) -> Model:
-    if run.network in ARCHITECTURES:
-        return load_model(folder / "model.safetensors")
-    return model_named(run.network)
-
-
 def _read_if_done(run: Run, path: Path) -> dict[str, object] | None:
     content = _read(path) if path.exists() else None
     if content is not None and content.get("cell") != run.digest:
@@ -304,7 +291,9 @@ def table_runs(
     for part in (first, others):
         for seed, dataset in product(range(seeds), part):
             if seed == 0:
-                runs += [Run(dataset, name, 0, None) for name in reference_rows(dataset)]
+                # Unlike the default weights, these know none of the groups that `ALL` holds out.
+                weights = "first-stage" if dataset.name == ALL else "default"
+                runs += [Run(dataset, name, 0, None) for name in (PDR, weights)]
             for name in leading if seed else names:
                 runs.append(Run(dataset, name, seed, run_recipe(recipe, name, seed, steps)))
     return runs

@@ -119,7 +119,11 @@ def set_table(
     rows = pd.DataFrame(
         {"network": name, "seeds": sorted(c["seed"] for c in completed if c["network"] == name)}
         | {"learned": len(test & learned.get(name, set()))}
-        | _means(means, name)
+        | {
+            f"{key}{suffix}": means[of].get((name, track, metric), np.nan)
+            for key, (_, track, metric) in COLUMNS.items()
+            for suffix, of in (("", "mean"), ("_sem", "sem"))
+        }
         for name in sorted(set(names), key=[PDR, *ARCHITECTURES, *names].index)
     )
     failures = [
@@ -137,12 +141,6 @@ def set_table(
         "skipped": [*dict.fromkeys(f"{each['item']}: {each['reason']}" for each in failures)],
     }
     return SetTable(dataset, scores, rows.merge(ranked, "left"), about)
-
-
-def _means(means: pd.DataFrame, network: str) -> dict[str, float]:
-    found = means.reindex([(network, track, metric) for _, track, metric in COLUMNS.values()])
-    rows = zip(COLUMNS, found["mean"], found["sem"], strict=True)
-    return {k: v for key, mean, error in rows for k, v in ((key, mean), (f"{key}_sem", error))}
 
 
 def _scores(completed: Completed) -> pd.DataFrame:
