@@ -11,7 +11,6 @@ weights, and so have the seeds of a network.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,19 +47,12 @@ class Interval:
         return f"{self.ratio:{form}} [{self.low:{form}}, {self.high:{form}}]"
 
 
-def block_rows(sums: Sequence[Sequence[float]] | FloatArray, **labels: object) -> pd.DataFrame:
-    """Return the rows of a recording's blocks (B, 2): sums of squared errors, and their counts.
-
-    Labels are `set`, `group`, `recording`, `network` and `seed`.
-    """
-    table = pd.DataFrame(np.reshape(sums, (-1, 2)), columns=["squares", "count"])
-    return table.assign(block=np.arange(len(table)), **labels)
-
-
 def paired_ratio(blocks: pd.DataFrame, ours: str, theirs: str) -> Interval | None:
     """Return the ratio of two networks' errors over the recordings that both have errors on.
 
-    A recording without any error, such as of a device at rest, has no ratio.
+    A recording without any error, such as of a device at rest, has no ratio. Blocks have the sum of
+    the squared errors (`squares`), their `count`, and the labels `set`, `group`, `recording`,
+    `block` (number in the recording), `network` and `seed`.
     """
     pair = blocks[blocks["network"].isin([ours, theirs])]
     total = pair.groupby([*_UNITS, "network", "seed"])["squares"].transform("sum")

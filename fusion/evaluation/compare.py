@@ -240,13 +240,12 @@ def compare(
         "pdr": lambda: pedestrian_track(sequence),
         "dead_reckoning": lambda: inertial_track(preprocessed, config),
     }
+    if sequence.truth is None:
+        del makers["network_true_attitude"]
     tracks: dict[str, Track] = {}
-    for name, make in makers.items():
-        without_truth = name == "network_true_attitude" and sequence.truth is None
-        if name != "track" and (name not in names or without_truth):
-            continue
+    for name in [name for name in makers if name in {"track", *names}]:
         try:
-            tracks[name] = make()
+            tracks[name] = makers[name]()
         except InputError as error:
             log.warning("no track %s: %s", name, error)
     return measured(sequence, tracks, config.place)

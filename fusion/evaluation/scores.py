@@ -24,17 +24,17 @@ LABELS = ("recording", "group", "track")
 POOLED = "all"
 """Name of the row over all groups; a group may have this name, too."""
 
-Figures = Mapping[str, float | None]
-"""Figures of a track by metric; None where unknown."""
-
 Parts = Iterable[tuple[str | tuple[str, ...], pd.DataFrame]]
 """Scores of the rows of a table, each with its name, or names."""
 
 
 def scored(
-    recording: str, figures: Mapping[str, Figures], group: str = "", **labels: object
+    recording: str,
+    figures: Mapping[str, Mapping[str, float | None]],
+    group: str = "",
+    **labels: object,
 ) -> pd.DataFrame:
-    """Return the rows of a recording from its figures by track; labels are columns of their own."""
+    """Return the rows of a recording from its figures by track, None where unknown, and labels."""
     names = {"recording": recording, "group": group, "track": [*figures], **labels}
     table = pd.DataFrame([*figures.values()], dtype=float)
     return pd.concat([pd.DataFrame(names), table], axis=1)
@@ -50,7 +50,7 @@ def values(scores: pd.DataFrame, metric: str, **where: str) -> FloatArray:
     for label, name in where.items():
         scores = scores[scores[label] == name]
     found = scores[metric] if metric in scores else pd.Series(dtype=float)
-    return found.dropna().to_numpy()
+    return np.asarray(found.dropna())
 
 
 def over_seeds(scores: pd.DataFrame) -> pd.DataFrame:

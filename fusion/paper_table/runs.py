@@ -20,7 +20,6 @@ from time import process_time
 
 import pandas as pd
 
-from stario.fusion.evaluation.bootstrap import block_rows
 from stario.fusion.evaluation.compare import TRACK_TITLES
 from stario.fusion.evaluation.displacement_error import BLOCK_SECONDS, FIGURES
 from stario.fusion.evaluation.groups import alone_on
@@ -178,7 +177,7 @@ def test_scores(
     work = partial(_recording, network=run.network, model=model, read=reading.read, groups=groups)
     skipped: list[Skipped] = []
     scores = [pd.DataFrame(columns=[*LABELS, "path_m"])]
-    blocks = [block_rows([], set="", group="", recording="", metric="")]
+    blocks = [pd.DataFrame(columns=["squares", "count", "block", "metric", "set", *LABELS[:2]])]
     drawn: dict[str, Drawn] = {}
     for figures, squares, track in without_skipped(each(work, groups, 1), skipped):
         scores.append(figures)
@@ -212,8 +211,9 @@ def _recording(
 
 def _position_blocks(poses: PoseErrors) -> pd.DataFrame:
     since, squares = poses.estimate.time - poses.estimate.time[0], poses.position_W[:, :2] ** 2
-    sums = pd.Series(squares.sum(axis=1)).groupby(since // BLOCK_SECONDS).agg(["sum", "count"])
-    return block_rows(sums.to_numpy(), metric="ate")
+    errors = pd.Series(squares.sum(axis=1)).groupby(since // BLOCK_SECONDS)
+    sums = errors.agg(squares="sum", count="count").reset_index(drop=True)
+    return sums.assign(block=sums.index, metric="ate")
 
 
 def _protocol_errors(

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from stario.fusion.evaluation.bootstrap import Interval, block_rows, paired_ratio, ranks
+from stario.fusion.evaluation.bootstrap import Interval, paired_ratio, ranks
 from stario.fusion.evaluation.groups import verdict
 from stario.fusion.evaluation.scores import POOLED, joined
 
@@ -18,8 +18,7 @@ Errors = dict[tuple[str, str, str], np.ndarray]
 def table_of(networks: dict[str, list[Errors]]) -> pd.DataFrame:
     """Errors of networks, by seed."""
     return joined(
-        block_rows(
-            np.stack([squares, np.ones(len(squares))], axis=1),
+        pd.DataFrame({"squares": squares, "count": 1.0, "block": range(len(squares))}).assign(
             set=s, group=group, recording=name, network=network, seed=seed,
         )
         for network, runs in networks.items()

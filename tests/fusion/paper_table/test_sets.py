@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from recorded import DATA
 
-from stario.fusion.evaluation.bootstrap import block_rows
 from stario.fusion.evaluation.scores import joined, scored
 from stario.fusion.paper_table import sets, training
 from stario.fusion.paper_table.figures import pde_boxes
@@ -109,9 +109,9 @@ def content(
         for name, pde in zip(names, (0.03, None), strict=True)
         for errors in [{"ate_m": ate_m, "rte_m": 2.0, "pde": pde}]
     ]
-    unit = {"set": "ridi", "group": "ridi", "metric": "ate", **labels}
-    blocks = [block_rows([[ate_m**2, 1.0]], recording=name, **unit) for name in names]
-    tables = {"scores": joined(scores), "blocks": joined(blocks)}
+    unit = {"set": "ridi", "group": "ridi", "metric": "ate", "block": 0, **labels}
+    blocks = pd.DataFrame({"recording": names, "squares": ate_m**2, "count": 1.0, **unit})
+    tables = {"scores": joined(scores), "blocks": blocks}
     return {**labels, **tables, "drawn": {}, "seconds": seconds, "skipped": []}
 
 
