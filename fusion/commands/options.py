@@ -313,8 +313,8 @@ def expanded(command: Callable[..., None]) -> Callable[..., None]:
 def _options(of: Callable[..., Any]) -> Iterator[inspect.Parameter]:
     """Yield the options of a command or of a group, and those of the groups in it."""
     for parameter in inspect.signature(of, eval_str=True).parameters.values():
-        if is_dataclass(group := parameter.annotation):
-            yield from _options(group)
+        if _is_group(parameter):
+            yield from _options(parameter.annotation)
         else:
             yield parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
 
@@ -323,9 +323,13 @@ def _grouped(of: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any
     """Return the arguments of a command or of a group from the values of all options."""
     arguments = {}
     for name, parameter in inspect.signature(of, eval_str=True).parameters.items():
-        group = parameter.annotation
-        arguments[name] = group(**_grouped(group, values)) if is_dataclass(group) else values[name]
+        group, grouped = parameter.annotation, _is_group(parameter)
+        arguments[name] = group(**_grouped(group, values)) if grouped else values[name]
     return arguments
+
+
+def _is_group(parameter: inspect.Parameter) -> bool:
+    return is_dataclass(parameter.annotation)
 
 
 def _attributes(words: Iterable[str]) -> dict[str, list[str]]:

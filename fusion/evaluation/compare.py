@@ -191,8 +191,8 @@ class Comparison:
         """The figures of all `TRACKS` as rows of `scores`; `duration_s` and `path_m` in each."""
         path_m = math.nan if self.path_m is None else self.path_m
         tracks = {name: self.metrics.get(name, dict.fromkeys(METRICS)) for name in TRACKS}
-        about = {"duration_s": self.sequence.duration, "path_m": path_m}
-        return scored(self.sequence.name, tracks, **about)
+        duration_s = self.sequence.duration
+        return scored(self.sequence.name, tracks, duration_s=duration_s, path_m=path_m)
 
     def aligned(self) -> dict[str, Trajectory]:
         """Return trajectories for figures, aligned with the truth if there is one."""
