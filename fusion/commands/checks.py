@@ -81,7 +81,7 @@ class _Check:
 class _CheckOfRecordings(_Check):
     """A check that has no simulated walks."""
 
-    paths: options.Paths = field()
+    paths: options.Paths = field()  # required: without the default that it has above
 
 
 def models(
@@ -227,10 +227,10 @@ def heights(
     def house(seed: int) -> ImuSequence:
         return simulate_house(seed, name=f"house-{seed}").sequence
 
-    def simulated(*given: Any) -> pd.DataFrame:
+    def score(*given: Any) -> pd.DataFrame:
         return score_heights(*given).assign(group="simulated")
 
-    check.walks(simulated, heights_table, [partial(house, k) for k in range(walks)])
+    check.walks(score, heights_table, [partial(house, k) for k in range(walks)])
 
 
 @options.expanded

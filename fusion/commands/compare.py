@@ -66,7 +66,7 @@ def compare(
     for name in chosen:
         check_choice("--tracks", name, TRACKS)
     settings, network = placing.settings(estimating.settings()), estimating.network()
-    model = estimating.for_processes(network, jobs)
+    model = network if jobs == 1 else estimating.model  # each process loads the weights once
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
     files, skipped = reading.recordings(paths or [])
     origin = common.origin_of(files, reading, estimating, network, fixes)
@@ -209,7 +209,7 @@ def _tracks(
     from stario.fusion.evaluation.text import summary, summary_table
 
     settings, network = estimating.settings(), estimating.network()
-    model = estimating.for_processes(network, jobs)
+    model = network if jobs == 1 else estimating.model  # each process loads the weights once
     origin = common.origin_of(files, reading, estimating, network)
     skipped: list[Skipped] = []
     found = []

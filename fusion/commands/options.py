@@ -223,10 +223,6 @@ class Estimator:
 
         return load_model(self.model)
 
-    def for_processes(self, network: DisplacementModel, jobs: int) -> DisplacementModel | str:
-        """Return the network, or for several processes its name: each loads the weights once."""
-        return network if jobs == 1 else self.model
-
 
 @dataclass(frozen=True)
 class Map:

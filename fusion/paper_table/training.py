@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from time import process_time
+from typing import Any
 
 import numpy as np
 
@@ -105,9 +106,10 @@ def train_run(
         folder,
         on_epoch=lambda report: write_json(clock, before + process_time() - began),
     )
-    rows = json.loads((folder / "log.json").read_text(encoding="utf-8"))
-    # In JSON, errors that are not finite are null.
-    reports = [EpochReport(**{k: math.nan if v is None else v for k, v in r.items()}) for r in rows]
+    rows: list[dict[str, Any]] = json.loads((folder / "log.json").read_text(encoding="utf-8"))
+    for row in rows:  # in JSON, errors that are not finite are null
+        row.update({name: math.nan for name, value in row.items() if value is None})
+    reports = [EpochReport(**row) for row in rows]
     return {
         "steps": recipe.steps,
         "windows_per_s": float(np.mean([report.windows_per_second for report in reports])),
