@@ -278,7 +278,7 @@ def simulation(
         check.refuse(*options.READING)
     model, settings = check.estimating.network(), check.estimating.settings()
     score = partial(carried.motion_scores, model, config=settings)
-    wanted = [(carry, seed) for carry in carried.SPEEDS for seed in range(walks)]
+    wanted = [(carry, seed) for carry in carried.WAYS for seed in range(walks)]
     found = [
         score(carried.simulated_walk(carry, seed, seconds), carry=carry, kind=carried.SIMULATED)
         for carry, seed in common.with_bar("simulation", wanted, len(wanted))

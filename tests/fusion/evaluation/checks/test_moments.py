@@ -12,7 +12,7 @@ from stario.fusion.evaluation.checks.simulation import (
     BANDS,
     RECORDED,
     SIMULATED,
-    SPEEDS,
+    WAYS,
     carry_of,
     motion,
     motion_scores,
@@ -117,7 +117,7 @@ MEASURED = {
 """Medians of the archives: force by band [m/s^2], and angular rate [rad/s]."""
 
 
-@pytest.mark.parametrize("carry", SPEEDS)
+@pytest.mark.parametrize("carry", WAYS)
 def test_simulated_walks_move_within_a_third_of_recorded_ones(carry):
     found = [motion(simulated_walk(carry, seed, 60.0)) for seed in range(6)]
     keys = [*(f"force_{low:g}" for low, _ in BANDS), "rate"]
