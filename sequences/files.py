@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import errno
 import itertools
 import json
@@ -11,7 +10,7 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
@@ -169,15 +168,6 @@ def write_json(path: Path | str, obj: object) -> None:
 def json_text(obj: object) -> str:
     """Return the text that `write_json` writes; raises what that does for the object."""
     return json.dumps(_plain(obj), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-
-
-def write_rows(path: Path | str, rows: Sequence[Mapping[str, object]]) -> None:
-    """Write rows, as mappings from column to value, to a CSV; missing cells stay empty."""
-    names = dict.fromkeys(key for row in rows for key in row)
-    with atomic_write(path) as file:
-        writer = csv.DictWriter(file, list(names), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def write_npz(path: Path | str, **arrays: ArrayLike) -> None:

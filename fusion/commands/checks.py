@@ -2,74 +2,86 @@
 
 from __future__ import annotations
 
+import importlib.resources
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from stario.fusion.commands import common, options
-from stario.fusion.commands.table import table
+from stario.sequences.datasets.batch import Skipped, each
+from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from stario.fusion.imu.inference import Predictor
+    from stario.fusion.paper_table.sets import DataSet
     from stario.fusion.values.config import NavigatorConfig
-    from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
 
     Score = Callable[[Predictor, ImuSequence, NavigatorConfig], pd.DataFrame]
-    Found = tuple[Sequence[pd.DataFrame], Sequence[Skipped]]
+    Table = Callable[[pd.DataFrame], str]
 
 _Graph = Annotated[bool, options.flag("--graph", help="Also run the graph (slower).")]
 
 
-def _of_recordings(
-    reading: options.Reading,
-    estimating: options.Estimator,
-    paths: Sequence[Path],
-    score: Score,
-    by: str = "",
-) -> Found:
-    """Score each recording, as one of its group if they are grouped by a label."""
-    from stario.fusion.evaluation.groups import labels
+@dataclass(frozen=True, kw_only=True)
+class _Check:
+    """What a check of tracks is given, and how it is done."""
 
-    model, settings = estimating.network(), estimating.settings()
+    context: typer.Context
+    paths: options.OptionalPaths = None
+    reading: options.Reading
+    estimating: options.Estimator
+    as_json: options.Json = False
 
-    def of_named(path: Path, sequence: ImuSequence) -> pd.DataFrame:
-        scores = score(model, sequence, settings)
-        return scores.assign(group=labels(path, sequence.attributes)[by]) if by else scores
+    def recordings(self, score: Score, table: Table, by: str = "") -> None:
+        """Score each recording, as one of its group if they are grouped by a label; print all."""
+        from stario.fusion.evaluation.groups import labels
 
-    return common.map_recordings("check", reading, paths, of_named)
+        model, settings = self.estimating.network(), self.estimating.settings()
+
+        def of_named(path: Path, sequence: ImuSequence) -> pd.DataFrame:
+            scores = score(model, sequence, settings)
+            return scores.assign(group=labels(path, sequence.attributes)[by]) if by else scores
+
+        files, skipped = self.reading.recordings(self.paths or [])
+        found, failed = common.map_recordings("check", self.reading, files, of_named)
+        self.show(found, skipped + failed, table)
+
+    def walks(self, score: Score, table: Table, walks: Sequence[Callable[[], ImuSequence]]) -> None:
+        """Score simulated walks, for which nothing is read, and print them."""
+        self.refuse(*options.READING)
+        model, settings = self.estimating.network(), self.estimating.settings()
+        made = common.with_bar("check", walks, len(walks))
+        self.show([score(model, walk(), settings) for walk in made], [], table)
+
+    def refuse(self, *names: str) -> None:
+        """Refuse options that do nothing with simulated walks."""
+        options.refuse(self.context, "with simulated walks", "use with PATH", *names)
+
+    def show(self, found: Sequence[pd.DataFrame], skipped: Sequence[Skipped], table: Table) -> None:
+        """Print scores as a table or JSON, and exit with 1 if any recording was skipped."""
+        from stario.fusion.evaluation.scores import joined
+
+        if found:
+            scores = joined(found)
+            common.print_result(self.as_json, scores.to_dict("records"), table(scores))
+        elif self.as_json:
+            common.print_result(True, [])
+        common.exit_if_skipped(skipped)
 
 
-def _of_walks(
-    context: typer.Context,
-    estimating: options.Estimator,
-    walks: Iterable[ImuSequence],
-    count: int,
-    score: Score,
-) -> Found:
-    """Score simulated walks, for which nothing is read."""
-    options.refuse(context, "with simulated walks", "use with PATH", *options.READING)
-    model, settings = estimating.network(), estimating.settings()
-    return [score(model, walk, settings) for walk in common.with_bar("check", walks, count)], []
+@dataclass(frozen=True, kw_only=True)
+class _CheckOfRecordings(_Check):
+    """A check that has no simulated walks."""
 
-
-def _print(found: Found, table: Callable[[pd.DataFrame], str], as_json: bool) -> None:
-    """Print scores as a table or JSON, and exit with 1 if any recording was skipped."""
-    from stario.fusion.evaluation.scores import joined, records
-
-    tables, skipped = found
-    if tables:
-        scores = joined(tables)
-        common.print_result(as_json, records(scores), table(scores))
-    elif as_json:
-        common.print_result(True, [])
-    common.exit_if_skipped(skipped)
+    paths: options.Paths = field()  # required: without the default that it has above
 
 
 def models(
@@ -106,7 +118,6 @@ def faults(
 ) -> None:
     """Inject faults into a recording one at a time; print the resulting error and the report."""
     from stario.fusion.evaluation.checks.faults import fault_table, matched_walk, run_faults
-    from stario.fusion.evaluation.scores import records
 
     if not network:
         options.refuse(context, "without --network", "use with --network", "model")
@@ -122,7 +133,7 @@ def faults(
     scores = run_faults(sequence, settings, estimating.network() if network else None, seed)
     named = scores.rename(columns={"group": "fault", "track": "backend"})
     title = f"{sequence.name}: {sequence.duration:.1f} s"
-    common.print_result(as_json, records(named), f"{title}\n{fault_table(scores)}")
+    common.print_result(as_json, named.to_dict("records"), f"{title}\n{fault_table(scores)}")
 
 
 def consistency(
@@ -154,62 +165,53 @@ def benchmark(as_json: options.Json = False) -> None:
 
 @options.expanded
 def fusion(
-    context: typer.Context,
-    reading: options.Reading,
-    estimating: options.Estimator,
-    paths: options.OptionalPaths = None,
+    check: _Check,
     by: options.By = "set",
     graph: _Graph = False,
     walks: int = typer.Option(20, min=1, help="Number of simulated walks."),
     seconds: float = typer.Option(120.0, min=5.0, help="Duration of each walk in s."),
-    as_json: options.Json = False,
 ) -> None:
     """Compare filter, and graphs, with the network alone: error, NIS, NEES, yaw, speed, by group.
 
     Without PATH, on simulated walks, measured with white noise of known magnitude.
     """
-    from stario.fusion.evaluation.checks import fusion as check
+    from stario.fusion.evaluation.checks.fusion import (
+        fusion_gain,
+        fusion_gain_table,
+        simulated_gain,
+    )
 
-    found: Found
-    if paths:
-        options.refuse(context, "with recordings", "use with simulated walks", "walks", "seconds")
-        score = partial(check.fusion_gain, graph=graph)
-        found = _of_recordings(reading, estimating, paths, score, by)
-    else:
-        unused = (*options.READING, *options.ESTIMATING, "by")
-        options.refuse(context, "with simulated walks", "use with PATH", *unused)
-        seeds = common.with_bar("fusion", range(walks), walks)
-        found = [check.simulated_gain(seed, seconds, graph) for seed in seeds], []
-    _print(found, check.fusion_gain_table, as_json)
+    if check.paths:
+        unused = "walks", "seconds"
+        options.refuse(check.context, "with recordings", "use with simulated walks", *unused)
+        check.recordings(partial(fusion_gain, graph=graph), fusion_gain_table, by)
+        return
+    check.refuse(*options.READING, *options.ESTIMATING, "by")
+    seeds = common.with_bar("fusion", range(walks), walks)
+    found = [simulated_gain(seed, seconds, graph) for seed in seeds]
+    check.show(found, [], fusion_gain_table)
 
 
 @options.expanded
 def fixes(
-    paths: options.Paths,
-    reading: options.Reading,
-    estimating: options.Estimator,
+    check: _CheckOfRecordings,
     every: float = typer.Option(5.0, min=0.1, help="Interval between fixes in s."),
     sigma: float = typer.Option(0.3, min=0.001, help="Fix sigma per axis \\[m]."),
     backend: Literal["ekf", "graph"] = typer.Option("ekf", help="Estimator."),
     by: options.By = "set",
-    as_json: options.Json = False,
 ) -> None:
     """Supply periodic true positions; check that position and yaw errors match their sigmas."""
     from stario.fusion.evaluation.checks.fusion import fixes_table, track_with_fixes
 
     score = partial(track_with_fixes, every=every, sigma=sigma, backend=backend)
-    _print(_of_recordings(reading, estimating, paths, score, by), fixes_table, as_json)
+    check.recordings(score, fixes_table, by)
 
 
 @options.expanded
 def heights(
-    context: typer.Context,
-    reading: options.Reading,
-    estimating: options.Estimator,
-    paths: options.OptionalPaths = None,
+    check: _Check,
     walks: int = typer.Option(40, min=1, help="Number of simulated walks."),
     by: options.By = "set",
-    as_json: options.Json = False,
 ) -> None:
     """Compare heights and floors with known ones, by the barometer and without it.
 
@@ -218,38 +220,32 @@ def heights(
     from stario.fusion.evaluation.checks.fusion import heights_table, score_heights
     from stario.sequences.simulation.house import simulate_house
 
-    if paths:
-        found = _of_recordings(reading, estimating, paths, score_heights, by)
-    else:
-        houses = (simulate_house(k, name=f"house-{k}").sequence for k in range(walks))
-        tables, _ = _of_walks(context, estimating, houses, walks, score_heights)
-        found = [scores.assign(group="simulated") for scores in tables], []
-    _print(found, heights_table, as_json)
+    if check.paths:
+        check.recordings(score_heights, heights_table, by)
+        return
+
+    def house(seed: int) -> ImuSequence:
+        return simulate_house(seed, name=f"house-{seed}").sequence
+
+    def score(*given: Any) -> pd.DataFrame:
+        return score_heights(*given).assign(group="simulated")
+
+    check.walks(score, heights_table, [partial(house, k) for k in range(walks)])
 
 
 @options.expanded
-def gaps(
-    paths: options.Paths,
-    reading: options.Reading,
-    estimating: options.Estimator,
-    by: options.By = "set",
-    as_json: options.Json = False,
-) -> None:
+def gaps(check: _CheckOfRecordings, by: options.By = "set") -> None:
     """Remove 0.1 s at one of six instants or 5 % of the samples; report how far the end moves."""
     from stario.fusion.evaluation.checks.fusion import end_shift_table, end_shifts
 
-    _print(_of_recordings(reading, estimating, paths, end_shifts, by), end_shift_table, as_json)
+    check.recordings(end_shifts, end_shift_table, by)
 
 
 @options.expanded
 def moments(
-    context: typer.Context,
-    reading: options.Reading,
-    estimating: options.Estimator,
-    paths: options.OptionalPaths = None,
+    check: _Check,
     graph: _Graph = False,
     seed: int = typer.Option(0, min=0, help="Seed of the moments."),
-    as_json: options.Json = False,
 ) -> None:
     """Insert bad moments (shake, drop, table, standing, lift); report what the rest of tracks pays.
 
@@ -259,45 +255,136 @@ def moments(
     from stario.fusion.evaluation.checks.simulation import simulated_walk
 
     score = partial(moment_costs, graph=graph, seed=seed)
-    if paths:
-        found = _of_recordings(reading, estimating, paths, score)
+    if check.paths:
+        check.recordings(score, moment_table)
     else:
-        walks = (simulated_walk(carry, k) for k, carry in enumerate(CARRIES))
-        found = _of_walks(context, estimating, walks, len(CARRIES), score)
-    _print(found, moment_table, as_json)
+        walks = [partial(simulated_walk, carry, k) for k, carry in enumerate(CARRIES)]
+        check.walks(score, moment_table, walks)
 
 
 @options.expanded
 def simulation(
-    context: typer.Context,
-    reading: options.Reading,
-    estimating: options.Estimator,
-    paths: options.OptionalPaths = None,
+    check: _Check,
     walks: int = typer.Option(10, min=1, help="Simulated walks of each way."),
     seconds: float = typer.Option(120.0, min=10.0, help="Duration of each walk in s."),
-    as_json: options.Json = False,
 ) -> None:
     """Compare simulated walks with recordings by way of carrying: motion by band, steps, errors.
 
     Without PATH, print those of the simulated walks.
     """
-    from stario.fusion.evaluation.checks import simulation as check
+    from stario.fusion.evaluation.checks import simulation as carried
 
-    if not paths:
-        options.refuse(context, "with simulated walks", "use with PATH", *options.READING)
-    model, settings = estimating.network(), estimating.settings()
-    score = partial(check.motion_scores, model, config=settings)
-    wanted = [(carry, seed) for carry in check.SPEEDS for seed in range(walks)]
+    if not check.paths:
+        check.refuse(*options.READING)
+    model, settings = check.estimating.network(), check.estimating.settings()
+    score = partial(carried.motion_scores, model, config=settings)
+    wanted = [(carry, seed) for carry in carried.WAYS for seed in range(walks)]
     found = [
-        score(check.simulated_walk(carry, seed, seconds), carry=carry, kind=check.SIMULATED)
+        score(carried.simulated_walk(carry, seed, seconds), carry=carry, kind=carried.SIMULATED)
         for carry, seed in common.with_bar("simulation", wanted, len(wanted))
     ]
 
     def recorded(path: Path, sequence: ImuSequence) -> pd.DataFrame:
-        return score(sequence, carry=check.carry_of(sequence), kind=check.RECORDED)
+        return score(sequence, carry=carried.carry_of(sequence), kind=carried.RECORDED)
 
-    more, skipped = common.map_recordings("simulation", reading, paths or [], recorded)
-    _print((found + more, skipped), check.motion_table, as_json)
+    files, skipped = check.reading.recordings(check.paths or [])
+    more, failed = common.map_recordings("simulation", check.reading, files, recorded)
+    check.show(found + more, skipped + failed, carried.motion_table)
+
+
+def table(
+    context: typer.Context,
+    out: Path = typer.Option(..., help="Folder of the finished runs; a repetition resumes there."),
+    data: Path | None = typer.Option(None, help="Folder of the development recordings."),
+    sets: str | None = typer.Option(
+        None, help="Sets of --data to use. Default: oxiod,ridi,all,tyrex,kipd,ilc."
+    ),
+    published: list[str] | None = typer.Option(
+        None,
+        "--set",
+        help="Published data set, NAME=FOLDER, such as ronin=/data/RoNIN; repeatable.",
+    ),
+    networks: str | None = typer.Option(
+        None, help="Networks of `stario check models`, comma-separated. Default: all."
+    ),
+    steps: int | None = typer.Option(
+        None, min=1, help="Training steps per network; overrides the recipe."
+    ),
+    seeds: int = typer.Option(
+        3, min=1, help="Seeds for StarIO with and without MSGCU, R-ResNet and DeepILS."
+    ),
+    split_seed: int = typer.Option(0, min=0, help="Seed of the recording split."),
+    per_group: int = typer.Option(
+        2, min=1, help="Maximum test recordings per group in the set all."
+    ),
+    config: Path | None = typer.Option(
+        None, help="TOML or JSON file with the recipe. Default: the package's."
+    ),
+    cache: options.Cache = None,
+    jobs: int | None = typer.Option(
+        None, help="Runs to run in parallel; -1 for as many as possible."
+    ),
+    backend: str = typer.Option("loky", help="Where runs run: loky (this machine), dask or ray."),
+) -> None:
+    """Train and test every network on every data set; a rerun adds only missing runs.
+
+    The paper's protocol: 8:1:1 by recordings, true attitude, same recipe and steps for all.
+    """
+    from stario.fusion.evaluation.results import make_folder
+    from stario.fusion.paper_table.runs import backend as on_backend
+    from stario.fusion.paper_table.runs import complete_run, table_runs
+    from stario.fusion.paper_table.table import known_costs, write_results
+    from stario.fusion.paper_table.training import ReaderConfig
+    from stario.network.architectures import ARCHITECTURES
+    from stario.network.training.splits import learned_from
+    from stario.sequences.datasets.stream_cache import cache_folder
+    from stario.sequences.settings import read_settings
+
+    if data is None:
+        options.refuse(context, "without --data", "use with --data", "sets", "per_group")
+    datasets = _data_sets(data, sets, published or [], split_seed, per_group)
+    chosen = None if networks is None else common.names_in(networks)
+    packaged = importlib.resources.files("stario.network.weights") / "recipe-table.json"
+    recipe = read_settings(config or Path(str(packaged)))
+    runs = table_runs(datasets, recipe, steps, chosen, seeds)
+    make_folder(out)
+    requested = {run.network for run in runs}
+    costs = known_costs([name for name in ARCHITECTURES if name in requested], out)
+    learned = {} if data is None else learned_from(data)
+    usual = options.Reading()
+    reading = ReaderConfig(usual.read, usual.as_read(), cache or cache_folder())
+    work, skipped = partial(complete_run, out=out, reading=reading), []
+    if jobs is None and backend != "loky":
+        jobs = -1
+    with on_backend(backend):
+        for done, outcome in enumerate(each(work, runs, jobs), 1):
+            run, status = str(outcome), "done"
+            if isinstance(outcome, Skipped):
+                skipped.append(outcome)
+                run, status = outcome.item, "not done"
+            typer.echo(f"{done} of {len(runs)}: {run}: {status}", err=True)
+            write_results(runs, out, costs, learned, drawn=False)
+    typer.echo(write_results(runs, out, costs, learned), nl=False)
+    common.exit_if_skipped(skipped)
+
+
+def _data_sets(
+    data: Path | None, sets: str | None, published: list[str], seed: int, per_group: int
+) -> list[DataSet]:
+    from stario.fusion.paper_table.sets import development_sets, folder_set
+
+    if data is None and not published:
+        raise InputError("data", "none", "recordings", "pass --data or --set NAME=FOLDER")
+    datasets: list[DataSet] = []
+    if data is not None:
+        names = None if sets is None else common.names_in(sets)
+        datasets += development_sets(data, seed, per_group, names)
+    for word in published:
+        name, folder = options.assignment("--set", word, "NAME=FOLDER", "such as ronin=/data/RoNIN")
+        if name in {dataset.name for dataset in datasets}:
+            raise InputError("--set", repr(name), "a name of its own", f"or drop {name} by --sets")
+        datasets.append(folder_set(name, Path(folder), seed))
+    return datasets
 
 
 COMMANDS = (

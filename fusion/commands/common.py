@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING, TypeVar
 import typer
 
 from stario.fusion.commands import options
+from stario.sequences.datasets.batch import Skipped, each, without_skipped
 from stario.sequences.errors import InputError
+from stario.sequences.lazy import optional_package
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.results import Writers
     from stario.fusion.recording import Progress
     from stario.network.model import DisplacementModel
-    from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
 
 Result = TypeVar("Result")
@@ -34,25 +35,10 @@ _NAMED = 3
 """Number of skipped recordings with the same reason that are listed one by one."""
 
 
-def _named_apart(reading: options.Reading) -> Callable[[Path], ImuSequence]:
-    """Return a function that reads recordings, each under a name of its own."""
-    from stario.fusion.evaluation.compare import distinct_name
-
-    names: set[str] = set()
-
-    def read(file: Path) -> ImuSequence:
-        sequence = reading.read(file)
-        return replace(sequence, name=distinct_name(sequence.name, names))
-
-    return read
-
-
 def each_used(
     title: str, work: Callable[[Path], Result], files: Collection[Path], jobs: int = 1
 ) -> tuple[list[Result], list[Skipped]]:
-    """Apply `work` to each file, with a progress bar; return the results, and what was skipped."""
-    from stario.sequences.datasets.batch import each, without_skipped
-
+    """Apply `work` to each file, with a bar if titled; return the results, and what was skipped."""
     skipped: list[Skipped] = []
     outcomes = with_bar(title, each(work, files, jobs), len(files))
     return list(without_skipped(outcomes, skipped)), skipped
@@ -61,14 +47,19 @@ def each_used(
 def map_recordings(
     title: str,
     reading: options.Reading,
-    paths: Sequence[Path],
+    files: Collection[Path],
     work: Callable[[Path, ImuSequence], Result],
 ) -> tuple[list[Result], list[Skipped]]:
-    """Apply `work` to each path and its recording; return the results, and what was skipped."""
-    files, skipped = reading.recordings(paths)
-    read = _named_apart(reading)
-    found, failed = each_used(title, lambda file: work(file, read(file)), files)
-    return found, skipped + failed
+    """Do as `each_used` with each file and its recording, which has a name of its own."""
+    from stario.fusion.evaluation.compare import distinct_name
+
+    names: set[str] = set()
+
+    def read(file: Path) -> Result:
+        sequence = reading.read(file)
+        return work(file, replace(sequence, name=distinct_name(sequence.name, names)))
+
+    return each_used(title, read, files)
 
 
 def process_each(
@@ -85,33 +76,28 @@ def process_each(
     allows only one recording is named by `single`.
     """
     from stario.fusion.evaluation.results import check_folder
-    from stario.sequences.datasets.batch import each, without_skipped
 
     files, skipped = reading.recordings(paths)
     if single and len(files) > 1:
         raise InputError(single, f"{len(files)} recordings", "one recording")
     if out is not None:
         check_folder(out)
-    read = _named_apart(reading)
 
-    def recorded(file: Path) -> dict[str, object]:
-        sequence = read(file)
+    def recorded(file: Path, sequence: ImuSequence) -> dict[str, object]:
         folder = out if out and len(files) == 1 else (out or Path("runs")) / sequence.name
         record, text = work(sequence, folder)
         if not as_json:
             typer.echo(text)
         return record
 
-    records = list(without_skipped(each(recorded, files, jobs=1), skipped))
+    records, failed = map_recordings("", reading, files, recorded)
     if as_json and records:
         print_result(True, records[0] if len(files) == 1 else records)
-    exit_if_skipped(skipped)
+    exit_if_skipped(skipped + failed)
 
 
 def further_files(report: bool, tiles: str = "", view: bool = False) -> Writers:
     """Return what writes the report and the viewer's file, if their packages are there."""
-    from stario.sequences.lazy import optional_package
-
     also: dict[str, Callable[..., object]] = {}
     if report:
         optional_package("plotly", "report")
@@ -178,10 +164,11 @@ def exit_if_skipped(skipped: Sequence[Skipped]) -> None:
 
 
 def with_bar(title: str, items: Iterable[Result], total: int) -> Iterable[Result]:
-    """Yield the items with a progress bar on stderr; hidden without a terminal."""
+    """Yield the items with a progress bar on stderr; hidden without a terminal or a title."""
     from tqdm import tqdm
 
-    shown: Iterable[Result] = tqdm(items, title, total, leave=False, disable=None)
+    hidden = None if title else True
+    shown: Iterable[Result] = tqdm(items, title, total, leave=False, disable=hidden)
     return shown
 
 

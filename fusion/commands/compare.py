@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from stario.fusion.commands import common, options
+from stario.sequences.datasets.batch import Skipped, without_skipped
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 
     from stario.fusion.evaluation.compare import Comparison
     from stario.fusion.evaluation.pedestrian import Model
-    from stario.sequences.datasets.batch import Skipped
     from stario.sequences.datasets.splits import ListEntry
     from stario.sequences.sequence import ImuSequence
 
@@ -58,7 +58,6 @@ def compare(
     from stario.fusion.evaluation.scores import joined
     from stario.fusion.values.fix_file import read_fixes
     from stario.sequences.arrays import check_choice
-    from stario.sequences.datasets.batch import without_skipped
 
     if not paths:
         options.refuse(context, "without PATH", "use with a recording to read", *options.READING)
@@ -67,7 +66,7 @@ def compare(
     for name in chosen:
         check_choice("--tracks", name, TRACKS)
     settings, network = placing.settings(estimating.settings()), estimating.network()
-    model = estimating.for_processes(network, jobs)
+    model = network if jobs == 1 else estimating.model  # each process loads the weights once
     absolute_fixes = [] if fixes is None else read_fixes(fixes)
     files, skipped = reading.recordings(paths or [])
     origin = common.origin_of(files, reading, estimating, network, fixes)
@@ -208,10 +207,9 @@ def _tracks(
     from stario.fusion.evaluation.results import write_recording, write_summary
     from stario.fusion.evaluation.scores import joined
     from stario.fusion.evaluation.text import summary, summary_table
-    from stario.sequences.datasets.batch import without_skipped
 
     settings, network = estimating.settings(), estimating.network()
-    model = estimating.for_processes(network, jobs)
+    model = network if jobs == 1 else estimating.model  # each process loads the weights once
     origin = common.origin_of(files, reading, estimating, network)
     skipped: list[Skipped] = []
     found = []

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Literal
 import typer
 
 from stario.fusion.commands import common, options
+from stario.sequences.datasets.batch import Skipped, each, without_skipped
 from stario.sequences.errors import InputError, StarioError
 
 if TYPE_CHECKING:
-    from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
     from stario.sequences.simulation.imu import ImuErrors
     from stario.sequences.simulation.walks import WalkStyle
@@ -95,13 +95,10 @@ def _read(
     reading: options.Reading, files: list[Path], skipped: list[Skipped], names: list[str]
 ) -> Iterator[ImuSequence]:
     """Yield each recording and append its name; add those that cannot be used to `skipped`."""
-    from stario.sequences.datasets.batch import each, without_skipped
     from stario.sequences.datasets.convert import check_content
 
-    def checked(file: Path) -> ImuSequence:
-        return check_content(reading.read(file))
-
-    for sequence in without_skipped(each(checked, files, jobs=1), skipped):
+    outcomes = each(lambda file: check_content(reading.read(file)), files, jobs=1)
+    for sequence in without_skipped(outcomes, skipped):
         typer.echo(sequence.summary())
         names.append(sequence.name)
         yield sequence

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import partial, wraps
 from pathlib import Path
@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from stario.sequences.datasets.batch import Skipped, skipped
 from stario.sequences.errors import InputError, StarioError
 
 if TYPE_CHECKING:
     from stario.fusion.values.config import NavigatorConfig
     from stario.network.model import DisplacementModel
-    from stario.sequences.datasets.batch import Skipped
     from stario.sequences.sequence import ImuSequence
 
 _reading = partial(typer.Option, rich_help_panel="Reading")
@@ -136,7 +136,6 @@ class Reading:
         One that is named twice, such as by its folder and a list, is returned once: it would count
         twice in training and in intervals.
         """
-        from stario.sequences.datasets.batch import skipped
         from stario.sequences.readers import find_recordings
 
         if self.format != "auto":  # a named format applies to the path itself
@@ -163,28 +162,19 @@ class Reading:
         Raises:
             InputError: it cannot be read; an option's invalid value is named by the option.
         """
+        from stario.sequences.conventions import with_conventions
+        from stario.sequences.readers import read_recording
+
+        names = ("imu_topic", "truth_topic", "rate")
+        given = {name: str(value) for name in names if (value := getattr(self, name)) is not None}
+        meant = self.gyro_unit, self.accel_unit, self.axes, self.gravity, self.accel_sign
         try:
-            return self._read(path)
+            return with_conventions(read_recording(path, self.format, **given), *meant)
         except InputError as error:
             if error.field not in self.as_read():
                 raise
             field = f"--{error.field.replace('_', '-')}"
             raise InputError(field, error.found, error.expected, error.fix) from None
-
-    def _read(self, path: Path) -> ImuSequence:
-        from stario.sequences.conventions import with_conventions
-        from stario.sequences.readers import read_recording
-
-        options = {
-            "imu_topic": self.imu_topic,
-            "truth_topic": self.truth_topic,
-            "rate": self.rate,
-        }
-        given = {name: str(value) for name, value in options.items() if value is not None}
-        sequence = read_recording(path, self.format, **given)
-        return with_conventions(
-            sequence, self.gyro_unit, self.accel_unit, self.axes, self.gravity, self.accel_sign
-        )
 
 
 @dataclass(frozen=True)
@@ -233,10 +223,6 @@ class Estimator:
 
         return load_model(self.model)
 
-    def for_processes(self, network: DisplacementModel, jobs: int) -> DisplacementModel | str:
-        """Return the network, or for several processes its name: each loads the weights once."""
-        return network if jobs == 1 else self.model
-
 
 @dataclass(frozen=True)
 class Map:
@@ -264,13 +250,16 @@ class Map:
         Raises:
             InputError: an option's value is none; it is named by the option.
         """
-        given: dict[str, object] = {name: v for name, v in asdict(self).items() if v}
-        if self.origin is not None:
-            given["origin"] = _numbers_in("--origin", self.origin)
+        given: dict[str, Any] = {name: value for name, value in asdict(self).items() if value}
         try:
-            return replace(config, place=replace(config.place, **given))  # type: ignore[arg-type]
+            if self.origin is not None:
+                given["origin"] = tuple(map(float, self.origin.split(",")))
+            return replace(config, place=replace(config.place, **given))
         except InputError as error:
             raise InputError(f"--{error.field}", error.found, error.expected) from None
+        except ValueError:
+            expected = "numbers separated by commas, as in 48.137,11.575"
+            raise InputError("--origin", repr(self.origin), expected) from None
 
 
 @dataclass(frozen=True)
@@ -284,15 +273,6 @@ class Place(Map):
     closed: Annotated[
         bool, _place(metavar="", help="The track ends where it began, to a metre.")
     ] = False
-
-
-def _numbers_in(option: str, text: str) -> tuple[float, ...]:
-    """Return the numbers of a comma-separated list."""
-    try:
-        return tuple(float(word) for word in text.split(","))
-    except ValueError:
-        expected = "numbers separated by commas, as in 48.137,11.575"
-        raise InputError(option, repr(text), expected) from None
 
 
 READING, ESTIMATING = (tuple(f.name for f in fields(group)) for group in (Reading, Estimator))
@@ -315,29 +295,37 @@ def refuse(context: typer.Context, found: str, expected: str, *names: str) -> No
 
 def expanded(command: Callable[..., None]) -> Callable[..., None]:
     """Put the options of groups, data classes such as `Reading`, in place of a command's groups."""
-    parameters = _parameters(command)
-    groups: dict[str, Any] = {
-        p.name: p.annotation for p in parameters if is_dataclass(p.annotation)
-    }
-    options = [
-        option.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-        for parameter in parameters
-        for option in (_parameters(groups.get(parameter.name)) or [parameter])
-    ]
+    options = [*_options(command)]
 
     @wraps(command)
     def flat(**values: Any) -> None:
-        for name, group in groups.items():
-            values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
-        command(**values)
+        command(**_grouped(command, values))
 
     flat.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     flat.__annotations__ = {option.name: option.annotation for option in options}
     return flat
 
 
-def _parameters(what: Callable[..., Any] | None) -> list[inspect.Parameter]:
-    return [*inspect.signature(what, eval_str=True).parameters.values()] if what else []
+def _options(of: Callable[..., Any]) -> Iterator[inspect.Parameter]:
+    """Yield the options of a command or of a group, and those of the groups in it."""
+    for parameter in inspect.signature(of, eval_str=True).parameters.values():
+        if _is_group(parameter):
+            yield from _options(parameter.annotation)
+        else:
+            yield parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+
+
+def _grouped(of: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of a command or of a group from the values of all options."""
+    arguments = {}
+    for name, parameter in inspect.signature(of, eval_str=True).parameters.items():
+        group, grouped = parameter.annotation, _is_group(parameter)
+        arguments[name] = group(**_grouped(group, values)) if grouped else values[name]
+    return arguments
+
+
+def _is_group(parameter: inspect.Parameter) -> bool:
+    return is_dataclass(parameter.annotation)
 
 
 def _attributes(words: Iterable[str]) -> dict[str, list[str]]:

@@ -11,6 +11,7 @@ import typer
 
 from stario.fusion.commands import common, options
 from stario.sequences.errors import InputError
+from stario.sequences.lazy import optional_package
 
 if TYPE_CHECKING:
     from stario.fusion.evaluation.compare import Comparison
@@ -151,8 +152,6 @@ def live(
     out: Path = typer.Option(Path("runs/live"), help="Folder for the recordings."),
 ) -> None:
     """Show live tracks on a web page, from Sensor Logger, phyphox or any device that posts JSON."""
-    from stario.sequences.lazy import optional_package
-
     for package in ("starlette", "uvicorn", "jinja2", "plotly", "segno"):
         optional_package(package, "live")
     from stario.fusion import demonstration

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import typer
 
 from stario.fusion.commands import common, options
+from stario.sequences.datasets.batch import Skipped
 from stario.sequences.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from stario.network.training.config import TrainingConfig
     from stario.network.training.data import RecordingStreams, TrainingData
     from stario.network.training.history import EpochReport
-    from stario.sequences.datasets.batch import Skipped
     from stario.sequences.windows import WorldStream
 
     Streams = tuple[list[RecordingStreams], list[Skipped]]

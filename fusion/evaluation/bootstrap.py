@@ -11,7 +11,6 @@ weights, and so have the seeds of a network.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,23 +47,16 @@ class Interval:
         return f"{self.ratio:{form}} [{self.low:{form}}, {self.high:{form}}]"
 
 
-def block_rows(sums: Sequence[Sequence[float]] | FloatArray, **labels: object) -> pd.DataFrame:
-    """Return the rows of a recording's blocks (B, 2): sums of squared errors, and their counts.
-
-    Labels are `set`, `group`, `recording`, `network` and `seed`.
-    """
-    table = pd.DataFrame(np.reshape(sums, (-1, 2)), columns=["squares", "count"])
-    return table.assign(block=np.arange(len(table)), **labels)
-
-
 def paired_ratio(blocks: pd.DataFrame, ours: str, theirs: str) -> Interval | None:
     """Return the ratio of two networks' errors over the recordings that both have errors on.
 
-    A recording without any error, such as of a device at rest, has no ratio.
+    A recording without any error, such as of a device at rest, has no ratio. Blocks have the sum of
+    the squared errors (`squares`), their `count`, and the labels `set`, `group`, `recording`,
+    `block` (number in the recording), `network` and `seed`.
     """
     pair = blocks[blocks["network"].isin([ours, theirs])]
     total = pair.groupby([*_UNITS, "network", "seed"])["squares"].transform("sum")
-    found = _ranked(pair[total > 0.0], theirs).set_index("network")["ratio"]
+    found = ranks(pair[total > 0.0], theirs).set_index("network")["ratio"]
     return found.get(ours) if theirs in found else None
 
 
@@ -73,16 +65,9 @@ def ranks(blocks: pd.DataFrame, against: str) -> pd.DataFrame:
 
     Returns:
         Each `network` with its `rank`, 1 for the smallest error, the interval's bounds `rank_low`
-        and `rank_high`, and the `ratio` of its error to that of `against`, an `Interval`; None for
-        `against` itself or without it. No rows if no recording is common to all.
+        and `rank_high`, and the `ratio` of its error to that of `against`, an `Interval`; None
+        without `against`. No rows if no recording is common to all.
     """
-    found = _ranked(blocks, against)
-    found.loc[found["network"] == against, "ratio"] = None
-    return found
-
-
-def _ranked(blocks: pd.DataFrame, against: str) -> pd.DataFrame:
-    """Return the columns of `ranks`, also with the ratio of a network to itself."""
     table = blocks.set_index([*_UNITS, "block", "network", "seed"])[["squares", "count"]]
     runs = table.unstack(["network", "seed"], sort=False).dropna()
     if runs.empty:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
@@ -187,13 +188,11 @@ class Comparison:
 
     @property
     def scores(self) -> pd.DataFrame:
-        """The figures as rows of `scores`: those of the recording, and of all tracks, by name.
-
-        The recording's are those of a track "truth": `duration_s` and `path_m`.
-        """
-        of_recording: Metrics = {"duration_s": self.sequence.duration, "path_m": self.path_m}
+        """The figures of all `TRACKS` as rows of `scores`; `duration_s` and `path_m` in each."""
+        path_m = math.nan if self.path_m is None else self.path_m
         tracks = {name: self.metrics.get(name, dict.fromkeys(METRICS)) for name in TRACKS}
-        return scored(self.sequence.name, {"truth": of_recording, **tracks})
+        duration_s = self.sequence.duration
+        return scored(self.sequence.name, tracks, duration_s=duration_s, path_m=path_m)
 
     def aligned(self) -> dict[str, Trajectory]:
         """Return trajectories for figures, aligned with the truth if there is one."""
@@ -241,13 +240,12 @@ def compare(
         "pdr": lambda: pedestrian_track(sequence),
         "dead_reckoning": lambda: inertial_track(preprocessed, config),
     }
+    if sequence.truth is None:
+        del makers["network_true_attitude"]
     tracks: dict[str, Track] = {}
-    for name, make in makers.items():
-        without_truth = name == "network_true_attitude" and sequence.truth is None
-        if name != "track" and (name not in names or without_truth):
-            continue
+    for name in [name for name in makers if name in {"track", *names}]:
         try:
-            tracks[name] = make()
+            tracks[name] = makers[name]()
         except InputError as error:
             log.warning("no track %s: %s", name, error)
     return measured(sequence, tracks, config.place)

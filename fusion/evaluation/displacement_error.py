@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.imu.direction import Complex, Direction, direction, weighted_force
-from stario.fusion.imu.inference import Predictor, StatefulInference
 from stario.sequences.attitude.rotations import yaw_of
 from stario.sequences.errors import InputError
 from stario.sequences.findings import warn
@@ -126,12 +125,6 @@ def usable_streams(sequence: ImuSequence) -> list[LevelledStream]:
     if not streams:
         raise InputError(f"{sequence.name}: samples", "no unbroken stretch", "one of 2 s")
     return streams
-
-
-def predicted(model: Predictor, stream: LevelledStream) -> Piece:
-    """Return a stretch with the network's predictions, its memory cleared before."""
-    network = StatefulInference(model, TICKS_PER_SECOND)
-    return Piece(stream, *network.predict(stream.windows(), stream.headings))
 
 
 class _AtTicks(NamedTuple):

@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -28,11 +28,10 @@ from stario.fusion.evaluation.displacement_error import (
 )
 from stario.fusion.evaluation.pedestrian import Model, PedestrianDeadReckoning, piece_of
 from stario.fusion.evaluation.results import Files, figure_files, write_results
-from stario.fusion.evaluation.scores import joined, parts, records, scored, values, wide
+from stario.fusion.evaluation.scores import Column, joined, parts, scored, table
 from stario.fusion.navigator import Navigator
 from stario.sequences.drawing.figures import BLUE, INK, apply_style, new_figure
-from stario.sequences.drawing.text_table import aligned, figure
-from stario.sequences.files import json_text, write_json, write_rows
+from stario.sequences.files import json_text, write_json
 from stario.sequences.readers.archive import split_name
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.truth.problems import warn_of_truth
@@ -72,20 +71,21 @@ WORDS: dict[str, str] = {
 }
 """Meaning of each figure."""
 
-_TITLES = {
-    "ate_fit_m": ("fit [m]", ".2f"),
-    "ate_fit_percent": ("fit [%]", ".2f"),
-    "ate_first_m": ("first [m]", ".2f"),
-    "stretch_percent": ("20 s [%]", ".2f"),
-    "length_ratio": ("length", ".3f"),
-    "rms_1s_m": ("1 s [m]", ".3f"),
-    "rms_10s_m": ("10 s [m]", ".2f"),
-    "rms_30s_m": ("30 s [m]", ".2f"),
-    "direction_deg": ("direction [deg]", ".0f"),
-    "nis": ("NIS", ".2f"),
-    "nis_filtered": ("filtered NIS", ".2f"),
-}
-"""Titles and formats of the figures of a benchmark."""
+_COLUMNS = (
+    Column("n", "recordings", ".0f"),
+    Column("km", "path_km"),
+    Column("fit [m]", "ate_fit_m"),
+    Column("fit [%]", "ate_fit_percent"),
+    Column("first [m]", "ate_first_m"),
+    Column("20 s [%]", "stretch_percent"),
+    Column("length", "length_ratio", ".3f"),
+    Column("1 s [m]", "rms_1s_m", ".3f"),
+    Column("10 s [m]", "rms_10s_m"),
+    Column("30 s [m]", "rms_30s_m"),
+    Column("direction [deg]", "direction_deg", ".0f"),
+    Column("NIS", "nis"),
+    Column("filtered NIS", "nis_filtered"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,31 +117,26 @@ class Benchmark:
         in those of ours the `RATIOS` of errors to theirs, as `Interval`s where there are any. For
         waypoints, the residuals replace the 10 s errors.
         """
-        found = parts(wide(self.scores), self.by)
-        return pd.DataFrame(
-            row
-            for k, (name, part) in enumerate(found)
-            for row in self._rows(name, part, 0 < k == len(found) - 1)
-        )
+        found, rows = parts(self.scores, self.by), []
+        for k, (name, part) in enumerate(found):
+            paths = part.loc[part["track"] == self.ours, "path_m"]
+            known = {"recordings": int((paths > 0.0).sum()), "path_km": paths.sum() / 1e3}
+            medians = part.groupby("track")[[*FIGURES]].median()
+            for role, weights in (("theirs", self.theirs), ("ours", self.ours)):
+                if weights:
+                    about = {"group": name, "pooled": 0 < k == len(found) - 1, "role": role}
+                    ratios = self._ratios(part) if role == "ours" else dict.fromkeys(RATIOS)
+                    figures = known | medians.loc[weights].to_dict() | ratios
+                    rows.append({**about, "weights": weights, **figures})
+        return pd.DataFrame(rows)
 
-    def _rows(self, name: str, part: pd.DataFrame, pooled: bool) -> list[dict[str, Any]]:
-        medians = part.groupby("track")[[*FIGURES]].median().to_dict("index")
+    def _ratios(self, part: pd.DataFrame) -> dict[str, Interval | None]:
         blocks = self.blocks[self.blocks["recording"].isin(part["recording"])]
-        ratios = {
-            key: self.theirs
-            and paired_ratio(blocks[blocks["metric"] == metric], self.ours, self.theirs)
-            for key, metric in RATIOS.items()
+        of = {key: blocks[blocks["metric"] == metric] for key, metric in RATIOS.items()}
+        return {
+            key: paired_ratio(errors, self.ours, self.theirs) if self.theirs else None
+            for key, errors in of.items()
         }
-        paths = part.loc[part["track"] == self.ours, "path_m"]
-        known = {"recordings": int((paths > 0.0).sum()), "path_km": paths.sum() / 1e3}
-        return [
-            {"group": name, "pooled": pooled, "role": role, "weights": weights}
-            | known
-            | medians[weights]
-            | (ratios if role == "ours" else dict.fromkeys(RATIOS))
-            for role, weights in (("theirs", self.theirs), ("ours", self.ours))
-            if weights
-        ]
 
     def as_dict(self) -> dict[str, object]:
         """Return the result as plain values, including the recordings."""
@@ -150,25 +145,22 @@ class Benchmark:
             "theirs": self.theirs,
             "verdict": verdict(self.rows),
             "groups": self.rows.to_dict("records"),
-            "recordings": records(self.scores.rename(columns={"track": "weights"})),
+            "recordings": self.scores.rename(columns={"track": "weights"}).to_dict("records"),
             "words": WORDS,
         }
 
     def text(self) -> str:
         """Return for every group rows "theirs" and "ours", the ratios, the verdict, the words."""
         rows = self.rows.to_dict("records")
-        cells = [["", "", "n", "km", *(title for title, _ in _TITLES.values())]]
-        for row in rows:
-            known = [row["group"], row["role"], str(row["recordings"]), f"{row['path_km']:.2f}"]
-            cells.append([*known, *(figure(row[key], form) for key, (_, form) in _TITLES.items())])
-        head, *body = aligned(cells)
+        parts = (((row["group"], row["role"]), pd.DataFrame([row])) for row in rows)
+        head, *body = table(parts, _COLUMNS, ("", "")).splitlines()
         lines = [head]
         for line, row in zip(body, rows, strict=True):
             lines.append(line)
-            for key, metric in RATIOS.items():
+            for key in RATIOS:
                 if isinstance(row[key], Interval):
-                    title = _TITLES[metric][0].split(" [")[0]
-                    lines.append(f"{row['group']}: ratio over {title}: {row[key]:.3f}")
+                    seconds = key.removeprefix("ratio_").removesuffix("s")
+                    lines.append(f"{row['group']}: ratio over {seconds} s: {row[key]:.3f}")
         lines += [conclusion] if (conclusion := verdict(self.rows)) else []
         lines += [f"ours: {self.ours}", *([f"theirs: {self.theirs}"] if self.theirs else [])]
         return "\n".join([*lines, *(f"{key}: {words}." for key, words in WORDS.items())])
@@ -215,7 +207,7 @@ def alone_on(
     streams, (kind, _) = usable_streams(sequence), known_truth(sequence)
     warn_of_truth(sequence)
     named = labels(path, sequence.attributes, group)
-    group, others = named["group"], {key: n for key, n in named.items() if key != "group"}
+    group = named["group"]
     unit = {"set": named["set"], "group": group, "recording": str(path)}
     figures, blocks = {}, []
     for name in weights:
@@ -227,7 +219,7 @@ def alone_on(
             figures[name]["nis_filtered"] = nis or np.nan
         block = errors.groupby("metric").cumcount()
         blocks.append(errors.assign(**unit, network=name, seed=0, block=block))
-    return scored(str(path), figures, group, **others, truth=kind), joined(blocks)
+    return scored(str(path), figures, **named, truth=kind), joined(blocks)
 
 
 def benchmark(
@@ -236,20 +228,16 @@ def benchmark(
     ours: str,
     theirs: str | None = None,
 ) -> Benchmark:
-    """Return the benchmark of the recordings that `alone_on` scored; at least one."""
-    scores, blocks = zip(*found, strict=True)
-    _warn_of_not_compared(scores)
-    return Benchmark(joined(scores), joined(blocks), by, ours, theirs)
+    """Return the benchmark of the recordings that `alone_on` scored; at least one.
 
-
-def _warn_of_not_compared(scores: Sequence[pd.DataFrame]) -> None:
-    """Log one warning about all recordings in which nothing could be compared."""
-    still = [part["recording"].iloc[0] for part in scores if not values(part, "path_m").any()]
-    if len(still) > 1:
-        message = "%d of %d recordings, the first %s: %s"
-        log.warning(message, len(still), len(scores), still[0], _NOT_COMPARED)
-    elif still:
-        log.warning("%s: %s", still[0], _NOT_COMPARED)
+    Recordings in which nothing could be compared are named in one warning.
+    """
+    scores, blocks = map(joined, zip(*found, strict=True))
+    compared = scores.groupby("recording", sort=False)["path_m"].any()
+    if len(still := compared.index[~compared]):
+        several = f"{len(still)} of {len(compared)} recordings, the first "
+        log.warning("%s%s: %s", several if len(still) > 1 else "", still[0], _NOT_COMPARED)
+    return Benchmark(scores, blocks, by, ours, theirs)
 
 
 def labels(path: Path, attributes: Mapping[str, object], group: str = "") -> dict[str, str]:
@@ -278,7 +266,7 @@ def write_benchmark(folder: Path, found: Benchmark) -> None:
     groups = pd.json_normalize(flat, sep="_").drop(columns=[*RATIOS], errors="ignore")
     files: Files = {
         "groups.csv": partial(groups.to_csv, index=False),
-        "recordings.csv": partial(write_rows, rows=records(found.scores)),
+        "recordings.csv": partial(found.scores.to_csv, index=False, na_rep="nan"),
         "groups.json": partial(write_json, obj=content),
         **figure_files({"groups.png": groups_figure(found)}),
     }

@@ -253,14 +253,12 @@ def _scale(
     known: PositionTrack, time: FloatArray, truth: Complex, estimate: Complex
 ) -> list[Finding]:
     """Compare the lengths of both ways, of their course and along their windings."""
-    sigma = known.typical_sigma or 0.0
-    course = _length_ratio(time, truth, estimate, max(_COURSE_S, 4.0 * sigma), 4.0 * sigma)
-    way = _length_ratio(time, truth, estimate, max(_WAY_S, 4.0 * sigma), 4.0 * sigma)
-    if (
-        course is None
-        or way is None
-        or not (min(course, way) > _SCALED or max(course, way) < 1.0 / _SCALED)
-    ):
+    least = 4.0 * (known.typical_sigma or 0.0)
+    course, way = ratios = [
+        _length_ratio(time, truth, estimate, max(seconds, least), least)
+        for seconds in (_COURSE_S, _WAY_S)
+    ]
+    if not (np.min(ratios) > _SCALED or np.max(ratios) < 1.0 / _SCALED):  # nor if one is NaN
         return []
     text = f"The {known.kind} say that the way is {way:.2g} times as long as the track."
     advice = "These weights do not know this motion or carrying: rely on no length of the track."
@@ -269,8 +267,8 @@ def _scale(
 
 def _length_ratio(
     time: FloatArray, truth: Complex, estimate: Complex, seconds: float, least: float
-) -> float | None:
-    """Return how much longer the true way is, by chords over `seconds`; None for too few.
+) -> float:
+    """Return how much longer the true way is, by chords over `seconds`; NaN for too few.
 
     Chords in which both moved less than `least` [m], or 0.2 m/s, are rest.
     """
@@ -279,7 +277,7 @@ def _length_ratio(
     moved, told = (np.abs(p[after[before]] - p[before]) for p in (truth, estimate))
     walked = np.maximum(moved, told) > max(_RESTING_M_S * seconds, least)
     if walked.sum() < _MIN_CHORDS:
-        return None
+        return math.nan
     return float(moved[walked].sum() / max(float(told[walked].sum()), 1e-3))
 
 

@@ -21,9 +21,9 @@ from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, find_peaks, hilbert, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
-from stario.fusion.evaluation.displacement_error import Piece, planar, predicted
+from stario.fusion.evaluation.displacement_error import Piece, planar
 from stario.fusion.imu.direction import Complex
-from stario.fusion.imu.inference import Predictor
+from stario.fusion.imu.inference import Predictor, StatefulInference
 from stario.fusion.values.state import Track
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
@@ -84,10 +84,11 @@ def model_named(name: str) -> Model:
 
 
 def piece_of(model: Model, stream: LevelledStream) -> Piece:
-    """Return an unbroken stretch with the displacements of a network or of steps."""
+    """Return an unbroken stretch with the displacements of steps, or of a network as it begins."""
     if isinstance(model, PedestrianDeadReckoning):
         return model.piece(stream)
-    return predicted(model, stream)
+    network = StatefulInference(model, TICKS_PER_SECOND)
+    return Piece(stream, *network.predict(stream.windows(), stream.headings))
 
 
 def pedestrian_track(sequence: ImuSequence) -> Track:

@@ -15,10 +15,16 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from stario.fusion.evaluation.compare import METRIC_WORDS, RECORDING_WORDS, TRACKS, Comparison
+from stario.fusion.evaluation.compare import (
+    METRIC_WORDS,
+    METRICS,
+    RECORDING_WORDS,
+    TRACKS,
+    Comparison,
+)
 from stario.fusion.evaluation.known_positions import shown_positions
 from stario.fusion.evaluation.map_files import on_map, write_geojson, write_gpx
-from stario.fusion.evaluation.scores import by_name, joined
+from stario.fusion.evaluation.scores import joined
 from stario.fusion.values.config import NavigatorConfig
 from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.plan import plan_view
@@ -122,8 +128,8 @@ def metrics_dict(
     """Return the content of `metrics.json` from the `scores` of comparisons."""
     recordings = {}
     for name, found in scores.groupby("recording", sort=False):
-        tracks = by_name(found, "track")
-        recordings[name] = {**tracks.pop("truth"), "tracks": tracks}
+        about, tracks = found.iloc[0][[*RECORDING_WORDS]], found.set_index("track")[[*METRICS]]
+        recordings[name] = {**about, "tracks": tracks.to_dict("index")}
     return {"recordings": recordings, "conventions": {**RECORDING_WORDS, **words}}
 
 
@@ -229,24 +235,25 @@ def write_results(folder: Path, files: Files) -> list[Path]:
         folder.mkdir(exist_ok=True)
         with _locked(folder):
             for source in [new, *(path for path in new.iterdir() if path.is_dir())]:
-                target = folder / source.relative_to(new)
-                target.mkdir(exist_ok=True)
-                written = [path for path in source.iterdir() if path.is_file()]
-                stale = _results_in(target)
-                for path in written:
-                    path.replace(target / path.name)
-                for path in stale:
-                    if path.name not in {file.name for file in written}:
-                        _remove(path)
+                _move_results(source, folder / source.relative_to(new))
         shutil.rmtree(new)
     return [folder / name for name in files]
 
 
-def _results_in(folder: Path) -> list[Path]:
-    """Return the results of earlier runs in a folder, the files that mark them last."""
-    marks = [mark for mark in RESULTS if (folder / mark).exists()]
-    names = dict.fromkeys(name for mark in marks for name in RESULTS[mark] if name not in marks)
-    return [folder / name for name in (*names, *marks) if (folder / name).exists()]
+def _move_results(source: Path, target: Path) -> None:
+    """Move files into a folder, and remove results of earlier runs, files that mark these last."""
+    target.mkdir(exist_ok=True)
+    marks = [mark for mark in RESULTS if (target / mark).exists()]
+    stale = dict.fromkeys([*(name for mark in marks for name in RESULTS[mark]), *marks])
+    for path in [path for path in source.iterdir() if path.is_file()]:
+        path.replace(target / path.name)
+        stale.pop(path.name, None)
+    try:
+        for name in sorted(stale, key=marks.__contains__):
+            (target / name).unlink(missing_ok=True)
+    except OSError as error:
+        reason = error.strerror or "an error"
+        raise InputError(str(target / name), reason, "a file that can be replaced") from error
 
 
 @contextmanager
@@ -262,11 +269,3 @@ def _locked(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
-
-
-def _remove(path: Path) -> None:
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        reason = error.strerror or "an error"
-        raise InputError(str(path), reason, "a file that can be replaced") from error

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -24,7 +22,7 @@ from stario.fusion.evaluation.compare import (
 )
 from stario.fusion.evaluation.known_positions import position_error_words
 from stario.fusion.evaluation.results import metrics_dict
-from stario.fusion.evaluation.scores import Column, rows_of
+from stario.fusion.evaluation.scores import Column, table
 from stario.sequences.arrays import check_type
 from stario.sequences.drawing.figures import distance
 from stario.sequences.drawing.text_table import aligned, figure
@@ -144,20 +142,13 @@ class _WithFit(Column):
         return f"{super().text(scores)} ({figure(fitted, self.form)})"
 
 
-def _columns(over: Callable[..., Any]) -> list[Column]:
-    others = {
-        "NIS": ("filtered", "nis_mean"),
-        "filtered NEES": ("filtered", "nees_median"),
-        "track NEES": ("track", "nees_median"),
-    }
-    return [
-        *(
-            _WithFit(title, "ate_m", over=over, where={"track": t})
-            for t, title in TRACK_TITLES.items()
-        ),
-        *(Column(title, m, over=over, where={"track": t}) for title, (t, m) in others.items()),
-    ]
-
+_COLUMNS = [
+    *(_WithFit(title, "ate_m", track=track) for track, title in TRACK_TITLES.items()),
+    Column("NIS", "nis_mean", track="filtered"),
+    Column("filtered NEES", "nees_median", track="filtered"),
+    Column("track NEES", "nees_median", track="track"),
+]
+"""Columns of a summary, of rows that have each track once."""
 
 _MIN_COVERAGE = 0.5
 """Share of a track at which the truth is known below which a recording does not count in medians
@@ -169,12 +160,10 @@ def summary(scores: pd.DataFrame) -> dict[str, object]:
 
     Medians and means leave out recordings whose truth is known for less than half of the track.
     """
-    known = _counted(scores).dropna()
-    known = known[known["metric"].isin([m for m in METRICS if not m.startswith("seconds_")])]
-    over = known.groupby(["track", "metric"], sort=False)["value"].agg(["median", "mean"])
-    means: dict[str, dict[str, object]] = {track: {} for track in TRACKS}
-    for (track, metric), row in over.iterrows():
-        means[track][metric] = row.to_dict()
+    figures = [name for name in METRICS if not name.startswith("seconds_")]
+    over = _counted(scores).groupby("track")[figures].agg(["median", "mean"]).reindex([*TRACKS])
+    known = {track: row.unstack(sort=False).dropna() for track, row in over.iterrows()}
+    means = {track: table.to_dict("index") for track, table in known.items()}
     return metrics_dict(scores) | {"over_recordings": means}
 
 
@@ -188,37 +177,28 @@ def summary_table(scores: pd.DataFrame) -> str:
         InputError: they are of another type.
     """
     check_type("scores", scores, pd.DataFrame, "pandas.concat of `Comparison.scores` returns one")
-    coverage, parts = _coverage(scores), []
+    rows = []
     for name, part in scores.groupby("recording", sort=False):
-        share = coverage.get(name, 1.0)
-        known = f" (truth of {share:.0%})" if share < FULL_COVERAGE else ""
-        parts.append((f"{name}{known}", part))
-    rows, counted = rows_of(parts, _columns(np.mean), ""), _counted(scores)
-    for name, over in (("median", np.median), ("mean", np.mean)):
-        rows += rows_of([(name, counted)], _columns(over), "")[1:]
-    lines = aligned(rows)
-    if (coverage < _MIN_COVERAGE).any():
-        least = f"{_MIN_COVERAGE:.0%}"
-        lines.append(f"median and mean without recordings whose truth covers less than {least};")
-    words = METRIC_WORDS
-    return "\n".join(
-        [
-            *lines,
-            f"ATE in m: {words['ate_m']};",
-            f"in parentheses {words['ate_fit_m']};",
-            f"horizontal: {words['horizontal']};",
-            f"NIS: {words['nis_mean']};",
-            f"NEES: {words['nees_median']}; alignment: {words['alignment']}.",
-        ]
-    )
-
-
-def _coverage(scores: pd.DataFrame) -> pd.Series[float]:
-    """Return the smallest share of a track at which the truth is known, by recording."""
-    return scores[scores["metric"] == "coverage"].groupby("recording")["value"].min()
+        coverage = part["coverage"].min()
+        known = f" (truth of {coverage:.0%})" if coverage < FULL_COVERAGE else ""
+        rows.append((f"{name}{known}", part))
+    counted = _counted(scores)
+    over = counted.groupby("track")[[*METRICS]]
+    rows += [(name, over.agg(name).reset_index()) for name in ("median", "mean")]
+    least, words = f"{_MIN_COVERAGE:.0%}", METRIC_WORDS
+    left_out = f"median and mean without recordings whose truth covers less than {least};"
+    notes = [
+        *([left_out] if len(counted) < len(scores) else []),
+        f"ATE in m: {words['ate_m']};",
+        f"in parentheses {words['ate_fit_m']};",
+        f"horizontal: {words['horizontal']};",
+        f"NIS: {words['nis_mean']};",
+        f"NEES: {words['nees_median']}; alignment: {words['alignment']}.",
+    ]
+    return table(rows, _COLUMNS, ("",), notes)
 
 
 def _counted(scores: pd.DataFrame) -> pd.DataFrame:
     """Return the figures of the recordings that count in medians and means."""
-    coverage = _coverage(scores)
-    return scores[~scores["recording"].isin(coverage.index[coverage < _MIN_COVERAGE])]
+    coverage = scores.groupby("recording")["coverage"].transform("min")
+    return scores[~(coverage < _MIN_COVERAGE)]

@@ -1,7 +1,7 @@
 """Runs of the table: a network trained and tested on a data set with a seed, kept as files.
 
 `<out>/<set>/<network>/<n>-steps/seed-<n>/` holds the model and `trained.json` once training is
-done, then `scores.json`. Repeating a run adds only what is missing.
+done, then `tested.json`. Repeating a run adds only what is missing.
 """
 
 from __future__ import annotations
@@ -20,9 +20,8 @@ from time import process_time
 
 import pandas as pd
 
-from stario.fusion.evaluation.bootstrap import block_rows
 from stario.fusion.evaluation.compare import TRACK_TITLES
-from stario.fusion.evaluation.displacement_error import BLOCK_SECONDS
+from stario.fusion.evaluation.displacement_error import BLOCK_SECONDS, FIGURES
 from stario.fusion.evaluation.groups import alone_on
 from stario.fusion.evaluation.pedestrian import NAME as PDR
 from stario.fusion.evaluation.pedestrian import (
@@ -31,7 +30,7 @@ from stario.fusion.evaluation.pedestrian import (
     model_named,
     pedestrian_track,
 )
-from stario.fusion.evaluation.scores import COLUMNS, joined, scored
+from stario.fusion.evaluation.scores import LABELS, joined, scored
 from stario.fusion.evaluation.tracks import network_track, network_track_true_attitude, true_poses
 from stario.fusion.navigator import Navigator
 from stario.fusion.paper_table.sets import ALL, FIRST, DataSet
@@ -111,17 +110,10 @@ def _weights_sha256(name: str) -> str:
     return load_model(name).card.sha256
 
 
-def reference_rows(dataset: DataSet) -> tuple[str, ...]:
-    """Return the references that are compared with the networks trained on a set.
-
-    The default weights were trained on the groups that `ALL` holds out; the first-stage weights,
-    of the same architecture, were not.
-    """
-    return (PDR, "first-stage") if dataset.name == ALL else (PDR, "default")
-
-
 def complete_run(run: Run, out: Path, reading: ReaderConfig) -> Run:
     """Train and evaluate a run, except for what is already done.
+
+    Every process that takes part must be able to write to `out`.
 
     Raises:
         ConfigError: existing results were made with another recipe, other weights or other
@@ -129,16 +121,18 @@ def complete_run(run: Run, out: Path, reading: ReaderConfig) -> Run:
         InputError: the network cannot be trained.
     """
     folder = run.folder(out)
-    if _read_if_done(run, folder / "scores.json") is not None:
+    if _read_if_done(run, folder / "tested.json") is not None:
         return run
     folder.mkdir(parents=True, exist_ok=True)
     if run.recipe is not None and _read_if_done(run, folder / "trained.json") is None:
-        trained = train_run(run.dataset, run.recipe, folder, reading)
-        write_json(folder / "trained.json", {"cell": run.digest, **trained})
+        result = train_run(run.dataset, run.recipe, folder, reading)
+        write_json(folder / "trained.json", {"cell": run.digest, **result})
         for spare in TEMPORARY_FILES:
             (folder / spare).unlink(missing_ok=True)
     began = process_time()
-    scores, blocks, drawn, skipped = test_scores(run, _model(run, folder), reading)
+    trained = run.network in ARCHITECTURES
+    model = load_model(folder / "model.safetensors") if trained else model_named(run.network)
+    scores, blocks, drawn, skipped = test_scores(run, model, reading)
     content = {
         "cell": run.digest,
         "network": run.network,
@@ -149,18 +143,18 @@ def complete_run(run: Run, out: Path, reading: ReaderConfig) -> Run:
         "drawn": drawn,
         "skipped": [asdict(failure) for failure in skipped],
     }
-    write_json(folder / "scores.json", content)
+    write_json(folder / "tested.json", content)
     return run
 
 
 def read_run(run: Run, out: Path) -> dict[str, object] | None:
-    """Return the content of a run's `scores.json` and `trained.json`; None if it is not completed.
+    """Return the content of a run's `tested.json` and `trained.json`; None if it is not completed.
 
     Raises:
         ConfigError: it was completed with another recipe, other weights or other recordings.
     """
     folder = run.folder(out)
-    content = _read_if_done(run, folder / "scores.json")
+    content = _read_if_done(run, folder / "tested.json")
     if content is None or run.recipe is None:
         return content
     return content | {"trained": _read(folder / "trained.json")}
@@ -182,16 +176,16 @@ def test_scores(
     groups = {entry.path: entry.group for entry in run.dataset.test}
     work = partial(_recording, network=run.network, model=model, read=reading.read, groups=groups)
     skipped: list[Skipped] = []
-    scores = [scored("", {}, network="")]
-    blocks = [block_rows([], set="", group="", recording="", network="", seed=0, metric="")]
+    scores = [pd.DataFrame(columns=[*LABELS, "path_m"])]
+    blocks = [pd.DataFrame(columns=["squares", "count", "block", "metric", "set", *LABELS[:2]])]
     drawn: dict[str, Drawn] = {}
     for figures, squares, track in without_skipped(each(work, groups, 1), skipped):
         scores.append(figures)
         blocks.append(squares)
         if track and len(drawn) < MAX_DRAWN:
             drawn[figures["recording"].iloc[0]] = track
-    tables = (joined(tables).assign(seed=run.seed) for tables in (scores, blocks))
-    return *tables, drawn, skipped
+    of_run = {"network": run.network, "seed": run.seed}
+    return *(joined(tables).assign(**of_run) for tables in (scores, blocks)), drawn, skipped
 
 
 def _recording(
@@ -201,25 +195,25 @@ def _recording(
     read: Callable[[Path], ImuSequence],
     groups: Mapping[Path, str],
 ) -> tuple[pd.DataFrame, pd.DataFrame, Drawn]:
-    sequence = read(path)
+    sequence, drawn = read(path), {}
     found, blocks = alone_on(sequence, path, groups[path], lambda *_: model, [network])
-    found = found.assign(track=found["truth"], network=network)
-    scores, drawn = [found[[*COLUMNS, "network"]]], {}
+    unit = found[["set", "group", "recording"]].iloc[0]
+    scores = [found.assign(track=found["truth"])[[*LABELS, "path_m", *FIGURES]]]
     if sequence.truth is not None:
-        unit = {key: found[key].iloc[0] for key in ("set", "group", "recording", "network")}
         tracks, poses = _protocol_errors(model, sequence)
-        scores.append(scored(str(path), tracks, unit["group"], network=network))
+        scores.append(scored(str(path), tracks, unit["group"]))
         if poses is not None:
-            blocks = joined([blocks, _position_blocks(poses, **unit)])
+            blocks = joined([blocks, _position_blocks(poses).assign(**unit)])
             estimate, truth = (each.position_W[:, :2] for each in (poses.estimate, poses.truth))
             drawn = {"time": poses.estimate.time, "track": estimate, "truth": truth}
     return joined(scores), blocks, drawn
 
 
-def _position_blocks(poses: PoseErrors, **labels: str) -> pd.DataFrame:
+def _position_blocks(poses: PoseErrors) -> pd.DataFrame:
     since, squares = poses.estimate.time - poses.estimate.time[0], poses.position_W[:, :2] ** 2
-    sums = pd.Series(squares.sum(axis=1)).groupby(since // BLOCK_SECONDS).agg(["sum", "count"])
-    return block_rows(sums.to_numpy(), seed=0, metric="ate", **labels)
+    errors = pd.Series(squares.sum(axis=1)).groupby(since // BLOCK_SECONDS)
+    sums = errors.agg(squares="sum", count="count").reset_index(drop=True)
+    return sums.assign(block=sums.index, metric="ate")
 
 
 def _protocol_errors(
@@ -247,12 +241,6 @@ def _errors_of(track: Trajectory, truth: Trajectory) -> dict[str, float]:
     """Return the errors of a track, averaged as in the paper."""
     result = evaluate_track(track, truth, convention="ronin")
     return {"ate_m": result.ate_m, "rte_m": result.rte_m, "pde": result.pde}
-
-
-def _model(run: Run, folder: Path) -> Model:
-    if run.network in ARCHITECTURES:
-        return load_model(folder / "model.safetensors")
-    return model_named(run.network)
 
 
 def _read_if_done(run: Run, path: Path) -> dict[str, object] | None:
@@ -303,21 +291,12 @@ def table_runs(
     for part in (first, others):
         for seed, dataset in product(range(seeds), part):
             if seed == 0:
-                runs += [Run(dataset, name, 0, None) for name in reference_rows(dataset)]
+                # Unlike the default weights, these know none of the groups that `ALL` holds out.
+                weights = "first-stage" if dataset.name == ALL else "default"
+                runs += [Run(dataset, name, 0, None) for name in (PDR, weights)]
             for name in leading if seed else names:
                 runs.append(Run(dataset, name, seed, run_recipe(recipe, name, seed, steps)))
     return runs
-
-
-def complete(
-    runs: Sequence[Run], out: Path, reading: ReaderConfig, jobs: int | None = 1
-) -> Iterator[Run | Skipped]:
-    """Do what is missing; yield each run once it is completed, or the reason why it is not.
-
-    Runs are started in their order; `out` must be writable by every process that takes part.
-    `jobs` is as for `stario.sequences.datasets.batch.each`.
-    """
-    return each(partial(complete_run, out=out, reading=reading), runs, jobs)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ import pandas as pd
 
 from stario.fusion.evaluation.bootstrap import Interval, ranks
 from stario.fusion.evaluation.pedestrian import NAME as PDR
-from stario.fusion.evaluation.scores import joined, over_seeds, scored
+from stario.fusion.evaluation.scores import LABELS, joined, over_seeds, scored
 from stario.fusion.paper_table.figures import write_figures
 from stario.fusion.paper_table.runs import (
     FILTERED,
@@ -29,7 +29,7 @@ from stario.network.runtime.survey import BATCHES, ModelRow, survey
 from stario.network.training.config import TrainingConfig
 from stario.sequences.accuracy.metrics import CONVENTIONS
 from stario.sequences.drawing.text_table import figure, markdown
-from stario.sequences.files import atomic_write, write_json, write_rows
+from stario.sequences.files import atomic_write, write_json
 
 REFERENCE_NETWORK = "StarIO"
 """Reference network that the others' errors are compared with."""
@@ -75,32 +75,18 @@ class SetTable:
         rows: networks, in order, with their `seeds`, the number of test recordings that given
             weights were trained on (`learned`), mean and standard error over seeds of each of
             `COLUMNS` ("ate", "ate_sem"; NaN if unknown), and the columns of `bootstrap.ranks`.
-        tested: number of tested recordings.
-        path_m: total length of their true paths [m].
-        measure: the error that networks are ranked by, in words.
-        skipped: reasons why recordings were skipped, each once.
+        about: the split in words, numbers of recordings, the length of the tested paths [m], the
+            error that networks are ranked by, and the reasons why recordings were skipped.
     """
 
     dataset: DataSet
     scores: pd.DataFrame
     rows: pd.DataFrame
-    tested: int
-    path_m: float
-    measure: str
-    skipped: list[str]
+    about: dict[str, Any]
 
     def as_dict(self) -> dict[str, object]:
         """Return the set's part of `table.json`."""
-        return {
-            "split": self.dataset.words,
-            "training": len(self.dataset.training),
-            "validation": len(self.dataset.validation),
-            "tested": self.tested,
-            "path_m": self.path_m,
-            "ranks_by": self.measure,
-            "rows": self.rows.to_dict("records"),
-            "skipped": self.skipped,
-        }
+        return self.about | {"rows": self.rows.to_dict("records")}
 
 
 def completed_runs(runs: Iterable[Run], out: Path) -> dict[str, list[Mapping[str, Any]]]:
@@ -121,7 +107,7 @@ def set_table(
 ) -> SetTable:
     """Return a set's table, given the recordings that packaged weights have `learned`, by name."""
     scores = _scores(completed)
-    paths = scores[scores["metric"] == "path_m"]
+    paths = scores.dropna(subset="path_m")
     measure = "ate" if set(paths["track"]) <= {"poses"} else "rms_10s_m"
     names = [content["network"] for content in completed]
     tested = paths.drop_duplicates("recording")
@@ -129,10 +115,15 @@ def set_table(
     means = over_seeds(scores)
     blocks = joined(pd.DataFrame(content["blocks"]) for content in completed)
     ranked = ranks(blocks[blocks["metric"] == measure], REFERENCE_NETWORK)
+    ranked.loc[ranked["network"] == REFERENCE_NETWORK, "ratio"] = None
     rows = pd.DataFrame(
         {"network": name, "seeds": sorted(c["seed"] for c in completed if c["network"] == name)}
         | {"learned": len(test & learned.get(name, set()))}
-        | _means(means, name)
+        | {
+            f"{key}{suffix}": means[of].get((name, track, metric), np.nan)
+            for key, (_, track, metric) in COLUMNS.items()
+            for suffix, of in (("", "mean"), ("_sem", "sem"))
+        }
         for name in sorted(set(names), key=[PDR, *ARCHITECTURES, *names].index)
     )
     failures = [
@@ -140,21 +131,16 @@ def set_table(
         for content in completed
         for failure in [*content["skipped"], *content.get("trained", {}).get("skipped", [])]
     ]
-    return SetTable(
-        dataset,
-        scores,
-        rows.merge(ranked, "left"),
-        len(tested),
-        float(tested["value"].sum()),
-        _MEASURES[measure],
-        list(dict.fromkeys(f"{failure['item']}: {failure['reason']}" for failure in failures)),
-    )
-
-
-def _means(means: pd.DataFrame, network: str) -> dict[str, float]:
-    found = means.reindex([(network, track, metric) for _, track, metric in COLUMNS.values()])
-    rows = zip(COLUMNS, found["mean"], found["sem"], strict=True)
-    return {k: v for key, mean, error in rows for k, v in ((key, mean), (f"{key}_sem", error))}
+    about = {
+        "split": dataset.words,
+        "training": len(dataset.training),
+        "validation": len(dataset.validation),
+        "tested": len(tested),
+        "path_m": float(tested["path_m"].sum()),
+        "ranks_by": _MEASURES[measure],
+        "skipped": [*dict.fromkeys(f"{each['item']}: {each['reason']}" for each in failures)],
+    }
+    return SetTable(dataset, scores, rows.merge(ranked, "left"), about)
 
 
 def _scores(completed: Completed) -> pd.DataFrame:
@@ -165,9 +151,10 @@ def _scores(completed: Completed) -> pd.DataFrame:
             errors = {key: trained[key] for key in ("training_error_m2", "validation_error_m2")}
             run = {key: content[key] for key in ("network", "seed")}
             found.append(scored("", {"trained": errors}, **run))
-    table = joined(found).astype({"value": float})
-    table.loc[table["metric"] == "pde", "value"] *= 100.0
-    return table
+    table = joined(found).set_index([*LABELS, "network", "seed"]).astype(float)
+    if "pde" in table:
+        table["pde"] *= 100.0
+    return table.reset_index()
 
 
 def work_of(tables: Iterable[Completed]) -> pd.DataFrame:
@@ -230,12 +217,10 @@ def write_results(
         "conventions": WORDS,
     }
     write_json(out / "table.json", content)
-    means = [
-        {"set": name, **row[["network", "rank", *COLUMNS]].dropna(), "seeds": len(row["seeds"])}
-        for name, table in tables.items()
-        for _, row in table.rows.iterrows()
-    ]
-    write_rows(out / "table.csv", means)
+    rows = pd.concat({name: table.rows for name, table in tables.items()}, names=["set"])
+    means = rows.assign(seeds=rows["seeds"].map(len))[["network", "rank", *COLUMNS, "seeds"]]
+    with atomic_write(out / "table.csv") as file:
+        means.dropna(axis=1, how="all").droplevel(1).to_csv(file)
     for name, table in tables.items() if drawn else ():
         scores = table.scores
         known = set(scores.loc[scores["track"] == TRUE_ATTITUDE, "network"])
@@ -279,7 +264,7 @@ def table_text(
 
 
 def _set_text(table: SetTable) -> str:
-    dataset, known = table.dataset, table.rows[[*COLUMNS]].notna().any()
+    about, known = table.about, table.rows[[*COLUMNS]].notna().any()
     columns = [key for key in COLUMNS if known[key]]
     titles = ["network", *(COLUMNS[key][0] for key in columns), "seeds", "rank"]
     lines = [[*titles, f"error / {REFERENCE_NETWORK}'s", "paper: ATE, RTE [m]"]]
@@ -289,25 +274,20 @@ def _set_text(table: SetTable) -> str:
             rank = "{rank:.0f} [{rank_low:.0f}, {rank_high:.0f}]".format(**row)
         if isinstance(row["ratio"], Interval):
             ratio = f"{row['ratio']:.2f}"
-        if paper := published(dataset.name, row["network"]):
+        if paper := published(table.dataset.name, row["network"]):
             errors = "{:.3f}, {:.3f}".format(*paper)
         cells = [_mean(row[key], row[f"{key}_sem"]) for key in columns]
-        title = _title(row, table.tested)
+        title = _title(row, about["tested"])
         lines.append([title, *cells, str(len(row["seeds"])), rank, ratio, errors])
-    return "\n".join(
-        [
-            f"### {dataset.title}",
-            "",
-            f"{len(dataset.training)} recordings for training, {len(dataset.validation)} for "
-            f"validation, {table.tested} for testing ({table.path_m:.0f} m); {dataset.words}. "
-            "Ranks and ratios are based on the geometric mean over recordings of the "
-            f"{table.measure}.",
-            "",
-            *markdown(lines),
-            *(["", f"Skipped: {len(table.skipped)} recordings, listed in `table.json`."]
-              if table.skipped else []),
-        ]
-    )  # fmt: skip
+    words = (
+        "{training} recordings for training, {validation} for validation, {tested} for testing "
+        "({path_m:.0f} m); {split}. Ranks and ratios are based on the geometric mean over "
+        "recordings of the {ranks_by}."
+    ).format(**about)
+    text = [f"### {table.dataset.title}", "", words, "", *markdown(lines)]
+    if skipped := about["skipped"]:
+        text += ["", f"Skipped: {len(skipped)} recordings, listed in `table.json`."]
+    return "\n".join(text)
 
 
 def _mean(mean: float, error: float) -> str:

@@ -106,7 +106,10 @@ def train_run(
         folder,
         on_epoch=lambda report: write_json(clock, before + process_time() - began),
     )
-    reports = _reports(folder / "log.json")
+    rows: list[dict[str, Any]] = json.loads((folder / "log.json").read_text(encoding="utf-8"))
+    for row in rows:  # in JSON, errors that are not finite are null
+        row.update({name: math.nan for name, value in row.items() if value is None})
+    reports = [EpochReport(**row) for row in rows]
     return {
         "steps": recipe.steps,
         "windows_per_s": float(np.mean([report.windows_per_second for report in reports])),
@@ -116,14 +119,6 @@ def train_run(
         "recipe": asdict(recipe),
         "skipped": [asdict(failure) for failure in skipped + missing],
     }
-
-
-def _reports(log: Path) -> list[EpochReport]:
-    """Return the reports of a run's epochs; in JSON, errors that are not finite are null."""
-    rows: list[dict[str, Any]] = json.loads(log.read_text(encoding="utf-8"))
-    for row in rows:
-        row.update({name: math.nan for name, value in row.items() if value is None})
-    return [EpochReport(**row) for row in rows]
 
 
 def recipe_digest(recipe: TrainingConfig, dataset: DataSet) -> str:

@@ -16,17 +16,12 @@ from stario.fusion.values.health import Health
 from stario.sequences.attitude.levelling import START_SECONDS
 from stario.sequences.findings import TOO_EARLY, Finding
 
-DROPPED_SHARE = 0.01
-"""Share of dropped samples above which to warn."""
+DROPPED_SHARE, FLAGGED_SHARE = 0.01, 1e-3
+"""Shares of dropped samples, and of spikes and saturated ones, above which to warn."""
 
-FLAGGED_SHARE = 1e-3
-"""Share of spikes and saturated samples above which to warn."""
-
-GATED_SHARE = 0.1
-"""Share of updates treated as outliers above which to warn."""
-
-BEARINGS_SHARE = 0.25
-"""Share of the magnetic bearings that contradict the gyroscope above which to warn."""
+GATED_SHARE, BEARINGS_SHARE = 0.1, 0.25
+"""Shares of updates treated as outliers, and of the magnetic bearings that contradict the
+gyroscope, above which to warn."""
 
 MIN_UPDATES = 20
 """Number of the network's displacements, or of bearings, below which nothing is said about them:
@@ -65,43 +60,45 @@ def health_findings(health: Health) -> list[Finding]:
         found += [*_flagged(health), *_network(health)]
     elif health.zero_velocity.get("applied", 0) < _RESTING:
         text = "Too early to judge the motion: it takes ten seconds of it."
-        found += [*_flagged(health), _note(TOO_EARLY, text)]
+        found += [*_flagged(health), _found(TOO_EARLY, text)]
     found += [*_floors(health), *_corrections(health), *_field(health)]
     found += [*_fixes(health), *_direction(health)]
     notes = (f"{note[:1].upper()}{note[1:]}." for note in health.notes)
     return found + [Finding(f"note_{k}", note) for k, note in enumerate(notes)]
 
 
-def _note(code: str, text: str, values: Mapping[str, object] | None = None) -> Finding:
-    return Finding(code, text, level="note", values=values or {})
+def _found(
+    code: str, text: str, advice: str = "", values: Mapping[str, object] | None = None
+) -> Finding:
+    """Return a finding: a warning if there is something to do, else a note."""
+    return Finding(code, text, advice, "warning" if advice else "note", values or {})
 
 
 def _clock(health: Health) -> Iterator[Finding]:
-    if health.set_back:
-        yield Finding(
-            "clock_set_back",
-            f"The recording's clock was set back by {health.set_back:.3g} s: the track ends there.",
-            "Split the recording there and run each part separately.",
-            values={"by_s": health.set_back},
-        )
-    elif health.longest_late > _LATE_S:
+    late = health.longest_late
+    if by := health.set_back:
+        text = f"The recording's clock was set back by {by:.3g} s: the track ends there."
+        advice = "Split the recording there and run each part separately."
+        yield _found("clock_set_back", text, advice, {"by_s": by})
+    elif late > _LATE_S:
         text = (
-            f"Samples arrived late for {health.longest_late:.1f} s in a row: logged twice, or "
-            "from a clock that was set back; if so, that time is missing, and counts as a gap."
+            f"Samples arrived late for {late:.1f} s in a row: logged twice, or from a clock that "
+            "was set back; if so, that time is missing, and counts as a gap."
         )
-        yield _note("samples_late", text, {"longest_s": health.longest_late})
+        yield _found("samples_late", text, values={"longest_s": late})
 
 
 def _stopped(health: Health) -> Iterator[Finding]:
     for sensor, count in health.stopped.items():
         other = "accelerometer" if sensor == "gyroscope" else "gyroscope"
-        yield Finding(
-            f"{sensor}_stopped",
+        text = (
             f"The {sensor} stopped: it repeats its value in {count} samples in which the {other} "
-            "shows motion; they were dropped.",
-            "Restart the device and record again; if it recurs, the sensor or the app is faulty.",
-            values={"samples": count},
+            "shows motion; they were dropped."
         )
+        advice = (
+            "Restart the device and record again; if it recurs, the sensor or the app is faulty."
+        )
+        yield _found(f"{sensor}_stopped", text, advice, {"samples": count})
 
 
 def _samples(health: Health) -> Iterator[Finding]:
@@ -111,8 +108,10 @@ def _samples(health: Health) -> Iterator[Finding]:
         dropped.pop("out_of_order", None)  # told already
     if health.stopped:
         dropped.pop("frozen", None)
+    if not dropped:
+        return
     count = sum(dropped.values())
-    share = count / max(1, used + count)
+    share = count / (used + count)
     amount = f"{share:.1%}" if share >= 0.001 else "Fewer than 0.1%"
     text = f"{amount} of the samples were dropped ({_counted(dropped)})."
     advice = "Log gyroscope and accelerometer at the same rate, and close other apps."
@@ -123,10 +122,7 @@ def _samples(health: Health) -> Iterator[Finding]:
         )
     elif dropped.get("out_of_order", 0) > 0.5 * count:
         advice = "`stario inspect` says when: sort the rows, or split the recording there."
-    if share > DROPPED_SHARE:
-        yield Finding("samples_dropped", text, advice, values=dropped)
-    elif dropped:
-        yield _note("samples_dropped", text, dropped)
+    yield _found("samples_dropped", text, advice if share > DROPPED_SHARE else "", dropped)
 
 
 def _flagged(health: Health) -> Iterator[Finding]:
@@ -134,6 +130,8 @@ def _flagged(health: Health) -> Iterator[Finding]:
     if sum(health.flagged.values()) <= FLAGGED_SHARE * max(1, health.samples.get("used", 0)):
         return
     counted = _counted(health.flagged)
+    text = f"Samples that motion cannot explain: {counted}."
+    advice = "Hold or strap the device more firmly, or choose a larger sensor range."
     if health.updates >= MIN_UPDATES and health.gated > GATED_SHARE * health.updates:
         text = (
             f"This track cannot be trusted: the device was shaken or struck beyond its sensors' "
@@ -141,10 +139,7 @@ def _flagged(health: Health) -> Iterator[Finding]:
             "displacements contradict the IMU."
         )
         advice = "Record a walk with the device held or strapped firmly."
-    else:
-        text = f"Samples that motion cannot explain: {counted}."
-        advice = "Hold or strap the device more firmly, or choose a larger sensor range."
-    yield Finding("samples_flagged", text, advice, values=health.flagged)
+    yield _found("samples_flagged", text, advice, health.flagged)
 
 
 def _gaps(health: Health) -> Iterator[Finding]:
@@ -152,13 +147,10 @@ def _gaps(health: Health) -> Iterator[Finding]:
         return
     amount = f"{health.gap_count} gaps" if health.gap_count > 1 else "1 gap"
     text = f"{amount} in the samples (longest: {health.longest_gap:.2f} s)."
-    values = {"count": health.gap_count, "longest_s": health.longest_gap}
     logger = "Keep the logger in the foreground and exempt it from battery saving"
-    if health.longest_gap > INTERPOLATED:
-        restore = "a yaw fix or position fixes after the gap restore the heading"
-        yield Finding("gaps", text, f"{logger}; {restore}.", values=values)
-    else:
-        yield _note("gaps", text, values)
+    restore = f"{logger}; a yaw fix or position fixes after the gap restore the heading."
+    values = {"count": health.gap_count, "longest_s": health.longest_gap}
+    yield _found("gaps", text, restore if health.longest_gap > INTERPOLATED else "", values)
     gaps = [(start, length) for start, length in health.gaps if length > BRIDGED]
     between = [b - (a + length) for (a, length), (b, _) in pairwise(gaps)]
     if short := sum(seconds < START_SECONDS for seconds in between):
@@ -167,7 +159,7 @@ def _gaps(health: Health) -> Iterator[Finding]:
             "suffice to level the attitude: the track leaves them out."
         )
         advice = f"{logger}; over Bluetooth, lower the rate."
-        yield Finding("short_stretches", text, advice, values={"count": short})
+        yield _found("short_stretches", text, advice, {"count": short})
 
 
 def _network(health: Health) -> Iterator[Finding]:
@@ -178,77 +170,79 @@ def _network(health: Health) -> Iterator[Finding]:
             "If the sensors' axes and signs are right, the weights do not know this motion "
             f"(carrying, running, wheels): {_CARRY}."
         )
-        yield Finding("network_contradicts", text, advice, values={"share": gated})
+        yield _found("network_contradicts", text, advice, {"share": gated})
     ratio = health.mean_nis / health.nis_expected
     nis = f"mean NIS {health.mean_nis:.2g}, expected {health.nis_expected:.0f}"
     if ratio > NIS_RATIO:
         text = f"The network and the IMU disagree by more than their sigmas allow ({nis})."
         advice = f"The track's sigmas are too small by a factor of about {math.sqrt(ratio):.1f}."
-        yield Finding("network_sigma", text, advice, values={"nis_ratio": ratio})
+        yield _found("network_sigma", text, advice, {"nis_ratio": ratio})
     elif ratio < 1.0 / NIS_RATIO:
         text = (
             f"The network and the IMU agree more closely than their sigmas suggest ({nis}). It "
             "does not mean that the track's sigmas are too large: errors that last as long as the "
             "track do not show here."
         )
-        yield _note("network_sigma", text, {"nis_ratio": ratio})
+        yield _found("network_sigma", text, values={"nis_ratio": ratio})
     turn, sigma = health.network_turn, health.network_turn_sigma
     if abs(turn) > max(TURNED_RAD, 3.0 * sigma):
         degrees, spread = math.degrees(turn), math.degrees(sigma)
-        yield Finding(
-            "network_direction",
+        text = (
             f"The network's direction differs from the accelerometer's by {degrees:.0f} "
-            f"(+-{spread:.0f}) degrees: its track is turned by as much.",
-            f"The weights do not know this motion: {_CARRY}.",
-            values={"turn_deg": degrees, "sigma_deg": spread},
+            f"(+-{spread:.0f}) degrees: its track is turned by as much."
         )
+        advice = f"The weights do not know this motion: {_CARRY}."
+        values = {"turn_deg": degrees, "sigma_deg": spread}
+        yield _found("network_direction", text, advice, values)
 
 
 def _corrections(health: Health) -> Iterator[Finding]:
     if not health.corrections:
         return
     time, metres, turn, cause = max(health.corrections, key=lambda found: found[1])
-    count = len(health.corrections)
+    count, degrees = len(health.corrections), math.degrees(turn)
     at_once = "Once the track was" if count == 1 else f"{count} times the track was"
     text = (
         f"{at_once} corrected by more than 1 m or 10 degrees (the largest by {metres:.1f} m and "
-        f"{math.degrees(turn):.0f} degrees at {time:.1f} s: {cause})."
+        f"{degrees:.0f} degrees at {time:.1f} s: {cause})."
     )
     advice = "Until then a stream's track was wrong by as much; a recording's is smoothed."
-    values = {"count": count, "largest_m": metres, "turn_deg": math.degrees(turn), "at_s": time}
-    yield Finding("corrections", text, advice, values=values)
+    values = {"count": count, "largest_m": metres, "turn_deg": degrees, "at_s": time}
+    yield _found("corrections", text, advice, values)
 
 
 def _floors(health: Health) -> Iterator[Finding]:
-    if not health.floors:
-        return
-    ways = "; ".join(map(str, health.floors))
-    floors = [change._asdict() for change in health.floors]
-    yield _note("floors", f"{ways[0].upper()}{ways[1:]}.", {"floors": floors})
+    if health.floors:
+        ways = "; ".join(map(str, health.floors))
+        floors = [change._asdict() for change in health.floors]
+        yield _found("floors", f"{ways[0].upper()}{ways[1:]}.", values={"floors": floors})
 
 
 def _field(health: Health) -> Iterator[Finding]:
     offered = sum(n for name, n in health.bearings.items() if name != "gated")
     against = health.bearings.get("contradicts the gyroscope", 0)
     if offered >= MIN_UPDATES and against > BEARINGS_SHARE * offered:
-        yield Finding(
-            "bearings_contradict",
+        text = (
             f"{against} of {offered} bearings of the magnetic field contradict the gyroscope and "
-            "were not used.",
-            "Iron, a current or the device disturbs the field: walk elsewhere, or calibrate it.",
-            values={"contradicting": against, "offered": offered},
+            "were not used."
         )
+        advice = (
+            "Iron, a current or the device disturbs the field: walk elsewhere, or calibrate it."
+        )
+        values = {"contradicting": against, "offered": offered}
+        yield _found("bearings_contradict", text, advice, values)
     elif offered - health.bearings.get("applied", 0) > 0.5 * offered:
         text = f"The magnetic field was of little use ({_counted(health.bearings)})."
-        yield _note("field_useless", text, health.bearings)
+        yield _found("field_useless", text, values=health.bearings)
     if health.fields_dropped > _FIELDS_DROPPED:
         text = (
             f"{health.fields_dropped} magnetic fields were dropped: the sensor repeated its last "
             "value, or their times or values are wrong."
         )
-        yield _note("fields_dropped", text, {"count": health.fields_dropped})
+        yield _found("fields_dropped", text, values={"count": health.fields_dropped})
     if refused := _counted(health.refused):
-        yield _note("displacements_refused", f"Displacements not used: {refused}.", health.refused)
+        text = f"Displacements not used: {refused}."
+        yield _found("displacements_refused", text, values=health.refused)
 
 
 def _fixes(health: Health) -> Iterator[Finding]:
@@ -256,34 +250,32 @@ def _fixes(health: Health) -> Iterator[Finding]:
         return
     applied = health.fixes.get("applied", 0)
     other = {name: n for name, n in health.fixes.items() if name != "applied" and n}
-    text = "1 fix applied" if applied == 1 else f"{applied} fixes applied"
-    if not other:
-        yield _note("fixes", f"{text}.", health.fixes)
-        return
     harmless = ("gated", "waiting", "yaw not known")
     refused = sum(n for name, n in other.items() if name not in harmless)
-    wrong = refused or other.get("gated", 0) > GATED_SHARE * applied
+    wrong = bool(refused or other.get("gated", 0) > GATED_SHARE * applied)
     advice = "Check the fixes' clock, frame, units and sigmas." if wrong else ""
     if not wrong and other.get("yaw not known", 0) > applied:
         advice = f"Two positions {_APART} give the heading; so does a yaw fix."
-    text = f"{text}; {_counted(other)}."
+    text = "1 fix applied" if applied == 1 else f"{applied} fixes applied"
+    text += f"; {_counted(other)}." if other else "."
     yield Finding("fixes", text, advice, "warning" if wrong else "note", health.fixes)
 
 
 def _direction(health: Health) -> Iterator[Finding]:
     yaw = health.final_sigma.get("yaw_rad", 0.0)
-    if yaw > YAW_SIGMA:
-        text = f"The heading is known only to {math.degrees(yaw):.0f} degrees (1 sigma)."
-        if yaw >= LOST_YAW_SIGMA:
-            text = "The heading is lost."
-        advice = f"A yaw fix or two position fixes {_APART} determine it."
-        if health.longest_gap <= INTERPOLATED and yaw < LOST_YAW_SIGMA:
-            advice = (
-                "Keep still for two seconds now and then; a yaw fix or two position fixes "
-                f"{_APART} help too."
-            )
-        yield Finding("yaw_unknown", text, advice, values={"sigma_deg": math.degrees(yaw)})
+    if yaw <= YAW_SIGMA:
+        return
+    lost = yaw >= LOST_YAW_SIGMA
+    text = f"The heading is known only to {math.degrees(yaw):.0f} degrees (1 sigma)."
+    advice = f"A yaw fix or two position fixes {_APART} determine it."
+    if health.longest_gap <= INTERPOLATED and not lost:
+        advice = (
+            "Keep still for two seconds now and then; a yaw fix or two position fixes "
+            f"{_APART} help too."
+        )
+    text = "The heading is lost." if lost else text
+    yield _found("yaw_unknown", text, advice, {"sigma_deg": math.degrees(yaw)})
 
 
-def _counted(counts: dict[str, int]) -> str:
+def _counted(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in counts.items() if n)

@@ -4,7 +4,6 @@ from copy import deepcopy
 
 import pytest
 from simulated import Oracle, Still, cut_once, simulated_walk, without
-from training_runs import narrow
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -52,4 +51,6 @@ def _without():
 @pytest.fixture
 def narrow_network(monkeypatch):
     """Train a small StarIO in place of the whole one."""
+    from training_runs import narrow  # which imports torch, for seconds
+
     narrow(monkeypatch)

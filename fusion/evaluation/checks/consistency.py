@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from stario.fusion.evaluation.scores import joined, scored, wide
+from stario.fusion.evaluation.scores import joined, scored
 from stario.fusion.filter import estimator
 from stario.fusion.filter.correlated_errors import ACCEL_SHARE, displacement_errors
 from stario.fusion.filter.ekf_state import CONSIDERED_SECONDS
@@ -62,11 +62,10 @@ def summary(scores: pd.DataFrame, seconds: float) -> dict[str, Any]:
     `nees_bounds` are met by `nees_end` of a consistent filter in 95 of 100 trials, and nearly so by
     `nees`, since times are correlated.
     """
-    runs = wide(scores)
-    means = runs[["nees", "nees_end", "yaw", "nis"]].mean().to_dict()
-    sizes = np.sqrt((runs[["yaw_sigma", "yaw_error"]] ** 2).mean()).to_dict()
-    bounds = nees_bounds(CORE, len(runs))
-    return {"runs": len(runs), "seconds": seconds, **means, **sizes, "nees_bounds": bounds}
+    means = scores[["nees", "nees_end", "yaw", "nis"]].mean().to_dict()
+    sizes = np.sqrt((scores[["yaw_sigma", "yaw_error"]] ** 2).mean()).to_dict()
+    bounds = nees_bounds(CORE, len(scores))
+    return {"runs": len(scores), "seconds": seconds, **means, **sizes, "nees_bounds": bounds}
 
 
 def consistency_text(found: dict[str, Any]) -> str:

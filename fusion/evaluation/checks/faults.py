@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stario.fusion.evaluation.compare import navigators
-from stario.fusion.evaluation.scores import Column, joined, rows_of, scored
+from stario.fusion.evaluation.scores import Column, joined, scored, table
 from stario.fusion.evaluation.tracks import true_poses
 from stario.fusion.imu.inference import Predictor, WindowDisplacement
 from stario.fusion.navigator import Navigator
@@ -29,7 +29,6 @@ from stario.fusion.values.state import Track
 from stario.sequences.accuracy.metrics import align, evaluate_track
 from stario.sequences.arrays import even_grid, interpolated
 from stario.sequences.attitude.rotations import about_z, yaw_of
-from stario.sequences.drawing.text_table import aligned
 from stario.sequences.errors import InputError
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
@@ -64,19 +63,20 @@ class Fault:
 def faults(duration: float) -> list[Fault]:
     """Return every fault of the table, for a recording of this duration [s]."""
     half, block = 0.5 * duration, 5.0 / duration
+    gaps = {f"gap of {s:g} s": partial(gap, start=half, seconds=s) for s in (0.1, 1.0, 3.0)}
+    dropped = {f"{s:.0%} of samples dropped": partial(drops, share=s) for s in (0.05, 0.2)}
+    resampled = {f"{rate:g} Hz": partial(_resampled, rate=rate) for rate in (190.0, 500.0)}
+    nans = {
+        f"one NaN in {name}": partial(_one_nan, field=name) for name in ("time", "gyro", "accel")
+    }
     return [
         Fault("none"),
         Fault("network off by 1 m for 5 s", modify_predictions=partial(_offset_block, share=block)),
         Fault("5 % of windows off by 2 m", modify_predictions=_outliers),
         Fault("covariance 100 times too small", modify_predictions=_overconfident),
-        *(Fault(f"gap of {length:g} s", gap(half, length)) for length in (0.1, 1.0, 3.0)),
-        *(Fault(f"{share:.0%} of samples dropped", drops(share)) for share in (0.05, 0.2)),
-        *(Fault(f"{rate:g} Hz", partial(_resampled, rate=rate)) for rate in (190.0, 500.0)),
+        *(Fault(*item) for part in (gaps, dropped, resampled) for item in part.items()),
         Fault("accelerometer clipped", _clipped),
-        *(
-            Fault(f"one NaN in {field}", partial(_one_nan, field=field))
-            for field in ("time", "gyro", "accel")
-        ),
+        *(Fault(*item) for item in nans.items()),
         Fault("one NaN from the network", modify_predictions=partial(_nan_prediction, which=0)),
         Fault("one NaN in the covariance", modify_predictions=partial(_nan_prediction, which=1)),
         Fault("1 % duplicated, 1 % swapped", _reordered),
@@ -103,26 +103,20 @@ def _nan_prediction(mean: FloatArray, covariance: FloatArray, rng: Rng, which: i
     (mean, covariance)[which][len(mean) // 2] = np.nan
 
 
-def gap(start: float, seconds: float) -> ModifySamples:
+def gap(sequence: ImuSequence, rng: Rng, start: float, seconds: float) -> ImuSequence:
     """Remove `seconds` of samples, from `start` seconds after the first sample on."""
-
-    def modify_samples(sequence: ImuSequence, rng: Rng) -> ImuSequence:
-        since = sequence.time - sequence.time[0] - start
-        return sequence.select((since <= 0.0) | (since >= seconds))
-
-    return modify_samples
+    since = sequence.time - sequence.time[0] - start
+    return sequence.select((since <= 0.0) | (since >= seconds))
 
 
-def drops(share: float) -> ModifySamples:
+def drops(sequence: ImuSequence, rng: Rng, share: float) -> ImuSequence:
     """Remove a share of the samples at random."""
-    return lambda sequence, rng: sequence.select(rng.random(len(sequence)) >= share)
+    return sequence.select(rng.random(len(sequence)) >= share)
 
 
 def _resampled(sequence: ImuSequence, rng: Rng, rate: float) -> ImuSequence:
     time = even_grid(sequence.time[0], sequence.time[-1], 1.0 / rate)
-    gyro, accel = (
-        interpolated(time, sequence.time, values) for values in (sequence.gyro, sequence.accel)
-    )
+    gyro, accel = (interpolated(time, sequence.time, v) for v in (sequence.gyro, sequence.accel))
     return replace(sequence, time=time, gyro=gyro, accel=accel)
 
 
@@ -239,16 +233,11 @@ def fault_table(scores: pd.DataFrame) -> str:
         Column("end [m]", "end_error", ".3f"),
         Column("sigma [m]", "end_sigma", ".3f"),
     )
-    rows = list(scores.groupby(["group", "track"], sort=False))
-    lines = aligned(rows_of(rows, columns, "fault", "track"))
-    finite = Column("", "finite", over=np.min)
-    reports = [
-        ("" if finite.value(part) else "NOT FINITE, ") + part["reported"].iloc[0]
-        for _, part in rows
-    ]
-    return "\n".join(
-        f"{line}   {words}" for line, words in zip(lines, ["reported", *reports], strict=True)
-    )
+    rows = scores.groupby(["group", "track"], sort=False)
+    lines = table(rows, columns, ("fault", "track")).splitlines()
+    finite = np.where(scores["finite"] == 0.0, "NOT FINITE, ", "")
+    reports = ["reported", *(finite + scores["reported"])]
+    return "\n".join(f"{line}   {words}" for line, words in zip(lines, reports, strict=True))
 
 
 def reported(health: Health) -> str:

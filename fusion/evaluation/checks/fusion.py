@@ -17,10 +17,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from time import process_time
 
 import numpy as np
 import pandas as pd
+from scipy.stats import gmean
 
 from stario.fusion.backends import BackendName
 from stario.fusion.evaluation.checks.faults import (
@@ -36,10 +38,8 @@ from stario.fusion.evaluation.known_positions import MIN_POSITIONS, position_err
 from stario.fusion.evaluation.scores import (
     Column,
     by_track,
-    geometric_mean,
     median_degrees,
     parts,
-    quantile,
     scored,
     table,
 )
@@ -209,10 +209,6 @@ def _yaw_at_the_end(track: Track, truth: Trajectory) -> dict[str, float]:
     }
 
 
-def _percentile_95(ratios: FloatArray) -> float:
-    return float(np.exp(np.quantile(np.log(ratios), 0.95)))
-
-
 def fusion_gain_table(scores: pd.DataFrame) -> str:
     """Return a row for each group and track: ratios to the network, NIS, NEES, yaw at the end.
 
@@ -223,8 +219,8 @@ def fusion_gain_table(scores: pd.DataFrame) -> str:
         Column("n", "error_m", ".0f", len),
         Column("error m", "error_m"),
         Column("% of path", "percent", ".1f"),
-        Column("ratio", "ratio", over=geometric_mean),
-        Column("p95", "ratio", over=_percentile_95),
+        Column("ratio", "ratio", over=gmean),
+        Column("p95", "ratio", over=lambda r: np.exp(np.quantile(np.log(r), 0.95))),
         Column("worst", "ratio", over=np.max),
         Column("NIS", "nis", ".1f", np.mean),
         Column("NEES", "nees", ".1f"),
@@ -240,13 +236,13 @@ def fusion_gain_table(scores: pd.DataFrame) -> str:
         "NIS: mean, 3 expected; NEES of position: median, 2.4 expected; yaw: error at the end "
         "relative to the start",
         "s/min: processor time without the network per minute of data; slowest: update of a stream",
-        *_to_filtered(scores[scores["metric"] == "error_m"]),
+        *_to_filtered(scores),
     ]
     return table(by_track(scores), columns, ("group", "track"), notes)
 
 
-def _to_filtered(errors: pd.DataFrame) -> Iterator[str]:
-    by_name = errors.pivot_table("value", ["group", "recording"], "track", sort=False)
+def _to_filtered(scores: pd.DataFrame) -> Iterator[str]:
+    by_name = scores.pivot_table("error_m", ["group", "recording"], "track", sort=False)
     for name in by_name.columns.difference(["network", "filtered"], sort=False):
         logs = np.log(by_name[name] / by_name["filtered"])
         ratio = math.exp(logs.mean())
@@ -335,12 +331,12 @@ def end_shifts(model: Predictor, sequence: ImuSequence, config: NavigatorConfig)
     if path < _MIN_PATH:
         raise InputError(f"{sequence.name}: track", f"{path:.2f} m", "at least a metre")
     instants = (np.arange(INSTANTS) + 0.5) / INSTANTS * sequence.duration
-    faults = {f"gap at {instant:.0f} s": gap(float(instant), GAP_SECONDS) for instant in instants}
-    faults[f"{DROPPED:.0%} dropped"] = drops(DROPPED)
+    rng = np.random.default_rng(0)
+    faulty = {f"gap at {t:.0f} s": gap(sequence, rng, t, GAP_SECONDS) for t in instants.tolist()}
+    faulty[f"{DROPPED:.0%} dropped"] = drops(sequence, rng, DROPPED)
     figures = {}
-    for name, modify_samples in faults.items():
-        faulty = modify_samples(sequence, np.random.default_rng(0))
-        other = navigator.run(faulty).trajectory
+    for name, recording in faulty.items():
+        other = navigator.run(recording).trajectory
         shift = float(np.linalg.norm(whole.position_W[-1, :2] - other.position_W[-1, :2])) / path
         turn = (other.attitude_WB[-1] * whole.attitude_WB[-1].inv()).as_matrix()
         degrees = abs(math.degrees(yaw_twist(turn)))
@@ -355,10 +351,10 @@ def end_shift_table(scores: pd.DataFrame) -> str:
         Column("ends", "metres", ".0f", len),
         Column(f"within {MAX_SHIFT:.0%} and {MAX_TURN:g} deg", "within", ".0%", np.mean),
         Column("of the path: median", "metres", ".2%"),
-        Column("p95", "metres", ".2%", quantile(0.95)),
+        Column("p95", "metres", ".2%", partial(np.quantile, q=0.95)),
         Column("worst", "metres", ".2%", np.max),
         Column("deg: median", "degrees"),
-        Column("p95", "degrees", over=quantile(0.95)),
+        Column("p95", "degrees", over=partial(np.quantile, q=0.95)),
         Column("worst", "degrees", over=np.max),
     )
     return table(parts(scores), columns)

@@ -12,10 +12,11 @@ import math
 import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
+from scipy.stats import gmean
 
 from stario.fusion.evaluation.compare import navigators
 from stario.fusion.evaluation.displacement_error import fit_yaw_and_position, known_truth, planar
-from stario.fusion.evaluation.scores import Column, by_track, geometric_mean, joined, scored, table
+from stario.fusion.evaluation.scores import Column, by_track, joined, scored, table
 from stario.fusion.evaluation.tracks import network_track
 from stario.fusion.imu.direction import Complex
 from stario.fusion.imu.inference import Predictor
@@ -54,9 +55,9 @@ CARRIES = ("handheld", "pocket", "swinging", "bag")
 _COLUMNS = (
     Column("n", "step", ".0f", len),
     Column("without [m]", "error_without"),
-    Column("rest: mean", "ratio", over=geometric_mean),
+    Column("rest: mean", "ratio", over=gmean),
     Column("worst", "ratio", over=np.max),
-    Column("joined: mean", "joined_ratio", over=geometric_mean),
+    Column("joined: mean", "joined_ratio", over=gmean),
     Column("worst", "joined_ratio", over=np.max),
     Column(f"ratio < {MAX_RATIO:g}", "ratio", ".0%", lambda ratio: (ratio < MAX_RATIO).mean()),
     Column("step [m]", "step", ".1f", np.max),
@@ -74,6 +75,8 @@ def moment_costs(
 ) -> pd.DataFrame:
     """Score a recording without and with each moment and place, the rows' group, by track.
 
+    It begins at the first known position, and is cut if it is long.
+
     Figures: error of the rest [m], its parts fitted separately (`error_without`, `error_with`,
     their `ratio`) or as a whole (`joined_...`); largest correction of position [m] and attitude
     [deg] between two outputs (`step`, `turn`, whether both are `small`, and without the moment).
@@ -81,7 +84,10 @@ def moment_costs(
     Raises:
         InputError: it has no ground truth, or cannot be run.
     """
-    sequence = _with_truth(sequence)
+    _, known = known_truth(sequence)
+    earlier = 0.0 if sequence.truth is not None else _BEFORE_WAYPOINTS
+    start = max(float(sequence.time[0]), float(known.time[0]) - earlier)
+    sequence = sequence.slice(start, start + MAX_SECONDS)
     estimators = navigators(model, config, graph)
     first = estimators["filtered"]
     observed = first.observe(sequence)
@@ -102,7 +108,7 @@ def moment_costs(
 
 def moment_table(scores: pd.DataFrame) -> str:
     """Return a row for each moment, place and track: ratios of errors, largest corrections."""
-    step, turn = (Column("", f"{m}_without", over=np.max).value(scores) for m in ("step", "turn"))
+    step, turn = scores[["step_without", "turn_without"]].max()
     notes = [
         "without: median error [m] of the parts before and after, each fitted in yaw and position;",
         "ratio of that error with the moment to that without: geometric mean, worst; joined: both "
@@ -113,20 +119,12 @@ def moment_table(scores: pd.DataFrame) -> str:
     return table(by_track(scores), _COLUMNS, ("moment", "track"), notes)
 
 
-def _with_truth(sequence: ImuSequence) -> ImuSequence:
-    """Return the recording from its first known position on, cut if it is long."""
-    _, known = known_truth(sequence)
-    earlier = 0.0 if sequence.truth is not None else _BEFORE_WAYPOINTS
-    start = max(float(sequence.time[0]), float(known.time[0]) - earlier)
-    return sequence.slice(start, start + MAX_SECONDS)
-
-
 def _cost(
     sequence: ImuSequence, inserted: Inserted, without: Track, track: Track
 ) -> dict[str, float]:
-    apart, as_one = _errors_of_rest(sequence, without, inserted.start, inserted.start)
-    with_it = inserted.sequence
-    apart_with, as_one_with = _errors_of_rest(with_it, track, inserted.start, inserted.stop)
+    with_it, start = inserted.sequence, inserted.start
+    apart, as_one = _errors_of_rest(sequence, without, start, start)
+    apart_with, as_one_with = _errors_of_rest(with_it, track, start, inserted.stop)
     step, turn = largest_correction(with_it, track)
     step_without, turn_without = largest_correction(sequence, without)
     return {

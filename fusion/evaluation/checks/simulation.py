@@ -1,7 +1,7 @@
 """Simulated walks beside recordings: motion by band, step rate, and errors, by way of carrying.
 
 A simulator that moves like people lets tests, training and the demonstration say something about
-real walks. Recordings are those of archives whose attribute `carry` is in `CARRIED`.
+real walks. Recordings are those of archives whose attribute `carry` is in `WAYS`.
 """
 
 from __future__ import annotations
@@ -27,30 +27,18 @@ from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.magnetometer import INDOOR_FIELD
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
-CARRIED = {
-    "pocket (front)": "pocket",
-    "pocket (back)": "back-pocket",
-    "handheld (texting)": "texting",
-    "handheld (at the ear)": "call",
-    "swinging": "swinging",
-    "bag": "bag",
-    "handheld": "handheld",
-    "handheld (flat in front)": "in-front",
+WAYS = {
+    "pocket": ("pocket (front)", 0.8),
+    "back-pocket": ("pocket (back)", 0.8),
+    "texting": ("handheld (texting)", 0.55),
+    "call": ("handheld (at the ear)", 0.65),
+    "swinging": ("swinging", 0.9),
+    "bag": ("bag", 1.25),
+    "handheld": ("handheld", 1.2),
+    "in-front": ("handheld (flat in front)", 1.2),
 }
-"""The simulator's carrying mode for an archive's attribute `carry`."""
-
-SPEEDS = {
-    "pocket": 0.8,
-    "back-pocket": 0.8,
-    "texting": 0.55,
-    "call": 0.65,
-    "swinging": 0.9,
-    "bag": 1.25,
-    "handheld": 1.2,
-    "in-front": 1.2,
-}
-"""Preferred speeds [m/s] of the simulated walks: the archives' medians while walking, since bands
-grow with the speed."""
+"""The simulator's ways of carrying: an archive's attribute `carry`, and the preferred speed [m/s]
+of the simulated walks: the archives' medians while walking, since bands grow with the speed."""
 
 BANDS = ((0.5, 3.0), (3.0, 6.0), (6.0, 10.0), (10.0, 20.0))
 """Edges [Hz] of the bands: steps, their harmonics, the resonance of heel strikes, and its end."""
@@ -65,7 +53,7 @@ SIMULATED, RECORDED = "simulated", "recorded"
 def simulated_walk(carry: str, seed: int, seconds: float = 120.0) -> ImuSequence:
     """Simulate a person, drawn with the walk, who carries a phone in a building."""
     rng = generator(seed)
-    speed = SPEEDS[carry] * float(rng.uniform(0.8, 1.2))
+    speed = WAYS[carry][1] * float(rng.uniform(0.8, 1.2))
     style = replace(WalkStyle.random(rng), carry=carry, next_carry="", preferred_speed=speed)
     walk = generate_walk(seed, seconds, style=style, corridors=True)
     name = f"{carry} {seed}"
@@ -76,13 +64,14 @@ def carry_of(sequence: ImuSequence) -> str:
     """Return the simulator's name of how a recording was carried.
 
     Raises:
-        InputError: its attributes do not say, or it is none of `CARRIED`.
+        InputError: its attributes do not say, or it is none of `WAYS`.
     """
-    carry = sequence.attributes.get("carry", "none")
-    if carry not in CARRIED:
+    carry = str(sequence.attributes.get("carry", "none"))
+    carried = {attribute: way for way, (attribute, _) in WAYS.items()}
+    if carry not in carried:
         where = f"{sequence.name}: attribute carry"
-        raise InputError(where, str(carry), f"one of {', '.join(CARRIED)}")
-    return CARRIED[str(carry)]
+        raise InputError(where, carry, f"one of {', '.join(carried)}")
+    return carried[carry]
 
 
 def motion_scores(

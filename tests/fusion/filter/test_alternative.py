@@ -11,7 +11,6 @@ from told import health_verdict
 
 from stario.fusion import Navigator
 from stario.fusion.evaluation.checks.faults import faults, matched_walk, run_faults
-from stario.fusion.evaluation.scores import wide
 from stario.fusion.filter.alternative import AlternativeHypothesis, Hypotheses
 from stario.fusion.filter.corrections import correction
 from stario.fusion.filter.displacements import update_with
@@ -40,7 +39,7 @@ def error_added(
     """Return what a fault adds to the error of the position [m]."""
     only = [each for each in faults(SECONDS) if each.name == fault]
     found = run_faults(sequence, config, seed=seed, graph=track == "track", only=only)
-    [result] = wide(found[found["track"] == track]).itertuples()
+    [result] = found[found["track"] == track].itertuples()
     return float(result.error_with - result.error_without)
 
 

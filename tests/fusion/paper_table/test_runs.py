@@ -23,7 +23,6 @@ from stario.fusion.paper_table.runs import (
     TRUE_ATTITUDE,
     Run,
     backend,
-    complete,
     complete_run,
     table_runs,
 )
@@ -31,7 +30,8 @@ from stario.fusion.paper_table.sets import DataSet, folder_set
 from stario.fusion.paper_table.table import completed_runs, set_table
 from stario.fusion.paper_table.training import ReaderConfig, run_recipe
 from stario.network.architectures import ARCHITECTURES
-from stario.sequences.datasets.batch import Skipped
+from stario.network.runtime.survey import ModelRow
+from stario.sequences.datasets.batch import each
 from stario.sequences.errors import ConfigError, InputError, WeightsError
 from stario.sequences.readers import read_recording
 from stario.sequences.readers.csv_writer import write_csv
@@ -79,12 +79,12 @@ def test_a_killed_run_resumes_and_gives_the_same_model(dataset, reading, tmp_pat
 
 
 def assert_complete(folder: Path) -> None:
-    names = {"scores.json", "log.json", "model.json", "model.safetensors", "trained.json"}
+    names = {"tested.json", "log.json", "model.json", "model.safetensors", "trained.json"}
     assert {path.name for path in folder.glob("[!.]*")} == names
     trained = json.loads((folder / "trained.json").read_text())
     assert trained["steps"] == 1
     assert min(trained["windows_per_s"], trained["seconds"]) > 0.0
-    content = json.loads((folder / "scores.json").read_text())
+    content = json.loads((folder / "tested.json").read_text())
     [drawn] = content["drawn"].values()
     assert len({len(values) for values in drawn.values()}) == 1
     scores, blocks = (pd.DataFrame(content[name]) for name in ("scores", "blocks"))
@@ -106,13 +106,14 @@ def test_filled_runs_are_kept_and_only_new_networks_and_seeds_are_trained(
         return original(dataset, recipe, *rest)
 
     monkeypatch.setattr(runs_module, "train_run", counted)
+    work = partial(complete_run, out=tmp_path, reading=reading)
     first = [run(dataset, steps=1), Run(dataset, "pdr", 0, None)]
-    assert list(complete(first, tmp_path, reading)) == first
+    assert list(each(work, first)) == first
     assert_complete(tmp_path / "own/StarIO/1-steps/seed-0")
-    errors = first[0].folder(tmp_path) / "scores.json"
+    errors = first[0].folder(tmp_path) / "tested.json"
     written = errors.stat().st_mtime_ns
     more = [*first, run(dataset, "StarIO without MSGCU", steps=1), run(dataset, seed=1, steps=1)]
-    assert list(complete(more, tmp_path, reading)) == more
+    assert list(each(work, more)) == more
     assert trained == ["StarIO 0", "StarIO without MSGCU 0", "StarIO 1"]
     assert errors.stat().st_mtime_ns == written
     table = set_table(dataset, completed_runs(more, tmp_path)["own"], {})
@@ -134,10 +135,8 @@ def test_runs_of_another_recipe_are_refused_and_other_step_counts_are_separate(
     done = run(dataset, steps=1)
     complete_run(done, tmp_path, reading)
     other = Run(dataset, "StarIO", 0, run_recipe({**RECIPE, "rate": 1e-2}, "StarIO", 0, 1))
-    with pytest.raises(ConfigError, match=r"scores\.json.*another recipe"):
+    with pytest.raises(ConfigError, match=r"tested\.json.*another recipe"):
         complete_run(other, tmp_path, reading)
-    [outcome] = complete([other], tmp_path, reading)
-    assert isinstance(outcome, Skipped)
     assert completed_runs([run(dataset, steps=2)], tmp_path) == {}
 
 
@@ -194,8 +193,10 @@ def test_an_unknown_backend_is_refused():
 def test_the_command_writes_tables_and_figures(dataset, tmp_path, monkeypatch):
     folder = dataset.training[0].parent
     monkeypatch.setenv("STARIO_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("stario.network.runtime.survey._RUNS", {1: 1, 64: 1})
-    saved = "stario.fusion.evaluation.results.save_figure"  # rendering is slow
+    costs = [ModelRow("DeepILS", 2_290_754, 15_287_000, {"torch": {"1": 1.0, "64": 0.5}}, 11.2)]
+    surveyed = "stario.fusion.paper_table.table.survey"  # measuring is slow, and so is rendering
+    monkeypatch.setattr(surveyed, lambda names: costs if names == ["DeepILS"] else [])
+    saved = "stario.fusion.evaluation.results.save_figure"
     monkeypatch.setattr(saved, lambda figure, path: path.touch())
     (tmp_path / "recipe.json").write_text(json.dumps(RECIPE))
     out = tmp_path / "out"
@@ -207,7 +208,7 @@ def test_the_command_writes_tables_and_figures(dataset, tmp_path, monkeypatch):
     assert text in done.output
     for words in (
         "1 training steps of 6 windows",
-        "| DeepILS |",
+        "| DeepILS | 2.291 (",
         "`pdr`",
         "4.374, 3.665",
         "core hours",

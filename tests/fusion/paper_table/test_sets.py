@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from recorded import DATA
 
-from stario.fusion.evaluation.bootstrap import block_rows
 from stario.fusion.evaluation.scores import joined, scored
 from stario.fusion.paper_table import sets, training
 from stario.fusion.paper_table.figures import pde_boxes
@@ -109,9 +109,9 @@ def content(
         for name, pde in zip(names, (0.03, None), strict=True)
         for errors in [{"ate_m": ate_m, "rte_m": 2.0, "pde": pde}]
     ]
-    unit = {"set": "ridi", "group": "ridi", "metric": "ate", **labels}
-    blocks = [block_rows([[ate_m**2, 1.0]], recording=name, **unit) for name in names]
-    tables = {"scores": joined(scores), "blocks": joined(blocks)}
+    unit = {"set": "ridi", "group": "ridi", "metric": "ate", "block": 0, **labels}
+    blocks = pd.DataFrame({"recording": names, "squares": ate_m**2, "count": 1.0, **unit})
+    tables = {"scores": joined(scores), "blocks": blocks}
     return {**labels, **tables, "drawn": {}, "seconds": seconds, "skipped": []}
 
 
@@ -150,7 +150,9 @@ def test_work_is_told_in_core_hours_and_windows_per_second():
     assert work.loc["StarIO"].tolist() == [14400.0, 3600.0, 200.0]
     times = {"torch": {"1": 1.0, "64": 0.5}}
     costs = [ModelRow("StarIO", 2_761_682, 24_854_000, times, 11.2)]
-    text = table_text([set_table(DATASET, completed, {})], costs, work, TrainingConfig())
+    table = set_table(DATASET, completed, {})
+    assert table.rows["ratio"].to_list() == [None]  # to itself
+    text = table_text([table], costs, work, TrainingConfig())
     assert "| StarIO | 2.762 (2.762) | 24.854 (25.122) | 11.2 | 1.00 | 0.50 | 5.00 | 200 |" in text
     assert "Total: 5.00 core hours, 4.00 for training and 1.00 for evaluation" in text
 

@@ -1,5 +1,6 @@
 """Any sequence of faults leaves finite states, valid covariances and increasing times."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,28 +16,29 @@ CONFIG = NavigatorConfig(filter=FilterConfig(update_rate=5))
 RATE = 50.0
 GRAVITY = np.array([0.0, 0.0, 9.8])
 
+EYE = np.eye(3)
+
+
+def meaningless(n: Navigator, at: float, size: float) -> None:
+    n.update_position(at, [np.nan, size, 0.0], EYE)
+    n.update_velocity(at, np.zeros(3), -EYE)
+    n.update_yaw(np.inf, size, 0.0)
+
+
+FIXES: dict[str, Callable[[Navigator, float, float], object]] = {
+    "position": lambda n, at, s: n.update_position(at + 0.3 + s, [10.0 * s, 5.0, 0.0], 0.1 * EYE),
+    "position far off": lambda n, at, s: n.update_position(at, 5e6 * s * np.ones(3), 1e-4 * EYE),
+    "late yaw": lambda n, at, s: n.update_yaw(at, 4.0 * s, 0.1),
+    "old velocity": lambda n, at, s: n.update_velocity(
+        at - 3.0 * abs(s), [1.0, s, 0.0], 0.01 * EYE
+    ),
+    "fix without meaning": meaningless,
+}
 FAULTS = (
-    "fine",
-    "not finite",
-    "gap",
-    "long gap",
-    "duplicate",
-    "back in time",
-    "wild time",
-    "wild times in a row",
-    "spike",
-    "saturated",
-    "free fall",
-    "network not finite",
-    "network far off",
-    "network too sure",
-    "covariance without meaning",
-    "position",
-    "position far off",
-    "late yaw",
-    "old velocity",
-    "fix without meaning",
-    "restored",
+    *("fine", "not finite", "gap", "long gap", "duplicate", "back in time"),
+    *("wild time", "wild times in a row", "spike", "saturated", "free fall"),
+    *("network not finite", "network far off", "network too sure", "covariance without meaning"),
+    *(*FIXES, "restored"),
 )
 
 WALK = st.lists(
@@ -108,8 +110,6 @@ class Stream:
 
     def inject(self, fault: str, count: int, size: float) -> None:
         self.model.fault, self.model.size = fault, size
-        n, at = self.navigator, self.now - 0.3
-        eye = np.eye(3)
         if fault == "gap":
             self.now += 5.0 * abs(size)
         elif fault == "long gap":
@@ -117,20 +117,10 @@ class Stream:
         elif fault.startswith("wild time"):
             for k in range(1 if fault == "wild time" else 4):
                 self.push(self.now + 1e6 * abs(size) + 20.0 + k, np.zeros(3), np.zeros(3))
-        elif fault == "position":
-            n.update_position(self.now + size, [10.0 * size, 5.0, 0.0], 0.1 * eye)
-        elif fault == "position far off":
-            n.update_position(at, 5e6 * size * np.ones(3), 1e-4 * eye)
-        elif fault == "late yaw":
-            n.update_yaw(at, 4.0 * size, 0.1)
-        elif fault == "old velocity":
-            n.update_velocity(at - 3.0 * abs(size), [1.0, size, 0.0], 0.01 * eye)
-        elif fault == "fix without meaning":
-            n.update_position(at, [np.nan, size, 0.0], eye)
-            n.update_velocity(at, np.zeros(3), -eye)
-            n.update_yaw(np.inf, size, 0.0)
+        elif fault in FIXES:
+            FIXES[fault](self.navigator, self.now - 0.3, size)
         elif fault == "restored":
-            data = n.snapshot()
+            data = self.navigator.snapshot()
             self.navigator = Navigator(self.model, CONFIG, backend=self.backend)
             self.navigator.restore(data)
         self.samples(count, fault, size)

@@ -14,7 +14,6 @@ from stario.fusion.evaluation.checks.faults import (
     run_faults,
     with_true_displacements,
 )
-from stario.fusion.evaluation.scores import wide
 from stario.fusion.navigator import Navigator
 from stario.sequences.errors import InputError
 
@@ -30,7 +29,7 @@ def scores():
 
 @pytest.fixture(scope="module")
 def results(scores):
-    return {row.group: row for row in wide(scores).itertuples()}
+    return {row.group: row for row in scores.itertuples()}
 
 
 def test_every_fault_ends_in_finite_states(results):
@@ -60,7 +59,7 @@ def test_a_refused_recording_is_a_row_of_the_table():
     in_degrees = Fault("rates in degrees", lambda s, _: replace(s, gyro=np.degrees(s.gyro)))
     sequence, config = matched_walk(SECONDS, seed=1)
     found = run_faults(sequence, config, graph=False, only=[in_degrees, Fault("none")])
-    refused, unchanged = wide(found).itertuples()
+    refused, unchanged = found.itertuples()
     assert np.isnan(refused.error_with)
     assert unchanged.error_with == refused.error_without
     row = next(row for row in fault_table(found).splitlines() if "degrees" in row)

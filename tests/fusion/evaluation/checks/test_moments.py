@@ -12,14 +12,14 @@ from stario.fusion.evaluation.checks.simulation import (
     BANDS,
     RECORDED,
     SIMULATED,
-    SPEEDS,
+    WAYS,
     carry_of,
     motion,
     motion_scores,
     motion_table,
     simulated_walk,
 )
-from stario.fusion.evaluation.scores import joined, scored, values, wide
+from stario.fusion.evaluation.scores import joined, scored, values
 from stario.fusion.values.config import NavigatorConfig
 from stario.fusion.values.state import Track
 from stario.network.model import load_model
@@ -93,7 +93,7 @@ def test_errors_are_those_of_each_part_and_of_both_as_one():
 def test_a_phone_laid_down_and_taken_up_costs_the_rest_little(walk, monkeypatch):
     monkeypatch.setattr(moments, "MOMENTS", (BY_NAME["table"],))
     monkeypatch.setattr(moments, "PLACES", {"middle": 0.5})
-    [found] = wide(moment_costs(load_model(), walk, NavigatorConfig())).itertuples()
+    [found] = moment_costs(load_model(), walk, NavigatorConfig()).itertuples()
     assert (found.group, found.track) == ("table, middle", "filtered")
     assert 0.0 < found.error_with < 2.0 * found.error_without
     assert 0.0 < found.step_without < moments.MAX_STEP
@@ -117,7 +117,7 @@ MEASURED = {
 """Medians of the archives: force by band [m/s^2], and angular rate [rad/s]."""
 
 
-@pytest.mark.parametrize("carry", SPEEDS)
+@pytest.mark.parametrize("carry", WAYS)
 def test_simulated_walks_move_within_a_third_of_recorded_ones(carry):
     found = [motion(simulated_walk(carry, seed, 60.0)) for seed in range(6)]
     keys = [*(f"force_{low:g}" for low, _ in BANDS), "rate"]
@@ -155,7 +155,7 @@ def test_the_table_has_a_row_of_each_kind_and_says_what_is_missing(still_model):
     simulated = motion_scores(still_model, walk, NavigatorConfig(), "bag", SIMULATED)
     assert values(simulated, "network_percent") > 20.0  # the network says that it rests
     assert "none given" in motion_table(simulated)
-    assert wide(simulated)["track_percent"].notna().all()
+    assert simulated["track_percent"].notna().all()
     both = joined([simulated, simulated.assign(track=RECORDED)])
     text = motion_table(both)
     assert "bag, simulated" in text
