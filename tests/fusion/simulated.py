@@ -6,8 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.fusion.imu.front_end import FrontEnd
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.recording import cut_recording
-from stario.fusion.values.config import NavigatorConfig
+from stario.fusion.values.config import FilterConfig, NavigatorConfig
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.sequence import BoolArray, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import ImuErrors, simulate_imu
@@ -31,8 +33,18 @@ class Windows(NamedTuple):
     contents: list[bytes]
 
 
-cut_once = lru_cache(maxsize=8)(cut_recording)
-"""`cut_recording`; its results must not be changed."""
+@lru_cache(maxsize=24)
+def _cut(
+    sequence: ImuSequence, update_rate: int, magnetometer: bool, gravity: float
+) -> tuple[list[ImuInterval], FrontEnd]:
+    settings = FilterConfig(update_rate=update_rate, magnetometer=magnetometer)
+    return cut_recording(sequence, NavigatorConfig(filter=settings, gravity=gravity))
+
+
+def cut_once(sequence: ImuSequence, config: NavigatorConfig) -> tuple[list[ImuInterval], FrontEnd]:
+    """`cut_recording`, once for all settings of the filter; its results must not be changed."""
+    f = config.filter
+    return _cut(sequence, f.update_rate, f.magnetometer, config.gravity)
 
 
 @lru_cache(maxsize=16)
