@@ -107,7 +107,7 @@ class KeyframeGraph:
                 converged; None if it must.
             trusted_rounds: number of first rounds in which none is down-weighted: a poor start must
                 not decide which of them are false.
-            only_last: whether the last keyframe alone is wanted.
+            only_last: whether the last keyframe alone is wanted, and checked.
 
         Returns:
             The keyframes by number, with their marginal covariances.
