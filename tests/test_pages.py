@@ -70,8 +70,10 @@ def stario_commands(text: str) -> list[list[str]]:
 def _prepared_once():
     """Load the packaged weights and build the command once, and leave figures blank."""
     with pytest.MonkeyPatch.context() as patch:
-        saved = "stario.fusion.evaluation.results.save_figure"  # rendering is slow
-        patch.setattr(saved, lambda figure, path: path.touch())
+        # Drawing is slow.
+        patch.setattr("stario.fusion.evaluation.results._figures", lambda found: {})
+        for module in ("fusion.evaluation.results", "sequences.drawing.figures"):
+            patch.setattr(f"stario.{module}.save_figure", lambda figure, path: path.touch())
         patch.setattr("stario.network.model.load_model", cache(load_model))
         patch.setattr("typer.main.get_command", cache(typer.main.get_command))
         yield

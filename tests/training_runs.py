@@ -45,8 +45,8 @@ HELD_OUT = TrainingData(VALIDATION)
 
 
 def narrow(patch: pytest.MonkeyPatch) -> None:
-    """Give StarIO a quarter of its channels and half of its blocks."""
-    patch.setattr("stario.network.stario.WIDTHS", tuple(width // 4 for width in WIDTHS))
+    """Give StarIO an eighth of its channels and half of its blocks."""
+    patch.setattr("stario.network.stario.WIDTHS", tuple(width // 8 for width in WIDTHS))
     patch.setattr("stario.network.stario.BLOCKS", (1, 1, 1, 1))
 
 

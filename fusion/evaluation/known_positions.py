@@ -12,6 +12,7 @@ import numpy as np
 from stario.fusion.evaluation.displacement_error import fit_yaw_and_position, known_truth, planar
 from stario.fusion.imu.direction import Complex
 from stario.fusion.report.health import TURNED_RAD, health_findings
+from stario.fusion.values.satellites import APART_M, georeference_of
 from stario.fusion.values.state import Track
 from stario.sequences.accuracy.metrics import align, pose_errors
 from stario.sequences.arrays import even_grid, interpolated, rms, scatter
@@ -44,9 +45,6 @@ _SCALED = 1.25
 
 _MIRRORED, _MIRRORED_M = 0.4, 2.0
 """Share of the error that a mirrored track must leave, and error [m] from which that is tested."""
-
-_APART_M = 3.0
-"""Distance from their centre [m] that positions must have to tell the direction of a track."""
 
 _SIGMAS = 3.0
 """Error in standard deviations, both over the whole track, that contradicts the track."""
@@ -131,26 +129,6 @@ def fitted_georeference(track: Track, known: PositionTrack) -> Georeference | No
     if inside.sum() < MIN_POSITIONS:
         return None
     return georeference_of(known.latlon_deg[inside], _track_at(track, known.time[inside]))
-
-
-def georeference_of(latlon_deg: FloatArray, track: FloatArray) -> Georeference | None:
-    """Return where a frame lies on the earth in which a track fits places best.
-
-    Args:
-        latlon_deg: (N, 2) latitude and longitude of at least one place [deg].
-        track: (N, 2) the track at the same times, in its frame [m].
-
-    Returns:
-        The frame's place; None if the places or the track are too close together to tell it.
-    """
-    first = Georeference(*latlon_deg[0].tolist())
-    w, z = planar(first.xy(latlon_deg)), planar(track)
-    turn = np.vdot(z - z.mean(), w - w.mean())
-    if min(np.abs(w - w.mean()).max(), np.abs(z - z.mean()).max()) < _APART_M:
-        return None
-    origin = w.mean() - turn / abs(turn) * z.mean()
-    latitude, longitude = first.latlon_deg(np.array([[origin.real, origin.imag]]))[0].tolist()
-    return Georeference(latitude, longitude, float(np.angle(turn)))
 
 
 def _within(track: Track, time: FloatArray) -> BoolArray:
@@ -287,7 +265,7 @@ def _direction(track: Track, truth: Trajectory | None) -> list[Finding]:
         return []
     fitted = pose_errors(align(track.trajectory, truth, "yaw"), truth)
     spread = scatter(fitted.truth.position_W[:, :2])
-    if spread < _APART_M:
+    if spread < APART_M:
         return []
     turn = -float(np.angle(np.exp(1j * fitted.yaw).mean()))
     if abs(turn) < max(TURNED_RAD, _SIGMAS * rms(fitted.position_W[:, :2]) / spread):

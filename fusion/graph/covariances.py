@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import gtsam
@@ -21,8 +21,8 @@ _MIN_VARIANCE, _MIN_EIGENVALUE = 1e-16, 1e-12
 """Lower bounds of variances and of the eigenvalues of normalised covariances: less is rounding."""
 
 
-def marginal_covariances(net: Any) -> dict[int, FloatArray]:
-    """Return the covariance (15, 15) of pose, velocity and biases of every keyframe.
+def marginal_covariances(net: Any) -> Iterator[tuple[int, FloatArray]]:
+    """Yield every keyframe and its covariance (15, 15) of pose, velocity and biases, last first.
 
     Its tangent is gtsam's. gtsam's own marginals use Cholesky's algorithm, which calls a pose
     undetermined if its last axis is 4096 times as uncertain as the one before, as with positions
@@ -47,7 +47,6 @@ def marginal_covariances(net: Any) -> dict[int, FloatArray]:
     first_use = np.arange(len(parents)) - _KEYS
     for n, p in enumerate(parents):
         first_use[p] = np.minimum(first_use[p], n)
-    covariances = {}
     held = np.zeros(0, dtype=np.intp)  # rows of the variables that P covers, in order of time
     P = np.zeros((0, 0))
     for n in reversed(range(len(conditionals))):
@@ -67,11 +66,10 @@ def marginal_covariances(net: Any) -> dict[int, FloatArray]:
         P, held = np.block([[own, cross], [cross.T, P]]), np.concatenate([rows, held])
         if chr(symbol.chr()) == "x":
             size = begin[n + _KEYS] - begin[n]
-            covariances[symbol.index()] = P[:size, :size]
+            yield symbol.index(), P[:size, :size]
         kept = first_use[variable[held]] < n
         if not kept.all():
             P, held = P[np.ix_(kept, kept)], held[kept]
-    return covariances
 
 
 def root_information(covariance: FloatArray) -> FloatArray:

@@ -150,7 +150,7 @@ class FixedLag:
     def _solve(self, filtered: EstimatorState) -> None:
         builder, last = self.builder, self.builder.graph.last
         try:
-            newest = builder.graph.solve(_MAX_ROUNDS)[last]
+            newest = builder.graph.solve(_MAX_ROUNDS, only_last=True)[last]
             builder.marginalise_until(newest.time - self._config.graph.lag)
         except IndeterminateError as error:
             self._fallbacks, self._reason = self._fallbacks + 1, str(error)

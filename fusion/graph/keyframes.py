@@ -94,7 +94,12 @@ class KeyframeGraph:
         limit = chi2_quantile(self._gate, len(term.covariance)) if gated else math.inf
         self._terms.append(Whitened.of(term, limit))
 
-    def solve(self, max_rounds: int | None = None, trusted_rounds: int = 0) -> dict[int, NavState]:
+    def solve(
+        self,
+        max_rounds: int | None = None,
+        trusted_rounds: int = 0,
+        only_last: bool = False,
+    ) -> dict[int, NavState]:
         """Optimise the keyframes by Gauss-Newton steps.
 
         Args:
@@ -102,6 +107,7 @@ class KeyframeGraph:
                 converged; None if it must.
             trusted_rounds: number of first rounds in which none is down-weighted: a poor start must
                 not decide which of them are false.
+            only_last: whether the last keyframe alone is wanted, and checked.
 
         Returns:
             The keyframes by number, with their marginal covariances.
@@ -112,9 +118,12 @@ class KeyframeGraph:
         """
         with self._undetermined_named():
             values, net = self._optimised(max_rounds, trusted_rounds)
-            covariances = marginal_covariances(net)
+            last_first = marginal_covariances(net)
+            covariances = dict([next(last_first)] if only_last else last_first)
         states = {k: KeyframeState.of(values, k) for k in self.times}
-        solved = {k: _solved(self.times[k], s, covariances[k]) for k, s in states.items()}
+        solved = {
+            k: _solved(self.times[k], states[k], covariances[k]) for k in states if k in covariances
+        }
         for k in (next(iter(solved)), self.last):
             _check_determined(solved[k])
         self.states = states

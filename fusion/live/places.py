@@ -7,10 +7,9 @@ from threading import Lock
 
 import numpy as np
 
-from stario.fusion.evaluation.known_positions import georeference_of
 from stario.fusion.live.payload import Vector
 from stario.fusion.values.fixes import Fix
-from stario.fusion.values.satellites import reliable, satellite_fixes
+from stario.fusion.values.satellites import georeference_of, reliable, satellite_fixes
 from stario.sequences.geodesy import Georeference
 from stario.sequences.readers.checked import OPTIONAL, satellites
 from stario.sequences.sequence import Satellites

@@ -17,6 +17,9 @@ from stario.sequences.geodesy import Georeference
 from stario.sequences.readers.checked import LARGEST_RADIUS, RADIUS_PER_SIGMA, USUAL_RADIUS
 from stario.sequences.sequence import BoolArray, FloatArray, Satellites
 
+APART_M = 3.0
+"""Distance from their centre [m] that positions must have to tell the direction of a track."""
+
 _RADIUS_FACTOR = 1.5
 """Factor on the stated radius: it held 44 % of the positions of 28 recordings in and around two
 buildings, and 1.7 to 2.2 times of it held 90 %."""
@@ -80,6 +83,26 @@ def reliable(satellites: Satellites) -> BoolArray:
     """Return which positions (N,) a receiver has measured well: not those held, nor of cells."""
     radius = _radius(satellites)
     return np.asarray((radius > 0.0) & (radius <= LARGEST_RADIUS) & ~_held(satellites))
+
+
+def georeference_of(latlon_deg: FloatArray, track: FloatArray) -> Georeference | None:
+    """Return where a frame lies on the earth in which a track fits places best.
+
+    Args:
+        latlon_deg: (N, 2) latitude and longitude of at least one place [deg].
+        track: (N, 2) the track at the same times, in its frame [m].
+
+    Returns:
+        The frame's place; None if the places or the track are too close together to tell it.
+    """
+    first = Georeference(*latlon_deg[0].tolist())
+    w, z = (xy[:, 0] + 1j * xy[:, 1] for xy in (first.xy(latlon_deg), track))
+    turn = np.vdot(z - z.mean(), w - w.mean())
+    if min(np.abs(w - w.mean()).max(), np.abs(z - z.mean()).max()) < APART_M:
+        return None
+    origin = w.mean() - turn / abs(turn) * z.mean()
+    latitude, longitude = first.latlon_deg(np.array([[origin.real, origin.imag]]))[0].tolist()
+    return Georeference(latitude, longitude, float(np.angle(turn)))
 
 
 def _radius(satellites: Satellites) -> FloatArray:

@@ -1,11 +1,14 @@
 """Simulated walks, and predictors of their true displacements or of none."""
 
 from functools import lru_cache
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stario.fusion.imu.front_end import FrontEnd
+from stario.fusion.imu.intervals import ImuInterval
 from stario.fusion.recording import cut_recording
 from stario.fusion.values.config import NavigatorConfig
 from stario.sequences.attitude.rotations import about_z, yaw_of
@@ -31,8 +34,19 @@ class Windows(NamedTuple):
     contents: list[bytes]
 
 
-cut_once = lru_cache(maxsize=8)(cut_recording)
-"""`cut_recording`; its results must not be changed."""
+@lru_cache(maxsize=24)
+def _cut(
+    sequence: ImuSequence, gravity: float, **used: float
+) -> tuple[list[ImuInterval], FrontEnd]:
+    # No others: a front end that asked for one would fail, and not be given another test's cut.
+    settings: Any = SimpleNamespace(gravity=gravity, filter=SimpleNamespace(**used))
+    return cut_recording(sequence, settings)
+
+
+def cut_once(sequence: ImuSequence, config: NavigatorConfig) -> tuple[list[ImuInterval], FrontEnd]:
+    """`cut_recording`, once for all settings that it does not use; its results are not changed."""
+    names = ("output_rate", "intervals_per_update", "magnetometer")
+    return _cut(sequence, config.gravity, **{name: getattr(config.filter, name) for name in names})
 
 
 @lru_cache(maxsize=16)

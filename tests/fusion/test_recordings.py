@@ -61,6 +61,7 @@ def test_stream_equals_batch_within_a_millimetre(model):
     assert navigator.health.gated == track.health.gated
 
 
+@pytest.mark.slow
 def test_a_phone_in_a_runners_hand_is_tracked_although_both_sensors_saturate(model):
     archive = DATA / "archives/tyrex.h5"
     if not archive.exists():

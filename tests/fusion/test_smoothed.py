@@ -95,8 +95,7 @@ def delayed(navigator: Navigator, walk: ImuSequence) -> list[SmoothedPose]:
     """Return the poses that a stream gives one window late."""
     poses: list[SmoothedPose] = []
     for row in zip(walk.time, walk.gyro, walk.accel, strict=True):
-        navigator.push(*row)
-        pose = navigator.smoothed
+        pose = navigator.smoothed if navigator.push(*row) is not None else None
         if pose is not None and (not poses or pose.time > poses[-1].time):
             poses.append(pose)
     return poses

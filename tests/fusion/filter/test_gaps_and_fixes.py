@@ -18,8 +18,6 @@ from stario.fusion.values.state import NavState
 from stario.sequences.attitude.rotations import about_z, yaw_of
 from stario.sequences.sequence import ImuSequence
 
-BACKENDS = ("ekf", "graph")
-
 
 def yaw_error(track: Track, walk: ImuSequence, rows: Any) -> np.ndarray:
     """Yaw error in the frame of the ground truth, wrapped [rad]."""
@@ -59,23 +57,24 @@ def test_a_position_before_a_gap_does_not_turn_the_track_after_it(backend, seed,
     assert backend == "graph" or position_nees(track, walk, early) < 20.0
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(
     ("seed", "gap", "turn"), [(2, 6.0, 2.5), pytest.param(18, 10.0, 1.8, marks=pytest.mark.slow)]
 )
 def test_fixes_find_the_direction_again_after_a_gap_with_fixes_in_it(
-    make_walk, make_oracle, without, backend, seed, gap, turn
+    make_walk, make_oracle, without, seed, gap, turn
 ):
     walk = turned(make_walk(seed, 50.0, 50.0), 20.0 + 0.5 * gap, turn)
     holed = without(walk, (walk.time > 20.0) & (walk.time < 20.0 + gap))
     oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     fixes = true_fixes(walk.truth, 3.0, 0.3, 0)
-    track = Navigator(oracle, CONFIG, backend=backend).run(holed, fixes=fixes)
-    late = (track.time > 20.5 + gap) & (track.time < walk.time[-1])
-    sigma = np.sqrt(track.covariance[late, 2, 2])
-    assert (np.abs(yaw_error(track, walk, late)) < 4.0 * sigma).all()
-    assert sigma[-1] < 0.1
-    assert track.health.fixes["in a long gap"] == sum(20.0 < f.time <= 20.0 + gap for f in fixes)
+    graph = Navigator(oracle, CONFIG).run(holed, fixes=fixes)
+    for track in (graph, graph.filtered):
+        late = (track.time > 20.5 + gap) & (track.time < walk.time[-1])
+        sigma = np.sqrt(track.covariance[late, 2, 2])
+        assert (np.abs(yaw_error(track, walk, late)) < 4.0 * sigma).all()
+        assert sigma[-1] < 0.1
+        within = sum(20.0 < f.time <= 20.0 + gap for f in fixes)
+        assert track.health.fixes["in a long gap"] == within
 
 
 @pytest.mark.parametrize(
@@ -182,18 +181,18 @@ def test_a_fix_within_a_gap_gives_little_information_about_the_track_before_it(k
     assert np.mean(nees) < 7.8  # 95 % of a chi-square with three degrees of freedom
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_yaw_within_a_short_gap_of_a_turning_device_is_that_of_its_time(
-    make_walk, make_oracle, without, backend
+    make_walk, make_oracle, without
 ):
     walk = swivelled(make_walk(1, 16.0, 50.0), 2.0)
     holed = without(walk, (walk.time > 10.0) & (walk.time < 10.8))
     oracle = make_oracle(holed, walk.truth, CONFIG, noise=0.03, sigma=0.03)
     fix = yaw_fix(10.5, yaw_of(walk.truth.at(np.array([10.5])).attitude_WB)[0], 0.02)
-    track = Navigator(oracle, CONFIG, backend=backend).run(holed, fixes=[fix])
-    before = int(np.searchsorted(track.time, 9.5))
-    error = yaw_error(track, walk, slice(before, before + 1))[0]
-    assert abs(error) < 3.0 * np.sqrt(track.covariance[before, 2, 2]) < 2.0
+    graph = Navigator(oracle, CONFIG).run(holed, fixes=[fix])
+    for track in (graph, graph.filtered):
+        before = int(np.searchsorted(track.time, 9.5))
+        error = yaw_error(track, walk, slice(before, before + 1))[0]
+        assert abs(error) < 3.0 * np.sqrt(track.covariance[before, 2, 2]) < 2.0
 
 
 @pytest.mark.parametrize(

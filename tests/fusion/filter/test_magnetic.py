@@ -215,6 +215,7 @@ def test_what_a_magnetometers_calibration_was_is_forgotten_within_minutes():
     assert math.sqrt(later.P[row, row]) == pytest.approx(HARD_IRON_SIGMA, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_streams_graph_estimates_the_same_bias_as_its_filter(biased_walk, make_oracle):
     config = replace(CONFIG, filter=replace(CONFIG.filter, gyro_bias_sigma=1e-2))
     walk = biased_walk.slice(0.0, 42.0)
@@ -294,22 +295,22 @@ def test_a_disabled_magnetometer_has_no_effect(biased_walk, make_oracle):
     np.testing.assert_array_equal(without.trajectory.position_W, blind.trajectory.position_W)
 
 
-@pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_a_declination_turns_the_track_to_true_north(biased_walk, make_oracle, backend):
+def test_a_declination_turns_the_track_to_true_north(biased_walk, make_oracle):
     """The whole track from the first pose on; the azimuth of the field here is 39 degrees."""
     declination = math.pi / 2.0 - math.atan2(FIELD_W[1], FIELD_W[0])
     settings = replace(CONFIG, filter=replace(CONFIG.filter, declination=declination))
     walk = biased_walk.slice(0.0, 20.0)
     oracle = make_oracle(walk, biased_walk.truth, settings, noise=0.05, sigma=0.05)
-    track = Navigator(oracle, settings, backend=backend).run(walk)
-    truth = walk.truth.at(track.time)
-    R = track.trajectory.attitude_WB * truth.attitude_WB.inv()
-    off = np.arctan2(*R.as_matrix()[:, [1, 0], 0].T)
-    sigma = np.sqrt(track.covariance[:, 2, 2])
-    assert 0.05 < sigma[-1] < 0.6
-    assert np.all(np.abs(off) < 3.0 * sigma[-1])
-    assert track.health.fixes == {}
-    assert track.health.bearings["north"] == 1
+    graph = Navigator(oracle, settings).run(walk)
+    for track in (graph, graph.filtered):
+        truth = walk.truth.at(track.time)
+        R = track.trajectory.attitude_WB * truth.attitude_WB.inv()
+        off = np.arctan2(*R.as_matrix()[:, [1, 0], 0].T)
+        sigma = np.sqrt(track.covariance[:, 2, 2])
+        assert 0.05 < sigma[-1] < 0.6
+        assert np.all(np.abs(off) < 3.0 * sigma[-1])
+        assert track.health.fixes == {}
+        assert track.health.bearings["north"] == 1
     before = Navigator(oracle, CONFIG, backend="ekf").run(walk.slice(0.0, 5.0))
     assert abs(yaw_of(before.trajectory.attitude_WB)[0]) < 0.02  # first yaw without a declination
 

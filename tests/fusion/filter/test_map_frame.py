@@ -61,14 +61,14 @@ def test_fixes_far_from_the_maps_origin_are_as_accurate_as_near_ones(backend):
     np.testing.assert_allclose(far_last.covariance, last.covariance, rtol=1e-3, atol=1e-9)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_fix_at_the_first_sample_places_the_first_state_too(make_walk, make_oracle, backend):
+def test_a_fix_at_the_first_sample_places_the_first_state_too(make_walk, make_oracle):
     walk = make_walk(3, 5.0)
     oracle = make_oracle(walk, walk.truth, CONFIG)
     fix = position_fix(walk.time[0], MAP, 0.01 * np.eye(3))
-    track = Navigator(oracle, CONFIG, backend=backend).run(walk, fixes=[fix])
-    np.testing.assert_allclose(track.trajectory.position_W[0], MAP, atol=1e-3)
-    np.testing.assert_allclose(np.diag(track.covariance[0, 6:9, 6:9]), 0.01, rtol=0.01)
+    graph = Navigator(oracle, CONFIG).run(walk, fixes=[fix])
+    for track in (graph, graph.filtered):
+        np.testing.assert_allclose(track.trajectory.position_W[0], MAP, atol=1e-3)
+        np.testing.assert_allclose(np.diag(track.covariance[0, 6:9, 6:9]), 0.01, rtol=0.01)
 
 
 @pytest.mark.parametrize(("backend", "gap"), [("ekf", 15.0), ("graph", 4.0)])
@@ -168,22 +168,20 @@ def test_a_wrong_first_position_does_not_turn_the_track(backend):
     assert np.linalg.norm(at_end.p_W - end.value) < 1.5
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_positions_undo_a_yaw_that_pointed_backwards(backend):
+def test_positions_undo_a_yaw_that_pointed_backwards():
     walk, _, oracle = measured(3, 40.0, CONFIG)
     wrong = yaw_of(walk.truth.at(np.array([4.0])).attitude_WB)[0] + np.pi
     right = [position_fix(t, true_at(walk, t), 0.09 * np.eye(3)) for t in np.arange(5.0, 38.0, 1.0)]
-    track = Navigator(oracle, CONFIG, backend=backend).run(
-        walk, fixes=[yaw_fix(4.0, wrong, 0.1), *right]
-    )
-    late = track.time > 28.0
-    truth = walk.truth.at(track.time[late])
-    turned = yaw_of(track.trajectory.attitude_WB[late] * truth.attitude_WB.inv())
-    sigma = np.sqrt(track.covariance[late, 2, 2])
-    assert (np.abs(turned) < np.maximum(3.0 * sigma, 0.1)).all()
-    assert sigma.max() < 0.3
-    error = np.linalg.norm(track.trajectory.position_W[late] - truth.position_W, axis=1)
-    assert error.max() < 1.0
+    graph = Navigator(oracle, CONFIG).run(walk, fixes=[yaw_fix(4.0, wrong, 0.1), *right])
+    for track in (graph, graph.filtered):
+        late = track.time > 28.0
+        truth = walk.truth.at(track.time[late])
+        turned = yaw_of(track.trajectory.attitude_WB[late] * truth.attitude_WB.inv())
+        sigma = np.sqrt(track.covariance[late, 2, 2])
+        assert (np.abs(turned) < np.maximum(3.0 * sigma, 0.1)).all()
+        assert sigma.max() < 0.3
+        error = np.linalg.norm(track.trajectory.position_W[late] - truth.position_W, axis=1)
+        assert error.max() < 1.0
 
 
 def test_more_accurate_positions_move_a_stationary_track(still_model):

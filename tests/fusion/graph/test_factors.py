@@ -230,7 +230,7 @@ def test_covariances_are_blocks_of_the_dense_inverse(height_sigma, closed):
     ordering = gtsam.Ordering()
     for key in keys:
         ordering.push_back(key)
-    covariances = marginal_covariances(graph.eliminateSequential(ordering, gtsam.EliminateQR))
+    covariances = dict(marginal_covariances(graph.eliminateSequential(ordering, gtsam.EliminateQR)))
     scale = np.tile([*[1.0] * 5, height_sigma, *[1.0] * 10], 7)
     dense = np.linalg.inv((J * scale).T @ (J * scale))
     assert sorted(covariances) == list(range(7))

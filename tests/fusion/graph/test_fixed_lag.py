@@ -233,11 +233,11 @@ def test_rest_stops_the_drift(still_model):
 def test_if_the_graph_fails_the_stream_continues_from_the_filter(walk, make_oracle, monkeypatch):
     solve, calls = KeyframeGraph.solve, []
 
-    def fails_once(self, max_rounds=5):
+    def fails_once(self, max_rounds, only_last):
         calls.append(self.times[self.last])
         if abs(calls[-1] - 8.0) < 1e-6 and calls.count(calls[-1]) == 1:
             raise IndeterminateError("velocity at 8.0 s is undetermined")
-        return solve(self, max_rounds)
+        return solve(self, max_rounds, only_last=only_last)
 
     walk = walk.slice(0.0, 12.0)
     oracle = make_oracle(walk, walk.truth, CONFIG)

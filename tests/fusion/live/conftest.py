@@ -52,12 +52,17 @@ def ends(session):
     return session.track.drawn.points[-1][1:4]
 
 
+def rerun(navigator, recording, fixes=()):
+    """The filter's track of a recorded file, by the model and settings of a navigator."""
+    alone = Navigator(navigator.model, navigator.config, navigator.prior, backend="ekf")
+    return alone.run(read_recording(recording), fixes=fixes)
+
+
 def end_of_rerun(session, navigator):
     """Where the navigator's track of the recording and fixes of a session ends [m]."""
     fixes = session.track.path.with_name(f"{session.track.path.stem}-fixes.csv")
     known = read_fixes(fixes) if fixes.exists() else ()
-    track = navigator.run(read_recording(session.track.path), fixes=known).filtered
-    return track.trajectory.position_W[-1]
+    return rerun(navigator, session.track.path, known).trajectory.position_W[-1]
 
 
 def full_disk(*arguments, **more):

@@ -17,7 +17,7 @@ from stario.sequences import read_recording
 from stario.sequences.geodesy import Georeference
 from stario.sequences.sequence import FloatArray
 
-from .conftest import SteadyWalk, added, command, send
+from .conftest import SteadyWalk, added, command, rerun, send
 
 PLACE = Georeference(48.1, 11.5)
 TILES = "http://tiles.example:81/{z}/{x}/{y}.png"
@@ -74,7 +74,7 @@ def test_used_places_put_the_track_where_a_run_of_its_recording_does(make_client
     status, track = session.status(), session.track
     assert status["georeferenced"]
     assert status["satellites"] == "13 satellite positions used, origin 48.100000,11.500000"
-    again = new_navigator().run(read_recording(track.path)).filtered
+    again = rerun(new_navigator(), track.path)
     there = again.trajectory.position_W
     np.testing.assert_allclose(track.drawn.points[-1][1:3], there[-1, :2], atol=0.05)
     # The whole track was moved and turned, not only what followed.

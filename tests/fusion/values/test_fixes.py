@@ -30,6 +30,12 @@ def model(walk, make_oracle):
     return make_oracle(walk, walk.truth, CONFIG)
 
 
+@pytest.fixture(scope="module")
+def fixed(walk, model):
+    """The filter's track of the walk with the fixes of `fixes_of`."""
+    return Navigator(model, CONFIG, backend="ekf").run(walk, fixes=fixes_of(walk))
+
+
 def truth_at(walk: ImuSequence, time: float) -> tuple[np.ndarray, np.ndarray, float]:
     """Position, velocity and yaw."""
     known = walk.truth.at(np.array([time]))
@@ -79,17 +85,15 @@ def assert_same(state: NavState, track: Track, atol: float = 1e-9) -> None:
 
 
 @pytest.mark.parametrize("late", [-3.0, 0.3, 0.85])
-def test_a_fix_is_applied_at_its_own_time_however_late(walk, make_oracle, late):
-    model, fixes = make_oracle(walk, walk.truth, CONFIG), fixes_of(walk)
-    track = Navigator(model, CONFIG, backend="ekf").run(walk, fixes=fixes)
+def test_a_fix_is_applied_at_its_own_time_however_late(walk, model, fixed, late):
     navigator = Navigator(model, CONFIG)
-    state = streamed(navigator, walk, fixes, late)
-    assert_same(state, track)
+    state = streamed(navigator, walk, fixes_of(walk), late)
+    assert_same(state, fixed)
     assert state.map_frame == 2
-    assert navigator.health.fixes["applied"] == track.health.fixes["applied"] == 4
-    assert navigator.health.updates == track.health.updates
-    assert navigator.health.mean_nis == pytest.approx(track.health.mean_nis)
-    assert navigator.health.zero_velocity == track.health.zero_velocity
+    assert navigator.health.fixes["applied"] == fixed.health.fixes["applied"] == 4
+    assert navigator.health.updates == fixed.health.updates
+    assert navigator.health.mean_nis == pytest.approx(fixed.health.mean_nis)
+    assert navigator.health.zero_velocity == fixed.health.zero_velocity
 
 
 def test_fixes_that_are_too_old_are_refused_and_counted(walk, model):
@@ -114,7 +118,7 @@ def test_a_fix_one_window_late_is_not_too_late_by_rounding(walk, model):
     assert "too late" not in navigator.health.fixes
 
 
-def test_future_fixes_wait_for_their_time(walk, model):
+def test_future_fixes_wait_for_their_time(walk, model, fixed):
     navigator = Navigator(model, CONFIG)
     for fix in reversed(fixes_of(walk)):
         apply_fix(navigator, fix)
@@ -122,7 +126,7 @@ def test_future_fixes_wait_for_their_time(walk, model):
     assert navigator.health.fixes == {"waiting": 5}
     state = streamed(navigator, walk, [], 0.0)
     assert navigator.health.fixes == {"applied": 4, "waiting": 1}
-    assert_same(state, Navigator(model, CONFIG, backend="ekf").run(walk, fixes=fixes_of(walk)))
+    assert_same(state, fixed)
 
 
 @pytest.mark.parametrize("backend", ["ekf", "graph"])
@@ -242,22 +246,22 @@ def test_positions_too_close_together_do_not_turn_the_map_frame(walk, model):
     assert track.health.fixes == {"applied": 1, "yaw not known": 2}
 
 
-@pytest.mark.parametrize("backend", ["ekf", "graph"])
-def test_one_position_leaves_the_direction_in_the_map_unknown(walk, model, backend):
+def test_one_position_leaves_the_direction_in_the_map_unknown(walk, model):
     """However the walk lies in the map, the error is within the sigma; the pivot is sure."""
     fix, walk = position_fix(5.0, truth_at(walk, 5.0)[0], 0.01 * EYE), walk.slice(0.0, 12.0)
-    track = Navigator(model, CONFIG, backend=backend).run(walk, fixes=[fix])
-    streamed = Navigator(model, CONFIG, backend=backend)
-    apply_fix(streamed, fix)
-    end = support.stream(streamed, walk)[-1]
-    arm = np.linalg.norm((track.trajectory.position_W - fix.value)[:, :2], axis=1)
-    sigma = np.sqrt(track.covariance[:, 6, 6] + track.covariance[:, 7, 7])
-    assert (sigma > 0.9 * arm).all()
-    assert sigma[np.argmin(arm)] < 0.5
-    assert np.sqrt(track.covariance[-1, 2, 2]) == pytest.approx(UNKNOWN_YAW, rel=0.05)
-    assert end.map_frame == 1
-    np.testing.assert_allclose(np.sqrt(end.covariance[2, 2]), UNKNOWN_YAW, rtol=0.05)
-    assert streamed.health.final_sigma["yaw_rad"] > 1.5
+    graph = Navigator(model, CONFIG).run(walk, fixes=[fix])
+    for backend, track in (("ekf", graph.filtered), ("graph", graph)):
+        streamed = Navigator(model, CONFIG, backend=backend)
+        apply_fix(streamed, fix)
+        end = support.stream(streamed, walk)[-1]
+        arm = np.linalg.norm((track.trajectory.position_W - fix.value)[:, :2], axis=1)
+        sigma = np.sqrt(track.covariance[:, 6, 6] + track.covariance[:, 7, 7])
+        assert (sigma > 0.9 * arm).all()
+        assert sigma[np.argmin(arm)] < 0.5
+        assert np.sqrt(track.covariance[-1, 2, 2]) == pytest.approx(UNKNOWN_YAW, rel=0.05)
+        assert end.map_frame == 1
+        np.testing.assert_allclose(np.sqrt(end.covariance[2, 2]), UNKNOWN_YAW, rtol=0.05)
+        assert streamed.health.final_sigma["yaw_rad"] > 1.5
 
 
 # --- bad fixes -------------------------------------------------------------------------------

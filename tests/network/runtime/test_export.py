@@ -1,4 +1,7 @@
+from importlib.util import find_spec
+
 import numpy as np
+import onnxruntime as ort
 import pytest
 import torch
 from training_runs import shallow
@@ -7,16 +10,16 @@ from stario.network.architectures import ARCHITECTURES, build_network
 from stario.network.card import Calibration, Card
 from stario.network.displacement import DisplacementNetwork
 from stario.network.model import DisplacementModel, load_model, save_model
+from stario.network.runtime.export import export_onnx
 from stario.network.runtime.survey import random_windows
 from stario.network.runtime.torch_engine import TorchEngine
 from stario.sequences.errors import InputError, WeightsError
 from stario.sequences.sequence import FloatArray
 
-pytest.importorskip("onnx")
-pytest.importorskip("onnxscript")
-ort = pytest.importorskip("onnxruntime")
-
-from stario.network.runtime.export import export_onnx  # noqa: E402
+# Not imported here: that takes longer than to collect all other tests of networks.
+pytestmark = pytest.mark.skipif(
+    not (find_spec("onnx") and find_spec("onnxscript")), reason="needs the extra onnx"
+)
 
 CALIBRATION = Calibration((1.5, 1.5, 0.7), (1.2, 1.2, 0.9), (0.02, 0.02, 0.01))
 

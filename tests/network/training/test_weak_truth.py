@@ -184,6 +184,7 @@ def test_a_recording_without_positions_has_no_legs():
         leg_streams(WALK)
 
 
+@pytest.mark.slow
 def test_training_with_legs_reduces_the_error_at_positions(tmp_path, monkeypatch):
     """Legs are trained together with windows of full truth from the same walk."""
     [legs] = leg_streams(with_positions("positions", 0.1))
