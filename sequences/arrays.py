@@ -97,14 +97,14 @@ def check_type(
     """
     if not (isinstance(value, kind) or (optional and value is None)):
         expected = f"a value of type {kind.__name__}" + (" or None" if optional else "")
-        raise InputError(name, shown(value), expected, remedy)
+        raise InputError(name, short_repr(value), expected, remedy)
 
 
 def check_choice(name: str, value: object, choices: Iterable[Choice]) -> Choice:
     """Return an argument; raise InputError, which names the choices, unless it is one of them."""
     known = tuple(choices)
     if not (isinstance(value, str) and value in known):
-        raise InputError(name, shown(value), f"one of {', '.join(known)}")
+        raise InputError(name, short_repr(value), f"one of {', '.join(known)}")
     return known[known.index(value)]
 
 
@@ -114,22 +114,22 @@ def generator(seed: int, *stream: int) -> np.random.Generator:
     Raises InputError unless the seed is an integer >= 0.
     """
     if not (isinstance(seed, int | np.integer) and seed >= 0):
-        raise InputError("seed", shown(seed), "an integer >= 0")
+        raise InputError("seed", short_repr(seed), "an integer >= 0")
     return np.random.default_rng([int(seed), *stream] if stream else int(seed))
 
 
-def shown(value: object) -> str:
+def short_repr(value: object) -> str:
     """Return a value as text for an error's single line."""
     return f"{' '.join(repr(value).split()):.60}"
 
 
-def first_of(names: Sequence[str], most: int = 5) -> str:
+def shortlist(names: Sequence[str], most: int = 5) -> str:
     """Return the first of the names for an error, and how many more there are."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
 
 
-def numbers(name: str, value: object) -> FloatArray:
+def as_float64(name: str, value: object) -> FloatArray:
     """Return an array-like as float64, NaN where a masked array has no value.
 
     Raises InputError if it holds dates, text or rows of unequal length.
@@ -141,14 +141,14 @@ def numbers(name: str, value: object) -> FloatArray:
             array = np.asarray(array, dtype=np.float64)
             return array if masked is None else np.where(masked, np.nan, array)
     except (TypeError, ValueError):
-        raise InputError(name, shown(value), "an array of numbers") from None
+        raise InputError(name, short_repr(value), "an array of numbers") from None
     remedy = f"({name} - {name}[0]) / np.timedelta64(1, 's') gives seconds since the first"
     raise InputError(name, f"values of type {array.dtype}", "numbers", remedy)
 
 
-def some_times(name: str, value: FloatArray) -> FloatArray:
+def finite_times(name: str, value: FloatArray) -> FloatArray:
     """Return times (N,) [s] in any order; raise InputError unless they are numbers, one or more."""
-    time = numbers(name, value)
+    time = as_float64(name, value)
     if time.ndim != 1 or time.size == 0:
         raise InputError(name, f"shape {time.shape}", "(N,) with at least one sample")
     return time
@@ -156,7 +156,7 @@ def some_times(name: str, value: FloatArray) -> FloatArray:
 
 def checked_time(name: str, value: FloatArray) -> FloatArray:
     """Return times (N,) [s]; raise InputError unless they are finite and strictly increase."""
-    time = some_times(name, value)
+    time = finite_times(name, value)
     if not np.isfinite(time).all():
         raise InputError(name, "a value that is not finite", "finite seconds")
     steps = np.diff(time)
@@ -191,7 +191,7 @@ def checked_array(
     name: str, value: FloatArray, shape: tuple[int, ...], where: BoolArray | bool = True
 ) -> FloatArray:
     """Return an array; raise InputError unless it has the shape, and finite rows at `where`."""
-    array = numbers(name, value)
+    array = as_float64(name, value)
     if array.shape != shape:
         raise InputError(name, f"shape {array.shape}", f"{shape}")
     bad = ~np.isfinite(array.reshape(len(array), -1)).all(axis=1) & where

@@ -17,11 +17,11 @@ from scipy.spatial.transform import Rotation
 from stario.sequences.arrays import BoolArray as BoolArray
 from stario.sequences.arrays import FloatArray as FloatArray
 from stario.sequences.arrays import (
+    as_float64,
     check_type,
     checked_time,
+    finite_times,
     interpolated,
-    numbers,
-    some_times,
 )
 from stario.sequences.attitude.stacks import slerp
 from stario.sequences.auxiliary import Barometer as Barometer
@@ -199,8 +199,8 @@ class ImuSequence:
         for name, kind in _PARTS.items():
             remedy = f"create one with {kind.__name__}(...)"
             check_type(name, getattr(self, name), kind, remedy, optional=True)
-        time = some_times("time", self.time)
-        vectors = {name: numbers(name, getattr(self, name)) for name in ("gyro", "accel")}
+        time = finite_times("time", self.time)
+        vectors = {name: as_float64(name, getattr(self, name)) for name in ("gyro", "accel")}
         for name, value in vectors.items():
             if value.shape != (len(time), 3):
                 raise InputError(name, f"shape {value.shape}", f"({len(time)}, 3) as time")

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from stario.sequences.arrays import check_type, shown
+from stario.sequences.arrays import check_type, short_repr
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 
@@ -169,7 +169,7 @@ def known_unit(field: str, text: str, known: Mapping[str, float]) -> str:
         InputError: it is not one of those known; names the field.
     """
     if (name := unit_named(text)) not in known:
-        raise InputError(field, shown(text), f"one of {', '.join(known)}")
+        raise InputError(field, short_repr(text), f"one of {', '.join(known)}")
     return name
 
 

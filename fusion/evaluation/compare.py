@@ -37,7 +37,7 @@ from stario.fusion.values.fixes import Fix, fix_list
 from stario.fusion.values.state import Track
 from stario.sequences.accuracy.metrics import CONVENTIONS, Alignment, align, evaluate_track
 from stario.sequences.accuracy.nees import position_nees
-from stario.sequences.arrays import check_choice, check_type, shown
+from stario.sequences.arrays import check_choice, check_type, short_repr
 from stario.sequences.datasets.batch import Skipped, each
 from stario.sequences.errors import InputError
 from stario.sequences.files import unused_name
@@ -337,7 +337,7 @@ def compare_recordings(
     """
     if isinstance(paths, str | Path):
         remedy = "find_recordings(path) returns one"
-        raise InputError("paths", shown(paths), "a list of paths", remedy)
+        raise InputError("paths", short_repr(paths), "a list of paths", remedy)
     paths, done = list(paths), 0
 
     def report_share(share: float) -> None:

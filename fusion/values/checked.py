@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from stario.fusion.imu.barometer import PRESSURE_RANGE
-from stario.sequences.arrays import numbers, shown
+from stario.sequences.arrays import as_float64, short_repr
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 
@@ -31,7 +31,7 @@ def shaped(name: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
         InputError: it is not numeric or has another shape.
     """
     try:
-        array = numbers(name, value)
+        array = as_float64(name, value)
     except InputError as error:
         expected = f"numbers of shape {shape}" if shape else "a number"
         raise InputError(name, error.found, expected) from None
@@ -63,7 +63,7 @@ def _number(name: str, value: float, expected: str) -> float:
             raise ValueError
         return float(value)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(name, shown(value), expected) from None
+        raise InputError(name, short_repr(value), expected) from None
 
 
 def three(name: str, value: Vector) -> tuple[float, float, float]:
@@ -73,7 +73,7 @@ def three(name: str, value: Vector) -> tuple[float, float, float]:
             raise ValueError  # "123" would be 1, 2, 3; a table yields its columns' names
         x, y, z = map(float, value)
     except (TypeError, ValueError, OverflowError):
-        raise InputError(name, shown(value), "three numbers in body axes") from None
+        raise InputError(name, short_repr(value), "three numbers in body axes") from None
     return x, y, z
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from stario.fusion.values.checked import floored, shaped
 from stario.fusion.values.health import Health
-from stario.sequences.arrays import check_type, shown
+from stario.sequences.arrays import check_type, short_repr
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray
 
@@ -131,7 +131,7 @@ def position_fix(time: float, p_W: Any, covariance: Any) -> Fix:
     latitude, longitude, height = np.abs(fix.value)
     if latitude <= 90.0 and longitude <= 180.0 and _HIGH_M < height < _HIGHEST_M:
         remedy = "give metres east, north and up of a place nearby; if these are, take it higher up"
-        found = f"{shown(fix.value.tolist())}, as of latitude, longitude and height"
+        found = f"{short_repr(fix.value.tolist())}, as of latitude, longitude and height"
         raise InputError("position", found, "metres in the map's frame", remedy)
     return fix
 

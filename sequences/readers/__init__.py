@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from stario.sequences.arrays import check_choice, shown
+from stario.sequences.arrays import check_choice, short_repr
 from stario.sequences.clean_samples import in_order
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers import bag, generic_csv, unpacking
@@ -199,7 +199,7 @@ def find_recordings(
 def _readable(path: str | Path, expected: str) -> Path:
     """Return a path, checked to be that of a file or a folder that may be read."""
     if not isinstance(path, str | Path):
-        raise InputError("path", shown(path), f"the path of {expected}")
+        raise InputError("path", short_repr(path), f"the path of {expected}")
     path = Path(path)
     file = split_name(path)[0]
     if not file.exists():

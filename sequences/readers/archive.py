@@ -19,7 +19,13 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from stario.sequences.arrays import checked_array, checked_valid, first_of, numbers, some_times
+from stario.sequences.arrays import (
+    as_float64,
+    checked_array,
+    checked_valid,
+    finite_times,
+    shortlist,
+)
 from stario.sequences.auxiliary import Timed
 from stario.sequences.errors import InputError, ReadError, StarioError
 from stario.sequences.files import atomic_path, unused_name
@@ -180,7 +186,7 @@ def _none_chosen(
     )
     key = next(none_match, next(iter(where)))
     values = sorted({_text(attributes.get(key, "")) for attributes in known} - {""})
-    listed = first_of(values, 6)
+    listed = shortlist(values, 6)
     expected = f"{key} to be one of {listed}" if listed else f"another attribute: none has {key}"
     return ReadError(path, f"recordings with {filter_words(where)}", "none", expected)
 
@@ -246,7 +252,7 @@ def _part(path: Path, group: Any, layout: Layout) -> Any:
         attribute: _numbers(group, f"{layout.stem}/{name}")
         for name, attribute in ({"t": "time"} | layout.needed | optional).items()
     }
-    time = some_times(f"{layout.stem}/t", rows["time"])
+    time = finite_times(f"{layout.stem}/t", rows["time"])
     if "attitude_WB" in rows:
         field = f"{layout.stem}/quat_xyzw"
         quat_xyzw = checked_array(field, rows["attitude_WB"], (len(time), 4), where=False)
@@ -263,7 +269,7 @@ def _part(path: Path, group: Any, layout: Layout) -> Any:
 def _numbers(group: Any, field: str) -> FloatArray:
     if not hasattr(dataset := group.get(field), "dtype"):
         raise InputError(field, "no such dataset", "an array of numbers")
-    return numbers(field, dataset[()])
+    return as_float64(field, dataset[()])
 
 
 def _plain(value: Any) -> str | float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from stario.sequences.arrays import first_of
+from stario.sequences.arrays import shortlist
 from stario.sequences.errors import ReadError
 from stario.sequences.readers.columns import HEADER
 from stario.sequences.readers.phones.files import (
@@ -50,7 +50,7 @@ def unrecognised(path: Path, inside: list[Path], known: str) -> ReadError:
         found, fix = "one sensor of a recording", f"name its gyroscope: {part_of.gyro}"
         return ReadError(path, "content", found, "a recording", fix)
     if path.is_dir() and (files := _of_several_devices(path)):
-        found = f"files of different devices or recordings ({first_of(files)})"
+        found = f"files of different devices or recordings ({shortlist(files)})"
         expected, fix = "those of one", "name the files of one alike: gyro_a.csv and accel_a.csv"
         return ReadError(path, "sensors", found, expected, fix)
     if path.is_dir() and (poses := pose_files(path)):
@@ -95,7 +95,7 @@ def _of_several_devices(folder: Path) -> list[str]:
 def _folder(path: Path) -> tuple[str, str]:
     """Return what a folder holds and what is wrong with the first file that may be a recording."""
     entries = sorted(p.name for p in path.iterdir() if not p.name.startswith("."))
-    found = f"a folder with {first_of(entries) or 'nothing'}"
+    found = f"a folder with {shortlist(entries) or 'nothing'}"
     files = [file for file in sorted(path.rglob("*")) if file.suffix.lower() in SUFFIXES]
     if not files:
         return found, "name a folder with a recording"

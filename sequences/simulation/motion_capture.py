@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.arrays import first_of
+from stario.sequences.arrays import shortlist
 from stario.sequences.errors import InputError, ReadError
 from stario.sequences.readers.archive import archive_attributes, is_hdf5, opened_hdf5, split_name
 from stario.sequences.sequence import FloatArray
@@ -101,7 +101,7 @@ def read_body(path: Path) -> BodyMotion:
 
 
 def _no_such_clip(path: Path, clip: str | None, names: list[str]) -> ReadError:
-    return ReadError(path, "clip", repr(clip), f"a name in it, such as {first_of(names, 3)}")
+    return ReadError(path, "clip", repr(clip), f"a name in it, such as {shortlist(names, 3)}")
 
 
 def _from_hdf5(path: Path, clip: str) -> BodyMotion:
