@@ -27,16 +27,21 @@ class Route:
     Attributes:
         position_W: (N, 3) point on the floor below the person [m].
         heading: (N,) direction that the person faces [rad].
-        speed: (N,) speed over the floor [m/s].
+        velocity_H: (N, 2) velocity over the floor, ahead and to the left [m/s].
         turn_rate: (N,) rate of change of the heading [rad/s].
         climb: (N,) vertical speed on stairs [m/s], negative when descending.
     """
 
     position_W: FloatArray
     heading: FloatArray
-    speed: FloatArray
+    velocity_H: FloatArray
     turn_rate: FloatArray
     climb: FloatArray
+
+    @property
+    def speed(self) -> FloatArray:
+        """(N,) speed over the floor [m/s]."""
+        return np.asarray(np.hypot(*self.velocity_H.T))
 
 
 class Command(NamedTuple):
@@ -101,8 +106,7 @@ def route_along(
     forward, left = velocity_H.T
     up = climb + smoothed(held[:, 4], rate, sigma)
     velocity_W = np.stack([c * forward - s * left, s * forward + c * left, up], axis=1)
-    speed = np.hypot(forward, left)
-    return Route(integral(velocity_W, rate), heading, speed, turn_rate, climb)
+    return Route(integral(velocity_W, rate), heading, velocity_H, turn_rate, climb)
 
 
 def _activity(rng: np.random.Generator, preferred: float, wheels: bool) -> list[Command]:

@@ -1,10 +1,8 @@
 """Generated walks of a person with a device, as input to the simulator; a seed defines each walk.
 
 A walk is a route (where the person goes), a gait that follows its speed, and a carrying mode (how
-the device moves relative to the person). Speed v determines the step rate f as in people, who walk
-slowly with short steps rather than with few: f grows with v^0.3, from k h f^2 = v at a brisk walk
-of people of height h. The medians of RIDI, tyrex and KIPD are 1.5, 1.8 and 2.0 Hz at 0.5, 1.1 and
-1.5 m/s.
+the device moves relative to the person). Step rate and motion at a speed are those of a recorded
+person (`strides`), who walks slowly with short steps rather than with few.
 """
 
 from __future__ import annotations
@@ -21,12 +19,9 @@ from stario.sequences.attitude.stacks import composed
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import FloatArray, Trajectory
 from stario.sequences.settings import check_number
-from stario.sequences.simulation.carrying import CARRIES
-from stario.sequences.simulation.gait import CarryMotion, Gait
+from stario.sequences.simulation.carrying import CARRYING_MODES, carry_motion, drawn_person
 from stario.sequences.simulation.routes import RISER, Route, drift, integral, random_route, smoothed
-
-CARRYING_MODES = tuple(CARRIES)
-"""Names of the carrying modes."""
+from stario.sequences.simulation.strides import CarryMotion, Gait, StrideCycle, step_rate
 
 MAX_SAMPLES = 2_000_000
 """Most samples of a simulated recording, which is about half a gigabyte as CSV."""
@@ -34,15 +29,8 @@ MAX_SAMPLES = 2_000_000
 _SLOWEST_STEP_RATE = 0.8
 """Step rate of a person who barely moves [Hz]."""
 
-_BRISK = 1.4
-"""Speed [m/s] at which the gait has its full strength."""
-
-_STEP_RATE_POWER = 0.3
-"""Exponent of the speed in the step rate."""
-
-_EFFORT_POWER = 1.2
-"""Exponent of the speed in the accelerations: on stiff legs the trunk rises by the square of the
-step's length, hence v^2; knees that give leave 0.8 to 1.4 of most ways (tyrex, RIDI, KIPD)."""
+_FACING = 0.1
+"""Speed ahead [m/s] that a person's steps have when they turn on the spot: those go nowhere."""
 
 _CHANGE = 0.6
 """Standard deviation of the Gaussian that smooths the change of carrying mode [s]."""
@@ -50,15 +38,13 @@ _CHANGE = 0.6
 
 @dataclass(frozen=True)
 class WalkStyle:
-    """A person's gait, and how the person carries the device.
+    """A person, and how the person carries the device.
 
     Attributes:
         carry: carrying mode, one of `CARRYING_MODES`.
         next_carry: carrying mode after a change within the walk; empty for no change.
         height: height of the person [m].
-        step_constant: k in speed = k height step_rate^2 at a brisk walk [s]; large for long steps.
         preferred_speed: preferred speed [m/s].
-        vigor: strength of arm swing and heel strike, 1 is typical.
         mount_rotvec: rotation vector of the device from its neutral attitude [rad], of any size.
 
     Raises:
@@ -68,9 +54,7 @@ class WalkStyle:
     carry: str = "handheld"
     next_carry: str = ""
     height: float = 1.75
-    step_constant: float = 0.21
     preferred_speed: float = 1.2
-    vigor: float = 1.0
     mount_rotvec: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
@@ -94,18 +78,14 @@ class WalkStyle:
             carry=carry,
             next_carry=str(rng.choice(others)) if changes else "",
             height=float(np.clip(rng.normal(1.72, 0.1), 1.45, 2.0)),
-            step_constant=float(np.clip(rng.normal(0.21, 0.02), 0.16, 0.27)),
             preferred_speed=float(np.clip(rng.normal(1.05, 0.3), 0.5, 1.8)),
-            vigor=float(rng.uniform(0.7, 1.3)),
             mount_rotvec=(float(x), float(y), float(z)),
         )
 
 
 _RANGES = (
     ("height", 1.0, 2.5),
-    ("step_constant", 0.1, 0.4),
     ("preferred_speed", 0.3, 2.2),
-    ("vigor", 0.0, 3.0),
 )
 
 _ODDS = (0.16, 0.07, 0.07, 0.08, 0.14, 0.08, 0.06, 0.1, 0.1, 0.14)
@@ -151,12 +131,22 @@ def carried_along(
     rng: np.random.Generator, route: Route, rate: float, style: WalkStyle
 ) -> Trajectory:
     """Return the poses of a device that a person carries along a route sampled at `rate` [Hz]."""
-    gait = _gait(rng, rate, route, style)
-    motion = _carried(gait, style)
+    n = len(route.heading)
+    modes = [carry for carry in (style.carry, style.next_carry) if carry]
+    people = [drawn_person(rng, carry, style.preferred_speed) for carry in modes]
+    later = np.zeros(n)
+    if style.next_carry:
+        after = np.arange(n) > n * rng.uniform(0.25, 0.75)
+        later = smoothed(after.astype(np.float64), rate, _CHANGE)
+    gait = _gait(rng, rate, route, style.height, people, later)
+    motion = carry_motion(gait, modes[0], people[0])
+    if style.next_carry:
+        second = carry_motion(gait, modes[1], people[1])
+        motion = _changed(rng, motion, second, later[:, None])
     R_WH = about_z(route.heading)
     R_HD = composed(Rotation.from_rotvec(motion.turn_H), Rotation.from_rotvec(style.mount_rotvec))
     return Trajectory(
-        time=np.arange(len(gait)) / rate,
+        time=np.arange(n) / rate,
         position_W=route.position_W + R_WH.apply(motion.offset_H),
         attitude_WB=composed(R_WH, R_HD),
     )
@@ -169,45 +159,43 @@ def check_amount(duration: float, rate: float) -> None:
         raise InputError("duration", f"{duration:g} s", most)
 
 
-def step_rate(speed: FloatArray, style: WalkStyle) -> FloatArray:
-    """Return the step rate (N,) [Hz] at a speed (N,) [m/s]."""
-    brisk = math.sqrt(_BRISK / (style.step_constant * style.height))
-    return np.asarray(brisk * (speed / _BRISK) ** _STEP_RATE_POWER)
-
-
-def _gait(rng: np.random.Generator, rate: float, route: Route, style: WalkStyle) -> Gait:
+def _gait(
+    rng: np.random.Generator,
+    rate: float,
+    route: Route,
+    height: float,
+    people: list[StrideCycle],
+    later: FloatArray,
+) -> Gait:
+    """Return the gait of one recorded person, or of one and, by the weight `later`, another."""
     n = len(route.heading)
     # Turning on the spot takes steps too: the feet move on a circle with a radius of 0.3 m.
     moving = np.hypot(route.speed, 0.3 * route.turn_rate)
     uneven = 1.0 + 0.025 * drift(rng, n, rate, 0.4)
     stairs = np.abs(route.climb) / RISER
-    wanted = np.stack([step_rate(moving, style), stairs, np.full(n, _SLOWEST_STEP_RATE)])
+    wanted = (1.0 - later) * step_rate(people[0], moving) + later * step_rate(people[-1], moving)
+    wanted = np.stack([wanted, stairs, np.full(n, _SLOWEST_STEP_RATE)])
     steps = uneven * np.sum(wanted**8, axis=0) ** 0.125  # the largest of the three, smoothly
-    strength = 1.0 + 0.1 * drift(rng, n, rate, 0.5)
-    pace = np.hypot(moving, 0.8 * stairs)
+    course = np.add(route.velocity_H, [_FACING, 0.0])
     return Gait(
         rng=rng,
         rate=rate,
-        phase=rng.uniform(0.0, 2.0 * np.pi) + 2.0 * np.pi * integral(steps, rate),
+        phase=rng.uniform(0.0, 2.0 * np.pi) + np.pi * integral(steps, rate),
         step_rate=steps,
-        effort=strength * (pace / _BRISK) ** _EFFORT_POWER,
+        pace=np.hypot(moving, 0.8 * stairs),
         speed=route.speed,
-        height=style.height,
-        vigor=style.vigor,
+        course=course / np.hypot(0.5 * _FACING, np.hypot(*course.T))[:, None],
+        height=height,
     )
 
 
-def _carried(gait: Gait, style: WalkStyle) -> CarryMotion:
-    first = CARRIES[style.carry](gait)
-    if not style.next_carry:
-        return first
-    second = CARRIES[style.next_carry](gait)
-    n, rng = len(gait), gait.rng
-    after = np.arange(n) > n * rng.uniform(0.25, 0.75)
-    weight = smoothed(after.astype(np.float64), gait.rate, _CHANGE)[:, None]
+def _changed(
+    rng: np.random.Generator, first: CarryMotion, second: CarryMotion, later: FloatArray
+) -> CarryMotion:
+    """Return the motion of a device that is put elsewhere, and gripped anew."""
     axis = rng.standard_normal(3)
     regrip = rng.uniform(0.2, 2.0) * axis / np.linalg.norm(axis)
-    turn = Rotation.from_rotvec((1.0 - weight) * first.turn_H + weight * second.turn_H)
-    turn = turn * Rotation.from_rotvec(weight * regrip)
-    offset = (1.0 - weight) * first.offset_H + weight * second.offset_H
+    turn = Rotation.from_rotvec((1.0 - later) * first.turn_H + later * second.turn_H)
+    turn = turn * Rotation.from_rotvec(later * regrip)
+    offset = (1.0 - later) * first.offset_H + later * second.offset_H
     return CarryMotion(offset, turn.as_rotvec())

@@ -28,7 +28,7 @@ def without_gravity(sequence: ImuSequence) -> ImuSequence:
 @pytest.mark.parametrize("carry", CARRYING_MODES)
 def test_walks_pass_and_their_wrong_units_are_named(carry):
     """Swinging arms and pockets rotate the device fast and press it outward, yet units are SI."""
-    style = WalkStyle(carry=carry, preferred_speed=1.4, vigor=1.5)
+    style = WalkStyle(carry=carry, preferred_speed=1.4)
     walk = simulate_imu(generate_walk(1, 30.0, style=style), 100.0, PHONE_IMU, 1)
     check_units(walk)
     check_units(walk.without_truth())
@@ -49,7 +49,7 @@ def test_a_hard_shaken_device_passes_but_not_without_gravity():
 
 def test_the_unit_is_not_asked_of_a_phone_that_swings_in_a_pocket():
     """Its average force is as large in either unit, but not since it turned about the vertical."""
-    style = WalkStyle(carry="pocket", preferred_speed=1.4, vigor=1.3)
+    style = WalkStyle(carry="pocket", preferred_speed=1.4)
     swung = simulate_imu(generate_walk(0, 30.0, style=style), 100.0, PHONE_IMU).without_truth()
     assert np.percentile(np.linalg.norm(swung.gyro, axis=1), 95) > 3.0
     assert unit_findings(swung) == []
@@ -230,7 +230,7 @@ def test_real_recordings_pass_and_their_wrong_units_are_named():
 
 def test_swapped_gyroscope_axes_are_not_mistaken_for_degrees():
     """At the ear the device turns at 1.3 rad/s; the cause is swapped axes, not deg/s."""
-    style = WalkStyle(carry="call", preferred_speed=1.4, vigor=1.5)
+    style = WalkStyle(carry="call", preferred_speed=1.4)
     walk = simulate_imu(generate_walk(1, 30.0, style=style), 100.0, PHONE_IMU, 1).without_truth()
     text = refusal(replace(walk, gyro=walk.gyro[:, [1, 2, 0]]))
     assert "contradict the accelerometer" in text

@@ -2,23 +2,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import hilbert, welch
+from scipy.signal import welch
 
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, Trajectory
-from stario.sequences.simulation.gait import Gait, Strike, heel_strikes, trunk
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.insertion import insert_moment
 from stario.sequences.simulation.moments import MOMENTS
 from stario.sequences.simulation.routes import Route, band_noise, drift, random_route
-from stario.sequences.simulation.walks import (
-    CARRYING_MODES,
-    WalkStyle,
-    _gait,
-    generate_walk,
-    step_rate,
-)
+from stario.sequences.simulation.strides import stride_cycles
+from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, _gait, generate_walk
 
 
 @pytest.mark.parametrize("carry", CARRYING_MODES)
@@ -58,53 +52,6 @@ def test_a_seed_reproduces_and_another_differs(simulate):
     assert len(first) != len(other) or not np.allclose(first.accel, other.accel)
 
 
-def test_step_rate_and_step_length_grow_together_with_speed():
-    style = WalkStyle(height=1.75)
-    speed = np.array([0.5, 1.0, 1.4, 2.0])
-    rate = step_rate(speed, style)
-    assert (np.diff(rate) > 0.0).all()
-    assert (np.diff(speed / rate) > 0.0).all()
-    # Measured on people with phones: 1.5, 1.75 to 1.85, 1.95 to 2.0 and 2.2 steps per second.
-    np.testing.assert_allclose(rate, [1.45, 1.78, 1.96, 2.18], atol=0.06)
-    tall, short = replace(style, height=1.95), replace(style, height=1.55)
-    assert (step_rate(speed, tall) < step_rate(speed, short)).all()
-
-
-@pytest.mark.parametrize("speed", [0.7, 1.1, 1.5])
-def test_the_device_bounces_at_the_step_rate_of_its_speed(speed):
-    """Over several walks the strongest vertical spectral line lies at the step rate."""
-    style = WalkStyle(carry="bag", preferred_speed=speed, vigor=0.5)
-    found, expected = [], []
-    for seed in range(4):
-        walk = generate_walk(seed, 60.0, style=style)
-        found += list(_bounce_rates(walk))
-        expected += list(step_rate(_window_speeds(walk), style))
-    walking = np.array(expected) > step_rate(np.array([0.5]), style)[0]
-    ratio = np.array(found)[walking] / np.array(expected)[walking]
-    assert walking.sum() > 20
-    assert np.median(ratio) == pytest.approx(1.0, abs=0.08)
-
-
-def _windows(walk: Trajectory) -> list[slice]:
-    return [slice(k, k + 400) for k in range(0, len(walk) - 400, 400)]
-
-
-def _window_speeds(walk: Trajectory) -> np.ndarray:
-    velocity = np.gradient(walk.position_W[:, :2], walk.time, axis=0)
-    smooth = np.stack([np.convolve(v, np.ones(100) / 100, mode="same") for v in velocity.T], axis=1)
-    return np.array([np.linalg.norm(smooth[w], axis=1).mean() for w in _windows(walk)])
-
-
-def _bounce_rates(walk: Trajectory) -> np.ndarray:
-    upward = np.gradient(np.gradient(walk.position_W[:, 2], walk.time), walk.time)
-    rates = []
-    for w in _windows(walk):
-        f, power = welch(upward[w], 100.0, nperseg=400, nfft=4096)
-        band = (f > 0.7) & (f < 2.6)
-        rates.append(f[band][np.argmax(power[band])])
-    return np.array(rates)
-
-
 def test_routes_stop_turn_climb_and_keep_to_pedestrian_speeds():
     routes = [random_route(np.random.default_rng(seed), 6000, 100.0, 1.1) for seed in range(20)]
     speed = np.concatenate([route.speed for route in routes])
@@ -141,47 +88,6 @@ def test_a_trolley_neither_climbs_nor_bounces():
 def _low_band(walk: Trajectory) -> float:
     f, power = welch(np.diff(walk.position_W[:, 2], 2) * 1e4, 100.0, nperseg=1024)
     return float(power[(f > 1.0) & (f < 3.0)].sum())
-
-
-_BLOW = Strike(1.0, 7.0, 0.3, (0.6, 90.0), 0.5, (0.3, 60.0), (0.2, 30.0), (0.4, -60.0), 0.0)
-
-
-def test_what_heel_strikes_excite_has_the_size_and_lead_that_were_measured():
-    time, one = np.arange(2000) / 200.0, np.ones(2000)
-    phase = 2.0 * np.pi * 1.8 * time
-    found = []
-    for seed in range(20):
-        gait = Gait(np.random.default_rng(seed), 200.0, phase, 1.8 * one, one, one, 1.75, 1.0)
-        ring = heel_strikes(gait, _BLOW)
-        rates = np.gradient(ring.turn_H, time, axis=0)
-        forces = np.gradient(np.gradient(ring.offset_H, time, axis=0), time, axis=0)
-        x, y, z, about_x, about_y, about_z = hilbert(np.hstack([forces, rates])[100:-100], axis=0).T
-        pairs = ((x, z), (about_x, y), (about_y, z), (about_z, y))
-        found.append([np.vdot(b, a) / np.vdot(b, b) for a, b in pairs])
-        assert np.std(z.real) == pytest.approx(1.0, rel=0.25)
-    mean = np.mean(found, axis=0)
-    np.testing.assert_allclose(np.degrees(np.angle(mean)), [90.0, 60.0, 30.0, -60.0], atol=15.0)
-    # Each harmonic strays, so that the coherent part is smaller than the whole.
-    assert ((np.abs(mean) > [0.35, 0.1, 0.1, 0.15]) & (np.abs(mean) < [0.6, 0.3, 0.2, 0.4])).all()
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_heel_strikes_and_surge_have_the_phases_of_people(seed):
-    """The trunk is slowest where it is highest, and over the standing leg there; the device rings
-    once the other leg is loaded."""
-    time, one = np.arange(2000) / 200.0, np.ones(2000)
-    phase = 2.0 * np.pi * 1.8 * time
-    gait = Gait(np.random.default_rng(seed), 200.0, phase, 1.8 * one, one, 1.3 * one, 1.75, 1.0)
-    body = trunk(gait, 2.0, 1.0)
-    assert np.corrcoef(np.gradient(body[:, 0], time), body[:, 2])[0, 1] < -0.7
-    assert np.corrcoef(body[:, 1] ** 2, np.cos(phase))[0, 1] > 0.8
-    calm = trunk(replace(gait, rng=np.random.default_rng(seed), effort=0.3 * one), 2.0, 1.0)
-    forward, side, up = calm.std(axis=0) / body.std(axis=0)
-    assert up < 0.35 < 0.5 < min(forward, side) < 1.0
-    strike = heel_strikes(gait, _BLOW)
-    ring = np.gradient(np.gradient(strike.offset_H[:, 2], time), time) ** 2
-    after_strike = np.mod(phase - np.pi - 0.9, 2.0 * np.pi) < np.pi
-    assert ring[after_strike].mean() > 2.0 * ring[~after_strike].mean()
 
 
 def test_a_mount_changes_neither_path_nor_rotation_in_the_world():
@@ -227,13 +133,16 @@ def test_noise_has_unit_deviation_in_its_band():
 
 def test_turning_on_the_spot_takes_steps():
     count, still = 500, np.zeros(500)
-    route = Route(np.zeros((count, 3)), 0.02 * np.arange(count), still, still + 2.0, still)
-    standing = replace(route, turn_rate=still)
-    turning, resting = (
-        _gait(np.random.default_rng(0), 100.0, r, WalkStyle()) for r in (route, standing)
+    route = Route(
+        np.zeros((count, 3)), 0.02 * np.arange(count), np.zeros((count, 2)), still + 2, still
     )
-    assert turning.effort.min() > 0.3
-    assert resting.effort.max() < 1e-9
+    standing = replace(route, turn_rate=still)
+    people = stride_cycles("handheld")[:1]
+    turning, resting = (
+        _gait(np.random.default_rng(0), 100.0, r, 1.75, people, still) for r in (route, standing)
+    )
+    assert turning.pace.min() > 0.5
+    assert resting.pace.max() < 1e-9
     assert turning.step_rate.mean() > 1.2 * resting.step_rate.mean()
 
 

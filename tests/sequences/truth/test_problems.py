@@ -74,7 +74,7 @@ def test_wrong_positions_are_named_with_the_remedy(walk, found):
 
 @pytest.mark.parametrize("carry", CARRYING_MODES)
 def test_right_positions_raise_nothing_however_the_device_is_carried(carry):
-    style = WalkStyle(carry=carry, vigor=1.5)
+    style = WalkStyle(carry=carry)
     walk = simulate_imu(generate_walk(3, 40.0, style=style), 100.0, PHONE_IMU, 3)
     kept = (walk.time % 12.0) > 0.5  # the mount needs 10 s without a gap
     gappy = walk.select(kept)

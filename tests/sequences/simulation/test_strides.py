@@ -1,0 +1,162 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stario.sequences.sequence import Trajectory
+from stario.sequences.simulation import strides
+from stario.sequences.simulation.carrying import PLACES
+from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
+from stario.sequences.simulation.measured import measured_stride, on_one_side
+from stario.sequences.simulation.routes import Command, route_along
+from stario.sequences.simulation.strides import (
+    MIRRORED,
+    Gait,
+    StrideCycle,
+    drawn_cycle,
+    step_rate,
+    stride_cycles,
+    stride_motion,
+)
+from stario.sequences.simulation.walks import WalkStyle, carried_along, generate_walk
+
+RATE, COUNT = 200.0, 4000
+
+
+def walking(person: StrideCycle, pace: float, seed: int = 0) -> Gait:
+    """A person who walks ahead at a constant pace [m/s]."""
+    one = np.ones(COUNT)
+    steps = float(step_rate(person, np.array([max(pace, 0.2)]))[0])
+    return Gait(
+        rng=np.random.default_rng(seed),
+        rate=RATE,
+        phase=np.pi * steps * np.arange(COUNT) / RATE,
+        step_rate=steps * one,
+        pace=pace * one,
+        speed=pace * one,
+        course=np.tile([1.0, 0.0], (COUNT, 1)),
+        height=1.75,
+    )
+
+
+def moved(gait: Gait, person: StrideCycle) -> np.ndarray:
+    """Acceleration [m/s^2] and angular rate [rad/s] (N, 6) of a device that moves so."""
+    motion = stride_motion(gait, person)
+    velocity = np.gradient(motion.offset_H, 1.0 / RATE, axis=0)
+    return np.hstack([np.gradient(each, 1.0 / RATE, axis=0) for each in (velocity, motion.turn_H)])[
+        200:-200
+    ]
+
+
+def amplitudes(motion: np.ndarray, gait: Gait, harmonics: int) -> np.ndarray:
+    waves = np.exp(1j * np.outer(gait.phase[200:-200], np.arange(1, harmonics + 1)))
+    fitted = np.linalg.lstsq(np.hstack([waves.real, waves.imag]), motion, rcond=None)[0]
+    return fitted[:harmonics] - 1j * fitted[harmonics:]
+
+
+@pytest.mark.parametrize("way", PLACES)
+def test_a_device_moves_as_with_the_recorded_person(way, monkeypatch):
+    monkeypatch.setattr(strides, "_WANDERING", 0.0)
+    person = stride_cycles(way)[0]
+    gait = walking(person, person.speed)
+    found, known = amplitudes(moved(gait, person), gait, 8), person.amplitude[:8]
+    sides = [np.linalg.norm(found - known * sign) for sign in (1.0, MIRRORED)]
+    # Differences over 5 ms take away up to a fifteenth at 8 harmonics.
+    assert min(sides) < 0.06 * np.linalg.norm(known)
+
+
+def test_strides_differ_more_from_each_other_the_faster_the_harmonic():
+    person = stride_cycles("handheld")[0]
+    shares = []
+    for seed in range(6):
+        gait = walking(person, person.speed, seed)
+        motion = moved(gait, person)
+        fits = amplitudes(motion, gait, strides.HARMONICS)
+        waves = np.exp(1j * np.outer(gait.phase[200:-200], np.arange(1, len(fits) + 1)))
+        rest = motion - (waves @ fits).real
+        f = np.fft.rfftfreq(len(motion), 1.0 / RATE)
+        power, whole = (np.abs(np.fft.rfft(x[:, :3], axis=0)) ** 2 for x in (rest, motion))
+        bands = [(f > low) & (f < high) for low, high in ((1.5, 3.0), (6.0, 10.0), (10.0, 20.0))]
+        shares.append([np.sqrt(power[k].sum() / whole[k].sum()) for k in bands])
+    steps, middle, fast = np.mean(shares, axis=0)
+    assert 0.1 < steps < 0.35 < middle < fast < 0.85
+
+
+def test_the_sides_of_the_body_are_mirror_images():
+    person = stride_cycles("pocket")[0]
+    first = [moved(walking(person, 1.0, seed), person)[:, 3] for seed in range(12)]
+    against = [np.sign(np.dot(first[0], each)) for each in first]
+    assert {-1.0, 1.0} == set(against)
+
+
+def test_who_walks_sideways_moves_along_the_way_as_one_who_walks_ahead():
+    person = stride_cycles("handheld")[0]
+    ahead = walking(person, 0.6)
+    left = replace(walking(person, 0.6), course=np.tile([0.0, 1.0], (COUNT, 1)))
+    forward, sideways = stride_motion(ahead, person), stride_motion(left, person)
+    np.testing.assert_allclose(sideways.offset_H[:, 1], forward.offset_H[:, 0], atol=1e-12)
+    np.testing.assert_allclose(sideways.turn_H[:, 0], -forward.turn_H[:, 1], atol=1e-12)
+    np.testing.assert_allclose(sideways.offset_H[:, 2], forward.offset_H[:, 2], atol=1e-12)
+
+
+def test_faster_walks_are_bouncier_and_who_stands_does_not_move():
+    person = stride_cycles("in-front")[0]
+    slow, brisk = (moved(walking(person, pace), person).std(axis=0) for pace in (0.7, 1.4))
+    assert 2.0 < brisk[2] / slow[2] < 2.6
+    assert 1.1 < brisk[1] / slow[1] < brisk[2] / slow[2]
+    assert not moved(walking(person, 0.0), person).any()
+
+
+@pytest.mark.parametrize("way", PLACES)
+def test_recorded_people_walk_like_people(way):
+    people = stride_cycles(way)
+    assert len(people) > 3
+    speed = np.array([0.5, 1.0, 1.4, 2.0])
+    for person in people:
+        rate = step_rate(person, speed)
+        assert (np.diff(rate) > 0.0).all()
+        assert (np.diff(speed / rate) > 0.0).all()  # steps become longer as well
+        assert 1.3 < rate[1] < 2.1
+        up = np.abs(person.amplitude[:, 2])
+        assert 0.1 < up[1] < 6.0
+    # The legs take turns: what is not at one leg rises twice in a stride, and sways once.
+    if way in ("handheld", "in-front"):
+        rise, sway = (np.mean([np.abs(p.amplitude[:2, k]) for p in people], axis=0) for k in (2, 1))
+        assert rise[1] > 5.0 * rise[0]
+        assert sway[0] > sway[1]
+
+
+def test_people_of_about_the_speed_are_drawn():
+    rng = np.random.default_rng(0)
+    slow, fast = (
+        np.mean([drawn_cycle(rng, "texting", speed).speed for _ in range(40)])
+        for speed in (0.4, 1.3)
+    )
+    assert slow < 0.65
+    assert fast > 1.0
+
+
+@pytest.mark.parametrize("way", ["handheld", "pocket"])
+def test_the_person_measured_in_a_walk_is_the_one_who_walked(way):
+    rng = np.random.default_rng(3)
+    route = route_along(rng, [Command(60.0, 1.2)], 6000, 100.0, walls=True)
+    walk = carried_along(rng, route, 100.0, WalkStyle(carry=way, preferred_speed=1.2))
+    recording = simulate_imu(walk, 100.0, PERFECT_IMU)
+    found = measured_stride(recording, walk)
+    assert found is not None
+    assert found.speed == pytest.approx(1.2, rel=0.02)
+    agreement = {person: agreed(person, found) for person in stride_cycles(way)}
+    assert max(agreement.values()) > 0.95
+    assert np.median(list(agreement.values())) < 0.93
+
+
+def agreed(person: StrideCycle, found: StrideCycle) -> float:
+    """How well two strides agree, from 0 to 1, once they are shifted and on one side."""
+    a, b = (stride.amplitude[:8].ravel() for stride in on_one_side([person, found]))
+    return float(np.abs(np.vdot(a, b)) / np.linalg.norm(a) / np.linalg.norm(b))
+
+
+def test_who_stands_has_no_stride():
+    standing = generate_walk(0, 20.0)
+    rest = Trajectory(standing.time, 0.0 * standing.position_W, standing.attitude_WB)
+    assert measured_stride(simulate_imu(rest, 100.0, PERFECT_IMU), rest) is None
