@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.fft import irfft, rfft, rfftfreq
+from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 
 from stario.sequences.sequence import FloatArray
 
@@ -184,12 +184,14 @@ def drift(
     Returns:
         (count,), or (count, columns) if `columns` is not 0.
     """
-    pad = int(np.ceil(5.0 * sigma * rate))
-    shape = (count + 2 * pad, columns) if columns else (count + 2 * pad,)
-    # A Gaussian of deviation s samples leaves 1 / (2 sqrt(pi) s) of white noise's variance.
-    scale = np.sqrt(2.0 * np.sqrt(np.pi) * sigma * rate)
-    noise = smoothed(rng.standard_normal(shape), rate, sigma)[pad : pad + count]
-    return np.asarray(scale * noise)
+    padded = next_fast_len(count + int(np.ceil(10.0 * sigma * rate)), real=True)
+    # White noise smoothed by a Gaussian has frequencies of up to 6 of its deviations.
+    bins = min(padded // 2, int(np.ceil(6.0 / (2.0 * np.pi * sigma) * padded / rate)))
+    gain = np.exp(-0.5 * (2.0 * np.pi * sigma * np.arange(bins) * rate / padded) ** 2)
+    noise = rng.standard_normal((max(columns, 1), 2 * bins)).view(np.complex128)
+    noise *= 0.5 * padded * gain / np.sqrt(np.sum(gain[1:] ** 2) + 0.25)
+    drawn = irfft(noise, padded, axis=1)[:, :count]
+    return np.asarray(drawn.T if columns else drawn[0])
 
 
 def band_noise(

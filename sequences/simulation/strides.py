@@ -134,23 +134,20 @@ def stride_motion(gait: Gait, cycle: StrideCycle) -> CarryMotion:
     An offset opposes its acceleration by n^2 omega^2, an angle follows its rate by n omega.
     """
     rng = gait.rng
-    omega = np.pi * gait.step_rate[:, None]
-    ratio = gait.pace[:, None] / cycle.speed
+    omega = np.pi * gait.step_rate
+    ratio = gait.pace / cycle.speed
     faster, steadier = ratio**_POWER, 2.0 * ratio / (1.0 + ratio)
+    growth = np.stack([steadier, steadier, faster, steadier, steadier, steadier])
     amplitude = cycle.amplitude * (1.0 if rng.random() < 0.5 else MIRRORED)
-    offset, turn = np.zeros((2, len(gait), 3))
+    motion = np.zeros((6, len(gait)))
     for n, size in enumerate(amplitude, start=1):
-        wander = _WANDERING * n**0.75 * np.sqrt(0.5) * drift(
-            rng, len(gait), gait.rate, _WANDER_TIME, 12
-        )  # fmt: skip
-        wave = np.exp(1j * n * gait.phase)[:, None] / (n * omega)
-        wave = wave * size * (1.0 + wander[:, :6] + 1j * wander[:, 6:])
-        growth = np.repeat(steadier if n <= _STEADY else faster, 6, axis=1)
-        growth[:, 2] = faster[:, 0]
-        wave *= growth
-        offset -= (wave[:, :3] / (n * omega)).real
-        turn += wave[:, 3:].imag
-    return CarryMotion(along(gait.course, offset), along(gait.course, turn))
+        wander = drift(rng, len(gait), gait.rate, _WANDER_TIME, 12).T
+        wander *= np.sqrt(0.5) * _WANDERING * n**0.75
+        wave = np.exp(1j * n * gait.phase) / (n * omega)
+        wave = np.stack([wave / (n * omega)] * 3 + [1j * wave] * 3) * size[:, None]
+        each = wave.real * (1.0 + wander[:6]) - wave.imag * wander[6:]
+        motion -= each * (growth if n <= _STEADY else faster)
+    return CarryMotion(along(gait.course, motion[:3].T), along(gait.course, motion[3:].T))
 
 
 def along(course: FloatArray, vector: FloatArray) -> FloatArray:
