@@ -18,7 +18,13 @@ from scipy.signal import butter, hilbert, sosfiltfilt
 from stario.sequences.arrays import even_grid, interpolated
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence, Trajectory
-from stario.sequences.simulation.strides import HARMONICS, MIRRORED, ComplexArray, StrideCycle
+from stario.sequences.simulation.strides import (
+    HARMONICS,
+    MIRRORED,
+    WANDERING,
+    ComplexArray,
+    StrideCycle,
+)
 
 _RATE = 100.0
 """Rate of the samples [Hz]."""
@@ -29,10 +35,10 @@ _WINDOW, _EDGE, _EVERY = 250, 60, 60
 _SPEEDS, _UNSTEADY, _TURNED = (0.4, 2.0), 0.5, 1.6
 """Speeds of a window [m/s], largest range of the speed per mean, and of the course [rad]."""
 
-_FEWEST, _SLOWEST = 12, 0.5
+_FEWEST, _SLOWEST = 10, 0.5
 """Fewest windows of a recording, and least median speed [m/s]: slower is not quite a walk."""
 
-_STEP_RATES = (0.7, 1.4)
+_STEP_RATES = (0.65, 1.5)
 """Step rates within a window relative to those of people at the same speed (1.75 Hz at 1 m/s)."""
 
 _HARMONICS = np.arange(1, HARMONICS + 1)
@@ -59,7 +65,9 @@ def measured_stride(sequence: ImuSequence, poses: Trajectory) -> StrideCycle | N
     aligned = _aligned([stride.amplitude for stride in found], mirrored=False)
     mean = aligned.mean(axis=0)
     # What is fast comes a little earlier or later in each stride: its size is that within strides.
-    size = np.median(np.abs(aligned), axis=0)
+    # Half of what the simulator adds to that from stride to stride remains in a window's fit.
+    added = 1.0 + 0.5 * (WANDERING * _HARMONICS[:, None]) ** 2
+    size = np.sqrt(np.mean(np.abs(aligned) ** 2, axis=0) / added)
     return StrideCycle(
         speed=float(np.median(speeds)),
         step_rate=float(np.median([stride.step_rate for stride in found])),

@@ -42,8 +42,8 @@ _STEADY = 3
 _NEARBY = 0.2
 """Deviation of the logarithm of the speed within which people of a speed are drawn."""
 
-_WANDERING = 0.1
-"""Deviation of a harmonic n from stride to stride, times n^0.75: what does not repeat is 0.1 to
+WANDERING = 0.085
+"""Deviation of a harmonic n from stride to stride, per n: what does not repeat is 0.1 to
 0.3 of the steps' band, 0.45 of 3 to 6 Hz, 0.5 of 6 to 10 and 0.7 of 10 to 20 Hz in all ways."""
 
 _WANDER_TIME = 0.4
@@ -142,7 +142,7 @@ def stride_motion(gait: Gait, cycle: StrideCycle) -> CarryMotion:
     motion = np.zeros((6, len(gait)))
     for n, size in enumerate(amplitude, start=1):
         wander = drift(rng, len(gait), gait.rate, _WANDER_TIME, 12).T
-        wander *= np.sqrt(0.5) * _WANDERING * n**0.75
+        wander *= np.sqrt(0.5) * WANDERING * n
         wave = np.exp(1j * n * gait.phase) / (n * omega)
         wave = np.stack([wave / (n * omega)] * 3 + [1j * wave] * 3) * size[:, None]
         each = wave.real * (1.0 + wander[:6]) - wave.imag * wander[6:]

@@ -56,7 +56,7 @@ def amplitudes(motion: np.ndarray, gait: Gait, harmonics: int) -> np.ndarray:
 
 @pytest.mark.parametrize("way", PLACES)
 def test_a_device_moves_as_with_the_recorded_person(way, monkeypatch):
-    monkeypatch.setattr(strides, "_WANDERING", 0.0)
+    monkeypatch.setattr(strides, "WANDERING", 0.0)
     person = stride_cycles(way)[0]
     gait = walking(person, person.speed)
     found, known = amplitudes(moved(gait, person), gait, 8), person.amplitude[:8]
