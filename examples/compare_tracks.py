@@ -13,7 +13,7 @@ from stario.sequences import PHONE_IMU, WalkStyle, generate_walk, simulate_imu
 def main(seconds: float = 60.0) -> Comparison:
     """Simulate a walk with the phone in a pocket and compare all tracks of the walk."""
     style = WalkStyle(carry="pocket", preferred_speed=1.3)
-    walk = generate_walk(seed=2**31 + 1, duration=seconds, style=style)
+    walk = generate_walk(seed=3, duration=seconds, style=style)
     recording = simulate_imu(walk, 100.0, PHONE_IMU, seed=7, name="pocket")
     return compare(load_model("default"), recording)
 

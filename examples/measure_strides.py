@@ -24,13 +24,15 @@ from stario.fusion import Navigator, network_track
 from stario.network import load_model
 from stario.sequences import (
     ImuSequence,
+    StrideCycle,
     Trajectory,
     WalkStyle,
     generate_walk,
+    measured_stride,
+    on_one_side,
     read_recording,
     simulate_imu,
 )
-from stario.sequences.simulation.measured import measured_stride, on_one_side
 
 WAYS = {
     "kipd.h5": {"handheld": "handheld"},
@@ -74,27 +76,17 @@ def poses_of(sequence: ImuSequence) -> Trajectory:
     return replace(track, position_W=track.position_W * true / found)
 
 
-def main() -> None:
-    """Measure archives, or a simulated walk."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("archives", nargs="?", type=Path)
-    parser.add_argument("out", nargs="?", type=Path)
-    arguments = parser.parse_args()
-    if arguments.archives is None:
-        style = WalkStyle(carry="pocket")
-        walk = simulate_imu(generate_walk(1, 60.0, style=style), 100.0)
-        stride = measured_stride(walk, walk.truth) if walk.truth else None
-        print(stride and f"{stride.step_rate:.2f} steps per second at {stride.speed:.2f} m/s")
-        return
+def measure(folder: Path, out: Path) -> None:
+    """Measure the people of the archives in a folder and write their strides."""
     people = defaultdict(list)
-    for way, sequence in recordings(arguments.archives):
+    for way, sequence in recordings(folder):
         if stride := measured_stride(sequence, poses_of(sequence)):
             people[way].append(stride)
             print(f"{way:12} {sequence.name:40} {stride.speed:.2f} m/s, {stride.step_rate:.2f} Hz")
     alike = [(way, each) for way, found in people.items() for each in on_one_side(found)]
     amplitude = np.array([stride.amplitude for _, stride in alike])
     np.savez_compressed(
-        arguments.out,
+        out,
         way=[way for way, _ in alike],
         speed=np.float32([stride.speed for _, stride in alike]),
         step_rate=np.float32([stride.step_rate for _, stride in alike]),
@@ -102,5 +94,23 @@ def main() -> None:
     )
 
 
+def main(seconds: float = 60.0) -> StrideCycle | None:
+    """Measure the stride of a simulated walk."""
+    walk = simulate_imu(generate_walk(1, seconds, style=WalkStyle(carry="pocket")), 100.0)
+    stride = measured_stride(walk, poses_of(walk))
+    if stride:
+        print(
+            f"a simulated walk: {stride.step_rate:.2f} steps per second at {stride.speed:.2f} m/s"
+        )
+    return stride
+
+
 if __name__ == "__main__":
-    main()
+    parser = argparse.ArgumentParser()
+    parser.add_argument("archives", nargs="?", type=Path)
+    parser.add_argument("out", nargs="?", type=Path, default=Path("strides.npz"))
+    arguments = parser.parse_args()
+    if arguments.archives:
+        measure(arguments.archives, arguments.out)
+    else:
+        main()

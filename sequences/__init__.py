@@ -13,7 +13,8 @@ Compare a track with the truth: `align`, `Alignment`, `evaluate_track`, `TrackMe
 `position_nees`, `PositionNees`.
 
 Simulate: `generate_walk`, `WalkStyle`, `simulate_imu`, `ImuErrors`, `PERFECT_IMU`, `GOOD_IMU`,
-`PHONE_IMU`, `MagneticField`, `INDOOR_FIELD`, `ImuNoise`.
+`PHONE_IMU`, `MagneticField`, `INDOOR_FIELD`, `ImuNoise`, `measured_stride`, `on_one_side`,
+`StrideCycle`.
 
 For training: `world_streams`, `WorldStream`, `leg_streams`, `LegStream`.
 

@@ -44,6 +44,9 @@ from stario.sequences.simulation.imu import ImuErrors as ImuErrors
 from stario.sequences.simulation.imu import simulate_imu as simulate_imu
 from stario.sequences.simulation.magnetometer import INDOOR_FIELD as INDOOR_FIELD
 from stario.sequences.simulation.magnetometer import MagneticField as MagneticField
+from stario.sequences.simulation.measured import measured_stride as measured_stride
+from stario.sequences.simulation.measured import on_one_side as on_one_side
+from stario.sequences.simulation.strides import StrideCycle as StrideCycle
 from stario.sequences.simulation.walks import WalkStyle as WalkStyle
 from stario.sequences.simulation.walks import generate_walk as generate_walk
 from stario.sequences.truth.problems import truth_findings as truth_findings

@@ -9,14 +9,15 @@ from stario.sequences import ImuSequence
 from stario.sequences.legs import LegStream, leg_streams
 from stario.sequences.sequence import FloatArray, PositionTrack
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
-from stario.sequences.simulation.walks import generate_walk
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 TIME = np.arange(1.0, 38.0)
 
 
 @pytest.fixture(scope="module")
 def recording():
-    return simulate_imu(generate_walk(3, 40.0), 100.0, PERFECT_IMU, 0, name="walk")
+    walk = generate_walk(3, 40.0, style=WalkStyle(preferred_speed=1.3))
+    return simulate_imu(walk, 100.0, PERFECT_IMU, 0, name="walk")
 
 
 def legs_of(

@@ -141,7 +141,18 @@ def test_a_batch_continues_after_failures_and_reports_them(stario, recording, tm
 def test_evaluate_compares_with_other_weights_by_groups(stario, recording, tmp_path):
     """Weights against themselves; twelve seconds are too few for an error over ten seconds."""
     (tmp_path / "walks").mkdir()
-    stario("simulate", "walks/long.csv", "--seconds", 25, "--carry", "handheld", "--rate", 100)
+    stario(
+        "simulate",
+        "walks/long.csv",
+        "--seconds",
+        25,
+        "--carry",
+        "handheld",
+        "--rate",
+        100,
+        "--seed",
+        1,
+    )
     done = stario(
         "evaluate", recording, "walks/long.csv", "--by", "set", "--against", "default",
         "--filtered", "--out", "out", "--json",

@@ -95,7 +95,7 @@ def test_states_before_the_first_position_are_as_uncertain_as_the_motion_until_i
 
 
 def test_a_first_yaw_that_was_off_is_off_about_the_position_that_places_the_track():
-    walk, _, oracle = measured(3, 45.0, CONFIG)
+    walk, _, oracle = measured(0, 45.0, CONFIG)
     yaw = yaw_of(walk.truth.at(np.array([5.0])).attitude_WB)[0] + 0.3
     fixes = [f for f in true_fixes(walk.truth, 2.0, 0.2, 0) if f.time > 30.0]
     track = Navigator(oracle, CONFIG, backend="ekf").run(

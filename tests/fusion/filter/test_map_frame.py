@@ -259,10 +259,10 @@ def test_a_horizontal_position_is_kept_over_a_coarser_one_with_height():
 
 
 def test_positions_too_close_to_give_a_direction_alone_give_it_together():
-    walk, _, oracle = measured(8, 45.0, CONFIG, noise=0.02)
+    walk, _, oracle = measured(13, 45.0, CONFIG, noise=0.02)
     farthest = np.linalg.norm(walk.truth.position_W[:, :2] - walk.truth.position_W[0, :2], axis=1)
     sigma = 0.4 * float(farthest.max())
-    fixes = true_fixes(walk.truth, 1.0, sigma, seed=3)
+    fixes = true_fixes(walk.truth, 1.0, sigma, seed=13)
     track = Navigator(oracle, CONFIG, backend="ekf").run(walk, fixes=fixes)
     counts = track.health.fixes
     assert counts["yaw not known"] > 3

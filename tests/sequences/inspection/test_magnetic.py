@@ -29,8 +29,8 @@ IRON = (15.0, -6.0, 9.0)
 
 
 @cache
-def walk(magnetic_field: MagneticField) -> ImuSequence:
-    style = WalkStyle(carry="handheld", mount_rotvec=(0.3, -0.5, 0.4))
+def walk(magnetic_field: MagneticField, carry: str = "handheld") -> ImuSequence:
+    style = WalkStyle(carry=carry, mount_rotvec=(0.3, -0.5, 0.4))
     track = generate_walk(9, 60.0, style=style)
     return simulate_imu(track, 100.0, PERFECT_IMU, 1, magnetic_field=magnetic_field)
 
@@ -76,7 +76,7 @@ def test_a_lag_outside_the_search_range_is_not_reported_as_measured(lag):
 
 
 def test_magnets_wrong_axes_apples_sign_and_wrong_units_are_detected():
-    good = walk(MagneticField())
+    good = walk(MagneticField(), "in-front")
     time, field = good.magnetometer.time, good.magnetometer.field
     near = field + np.outer((time % 8.0 < 4.0) * np.sign(np.sin(time)), [150.0, 0.0, 0.0])
     disturbed = assess_magnetometer(replace(good, magnetometer=Magnetometer(time, near)))

@@ -61,7 +61,7 @@ def test_a_sensor_stuck_for_seconds_is_named(walk, sensor):
 
 def test_a_sensor_at_its_limit_is_named_with_the_share_of_samples():
     style = WalkStyle(carry="swinging", preferred_speed=1.6)
-    free = simulate_imu(generate_walk(2, 30.0, style=style), 100.0, PHONE_IMU, 2).without_truth()
+    free = simulate_imu(generate_walk(5, 30.0, style=style), 100.0, PHONE_IMU, 5).without_truth()
     limits = {"gyro": 3.5, "accel": 16.0}
     for sensor, limit in limits.items():
         values = getattr(free, sensor)

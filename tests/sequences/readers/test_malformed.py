@@ -109,7 +109,7 @@ def test_a_damaged_csv_with_named_columns_is_refused(tmp_path, walks, which, qua
     for axis in "wxyz":
         change(csv, 40, f"{quaternion}_{axis}", "0.0")
     assert_refused(path, f"row 42, {quaternion}: found norm 0, expected a unit quaternion")
-    csv.write_text(good[: int(0.7 * len(good))].rsplit(",", 4)[0])
+    csv.write_text(good[: int(0.7 * len(good))].rsplit("\n", 1)[0].rsplit(",", 4)[0])
     assert_refused(path, "values, expected", "cut short")
     csv.write_text(good.replace(f"{missing},", "other,", 1).replace(f",{missing}\n", ",other\n", 1))
     assert_refused(path, f"{csv.name}: header: found no {missing}")
