@@ -27,7 +27,7 @@ from stario.sequences.windows import world_streams
 PLAIN = replace(UNVARIED, mirrored=0.5)
 SECONDS = 12
 STYLE = WalkStyle(carry="handheld", preferred_speed=1.4, mount_rotvec=(0.3, -0.2, 0.9))
-WALK = simulate_imu(generate_walk(3, 60.0, style=STYLE), 100.0, PERFECT_IMU, 0, name="walk")
+WALK = simulate_imu(generate_walk(2, 60.0, style=STYLE), 100.0, PERFECT_IMU, 0, name="walk")
 
 
 def with_positions(kind: str, every: float, yaw: float = 0.0) -> ImuSequence:
@@ -150,7 +150,7 @@ def test_jumps_and_rides_of_a_track_make_no_legs():
     [whole], [cut] = leg_streams(recording), leg_streams(jumped)
     assert len(whole.start) - len(cut.start) == 1
     assert not ((cut.start < 30.0) & (cut.stop > 30.1)).any()
-    ride = replace(recording, positions=PositionTrack(time, 20.0 * position, "positions"))
+    ride = replace(recording, positions=PositionTrack(time, 9.0 * position, "positions"))
     assert leg_streams(ride) == []
     run = replace(recording, positions=PositionTrack(time, 2.5 * position, "positions"))
     [slow] = leg_streams(run)  # without those of the full pace, which is below that of a jump
