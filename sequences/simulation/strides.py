@@ -141,12 +141,12 @@ def stride_motion(gait: Gait, cycle: StrideCycle) -> CarryMotion:
     amplitude = cycle.amplitude * (1.0 if rng.random() < 0.5 else MIRRORED)
     motion = np.zeros((6, len(gait)))
     for n, size in enumerate(amplitude, start=1):
-        wander = drift(rng, len(gait), gait.rate, _WANDER_TIME, 12).T
-        wander *= np.sqrt(0.5) * WANDERING * n
-        wave = np.exp(1j * n * gait.phase) / (n * omega)
-        wave = np.stack([wave / (n * omega)] * 3 + [1j * wave] * 3) * size[:, None]
-        each = wave.real * (1.0 + wander[:6]) - wave.imag * wander[6:]
-        motion -= each * (growth if n <= _STEADY else faster)
+        real, imaginary = (
+            np.sqrt(0.5) * WANDERING * n * drift(rng, len(gait), gait.rate, _WANDER_TIME, 2).T
+        )
+        wave = (1.0 + real + 1j * imaginary) * np.exp(1j * n * gait.phase) / (n * omega)
+        wave = np.stack([wave / (n * omega)] * 3 + [1j * wave] * 3)
+        motion -= (wave * size[:, None]).real * (growth if n <= _STEADY else faster)
     return CarryMotion(along(gait.course, motion[:3].T), along(gait.course, motion[3:].T))
 
 
