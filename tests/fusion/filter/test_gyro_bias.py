@@ -101,7 +101,7 @@ def biased(walk: ImuSequence, bias: np.ndarray) -> ImuSequence:
 
 def test_a_raw_bias_is_within_its_sigma_on_every_axis(make_walk, make_oracle):
     config = NavigatorConfig()
-    walk = biased(make_walk(seed=2, seconds=40.0), RAW)
+    walk = biased(make_walk(seed=6, seconds=40.0), RAW)
     track = Navigator(make_oracle(walk, walk.truth, config), config, backend="ekf").run(walk)
     error = track.arrays()["gyro_bias_B"][-1] - RAW
     sigma = np.sqrt(np.diagonal(track.covariance[-1])[9:12])

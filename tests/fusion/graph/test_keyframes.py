@@ -270,7 +270,7 @@ def test_accurate_positions_with_an_unknown_height_need_no_fall_back(walk, make_
 
 
 def test_two_positions_place_and_turn_a_track_that_started_without_a_pose(make_walk, make_oracle):
-    walk = make_walk(2, 40.0)
+    walk = make_walk(1, 40.0)
     R, shift = about_z(-2.1), np.array([500.0, 200.0, 10.0])
     truth = walk.truth.at(np.array([5.0, 30.0]))
     p_W = R.apply(truth.position_W) + shift

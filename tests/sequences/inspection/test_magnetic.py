@@ -42,7 +42,7 @@ def test_correlation_lag_hard_iron_dip_and_drift_are_recovered():
     up_B = truth.attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)
     found = assess_magnetometer(replace(sequence, gyro=sequence.gyro + drift * up_B))
     assert found.figures["verdict"] == "good"
-    assert found.figures["correlation_with_gyroscope"] > 0.88  # its own noise and lag leave that
+    assert found.figures["correlation_with_gyroscope"] > 0.87  # its own noise and lag leave that
     assert found.figures["lag_s"] == pytest.approx(0.04, abs=0.01)
     np.testing.assert_allclose(found.figures["hard_iron_uT"], IRON, atol=3.0)
     assert found.figures["dip_rad"] == pytest.approx(math.radians(63.0), abs=0.1)

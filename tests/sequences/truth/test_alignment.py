@@ -138,7 +138,7 @@ def test_single_frames_rotated_about_any_axis_are_masked():
 
 
 @pytest.mark.parametrize(
-    ("gap", "flips"), [((52.0, 55.0), False), ((50.0, 61.0), True), ((113.0, 115.0), True)]
+    ("gap", "flips"), [((62.0, 65.0), False), ((50.0, 61.0), True), ((113.0, 115.0), True)]
 )
 def test_rotation_during_an_imu_gap_is_not_a_flip(gap, flips):
     """The gap leaves the mount unchanged; a flip that the IMU observes changes it."""
