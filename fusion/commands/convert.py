@@ -180,7 +180,8 @@ def simulate(
 def _style(carry: str) -> WalkStyle | None:
     """Return the typical person who carries the device so; None to draw both."""
     from stario.sequences.arrays import check_choice
-    from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle
+    from stario.sequences.simulation.carrying import CARRYING_MODES
+    from stario.sequences.simulation.walks import WalkStyle
 
     check_choice("--carry", carry, (*CARRYING_MODES, "random"))
     return None if carry == "random" else WalkStyle(carry=carry)

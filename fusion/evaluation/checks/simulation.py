@@ -41,7 +41,7 @@ WAYS = {
 of the simulated walks: the archives' medians while walking, since bands grow with the speed."""
 
 BANDS = ((0.5, 3.0), (3.0, 6.0), (6.0, 10.0), (10.0, 20.0))
-"""Edges [Hz] of the bands: steps, their harmonics, the resonance of heel strikes, and its end."""
+"""Edges [Hz] of the bands: steps, their harmonics, what rings after heel strikes, and its end."""
 
 _RATE = 100.0
 _STEP_RATES, _STEP_WINDOW = (1.1, 2.8), 5.0

@@ -13,8 +13,9 @@ from stario.sequences.attitude.levelling import (
 )
 from stario.sequences.attitude.so3 import exp_so3
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
+from stario.sequences.simulation.carrying import CARRYING_MODES
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, ImuErrors, simulate_imu
-from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 UP = np.array([0.0, 0.0, 1.0])
 

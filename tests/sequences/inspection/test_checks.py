@@ -12,8 +12,9 @@ from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units, unit_findings
 from stario.sequences.readers import find_recordings, read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
+from stario.sequences.simulation.carrying import CARRYING_MODES
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
-from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, generate_walk
+from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.units import with_units
 
 

@@ -7,12 +7,13 @@ from scipy.signal import welch
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, Trajectory
+from stario.sequences.simulation.carrying import CARRYING_MODES
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.insertion import insert_moment
 from stario.sequences.simulation.moments import MOMENTS
 from stario.sequences.simulation.routes import Route, band_noise, drift, random_route
 from stario.sequences.simulation.strides import stride_cycles
-from stario.sequences.simulation.walks import CARRYING_MODES, WalkStyle, _gait, generate_walk
+from stario.sequences.simulation.walks import WalkStyle, _gait, generate_walk
 
 
 @pytest.mark.parametrize("carry", CARRYING_MODES)
