@@ -104,7 +104,7 @@ def generate_walk(
     Args:
         seed: seed of every draw; the same seed gives the same walk.
         duration: duration [s], minimum 1.
-        rate: rate of the poses [Hz], minimum 50, so that fast harmonics are resolved and not aliased.
+        rate: rate of the poses [Hz], minimum 50, so that harmonics are not aliased.
         style: person and carrying mode; None draws them.
         corridors: whether to walk along the corridors of a floor instead of anywhere.
 
