@@ -73,7 +73,7 @@ TRACK_TITLES = {
 }
 """Titles of the columns of tracks."""
 
-DEMONSTRATION_SEED = 2**31 + 50
+DEMONSTRATION_SEED = 2**31 + 49
 """Seed of the bundled demonstration: training seeds are below 2^31 and exclude this walk. 49 is the
 number of the issue that asked for it, so chosen before its result was known."""
 
