@@ -21,6 +21,7 @@ from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence,
 from stario.sequences.simulation.strides import (
     HARMONICS,
     MIRRORED,
+    STEP_RATE_POWER,
     WANDERING,
     ComplexArray,
     StrideCycle,
@@ -112,7 +113,7 @@ def _stride(motion: FloatArray, speed: float) -> StrideCycle | None:
     time = (np.arange(_WINDOW) - 0.5 * _WINDOW) / _RATE
     force = motion[:, :3] - motion[:, :3].mean(axis=0)
     power = np.abs(np.fft.rfft(force * np.hanning(len(force))[:, None], 4096, axis=0)) ** 2
-    f, usual = np.fft.rfftfreq(4096, 1.0 / _RATE), 1.75 * speed**0.4
+    f, usual = np.fft.rfftfreq(4096, 1.0 / _RATE), 1.75 * speed**STEP_RATE_POWER
     possible = (f > _STEP_RATES[0] * usual) & (f < _STEP_RATES[1] * usual)
     about = f[possible][np.argmax(power[possible].sum(axis=1))]
     band = butter(2, [0.6 * about, 1.45 * about], "bandpass", fs=_RATE, output="sos")

@@ -29,7 +29,7 @@ ComplexArray = NDArray[np.complex128]
 HARMONICS = 20
 """Harmonics of the stride: up to about 18 Hz."""
 
-_STEP_RATE_POWER = 0.4
+STEP_RATE_POWER = 0.4
 """Exponent of the speed in the step rate: the medians of tyrex, RIDI and KIPD are 1.25, 1.5, 1.65,
 1.8, 1.9 and 2.0 Hz at 0.45, 0.7, 0.9, 1.1, 1.3 and 1.5 m/s."""
 
@@ -107,7 +107,7 @@ class CarryMotion:
 
 @cache
 def stride_cycles(way: str) -> list[StrideCycle]:
-    """Return the recorded people of a way of carrying; the device is on their right, if on one."""
+    """Return the recorded people of a way of carrying, with the device on one side of all."""
     with np.load(str(files(__package__).joinpath("strides.npz")), allow_pickle=False) as found:
         chosen = found["way"] == way
         amplitude = found["amplitude"][chosen].astype(np.float64) @ [1.0, 1j]
@@ -117,7 +117,7 @@ def stride_cycles(way: str) -> list[StrideCycle]:
 
 def step_rate(person: StrideCycle, speed: FloatArray) -> FloatArray:
     """Return a person's step rate (N,) [Hz] at a speed (N,) [m/s]."""
-    return np.asarray(person.step_rate * (speed / person.speed) ** _STEP_RATE_POWER)
+    return np.asarray(person.step_rate * (speed / person.speed) ** STEP_RATE_POWER)
 
 
 def drawn_cycle(rng: np.random.Generator, way: str, speed: float) -> StrideCycle:
@@ -147,10 +147,10 @@ def stride_motion(gait: Gait, cycle: StrideCycle) -> CarryMotion:
         wave = (1.0 + real + 1j * imaginary) * np.exp(1j * n * gait.phase) / (n * omega)
         wave = np.stack([wave / (n * omega)] * 3 + [1j * wave] * 3)
         motion -= (wave * size[:, None]).real * (growth if n <= _STEADY else faster)
-    return CarryMotion(along(gait.course, motion[:3].T), along(gait.course, motion[3:].T))
+    return CarryMotion(_along(gait.course, motion[:3].T), _along(gait.course, motion[3:].T))
 
 
-def along(course: FloatArray, vector: FloatArray) -> FloatArray:
+def _along(course: FloatArray, vector: FloatArray) -> FloatArray:
     """Return vectors (N, 3) of the frame H' in H."""
     c, s = course.T
     x, y, z = vector.T
