@@ -59,6 +59,7 @@ def test_streaming_yields_states_ten_times_a_second():
     np.testing.assert_allclose(np.diff(times), np.diff(times)[0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_train_own_produces_a_model_that_predicts(tmp_path, monkeypatch):
     narrow(monkeypatch)
     model = load("train_own").main(tmp_path, epochs=1)
@@ -215,7 +216,13 @@ BAGS = sorted(DATA.glob("raw/rosbag/*.bag"))
 
 
 @pytest.mark.skipif(not BAGS, reason="the data folder holds no recorded bags")
-@pytest.mark.parametrize("bag", BAGS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "bag",
+    [
+        pytest.param(bag, id=bag.stem, marks=pytest.mark.slow if "upside_down" in bag.stem else ())
+        for bag in BAGS
+    ],
+)
 def test_ros2_node_runs_on_recorded_bags(bag):
     pytest.importorskip("rosbags", reason="pip install '.[bags]'")
     outputs = load("ros2_node").main(bag)

@@ -125,7 +125,14 @@ def run_line(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
         assert not leaving.value.code, line
 
 
-@pytest.mark.parametrize("page", GUIDES, ids=page_name)
+FOLLOWED = [
+    # These two run the most commands; the others' options are checked above as well.
+    pytest.param(page, marks=pytest.mark.slow if page.stem in ("maps", "recordings") else ())
+    for page in GUIDES
+]
+
+
+@pytest.mark.parametrize("page", FOLLOWED, ids=page_name)
 def test_a_reader_can_follow_a_guide(page, monkeypatch, tmp_path, tmp_path_factory):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("STARIO_CACHE", str(tmp_path_factory.mktemp("cache")))
@@ -148,6 +155,7 @@ ON_DATA = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", ON_DATA)
 def test_commands_on_recordings_run(line, monkeypatch, tmp_path):
     if not DATA.is_dir():

@@ -109,6 +109,7 @@ def case(name: str) -> dict[str, Finding]:
         return {found.code: found for found in recording_verdict(sequence, track, train="train")}
 
 
+@pytest.mark.slow
 def test_positions_that_say_the_way_is_longer_are_told_with_the_factor():
     """A real walk with an instrument in the hand; nothing but its positions can tell."""
     found = case("handheld_walk_too_short/walk.csv")
@@ -117,6 +118,7 @@ def test_positions_that_say_the_way_is_longer_are_told_with_the_factor():
     assert "train" not in found  # positions without attitude cannot teach the weights
 
 
+@pytest.mark.slow
 def test_positions_that_fit_the_mirror_image_name_the_accelerometers_sign():
     found = case("sign_flipped_with_positions/walk.csv")["mirror_image"]
     assert found.values["error_m"] == pytest.approx(7.6, abs=0.5)
@@ -124,6 +126,7 @@ def test_positions_that_fit_the_mirror_image_name_the_accelerometers_sign():
     assert "--accel-sign apple" in found.advice
 
 
+@pytest.mark.slow
 def test_a_robot_that_turns_about_one_axis_gets_no_remedy_that_harms():
     found = case("planar_robot/robot.csv")
     assert not {code for code in found if code.startswith("truth_")}

@@ -141,6 +141,7 @@ def straight_walk(rng: np.random.Generator, seconds: int) -> tuple[Driven, np.nd
     return ekf, seconds * speed, float(np.mean(nis[3:]))
 
 
+@pytest.mark.slow
 def test_the_covariance_is_that_of_drawn_errors():
     """Of 60 walks; what the gains assume is a fraction of it."""
     rng, seconds = np.random.default_rng(1), 30

@@ -165,6 +165,7 @@ def test_the_graph_is_no_more_certain_of_the_turn_in_a_gap_than_the_filter(gap):
     assert np.sqrt(streamed.covariance[2, 2]) > 0.85 * expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["yaw", "position"])
 def test_a_fix_within_a_gap_gives_little_information_about_the_track_before_it(kind):
     nees = []

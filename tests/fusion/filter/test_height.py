@@ -154,6 +154,7 @@ def test_floors_are_those_of_the_house(house, house_track):
     assert any(str(change) in str(house_track.health) for change in house_track.health.floors)
 
 
+@pytest.mark.slow
 def test_the_check_of_heights_tells_with_from_without(house, level_oracle):
     scores = score_heights(level_oracle, house.sequence, CONFIG)
     assert values(scores, "height_rms", track="pressure")[0] < 0.6
@@ -171,7 +172,7 @@ def test_the_report_draws_floors_along_the_height(house_track):
     assert labels == ["floor 0", "1", "4"]
 
 
-@pytest.mark.parametrize("backend", ["ekf", "graph"])
+@pytest.mark.parametrize("backend", ["ekf", pytest.param("graph", marks=pytest.mark.slow)])
 def test_a_stream_has_the_heights_of_the_recording(house, level_oracle, house_track, backend):
     sequence = house.sequence.slice(45.0, 72.0)
     pressures = dict(zip(sequence.barometer.time, sequence.barometer.pressure_hPa, strict=True))

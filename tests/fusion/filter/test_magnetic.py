@@ -173,6 +173,7 @@ def test_a_field_that_the_device_carries_on_has_less_weight():
     assert remaining[1] > remaining[0] + 0.1
 
 
+@pytest.mark.slow
 def test_the_bias_is_consistent_in_a_quiet_and_in_a_disturbed_field(make_oracle):
     walk = generate_walk(3, 50.0, style=WalkStyle(carry="handheld", mount_rotvec=(0.0, 0.0, 0.4)))
     for disturbance in (0.5, 8.0):

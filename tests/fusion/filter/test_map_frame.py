@@ -123,6 +123,7 @@ class Climbing:
         return mean + np.array([0.0, 0.0, 0.4]), covariance
 
 
+@pytest.mark.slow
 def test_fixes_that_agree_prevail_over_an_overconfident_track(make_walk, make_oracle):
     """Otherwise it ends twenty metres too high, as each fix alone looks like an outlier."""
     walk = make_walk(3, 60.0, 50.0)
@@ -168,6 +169,7 @@ def test_a_wrong_first_position_does_not_turn_the_track(backend):
     assert np.linalg.norm(at_end.p_W - end.value) < 1.5
 
 
+@pytest.mark.slow
 def test_positions_undo_a_yaw_that_pointed_backwards():
     walk, _, oracle = measured(3, 40.0, CONFIG)
     wrong = yaw_of(walk.truth.at(np.array([4.0])).attitude_WB)[0] + np.pi

@@ -88,6 +88,7 @@ def test_samples_late_for_a_moment_are_not_worth_a_note() -> None:
     assert ["samples_late" in [f.code for f in found] for found in late] == [False, True]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not BAGS.is_dir(), reason=f"no recordings at {BAGS}")
 def test_a_board_shaken_beyond_its_range_is_distrusted_and_one_turned_by_hand_is_not() -> None:
     """The first exceeds the 2 g of its accelerometer for seconds, the second stays within it."""

@@ -166,6 +166,7 @@ def test_weights_in_another_number_format_run_in_pytorch(tmp_path, network, conv
     np.testing.assert_allclose(found, expected, atol=0.05)
 
 
+@pytest.mark.slow
 def test_weights_and_commands_need_no_pytorch(tmp_path):
     """Importing it takes seconds and 200 MB."""
     code = (

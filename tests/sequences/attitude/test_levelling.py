@@ -64,6 +64,7 @@ def test_a_pedestrian_starts_level_to_within_the_stated_sigma(carry):
     assert np.sqrt(np.mean(np.square(errors))) < 1.4 * 2.9 * np.sqrt(2.0)
 
 
+@pytest.mark.slow
 def test_levelling_bounds_the_tilt_error_of_a_bias_but_integration_does_not():
     levelled, integrated = [], []
     for seed in range(6):

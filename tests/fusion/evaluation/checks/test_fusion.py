@@ -176,6 +176,7 @@ def test_truth_before_the_first_sample_gives_no_fixes(walk, make_oracle, caplog)
     assert (row[:2], row[-1]) == (["walks", "1"], "100.0%")
 
 
+@pytest.mark.slow
 def test_gaps_of_a_tenth_of_a_second_and_5_percent_loss_hardly_move_the_end(walk, monkeypatch):
     monkeypatch.setattr(fusion, "INSTANTS", 2)
     found = end_shifts(load_model("default"), walk, NavigatorConfig())
