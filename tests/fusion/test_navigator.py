@@ -95,7 +95,7 @@ def test_the_track_is_accurate_at_any_imu_rate(make_walk, make_oracle, rate):
     )
 
 
-@pytest.mark.parametrize("update_rate", [1, 5, 20])
+@pytest.mark.parametrize("update_rate", [1, 5, pytest.param(20, marks=pytest.mark.slow)])
 def test_the_track_is_accurate_at_every_update_rate(walk, make_oracle, update_rate):
     config = NavigatorConfig(filter=FilterConfig(update_rate=update_rate))
     track = Navigator(make_oracle(walk, walk.truth, config), config, backend="ekf").run(walk)

@@ -101,6 +101,7 @@ def delayed(navigator: Navigator, walk: ImuSequence) -> list[SmoothedPose]:
     return poses
 
 
+@pytest.mark.slow
 def test_a_streams_smoothed_poses_are_one_window_late_and_better_than_its_states(walks, tracks):
     errors, nees = [], []
     for (walk, model), (_, track) in zip(walks, tracks, strict=True):

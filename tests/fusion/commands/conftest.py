@@ -69,6 +69,8 @@ def stario(monkeypatch, tmp_path, tmp_path_factory, capsys):
 def no_figures(monkeypatch):
     """Skip figures, which take most of the time, in tests that do not check them."""
     monkeypatch.setattr("stario.fusion.evaluation.results._figures", lambda found: {})
+    saved = "stario.sequences.drawing.figures.save_figure"  # of `inspect`
+    monkeypatch.setattr(saved, lambda figure, path: path.touch())
 
 
 @pytest.fixture(scope="session")

@@ -136,6 +136,7 @@ def test_fixes_that_agree_prevail_over_an_overconfident_track(make_walk, make_or
     assert track.health.fixes["gated"] > 3
 
 
+@pytest.mark.slow
 def test_neither_gaps_nor_fixes_make_a_streams_graph_grow(make_walk, make_oracle, without):
     walk = make_walk(5, 12.0, 50.0)
     holed = without(walk, (walk.time > 3.0) & (walk.time % 3.0 < 0.3))

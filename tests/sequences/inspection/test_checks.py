@@ -216,6 +216,7 @@ def test_stretches_too_short_to_determine_the_units_are_ignored():
     check_units(ImuSequence("shreds", walk.time[kept], walk.gyro[kept], walk.accel[kept]))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
 def test_real_recordings_pass_and_their_wrong_units_are_named():
     paths = [path for name in ("euroc", "oxiod", "tumvi") for path in find_recordings(DATA / name)]

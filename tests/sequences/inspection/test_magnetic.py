@@ -123,6 +123,7 @@ def test_inspection_reports_a_good_magnetometer_and_a_missing_one():
     assert bare.as_dict()["magnetometer"] is None
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not DATA.is_dir(), reason="the development recordings are not here")
 @pytest.mark.parametrize(
     ("name", "verdict", "tolerance"),
