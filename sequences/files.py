@@ -1,4 +1,4 @@
-"""Atomic writing of results: complete or not at all."""
+"""Atomic writing of results, complete or not at all, and folders for them."""
 
 from __future__ import annotations
 
@@ -131,6 +131,34 @@ def temporary_path(path: Path, kind: str) -> Iterator[Path]:
         found = f"{path}: {error.strerror or error}"
         fix = "choose another folder, fix its permissions or free disk space"
         raise InputError("path", found, "a writable location", fix) from error
+
+
+def check_folder(folder: Path) -> None:
+    """Check a folder for results before any work that could not be written; create nothing.
+
+    Raises:
+        InputError: the folder, or one above it, is a file or cannot be written to.
+    """
+    existing = next(part for part in (folder, *folder.parents) if part.exists())
+    if not existing.is_dir():
+        raise InputError(str(existing), "a file", "a folder, new or existing")
+    if not os.access(existing, os.W_OK):
+        raise InputError(str(existing), "no permission to write", "a folder that can be written")
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder and its parents.
+
+    Raises:
+        InputError: the path is taken by something else, or permission is denied.
+    """
+    check_folder(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            str(folder), error.strerror or "an error", "a folder that can be created"
+        ) from error
 
 
 def remove_abandoned(folder: Path, seconds: float, name: str = "*") -> None:

@@ -330,7 +330,6 @@ def table(
 
     The paper's protocol: 8:1:1 by recordings, true attitude, same recipe and steps for all.
     """
-    from stario.fusion.evaluation.results import make_folder
     from stario.fusion.paper_table.runs import backend as on_backend
     from stario.fusion.paper_table.runs import complete_run, table_runs
     from stario.fusion.paper_table.table import known_costs, write_results
@@ -338,6 +337,7 @@ def table(
     from stario.network.architectures import ARCHITECTURES
     from stario.network.training.splits import learned_from
     from stario.sequences.datasets.stream_cache import cache_folder
+    from stario.sequences.files import make_folder
     from stario.sequences.settings import read_settings
 
     if data is None:

@@ -75,7 +75,7 @@ def process_each(
     The folder is `out` for a single recording, else within it; None for `runs`/NAME. An option that
     allows only one recording is named by `single`.
     """
-    from stario.fusion.evaluation.results import check_folder
+    from stario.sequences.files import check_folder
 
     files, skipped = reading.recordings(paths)
     if single and len(files) > 1:

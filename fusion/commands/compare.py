@@ -54,10 +54,11 @@ def compare(
     Without PATH, that of a simulated walk.
     """
     from stario.fusion.evaluation.compare import TRACKS, compare_recordings, demonstration
-    from stario.fusion.evaluation.results import check_folder, metrics_dict, write_comparison
+    from stario.fusion.evaluation.results import metrics_dict, write_comparison
     from stario.fusion.evaluation.scores import joined
     from stario.fusion.values.fix_file import read_fixes
     from stario.sequences.arrays import check_choice
+    from stario.sequences.files import check_folder
 
     if not paths:
         options.refuse(context, "without PATH", "use with a recording to read", *options.READING)
@@ -143,8 +144,8 @@ def evaluate(
     as_json: options.Json = False,
 ) -> None:
     """Evaluate accuracy and consistency over recordings with ground truth: medians and means."""
-    from stario.fusion.evaluation.results import check_folder
     from stario.network.training.splits import warn_of_learned
+    from stario.sequences.files import check_folder
 
     if out is not None:
         check_folder(out)

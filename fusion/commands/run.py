@@ -98,12 +98,11 @@ def inspect(
 ) -> None:
     """Inspect recordings: timing, noise, units, signs, magnetometer, truth, track."""
     from stario.fusion.evaluation.known_positions import recording_verdict
-    from stario.fusion.evaluation.results import make_folder
     from stario.fusion.navigator import Navigator
     from stario.network.model import load_model
     from stario.sequences.drawing.figures import save_figure
     from stario.sequences.drawing.plots import imu_overview
-    from stario.sequences.files import write_json
+    from stario.sequences.files import make_folder, write_json
     from stario.sequences.inspection.report import inspect_recording
     from stario.sequences.inspection.samples import without_times_ahead
 
@@ -154,10 +153,9 @@ def live(
     """Show live tracks on a web page, from Sensor Logger, phyphox or any device that posts JSON."""
     for package in ("starlette", "uvicorn", "jinja2", "plotly", "segno"):
         optional_package(package, "live")
-    from stario.fusion import demonstration
-    from stario.fusion.evaluation.results import check_folder
     from stario.fusion.live.run import LiveServer
     from stario.fusion.navigator import Navigator
+    from stario.sequences.files import check_folder
 
     model, settings = estimating.network(), placing.settings(estimating.settings())
     if settings.place.origin is not None and len(settings.place.origin) > 2:
@@ -168,7 +166,11 @@ def live(
 
         check_tiles(tiles)
     check_folder(out)
-    simulated = demonstration() if demo else None
+    simulated = None
+    if demo:
+        from stario.fusion import demonstration
+
+        simulated = demonstration()
     server = LiveServer(
         lambda: Navigator(model, settings), out, host, port, phyphox or [], simulated, tiles
     )

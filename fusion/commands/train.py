@@ -98,7 +98,6 @@ def train(
     default weights on your own walks. All networks share one recipe. In several processes:
     torchrun --nproc-per-node 2 --no-python stario train ...
     """
-    from stario.fusion.evaluation.results import make_folder
     from stario.network.model import load_model
     from stario.network.training.config import INSERTED
     from stario.network.training.data import recording_streams, seconds_of
@@ -108,6 +107,7 @@ def train(
     from stario.network.training.train import train as train_network
     from stario.sequences.datasets.stream_cache import cache_folder
     from stario.sequences.datasets.stream_cache import recorded as recorded_streams
+    from stario.sequences.files import make_folder
 
     if recorded_only and generated:
         raise InputError("--generated", "use with --recorded-only", "one of the two")

@@ -30,7 +30,13 @@ from stario.sequences.drawing.figures import save_figure
 from stario.sequences.drawing.plan import plan_view
 from stario.sequences.drawing.plots import error_over_time, innovations
 from stario.sequences.errors import InputError
-from stario.sequences.files import temporary_path, write_json, write_npz
+from stario.sequences.files import (
+    check_folder,
+    make_folder,
+    temporary_path,
+    write_json,
+    write_npz,
+)
 from stario.sequences.readers.tum import write_tum
 
 if TYPE_CHECKING:
@@ -182,34 +188,6 @@ def _figures(found: Comparison) -> Files:
         values = drawn.time, drawn.residual_W, drawn.sigma, drawn.nis, drawn.gated
         figures["innovations.png"] = innovations(*values, f"{name}: innovations")
     return figure_files(figures)
-
-
-def check_folder(folder: Path) -> None:
-    """Check a folder for results before any work that could not be written; create nothing.
-
-    Raises:
-        InputError: the folder, or one above it, is a file or cannot be written to.
-    """
-    existing = next(part for part in (folder, *folder.parents) if part.exists())
-    if not existing.is_dir():
-        raise InputError(str(existing), "a file", "a folder, new or existing")
-    if not os.access(existing, os.W_OK):
-        raise InputError(str(existing), "no permission to write", "a folder that can be written")
-
-
-def make_folder(folder: Path) -> None:
-    """Create a folder and its parents.
-
-    Raises:
-        InputError: the path is taken by something else, or permission is denied.
-    """
-    check_folder(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            str(folder), error.strerror or "an error", "a folder that can be created"
-        ) from error
 
 
 def write_results(folder: Path, files: Files) -> list[Path]:

@@ -129,7 +129,9 @@ def serve(tmp_path, new_navigator):
 @pytest.fixture
 def process(tmp_path):
     """`stario live` as a process of its own, and the address of its pushes."""
-    command = "from stario.fusion.commands.cli import main; main()"
+    # Without pandas and with it the evaluation, which take seconds: a server starts at once.
+    command = "import sys; sys.modules['pandas'] = None; "
+    command += "from stario.fusion.commands.cli import main; main()"
     options = ["live", "--port", "0", "--out", str(tmp_path)]
     with subprocess.Popen(
         [sys.executable, "-c", command, *options], stderr=subprocess.PIPE, text=True
