@@ -34,7 +34,7 @@ class Shown:
         self.page.wait_for_function(fits)
 
 
-@pytest.fixture(scope="package")  # while it is open no test elsewhere can run an event loop
+@pytest.fixture(scope="module")  # while it is open no other test can run an event loop
 def browser() -> Iterator[Any]:
     if CHROMIUM is None:
         pytest.skip("no Chromium: apt-get install chromium")
