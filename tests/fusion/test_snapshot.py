@@ -209,7 +209,6 @@ def memory_growth(navigator: Navigator, walk: ImuSequence, warm_up: float, secon
         tracemalloc.stop()
 
 
-@pytest.mark.slow
 def test_the_memory_of_a_stream_does_not_grow(make_walk, still_model):
     growth = memory_growth(Navigator(still_model), make_walk(1, 12.0, RATE), 8.0, 12.0)
     # One number per sample.
