@@ -5,6 +5,8 @@ README.md, "Displacement measurement" and "Gates".
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -14,28 +16,31 @@ from stario.fusion.filter.correlated_errors import displacement_errors
 from stario.fusion.filter.ekf import Updated, update_displacement
 from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.innovations import InnovationStatistics
+from stario.fusion.filter.jacobians import GAIN, REPORTED
 from stario.fusion.filter.kalman import UpdateResult
 from stario.fusion.imu.inference import WindowDisplacement
 from stario.fusion.values.config import FilterConfig
 from stario.fusion.values.lie import yaw_rotation
 from stario.fusion.values.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
-from stario.sequences.sequence import FloatArray
 
 _RARE_SHARE, _RARE_POWER = 0.35, 4.0
 """While less than this share of recent displacements were outliers, they are attributed to the
 network and inflated by this power of NIS / gate; a filter that gates more of them may itself be
 wrong. This bridges about five seconds of false displacements."""
 
-_OFFSET_GAIN = 0.5
-"""Share of the latest outlier's residual in the alternative's offset, which may turn with the
-device."""
+_STEADY_SIGMA, _STEADY_WALK = 1.0, 0.28
+"""Sigma of a steady error [m], and its random walk [m/sqrt(s)]: it may turn with the device."""
 
-_OFFSET_SCALE = 10.0
-"""Factor on the covariance of a displacement less the offset, which comes from such residuals."""
+_RUN_SECONDS, _MAX_SECONDS = 5.0, 6.0
+"""Mean and maximum duration of a run of false displacements [s]: an error that lasts longer is not
+taken for false."""
 
-_ALTERNATIVE_GATE = 0.95
-"""Probability of the chi-square test beyond which a displacement does not fit the alternative."""
+_RUN_ODDS = 0.1
+"""Prior odds that an outlier began such a run, and did not correct a filter that was wrong."""
+
+_FALSE_DENSITY = 1e-3
+"""Density of a displacement that fits nothing [1/m^3]: one in a hundred is anywhere in 10 m^3."""
 
 
 class Displaced(NamedTuple):
@@ -60,41 +65,58 @@ def update_with(
     power = _RARE_POWER if rare else 1.0
     ekf, result = _applied(before.ekf, displacement, statistics, f, f.gate, power)
     statistics = statistics.updated(result, f)
-    if before.alternative is None and rare and result.gated:
-        assert result.residual is not None  # it has been compared with the gate
-        first = AlternativeHypothesis(before.ekf, result.residual, (before.ekf.time,))
-        return Displaced(Hypotheses(ekf, first), statistics, result, ())
-    if before.alternative is None or not result.accepted:
+    if not result.accepted:
         return Displaced(changed(before, ekf=ekf), statistics, result, ())
-    other, fits = _alternative_with(displacement, before.alternative, statistics, f)
-    after, rejected_later = Hypotheses(ekf, other).judged(fits, not result.gated)
-    return Displaced(after, statistics, result, rejected_later)
+
+    def honest(state: EkfState) -> Updated:
+        """Update by the errors as they are: the gains assumed otherwise soon forget the speed."""
+        return _applied(state, displacement, statistics, f, gains_from=REPORTED)
+
+    if before.alternative is not None:
+        after, rejected_later = _judged(before.alternative, ekf, result, honest, f)
+        return Displaced(after, statistics, result, rejected_later)
+    opened = None
+    if rare and result.gated:
+        first, _ = honest(before.ekf.with_steady_error(_STEADY_SIGMA**2))
+        opened = AlternativeHypothesis(first, (ekf.time,))
+    return Displaced(Hypotheses(ekf, opened), statistics, result, ())
 
 
-def _alternative_with(
-    displacement: WindowDisplacement,
-    before: AlternativeHypothesis,
-    statistics: InnovationStatistics,
+def _judged(
+    other: AlternativeHypothesis,
+    ekf: EkfState,
+    result: UpdateResult,
+    honest: Callable[[EkfState], Updated],
     f: FilterConfig,
-) -> tuple[AlternativeHypothesis, bool]:
-    """Update the alternative with a displacement: as it is if it fits, else less the offset.
+) -> tuple[Hypotheses, tuple[float, ...]]:
+    """Update the alternative; once the false displacements have ended, keep the likelier of both.
 
-    An alternative that is uncertain after some seconds would take any displacement for right, so
-    one nearer to the offset than to zero does not fit.
+    Args:
+        other: the alternative before a displacement.
+        ekf: the filter after it.
+        result: its outcome in the filter.
+        honest: update with it.
+        f: settings of the filter.
 
-    Return whether it fits, too.
+    Returns:
+        Both, and the times of the displacements [s] that were false after all, since the
+        alternative without them is adopted; empty otherwise.
     """
-    ekf, result = _applied(before.ekf, displacement, statistics, f, _ALTERNATIVE_GATE, None)
-    offset_W, residual = before.offset_W, result.residual
-    if residual is None:
-        return changed(before, ekf=ekf), True
-    nearer_offset = residual @ offset_W > 0.5 * offset_W @ offset_W
-    if result.accepted and not nearer_offset:
-        return changed(before, ekf=ekf), True
-    offset_W = offset_W + _OFFSET_GAIN * (residual - offset_W)
-    ekf, _ = _applied(before.ekf, displacement, statistics, f, None, None, offset_W)
-    outliers = (*before.outliers, before.ekf.time)
-    return changed(before, ekf=ekf, offset_W=offset_W, outliers=outliers), False
+    lasting, if_lasting = honest(other.ekf.with_steady_error(_STEADY_WALK**2 / f.update_rate))
+    ended, if_ended = honest(other.ekf.without_steady_error())
+    end_odds = 1.0 / (_RUN_SECONDS * f.update_rate)
+    if math.log(end_odds) + _evidence(if_ended) > _evidence(if_lasting):
+        if math.log(_RUN_ODDS) + _evidence(if_ended) > _evidence(result):
+            return Hypotheses(ended), other.false
+        return Hypotheses(ekf), ()
+    if ekf.time - other.false[0] > _MAX_SECONDS:
+        return Hypotheses(ekf), ()
+    return Hypotheses(ekf, AlternativeHypothesis(lasting, (*other.false, ekf.time))), ()
+
+
+def _evidence(result: UpdateResult) -> float:
+    """Return the logarithm of a displacement's probability density, which may be false anyway."""
+    return float(np.logaddexp(result.log_likelihood, math.log(_FALSE_DENSITY)))
 
 
 def _applied(
@@ -102,22 +124,20 @@ def _applied(
     displacement: WindowDisplacement,
     statistics: InnovationStatistics,
     f: FilterConfig,
-    gate: float | None,
-    inflation: float | None,
-    offset_W: FloatArray | None = None,
+    gate: float | None = None,
+    inflation: float = 1.0,
+    gains_from: int = GAIN,
 ) -> Updated:
-    """Update a state with a displacement, in W and less an offset (3,) [m]."""
+    """Update a state with a displacement, in W."""
     d_N, covariance_N, R_NB = displacement
     slot = s.clone_slots[0]
     R_WN = yaw_rotation(s.clone_pose(slot)[0] @ R_NB.T)
     # Values that are not finite are rejected and counted by the filter.
     with np.errstate(invalid="ignore"):
         d_W, covariance_W = R_WN @ d_N, R_WN @ covariance_N @ R_WN.T
-        if offset_W is not None:
-            d_W, covariance_W = d_W - offset_W, _OFFSET_SCALE * covariance_W
         errors = None
         if f.correlated_errors and np.isfinite(covariance_W).all():
             errors = displacement_errors(d_W, covariance_W, statistics.error_level, f)
         limit = None if gate is None else chi2_quantile(gate, 3)
         covariance_W = f.overlap_scale * covariance_W
-        return update_displacement(s, slot, d_W, covariance_W, limit, inflation, errors)
+        return update_displacement(s, slot, d_W, covariance_W, limit, inflation, errors, gains_from)

@@ -16,6 +16,7 @@ from stario.fusion.filter.ekf_state import EkfState
 from stario.fusion.filter.jacobians import (
     CLONED,
     CORE,
+    GAIN,
     REPORTED,
     Propagation,
     bearing_jacobian,
@@ -145,6 +146,7 @@ def update_displacement(
     gate: float | None = None,
     inflation: float | None = 1.0,
     errors: DisplacementErrors | None = None,
+    gains_from: int = GAIN,
 ) -> Updated:
     """Update with the displacement from clone i to the current pose j, in the estimated world.
 
@@ -161,6 +163,7 @@ def update_displacement(
         gate: as for `kalman.update`.
         inflation: likewise.
         errors: its errors as they are; None if they are white with that covariance.
+        gains_from: as for `kalman.update`.
 
     Raises:
         InputError: the slot holds no clone.
@@ -172,8 +175,11 @@ def update_displacement(
     if errors is not None:
         noise, s = errors.white, with_considered_propagated(s)
         blocks.append((s.considered_rows.start, errors.considered))
+    if s.steady_W is not None:
+        d_W = d_W - s.steady_W
+        blocks.append((s.steady_rows.start, np.eye(3)))
     measured = Linear(d_W - (p_j - p_i), blocks, covariance, noise)
-    after, result = update(s, measured, gate, inflation)
+    after, result = update(s, measured, gate, inflation, gains_from)
     return (after if result.accepted else before), result
 
 

@@ -90,6 +90,8 @@ class EkfState:
         considered_time: time up to which the considered errors are propagated [s].
         field: the magnetic field; None before its first measurement.
         offset: that of the barometer; None before its first height.
+        steady_W: (3,) error that the displacements share under the alternative hypothesis [m]; None
+            if they have none.
     """
 
     time: float
@@ -102,6 +104,7 @@ class EkfState:
     considered_time: float
     field: FieldState | None = None
     offset: PressureOffset | None = None
+    steady_W: FloatArray | None = None
 
     @classmethod
     def initial(cls, state: NavState, slots: int) -> EkfState:
@@ -155,15 +158,22 @@ class EkfState:
         return nav_states([self.estimate()])[0]
 
     @property
+    def steady_rows(self) -> slice:
+        """Rows of the error that displacements share, if there is one."""
+        first = CORE + CLONE * len(self.clone_times)
+        return slice(first, first + 3 * (self.steady_W is not None))
+
+    @property
     def considered_rows(self) -> slice:
         """Rows of the network's errors that are considered and never estimated."""
-        first = CORE + CLONE * len(self.clone_times)
+        first = self.steady_rows.stop
         return slice(first, first + len(CONSIDERED_SECONDS))
 
     @property
     def offset_row(self) -> int:
         """Row of the error of the barometer's offset, if there is one."""
-        return CORE + CLONE * len(self.clone_times) + len(CONSIDERED_SECONDS)
+        row: int = self.considered_rows.stop
+        return row
 
     @property
     def field_row(self) -> int:
@@ -225,7 +235,7 @@ class EkfState:
         """Return the state moved by an error (n,), X <- exp(error) X, with its covariances."""
         xi = np.zeros((len(self.X), 3, 3))  # rows theta, rho_v, rho_p of each pose
         xi[0] = error[:9].reshape(3, 3)
-        xi[1:, ::2] = error[CORE : self.considered_rows.start].reshape(-1, 2, 3)
+        xi[1:, ::2] = error[CORE : self.steady_rows.start].reshape(-1, 2, 3)
         field = self.field
         if field is not None:
             azimuth, disturbance, *_ = error[self.field_row :].tolist()
@@ -235,6 +245,9 @@ class EkfState:
         offset = self.offset
         if offset is not None:
             offset = changed(offset, metres=offset.metres + float(error[self.offset_row]))
+        steady_W = self.steady_W
+        if steady_W is not None:
+            steady_W = steady_W + error[self.steady_rows]
         return changed(
             self,
             X=exp_times(xi[:, 0], xi[:, 1:].transpose(0, 2, 1), self.X),
@@ -242,7 +255,23 @@ class EkfState:
             b_a=self.b_a + error[12:15],
             field=field,
             offset=offset,
+            steady_W=steady_W,
         )
+
+    def with_steady_error(self, variance: float) -> EkfState:
+        """Return the state whose displacements share an error, with a variance [m^2] or more."""
+        P, rows, steady_W = self.covariances, self.steady_rows, self.steady_W
+        if steady_W is None:
+            at = [rows.start] * 3
+            P, steady_W = np.insert(np.insert(P, at, 0.0, 1), at, 0.0, 2), np.zeros(3)
+        after = changed(self, covariances=P.copy(), steady_W=steady_W)
+        after.covariances[:, after.steady_rows, after.steady_rows] += variance * np.eye(3)
+        return after
+
+    def without_steady_error(self) -> EkfState:
+        """Return the state whose displacements share no error any more."""
+        P, rows = self.covariances, self.steady_rows
+        return changed(self, covariances=np.delete(np.delete(P, rows, 1), rows, 2), steady_W=None)
 
     def transformed(self, R: FloatArray, shift: FloatArray) -> EkfState:
         """Return the state in another frame: p <- R p + shift, R applied to attitude and velocity.

@@ -36,6 +36,7 @@ class UpdateResult(NamedTuple):
             likewise.
         gate_nis: the same NIS under the covariance that determined the gain (`gains_from`), which
             is what gates.
+        log_likelihood: logarithm of the residual's density under the covariance of the error.
     """
 
     reason: str = ""
@@ -44,6 +45,7 @@ class UpdateResult(NamedTuple):
     residual: FloatArray | None = None
     sigma: FloatArray | None = None
     gate_nis: float = math.nan
+    log_likelihood: float = math.nan
 
     @property
     def accepted(self) -> bool:
@@ -119,16 +121,17 @@ def update(
     H = measured.jacobian(s.covariances.shape[1])
     R = np.array((covariance, covariance if noise is None else noise))
     S = H @ s.covariances @ H.T + R
-    nis, gate_nis = _nis(residual, S[REPORTED]), _nis(residual, S[gains_from])
+    nis, log_likelihood = _nis(residual, S[REPORTED])
+    gate_nis, _ = _nis(residual, S[gains_from])
     if not math.isfinite(gate_nis):
         return s, UpdateResult("innovation covariance not invertible")
     sigma, scale = np.sqrt(S[REPORTED].diagonal()), 1.0
     if gate is not None and gate_nis > gate:
         if inflation is None:
-            return s, UpdateResult("gated", nis, 1.0, residual, sigma, gate_nis)
+            return s, UpdateResult("gated", nis, 1.0, residual, sigma, gate_nis, log_likelihood)
         scale = (gate_nis / gate) ** inflation
     after = corrected(s, residual, H, scale * R, gains_from)
-    return after, UpdateResult("", nis, scale, residual, sigma, gate_nis)
+    return after, UpdateResult("", nis, scale, residual, sigma, gate_nis, log_likelihood)
 
 
 def corrected(
@@ -177,7 +180,11 @@ def _fault_of(value: FloatArray, covariance: FloatArray) -> str:
     return "covariance not positive definite" if dpotrf(covariance, lower=1)[1] else ""
 
 
-def _nis(residual: FloatArray, S: FloatArray) -> float:
-    """Return the normalised innovation squared; NaN if S is not positive definite."""
-    _, solved, failed = dposv(S, residual)
-    return math.nan if failed else float(residual @ solved.ravel())
+def _nis(residual: FloatArray, S: FloatArray) -> tuple[float, float]:
+    """Return the normalised innovation squared and the log-likelihood, NaN if S is not definite."""
+    root, solved, failed = dposv(S, residual)
+    if failed:
+        return math.nan, math.nan
+    nis = float(residual @ solved.ravel())
+    log_det = 2.0 * float(np.log(root.diagonal()).sum())
+    return nis, -0.5 * (nis + log_det + len(residual) * math.log(2.0 * math.pi))
