@@ -20,7 +20,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from stario.fusion import Navigator, network_track
+from stario.fusion import FilterConfig, Navigator, NavigatorConfig, network_track
 from stario.network import load_model
 from stario.sequences import (
     ImuSequence,
@@ -67,7 +67,10 @@ def poses_of(sequence: ImuSequence) -> Trajectory:
     """Return true poses, or those along the network's track with the waypoints' length."""
     if sequence.truth is not None:
         return sequence.truth
-    track = network_track(Navigator(load_model("default")).observe(sequence)).trajectory
+    # At twenty updates a second: between the attitudes of two, a hand's turning would be lost.
+    config = NavigatorConfig(filter=FilterConfig(update_rate=20))
+    navigator = Navigator(load_model("default"), config)
+    track = network_track(navigator.observe(sequence)).trajectory
     if sequence.positions is None:
         return track
     at = sequence.positions.time.clip(*track.time[[0, -1]])
@@ -90,6 +93,7 @@ def measure(folder: Path, out: Path) -> None:
         way=[way for way, _ in alike],
         speed=np.float32([stride.speed for _, stride in alike]),
         step_rate=np.float32([stride.step_rate for _, stride in alike]),
+        quat_xyzw=np.float32([stride.quat_xyzw for _, stride in alike]),
         amplitude=np.stack([amplitude.real, amplitude.imag], axis=-1).astype(np.float16),
     )
 

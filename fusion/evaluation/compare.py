@@ -398,7 +398,7 @@ def demonstration() -> ImuSequence:
 
     A phone with a magnetometer is held flat in front along the corridors, as one follows a map.
     """
-    style = WalkStyle(carry="in-front", mount_rotvec=(0.3, -0.2, 0.9))
+    style = WalkStyle(carry="in-front")
     walk = generate_walk(DEMONSTRATION_SEED, duration=150.0, style=style, corridors=True)
     name = "demonstration"
     seed, field = DEMONSTRATION_SEED, INDOOR_FIELD

@@ -8,9 +8,10 @@ H [rad]. What a device in a hand, a pocket or a bag does with the stride is that
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from stario.sequences.sequence import FloatArray
 from stario.sequences.simulation.routes import band_noise, drift, smoothed
@@ -79,7 +80,7 @@ def _held(gait: Gait, place: Place, person: StrideCycle) -> CarryMotion:
     tremor = band_noise(rng, n, gait.rate, 5.0, 11.0, 6) / (2.0 * np.pi * 8.0)
     turn += place.tremor * tremor[:, :3]
     offset += 2.0 * place.tremor * tremor[:, 3:] / (2.0 * np.pi * 8.0)
-    return CarryMotion(offset, turn)
+    return replace(motion, offset_H=offset, turn_H=turn)
 
 
 def _trolley(gait: Gait) -> CarryMotion:
@@ -98,7 +99,7 @@ def _trolley(gait: Gait) -> CarryMotion:
     place = np.array([0.6, 0.0, rng.uniform(0.4, 1.0)])
     # The push pulses slightly with the steps of the person behind.
     offset[:, 0] += 0.002 * gait.pace * np.cos(2.0 * gait.phase)
-    return CarryMotion(offset + place, turn)
+    return CarryMotion(offset + place, turn, Rotation.identity())
 
 
 def _rig(gait: Gait, person: StrideCycle) -> CarryMotion:
@@ -110,7 +111,7 @@ def _rig(gait: Gait, person: StrideCycle) -> CarryMotion:
     lively = 0.5 * (1.0 + np.tanh(1.5 + 1.5 * drift(rng, n, gait.rate, 3.0, 1)))
     looks = _looks(gait, np.array([0.5, 0.5, 0.9]) * rng.uniform(0.5, 1.2))
     offset = reach * np.tanh(waved) * lively
-    return CarryMotion(motion.offset_H + offset, motion.turn_H + looks)
+    return replace(motion, offset_H=motion.offset_H + offset, turn_H=motion.turn_H + looks)
 
 
 def _looks(gait: Gait, spread: FloatArray) -> FloatArray:

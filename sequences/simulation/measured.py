@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.signal import butter, hilbert, sosfiltfilt
+from scipy.spatial.transform import Rotation
 
 from stario.sequences.arrays import even_grid, interpolated
 from stario.sequences.attitude.rotations import about_z
@@ -25,6 +26,7 @@ from stario.sequences.simulation.strides import (
     WANDERING,
     ComplexArray,
     StrideCycle,
+    on_other_side,
 )
 
 _RATE = 100.0
@@ -59,11 +61,12 @@ def measured_stride(sequence: ImuSequence, poses: Trajectory) -> StrideCycle | N
     Returns:
         The stride at the median speed; None if too little of the recording is a steady walk.
     """
-    found = [s for w in _steady_walks(sequence, poses) if (s := _stride(*w)) is not None]
+    walks = _steady_walks(sequence, poses)
+    found = [stride for walk in walks if (stride := _stride(*walk)) is not None]
     speeds = np.array([stride.speed for stride in found])
     if len(found) < _FEWEST or np.median(speeds) < _SLOWEST:
         return None
-    aligned = _aligned([stride.amplitude for stride in found], mirrored=False)
+    aligned, _ = _aligned([stride.amplitude for stride in found], mirrored=False)
     mean = aligned.mean(axis=0)
     # What is fast comes a little earlier or later in each stride: its size is that within strides.
     # Half of what the simulator adds to that from stride to stride remains in a window's fit.
@@ -73,17 +76,23 @@ def measured_stride(sequence: ImuSequence, poses: Trajectory) -> StrideCycle | N
         speed=float(np.median(speeds)),
         step_rate=float(np.median([stride.step_rate for stride in found])),
         amplitude=mean * np.minimum(size / np.abs(mean), 2.0),
+        quat_xyzw=Rotation.from_quat([stride.quat_xyzw for stride in found]).mean().as_quat(),
     )
 
 
 def on_one_side(people: list[StrideCycle]) -> list[StrideCycle]:
     """Return the strides of people with a device in one way, all as if on the same side."""
-    aligned = _aligned([person.amplitude for person in people], mirrored=True)
-    return [replace(person, amplitude=a) for person, a in zip(people, aligned, strict=True)]
+    aligned, other = _aligned([person.amplitude for person in people], mirrored=True)
+    sides = [
+        on_other_side(each) if turn else each for each, turn in zip(people, other, strict=True)
+    ]
+    return [replace(person, amplitude=a) for person, a in zip(sides, aligned, strict=True)]
 
 
-def _steady_walks(sequence: ImuSequence, poses: Trajectory) -> Iterator[tuple[FloatArray, float]]:
-    """Yield force less gravity and angular rate (M, 6) along the walk, and the speed [m/s]."""
+def _steady_walks(
+    sequence: ImuSequence, poses: Trajectory
+) -> Iterator[tuple[FloatArray, float, FloatArray]]:
+    """Yield force less gravity and angular rate (M, 6) in H', speed [m/s], attitude (4,)."""
     start, stop = (pick(sequence.time[k], poses.time[k]) for pick, k in ((max, 0), (min, -1)))
     time = even_grid(float(start), float(stop), 1.0 / _RATE)
     if len(time) < 2 * _WINDOW:
@@ -104,10 +113,11 @@ def _steady_walks(sequence: ImuSequence, poses: Trajectory) -> Iterator[tuple[Fl
         mean = float(speed[window].mean())
         steady = np.ptp(speed[window]) < _UNSTEADY * mean and np.ptp(course[window]) < _TURNED
         if steady and _SPEEDS[0] < mean < _SPEEDS[1] and at.valid[window].all():
-            yield motion[first - _EDGE : first + _WINDOW + _EDGE], mean
+            attitude = R_HB[window].mean().as_quat()
+            yield motion[first - _EDGE : first + _WINDOW + _EDGE], mean, attitude
 
 
-def _stride(motion: FloatArray, speed: float) -> StrideCycle | None:
+def _stride(motion: FloatArray, speed: float, quat_xyzw: FloatArray) -> StrideCycle | None:
     """Return the stride in a window; None if its step rate is no person's at that speed."""
     inner = slice(_EDGE, -_EDGE)
     time = (np.arange(_WINDOW) - 0.5 * _WINDOW) / _RATE
@@ -126,24 +136,25 @@ def _stride(motion: FloatArray, speed: float) -> StrideCycle | None:
     basis = np.hstack([np.ones((_WINDOW, 1)), time[:, None], waves.real, -waves.imag])
     fitted = np.linalg.lstsq(basis, motion[inner], rcond=None)[0][2:]
     amplitude = fitted[:HARMONICS] + 1j * fitted[HARMONICS:]
-    return StrideCycle(speed, usual * float(step_rates.mean()), amplitude)
+    return StrideCycle(speed, usual * float(step_rates.mean()), amplitude, quat_xyzw)
 
 
-def _aligned(amplitudes: list[ComplexArray], mirrored: bool) -> ComplexArray:
-    """Return amplitudes (K, HARMONICS, 6) shifted, and perhaps mirrored, to agree best."""
+def _aligned(amplitudes: list[ComplexArray], mirrored: bool) -> tuple[ComplexArray, list[bool]]:
+    """Return amplitudes (K, HARMONICS, 6), shifted and mirrored to agree best, and which were."""
     found = np.stack(amplitudes)
     size = np.sqrt(np.sum(_WEIGHT * np.abs(found) ** 2, axis=(1, 2), keepdims=True))
-    aligned = found
     mean = found[len(found) // 2]
     for _ in range(8):
-        aligned = np.stack([_closest(each, mean, mirrored) for each in found])
-        mean = (aligned / size).mean(axis=0)
-    return aligned
+        aligned, other = zip(*(_closest(each, mean, mirrored) for each in found), strict=True)
+        mean = (np.stack(aligned) / size).mean(axis=0)
+    return np.stack(aligned), list(other)
 
 
-def _closest(amplitude: ComplexArray, mean: ComplexArray, mirrored: bool) -> ComplexArray:
-    """Return amplitudes with the shift, and on the side, that agree best with a mean."""
+def _closest(
+    amplitude: ComplexArray, mean: ComplexArray, mirrored: bool
+) -> tuple[ComplexArray, bool]:
+    """Return amplitudes shifted to agree best with a mean, and whether as their mirror image."""
     sides = [amplitude, amplitude * MIRRORED] if mirrored else [amplitude]
     agreement = [(_SHIFTS @ np.sum(_WEIGHT * each * mean.conj(), axis=1)).real for each in sides]
     side = int(np.argmax([np.max(each) for each in agreement]))
-    return np.asarray(sides[side] * _SHIFTS[np.argmax(agreement[side])][:, None])
+    return np.asarray(sides[side] * _SHIFTS[np.argmax(agreement[side])][:, None]), bool(side)

@@ -14,12 +14,13 @@ of people who walk sideways or backward have the same cycles along the way they 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from stario.sequences.sequence import FloatArray
 from stario.sequences.simulation.routes import drift
@@ -52,6 +53,9 @@ _WANDER_TIME = 0.4
 MIRRORED = np.array([1, -1, 1, -1, 1, -1])
 """Signs of force and angular rate of the mirror image, to the other side of the body."""
 
+_HALF_TURNS = Rotation.from_euler("x", np.pi), Rotation.from_euler("y", np.pi)
+"""About x and y: reflections of a device's x and of H's y, each of them times -1."""
+
 
 @dataclass(frozen=True, eq=False)
 class StrideCycle:
@@ -62,11 +66,13 @@ class StrideCycle:
         step_rate: step rate [Hz].
         amplitude: (HARMONICS, 6) complex amplitudes of the specific force [m/s^2] and of the
             angular rate [rad/s] in H'.
+        quat_xyzw: (4,) mean attitude of the device's axes in H'.
     """
 
     speed: float
     step_rate: float
     amplitude: ComplexArray
+    quat_xyzw: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,10 +105,17 @@ class Gait:
 
 @dataclass(frozen=True, eq=False)
 class CarryMotion:
-    """Offset (N, 3) [m] in H and rotation vector (N, 3) [rad] in H from the neutral attitude."""
+    """How a device moves.
+
+    Attributes:
+        offset_H: (N, 3) offset in H [m].
+        turn_H: (N, 3) rotation vector in H from the neutral attitude [rad].
+        neutral_HB: the neutral attitude.
+    """
 
     offset_H: FloatArray
     turn_H: FloatArray
+    neutral_HB: Rotation
 
 
 @cache
@@ -111,13 +124,24 @@ def stride_cycles(way: str) -> list[StrideCycle]:
     with np.load(str(files(__package__).joinpath("strides.npz")), allow_pickle=False) as found:
         chosen = found["way"] == way
         amplitude = found["amplitude"][chosen].astype(np.float64) @ [1.0, 1j]
-        values = zip(found["speed"][chosen], found["step_rate"][chosen], amplitude, strict=True)
-        return [StrideCycle(float(speed), float(steps), a) for speed, steps, a in values]
+        speed, steps, quat = (found[key][chosen] for key in ("speed", "step_rate", "quat_xyzw"))
+        values = zip(speed.tolist(), steps.tolist(), amplitude, quat, strict=True)
+        return [StrideCycle(*each) for each in values]
 
 
 def step_rate(person: StrideCycle, speed: FloatArray) -> FloatArray:
     """Return a person's step rate (N,) [Hz] at a speed (N,) [m/s]."""
     return np.asarray(person.step_rate * (speed / person.speed) ** STEP_RATE_POWER)
+
+
+def on_other_side(person: StrideCycle) -> StrideCycle:
+    """Return a person with the device on the other side of the body.
+
+    A device is its own mirror image, left for right: its attitude is reflected on both sides.
+    """
+    about_x, about_y = _HALF_TURNS
+    R_HB = about_y * Rotation.from_quat(person.quat_xyzw) * about_x
+    return replace(person, amplitude=person.amplitude * MIRRORED, quat_xyzw=R_HB.as_quat())
 
 
 def drawn_cycle(rng: np.random.Generator, way: str, speed: float) -> StrideCycle:
@@ -138,16 +162,17 @@ def stride_motion(gait: Gait, cycle: StrideCycle) -> CarryMotion:
     ratio = gait.pace / cycle.speed
     faster, steadier = ratio**_POWER, 2.0 * ratio / (1.0 + ratio)
     growth = np.stack([steadier, steadier, faster, steadier, steadier, steadier])
-    amplitude = cycle.amplitude * (1.0 if rng.random() < 0.5 else MIRRORED)
+    person = cycle if rng.random() < 0.5 else on_other_side(cycle)
     motion = np.zeros((6, len(gait)))
-    for n, size in enumerate(amplitude, start=1):
+    for n, size in enumerate(person.amplitude, start=1):
         real, imaginary = (
             np.sqrt(0.5) * WANDERING * n * drift(rng, len(gait), gait.rate, _WANDER_TIME, 2).T
         )
         wave = (1.0 + real + 1j * imaginary) * np.exp(1j * n * gait.phase) / (n * omega)
         wave = np.stack([wave / (n * omega)] * 3 + [1j * wave] * 3)
         motion -= (wave * size[:, None]).real * (growth if n <= _STEADY else faster)
-    return CarryMotion(_along(gait.course, motion[:3].T), _along(gait.course, motion[3:].T))
+    offset, turn = (_along(gait.course, part.T) for part in (motion[:3], motion[3:]))
+    return CarryMotion(offset, turn, Rotation.from_quat(person.quat_xyzw))
 
 
 def _along(course: FloatArray, vector: FloatArray) -> FloatArray:

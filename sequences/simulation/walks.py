@@ -45,7 +45,8 @@ class WalkStyle:
         next_carry: carrying mode after a change within the walk; empty for no change.
         height: height of the person [m].
         preferred_speed: preferred speed [m/s].
-        mount_rotvec: rotation vector of the device from its neutral attitude [rad], of any size.
+        mount_rotvec: rotation vector from H (x ahead, y left, z up) to the device's neutral
+            attitude [rad], of any size; None for that of the recorded person.
 
     Raises:
         InputError: a carrying mode is unknown or a value is out of range.
@@ -55,7 +56,7 @@ class WalkStyle:
     next_carry: str = ""
     height: float = 1.75
     preferred_speed: float = 1.2
-    mount_rotvec: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mount_rotvec: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         check_choice("carry", self.carry, CARRYING_MODES)
@@ -63,23 +64,22 @@ class WalkStyle:
             check_choice("next_carry", self.next_carry, CARRYING_MODES)
         for name, low, high in _RANGES:
             check_number(self, name, low, high)
-        if len(self.mount_rotvec) != 3 or not all(map(math.isfinite, self.mount_rotvec)):
-            raise InputError("mount_rotvec", repr(self.mount_rotvec), "three finite angles [rad]")
+        mount = self.mount_rotvec
+        if mount is not None and (len(mount) != 3 or not all(map(math.isfinite, mount))):
+            raise InputError("mount_rotvec", repr(mount), "three finite angles [rad]")
 
     @staticmethod
     def random(rng: np.random.Generator) -> WalkStyle:
-        """Draw a person, a carrying mode (about a third of walks change it) and a mount."""
+        """Draw a person and a carrying mode (about a third of walks change it)."""
         carry = str(rng.choice(CARRYING_MODES, p=_ODDS))
         # A device is not put onto a trolley, or taken off it, within a step or two.
         others = [mode for mode in CARRYING_MODES if mode not in (carry, "trolley")]
         changes = carry != "trolley" and rng.random() < 1.0 / 3.0
-        x, y, z = Rotation.random(rng=rng).as_rotvec()
         return WalkStyle(
             carry=carry,
             next_carry=str(rng.choice(others)) if changes else "",
             height=float(np.clip(rng.normal(1.72, 0.1), 1.45, 2.0)),
             preferred_speed=float(np.clip(rng.normal(1.05, 0.3), 0.5, 1.8)),
-            mount_rotvec=(float(x), float(y), float(z)),
         )
 
 
@@ -142,13 +142,15 @@ def carried_along(
     motion = carry_motion(gait, modes[0], people[0])
     if style.next_carry:
         second = carry_motion(gait, modes[1], people[1])
-        motion = _changed(rng, motion, second, later[:, None])
+        motion = _changed(motion, second, later[:, None])
+    mount = style.mount_rotvec
+    neutral_HB = motion.neutral_HB if mount is None else Rotation.from_rotvec(mount)
     R_WH = about_z(route.heading)
-    R_HD = composed(Rotation.from_rotvec(motion.turn_H), Rotation.from_rotvec(style.mount_rotvec))
+    R_HB = composed(Rotation.from_rotvec(motion.turn_H), neutral_HB)
     return Trajectory(
         time=np.arange(n) / rate,
         position_W=route.position_W + R_WH.apply(motion.offset_H),
-        attitude_WB=composed(R_WH, R_HD),
+        attitude_WB=composed(R_WH, R_HB),
     )
 
 
@@ -189,13 +191,10 @@ def _gait(
     )
 
 
-def _changed(
-    rng: np.random.Generator, first: CarryMotion, second: CarryMotion, later: FloatArray
-) -> CarryMotion:
-    """Return the motion of a device that is put elsewhere, and gripped anew."""
-    axis = rng.standard_normal(3)
-    regrip = rng.uniform(0.2, 2.0) * axis / np.linalg.norm(axis)
+def _changed(first: CarryMotion, second: CarryMotion, later: FloatArray) -> CarryMotion:
+    """Return the motion of a device that is put elsewhere, and so to another attitude."""
+    put = (second.neutral_HB * first.neutral_HB.inv()).as_rotvec()
     turn = Rotation.from_rotvec((1.0 - later) * first.turn_H + later * second.turn_H)
-    turn = turn * Rotation.from_rotvec(later * regrip)
+    turn = turn * Rotation.from_rotvec(later * put)
     offset = (1.0 - later) * first.offset_H + later * second.offset_H
-    return CarryMotion(offset, turn.as_rotvec())
+    return CarryMotion(offset, turn.as_rotvec(), first.neutral_HB)
