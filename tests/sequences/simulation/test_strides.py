@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from stario.sequences.sequence import Trajectory
 from stario.sequences.simulation import strides
@@ -14,6 +15,7 @@ from stario.sequences.simulation.strides import (
     Gait,
     StrideCycle,
     drawn_cycle,
+    on_other_side,
     step_rate,
     stride_cycles,
     stride_motion,
@@ -89,6 +91,31 @@ def test_the_sides_of_the_body_are_mirror_images():
     assert {-1.0, 1.0} == set(against)
 
 
+@pytest.mark.parametrize("way", PLACES)
+def test_a_device_on_the_other_side_is_a_device_and_its_other_side_the_first(way):
+    for person in stride_cycles(way):
+        other = on_other_side(person)
+        R_HB, R_HO = (Rotation.from_quat(each.quat_xyzw).as_matrix() for each in (person, other))
+        # A screen that faces the body still does, and what pointed ahead or up still does.
+        mirror = np.diag([1.0, -1.0, 1.0])
+        np.testing.assert_allclose(R_HO[:, 1:], mirror @ R_HB[:, 1:], atol=1e-6)
+        again = on_other_side(other)
+        np.testing.assert_array_equal(again.amplitude, person.amplitude)
+        assert abs(again.quat_xyzw @ person.quat_xyzw) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_phones_are_held_as_people_hold_them():
+    """In a hand in front, its upper edge ahead or up; at the ear its screen to the head."""
+    for way in ("handheld", "in-front", "texting"):
+        for person in stride_cycles(way):
+            x_H, y_H, _ = Rotation.from_quat(person.quat_xyzw).as_matrix().T
+            assert y_H @ [1.0, 0.0, 1.0] > 0.9
+            assert x_H[1] < -0.6
+    for person in stride_cycles("call"):
+        z_H = Rotation.from_quat(person.quat_xyzw).as_matrix()[:, 2]
+        assert abs(z_H[1]) > 0.8
+
+
 def test_who_walks_sideways_moves_along_the_way_as_one_who_walks_ahead():
     person = stride_cycles("handheld")[0]
     ahead = walking(person, 0.6)
@@ -102,7 +129,7 @@ def test_who_walks_sideways_moves_along_the_way_as_one_who_walks_ahead():
 def test_faster_walks_are_bouncier_and_who_stands_does_not_move():
     person = stride_cycles("in-front")[0]
     slow, brisk = (moved(walking(person, pace), person).std(axis=0) for pace in (0.7, 1.4))
-    assert 2.0 < brisk[2] / slow[2] < 2.6
+    assert 3.0 < brisk[2] / slow[2] < 4.1
     assert 1.1 < brisk[1] / slow[1] < brisk[2] / slow[2]
     assert not moved(walking(person, 0.0), person).any()
 
@@ -148,6 +175,9 @@ def test_the_person_measured_in_a_walk_is_the_one_who_walked(way):
     agreement = {person: agreed(person, found) for person in stride_cycles(way)}
     assert max(agreement.values()) > 0.95
     assert np.median(list(agreement.values())) < 0.93
+    person = max(agreement, key=agreement.__getitem__)
+    sides = [each.quat_xyzw for each in (person, on_other_side(person))]
+    assert max(abs(found.quat_xyzw @ quat) for quat in sides) > np.cos(0.5 * 0.1)
 
 
 def agreed(person: StrideCycle, found: StrideCycle) -> float:

@@ -147,15 +147,15 @@ def test_turning_on_the_spot_takes_steps():
     assert turning.step_rate.mean() > 1.2 * resting.step_rate.mean()
 
 
-def test_a_change_of_carrying_mode_turns_the_device_in_the_hand():
+def test_a_change_of_carrying_mode_turns_the_device_as_it_is_carried_there():
     angles = []
     for seed in range(8):
-        walk = generate_walk(seed, 20.0, style=WalkStyle(carry="bag", next_carry="bag"))
+        walk = generate_walk(seed, 20.0, style=WalkStyle(carry="in-front", next_carry="call"))
         up_B = walk.attitude_WB.apply([0.0, 0.0, 1.0], inverse=True)
         before, after = up_B[:400].mean(axis=0), up_B[-400:].mean(axis=0)
         cosine = before @ after / (np.linalg.norm(before) * np.linalg.norm(after))
         angles.append(np.arccos(cosine))
-    assert np.median(angles) > 0.3
+    assert min(angles) > 0.8  # from lying to upright
 
 
 def test_styles_and_arguments_are_checked():
