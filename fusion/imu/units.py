@@ -128,5 +128,11 @@ class SensorCheck:
             warn("stream", doubts)
             speed = np.percentile(np.linalg.norm(gyro, axis=1), 95)
             if speed < _DOUBTFUL_RAD_S:
-                self._wrong = 0
+                # A sensor that is dead does not get better while the device is calm.
+                if _varies(gyro) and _varies(accel):
+                    self._wrong = 0
                 self._turned += int(speed > _TURNING_RAD_S)
+
+
+def _varies(values: FloatArray) -> bool:
+    return bool(np.diff(values, axis=0).any())

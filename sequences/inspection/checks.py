@@ -19,6 +19,7 @@ from stario.sequences.attitude.rotations import integrated_gyro
 from stario.sequences.clean_samples import clean_samples, unbroken, without_spikes
 from stario.sequences.errors import InputError
 from stario.sequences.findings import Finding, warn
+from stario.sequences.inspection.gyro_axes import check_gyro_axes
 from stario.sequences.inspection.samples import LARGE_M_S2, check_not_dead, check_time, limit_words
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence
 from stario.sequences.truth.fit import TruthFit, fit_truth
@@ -102,8 +103,9 @@ def unit_findings(sequence: ImuSequence) -> list[Finding]:
 
     Raises:
         InputError: it is too short or holds no number, time is in another unit, a sensor is dead,
-            the gyroscope is in deg/s, the accelerometer is in g, lacks gravity or has the opposite
-            sign (detected only with a true attitude). The text names the option that fixes it.
+            the gyroscope is in deg/s or has other axes or signs than the accelerometer, or that is
+            in g, lacks gravity or has the opposite sign (detected only with a true attitude). The
+            text names the option that fixes it.
     """
     _check_content(sequence)
     check_time(sequence)
@@ -119,6 +121,7 @@ def unit_findings(sequence: ImuSequence) -> list[Finding]:
         force, average, found = check_gyro(sequence.name, time, gyro, accel, pieces, fix)
         saturated = limit_words("accelerometer", accel, "m/s^2", LARGE_M_S2)
         found += _check_force(sequence, force, average, saturated)
+        check_gyro_axes(sequence.name, time, gyro, accel, pieces)
     _check_direction(sequence, time, accel)
     if sequence.maybe_apple and sequence.truth is None:
         text = (

@@ -101,6 +101,21 @@ def test_a_stream_with_a_sensor_dead_from_the_beginning_is_refused(make_walk, st
     assert stream(navigator, right.slice(0.0, 3.0))
 
 
+def starts_and_stops(gyro: np.ndarray) -> ImuSequence:
+    """Shaken for six seconds and calm for six, in turn."""
+    time = 0.01 * np.arange(4800)
+    shaken = np.where(time % 12.0 < 6.0, np.sin(6.0 * time), 0.0)
+    accel = np.array([0.0, 0.0, STANDARD_GRAVITY]) + np.outer(shaken, [0.5, 1.0, 2.0])
+    return ImuSequence("starts and stops", time, np.tile(gyro, (1200, 1)), accel)
+
+
+def test_calm_in_between_does_not_hide_a_gyroscope_that_is_dead_from_the_beginning(still_model):
+    with pytest.raises(InputError, match="gyro: found values that never change"):
+        stream(Navigator(still_model), starts_and_stops(np.zeros((4, 3))))
+    live = np.outer([0.0, 0.001, 0.0, 0.002], [1.0, 1.0, 1.0])
+    assert stream(Navigator(still_model), starts_and_stops(live))[-1].time > 47.0
+
+
 def test_a_briefly_tumbling_device_is_not_mistaken_for_a_stream_in_degrees(make_walk, still_model):
     walk = make_walk(3, 26.0)
     gyro = walk.gyro.copy()

@@ -13,7 +13,7 @@ from recorded import CASES
 
 from stario.fusion.values.config import read_config
 from stario.fusion.values.fix_file import read_fixes
-from stario.sequences.errors import StarioError
+from stario.sequences.errors import InputError, StarioError
 from stario.sequences.inspection.checks import check_units
 from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.readers import find_recordings, read_recording
@@ -92,10 +92,12 @@ def test_degrees_of_a_robot_that_turns_only_about_the_vertical_are_asked_for(cap
     assert "--gyro-unit deg/s" in found["gyro_unit_open"].advice
 
 
-def test_axes_of_the_gyroscope_that_are_not_the_accelerometers_are_a_problem():
+def test_axes_of_the_gyroscope_that_are_not_the_accelerometers_are_refused():
     read = read_recording(case("run_silent_on_axes/gyro_not_rotated.csv"))
-    levels = {found.code: found.level for found in inspect_recording(read).findings}
-    assert levels["gyro_axes"] == "warning"
+    with pytest.raises(InputError, match=r"gyroscope: .* seem to be its x, -y, -z"):
+        check_units(read)
+    (told,) = [found for found in inspect_recording(read).findings if found.code == "refused"]
+    assert "seem to be its x, -y, -z" in told.advice
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
