@@ -121,7 +121,7 @@ def test_simulate_writes_a_recording_with_truth(stario, tmp_path):
 
 
 def test_a_simulated_house_has_floors_pressure_and_satellites(stario, tmp_path):
-    done = stario("simulate", "h.csv", "--floors", "--seconds", 120, "--rate", 50, "--json")
+    done = stario("simulate", "h.csv", "--floors", "--seconds", 180, "--rate", 50, "--json")
     assert done.code == 0
     stays = json.loads(done.out)["stays"]
     sequence = read_generic_csv(tmp_path / "h.csv")

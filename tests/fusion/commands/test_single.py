@@ -250,7 +250,7 @@ def test_run_accepts_a_folder_or_a_list_and_explains_figures_once(stario, record
 def test_every_command_accepts_units_axes_and_gravity(stario, recording, tmp_path, command):
     """Rates in degrees, Apple's user acceleration in g, axes rotated relative to the truth's."""
     walk = with_axes(read_generic_csv(recording), "-y,x,z")
-    upright = walk.truth.at(walk.time).attitude_WB * Rotation.from_euler("z", 90, degrees=True)
+    upright = walk.truth.at(walk.time).attitude_WB * Rotation.from_euler("z", -90, degrees=True)
     linear = walk.accel - upright.apply([0.0, 0.0, 9.80665], inverse=True)
     write_csv(
         tmp_path / "odd.csv", replace(walk, gyro=np.degrees(walk.gyro), accel=linear / -9.80665)

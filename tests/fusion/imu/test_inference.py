@@ -126,7 +126,7 @@ def compared(stream, displacement) -> Direction:
 @pytest.fixture(scope="module")
 def stream_and_truth():
     """Levelled stream of a simulated walk, and its true displacements in the stream's frame N."""
-    sequence = simulate_imu(generate_walk(2, 90.0), 200.0, PHONE_IMU, 2)
+    sequence = simulate_imu(generate_walk(2, 120.0), 200.0, PHONE_IMU, 2)
     (stream,) = levelled_streams(sequence)
     truth = sequence.truth
     starts = stream.start + TICK_SAMPLES / 200.0 * np.arange(stream.window_count)

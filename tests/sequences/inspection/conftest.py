@@ -8,4 +8,5 @@ from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 @pytest.fixture(scope="module")
 def walk():
-    return simulate_imu(generate_walk(4, 30.0, style=WalkStyle()), rate=200.0)
+    level = WalkStyle(mount_rotvec=(0.0, 0.0, 0.0))
+    return simulate_imu(generate_walk(4, 30.0, style=level), rate=200.0)

@@ -233,7 +233,7 @@ def test_real_recordings_pass_and_their_wrong_units_are_named():
 
 def test_swapped_gyroscope_axes_are_not_mistaken_for_degrees():
     """A rig turns at 2 rad/s about all axes; the cause is swapped axes, not deg/s."""
-    style = WalkStyle(carry="rig", preferred_speed=1.4)
+    style = WalkStyle(carry="rig", preferred_speed=1.4, mount_rotvec=(0.0, 0.0, 0.0))
     walk = simulate_imu(generate_walk(11, 30.0, style=style), 100.0, PHONE_IMU, 11).without_truth()
     text = refusal(replace(walk, gyro=walk.gyro[:, [1, 2, 0]]))
     assert "contradict the accelerometer" in text

@@ -28,7 +28,8 @@ from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 @pytest.fixture(scope="module")
 def walk():
-    return simulate_imu(generate_walk(8, 30.0, style=WalkStyle()), 100.0, seed=2, name="walk")
+    level = WalkStyle(mount_rotvec=(0.0, 0.0, 0.0))
+    return simulate_imu(generate_walk(8, 30.0, style=level), 100.0, seed=2, name="walk")
 
 
 def problem(sequence: ImuSequence) -> str:

@@ -22,7 +22,7 @@ LEVER_B = np.array([0.02, -0.1, 0.01])
 
 
 def recorded(carry: str, seconds: float = 120.0) -> tuple[ImuSequence, Trajectory]:
-    style = WalkStyle(carry=carry, preferred_speed=0.8)
+    style = WalkStyle(carry=carry, preferred_speed=0.8, mount_rotvec=(0.0, 0.0, 0.0))
     imu = simulate_imu(generate_walk(3, seconds, style=style), 100.0, PHONE_IMU)
     return imu, imu.truth
 

@@ -122,7 +122,7 @@ def test_a_truth_that_may_be_of_another_walk_gives_neither_offset_nor_axes(walk,
 
 @pytest.mark.parametrize("signs", [(-1.0, -1.0, -1.0), (1.0, 1.0, -1.0)])
 def test_wrong_gyroscope_signs_are_not_blamed_on_the_truth(signs):
-    style = WalkStyle(carry="pocket")
+    style = WalkStyle(carry="pocket", mount_rotvec=(0.0, 0.0, 0.0))
     walk = simulate_imu(generate_walk(8, 40.0, style=style), 100.0, seed=2)
     (problem,) = fit_findings(fit_truth(replace(walk, gyro=walk.gyro * signs)), "")
     assert "gyroscope" in str(problem)
