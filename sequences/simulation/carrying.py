@@ -20,6 +20,7 @@ from stario.sequences.simulation.strides import (
     Gait,
     StrideCycle,
     drawn_cycle,
+    on_other_side,
     stride_motion,
 )
 
@@ -32,17 +33,20 @@ class Place:
         least, most: range of where it is, ahead and aside [m] and up, in heights of the person.
         restless: size of its turning that no stride explains [rad], within about a second.
         tremor: angular rate of a hand's tremor [rad/s].
+        either_side: whether it is as often on the other side of the body; held flat in front it is
+            on the same side in all sixteen recordings.
     """
 
     least: tuple[float, float, float]
     most: tuple[float, float, float]
     restless: float
     tremor: float = 0.0
+    either_side: bool = True
 
 
 PLACES = {
     "handheld": Place((0.2, -0.2, 0.7), (0.45, 0.2, 0.7), 0.05, 0.05),
-    "in-front": Place((0.2, -0.2, 0.7), (0.45, 0.2, 0.7), 0.05, 0.05),
+    "in-front": Place((0.2, -0.2, 0.7), (0.45, 0.2, 0.7), 0.05, 0.05, either_side=False),
     "texting": Place((0.2, -0.1, 0.72), (0.4, 0.1, 0.72), 0.04, 0.03),
     "call": Place((0.05, -0.1, 0.93), (0.05, 0.1, 0.93), 0.1, 0.03),
     "swinging": Place((-0.05, -0.25, 0.43), (0.05, 0.25, 0.43), 0.1),
@@ -72,7 +76,8 @@ def carry_motion(gait: Gait, carry: str, person: StrideCycle) -> CarryMotion:
 
 def _held(gait: Gait, place: Place, person: StrideCycle) -> CarryMotion:
     rng, n = gait.rng, len(gait)
-    motion = stride_motion(gait, person)
+    other = rng.random() > 0.5 and place.either_side
+    motion = stride_motion(gait, on_other_side(person) if other else person)
     offset = rng.uniform(place.least, place.most) * [1.0, 1.0, gait.height]
     offset = motion.offset_H + offset + 0.01 * drift(rng, n, gait.rate, 0.6, 3)
     turn = motion.turn_H + place.restless * drift(rng, n, gait.rate, 0.7, 3)

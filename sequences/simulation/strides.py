@@ -157,17 +157,16 @@ def drawn_cycle(rng: np.random.Generator, way: str, speed: float) -> StrideCycle
     return cycles[rng.choice(len(cycles), p=odds / odds.sum())]
 
 
-def stride_motion(gait: Gait, cycle: StrideCycle) -> CarryMotion:
-    """Return a device's motion with the stride, on either side of the body.
+def stride_motion(gait: Gait, person: StrideCycle) -> CarryMotion:
+    """Return a device's motion with a person's stride.
 
     An offset opposes its acceleration by n^2 omega^2, an angle follows its rate by n omega.
     """
     rng = gait.rng
     omega = np.pi * gait.step_rate
-    ratio = gait.pace / cycle.speed
+    ratio = gait.pace / person.speed
     faster, steadier = ratio**_FAST_POWER, 2.0 * ratio / (1.0 + ratio)
     growth = np.stack([steadier, steadier, ratio**_RISE_POWER, steadier, steadier, steadier])
-    person = cycle if rng.random() < 0.5 else on_other_side(cycle)
     motion = np.zeros((6, len(gait)))
     for n, size in enumerate(person.amplitude, start=1):
         real, imaginary = (
