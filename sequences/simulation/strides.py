@@ -34,8 +34,6 @@ STEP_RATE_POWER = 0.4
 """Exponent of the speed in the step rate: the medians of tyrex, RIDI and KIPD are 1.25, 1.5, 1.65,
 1.8, 1.9 and 2.0 Hz at 0.45, 0.7, 0.9, 1.1, 1.3 and 1.5 m/s."""
 
-_POWER = 1.2
-
 _RISE_POWER, _FAST_POWER = 2.0, 1.2
 """Exponents of the speed in accelerations up, and in what is above harmonic 3. Above a leg that
 does not bend the body rises by the square of a step's length, so that its acceleration grows with
