@@ -87,7 +87,8 @@ class TrainingConfig:
         learned: share of this average in the result; initial weights, if there are any, make up the
             rest (Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022).
         patience: epochs without a better validation error after which training stops.
-        precision: "float32" or "bfloat16" (mixed; nearly twice as fast where supported).
+        precision: "float32" or "bfloat16" (mixed, nearly twice as fast; a CPU without AVX-512
+            computes in float32 all the same).
         device: "auto", "cpu" or "cuda".
         attitude: attitude that rotates windows into the world frame: "levelled" by the IMU, as at
             inference, or "true", the papers' protocol.

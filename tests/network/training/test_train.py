@@ -10,7 +10,7 @@ import pytest
 import safetensors.torch
 import torch
 from cut_windows import windows_of
-from training_runs import HELD_OUT, STREAMS, TINY, VALIDATION, run, shallow, swaying
+from training_runs import HELD_OUT, STREAMS, TINY, VALIDATION, narrow, run, shallow, swaying
 
 from stario.network.architectures import build_network
 from stario.network.displacement import DisplacementNetwork
@@ -275,6 +275,21 @@ def test_a_sigma_that_is_wrong_way_round_is_ignored():
     np.testing.assert_allclose(found.exponent, 0.0, atol=1e-3)
     rms = np.sqrt(np.mean(np.minimum(error**2, 25.0 * np.square(found.scale)), axis=0))
     np.testing.assert_allclose(found.scale, rms, rtol=0.05)
+
+
+@pytest.mark.parametrize(("capability", "equal"), [("AVX2", True), ("AVX512", False)])
+def test_a_cpu_without_the_instructions_computes_in_float32(
+    tmp_path, monkeypatch, capability, equal
+):
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
+    narrow(monkeypatch)
+    errors: list[float] = []
+    for precision in ("float32", "bfloat16"):
+        config = replace(TINY, epochs=1, epoch_windows=32, precision=precision)
+        reports: list[EpochReport] = []
+        run(tmp_path / precision, config, on_epoch=reports.append)
+        errors.append(reports[0].training_error)
+    assert (errors[0] == errors[1]) == equal
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
