@@ -51,23 +51,30 @@ def check_gyro_axes(
         InputError: others explain how the force turns several times better.
     """
     changes = [
-        _changes(time[piece], gyro[piece], accel[piece])
+        force_changes(time[piece], gyro[piece], accel[piece])
         for piece in pieces
         if time[piece.stop - 1] - time[piece.start] > _SHORTEST_S
     ]
-    if not changes:
-        return
-    change = np.mean(changes, axis=0)
+    if changes:
+        check_changes(f"{name}: gyroscope", np.mean(changes, axis=0))
+
+
+def check_changes(field: str, change: FloatArray) -> None:
+    """Check the mean changes (48,) of several pieces.
+
+    Raises:
+        InputError: other axes and signs leave several times less than those given.
+    """
     best = int(change.argmin())
     if change[_GIVEN] < max(_NOTICEABLE, _BETTER * change[best]):
         return
     found = "rotations that contradict the accelerometer"
     fix = "are its axes and signs the accelerometer's? "
     fix += f"The accelerometer's x, y, z seem to be its {_words(best)}"
-    raise InputError(f"{name}: gyroscope", found, "rates about the accelerometer's axes", fix)
+    raise InputError(field, found, "rates about the accelerometer's axes", fix)
 
 
-def _changes(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:
+def force_changes(time: FloatArray, gyro: FloatArray, accel: FloatArray) -> FloatArray:
     """Return the mean squared change of the averaged force with all axes (48,) [m^2/s^4].
 
     With other axes M the rotation R becomes M R M^T, and if M mirrors, that of the opposite rate:

@@ -116,6 +116,13 @@ def test_calm_in_between_does_not_hide_a_gyroscope_that_is_dead_from_the_beginni
     assert stream(Navigator(still_model), starts_and_stops(live))[-1].time > 47.0
 
 
+def test_a_stream_whose_gyroscope_has_other_axes_is_refused(make_walk, still_model):
+    walk = make_walk(1, 26.0, carry="pocket")
+    swapped = replace(walk, gyro=walk.gyro[:, [1, 0, 2]])
+    with pytest.raises(InputError, match=r"gyro: .* x, y, z seem to be its y, x, z$"):
+        stream(Navigator(still_model), swapped)
+
+
 def test_a_briefly_tumbling_device_is_not_mistaken_for_a_stream_in_degrees(make_walk, still_model):
     walk = make_walk(3, 26.0)
     gyro = walk.gyro.copy()
