@@ -24,11 +24,6 @@ from stario.fusion.values.lie import yaw_rotation
 from stario.fusion.values.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 
-_RARE_SHARE, _RARE_POWER = 0.35, 4.0
-"""While less than this share of recent displacements were outliers, they are attributed to the
-network and inflated by this power of NIS / gate; a filter that gates more of them may itself be
-wrong. This bridges about five seconds of false displacements."""
-
 _STEADY_SIGMA, _STEADY_WALK = 1.0, 0.28
 """Sigma of a steady error [m], and its random walk [m/sqrt(s)]: it may turn with the device."""
 
@@ -61,9 +56,7 @@ def update_with(
     f: FilterConfig,
 ) -> Displaced:
     """Update with the displacement of the window that began at the oldest clone and ends now."""
-    rare = statistics.outlier_share < _RARE_SHARE
-    power = _RARE_POWER if rare else 1.0
-    ekf, result = _applied(before.ekf, displacement, statistics, f, f.gate, power)
+    ekf, result = _applied(before.ekf, displacement, statistics, f, f.gate)
     statistics = statistics.updated(result, f)
     if not result.accepted:
         return Displaced(changed(before, ekf=ekf), statistics, result, ())
@@ -76,7 +69,7 @@ def update_with(
         after, rejected_later = _judged(before.alternative, ekf, result, honest, f)
         return Displaced(after, statistics, result, rejected_later)
     opened = None
-    if rare and result.gated:
+    if result.gated:
         first, _ = honest(before.ekf.with_steady_error(_STEADY_SIGMA**2))
         opened = AlternativeHypothesis(first, (ekf.time,))
     return Displaced(Hypotheses(ekf, opened), statistics, result, ())
@@ -125,7 +118,6 @@ def _applied(
     statistics: InnovationStatistics,
     f: FilterConfig,
     gate: float | None = None,
-    inflation: float = 1.0,
     gains_from: int = GAIN,
 ) -> Updated:
     """Update a state with a displacement, in W."""
@@ -140,4 +132,4 @@ def _applied(
             errors = displacement_errors(d_W, covariance_W, statistics.error_level, f)
         limit = None if gate is None else chi2_quantile(gate, 3)
         covariance_W = f.overlap_scale * covariance_W
-        return update_displacement(s, slot, d_W, covariance_W, limit, inflation, errors, gains_from)
+        return update_displacement(s, slot, d_W, covariance_W, limit, errors, gains_from)

@@ -144,7 +144,6 @@ def update_displacement(
     d_W: FloatArray,
     covariance: FloatArray,
     gate: float | None = None,
-    inflation: float | None = 1.0,
     errors: DisplacementErrors | None = None,
     gains_from: int = GAIN,
 ) -> Updated:
@@ -161,7 +160,6 @@ def update_displacement(
         covariance: (3, 3) covariance in the same axes [m^2]; overlapping windows contain the
             same motion, so the caller scales it by update rate x window length.
         gate: as for `kalman.update`.
-        inflation: likewise.
         errors: its errors as they are; None if they are white with that covariance.
         gains_from: as for `kalman.update`.
 
@@ -179,7 +177,7 @@ def update_displacement(
         d_W = d_W - s.steady_W
         blocks.append((s.steady_rows.start, np.eye(3)))
     measured = Linear(d_W - (p_j - p_i), blocks, covariance, noise)
-    after, result = update(s, measured, gate, inflation, gains_from)
+    after, result = update(s, measured, gate, gains_from)
     return (after if result.accepted else before), result
 
 
