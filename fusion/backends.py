@@ -21,7 +21,7 @@ from stario.fusion.filter.initial import PriorPose
 from stario.fusion.filter.jacobians import GAIN, GYRO_BIAS
 from stario.fusion.filter.map_frame import YAW_UNKNOWN
 from stario.fusion.filter.record import Record, innovations_of
-from stario.fusion.graph.batch import smooth
+from stario.fusion.graph.batch import CLOSURE_SIGMA, smooth
 from stario.fusion.graph.covariances import with_reported_covariances
 from stario.fusion.graph.term import IndeterminateError
 from stario.fusion.place import known_fixes
@@ -36,6 +36,9 @@ from stario.sequences.errors import InputError
 
 BackendName = Literal["ekf", "graph"]
 """The EKF, or the factor graph: over the last seconds of a stream, over all of a recording."""
+
+_CONTRADICTED = 3.0
+"""Distance of the end of a closed walk from its start, in sigmas, beyond which to doubt it."""
 
 
 class _Filtered(NamedTuple):
@@ -78,6 +81,19 @@ def _smoothed_states(
     ]
     solved = with_reported_covariances(solved, filtered.estimates, np.array(turns))
     return with_unknown_yaws(solved, frame.unknown_yaws), []
+
+
+def _doubts_of_closure(filtered: Sequence[NavState]) -> list[str]:
+    """Tell if a walk taken for closed ended further from its start than its sigma allows."""
+    first, last = filtered[0], filtered[-1]
+    apart, variance = (last.p_W - first.p_W)[:2], np.trace(last.position_covariance[:2, :2])
+    distance, sigma = float(np.linalg.norm(apart)), math.sqrt(variance + 2.0 * CLOSURE_SIGMA**2)
+    if distance < _CONTRADICTED * sigma:
+        return []
+    return [
+        f"by its steps the walk ended {distance:.1f} m from its start (sigma {sigma:.1f} m); leave "
+        "out `closed` if it did not end there"
+    ]
 
 
 def _floors(states: Sequence[NavState]) -> list[FloorChange]:
@@ -139,6 +155,8 @@ def track_recording(
         found.health.notes += notes
         if not notes:
             _count_later_fixes(found.health, run)
+        if config.place.closed:
+            found.health.notes += _doubts_of_closure(run.states())
     progress(1.0)
     return found
 

@@ -68,9 +68,12 @@ def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[I
 def atomic_path(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path for libraries that open files themselves; else as `atomic_write`."""
     path = Path(path)
+    if path.is_symlink():
+        path = path.resolve()  # what it points to is replaced, not the link
     with temporary_path(path, "a file") as temporary:
-        if path.is_dir():
-            raise InputError("path", f"the folder {path}", "a file")
+        if path.exists() and not path.is_file():
+            kind = "folder" if path.is_dir() else "device or pipe"
+            raise InputError("path", f"the {kind} {path}", "a file")
         yield temporary
         temporary.replace(path)
 

@@ -118,11 +118,11 @@ def further_files(report: bool, tiles: str = "", view: bool = False) -> Writers:
     return also
 
 
-def explain() -> None:
-    """Print what the words of `run` and `compare` mean."""
+def explain(as_json: bool) -> None:
+    """Print what the words of `run` and `compare` mean; on stderr if stdout is JSON."""
     from stario.fusion.evaluation.text import EXPLANATION
 
-    typer.echo(EXPLANATION)
+    typer.echo(EXPLANATION, err=as_json)
 
 
 def check_new(field: str, path: Path, overwrite: bool) -> None:

@@ -85,7 +85,7 @@ def compare(
         train = common.training_command(paths, reading) if paths else ""
         comparisons = [replace(c, train=train) for c in without_skipped(outcomes, skipped)]
     if explained:
-        common.explain()
+        common.explain(as_json)
     if comparisons:
         written = write_comparison(folder, comparisons, settings, origin, also)
         lines = [line for found in comparisons for line in _lines(found, bool(tracks))]

@@ -48,7 +48,7 @@ def run(
     navigator = Navigator(network, placing.settings(estimating.settings()))
     given = [] if fixes is None else read_fixes(fixes)
     if explained:
-        common.explain()
+        common.explain(as_json)
     origin = common.origin_of(paths, reading, estimating, network, fixes)
     train = common.training_command(paths, reading)
 

@@ -23,6 +23,7 @@ from stario.fusion.evaluation.compare import (
 from stario.fusion.evaluation.known_positions import position_error_words
 from stario.fusion.evaluation.results import metrics_dict
 from stario.fusion.evaluation.scores import Column, table
+from stario.fusion.report.health import LOST_YAW_SIGMA
 from stario.sequences.arrays import check_type
 from stario.sequences.drawing.figures import distance
 from stario.sequences.drawing.text_table import aligned, figure
@@ -63,7 +64,7 @@ def track_words(found: Comparison) -> str:
     length = track.trajectory.path_length()
     words = f"{length:.1f} m in {duration}, ending {ends:.1f} m from its start"
     if sigma := track.health and track.health.final_sigma:
-        lost = sigma["yaw_rad"] > math.pi
+        lost = sigma["yaw_rad"] >= LOST_YAW_SIGMA
         yaw = "yaw lost" if lost else f"yaw {math.degrees(sigma['yaw_rad']):.1f} deg"
         there = f"sigma there {sigma['position_m']:.1f} m, height {sigma['height_m']:.1f} m"
         words += f" ({there}, {yaw})"

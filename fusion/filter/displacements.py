@@ -131,5 +131,5 @@ def _applied(
         if f.correlated_errors and np.isfinite(covariance_W).all():
             errors = displacement_errors(d_W, covariance_W, statistics.error_level, f)
         limit = None if gate is None else chi2_quantile(gate, 3)
-        covariance_W = f.overlap_scale * covariance_W
+        covariance_W = statistics.excess * f.overlap_scale * covariance_W
         return update_displacement(s, slot, d_W, covariance_W, limit, errors, gains_from)

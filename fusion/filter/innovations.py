@@ -21,8 +21,12 @@ the first one."""
 _MAX_EXCESS = 4.0
 """Largest excess of NIS over its expectation that counts for the level."""
 
-MIN_LEVEL, MAX_LEVEL = 0.1, 5.0
+MIN_LEVEL, MAX_LEVEL = 0.1, 100.0
 """Bounds of the level."""
+
+USUAL_LEVEL = 5.0
+"""Level up to which devices and ways of carrying differ. An accelerometer in a runner's pocket
+raises it as well; only what is beyond are errors of the network that its sigma does not know."""
 
 TARGET_NIS = 0.3
 """Target for the median NIS per degree of freedom: the network's errors are correlated over
@@ -55,6 +59,11 @@ class InnovationStatistics:
     def error_level(self) -> float:
         """Variance of the errors that change within seconds, relative to the predicted one."""
         return math.exp(self.log_error_level)
+
+    @property
+    def excess(self) -> float:
+        """Factor on the predicted variance that the gains assume."""
+        return max(1.0, self.error_level / USUAL_LEVEL)
 
     def updated(self, result: UpdateResult, f: FilterConfig) -> InnovationStatistics:
         """Return the statistics after one displacement, which may have no innovation."""

@@ -31,7 +31,7 @@ _LEAST_CLIMB, _SLOW = 0.8, 1e-3
 """Height [m] below which a climb may be none, and its speed then [m/s]: its height yields to the
 pressure's, its length does not."""
 
-_CLOSURE_SIGMA = 1.0
+CLOSURE_SIGMA = 1.0
 """Standard deviation [m] per axis of a walk's end, relative to the start at which it ends."""
 
 _TRUSTED_ROUNDS = 2
@@ -84,7 +84,7 @@ def smooth(
         b_g, covariance = gyro_bias
         graph.add(GyroBias((graph.last,), covariance, b_g), gated=False)
     if config.place.closed:
-        covariance = _CLOSURE_SIGMA**2 * np.eye(3)
+        covariance = CLOSURE_SIGMA**2 * np.eye(3)
         graph.add(SamePlace((0, graph.last), covariance), gated=False)
     solved = graph.solve(trusted_rounds=_TRUSTED_ROUNDS)
     states = {state.time: state for state in _all_states(solved, builder.segments)}

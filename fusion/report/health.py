@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 
+from stario.fusion.filter.innovations import USUAL_LEVEL
 from stario.fusion.imu.front_end import BRIDGED
 from stario.fusion.imu.gap import INTERPOLATED
 from stario.fusion.values.health import Health
@@ -46,7 +47,7 @@ YAW_SIGMA = math.radians(15.0)
 LOST_YAW_SIGMA = 1.5
 """Yaw sigma beyond which the yaw is unknown [rad], not drifted: standing still does not help."""
 
-_APART = "at least six times their sigma apart"
+_APART = "at least six times their sigma apart, as far as the track is long between them,"
 """How far apart two positions determine the direction (`filter.map_frame.MAX_POSITION_YAW_SIGMA`):
 the root of two over that sigma, and some more for the drift between them."""
 
@@ -173,7 +174,12 @@ def _network(health: Health) -> Iterator[Finding]:
         yield _found("network_contradicts", text, advice, {"share": gated})
     ratio = health.mean_nis / health.nis_expected
     nis = f"mean NIS {health.mean_nis:.2g}, expected {health.nis_expected:.0f}"
-    if ratio > NIS_RATIO:
+    if health.network_error_level > NIS_RATIO * USUAL_LEVEL:
+        times = math.sqrt(health.network_error_level)
+        text = f"The network's errors are {times:.1f} times as large as it predicts."
+        advice = f"The weights know neither this motion nor how wrong they are: {_CARRY}."
+        yield _found("network_sigma", text, advice, {"sigmas": times})
+    elif ratio > NIS_RATIO:
         text = f"The network and the IMU disagree by more than their sigmas allow ({nis})."
         advice = f"The track's sigmas are too small by a factor of about {math.sqrt(ratio):.1f}."
         yield _found("network_sigma", text, advice, {"nis_ratio": ratio})
@@ -257,6 +263,8 @@ def _fixes(health: Health) -> Iterator[Finding]:
     if not wrong and other.get("yaw not known", 0) > applied:
         advice = f"Two positions {_APART} give the heading; so does a yaw fix."
     text = "1 fix applied" if applied == 1 else f"{applied} fixes applied"
+    if gated := other.pop("gated", 0):
+        text += f", {gated} of them with less weight, since the track contradicts them"
     text += f"; {_counted(other)}." if other else "."
     yield Finding("fixes", text, advice, "warning" if wrong else "note", health.fixes)
 

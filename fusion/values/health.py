@@ -128,7 +128,7 @@ def _sigma_words(name: str, sigma: float) -> str:
     """Return a sigma by name, unit and value; angles are in degrees."""
     end = next(end for end in ("m_s2", "rad_s", "m_s", "rad", "m") if name.endswith(f"_{end}"))
     value = math.degrees(sigma) if end.startswith("rad") else sigma
-    return f"{name.removesuffix(f'_{end}').replace('_', ' ')} {value:.2g} {_UNITS[end]}"
+    return f"{name.removesuffix(f'_{end}').replace('_', ' ')} {value:.3g} {_UNITS[end]}"
 
 
 def _counted(counts: dict[str, int]) -> str:

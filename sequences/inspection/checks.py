@@ -275,6 +275,8 @@ def _check_force(
         fix = "convert it to m/s^2 or g, with gravity included"
         if _G_RANGE[0] <= average / STANDARD_GRAVITY**2 <= _G_RANGE[1]:
             fix = "it seems to be in m/s^2 already: omit the unit g"
+        if abs(average / STANDARD_GRAVITY - 2.0) < _SHAKEN_OFF_GRAVITY:
+            fix = "it is twice gravity: omit `--gravity removed` if the file's force contains it"
     else:
         return []
     raise InputError(field, found, expected, fix)
@@ -318,7 +320,10 @@ def _downward(sequence: ImuSequence, fit: TruthFit | None) -> InputError:
     The accelerometer has the opposite sign, or the truth's world has z down: its positions' own
     acceleration, or the opposite, is what the accelerometer measures.
     """
-    sign = "pass `--accel-sign apple` or write `ax [-m/s^2]` (or `[-g]`) in the CSV's header"
+    sign = (
+        "pass `--accel-sign apple` (leave it out if you did) or write `ax [-m/s^2]` (or `[-g]`) in "
+        "the CSV's header"
+    )
     sign = _UNIT_NAMED if "sign" in sequence.converted else sign
     fix = f"{sign}; or if the truth's world has z down, {_TO_Z_UP}"
     positions = fit_positions(sequence, fit.time_offset) if fit and fit.consistent else None

@@ -54,6 +54,21 @@ def test_a_recordings_track_is_more_accurate_than_the_filters_and_consistent(tra
     assert 1.2 < np.median(np.concatenate(nees)) < 3.6  # median of chi-square with 3 DoF: 2.4
 
 
+def test_a_walk_taken_for_closed_is_bent_towards_its_start_and_doubted(walks):
+    closed = replace(CONFIG, place=replace(CONFIG.place, closed=True))
+    for walk, model in walks[:2]:
+        ends = walk.truth.position_W[[0, -1], :2]
+        apart = np.linalg.norm(np.diff(ends, axis=0))
+        track = Navigator(model, closed).run(walk)
+        assert np.linalg.norm(track.trajectory.position_W[-1, :2]) < 0.9 * apart
+        assert ["leave out" in note for note in track.health.notes] == [True]
+
+
+def test_a_closed_walk_is_not_doubted(walk, still_model):
+    closed = replace(PHONE, place=replace(PHONE.place, closed=True))
+    assert Navigator(still_model, closed).run(walk).health.notes == []
+
+
 def test_a_recordings_track_moves_by_its_velocity_where_the_filters_steps(tracks):
     def steps(track):
         p, v, t = track.trajectory.position_W, track.trajectory.velocity_W, track.time

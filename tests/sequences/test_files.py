@@ -54,6 +54,19 @@ def test_permissions_are_those_of_any_new_file(tmp_path):
     assert (tmp_path / "atomic").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
+def test_what_a_link_points_to_is_replaced_and_what_is_no_file_stays(tmp_path):
+    (tmp_path / "file").touch()
+    (tmp_path / "link").symlink_to("file")
+    with atomic_write(tmp_path / "link") as file:
+        file.write("new")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "file").read_text() == "new"
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="device or pipe"), atomic_write(tmp_path / "pipe"):
+        pass
+    assert (tmp_path / "pipe").is_fifo()
+
+
 def test_a_missing_folder_is_named(tmp_path):
     with pytest.raises(InputError, match="existing folder"), atomic_write(tmp_path / "no" / "f"):
         pass

@@ -234,7 +234,7 @@ def test_run_accepts_a_folder_or_a_list_and_explains_figures_once(stario, record
     assert done.out.count("m rms from the truth") == 2
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"a", "b"}
     (tmp_path / "list.txt").write_text("all/b.csv\nall/c.csv\n")
-    done = stario("run", "list.txt", "--out", "alone", "--json")
+    done = stario("run", "list.txt", "--out", "alone", "--json", "--explain")
     assert done.code == 1
     assert json.loads(done.out)["recording"] == "b"
     assert "skipped" in done.err

@@ -27,6 +27,7 @@ from stario.fusion.recording import cut_recording
 from stario.fusion.values.config import FilterConfig
 from stario.fusion.values.fixes import position_fix
 from stario.fusion.values.state import NavState
+from stario.sequences.accuracy.metrics import evaluate_track
 from stario.sequences.attitude.rotations import about_z
 from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
@@ -107,6 +108,19 @@ def test_the_level_makes_the_mean_nis_three():
 def test_one_displacement_changes_the_level_by_a_fifth_at_most():
     after = InnovationStatistics(gain=0.05).updated(UpdateResult(nis=1e6, gate_nis=1e6), F)
     assert after.error_level == pytest.approx(np.exp(0.2))
+
+
+def test_a_network_that_claims_a_fifth_of_its_sigma_costs_little(make_walk, make_oracle):
+    """As weights do that were trained on few walks, or do not know a way of carrying."""
+    walk, settings = make_walk(2, 60.0), NavigatorConfig()
+    found = []
+    for sigma in (0.1, 0.02):
+        oracle = make_oracle(walk, walk.truth, settings, noise=0.1, sigma=sigma)
+        track = Navigator(oracle, settings, backend="ekf").run(walk)
+        found.append((evaluate_track(track.trajectory, walk.truth).ate_m, track.nis))
+    (honest, _), (overconfident, nis) = found
+    assert overconfident < honest + 0.2  # 0.5 if the gains believed it
+    assert nis < 10.0  # 32 at a level of at most 5
 
 
 # --- the covariance ------------------------------------------------------------------------------

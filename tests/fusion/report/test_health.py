@@ -30,6 +30,7 @@ NOTHING = "nothing"
          "the same rate"),
         (GOOD | {"gated": 30}, ["network_contradicts"], "", "signs are right, the weights"),
         (GOOD | {"mean_nis": 12.0}, ["network_sigma"], "", "a factor of about 2.0"),
+        (GOOD | {"mean_nis": 7.0, "network_error_level": 25.0}, ["network_sigma"], "", "5.0 times"),
         (GOOD | {"mean_nis": 0.8}, [], "network_sigma",
          "does not mean that the track's sigmas are too large"),
         (GOOD | {"final_sigma": {"yaw_rad": 1.0}}, ["yaw_unknown"], "",
