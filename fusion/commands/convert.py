@@ -137,7 +137,7 @@ def simulate(
     overwrite: options.Overwrite = False,
     as_json: options.Json = False,
 ) -> None:
-    """Write a simulated walk, or a device on motion capture, with its truth as a CSV recording."""
+    """Write a simulated walk on a level floor, or a device on motion capture, with its truth."""
     from stario.sequences.readers.csv_writer import write_csv
     from stario.sequences.simulation.house import simulate_house
     from stario.sequences.simulation.imu import GOOD_IMU, PERFECT_IMU, PHONE_IMU, simulate_imu
@@ -160,7 +160,8 @@ def simulate(
     else:
         style, field = _style(carry), INDOOR_FIELD if magnetometer else None
         check_amount(seconds or 60.0, rate)
-        walk = generate_walk(seed, seconds or 60.0, style=style)
+        # Without a barometer stairs are read twice too long: README.md, "Limits".
+        walk = generate_walk(seed, seconds or 60.0, style=style, level=True)
         sequence = simulate_imu(walk, rate, errors, seed, name=name, magnetic_field=field)
     length = 0.0 if sequence.truth is None else sequence.truth.path_length()
     write_csv(path, sequence)

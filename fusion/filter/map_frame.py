@@ -68,6 +68,9 @@ more than this [m], beyond which the covariance keeps no digits for the fix."""
 YAW_UNKNOWN = "yaw not known"
 """Why a position or velocity is refused before the track's direction in the map is known."""
 
+_TOO_FAR = "at a distance that contradicts the track"
+"""Why a position is refused then that is nearer to the first one, or further, than the track."""
+
 
 class Mapped(NamedTuple):
     """A filter's state and that of its map frame."""
@@ -99,7 +102,7 @@ def update_with(fix: Fix, m: Mapped, f: FilterConfig) -> tuple[Mapped, UpdateRes
     if places:
         m, transform = _placed(fix, m)
     elif fix.kind == "position" and m.frame.distance_mismatches > 0:
-        transform = None
+        return m, UpdateResult(_TOO_FAR)
     else:
         m, transform = _oriented(fix, m)
     if transform is None:

@@ -65,6 +65,7 @@ def random_route(
     preferred_speed: float,
     wheels: bool = False,
     corridors: bool = False,
+    level: bool = False,
 ) -> Route:
     """Draw a route of `count` samples at `rate` [Hz].
 
@@ -75,13 +76,14 @@ def random_route(
         preferred_speed: preferred speed [m/s]; actual speeds are 0.3 to 2.2 m/s, 0 when standing.
         wheels: whether the person pushes a trolley: no stairs, no steps sideways or backward.
         corridors: whether the person walks along the corridors of a floor instead of anywhere.
+        level: whether the person takes no stairs.
     """
     commands: list[Command] = []
     while sum(command.duration for command in commands) < count / rate:
         if corridors:
             commands += corridor(rng, preferred_speed)
         else:
-            commands += _activity(rng, preferred_speed, wheels)
+            commands += _activity(rng, preferred_speed, wheels, level or wheels)
     return route_along(rng, commands, count, rate, corridors)
 
 
@@ -109,13 +111,14 @@ def route_along(
     return Route(integral(velocity_W, rate), heading, velocity_H, turn_rate, climb)
 
 
-def _activity(rng: np.random.Generator, preferred: float, wheels: bool) -> list[Command]:
+def _activity(
+    rng: np.random.Generator, preferred: float, wheels: bool, level: bool
+) -> list[Command]:
     speed = float(np.clip(preferred * rng.uniform(0.6, 1.4), 0.3, 2.2))
     side = float(rng.choice([-1.0, 1.0]))
     kinds = ["straight", "curve", "corner", "spot", "stand", "sidle", "stairs", "slow"]
     odds = np.array([0.28, 0.24, 0.2, 0.06, 0.07, 0.05, 0.06, 0.04])
-    if wheels:
-        odds[[5, 6]] = 0.0
+    odds[[kinds.index("sidle"), kinds.index("stairs")]] *= [not wheels, not level]
     kind = rng.choice(kinds, p=odds / odds.sum())
     if kind == "curve":
         radius = rng.uniform(0.8, 6.0)

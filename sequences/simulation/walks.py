@@ -98,6 +98,7 @@ def generate_walk(
     rate: float = 100.0,
     style: WalkStyle | None = None,
     corridors: bool = False,
+    level: bool = False,
 ) -> Trajectory:
     """Generate the trajectory of a carried device.
 
@@ -107,6 +108,7 @@ def generate_walk(
         rate: rate of the poses [Hz], minimum 50, so that harmonics are not aliased.
         style: person and carrying mode; None draws them.
         corridors: whether to walk along the corridors of a floor instead of anywhere.
+        level: whether to take no stairs, which an IMU alone does not notice.
 
     Returns:
         Poses of the device in a world frame whose origin is the start on the floor.
@@ -123,7 +125,7 @@ def generate_walk(
     style = WalkStyle.random(rng) if style is None else style
     count = round(duration * rate) + 1
     wheels = style.carry == "trolley"
-    route = random_route(rng, count, rate, style.preferred_speed, wheels, corridors)
+    route = random_route(rng, count, rate, style.preferred_speed, wheels, corridors, level)
     return carried_along(rng, route, rate, style)
 
 

@@ -55,6 +55,8 @@ def test_a_seed_reproduces_and_another_differs(simulate):
 
 def test_routes_stop_turn_climb_and_keep_to_pedestrian_speeds():
     routes = [random_route(np.random.default_rng(seed), 6000, 100.0, 1.1) for seed in range(20)]
+    level = random_route(np.random.default_rng(0), 60000, 100.0, 1.1, level=True)
+    assert np.ptp(level.position_W[:, 2]) < 1e-9
     speed = np.concatenate([route.speed for route in routes])
     turning = np.concatenate([np.abs(route.turn_rate) for route in routes])
     assert speed.max() < 2.25
