@@ -42,6 +42,11 @@ def shown_value(metrics: Metrics, key: str) -> float | None:
     return None if value is None else _SHOWN_FACTORS.get(key, 1.0) * value
 
 
+def without_unit(words: str) -> str:
+    """Return the meaning of a figure without its unit in JSON, which tables do not always have."""
+    return re.sub(r" \[[^]]*\]", "", words)
+
+
 def track_table(found: Comparison) -> str:
     """Format a table with a row of known metrics per track; `EXPLANATION` explains it."""
     known = [key for values in found.metrics.values() for key, v in values.items() if v is not None]
@@ -124,12 +129,7 @@ EXPLANATION = "\n".join(
         *(f"{name}: {words}." for name, words in TRACK_WORDS.items()),
         "length: along chords of one second, so that neither sway nor noise adds to it.",
         "sigma: one standard deviation, horizontal unless said.",
-        # Without the units of JSON, which are not always those of the tables.
-        *(
-            f"{title}: {word}."
-            for key, title in METRIC_TITLES.items()
-            for word in [re.sub(r" \[[^]]*\]", "", METRIC_WORDS[key])]
-        ),
+        *(f"{title}: {without_unit(METRIC_WORDS[key])}." for key, title in METRIC_TITLES.items()),
         *(f"{key}: {METRIC_WORDS[key]}." for key in ("horizontal", "alignment")),
     ]
 )

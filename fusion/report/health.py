@@ -212,7 +212,10 @@ def _corrections(health: Health) -> Iterator[Finding]:
         f"{at_once} corrected by more than 1 m or 10 degrees (the largest by {metres:.1f} m and "
         f"{degrees:.0f} degrees at {time:.1f} s: {cause})."
     )
-    advice = "Until then a stream's track was wrong by as much; a recording's is smoothed."
+    advice = (
+        "If the track is wrong, look there first: a stream's was until then; a recording's is "
+        "smoothed."
+    )
     values = {"count": count, "largest_m": metres, "turn_deg": degrees, "at_s": time}
     yield _found("corrections", text, advice, values)
 

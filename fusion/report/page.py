@@ -18,7 +18,7 @@ from plotly.offline import get_plotlyjs
 
 from stario.fusion.evaluation.compare import METRIC_TITLES, Comparison, Metrics
 from stario.fusion.evaluation.known_positions import shown_positions
-from stario.fusion.evaluation.text import shown_value
+from stario.fusion.evaluation.text import shown_value, without_unit
 from stario.fusion.report.figures import map_figure, time_figure
 from stario.fusion.report.panels import (
     MAIN,
@@ -33,7 +33,7 @@ from stario.fusion.report.series import track_series
 from stario.fusion.values.health import Health
 from stario.fusion.values.state import Track
 from stario.sequences.accuracy.metrics import moved
-from stario.sequences.drawing.figures import clock
+from stario.sequences.drawing.figures import clock, distance
 from stario.sequences.drawing.text_table import figure
 from stario.sequences.files import atomic_write
 from stario.sequences.geodesy import turned
@@ -104,7 +104,7 @@ def write_report(path: Path, found: Comparison, tiles: str = "") -> Path:
         verdict=found.verdict,
         titles={key: METRIC_TITLES[key] for key in ([] if truth is None else _DIGITS)},
         metrics={style(name)[0]: [*_cells(m)] for name, m in found.metrics.items()},
-        words=found.words,
+        words={key: without_unit(words) for key, words in found.words.items()},
         data=_packed(json.dumps(data, separators=(",", ":"))),
         plotly=_packed_plotly(),
     )
@@ -132,7 +132,7 @@ def _facts(sequence: ImuSequence, track: Track, series: pd.DataFrame) -> Iterato
     """Yield what heads the page: figures with their units, and what they are."""
     yield clock(sequence.duration), "recorded (min:s)"
     yield clock(track.time[-1] - track.time[0]), "tracked (min:s)"
-    yield f"{track.trajectory.path_length():.0f} m", "estimated path length"
+    yield distance(track.trajectory.path_length()), "estimated path length"
     yield f"{len(sequence) / max(sequence.duration, 1e-9):.0f} Hz", "sampling rate"
     if "sigma yaw" in series:
         yield f"{series.sigma.iloc[-1]:.2f} m", "final position, 1 sigma"
