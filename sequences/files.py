@@ -68,8 +68,8 @@ def atomic_write(path: Path | str, mode: Literal["w", "wb"] = "w") -> Iterator[I
 def atomic_path(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path for libraries that open files themselves; else as `atomic_write`."""
     path = Path(path)
-    if path.is_symlink():
-        path = path.resolve()  # what it points to is replaced, not the link
+    with suppress(OSError):  # such as of a name that is too long, which is told below
+        path = path.resolve() if path.is_symlink() else path  # the link itself stays
     with temporary_path(path, "a file") as temporary:
         if path.exists() and not path.is_file():
             kind = "folder" if path.is_dir() else "device or pipe"

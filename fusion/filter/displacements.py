@@ -129,7 +129,8 @@ def _applied(
         d_W, covariance_W = R_WN @ d_N, R_WN @ covariance_N @ R_WN.T
         errors = None
         if f.correlated_errors and np.isfinite(covariance_W).all():
-            errors = displacement_errors(d_W, covariance_W, statistics.error_level, f)
+            level = statistics.error_level / statistics.excess  # which is in the covariance
+            errors = displacement_errors(d_W, covariance_W, level, f)
         limit = None if gate is None else chi2_quantile(gate, 3)
-        covariance_W = statistics.excess * f.overlap_scale * covariance_W
+        covariance_W = f.overlap_scale * covariance_W
         return update_displacement(s, slot, d_W, covariance_W, limit, errors, gains_from)

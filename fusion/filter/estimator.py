@@ -90,7 +90,10 @@ def step(
     s, zero_velocity = _with_rest(s, interval, config)
     s, before = s.with_correction(before, "rest"), s.ekf
     # Zero velocity is more accurate than a network trained on walks, off by 1 cm/s at rest.
-    offered = displacement if zero_velocity is None else None
+    offered = None
+    if displacement is not None and zero_velocity is None:
+        covariance_N = s.statistics.excess * displacement.covariance_N
+        offered = displacement._replace(covariance_N=covariance_N)
     climb_rate = None if s.ekf.offset is None else s.climb_rate
     used = offered
     if offered is not None and climb_rate is not None:

@@ -62,7 +62,7 @@ class InnovationStatistics:
 
     @property
     def excess(self) -> float:
-        """Factor on the predicted variance that the gains assume."""
+        """Factor by which the predicted covariance is too small as a whole."""
         return max(1.0, self.error_level / USUAL_LEVEL)
 
     def updated(self, result: UpdateResult, f: FilterConfig) -> InnovationStatistics:
