@@ -24,6 +24,11 @@ from stario.fusion.values.lie import yaw_rotation
 from stario.fusion.values.state import changed
 from stario.sequences.accuracy.chi_square import chi2_quantile
 
+_OUTLIER_POWER = 2.0
+"""False displacements come in a row, and are inflated by this power of NIS / gate. Five seconds off
+by 1 m then cost 0.14 m (mean of 12 simulated walks) instead of 0.27, one in twenty off by 2 m 0.16
+instead of 0.48 (4)."""
+
 _STEADY_SIGMA, _STEADY_WALK = 1.0, 0.28
 """Sigma of a steady error [m], and its random walk [m/sqrt(s)]: it may turn with the device."""
 
@@ -133,4 +138,6 @@ def _applied(
             errors = displacement_errors(d_W, covariance_W, level, f)
         limit = None if gate is None else chi2_quantile(gate, 3)
         covariance_W = f.overlap_scale * covariance_W
-        return update_displacement(s, slot, d_W, covariance_W, limit, errors, gains_from)
+        return update_displacement(
+            s, slot, d_W, covariance_W, limit, errors, gains_from, _OUTLIER_POWER
+        )

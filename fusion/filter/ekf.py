@@ -146,6 +146,7 @@ def update_displacement(
     gate: float | None = None,
     errors: DisplacementErrors | None = None,
     gains_from: int = GAIN,
+    power: float = 1.0,
 ) -> Updated:
     """Update with the displacement from clone i to the current pose j, in the estimated world.
 
@@ -162,6 +163,7 @@ def update_displacement(
         gate: as for `kalman.update`.
         errors: its errors as they are; None if they are white with that covariance.
         gains_from: as for `kalman.update`.
+        power: likewise.
 
     Raises:
         InputError: the slot holds no clone.
@@ -177,7 +179,7 @@ def update_displacement(
         d_W = d_W - s.steady_W
         blocks.append((s.steady_rows.start, np.eye(3)))
     measured = Linear(d_W - (p_j - p_i), blocks, covariance, noise)
-    after, result = update(s, measured, gate, gains_from)
+    after, result = update(s, measured, gate, gains_from, power)
     return (after if result.accepted else before), result
 
 

@@ -99,17 +99,17 @@ def update(
     measured: Linear,
     gate: float | None = None,
     gains_from: int = GAIN,
-    rejecting: bool = False,
+    power: float | None = 1.0,
 ) -> tuple[EkfState, UpdateResult]:
     """Update a state with a measurement.
 
     Args:
         s: the state.
         measured: the measurement.
-        gate: NIS above which it counts as an outlier; None for no gate. An outlier's covariance is
-            multiplied by NIS / gate, so that a run of outliers can still correct a wrong filter.
+        gate: NIS above which it counts as an outlier; None for no gate.
         gains_from: which covariance determines the gains: `GAIN` or `REPORTED`.
-        rejecting: whether outliers are rejected instead.
+        power: an outlier's covariance is multiplied by this power of NIS / gate, so that a run of
+            outliers can still correct a wrong filter; None rejects outliers.
 
     Returns:
         The state and the outcome. Values that are not finite and covariances that are not positive
@@ -127,9 +127,9 @@ def update(
         return s, UpdateResult("innovation covariance not invertible")
     sigma, scale = np.sqrt(S[REPORTED].diagonal()), 1.0
     if gate is not None and gate_nis > gate:
-        if rejecting:
+        if power is None:
             return s, UpdateResult("gated", nis, 1.0, residual, sigma, gate_nis, log_likelihood)
-        scale = gate_nis / gate
+        scale = (gate_nis / gate) ** power
     after = corrected(s, residual, H, scale * R, gains_from)
     return after, UpdateResult("", nis, scale, residual, sigma, gate_nis, log_likelihood)
 

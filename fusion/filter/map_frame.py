@@ -94,7 +94,7 @@ def first_frame(prior: PriorPose | None) -> MapFrameState:
 
 def update_with(fix: Fix, m: Mapped, f: FilterConfig) -> tuple[Mapped, UpdateResult]:
     """Apply a fix at the filter's time."""
-    places = False
+    places, transform = False, None
     if fix.kind == "position":
         places, m = _needs_placing(fix, m)
     if not places and m.frame.yaw_known:

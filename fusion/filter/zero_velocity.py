@@ -142,4 +142,4 @@ def update_zero_velocity(s: EkfState, measured: ZeroVelocity, f: FilterConfig) -
     residual = np.concatenate([-s.v_W, measured.b_g - s.b_g])
     blocks = [(3, _H_VELOCITY), (9, _H_BIAS)]
     limit = chi2_quantile(f.gate, 6)
-    return update(s, Linear(residual, blocks, measured.covariance), limit, rejecting=True)
+    return update(s, Linear(residual, blocks, measured.covariance), limit, power=None)
