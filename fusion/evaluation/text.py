@@ -91,7 +91,9 @@ def place_words(found: Comparison) -> str:
     at = f"starts at {start[0]:.6f}, {start[1]:.6f}"
     if place is not found.track.georeference and positions is not None:
         at += f", fitted to {positions.kind}"
-    elif found.track.health and not found.track.health.fixes.get("applied"):
+    elif (health := found.track.health) and not (
+        health.fixes.get("applied") or health.bearings.get("north")
+    ):
         at += ", in a direction that no fix has confirmed"
     return "; ".join([at, *words])
 

@@ -35,17 +35,22 @@ seconds, so consistent innovations are smaller than single errors."""
 MAX_FACTOR = 15.0
 """Maximum noise factor: the accelerometer then rules out little more than jumps."""
 
+_SHARE_SECONDS = 20.0
+"""Time over which the share of outliers is averaged [s]."""
+
 
 @dataclass(frozen=True)
 class InnovationStatistics:
     """What the innovations of the displacements so far tell.
 
     Attributes:
+        outlier_share: fraction of outliers among recent ones, which are assumed common at first.
         log_accel_factor: natural logarithm of the factor on the accelerometer's noise density.
         log_error_level: that of `error_level`.
         gain: step of both logarithms for the next displacement.
     """
 
+    outlier_share: float = 0.5
     log_accel_factor: float = 0.0
     log_error_level: float = 0.0
     gain: float = FIRST_GAIN
@@ -67,8 +72,10 @@ class InnovationStatistics:
 
     def updated(self, result: UpdateResult, f: FilterConfig) -> InnovationStatistics:
         """Return the statistics after one displacement, which may have no innovation."""
+        change = (result.gated - self.outlier_share) / (f.update_rate * _SHARE_SECONDS)
+        counted = changed(self, outlier_share=self.outlier_share + change)
         if not (f.adaptive and math.isfinite(result.nis + result.gate_nis)):
-            return self
+            return counted
         ratio = (result.gate_nis / (3.0 * TARGET_NIS)) ** 2
         step = self.gain * (1.0 - 2.0 / (ratio + 1.0))
         factor = min(max(self.log_accel_factor + step, 0.0), math.log(MAX_FACTOR))
@@ -78,4 +85,4 @@ class InnovationStatistics:
             level = min(max(level, math.log(MIN_LEVEL)), math.log(MAX_LEVEL))
         # The gains are 1/5, 1/6, 1/7, ... down to `GAIN` (Robbins and Monro 1951).
         gain = max(1.0 / (1.0 / self.gain + 1.0), GAIN)
-        return changed(self, log_accel_factor=factor, log_error_level=level, gain=gain)
+        return changed(counted, log_accel_factor=factor, log_error_level=level, gain=gain)

@@ -168,7 +168,7 @@ def sharing(d_W: np.ndarray, sigma: float, since: float = 0.5) -> AlternativeHyp
 
 def after(d_W: np.ndarray, pair: Hypotheses) -> Displaced:
     measured = WindowDisplacement(d_W, 0.01 * np.eye(3), np.eye(3))
-    return update_with(measured, pair, InnovationStatistics(), FilterConfig())
+    return update_with(measured, pair, InnovationStatistics(outlier_share=0.0), FilterConfig())
 
 
 def test_an_outlier_opens_the_alternative_which_takes_it_for_a_shared_error():
