@@ -133,7 +133,7 @@ def track_recording(
     run = _filtered(recording, config, prior, queue, progress)
     innovations = innovations_of(run.records)
 
-    def track(states: list[NavState], filtered: Track | None = None) -> Track:
+    def track(states: list[NavState], filter_track: Track | None = None) -> Track:
         health = queue.health(run.last.health(recording.counts, config.filter, states[-1]))
         if health.pressures:
             health.floors = _floors(states)
@@ -141,22 +141,23 @@ def track_recording(
             track_from_states(states),
             innovations=innovations,
             health=health,
-            filtered=filtered,
+            filtered=filter_track,
             georeference=origin,
             seconds_network=recording.seconds_network,
             seconds_filter=recording.seconds_front_end + perf_counter() - began,
         )
 
-    found = track(run.states())
+    filtered = run.states()
+    found = track(filtered)
     if backend == "graph":
         states, notes = _smoothed_states(run, config)
-        found = track(states, filtered=found)
+        found = track(states, found)
         assert found.health is not None
         found.health.notes += notes
         if not notes:
             _count_later_fixes(found.health, run)
         if config.place.closed:
-            found.health.notes += _doubts_of_closure(run.states())
+            found.health.notes += _doubts_of_closure(filtered)
     progress(1.0)
     return found
 
