@@ -8,7 +8,7 @@ sy sz standard deviations of the other axes; empty, or no column, where they equ
 
 Columns may be in any order, separated by commas, semicolons or tabs; numbers may have a
 decimal comma where that is not the separator. `yaw [deg]` is a kind as well.
-A position without z is horizontal; its height is unknown.
+A position without z is horizontal; its height is unknown. Lines that begin with # are comments.
 """
 
 from __future__ import annotations
@@ -42,25 +42,23 @@ def read_fixes(path: Path | str) -> list[Fix]:
             names line and column.
     """
     path = Path(path)
-    lines = read_lines(path)
-    separator = max(",;\t", key=lines[0].count)
-    decimal = decimal_mark(lines[1:], separator)
+    # A comment is blanked, not removed, so that errors count the lines of the file.
+    lines = ["" if line.lstrip().startswith("#") else line for line in read_lines(path)]
+    title = next((line for line in lines if line.strip()), "")
+    separator = max(",;\t", key=title.count)
+    decimal = decimal_mark(lines[lines.index(title) + 1 :], separator)
     try:
-        rows = [_trimmed(row) for row in csv.reader(lines, delimiter=separator)]
+        rows = enumerate(map(_trimmed, csv.reader(lines, delimiter=separator)), start=1)
+        (first, titles), *numbered = [(number, row) for number, row in rows if row] or [(1, [])]
     except csv.Error as error:
         raise ReadError(path, "file", str(error), "a readable CSV of fixes") from error
-    header = [_without_unit(word).lower() for word in rows[0]]
-    for number, row in enumerate(rows, start=1):
-        if row and row[0].lstrip().startswith("#"):
-            expected = "only the header and fixes"
-            raise ReadError(path, f"line {number}", "a comment", expected, "remove it")
+    header = [_without_unit(word).lower() for word in titles]
     if found := _wrong_column(header):
-        raise ReadError(path, "line 1", found, f"the header {','.join(_COLUMNS)}")
+        raise ReadError(path, f"line {first}", found, f"the header {','.join(_COLUMNS)}")
     fixes = []
-    for number, row in enumerate(rows[1:], start=2):
-        if row:
-            cells = [word.strip().replace(decimal, ".") for word in row]
-            fixes.append(_read_row(path, f"line {number}", header, cells))
+    for number, row in numbered:
+        cells = [word.strip().replace(decimal, ".") for word in row]
+        fixes.append(_read_row(path, f"line {number}", header, cells))
     if not fixes:
         raise ReadError(path, "file", "a header only", "at least one fix")
     return fixes

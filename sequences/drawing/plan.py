@@ -64,11 +64,11 @@ def plan_view(
     title: str,
     known: PositionTrack | None = None,
 ) -> Figure:
-    """Draw all tracks from above, on equal axes that fit the ground truth and the tracks near it.
+    """Draw all tracks from above, on equal axes that fit the truth, the first track and those near.
 
     The first track is coloured by time; where the truth is known, its error and sigma are drawn
-    beside. A track that drifts far beyond the others is cut at the frame, and the legend states how
-    far it goes. Invalid poses and gaps appear as breaks; the first pose after a gap of more than a
+    beside. Another that drifts far beyond is cut at the frame, and the legend states how far it
+    goes. Invalid poses and gaps appear as breaks; the first pose after a gap of more than a
     second is marked. Tracks are drawn as given: align them first.
 
     Args:
@@ -95,7 +95,8 @@ def plan_view(
         raise InputError("tracks", "no valid pose", "at least one track to draw")
     home = _box_of(typical)
     beyond = {name: _excess(box, home) for name, box in boxes.items()}
-    leaves = {name for name in boxes if beyond[name] > 0.5 * _size_of(home)}
+    others = [name for name in boxes if name != next(iter(tracks))]
+    leaves = {name for name in others if beyond[name] > 0.5 * _size_of(home)}
     near = [boxes[name] for name in boxes if name not in leaves]
     if known is not None:
         near.append(_box_of(known.position_W))

@@ -61,8 +61,8 @@ def test_a_spreadsheets_blank_cells_and_encoding_are_read(tmp_path, encoding):
         (HEADER.strip() + ",note\n1,position,1,2,3,1,1,1,a\n", "line 1.*unknown column 'note'"),
         ("t,kind,x,y\n1,position,1,2\n", "line 1.*no column 'sx'"),
         ("t,kind,x,y,y,sx\n1,position,1,2,2,1\n", "line 1.*two columns 'y'"),
-        ("# mine\n" + HEADER + "1,position,1,2,3,1,,\n", "line 1: found a comment.*remove"),
-        (HEADER + "# first\n1,position,1,2,3,1,,\n", "line 2: found a comment.*remove"),
+        ("# mine\n\n" + HEADER + "# a, b\n1,position,1,2,3,0,,\n", "line 5, sigma"),
+        ("# mine\n", "line 1: found nothing"),
         (HEADER + "\n", "a header only, expected at least one fix"),
     ],
 )
@@ -77,7 +77,8 @@ def test_an_invalid_file_raises_an_error_that_names_line_and_field(tmp_path, tex
 
 def test_columns_may_be_in_any_order_in_degrees_and_without_height(tmp_path):
     path = tmp_path / "fixes.csv"
-    path.write_text("Kind;t [s];x;y;z;sx\nposition;1;2;3;;0.5\nyaw[deg];2;170;;;5\n")
+    lines = "# mine, from the plan\nKind;t [s];x;y;z;sx\nposition;1;2;3;;0.5\n# 2\nyaw[deg];2;170;;;5\n"
+    path.write_text(lines)
     position, yaw = read_fixes(path)
     np.testing.assert_allclose(position.value, [2.0, 3.0, 0.0])
     assert position.covariance[0, 0] == pytest.approx(0.25)

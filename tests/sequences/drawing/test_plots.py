@@ -62,6 +62,15 @@ def test_plan_view_fits_the_truth_and_labels_tracks_that_leave_it(truth, tracks)
         assert (track.position_W[:, 1] > axes.get_ylim()[0]).all()
 
 
+def test_plan_view_cuts_any_track_but_the_first(truth, tracks):
+    astray = with_growing_error(truth, 3.0)
+    for given, cut in (((astray, truth), False), ((truth, astray), True)):
+        fig = plan_view(dict(zip(("track", "network"), given, strict=True)), truth, "")
+        inside = astray.position_W[-1, 0] < fig.axes[0].get_xlim()[1]
+        assert inside != cut
+        assert any("leaves the figure" in label for label in labels(fig.legends[0])) == cut
+
+
 def test_plan_view_without_truth_is_not_stretched_by_a_diverging_track(tracks):
     axes = plan_view(tracks, None, "a walk").axes[0]
     assert axes.get_xlim()[1] - axes.get_xlim()[0] < 40.0
