@@ -77,8 +77,14 @@ def test_an_invalid_file_raises_an_error_that_names_line_and_field(tmp_path, tex
 
 def test_columns_may_be_in_any_order_in_degrees_and_without_height(tmp_path):
     path = tmp_path / "fixes.csv"
-    lines = "# mine, from the plan\nKind;t [s];x;y;z;sx\nposition;1;2;3;;0.5\n# 2\nyaw[deg];2;170;;;5\n"
-    path.write_text(lines)
+    rows = [
+        "# from the plan",
+        "Kind;t [s];x;y;z;sx",
+        "position;1;2;3;;0.5",
+        "# 2",
+        "yaw[deg];2;170;;;5",
+    ]
+    path.write_text("\n".join(rows))
     position, yaw = read_fixes(path)
     np.testing.assert_allclose(position.value, [2.0, 3.0, 0.0])
     assert position.covariance[0, 0] == pytest.approx(0.25)
