@@ -242,14 +242,15 @@ def origin_of(
     }
 
 
-def training_command(paths: Sequence[Path], reading: options.Reading) -> str:
-    """Return the command that trains weights on these recordings, read in the same way."""
+def training_command(paths: Sequence[Path], reading: options.Reading, model: str) -> str:
+    """Return the command that goes on training a model's weights on recordings, read alike."""
     options = [
         f"--{name.replace('_', '-')}={each}"
         for name, value in reading.changed().items()
         for each in (value if isinstance(value, list) else [value])
     ]
-    words = ["stario", "train", *map(str, paths), *options, "--start-from", "default"]
+    start = "default" if Path(model).suffix == ".onnx" else model
+    words = ["stario", "train", *map(str, paths), *options, "--start-from", start]
     return shlex.join(words)
 
 

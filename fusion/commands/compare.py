@@ -82,7 +82,7 @@ def compare(
         outcomes = compare_recordings(
             files, model, settings, read, jobs, absolute_fixes, progress=progress, names=chosen
         )
-        train = common.training_command(paths, reading) if paths else ""
+        train = common.training_command(paths, reading, estimating.model) if paths else ""
         comparisons = [replace(c, train=train) for c in without_skipped(outcomes, skipped)]
     if explained:
         common.explain(as_json)

@@ -50,7 +50,7 @@ def run(
     if explained:
         common.explain(as_json)
     origin = common.origin_of(paths, reading, estimating, network, fixes)
-    train = common.training_command(paths, reading)
+    train = common.training_command(paths, reading, estimating.model)
 
     def fuse(sequence: ImuSequence, folder: Path) -> tuple[dict[str, object], str]:
         """Write one recording's track; return its record and a summary."""
@@ -106,7 +106,7 @@ def inspect(
     from stario.sequences.inspection.report import inspect_recording
     from stario.sequences.inspection.samples import without_times_ahead
 
-    train = common.training_command(paths, reading)
+    train = common.training_command(paths, reading, model)
     navigator = Navigator(load_model(model))
 
     def inspected(given: ImuSequence, folder: Path) -> tuple[dict[str, object], str]:
