@@ -180,11 +180,6 @@ def test_stretches_are_divided_among_two_processes_but_not_among_three():
     assert all(map(torch.equal, Workers(1, 3, cpu).share(batch), batch))
 
 
-def test_a_recording_without_positions_has_no_legs():
-    with pytest.raises(InputError, match="positions: found none"):
-        leg_streams(WALK)
-
-
 @pytest.mark.slow
 def test_training_with_legs_reduces_the_error_at_positions(tmp_path, monkeypatch):
     """Legs are trained together with windows of full truth from the same walk."""

@@ -84,8 +84,6 @@ def test_the_papers_split_is_by_recording_and_reproducible_by_seed():
     assert random_split(paths, seed=8) != split
     few = random_split(paths[:3], seed=0)
     assert [len(few.training), len(few.validation), len(few.test)] == [1, 1, 1]
-    with pytest.raises(InputError, match="at least 3"):
-        random_split(paths[:2], seed=0)
 
 
 def test_a_list_may_mix_formats_folders_and_duplicates(tmp_path):

@@ -12,7 +12,6 @@ from stario.sequences.drawing.figures import TRACK_STYLES
 from stario.sequences.drawing.plan import plan_view
 from stario.sequences.drawing.plots import error_over_time, imu_overview, innovations
 from stario.sequences.drawing.text_table import aligned, figure
-from stario.sequences.errors import InputError
 from stario.sequences.sequence import ImuSequence, PositionTrack, Trajectory
 
 
@@ -217,14 +216,6 @@ def test_imu_overview_tolerates_the_bad_samples_that_readers_keep(truth):
     )
     assert tallest == 30.0  # a single spike survives the decimation
     assert len(imu_overview(ImuSequence("walk", time[:50], gyro[:50], accel[:50])).axes) == 2
-
-
-def test_what_cannot_be_drawn_is_refused(truth):
-    nowhere = replace(truth, valid=np.zeros(len(truth), dtype=bool))
-    with pytest.raises(InputError, match="no valid pose"):
-        plan_view({"track": nowhere}, None, "")
-    with pytest.raises(InputError, match="at least one track"):
-        error_over_time({}, truth)
 
 
 def test_matplotlib_is_imported_lazily_and_pyplot_never():

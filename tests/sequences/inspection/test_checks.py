@@ -10,6 +10,7 @@ from told import UP, refusal, told
 from stario.sequences.conventions import SAME_AXES, with_axes, with_conventions
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units, unit_findings
+from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.readers import find_recordings, read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
 from stario.sequences.simulation.carrying import CARRYING_MODES
@@ -269,6 +270,8 @@ def test_the_unit_of_a_vehicle_that_turns_about_the_vertical_is_asked_for(caplog
     caplog.clear()
     check_units(robot)
     assert ("np.radians(gyro)" in caplog.text) == asked
+    codes = [found.code for found in inspect_recording(robot).findings]
+    assert ("gyro_unit_open" in codes) == asked
 
 
 def test_advice_on_arrays_names_no_option_of_the_command(walk):

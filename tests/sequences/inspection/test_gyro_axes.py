@@ -7,6 +7,7 @@ import pytest
 
 from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units
+from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
@@ -28,8 +29,11 @@ def test_other_axes_and_signs_are_refused_and_the_right_ones_named(carry, axes, 
     carried = walk(carry)
     columns = ["xyz".index(name.lower()) for name in axes]
     signs = [-1.0 if name.isupper() else 1.0 for name in axes]
-    with pytest.raises(InputError, match=f"gyroscope: .* seem to be its {named}$"):
-        check_units(replace(carried, gyro=carried.gyro[:, columns] * signs))
+    turned = replace(carried, gyro=carried.gyro[:, columns] * signs)
+    with pytest.raises(InputError, match=f"gyroscope: .* its {named}$"):
+        check_units(turned)
+    (told,) = [found for found in inspect_recording(turned).findings if found.code == "refused"]
+    assert f"its {named}" in told.advice
 
 
 @pytest.mark.parametrize("carry", ["handheld", "pocket", "swinging", "trolley"])

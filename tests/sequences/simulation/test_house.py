@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.errors import InputError
 from stario.sequences.geodesy import Georeference, east_north, turned
 from stario.sequences.sequence import FloatArray, Trajectory
 from stario.sequences.simulation.house import SHORTEST, simulate_house
@@ -14,7 +13,6 @@ from stario.sequences.simulation.outside_sensors import (
     simulate_barometer,
     simulate_satellites,
 )
-from stario.sequences.simulation.walks import WalkStyle
 from stario.sequences.units import standard_pressure
 
 METRES_PER_HPA = 8.43
@@ -125,13 +123,3 @@ def test_doppler_velocity_and_positions_agree_on_where_north_is(walk):
     assert np.sqrt(np.mean(np.square(moved))) > 0.5
     true = truth.at(found.time).position_W
     np.testing.assert_allclose(place, turned((true - true[0])[:, :2], there.yaw), atol=0.02)
-
-
-def test_a_walk_too_short_for_a_house_is_refused():
-    with pytest.raises(InputError, match="duration: found 30 s, expected at least 120 s"):
-        simulate_house(0, 30.0)
-
-
-def test_a_trolley_takes_no_stairs():
-    with pytest.raises(InputError, match="trolley"):
-        simulate_house(0, style=WalkStyle(carry="trolley"))

@@ -5,7 +5,6 @@ import pytest
 from scipy.signal import welch
 
 from stario.sequences.attitude.rotations import about_z
-from stario.sequences.errors import InputError
 from stario.sequences.sequence import STANDARD_GRAVITY, Trajectory
 from stario.sequences.simulation.carrying import CARRYING_MODES
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
@@ -158,16 +157,3 @@ def test_a_change_of_carrying_mode_turns_the_device_as_it_is_carried_there():
         cosine = before @ after / (np.linalg.norm(before) * np.linalg.norm(after))
         angles.append(np.arccos(cosine))
     assert min(angles) > 0.8  # from lying to upright
-
-
-def test_styles_and_arguments_are_checked():
-    with pytest.raises(InputError, match="carry"):
-        WalkStyle(carry="on a hat")
-    with pytest.raises(InputError, match="height"):
-        WalkStyle(height=17.5)
-    with pytest.raises(InputError, match="mount_rotvec"):
-        WalkStyle(mount_rotvec=(0.0, 0.0, float("nan")))
-    with pytest.raises(InputError, match="duration"):
-        generate_walk(0, duration=0.0)
-    with pytest.raises(InputError, match="rate"):
-        generate_walk(0, rate=10.0)
