@@ -46,23 +46,6 @@ def test_parts_too_short_for_windows_are_dropped():
     assert not last[0].has_poses
 
 
-def test_recorded_and_generated_streams_get_their_shares():
-    recorded = recordings_of([stream("a", 3000), stream("a", 1000)])
-    material = mix_sources(recorded, [stream("c", 700)], {SIMULATED: 0.05})
-    drawn = np.array([len(s) for s in material.streams]) * material.weights
-    assert drawn[2:].sum() / drawn.sum() == pytest.approx(0.05)
-    assert material.words[0].startswith("recorded")
-
-
-def test_bad_moments_get_their_share_of_all_windows():
-    recorded = recordings_of([stream("a", 3000)])
-    shares = {SIMULATED: 0.2, INSERTED: 0.1, "r": 0.3}
-    material = mix_sources(recorded, [stream("c", 700)], shares, moments=[stream("m", 900)])
-    assert drawn_shares(material) == pytest.approx({"a": 0.7, "c": 0.2, "m": 0.1}, abs=1e-3)
-    with pytest.raises(ConfigError, match=r"1\.1 for simulated walks and moments"):
-        mix_sources(recorded, [], {SIMULATED: 0.4, INSERTED: 0.7}, moments=[stream("m", 900)])
-
-
 def test_streams_are_drawn_alike_unless_each_has_a_weight():
     streams = [stream("a", 3000), stream("b", 1000)]
     assert drawn_shares(TrainingData(streams)) == pytest.approx({"a": 0.75, "b": 0.25})
@@ -80,17 +63,30 @@ def drawn_shares(material: TrainingData, reach: int = 1) -> dict[str, float]:
     return {name: value / sum(found.values()) for name, value in found.items()}
 
 
-def test_named_sources_get_their_shares_whatever_their_length():
+LONG, SHORT = "a/long.h5:x", "a/short.h5:y"
+
+
+@pytest.mark.parametrize(
+    ("paths", "shares", "expected"),
+    [
+        ([LONG, SHORT, "z.csv"], {"long.h5": 0.5, "short.h5": 0.3}, {"x": 0.5, "y": 0.3, "z": 0.2}),
+        ([LONG], {SIMULATED: 0.05}, {"x": 0.95, "simulated": 0.05}),
+        ([LONG], {SIMULATED: 0.2, INSERTED: 0.1}, {"x": 0.7, "simulated": 0.2, "moments": 0.1}),
+        # The share of an absent source goes to the other recordings.
+        ([LONG, "z.csv"], {"long": 0.2, "kipd": 0.5, SIMULATED: 0.1},
+         {"x": 0.36, "z": 0.54, "simulated": 0.1}),
+        ([LONG], {"long": 0.2, "kipd": 0.5, SIMULATED: 0.1}, {"x": 0.9, "simulated": 0.1}),
+    ],
+)  # fmt: skip
+def test_named_sources_get_their_shares_whatever_their_length(paths, shares, expected):
+    names = {LONG: ["x"] * 9, SHORT: ["y"], "z.csv": ["z"]}
     recorded = [
-        RecordingStreams(Path("a/long.h5:x"), [moving("x", 1.0)] * 9),
-        RecordingStreams(Path("a/short.h5:y"), [moving("y", 1.0)]),
-        RecordingStreams(Path("other.csv"), [moving("z", 1.0)]),
+        RecordingStreams(Path(path), [moving(name, 1.0) for name in names[path]]) for path in paths
     ]
-    shares = {"long.h5": 0.5, "short.h5": 0.3}
-    expected = pytest.approx({"x": 0.5, "y": 0.3, "z": 0.2})
-    assert drawn_shares(mix_sources(recorded, [], shares)) == expected
-    with pytest.raises(ConfigError, match="shares"):
-        mix_sources(recorded, [], {"long.h5": 0.5, "short.h5": 0.5})
+    made = [moving("simulated", 1.0).part(0, 700)] if SIMULATED in shares else []
+    moments = [moving("moments", 1.0)] if INSERTED in shares else []
+    found = drawn_shares(mix_sources(recorded, made, shares, moments=moments))
+    assert found == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
@@ -114,19 +110,6 @@ def test_a_source_is_named_by_a_folder_an_archive_or_a_file(source, path):
     )
 
 
-def test_the_share_of_an_absent_source_goes_to_the_other_recordings():
-    recorded = [
-        RecordingStreams(Path("a/ridi.h5:x"), [moving("x", 1.0)]),
-        RecordingStreams(Path("other.csv"), [moving("z", 1.0)]),
-    ]
-    shares = {"ridi": 0.2, "kipd": 0.5, SIMULATED: 0.1}
-    found = drawn_shares(mix_sources(recorded, [moving("c", 1.0)], shares))
-    assert found["c"] == pytest.approx(0.1)
-    assert found["x"] == pytest.approx(0.9 * 0.4)
-    alone = drawn_shares(mix_sources(recorded[:1], [moving("c", 1.0)], shares))
-    assert alone["c"] == pytest.approx(0.1)
-
-
 def test_shares_count_the_windows_that_can_be_drawn():
     """Stretches hardly longer than a window hold few windows, which are drawn more often."""
     whole = moving("y", 1.0)
@@ -141,10 +124,15 @@ def test_shares_count_the_windows_that_can_be_drawn():
 
 
 def test_shares_that_leave_nothing_are_refused():
-    recorded = recordings_of([moving("x", 1.0)])
-    for given, generated in (({SIMULATED: 1.0}, []), ({SIMULATED: 0.0}, [moving("c", 1.0)])):
-        with pytest.raises(ConfigError, match="shares: found 0 for every"):
-            mix_sources([] if generated else recorded, generated, given)
+    recorded, made = recordings_of([moving("x", 1.0)]), [moving("c", 1.0)]
+    for given, recordings, generated, words in (
+        ({SIMULATED: 1.0}, recorded, [], "found 0 for every"),
+        ({SIMULATED: 0.0}, [], made, "found 0 for every"),
+        ({"0": 1.0}, recordings_of([moving("x", 1.0)], [moving("z", 1.0)]), [], ""),
+        ({SIMULATED: 0.4, INSERTED: 0.7}, recorded, [], r"1\.1 for simulated walks and moments"),
+    ):
+        with pytest.raises(ConfigError, match=f"shares: .*{words}"):
+            mix_sources(recordings, generated, given, moments=made if INSERTED in given else [])
     with pytest.raises(ConfigError, match=r"shares: found a sum of 1\.2"):
         TrainingConfig(shares={"ridi": 0.6, "kipd": 0.6})
     TrainingConfig(shares={"ridi": 0.7, "kipd": 0.2, "tyrex": 0.1, SIMULATED: 0.5})
