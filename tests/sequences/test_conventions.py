@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stario.sequences import STANDARD_GRAVITY, Barometer, ImuSequence, Magnetometer, Satellites
 from stario.sequences.conventions import (
     axes_matrix,
     axes_named,
@@ -13,13 +14,6 @@ from stario.sequences.conventions import (
     with_gravity,
 )
 from stario.sequences.errors import InputError
-from stario.sequences.sequence import (
-    STANDARD_GRAVITY,
-    Barometer,
-    ImuSequence,
-    Magnetometer,
-    Satellites,
-)
 from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import generate_walk
 from stario.sequences.units import MAGNETIC_UNITS

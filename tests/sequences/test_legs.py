@@ -5,11 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stario.sequences import ImuSequence
-from stario.sequences.legs import LegStream, leg_streams
+from stario.sequences import ImuSequence, LegStream, WalkStyle, generate_walk, leg_streams
 from stario.sequences.sequence import FloatArray, PositionTrack
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 TIME = np.arange(1.0, 38.0)
 

@@ -7,12 +7,10 @@ from scipy.spatial.transform import Rotation
 
 from stario.fusion.recording import cut_recording
 from stario.fusion.values.config import NavigatorConfig
-from stario.sequences.attitude.rotations import about_z, yaw_of
+from stario.sequences import PERFECT_IMU, WalkStyle, about_z, generate_walk, simulate_imu, yaw_of
 from stario.sequences.clean_samples import clean_samples
 from stario.sequences.levelled_stream import levelled_streams
 from stario.sequences.sequence import FloatArray, ImuSequence, Trajectory
-from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.windows import (
     VELOCITY_WEIGHTS,
     facing,
@@ -96,12 +94,13 @@ def test_the_target_is_the_displacement_over_the_window(walk):
 
 
 def test_no_window_spans_a_gap_in_the_truth(walk):
+    """Stretches too short for a window are dropped."""
     truth = walk.truth
     valid = np.ones(len(truth), dtype=np.bool_)
-    valid[1600:1700] = False
+    valid[1300:1400] = valid[1600:1700] = False
     streams = world_streams(replace(walk, truth=replace(truth, valid=valid)))
     assert len(streams) == 2
-    assert len(streams[0]) == pytest.approx(1600, abs=1)
+    assert len(streams[0]) == pytest.approx(1300, abs=1)
     assert len(streams[1]) == pytest.approx(len(truth) - 1700, abs=2)
     ends = truth.position_W[1700], truth.position_W[1900]
     assert np.allclose(windows_of(streams[1], 200)[1][0], ends[1] - ends[0], atol=0.01)
@@ -113,13 +112,6 @@ def test_no_window_spans_a_long_gap_in_the_imu(walk, gap, seconds):
     gappy = ImuSequence("holed", walk.time[kept], walk.gyro[kept], walk.accel[kept], walk.truth)
     lengths = [len(stream) / 200.0 for stream in world_streams(gappy)]
     assert lengths == pytest.approx(seconds, abs=0.011)
-
-
-def test_short_stretches_of_truth_are_dropped(walk):
-    truth = walk.truth
-    valid = np.ones(len(truth), dtype=np.bool_)
-    valid[1000:1100] = valid[1300:1400] = False
-    assert len(world_streams(replace(walk, truth=replace(truth, valid=valid)))) == 2
 
 
 def test_a_misaligned_truth_does_not_affect_levelled_windows():

@@ -28,10 +28,7 @@ from stario.network.runtime.engines import (
 from stario.network.runtime.survey import random_windows
 from stario.network.runtime.torch_engine import TorchEngine
 from stario.network.stario import StarIO
-from stario.sequences.sequence import STANDARD_GRAVITY
-from stario.sequences.simulation.imu import simulate_imu
-from stario.sequences.simulation.walks import generate_walk
-from stario.sequences.windows import world_streams
+from stario.sequences import STANDARD_GRAVITY, generate_walk, simulate_imu, world_streams
 
 
 def randomise_norms(network: nn.Module) -> None:

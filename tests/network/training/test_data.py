@@ -15,13 +15,10 @@ from stario.network.training.data import (
     split_off,
 )
 from stario.network.training.made import moment_streams, virtual_recordings
-from stario.sequences.datasets.batch import Skipped
+from stario.sequences import STANDARD_GRAVITY, Skipped, WorldStream, generate_walk
 from stario.sequences.errors import ConfigError, InputError
 from stario.sequences.readers.archive import write_archive
-from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
-from stario.sequences.simulation.walks import generate_walk
-from stario.sequences.windows import WorldStream
 
 
 def stream(name: str, samples: int) -> WorldStream:

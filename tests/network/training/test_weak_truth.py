@@ -16,13 +16,10 @@ from stario.network.training.losses import direction_loss, leg_residuals
 from stario.network.training.parallel import Workers
 from stario.network.training.train import train
 from stario.network.training.validation import ValidationSet
-from stario.sequences.attitude.rotations import about_z
-from stario.sequences.errors import ConfigError, InputError
-from stario.sequences.legs import LegStream, leg_streams
+from stario.sequences import ConfigError, InputError, LegStream, about_z, leg_streams, world_streams
 from stario.sequences.sequence import FloatArray, ImuSequence, PositionTrack
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
-from stario.sequences.windows import world_streams
 
 PLAIN = replace(UNVARIED, mirrored=0.5)
 SECONDS = 12

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stario.sequences import STANDARD_GRAVITY, ImuSequence, WalkStyle, generate_walk
 from stario.sequences.attitude.levelling import (
     GravityStart,
     LevelledAttitude,
@@ -12,10 +13,8 @@ from stario.sequences.attitude.levelling import (
     start_from_gravity,
 )
 from stario.sequences.attitude.so3 import exp_so3
-from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 from stario.sequences.simulation.carrying import CARRYING_MODES
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, ImuErrors, simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -9,10 +9,9 @@ import pytest
 from joblib import parallel_config
 
 from stario.network.training.splits import NAMES, read_packaged_list
+from stario.sequences import InputError, ReadError, find_recordings
 from stario.sequences.datasets.batch import Skipped, each, without_skipped
 from stario.sequences.datasets.splits import hold_out_group, random_split, read_list
-from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers import find_recordings
 
 
 @pytest.mark.parametrize("jobs", [None, 1, 2])

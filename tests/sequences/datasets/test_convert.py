@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from stario.sequences import Barometer, DeviceAttitude, Magnetometer, Satellites, find_recordings
 from stario.sequences.datasets.convert import convert
 from stario.sequences.errors import InputError
-from stario.sequences.files import atomic_folder
 from stario.sequences.readers import read_recording
 from stario.sequences.readers.archive import write_archive
 from stario.sequences.sequence import STANDARD_GRAVITY, PositionTrack, Trajectory
@@ -101,21 +100,18 @@ def test_positions_that_a_csv_would_change_give_a_warning(
     assert f", {kind} alongside true poses, its attributes: write .h5" in caplog.text
 
 
-def test_a_recording_without_truth_is_converted_without_truth(walk, tmp_path):
+def test_short_recordings_without_truth_are_converted(walk, tmp_path):
+    """Too short to check their units."""
     for path in (tmp_path / "a.csv", tmp_path / "a"):
-        convert(walk.without_truth(), path)
+        convert(walk.without_truth().slice(0.0, 0.5), path)
         assert read_recording(path).truth is None
+        assert read_recording(path).duration < 0.5
 
 
 def test_wrong_units_are_refused_and_nothing_is_written(walk, tmp_path):
     with pytest.raises(InputError, match=r"give 9\.80665 \* accel"):
         convert(replace(walk, accel=walk.accel / STANDARD_GRAVITY), tmp_path / "a.csv")
     assert not list(tmp_path.iterdir())
-
-
-def test_a_recording_too_short_to_check_is_converted(walk, tmp_path):
-    convert(walk.without_truth().slice(0.0, 0.5), tmp_path / "short")
-    assert read_recording(tmp_path / "short").duration < 0.5
 
 
 def test_what_cannot_be_converted_is_refused_with_the_reason(walk, tmp_path):
@@ -131,17 +127,6 @@ def test_what_cannot_be_converted_is_refused_with_the_reason(walk, tmp_path):
     with pytest.raises(InputError, match="file, which would be lost"):
         convert(walk, tmp_path / "full")
     assert [p.name for p in (tmp_path / "full").iterdir()] == ["file"]
-
-
-def test_a_folder_appears_whole_or_not_at_all(tmp_path):
-    def fail(folder):
-        (folder / "half").touch()
-        assert not (tmp_path / "whole").exists()
-        raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError), atomic_folder(tmp_path / "whole") as folder:
-        fail(folder)
-    assert not list(tmp_path.iterdir())
 
 
 def test_truth_that_starts_before_the_imu_keeps_its_offset(tmp_path):

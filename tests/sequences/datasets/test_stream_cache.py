@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stario.sequences import ImuSequence, Skipped, generate_walk, simulate_imu
 from stario.sequences.datasets import stream_cache
-from stario.sequences.datasets.batch import Skipped
 from stario.sequences.datasets.stream_cache import (
     cache_folder,
     cached,
@@ -26,9 +26,6 @@ from stario.sequences.datasets.stream_cache import (
 )
 from stario.sequences.readers import find_recordings, read_recording, write_csv
 from stario.sequences.readers.archive import write_archive
-from stario.sequences.sequence import ImuSequence
-from stario.sequences.simulation.imu import simulate_imu
-from stario.sequences.simulation.walks import generate_walk
 from stario.sequences.windows import WorldStream, world_streams
 
 WALK = simulate_imu(generate_walk(6, 9.0), 100.0, seed=4, name="walk")

@@ -7,16 +7,13 @@ from recorded import DATA
 from scipy.spatial.transform import Rotation
 from told import UP, refusal, told
 
+from stario.sequences import PHONE_IMU, InputError, inspect_recording, simulate_imu, with_units
 from stario.sequences.conventions import SAME_AXES, with_axes, with_conventions
-from stario.sequences.errors import InputError
 from stario.sequences.inspection.checks import check_units, unit_findings
-from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.readers import find_recordings, read_recording
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
 from stario.sequences.simulation.carrying import CARRYING_MODES
-from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
-from stario.sequences.units import with_units
 
 
 def in_degrees(sequence: ImuSequence) -> ImuSequence:

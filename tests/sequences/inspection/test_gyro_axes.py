@@ -5,10 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stario.sequences.errors import InputError
-from stario.sequences.inspection.checks import check_units
-from stario.sequences.inspection.report import inspect_recording
-from stario.sequences.sequence import ImuSequence
+from stario.sequences import ImuSequence, InputError, check_units, inspect_recording
 from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 

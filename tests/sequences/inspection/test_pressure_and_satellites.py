@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stario.sequences import Georeference, inspect_recording
 from stario.sequences.findings import Assessment, Finding
-from stario.sequences.geodesy import Georeference
 from stario.sequences.inspection.outside_sensors import assess_barometer, assess_satellites
-from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.sequence import Barometer, FloatArray, Satellites, Trajectory
 from stario.sequences.simulation.house import simulate_house
 from stario.sequences.simulation.outside_sensors import simulate_barometer, simulate_satellites

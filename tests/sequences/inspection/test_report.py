@@ -7,12 +7,10 @@ from recorded import DATA
 from scipy.spatial.transform import Rotation
 from told import told
 
+from stario.sequences import InputError, inspect_recording, read_recording, simulate_imu
 from stario.sequences.drawing.plots import imu_overview
-from stario.sequences.errors import InputError
 from stario.sequences.files import json_text
-from stario.sequences.inspection.report import inspect_recording
 from stario.sequences.inspection.samples import clock_findings
-from stario.sequences.readers import read_recording
 from stario.sequences.sequence import (
     STANDARD_GRAVITY,
     Barometer,
@@ -21,7 +19,6 @@ from stario.sequences.sequence import (
     PositionTrack,
     Satellites,
 )
-from stario.sequences.simulation.imu import simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 

@@ -8,11 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from told import UP, refusal, told
 
-from stario.sequences.inspection.checks import check_units
+from stario.sequences import PHONE_IMU, WalkStyle, check_units, generate_walk, simulate_imu
 from stario.sequences.inspection.samples import dead_axes, sample_findings, stuck_findings
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
-from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 
 def test_a_constant_gyroscope_is_refused_while_the_accelerometer_varies(walk):

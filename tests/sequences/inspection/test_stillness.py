@@ -2,11 +2,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stario.sequences import ImuNoise, WalkStyle, generate_walk, simulate_imu
 from stario.sequences.inspection.stillness import find_rest, scatter_bound
-from stario.sequences.noise import ImuNoise
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
-from stario.sequences.simulation.imu import simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 NOISE = ImuNoise(gyro_noise=8e-4, accel_noise=6e-3)
 BIAS = np.array([0.01, -0.02, 0.005])

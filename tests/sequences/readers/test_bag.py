@@ -8,12 +8,9 @@ import pytest
 from alike import max_angle
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.conventions import with_conventions
+from stario.sequences import STANDARD_GRAVITY, check_units, read_recording, with_conventions
 from stario.sequences.errors import InputError, ReadError
-from stario.sequences.inspection.checks import check_units
-from stario.sequences.readers import read_recording
 from stario.sequences.readers.bag import read_bag
-from stario.sequences.sequence import STANDARD_GRAVITY
 
 
 @pytest.mark.parametrize(

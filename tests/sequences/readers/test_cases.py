@@ -13,8 +13,7 @@ from recorded import CASES
 
 from stario.fusion.values.config import read_config
 from stario.fusion.values.fix_file import read_fixes
-from stario.sequences.errors import StarioError
-from stario.sequences.readers import find_recordings, read_recording
+from stario.sequences import StarioError, find_recordings, read_recording
 
 
 def case(name: str) -> Path:

@@ -11,9 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from stario.sequences import Barometer, Satellites
-from stario.sequences.errors import ReadError
-from stario.sequences.readers import read_recording, write_csv
+from stario.sequences import Barometer, ReadError, Satellites, read_recording, write_csv
 from stario.sequences.readers.generic_csv import read_generic_csv
 from stario.sequences.sequence import FloatArray, ImuSequence, Magnetometer, PositionTrack
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from csv_lines import write_lines
 
-from stario.sequences import ReadError, check_units, read_recording
-from stario.sequences.errors import InputError
+from stario.sequences import InputError, ReadError, check_units, read_recording
 from stario.sequences.readers.text import with_seconds
 
 NOON = datetime(2024, 5, 1, 12, 34, 56, 789000)

@@ -4,12 +4,9 @@ import numpy as np
 import pytest
 from csv_lines import ROW, write_lines
 
-from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers import write_csv
+from stario.sequences import ImuSequence, InputError, ReadError, with_units, write_csv
 from stario.sequences.readers.columns import HEADER, TRUTH_HEADER
 from stario.sequences.readers.generic_csv import read_generic_csv
-from stario.sequences.sequence import ImuSequence
-from stario.sequences.units import with_units
 
 
 def test_bad_samples_and_their_order_are_kept(tmp_path, walk):

@@ -8,8 +8,7 @@ import pytest
 from alike import assert_same_samples
 from phone_exports import export, save
 
-from stario.sequences.errors import StarioError
-from stario.sequences.readers import read_recording
+from stario.sequences import StarioError, read_recording
 
 SENSORS = ",".join(f"{sensor}_{axis}" for sensor in ("gyro", "accel") for axis in "xyz")
 

@@ -9,9 +9,8 @@ import numpy as np
 import published_formats as formats
 import pytest
 
+from stario.sequences import InputError, ReadError, read_recording
 from stario.sequences.clean_samples import clean_samples
-from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers import read_recording
 
 ROW = 500
 """A row to damage."""

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 from published_formats import tumvi
 
-from stario.sequences.errors import InputError, ReadError
+from stario.sequences import PHONE_IMU, InputError, ReadError, simulate_imu
 from stario.sequences.readers import find_recordings, read_recording, write_csv
-from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.errors import InputError, ReadError
-from stario.sequences.readers.tum import read_tum, write_tum
-from stario.sequences.sequence import Trajectory
+from stario.sequences import InputError, ReadError, Trajectory, read_tum, write_tum
 
 
 def track(n: int = 50, start: float = 0.0, seed: int = 1) -> Trajectory:

@@ -9,8 +9,7 @@ import pytest
 from alike import max_angle
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.errors import InputError
-from stario.sequences.readers import find_recordings, read_recording
+from stario.sequences import InputError, find_recordings, read_recording
 
 
 def relative_to_first(attitude: Rotation) -> Rotation:

@@ -5,13 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stario.sequences import ImuSequence, PositionTrack
+from stario.sequences import STANDARD_GRAVITY, ImuSequence, MagneticField, PositionTrack
 from stario.sequences.attitude.rotations import GyroIntegral
-from stario.sequences.sequence import STANDARD_GRAVITY
 from stario.sequences.simulation import insertion
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
 from stario.sequences.simulation.insertion import Inserted, insert_moment
-from stario.sequences.simulation.magnetometer import MagneticField
 from stario.sequences.simulation.moments import MOMENTS
 from stario.sequences.simulation.outside_sensors import simulate_barometer, simulate_satellites
 from stario.sequences.simulation.walks import WalkStyle, generate_walk

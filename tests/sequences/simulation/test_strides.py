@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.sequence import Trajectory
+from stario.sequences import PERFECT_IMU, Trajectory, measured_stride, on_one_side, simulate_imu
 from stario.sequences.simulation import strides
 from stario.sequences.simulation.carrying import PLACES, carry_motion
-from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
-from stario.sequences.simulation.measured import measured_stride, on_one_side
 from stario.sequences.simulation.routes import Command, route_along
 from stario.sequences.simulation.strides import (
     Gait,

@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from stario.sequences import InputError, WalkStyle, generate_walk
 from stario.sequences.arrays import samples_in
 from stario.sequences.attitude.alignment import align_tracked_body, clock_offset
 from stario.sequences.attitude.mounts import heading_turn
 from stario.sequences.attitude.rotations import cumulative_rotations
 from stario.sequences.conventions import axes_matrix
-from stario.sequences.errors import InputError
 from stario.sequences.readers.poses import accel_axes
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 MOUNT_VB = Rotation.from_euler("zyx", [172.0, 3.0, -4.0], degrees=True)
 LEVER_B = np.array([0.02, -0.1, 0.01])
@@ -161,12 +160,17 @@ def test_rotation_during_an_imu_gap_is_not_a_flip(gap, flips):
     assert aligned.correlation > 0.95
 
 
-def test_a_recording_hardly_too_short_is_not_said_to_be_long_enough():
+def test_what_cannot_be_aligned_is_refused():
+    """Hardly too short, without gravity, or with a clock whose span would not fit in memory."""
     imu, truth = recorded("handheld", 12.0)
-    imu = imu.slice(0.0, 9.995)
-    valid = np.ones(len(truth), dtype=np.bool_)
+    attitude, valid = truth.attitude_WB, np.ones(len(truth), dtype=np.bool_)
+    short, dead = imu.slice(0.0, 9.995), np.zeros_like(imu.accel)
     with pytest.raises(InputError, match=r"found 9\.99 s, expected at least 10 s"):
-        align_tracked_body(imu.time, imu.gyro, imu.accel, truth.time, truth.attitude_WB, valid)
+        align_tracked_body(short.time, short.gyro, short.accel, truth.time, attitude, valid)
+    with pytest.raises(InputError, match="gravity"):
+        align_tracked_body(imu.time, imu.gyro, dead, truth.time, attitude, valid)
+    with pytest.raises(InputError, match="clock"):
+        clock_offset(imu.time, imu.gyro, np.append(0.0, truth.time[1:] + 1.7e9), attitude, valid)
 
 
 @pytest.fixture(scope="module")

@@ -8,12 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from told import told
 
-from stario.sequences import inspect_recording
+from stario.sequences import ImuSequence, Trajectory, WalkStyle, generate_walk, inspect_recording
 from stario.sequences.clean_samples import middle_part
 from stario.sequences.conventions import SAME_AXES, with_axes
-from stario.sequences.sequence import ImuSequence, Trajectory
 from stario.sequences.simulation.imu import PERFECT_IMU, PHONE_IMU, simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.truth.fit import fit_truth, yaw_drift
 from stario.sequences.truth.problems import fit_findings
 

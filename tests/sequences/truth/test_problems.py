@@ -6,11 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from told import told
 
-from stario.sequences.errors import InputError
-from stario.sequences.inspection.report import inspect_recording
+from stario.sequences import PHONE_IMU, InputError, inspect_recording, simulate_imu
 from stario.sequences.sequence import STANDARD_GRAVITY, FloatArray, ImuSequence, Trajectory
 from stario.sequences.simulation.carrying import CARRYING_MODES
-from stario.sequences.simulation.imu import PHONE_IMU, simulate_imu
 from stario.sequences.simulation.walks import WalkStyle, generate_walk
 from stario.sequences.truth.positions import fit_positions
 from stario.sequences.truth.problems import (

@@ -67,6 +67,7 @@ def test_a_malformed_json_export_is_refused_in_one_line(text, message, tmp_path)
 
 
 def test_a_sensors_file_without_samples_is_named(walk, tmp_path, caplog):
+    """One of another sensor than the gyroscope's is no name of a recording."""
     save_zyx(tmp_path, walk, Gyroscope=walk.gyro, GyroscopeUncalibrated=walk.gyro)
     (tmp_path / "TotalAcceleration.csv").write_text("time,seconds_elapsed,z,y,x\n")
     lacking = "no rows with a time that grows and three values"
@@ -74,6 +75,9 @@ def test_a_sensors_file_without_samples_is_named(walk, tmp_path, caplog):
     with pytest.raises(ReadError, match=message):
         read_recording(tmp_path)
     save_zyx(tmp_path, walk, TotalAcceleration=walk.accel)
+    with pytest.raises(ReadError, match=r"one sensor of .*gyroscope: .*/Gyroscope\.csv$"):
+        read_recording(tmp_path / "TotalAcceleration.csv")
+    assert len(read_recording(tmp_path / "Gyroscope.csv")) == len(walk)
     (tmp_path / "Gyroscope.csv").write_text("")
     read_recording(tmp_path)
     assert "Gyroscope.csv: not read: it has no rows" in caplog.text
@@ -90,14 +94,6 @@ def test_samples_without_an_accelerometer_are_counted(walk, tmp_path, caplog):
         read_recording(tmp_path)
         assert ("dropped 750 of 1501 samples at whose times only" in caplog.text) == dropped
         assert ("dropped" in caplog.text) == dropped
-
-
-def test_a_file_of_one_sensor_names_that_of_the_gyroscope(walk, tmp_path):
-    save_zyx(tmp_path, walk, Gyroscope=walk.gyro, TotalAcceleration=walk.accel)
-    message = r"found one sensor of a recording, .*; name its gyroscope: .*/Gyroscope\.csv$"
-    with pytest.raises(ReadError, match=message):
-        read_recording(tmp_path / "TotalAcceleration.csv")
-    assert len(read_recording(tmp_path / "Gyroscope.csv")) == len(walk)
 
 
 def test_single_wild_samples_are_no_reason_to_refuse_a_file(walk, tmp_path):

@@ -1,5 +1,6 @@
 """Pressure next to the sensors of a phone's recording, and in lines of events."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -83,29 +84,20 @@ def test_pressure_repeated_in_every_row_of_a_wide_file_is_read_once(walk, tmp_pa
 @pytest.mark.parametrize(
     ("title", "values", "words"),
     [
-        ("altitude", 520.0 + TIME, "altitude: found 526 m, expected pressure of 300 to 1100 hPa"),
-        ("height (m)", 520.0 + TIME, "found 526 m"),
-        ("value", 3.0 + TIME, "value: found 9, expected pressure"),
-        ("value", 520.0 + TIME, "found steps of 1 hPa, which is 8 m of height, expected pressure"),
+        ("altitude", 520.0 + TIME, "altitude: found 526 m, .* 300 to 1100 hPa.*altitude"),
+        ("height (m)", 520.0 + TIME, "found 526 m.*altitude"),
+        ("value", 3.0 + TIME, "value: found 9,.*altitude"),
+        ("value", 520.0 + TIME, "1 hPa, which is 8 m of height.*altitude"),
+        ("pressure (hPa)", HPA, "from 7200 to 7212 s after the first sample"),
     ],
 )
-def test_an_altitude_in_place_of_pressure_is_named_in_one_line(
-    walk, tmp_path, title, values, words, caplog
-):
+def test_what_is_no_pressure_is_named_in_one_line(walk, tmp_path, title, values, words, caplog):
     export("phyphox", tmp_path / "p", walk)
-    save(tmp_path / "p/Barometer.csv", f"time,{title}", TIME, values)
+    time = TIME + (7200.0 if "hPa" in title else 0.0)
+    save(tmp_path / "p/Barometer.csv", f"time (s),{title}", time, values)
     assert read_recording(tmp_path / "p").barometer is None
     [line] = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert words in line
-    assert line.endswith("is it an altitude?")
-
-
-def test_pressure_of_another_clock_is_named_in_one_line(walk, tmp_path, caplog):
-    export("phyphox", tmp_path / "p", walk)
-    save(tmp_path / "p/Barometer.csv", "time (s),pressure (hPa)", TIME + 7200.0, HPA)
-    assert read_recording(tmp_path / "p").barometer is None
-    assert "pressure skipped" in caplog.text
-    assert "found times from 7200 to 7212 s after the first sample" in caplog.text
+    assert re.search(words, line)
 
 
 def test_a_walk_through_a_bar_is_no_pressure(walk, tmp_path):

@@ -11,10 +11,9 @@ from phone_exports import EXPORTS, Y_UP, ZYX, export, field, gravity, ns, save
 from recorded import DATA
 from scipy.spatial.transform import Rotation
 
-from stario.sequences import ReadError, find_recordings, read_recording
+from stario.sequences import ReadError, WalkStyle, find_recordings, generate_walk, read_recording
 from stario.sequences.conventions import with_axes, with_gravity
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 RAW = DATA / "raw"
 
@@ -139,26 +138,23 @@ def test_a_pose_file_without_any_rotation_gives_a_warning(columns, walk, tmp_pat
     assert "no row in ARKit_pose.txt holds a pose" in caplog.text
 
 
-def test_poses_without_an_imu_are_refused_as_such(walk, tmp_path):
-    rows = np.hstack([walk.truth.position_W, walk.truth.quat_xyzw])
-    save(tmp_path / "s/ARCore_sensor_pose.txt", "# by a logger", ns(walk), rows, sep=" ")
-    for read in (read_recording, find_recordings):
-        with pytest.raises(ReadError, match=r"only poses, ARCore_sensor_pose\.txt, expected a gyr"):
-            read(tmp_path / "s")
-
-
 def test_a_missing_sensor_is_named(walk, tmp_path):
     save(tmp_path / "s/Accelerometer.csv", "time,x,y,z", walk.time, walk.accel)
     save(tmp_path / "s/Magnetometer.csv", "time,x,y,z", walk.time, field(walk))
-    message = "only accel and mag, expected a gyroscope and an accelerometer"
-    for read in (read_recording, find_recordings):
-        with pytest.raises(ReadError, match=message):
-            read(tmp_path / "s")
+    poses = np.hstack([walk.truth.position_W, walk.truth.quat_xyzw])
+    save(tmp_path / "p/ARCore_sensor_pose.txt", "# by a logger", ns(walk), poses, sep=" ")
     header = ";".join(f"ACCELEROMETER {axis} (m/s²)" for axis in "XYZ")
-    header += ";Time since start in ms "
-    save(tmp_path / "a.csv", header, walk.accel, np.round(1e3 * walk.time), sep=";")
-    with pytest.raises(ReadError, match="only accel"):
-        read_recording(tmp_path / "a.csv")
+    wide = f"{header};Time since start in ms "
+    save(tmp_path / "a.csv", wide, walk.accel, np.round(1e3 * walk.time), sep=";")
+    for read, name, words in (
+        (read_recording, "s", "only accel and mag, expected a gyro"),
+        (find_recordings, "s", "only accel and mag, expected a gyro"),
+        (read_recording, "p", r"only poses, ARCore_sensor_pose\.txt, expected a gyr"),
+        (find_recordings, "p", r"only poses, ARCore_sensor_pose\.txt, expected a gyr"),
+        (read_recording, "a.csv", "only accel"),
+    ):
+        with pytest.raises(ReadError, match=words):
+            read(tmp_path / name)
 
 
 def test_an_accelerometer_in_other_axes_than_the_gyroscope_is_corrected(tmp_path, caplog):

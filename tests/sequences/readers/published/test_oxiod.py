@@ -10,11 +10,9 @@ from alike import assert_same_poses, assert_upright, turned_and_measured
 from recorded import DATA
 from scipy.spatial.transform import Rotation
 
-from stario.sequences.errors import ReadError
+from stario.sequences import ImuSequence, ReadError, WalkStyle, generate_walk
 from stario.sequences.readers import find_recordings, read_recording
-from stario.sequences.sequence import ImuSequence
 from stario.sequences.simulation.imu import PERFECT_IMU, simulate_imu
-from stario.sequences.simulation.walks import WalkStyle, generate_walk
 
 MOUNT_VB = Rotation.from_euler("zyx", [172.0, 3.0, -4.0], degrees=True)
 TILT_WW = Rotation.from_euler("xy", [0.5, -0.6], degrees=True)
