@@ -128,11 +128,6 @@ def test_one_wild_time_is_counted_and_nothing_else(walk, caplog):
             assert any("1 ahead of their time" in line for line in found.lines())
 
 
-def test_a_truth_on_another_clock_is_named_with_the_offset(walk):
-    late = replace(walk, truth=replace(walk.truth, time=walk.truth.time - 0.25))
-    assert "add +0.25" in problem(late)
-
-
 def test_a_truth_too_slow_to_compare_is_named_as_such(walk):
     """Its attitude between two poses is unknown, so neither clock nor axes may be blamed."""
     truth = walk.truth

@@ -13,18 +13,16 @@ from stario.sequences.inspection.samples import dead_axes, sample_findings, stuc
 from stario.sequences.sequence import STANDARD_GRAVITY, ImuSequence
 
 
-def test_a_constant_gyroscope_is_refused_while_the_accelerometer_varies(walk):
-    for value in (0.0, 0.3):
-        dead = replace(walk, gyro=np.full_like(walk.gyro, value))
-        assert "gyroscope: found values that never change" in refusal(dead)
-        assert len(told(dead.without_truth())) == 1
-
-
-@pytest.mark.parametrize("value", [0.0, 5.66])
-def test_a_constant_accelerometer_is_refused_while_the_device_tilts(walk, value):
-    dead = replace(walk, accel=np.full_like(walk.accel, value)).without_truth()
-    assert "accelerometer: found values that never change" in refusal(dead)
-    assert len(told(dead)) == 1
+@pytest.mark.parametrize(
+    ("sensor", "value", "name"),
+    [("gyro", 0.0, "gyroscope"), ("gyro", 0.3, "gyroscope"),
+     ("accel", 0.0, "accelerometer"), ("accel", 5.66, "accelerometer")],
+)  # fmt: skip
+def test_a_constant_sensor_is_refused_while_the_other_varies(walk, sensor, value, name):
+    dead = replace(walk, **{sensor: np.full((len(walk), 3), value)})
+    for recording in (dead, dead.without_truth()):
+        assert f"{name}: found values that never change" in refusal(recording)
+    assert len(told(dead.without_truth())) == 1
 
 
 def test_a_constant_rate_without_noise_and_a_device_at_rest_pass():
@@ -82,11 +80,8 @@ def test_one_huge_value_neither_refuses_nor_warns(walk):
         check_units(sequence)
         (text,) = told(sequence)
     assert text.endswith("in 1 sample")
-
-
-def test_one_spike_does_not_turn_the_average_force(walk):
     accel = walk.accel.copy()
-    accel[100] = [9e4, 0.0, 0.0]
+    accel[100] = [9e4, 0.0, 0.0]  # nor does one spike turn the average force
     check_units(replace(walk, accel=accel))
 
 

@@ -32,7 +32,9 @@ def test_noise_and_bias_match_the_sensor_at_any_rate(rate):
     assert rest.accel_noise_m_s2_sqrt_hz == pytest.approx(NOISE.accel_noise, rel=0.1)
 
 
-def test_a_walk_contains_no_rest():
+def test_a_walk_contains_no_rest_and_less_than_a_second_is_too_short():
+    assert find_rest(device_at_rest(0.8, 100.0)) is None
+    assert find_rest(device_at_rest(0.2, 100.0)) is None
     assert find_rest(simulate_imu(generate_walk(2, 20.0, style=WalkStyle()), 200.0)) is None
 
 
@@ -66,11 +68,6 @@ def test_a_large_bias_is_one_if_gravity_does_not_turn():
     rest = find_rest(ImuSequence("t", still.time, still.gyro - BIAS + bias, still.accel))
     assert rest.seconds == pytest.approx(10.0, abs=0.6)
     np.testing.assert_allclose(rest.gyro_bias_rad_s, bias, atol=1e-3)
-
-
-def test_less_than_a_second_of_rest_is_too_short():
-    assert find_rest(device_at_rest(0.8, 100.0)) is None
-    assert find_rest(device_at_rest(0.2, 100.0)) is None
 
 
 def test_one_in_a_thousand_stretches_at_rest_fails_the_test_whatever_their_length():

@@ -118,7 +118,8 @@ def test_a_jump_of_the_attitude_is_not_taken_for_an_error_of_the_gyroscope(walk)
 
 
 @pytest.mark.parametrize(
-    ("late", "named"), [(5.08, "add -5.08 s"), (1e6, "none of them at a sample's time")]
+    ("late", "named"),
+    [(-0.25, "add +0.249 s"), (5.08, "add -5.08 s"), (1e6, "none of them at a sample's time")],
 )
 def test_a_truth_on_a_distant_clock_is_named(walk, late, named):
     shifted = replace(walk, truth=replace(walk.truth, time=walk.truth.time + late))
