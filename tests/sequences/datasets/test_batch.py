@@ -66,8 +66,7 @@ def test_several_jobs_run_in_separate_processes():
         time.sleep(delay)
         return os.getpid()
 
-    found = set(each(process, [0.2] * 4, 2))
-    assert os.getpid() not in found
+    assert os.getpid() not in set(each(process, [0.2] * 4, 2))
     assert set(each(process, [0.0], 1)) == {os.getpid()}
 
 

@@ -123,10 +123,8 @@ def test_exchanged_latitude_and_longitude_contradict_the_speed():
     assert right.figures["doppler"]["scale"] == pytest.approx(1.0, abs=0.1)
     wrong = receiver(replace(reported, latlon_deg=reported.latlon_deg[:, ::-1]))
     assert codes(wrong.findings) == ["satellites_exchanged"]
-
-
-def test_positions_far_to_the_east_are_judged_although_they_cannot_be_exchanged():
-    assert receiver(simulate_satellites(LEVEL, Georeference(48.0, 118.9), sigma=1.0)).findings == []
+    east = simulate_satellites(LEVEL, Georeference(48.0, 118.9), sigma=1.0)
+    assert receiver(east).findings == []  # cannot be exchanged
 
 
 def test_minutes_in_place_of_decimals_contradict_the_speed():

@@ -131,25 +131,22 @@ def test_errors_of_scale_and_alignment_grow_with_the_rotation():
     assert np.degrees(wrong) > 5.0
 
 
-def test_known_positions_after_the_moment_come_later(walk):
+def test_pressure_goes_on_in_a_moment_and_known_positions_after_it(walk):
     time = np.array([2.0, 8.0, 15.0])
     known = PositionTrack(time, walk.truth.at(time).position_W[:, :2], "waypoints")
-    without = replace(walk, truth=None, positions=known)
-    found = insert_moment(without, walk.truth, BY_NAME["table"], 0.5, seed=1).sequence
-    np.testing.assert_allclose(found.positions.time, [2.0, 8.0, 35.0])
-    np.testing.assert_allclose(found.positions.position_W, known.position_W)
-
-
-def test_pressure_goes_on_in_a_moment_and_satellites_after_it(walk):
     full = replace(
         walk,
+        truth=None,
+        positions=known,
         barometer=simulate_barometer(walk.truth, weather=0.0, door=0.0, noise=0.02),
         satellites=simulate_satellites(walk.truth),
     )
     found = insert_moment(full, walk.truth, BY_NAME["table"], 0.5, seed=1)
+    np.testing.assert_allclose(found.sequence.positions.time, [2.0, 8.0, 35.0])
+    np.testing.assert_allclose(found.sequence.positions.position_W, known.position_W)
     pressure, reported = found.sequence.barometer, found.sequence.satellites
     assert np.diff(pressure.time).max() < 0.3
-    true = found.sequence.truth.at(pressure.time).position_W[:, 2]
+    true = inserted(walk, "table").sequence.truth.at(pressure.time).position_W[:, 2]
     height = METRES_PER_HPA * (pressure.pressure_hPa[0] - pressure.pressure_hPa)
     np.testing.assert_allclose(height - height.mean(), true - true.mean(), atol=0.2)
     late = full.satellites.time >= found.start

@@ -59,15 +59,11 @@ def test_lines_of_an_attitude_that_cannot_be_read_cost_no_recording(walk, tmp_pa
 
 def test_a_file_in_g_is_named_by_its_own_name_and_read_without_advice_on_options(tmp_path, caplog):
     """`check_units` asks for the options, and only if they were not given."""
-    names = [
-        f"{name}.{axis}"
-        for name in ("gravity", "rotationRate", "userAcceleration")
-        for axis in "xyz"
-    ]
+    sensors = ("gravity", "rotationRate", "userAcceleration")
+    titles = ",".join(["timestamp", *(f"{name}.{axis}" for name in sensors for axis in "xyz")])
     rows = [f"{0.01 * k:.2f},0,0,-1,0,0,0,0,0,{0.01 * (k % 3)}" for k in range(200)]
-    path = write_lines(tmp_path / "walk.csv", ",".join(["timestamp", *names]), *rows)
     with caplog.at_level("INFO"):
-        read_recording(path)
+        read_recording(write_lines(tmp_path / "walk.csv", titles, *rows))
     assert "walk.csv: added gravity" in caplog.text
     assert "--accel-unit" not in caplog.text
 
