@@ -70,8 +70,8 @@ def test_what_a_link_points_to_is_replaced_and_what_is_no_file_stays(tmp_path):
 @pytest.mark.parametrize("write", [atomic_write, atomic_folder])
 def test_an_operating_system_error_names_path_reason_and_fix(tmp_path, write):
     long = tmp_path / ("x" * 300)
-    expected = rf"path: found .*{long.name}: File name too long, expected .*; choose another folder"
-    with pytest.raises(InputError, match=expected), write(long):
+    words = f"path: .*{long.name}: File name too long.*another folder"
+    with pytest.raises(InputError, match=words), write(long):
         pass
 
     with pytest.raises(InputError, match="existing folder"), write(tmp_path / "no" / "f"):

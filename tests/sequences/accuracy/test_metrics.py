@@ -153,6 +153,12 @@ def test_a_constant_velocity_error_gives_the_analytic_errors(duration, scaled):
     assert found.aye_rad == pytest.approx(0.0, abs=1e-9)
     in_3d = evaluate_track(with_velocity_error(truth, (0.03, 0.04, 0.12)), truth, horizontal=False)
     assert in_3d.rte_m == pytest.approx(0.13 * 60.0)
+    climb = with_velocity_error(straight(duration, speed=0.0), (3.0, 0.0, 4.0))
+    for horizontal, speed in ((True, 3.0), (False, 5.0)):  # the path of what is compared
+        path = evaluate_track(climb, climb, horizontal=horizontal).path_m
+        assert path == pytest.approx(speed * duration)
+    standing = straight(duration, speed=0.0)
+    assert np.isnan(evaluate_track(standing, standing).pde)
 
 
 def test_relative_error_ignores_a_constant_offset():
@@ -221,19 +227,6 @@ def test_no_overlap_is_an_error_that_names_both_spans():
     later = replace(truth, time=truth.time + 100.0)
     with pytest.raises(InputError, match=r"overlap: 100.* against truth 0"):
         evaluate_track(later, truth)
-
-
-def test_drift_per_metre_of_a_stationary_track_is_nan():
-    truth = straight(10.0, speed=0.0)
-    assert np.isnan(evaluate_track(truth, truth).pde)
-
-
-@pytest.mark.parametrize(("horizontal", "path"), [(True, 30.0), (False, 50.0)])
-def test_the_path_is_that_of_the_compared_coordinates(horizontal, path):
-    time = np.arange(101) / 10.0
-    climb = Trajectory(time, np.outer(time, [3.0, 0.0, 4.0]), about_z(0.0 * time))
-    found = evaluate_track(climb, climb, horizontal=horizontal)
-    assert found.path_m == pytest.approx(path)
 
 
 def gaussian_samples(n: int, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:

@@ -122,7 +122,7 @@ def test_a_text_of_something_else_is_one_error(tmp_path):
     path = tmp_path / "serial.txt"
     path.write_text("".join(f"t: {k} ax: 0.1 ay: 0.2 az: 9.8\n" for k in range(100)))
     errors = []
-    with pytest.raises(ReadError, match="found 100 lines without an existing name, such as t: 0 "):
+    with pytest.raises(ReadError, match=r"100 lines .* such as t: 0 "):
         find_recordings(path, errors.append)
     assert errors == []
 

@@ -32,9 +32,7 @@ def test_an_euroc_folder_without_its_imu_is_no_recording_of_its_truth(walk, tmp_
 def test_an_empty_file_in_a_folder_is_named(tmp_path):
     (tmp_path / "dan/processed").mkdir(parents=True)
     (tmp_path / "dan/processed/data.csv").touch()
-    with pytest.raises(
-        ReadError, match=r"processed/data\.csv holds no line of text, .* is it empty"
-    ):
+    with pytest.raises(ReadError, match=r"processed/data\.csv .* empty"):
         read_recording(tmp_path / "dan")
 
 
@@ -46,9 +44,8 @@ def test_a_column_of_a_code_is_no_axis_of_a_sensor(walk, tmp_path):
     save(folder / "accelerometer.csv", "", walk.time, walk.accel)
     save(folder / "imu-gyro.csv", "", walk.time, code, walk.gyro, walk.accel)
     (folder / "gyro.csv").touch()
-    with pytest.raises(ReadError, match=r"iphone: sensors: found only accel, .*gyro\.csv") as error:
+    with pytest.raises(ReadError, match=r"only accel, .*gyro\.csv.*no rows"):
         read_recording(tmp_path / "advio-01")
-    assert "no rows with a time that grows" in str(error.value)
 
 
 def test_a_sensor_file_without_permission_is_named(walk, tmp_path, monkeypatch):
@@ -65,7 +62,7 @@ def test_a_line_of_words_among_rows_is_named_with_the_remedy(walk, tmp_path):
     imu, *_ = write_euroc(tmp_path / "V1", walk)
     lines = imu.read_text().splitlines()
     imu.write_text("\n".join([*lines[:9], "recording paused", *lines[9:]]))
-    with pytest.raises(ReadError, match=r"line 10: found 1 values, .*, or remove the line"):
+    with pytest.raises(ReadError, match=r"line 10: .*remove the line"):
         read_recording(tmp_path / "V1")
 
 

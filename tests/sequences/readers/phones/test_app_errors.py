@@ -30,8 +30,7 @@ def test_two_recordings_in_a_zip_are_named(walk, tmp_path):
         for one in (tmp_path / "s").iterdir():
             file.write(one, f"a/{one.name}")
             file.write(one, f"b/{one.name}")
-    expected = r"two\.zip: content: found 2 recordings \(a, b\), expected one; unpack the zip"
-    with pytest.raises(ReadError, match=rf"^[^:]*/{expected}$"):
+    with pytest.raises(ReadError, match=r"two\.zip: .* \(a, b\), .*unpack the zip"):
         read_recording(tmp_path / "two.zip")
 
 
@@ -69,9 +68,7 @@ def test_a_sensors_file_without_samples_is_named(walk, tmp_path, caplog):
     """One of another sensor than the gyroscope's is no name of a recording."""
     save_zyx(tmp_path, walk, Gyroscope=walk.gyro, GyroscopeUncalibrated=walk.gyro)
     (tmp_path / "TotalAcceleration.csv").write_text("time,seconds_elapsed,z,y,x\n")
-    lacking = "no rows with a time that grows and three values"
-    message = rf"found only gyro, expected .*; TotalAcceleration\.csv: {lacking}$"
-    with pytest.raises(ReadError, match=message):
+    with pytest.raises(ReadError, match=r"only gyro, .*TotalAcceleration\.csv: no rows"):
         read_recording(tmp_path)
     save_zyx(tmp_path, walk, TotalAcceleration=walk.accel)
     with pytest.raises(ReadError, match=r"one sensor of .*gyroscope: .*/Gyroscope\.csv$"):

@@ -77,9 +77,7 @@ def test_the_first_of_two_imus_is_read_and_named(titles, words, walk, tmp_path, 
     assert words in caplog.text
     columns = walk.time, walk.gyro, walk.accel, walk.accel
     neither = table(tmp_path, "time,gyro_@,acc_wrist_@,acc_hip_@", *columns)
-    with pytest.raises(
-        ReadError, match=r"several IMUs \(acc_wrist_x and acc_hip_x\).*keep the col"
-    ):
+    with pytest.raises(ReadError, match=r"\(acc_wrist_x and acc_hip_x\).*keep"):
         read_recording(neither)
 
 

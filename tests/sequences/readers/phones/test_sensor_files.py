@@ -176,5 +176,5 @@ def test_clocks_of_different_phase_are_interpolated_but_not_across_a_gap(walk, t
     assert np.abs(read.accel - walk.accel[kept]).max() < 0.8
     late = written(tmp_path / "late", walk, t, t)
     save(late / "Accelerometer.csv", HEADER, t + 100.0, walk.accel)
-    with pytest.raises(ReadError, match=r"gyroscope from 0.000 to 15.000 s, accelerometer from 1"):
+    with pytest.raises(ReadError, match=r"from 0.000 to 15.000 s, accelerometer from 1"):
         read_recording(late)
