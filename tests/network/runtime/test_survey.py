@@ -42,7 +42,7 @@ def test_multiplications_are_almost_all_that_the_paper_counts(name):
 
 
 def test_an_unknown_name_is_refused_with_the_known_ones():
-    with pytest.raises(InputError, match="architecture: .*'ResNet99'.*RNIN"):
+    with pytest.raises(InputError, match=r"architecture: .*'ResNet99'.*RNIN"):
         table_counts("ResNet99")
 
 
@@ -136,5 +136,3 @@ def test_rnin_gives_the_same_for_a_series_at_once_and_step_by_step():
         for k in range(5):
             outputs, state = rnin.step(series[:, k], state)
             torch.testing.assert_close(outputs, at_once[:, k], rtol=1e-4, atol=1e-6)
-
-

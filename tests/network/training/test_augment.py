@@ -142,9 +142,13 @@ def resting(name: str, length: int = 2000, climb: float = 0.0) -> WorldStream:
     return WorldStream(name, imu_W, position_W, ahead)
 
 
+def at_rest_with(**ranges: float) -> torch.Tensor:
+    sampler = WindowSampler([resting("rest")], [1.0], replace(YAW_ONLY, **ranges), seed=0)
+    return sampler.batch(256)[0]
+
+
 def test_tilt_rotates_gravity_by_no_more_than_its_limit():
-    ranges = replace(YAW_ONLY, tilt=0.1)
-    windows, _ = WindowSampler([resting("rest")], [1.0], ranges, seed=0).batch(256)
+    windows = at_rest_with(tilt=0.1)
     gravity = windows[:, 3:, 0].double()
     np.testing.assert_allclose(gravity.norm(dim=1), STANDARD_GRAVITY, rtol=1e-6)
     angle = torch.acos((gravity[:, 2] / STANDARD_GRAVITY).clamp(max=1.0))
@@ -153,8 +157,7 @@ def test_tilt_rotates_gravity_by_no_more_than_its_limit():
 
 
 def test_biases_are_constant_over_a_window_and_within_their_range():
-    ranges = replace(YAW_ONLY, gyro_bias=0.05, accel_bias=0.2)
-    windows, _ = WindowSampler([resting("rest")], [1.0], ranges, seed=0).batch(256)
+    windows = at_rest_with(gyro_bias=0.05, accel_bias=0.2)
     torch.testing.assert_close(windows, windows[:, :, :1].expand(-1, -1, WINDOW_SAMPLES))
     bias = windows[:, :, 0]
     bias[:, 5] -= STANDARD_GRAVITY
@@ -164,8 +167,7 @@ def test_biases_are_constant_over_a_window_and_within_their_range():
 
 
 def test_noise_is_white_and_within_its_deviation():
-    ranges = replace(YAW_ONLY, gyro_noise=0.02, accel_noise=0.15)
-    windows, _ = WindowSampler([resting("rest")], [1.0], ranges, seed=0).batch(256)
+    windows = at_rest_with(gyro_noise=0.02, accel_noise=0.15)
     deviation = windows.std(dim=2)
     limits = torch.tensor([0.02] * 3 + [0.15] * 3)
     assert (deviation <= 1.3 * limits).all()

@@ -33,12 +33,9 @@ def test_the_last_fifth_of_each_recording_is_held_out():
     assert [(s.name, len(s)) for s in first] == [("a", 6000), ("a", 2000), ("b", 4000)]
     assert [(s.name, len(s)) for s in last] == [("a", 2000), ("b", 1000)]
     assert last[0].imu_W[0, 0] == 2000  # where the first part ends
-
-
-def test_parts_too_short_for_windows_are_dropped():
     first, last = split_off(recordings_of([stream("a", 1500)]))
     assert [len(s) for s in first[0].streams] == [1200]
-    assert not last[0].streams
+    assert not last[0].streams  # too short for windows
     assert first[0].has_poses
     assert not last[0].has_poses
 
@@ -229,14 +226,10 @@ def test_a_moment_turns_the_device_and_moves_it_by_no_more_than_a_hand_reaches(r
         assert force.mean() == pytest.approx(STANDARD_GRAVITY, rel=0.2)
 
 
-def test_the_last_fifth_of_a_recording_is_left_to_judge(recording, tmp_path):
-    def only_the_end_is_known(path: Path):
-        start = WALK.time[0] + 0.8 * (WALK.time[-1] - WALK.time[0])
-        return replace(WALK, truth=WALK.truth.select(WALK.truth.time > start))
-
-    assert not moment_streams([recording], only_the_end_is_known, {}, 3, tmp_path / "cache")
-
-
-def test_a_recording_without_poses_has_no_moments(recording, tmp_path):
-    read = replace(WALK, truth=None)
-    assert not moment_streams([recording], lambda path: read, {}, 3, tmp_path / "cache")
+def test_the_last_fifth_and_recordings_without_poses_have_no_moments(recording, tmp_path):
+    start = WALK.time[0] + 0.8 * (WALK.time[-1] - WALK.time[0])
+    of_the_end = WALK.truth.select(WALK.truth.time > start)
+    for number, truth in enumerate((of_the_end, None)):
+        cache = tmp_path / str(number)
+        read = replace(WALK, truth=truth)
+        assert not moment_streams([recording], lambda path, read=read: read, {}, 3, cache)

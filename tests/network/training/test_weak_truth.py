@@ -183,7 +183,6 @@ def test_stretches_are_divided_among_two_processes_but_not_among_three():
 def test_training_with_legs_reduces_the_error_at_positions(tmp_path, monkeypatch):
     """Legs are trained together with windows of full truth from the same walk."""
     [legs] = leg_streams(with_positions("positions", 0.1))
-    assert isinstance(legs, LegStream)
     streams = [stream.part(0, 4000) for stream in world_streams(WALK)]
     monkeypatch.setattr("stario.network.training.validation._STRETCHES", 6)
     config = TrainingConfig(

@@ -56,7 +56,6 @@ def streams_of(
     path: Path, folder: Path, read: Callable[[Path], ImuSequence], **options: object
 ) -> list[WorldStream]:
     (streams,) = recorded([path], read, options, folder)
-    assert not isinstance(streams, Skipped)
     return streams
 
 
@@ -208,10 +207,8 @@ def test_files_of_other_code_are_removed_once_nobody_uses_them(recording, tmp_pa
 def test_processes_return_memory_mapped_files(recording, tmp_path):
     paths = [recording, tmp_path / "missing.csv", recording]
     first, missing, second = recorded(paths, read_recording, {}, tmp_path / "cache", jobs=2)
-    assert isinstance(missing, Skipped)
     assert "missing.csv" in missing.reason
     for streams in (first, second):
-        assert not isinstance(streams, Skipped)
         assert all(is_mapped(s.imu_W) for s in streams)
 
 
@@ -266,7 +263,6 @@ def test_a_truth_that_contradicts_the_imu_is_skipped_with_the_reason(tmp_path):
     path = tmp_path / "walk.csv"
     write_csv(path, replace(walk, truth=replace(truth, position_W=1e3 * truth.position_W)))
     (outcome,) = recorded([path], Reader(), {}, tmp_path / "cache")
-    assert isinstance(outcome, Skipped)
     assert "truth: found positions that seem to be in mm, expected poses that" in outcome.reason
 
 

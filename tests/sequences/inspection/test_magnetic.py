@@ -117,7 +117,6 @@ def test_inspection_reports_a_good_magnetometer_and_a_missing_one():
     assert not good.findings
     assert any(line.startswith("magnetometer: ") and "dip 63 deg" in line for line in good.lines())
     report = good.as_dict()["magnetometer"]
-    assert isinstance(report, dict)
     assert report["verdict"] == "good"
     bare = inspect_recording(replace(walk(MagneticField()), magnetometer=None))
     assert bare.as_dict()["magnetometer"] is None

@@ -143,9 +143,7 @@ def test_columns_may_name_other_units(tmp_path):
     found = read_recording(file_of(tmp_path, titles, "100.5,48.5,11.5,100,36"))
     np.testing.assert_allclose(found.barometer.pressure_hPa, 1005.0)
     np.testing.assert_array_equal(found.satellites.latlon_deg, [[48.5, 11.5]] * len(found))
-    assert found.satellites.altitude_m is not None
     np.testing.assert_allclose(found.satellites.altitude_m, 30.48)
-    assert found.satellites.speed_m_s is not None
     np.testing.assert_allclose(found.satellites.speed_m_s, 10.0)
 
 

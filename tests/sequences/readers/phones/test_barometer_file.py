@@ -18,9 +18,7 @@ HPA = 1013.25 - 0.01 * TIME
 
 
 def pressure_of(path: Path) -> Barometer:
-    found = read_recording(path).barometer
-    assert found is not None
-    return found
+    return read_recording(path).barometer
 
 
 def assert_pressure(found: Barometer, time: FloatArray, pressure_hPa: FloatArray) -> None:
@@ -109,11 +107,9 @@ def test_a_walk_through_a_bar_is_no_pressure(walk, tmp_path):
 def test_lines_of_pressure_satellites_and_floors_are_read(walk, tmp_path):
     export("get_sensor_data", tmp_path / "g", walk)
     read = read_recording(tmp_path / "g/log.txt")
-    assert read.barometer is not None
     assert_pressure(read.barometer, np.array([0.5, 1.5]), np.array([1013.055, 1013.065]))
     found = read.satellites
     np.testing.assert_allclose(found.time, [0.75, 1.75], atol=1e-3)
-    assert found.altitude_m is not None
     np.testing.assert_array_equal(found.altitude_m, [5.5, 6.5])
     stated = (found.bearing_deg, found.radius_m, found.speed_m_s)
     np.testing.assert_array_equal(stated, [[90.0] * 2, [4.5] * 2, [1.25] * 2])
