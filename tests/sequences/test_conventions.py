@@ -103,13 +103,17 @@ def test_magnetic_units_agree():
     assert {unit: 50.0 / value for unit, value in units.items()} == pytest.approx(MAGNETIC_UNITS)
 
 
-def test_all_conventions_are_undone_at_once(walk):
+def test_all_conventions_are_undone_at_once_with_a_warning_of_doubtful_degrees(walk, caplog):
     """Apple's user acceleration in g, rates in deg/s, axes rotated relative to the truth's."""
     bare = with_axes(without_gravity(walk), "-y,x,z")
     apple = replace(bare, gyro=np.degrees(bare.gyro), accel=-bare.accel / STANDARD_GRAVITY)
     corrected = with_conventions(apple, "deg/s", "-g", "y,-x,z", "removed")
     np.testing.assert_allclose(corrected.gyro, walk.gyro, atol=1e-9)
     np.testing.assert_allclose(corrected.accel, walk.accel, atol=1e-9)
+    with_conventions(replace(walk, gyro=np.degrees(walk.gyro)), gyro_unit="deg/s")
+    assert not caplog.records
+    with_conventions(walk, gyro_unit="dps")
+    assert "fit rad/s; --gyro-unit deg/s divides them by 57" in caplog.text
 
 
 def test_samples_of_unknown_attitude_are_dropped_and_counted(walk, caplog):
@@ -132,10 +136,3 @@ def test_without_an_attitude_gravity_is_not_guessed(walk):
     ):
         with pytest.raises(InputError, match=r"gravity: found removed and no .*record the raw"):
             with_gravity(blind)
-
-
-def test_degrees_for_rates_that_fit_radians_give_a_warning(walk, caplog):
-    with_conventions(replace(walk, gyro=np.degrees(walk.gyro)), gyro_unit="deg/s")
-    assert not caplog.records
-    with_conventions(walk, gyro_unit="dps")
-    assert "fit rad/s; --gyro-unit deg/s divides them by 57" in caplog.text

@@ -242,17 +242,14 @@ def test_heading_is_the_yaw_at_any_tilt_except_upside_down():
     np.testing.assert_allclose(upside_down, 0.0, atol=1e-10)
 
 
-def test_windows_of_a_levelled_stream_reach_its_end(walk):
+def test_levelled_windows_reach_the_end_and_attitudes_at_ticks_are_interpolated(walk):
     (stream,) = levelled_streams(walk)
     windows = stream.windows()
     assert (len(stream), len(windows), len(stream.headings)) == (4000, 39, 39)
     np.testing.assert_allclose(windows[-1], stream.imu_N[3800:].T, atol=1e-5)
     at_ticks = np.stack([facing(R) for R in stream.R_NB])
     np.testing.assert_allclose(at_ticks, stream.facing_N[::100], atol=1e-6)
-
-
-def test_attitudes_at_the_ticks_of_a_slow_sensor_are_interpolated(walk):
-    """At 73 Hz, most ticks lie between two samples."""
+    # At 73 Hz, most ticks lie between two samples.
     poses = Trajectory(walk.time, np.zeros((len(walk), 3)), about_z(2.0 * walk.time))
     (stream,) = levelled_streams(simulate_imu(poses, 73.0, PERFECT_IMU))
     yaw = yaw_of(Rotation.from_matrix(stream.R_NB))

@@ -188,15 +188,12 @@ def test_the_same_seed_draws_the_same_windows():
     assert not torch.equal(first[0], first[2])
 
 
-def test_weights_are_per_second_of_stream():
+def test_weights_are_per_second_of_stream_and_no_window_extends_past_its_end():
     # A short lift up and a long lift down; the short one has three times the weight.
     streams = [resting("up", 1201, climb=1.0), resting("down", 4201, climb=-1.0)]
     _, displacement = WindowSampler(streams, [3.0, 1.0], YAW_ONLY, seed=0).batch(2000)
     share = float((displacement[:, 2] > 0.0).double().mean())
     assert share == pytest.approx(3 * 5 / (3 * 5 + 20), abs=0.05)
-
-
-def test_no_window_extends_past_the_end_of_its_stream():
     streams = [resting(str(k), 400, climb=1.0) for k in range(8)]
     ranges = replace(YAW_ONLY, speeds=(0.6, 1.8), replayed=0.5)
     _, displacement = WindowSampler(streams, [1.0] * 8, ranges, seed=0).batch(2000)
@@ -290,14 +287,7 @@ def test_windows_do_not_depend_on_where_the_device_points():
         torch.testing.assert_close(a, b, atol=5e-3, rtol=1e-3)
 
 
-def test_a_heading_counts_as_much_as_the_device_is_level():
-    """Facing vectors are short where the device points up or down, and its heading is vague."""
-    facing = torch.zeros(1, 1, 10, 2)
-    facing[0, 0, :5, 0], facing[0, 0, 5:, 1] = 0.1, 1.0
-    assert float(heading_of(facing)) == pytest.approx(np.arctan2(1.0, 0.1))
-
-
-def test_a_swing_rotates_the_heading_of_the_device():
+def test_a_swing_rotates_the_heading_which_counts_as_much_as_the_device_is_level():
     """The heading of a level device rotates by the mean vertical component of the swing's angle."""
     generator = torch.Generator().manual_seed(0)
     swings = sample_swing(64, 1.0, 2.0, 0.0, generator)
@@ -308,6 +298,10 @@ def test_a_swing_rotates_the_heading_of_the_device():
     torch.testing.assert_close(
         heading_of(level, swings)[small, 0], turn[small], atol=0.05, rtol=0.0
     )
+    # Facing vectors are short where the device points up or down, and its heading is vague.
+    facing = torch.zeros(1, 1, 10, 2)
+    facing[0, 0, :5, 0], facing[0, 0, 5:, 1] = 0.1, 1.0
+    assert float(heading_of(facing)) == pytest.approx(np.arctan2(1.0, 0.1))
 
 
 # --- rate, acceleration and displacement of a swing are those of one motion -----------------------

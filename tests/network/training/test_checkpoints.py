@@ -47,7 +47,7 @@ def test_a_finished_run_is_not_trained_further(finished, tmp_path, caplog):
     assert (tmp_path / lost).read_text() == (finished[0].parent / lost).read_text()
 
 
-def test_a_checkpoint_of_other_recordings_is_refused(finished):
+def test_a_checkpoint_of_other_recordings_or_another_recipe_is_refused(finished):
     """Also of those that were corrected since: names and lengths are the same, numbers are not."""
     folder, first = finished[0].parent, STREAMS[0]
     swapped = replace(first, position_W=first.position_W[:, [1, 0, 2]])
@@ -62,9 +62,6 @@ def test_a_checkpoint_of_other_recordings_is_refused(finished):
             train(TINY, others, HELD_OUT, folder)
     with pytest.raises(ConfigError, match="initial weights"):
         run(folder, start_from=load_model(finished[0]))
-
-
-def test_a_checkpoint_of_another_recipe_is_refused(finished):
     harder = replace(TINY, augmentation=replace(TINY.augmentation, tilt=0.3))
     for recipe, words in ((replace(TINY, rate=0.01), r"rate: .*0\.001"), (harder, "augmentation")):
         with pytest.raises(ConfigError, match=words):
@@ -113,7 +110,7 @@ def test_a_folder_is_refused_while_another_run_trains_there(tmp_path):
         pass
 
 
-def test_only_old_temporary_files_are_removed(tmp_path):
+def test_only_old_temporary_files_are_removed_and_a_bad_folder_is_named(tmp_path):
     young, old = (tmp_path / f".checkpoint.safetensors.{name}.tmp" for name in ("young", "old"))
     for path in (young, old):
         path.touch()
@@ -121,9 +118,6 @@ def test_only_old_temporary_files_are_removed(tmp_path):
     with exclusive(tmp_path):
         assert young.exists()
         assert not old.exists()
-
-
-def test_a_folder_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match=r"file/run.*--out"), exclusive(tmp_path / "file/run"):
         pass

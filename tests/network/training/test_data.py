@@ -40,12 +40,16 @@ def test_the_last_fifth_of_each_recording_is_held_out():
     assert not last[0].has_poses
 
 
-def test_streams_are_drawn_alike_unless_each_has_a_weight():
+def test_streams_are_drawn_alike_unless_they_have_a_weight_or_more_motion():
     streams = [stream("a", 3000), stream("b", 1000)]
     assert drawn_shares(TrainingData(streams)) == pytest.approx({"a": 0.75, "b": 0.25})
     assert drawn_shares(TrainingData(streams, np.array([1.0, 3.0])))["a"] == pytest.approx(0.5)
     with pytest.raises(InputError, match="weights: found 1, expected 2"):
         TrainingData(streams, [1.0])
+    calm, lively = moving("calm", 0.5), moving("lively", 1.5)
+    material = mix_sources(recordings_of([calm], [lively]), [])
+    assert material.weights[1] / material.weights[0] == pytest.approx(3.0, rel=1e-3)
+    assert sum(material.weights) * len(calm) / 200.0 == pytest.approx(0.6)
 
 
 def drawn_shares(material: TrainingData, reach: int = 1) -> dict[str, float]:
@@ -132,7 +136,7 @@ def test_shares_that_leave_nothing_are_refused():
     TrainingConfig(shares={"ridi": 0.7, "kipd": 0.2, "tyrex": 0.1, SIMULATED: 0.5})
 
 
-def test_streams_come_with_the_licence_of_their_archive(tmp_path):
+def test_streams_come_with_the_licence_of_their_archive_and_names_of_their_own(tmp_path):
     walk = simulate_imu(generate_walk(0, 4.0), 100.0, PERFECT_IMU, 0, name="walk")
     licensed = replace(walk, attributes={"licence": "CC BY 4.0"})
     write_archive(tmp_path / "walks.h5", [licensed])
@@ -142,10 +146,7 @@ def test_streams_come_with_the_licence_of_their_archive(tmp_path):
     assert [(one.path, one.licence) for one in found] == [(paths[0], "CC BY 4.0"), (paths[1], "")]
     assert skipped == outcomes[2:]
     assert mix_sources(found, []).words[-1] == "walks.h5, licence CC BY 4.0: 1 recordings, 10 s"
-
-
-def test_recordings_of_one_name_are_told_apart_in_validation():
-    """Their errors would be averaged as those of one recording."""
+    # Their errors would be averaged as those of one recording.
     outcomes = [[moving("walk", speed)] for speed in (1.0, 2.0, 3.0)]
     paths = [Path(f"{k}/walk.csv") for k in range(3)]
     found, _ = recording_streams(zip(paths, outcomes, strict=True))
@@ -154,13 +155,6 @@ def test_recordings_of_one_name_are_told_apart_in_validation():
 
 def recordings_of(*recordings: list[WorldStream]) -> list[RecordingStreams]:
     return [RecordingStreams(Path(str(k)), streams) for k, streams in enumerate(recordings)]
-
-
-def test_recordings_with_more_motion_are_drawn_more_often():
-    calm, lively = moving("calm", 0.5), moving("lively", 1.5)
-    material = mix_sources(recordings_of([calm], [lively]), [])
-    assert material.weights[1] / material.weights[0] == pytest.approx(3.0, rel=1e-3)
-    assert sum(material.weights) * len(calm) / 200.0 == pytest.approx(0.6)
 
 
 def moving(name: str, acceleration: float) -> WorldStream:

@@ -141,7 +141,7 @@ def test_a_waypoint_tapped_late_moves_two_legs_in_opposite_directions():
     np.testing.assert_allclose(np.cov(legs), C, atol=0.01)
 
 
-def test_jumps_and_rides_of_a_track_make_no_legs():
+def test_jumps_rides_invalid_positions_and_another_clock_make_no_legs():
     recording = with_positions("positions", 0.1)
     time, position = recording.positions.time, recording.positions.position_W.copy()
     position[time > 30.0] += [5.0, 0.0, 0.0]
@@ -156,6 +156,13 @@ def test_jumps_and_rides_of_a_track_make_no_legs():
     speed = np.linalg.norm(slow.displacement, axis=1) / (slow.stop - slow.start)
     assert len(slow.start) < len(cut.start)
     assert speed.max() <= 2.5
+    recording = with_positions("positions", 0.1)
+    time, position = recording.positions.time, recording.positions.position_W
+    nothing = PositionTrack(time, position, "positions", np.zeros(len(time), dtype=bool))
+    assert leg_streams(replace(recording, positions=nothing)) == []
+    stray = PositionTrack(np.append(time, 1.7e10), np.vstack([position, position[-1]]), "positions")
+    [stream], [usual] = leg_streams(replace(recording, positions=stray)), leg_streams(recording)
+    assert abs(len(stream.start) - len(usual.start)) <= 1
 
 
 @pytest.mark.parametrize(("every", "legs"), [(0.1, 28), (1.0, 28), (2.5, 22)])
@@ -219,16 +226,6 @@ def test_a_recurrent_network_is_trained_on_stretches_in_rows(tmp_path, monkeypat
     assert (5, 10, 6, 200) in shapes
     with pytest.raises(ConfigError, match=r"positions: found 12, expected a multiple.*=10"):
         train(replace(config, track_seconds=12), data, data, tmp_path)
-
-
-def test_invalid_positions_and_those_of_another_clock_make_no_legs():
-    recording = with_positions("positions", 0.1)
-    time, position = recording.positions.time, recording.positions.position_W
-    nothing = PositionTrack(time, position, "positions", np.zeros(len(time), dtype=bool))
-    assert leg_streams(replace(recording, positions=nothing)) == []
-    stray = PositionTrack(np.append(time, 1.7e10), np.vstack([position, position[-1]]), "positions")
-    [stream], [usual] = leg_streams(replace(recording, positions=stray)), leg_streams(recording)
-    assert abs(len(stream.start) - len(usual.start)) <= 1
 
 
 def test_legs_of_short_walks_can_select_the_weights_alone():

@@ -98,7 +98,7 @@ def test_alignment_never_changes_the_tilt(mode):
     )
 
 
-def test_first_alignment_matches_the_first_pose_and_rotates_velocity_and_covariance():
+def test_first_alignment_matches_the_first_common_pose_and_rotates_velocity_and_covariance():
     truth = walk()
     covariance = np.broadcast_to(np.diag([4.0, 1.0, 9.0]), (len(truth), 3, 3))
     velocity = np.broadcast_to([1.0, 0.0, 0.5], (len(truth), 3))
@@ -110,9 +110,6 @@ def test_first_alignment_matches_the_first_pose_and_rotates_velocity_and_covaria
     np.testing.assert_allclose(
         aligned.position_covariance_W[0], np.diag([1.0, 4.0, 9.0]), atol=1e-10
     )
-
-
-def test_first_alignment_uses_the_first_pose_valid_in_both_tracks():
     truth = walk()
     late = replace(truth, valid=truth.time >= 10.0)
     estimate = moved(truth, 0.5, (1.0, 2.0, 3.0))
@@ -236,14 +233,11 @@ def gaussian_samples(n: int, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray
     return scale * error, factor @ factor.transpose(0, 2, 1)
 
 
-def test_nees_of_gaussian_samples_lies_within_its_bounds():
+def test_nees_of_gaussian_samples_lies_within_bounds_of_the_stated_share():
     low, high = nees_bounds(3, 500, confidence=0.999)
     assert low < nees(*gaussian_samples(500)).mean() < high
     assert nees(*gaussian_samples(500, scale=1.3)).mean() > high
     assert nees(*gaussian_samples(500, scale=0.7)).mean() < low
-
-
-def test_nees_bounds_contain_the_stated_share_of_means():
     rng = np.random.default_rng(5)
     means = (rng.normal(size=(4000, 20, 3)) ** 2).sum(axis=2).mean(axis=1)
     low, high = nees_bounds(3, 20)

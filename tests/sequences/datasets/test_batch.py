@@ -31,7 +31,7 @@ def test_a_failing_item_is_skipped_with_its_reason(jobs):
     assert skipped == [odd]
 
 
-def test_results_are_yielded_one_by_one():
+def test_results_are_yielded_one_by_one_and_an_exception_costs_one(caplog):
     processed = []
 
     def record(number):
@@ -42,6 +42,10 @@ def test_results_are_yielded_one_by_one():
     assert next(results) == 0
     assert len(processed) < 10
     assert list(results) == list(range(1, 10))
+    outcomes = list(each(lambda number: 1 // number, [1, 0, -1]))
+    assert outcomes[::2] == [1, -1]
+    assert outcomes[1].reason.startswith("ZeroDivisionError")
+    assert "Traceback" in caplog.text
 
 
 def double(number: int) -> int:
@@ -52,13 +56,6 @@ def test_a_backend_that_returns_nothing_before_the_end_works_too():
     """Like Ray's; joblib's own backend of this kind runs processes without loky."""
     with parallel_config("multiprocessing"):
         assert list(each(double, [1, 2, 3], 2)) == [2, 4, 6]
-
-
-def test_an_unexpected_exception_costs_one_item_and_its_traceback_is_logged(caplog):
-    outcomes = list(each(lambda number: 1 // number, [1, 0, -1]))
-    assert outcomes[::2] == [1, -1]
-    assert outcomes[1].reason.startswith("ZeroDivisionError")
-    assert "Traceback" in caplog.text
 
 
 def test_several_jobs_run_in_separate_processes():

@@ -254,16 +254,13 @@ def test_positions_are_drawn_below_the_tracks_and_waypoints_above(tracks):
         assert (line(axes, kind).get_zorder() > axes.collections[0].get_zorder()) == above
 
 
-def test_the_axes_of_a_tall_plan_fill_its_figure(truth):
+def test_the_axes_of_a_tall_plan_fill_its_figure_and_a_long_legend_fits(truth, tracks):
     tall = replace(truth, position_W=np.outer(truth.time, [0.1, 1.2, 0.0]))
     names = ("track", "filtered", "network", "network_true_attitude", "pdr", "dead_reckoning")
     for shown in (names[:1], names):  # with a legend of one row or of several
         fig = plan_view(dict.fromkeys(shown, tall), None, "")
         fig.canvas.draw()
         assert fig.axes[1].get_tightbbox().x1 > 0.95 * fig.bbox.x1  # the bar of times
-
-
-def test_the_legend_of_many_distant_tracks_fits_the_figure(truth, tracks):
     straight = replace(truth, position_W=np.outer(truth.time, [0.0, 1.2, 0.0]))
     names = ("dead_reckoning", "pdr", "network", "network_true_attitude", "track")
     distant = {name: with_growing_error(straight, 0.5, power=2) for name in names}
@@ -286,11 +283,8 @@ def test_lost_samples_are_marked_at_the_edge_and_only_gaps_are_shaded(truth):
         assert set(marks.get_ydata()) == {1.0}
 
 
-def test_columns_are_as_wide_as_their_widest_cell_with_space_between_them():
+def test_columns_are_as_wide_as_their_widest_cell_and_unknown_values_are_dashes():
     lines = aligned([["", "ATE [m]", "n"], ["a walk", "1.5", "12"], ["b", "-", "3"]])
     assert lines == ["         ATE [m]    n", "a walk       1.5   12", "b              -    3"]
-
-
-def test_unknown_values_are_shown_as_a_dash():
     assert [figure(value) for value in (None, float("nan"), 0.0)] == ["-", "-", "0.000"]
     assert figure(1.25, ".1f") == "1.2"

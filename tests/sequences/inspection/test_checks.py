@@ -67,15 +67,12 @@ def test_a_device_at_rest_passes_but_not_with_its_bias_in_degrees():
     assert "record the raw accelerometer" in refusal(replace(still, accel=still.accel - UP))
 
 
-def test_a_reversed_sign_is_detected_only_with_a_true_attitude(walk):
+def test_a_reversed_sign_and_other_axes_are_named_only_with_a_true_attitude(walk):
     apple = replace(walk, accel=-walk.accel)
     assert "--accel-sign apple" in refusal(apple)
     check_units(with_conventions(apple, accel_sign="apple"))
     check_units(apple.without_truth())
-
-
-def test_axes_that_differ_from_the_truths_are_named(walk):
-    """Also if gravity points exactly down, which a wrong sign would explain too."""
+    # Also if gravity points exactly down, which a wrong sign would explain too.
     for axes, undone in (("y,z,x", "z,x,y"), ("x,-y,-z", "x,-y,-z"), ("z,y,-x", "-z,y,x")):
         turned = replace(with_axes(walk, axes), axes=SAME_AXES)
         assert f"--axes={undone}" in refusal(turned)

@@ -67,16 +67,13 @@ def test_a_door_is_a_step_and_stairs_or_a_lift_are_none():
     assert lifted.figures["steps"] == []
 
 
-def test_a_jump_that_is_no_height_is_a_problem():
+def test_a_jump_that_is_no_height_is_a_problem_and_repeats_and_wind_are_good_to_know():
     calm = simulate_barometer(LEVEL, **CALM)
     hPa = calm.pressure_hPa - 2.0 * (calm.time > 30.0)
     found = assess_barometer(replace(calm, pressure_hPa=hPa)).findings
     assert codes(found) == ["pressure_jump"]
     assert found[0].values["rise_m"] == pytest.approx(16.9, abs=0.2)
     assert found[0].values["time_s"] == pytest.approx(30.0, abs=1.0)
-
-
-def test_repeated_samples_and_wind_are_good_to_know():
     calm = simulate_barometer(LEVEL, **CALM)
     held = replace(calm, pressure_hPa=np.repeat(calm.pressure_hPa[::4], 4)[: len(calm)])
     found = assess_barometer(held)
@@ -101,7 +98,7 @@ def test_pressure_in_another_unit_is_a_problem(house, factor, offset, words):
     assert words in str(finding)
 
 
-def test_exchanged_latitude_and_longitude_contradict_the_speed():
+def test_exchanged_degrees_and_minutes_for_decimals_contradict_the_speed():
     reported = simulate_satellites(LEVEL, Georeference(48.0, 11.0, 0.6), sigma=1.0)
     right = assess_satellites(reported)
     assert right.findings == []
@@ -111,10 +108,7 @@ def test_exchanged_latitude_and_longitude_contradict_the_speed():
     assert codes(wrong.findings) == ["satellites_exchanged"]
     east = simulate_satellites(LEVEL, Georeference(48.0, 118.9), sigma=1.0)
     assert assess_satellites(east).findings == []  # cannot be exchanged
-
-
-def test_minutes_in_place_of_decimals_contradict_the_speed():
-    """48 degrees 7.038 minutes as 48.07038."""
+    # 48 degrees 7.038 minutes as 48.07038.
     reported = simulate_satellites(LEVEL, Georeference(48.3, 11.3), sigma=1.0)
     whole, part = np.divmod(reported.latlon_deg, 1.0)
     found = assess_satellites(replace(reported, latlon_deg=whole + 0.6 * part)).findings

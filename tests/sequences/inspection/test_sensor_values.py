@@ -132,14 +132,11 @@ def test_motion_in_a_plane_is_no_problem():
         assert dead_axes(planar) == []
 
 
-def test_two_equal_samples_are_not_stuck_for_the_seconds_of_a_wrong_unit(mounted):
+def test_two_equal_samples_are_not_stuck_and_few_or_rounded_maxima_are_no_limit(mounted):
     gyro, accel = mounted.gyro.copy(), mounted.accel.copy()
     gyro[501] = gyro[500]
     accel[501, 0] += 9.0
     assert stuck_findings(1e3 * mounted.time, gyro, accel) == []
-
-
-def test_few_or_coarsely_rounded_maxima_are_no_limit(mounted):
     short = mounted.slice(0.0, 4.0)
     accel = short.accel.copy()
     accel[100:103, 0] = 40.0  # twice a repetition: a knock

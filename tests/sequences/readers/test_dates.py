@@ -62,12 +62,16 @@ def test_days_of_a_spreadsheet_are_times(tmp_path, header):
     assert "taken as" not in read.source
 
 
-def test_zones_and_names_of_months_give_the_same_instant():
+def test_zones_give_the_same_instant_and_midnight_passes_in_every_column_and_for_late_rows():
     noon = "1714564800.5"
     for text in ("2024-05-01T12:00:00.5Z", "2024-05-01 14:00:00.5 +02:00", "2024/05/01 12:00:00.5",
                  "2024-05-01 08:30:00.5 GMT-0330", "01-May-2024 12:00:00.5",
                  "2024-05-01_14:00:00.5+02"):  # fmt: skip
         assert with_seconds([text]) == [noon]
+    lines = ["23:59:59.9,23:59:58.9", "00:00:00.1,23:59:59.1", "23:59:59.95,00:00:00.1"]
+    first, second = np.array([[float(x) for x in row.split(",")] for row in with_seconds(lines)]).T
+    np.testing.assert_allclose(first - first[0], [0.0, 0.2, 0.05], atol=1e-9)
+    np.testing.assert_allclose(second - second[0], [0.0, 0.2, 1.2], atol=1e-9)
 
 
 @pytest.mark.parametrize("header", [GENERIC, WIDE])
@@ -84,13 +88,6 @@ def test_dates_without_separators_are_refused(tmp_path, header, digits):
     write_lines(path, lines[0], *cut, "inf" + cut[5][digits:])
     with pytest.raises(ReadError, match=message):
         read_recording(path)
-
-
-def test_midnight_passes_in_every_column_of_times_and_for_late_rows():
-    lines = ["23:59:59.9,23:59:58.9", "00:00:00.1,23:59:59.1", "23:59:59.95,00:00:00.1"]
-    first, second = np.array([[float(x) for x in row.split(",")] for row in with_seconds(lines)]).T
-    np.testing.assert_allclose(first - first[0], [0.0, 0.2, 0.05], atol=1e-9)
-    np.testing.assert_allclose(second - second[0], [0.0, 0.2, 1.2], atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,7 @@ def test_a_count_of_rows_is_no_time_unless_it_has_a_unit(tmp_path, first, caplog
     assert "own.csv: its times name no unit, their rate fits ms" in caplog.text
 
 
-def test_slower_truth_has_only_its_own_rows(tmp_path):
+def test_slower_truth_has_only_its_own_rows_and_an_outlying_time_loses_no_other(tmp_path):
     rows = [
         f"{0.01 * k},{ROW}," + (f"{k},0,1,0,0,0,1" if k % 5 == 0 else ",,,,,,") for k in range(21)
     ]
@@ -67,6 +67,11 @@ def test_slower_truth_has_only_its_own_rows(tmp_path):
     assert np.allclose(read.truth.position_W[:, 0], [0, 5, 10, 15])
     none = [row.rsplit(",", 7)[0] + ",,,,,,," for row in rows]
     assert read_generic_csv(write_lines(path, f"{HEADER},{TRUTH_HEADER}", *none)).truth is None
+    rows = [f"{0.01 * k + 1e6 * (k == 3)},{ROW},{k},0,1,0,0,0,1" for k in range(10)]
+    truth = read_generic_csv(
+        write_lines(tmp_path / "wild.csv", f"{HEADER},{TRUTH_HEADER}", *rows)
+    ).truth
+    assert truth.position_W[:, 0].tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
 
 
 GOOD = [HEADER, f"0,{ROW}", f"0.01,{ROW}", f"0.02,{ROW}"]
@@ -122,14 +127,6 @@ def test_rows_that_begin_and_end_with_blank_cells_stay_separate(tmp_path):
     assert np.allclose(read.time, [0.0, 0.01, 0.02, 0.03])
     assert np.allclose(read.accel, [1.0, 2.0, 9.0])
     assert read.truth.time.tolist() == [0.0, 0.03]
-
-
-def test_an_outlying_time_does_not_lose_the_truth_after_it(tmp_path):
-    rows = [f"{0.01 * k + 1e6 * (k == 3)},{ROW},{k},0,1,0,0,0,1" for k in range(10)]
-    truth = read_generic_csv(
-        write_lines(tmp_path / "wild.csv", f"{HEADER},{TRUTH_HEADER}", *rows)
-    ).truth
-    assert truth.position_W[:, 0].tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
 
 
 @pytest.mark.parametrize("names", ["x,y,z,qx,qy,qz,qw", "qx,qy,qz,qw", "pos_x_m,pos_y_m,pos_z_m"])

@@ -51,12 +51,15 @@ def test_ronin_without_an_ekf_uses_the_other_sources(tmp_path, walks):
     assert max_angle(read.truth.attitude_WB, recording.expected.truth.attitude_WB) < 2e-3
 
 
-def test_rnin_without_motion_capture_uses_the_odometry(tmp_path, walks):
+def test_poses_of_the_odometry_and_those_in_a_world_with_z_up_are_read(tmp_path, walks):
     recording = formats.rnin(tmp_path, walks(200.0), captured=False)
     assert_truth_is_read(recording)
     csv = recording.path / "SenseINS.csv"
     csv.write_text(csv.read_text().replace("times,", "time,", 1))
     assert np.array_equal(read_recording(csv).gyro, read_recording(recording.path).gyro)
+    # RIDI's raw folders contain IMUNet's files, from a Tango.
+    recording = formats.imunet_raw(tmp_path / "seq", walks(200.0), world=Rotation.identity())
+    assert_truth_is_read(recording)
 
 
 def test_tlio_quaternion_order_is_that_of_the_column_name(tmp_path, walks):
@@ -75,12 +78,6 @@ def test_tlio_raw_poses_are_in_the_imus_axes(tmp_path, walks):
     alone = read_recording(recording.path.parent)
     assert alone.truth is None
     assert np.abs(alone.accel - recording.expected.accel).max() < 1e-9
-
-
-def test_raw_poses_in_a_world_with_z_up_are_kept(tmp_path, walks):
-    """RIDI's raw folders contain IMUNet's files, from a Tango."""
-    recording = formats.imunet_raw(tmp_path / "seq", walks(200.0), world=Rotation.identity())
-    assert_truth_is_read(recording)
 
 
 def test_a_processed_recording_is_preferred_to_the_raw_files_next_to_it(tmp_path, walks):

@@ -33,7 +33,7 @@ def height(pressure_hPa: FloatArray) -> FloatArray:
     return METRES_PER_HPA * (pressure_hPa[0] - pressure_hPa)
 
 
-def test_each_stay_is_on_the_level_of_its_floor(walk):
+def test_each_stay_is_on_the_level_of_its_floor_which_its_waypoints_name(walk):
     truth = walk.sequence.truth
     assert len({stay.floor for stay in walk.stays}) > 1
     ground = truth.slice(0.0, walk.stays[0].stop).position_W[:, 2].mean()
@@ -41,6 +41,9 @@ def test_each_stay_is_on_the_level_of_its_floor(walk):
         level = truth.slice(stay.start + 1.0, stay.stop - 1.0).position_W[:, 2]
         assert level.mean() - ground == pytest.approx(3.0 * stay.floor, abs=0.1)
         assert level.std() < 0.05
+    known = walk.sequence.positions
+    np.testing.assert_array_equal(known.floor, np.repeat([s.floor for s in walk.stays[1:]], 2))
+    np.testing.assert_allclose(known.time, [t for s in walk.stays[1:] for t in (s.start, s.stop)])
 
 
 def test_the_shortest_walk_changes_floors():
@@ -48,12 +51,6 @@ def test_the_shortest_walk_changes_floors():
         stays = simulate_house(seed, SHORTEST, rate=20.0).stays
         assert any(one.floor != stays[0].floor for one in stays)
         assert stays[-1].stop == SHORTEST
-
-
-def test_waypoints_name_the_floor_at_both_ends_of_a_stay(walk):
-    known = walk.sequence.positions
-    np.testing.assert_array_equal(known.floor, np.repeat([s.floor for s in walk.stays[1:]], 2))
-    np.testing.assert_allclose(known.time, [t for s in walk.stays[1:] for t in (s.start, s.stop)])
 
 
 @pytest.mark.parametrize("way", ["stairs", "lift"])

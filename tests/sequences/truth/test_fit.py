@@ -74,14 +74,11 @@ def test_a_tilted_world_is_detected(walk):
     assert fit_truth(replace(walk, accel=accel)).tilt < np.radians(1.5)
 
 
-def test_another_recordings_truth_does_not_agree(walk):
+def test_a_truth_of_another_recording_or_time_is_not_taken_for_right(walk):
     other = simulate_imu(generate_walk(97, 40.0, style=WalkStyle(carry="pocket")), 200.0)
     fit = fit_truth(replace(walk, truth=other.truth))
     assert fit.correlation < 0.7
     assert fit.axes() is None
-
-
-def test_a_truth_at_another_time_is_found_but_not_taken_for_right(walk):
     truth = walk.truth
     fit = fit_truth(replace(walk, truth=replace(truth, time=truth.time + 500.0)))
     assert fit.time_offset == pytest.approx(-500.0, abs=0.01)

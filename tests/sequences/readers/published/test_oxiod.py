@@ -212,11 +212,10 @@ def test_times_rounded_too_coarsely_are_refused(tmp_path, walk):
 # --- recordings ------------------------------------------------------------------------------
 
 SELECTED = (
-    "handheld/data1/syn/imu2.csv",  # flips at 149 s
-    "multi users/user2/syn/imu6.csv",  # flips at 252 s
-    "trolley/data2/syn/imu1.csv",  # turns about the vertical only
+    OXIOD / "handheld/data1/syn/imu2.csv",  # flips at 149 s
+    OXIOD / "multi users/user2/syn/imu6.csv",  # flips at 252 s
+    OXIOD / "trolley/data2/syn/imu1.csv",  # turns about the vertical only
 )
-ALL = find_recordings(OXIOD) if OXIOD.is_dir() else []
 
 
 def assert_consistent(path: Path) -> None:
@@ -244,13 +243,13 @@ def assert_consistent(path: Path) -> None:
 
 
 @pytest.mark.skipif(not OXIOD.is_dir(), reason=f"no recordings at {OXIOD}")
-@pytest.mark.parametrize("name", SELECTED)
-def test_selected_recordings_are_self_consistent(name):
-    assert_consistent(OXIOD / name)
-
-
-@pytest.mark.skipif(not OXIOD.is_dir(), reason=f"no recordings at {OXIOD}")
-@pytest.mark.slow
-@pytest.mark.parametrize("path", ALL, ids=str)
-def test_every_recording_is_self_consistent(path):
+@pytest.mark.parametrize(
+    "path",
+    [
+        path if path in SELECTED else pytest.param(path, marks=pytest.mark.slow)
+        for path in (find_recordings(OXIOD) if OXIOD.is_dir() else SELECTED)
+    ],
+    ids=str,
+)
+def test_recordings_are_self_consistent(path):
     assert_consistent(path)
