@@ -47,14 +47,11 @@ def test_a_finished_file_replaces_the_old_one(tmp_path, mode, content):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="permissions of POSIX")
-def test_permissions_are_those_of_any_new_file(tmp_path):
+def test_permissions_are_those_of_new_files_links_stay_and_so_does_what_is_no_file(tmp_path):
     (tmp_path / "plain").write_text("")
     with atomic_write(tmp_path / "atomic") as file:
         file.write("")
     assert (tmp_path / "atomic").stat().st_mode == (tmp_path / "plain").stat().st_mode
-
-
-def test_what_a_link_points_to_is_replaced_and_what_is_no_file_stays(tmp_path):
     (tmp_path / "file").touch()
     (tmp_path / "link").symlink_to("file")
     with atomic_write(tmp_path / "link") as file:

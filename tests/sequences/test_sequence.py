@@ -138,15 +138,12 @@ def test_parts_have_the_truth_of_their_time_and_without_truth_none_is_left():
     assert bare.truth is bare.positions is None
 
 
-def test_rotating_the_world_adds_to_the_yaw_at_any_tilt():
+def test_rotating_the_world_adds_to_the_yaw_and_tilt_aligning_rotates_up_to_z():
     attitudes = Rotation.random(200, rng=np.random.default_rng(1))
     for yaw in (-2.0, 0.3, 3.0):
         turned = yaw_of(about_z(yaw) * attitudes)
         assert np.allclose(np.exp(1j * (turned - yaw_of(attitudes) - yaw)), 1.0, atol=1e-9)
         assert (np.abs(turned) <= np.pi).all()
-
-
-def test_tilt_aligning_rotates_up_to_z_by_the_smallest_angle():
     rng = np.random.default_rng(2)
     for up in rng.standard_normal((100, 3)):
         R_WB = tilt_aligning(9.8 * up)

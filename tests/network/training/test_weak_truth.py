@@ -156,8 +156,7 @@ def test_jumps_rides_invalid_positions_and_another_clock_make_no_legs():
     speed = np.linalg.norm(slow.displacement, axis=1) / (slow.stop - slow.start)
     assert len(slow.start) < len(cut.start)
     assert speed.max() <= 2.5
-    recording = with_positions("positions", 0.1)
-    time, position = recording.positions.time, recording.positions.position_W
+    position = recording.positions.position_W
     nothing = PositionTrack(time, position, "positions", np.zeros(len(time), dtype=bool))
     assert leg_streams(replace(recording, positions=nothing)) == []
     stray = PositionTrack(np.append(time, 1.7e10), np.vstack([position, position[-1]]), "positions")

@@ -232,7 +232,7 @@ def test_recordings_unsuitable_for_training_are_skipped_with_the_reason(tmp_path
         assert words in reason
 
 
-def test_built_streams_are_cached_by_key(tmp_path):
+def test_built_streams_are_cached_by_key_and_those_of_an_archive_by_name(tmp_path):
     calls = []
 
     def build():
@@ -243,9 +243,6 @@ def test_built_streams_are_cached_by_key(tmp_path):
         assert_equal(cached({"seed": seed}, build, tmp_path), world_streams(WALK))
     assert len(calls) == 2
     assert cached({"seed": 3}, list, tmp_path) == []
-
-
-def test_a_recording_of_an_archive_is_cached_by_its_name(tmp_path):
     archive, read = tmp_path / "walks.h5", Reader()
     write_archive(archive, [WALK, WALK.slice(0.0, 5.0)])
     whole, part = find_recordings(archive)

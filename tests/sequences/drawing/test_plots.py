@@ -96,7 +96,7 @@ def test_a_way_back_differs_from_the_way_out_in_brightness_and_width():
     assert width[-1] < 0.5 * width[0]
 
 
-def test_arrows_point_along_the_walk_and_its_ends_have_times():
+def test_arrows_point_along_the_walk_its_ends_have_times_and_positions_lie_below(tracks):
     t = np.arange(0.0, 125.0, 0.1)
     x = np.interp(t, [0.0, 40.0, 70.0, 125.0], [0.0, 40.0, 40.0, 95.0])  # a stop of 30 s
     along = Trajectory(t, np.outer(x, [0.6, -0.8, 0.0]), Rotation.identity(len(t)))
@@ -107,6 +107,11 @@ def test_arrows_point_along_the_walk_and_its_ends_have_times():
         step = np.subtract(arrow.xy, arrow.xyann)
         np.testing.assert_allclose(step / np.linalg.norm(step), [0.6, -0.8], atol=1e-6)
     assert {"0:00", "2:05"} <= {text.get_text() for text in axes.texts}
+    ekf = tracks["track"]
+    for kind, above in (("positions", False), ("waypoints", True)):
+        known = PositionTrack(ekf.time, ekf.position_W[:, :2], kind=kind)
+        axes = plan_view({"track": ekf}, None, "", known).axes[0]
+        assert (line(axes, kind).get_zorder() > axes.collections[0].get_zorder()) == above
 
 
 @pytest.mark.parametrize("size", [0.3, 7.0, 260.0, 4000.0])
@@ -244,14 +249,6 @@ def test_a_track_is_marked_where_it_resumes_after_a_gap(truth, tracks):
     assert (mark.get_xdata()[0], mark.get_ydata()[0]) == tuple(broken.position_W[half + 1, :2])
     far = {"track": truth, "dead_reckoning": with_growing_error(broken, 0.5, power=2)}
     assert "after a gap" not in labels(plan_view(far, truth, "").legends[0])
-
-
-def test_positions_are_drawn_below_the_tracks_and_waypoints_above(tracks):
-    ekf = tracks["track"]
-    for kind, above in (("positions", False), ("waypoints", True)):
-        known = PositionTrack(ekf.time, ekf.position_W[:, :2], kind=kind)
-        axes = plan_view({"track": ekf}, None, "", known).axes[0]
-        assert (line(axes, kind).get_zorder() > axes.collections[0].get_zorder()) == above
 
 
 def test_the_axes_of_a_tall_plan_fill_its_figure_and_a_long_legend_fits(truth, tracks):

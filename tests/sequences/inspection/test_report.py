@@ -77,7 +77,7 @@ def test_a_truth_of_hardly_any_poses_is_a_problem(walk, count):
     assert any(f"truth: only {count} usable pose" in problem for problem in found)
 
 
-def test_a_good_recording_has_no_problems(walk):
+def test_a_good_recording_has_no_problems_and_findings_are_plain_json_values(walk):
     found = inspect_recording(walk)
     assert found.findings == ()
     figures = found.figures
@@ -87,6 +87,13 @@ def test_a_good_recording_has_no_problems(walk):
     assert figures["accel_norm_mean_m_s2"] == pytest.approx(STANDARD_GRAVITY, abs=0.5)
     assert figures["truth"]["coverage"] > 0.99
     assert figures["truth"]["path_m"] == pytest.approx(walk.truth.path_length())
+    content = json.loads(json_text(inspect_recording(walk).as_dict()))
+    assert content["truth"]["coverage"] > 0.99
+    assert abs(content["truth_against_gyroscope"]["time_offset_s"]) < 0.005
+    assert len(content["truth_against_gyroscope"]["misalignment_rotvec_rad"]) == 3
+    bare = json.loads(json_text(inspect_recording(walk.without_truth()).as_dict()))
+    assert bare["truth"] is None
+    assert bare["truth_against_gyroscope"] is None
 
 
 def test_gaps_and_wrong_times_are_counted(walk, caplog):
@@ -151,16 +158,6 @@ def test_rest_is_reported(walk):
     found = inspect_recording(ImuSequence("r", time, gyro, accel))
     assert "at rest: 5.0 s in 1 stretch" in found.lines()
     assert "truth: none" in found.lines()
-
-
-def test_findings_are_plain_json_values(walk):
-    content = json.loads(json_text(inspect_recording(walk).as_dict()))
-    assert content["truth"]["coverage"] > 0.99
-    assert abs(content["truth_against_gyroscope"]["time_offset_s"]) < 0.005
-    assert len(content["truth_against_gyroscope"]["misalignment_rotvec_rad"]) == 3
-    bare = json.loads(json_text(inspect_recording(walk.without_truth()).as_dict()))
-    assert bare["truth"] is None
-    assert bare["truth_against_gyroscope"] is None
 
 
 def test_poor_recordings_are_described_not_refused(walk):

@@ -111,15 +111,14 @@ def test_an_error_is_reported_in_one_line(tmp_path, lines, message):
     assert "\n" not in str(caught.value)
 
 
-def test_rows_with_more_values_than_titles_are_told(tmp_path, caplog):
+def test_rows_with_too_many_values_are_told_and_those_with_blank_ends_stay_separate(
+    tmp_path, caplog
+):
     rows = [f"{0.01 * k:.2f},{ROW}" + (",7" if k in {3, 5} else ",") for k in range(8)]
     read = read_generic_csv(write_lines(tmp_path / "own.csv", HEADER, *rows))
     assert len(read) == 8
     assert "line 5 and 1 others" in caplog.text
     assert np.allclose(read.accel, [1.0, 2.0, 9.0])
-
-
-def test_rows_that_begin_and_end_with_blank_cells_stay_separate(tmp_path):
     header = f"{TRUTH_HEADER},{HEADER},note"
     truths = ["1,2,3,0,0,0,1", ",,,,,,", " , , ,,,,", "4,5,6,0,0,0,1"]
     rows = [f"{truth},{0.01 * k:.2f},{ROW}," for k, truth in enumerate(truths)]

@@ -114,14 +114,11 @@ def test_a_lift_turns_the_field_and_weakens_it_and_standing_does_not(walk):
     np.testing.assert_allclose(np.arctan2(standing[:, 1], standing[:, 0]), 0.0, atol=0.2)
 
 
-def test_the_gyroscope_keeps_its_bias(walk):
+def test_the_gyroscope_keeps_its_bias_and_errors_of_scale_grow_with_the_rotation(walk):
     bias = np.array([0.03, -0.02, 0.01])
     part = within(inserted(replace(walk, gyro=walk.gyro + bias), "table"))
     lying = (part.time > part.time[0] + 5.0) & (part.time < part.time[0] + 15.0)
     np.testing.assert_allclose(part.gyro[lying].mean(axis=0), bias, atol=2e-3)
-
-
-def test_errors_of_scale_and_alignment_grow_with_the_rotation():
     found = inserted(walk_of(PHONE_IMU), "shake 25 s")
     whole = found.sequence
     ends = np.array([found.start, found.stop])

@@ -46,13 +46,19 @@ def test_the_clock_offset_is_found(walk, offset):
     assert fit_truth(late).time_offset == pytest.approx(offset, abs=0.003)
 
 
-def test_the_rotation_between_the_axes_is_found(walk):
+def test_the_rotation_between_the_axes_and_a_tilt_of_the_world_are_found(walk):
     truth = walk.truth
     R_TB = Rotation.from_rotvec([0.3, -0.8, 0.4])
     turned = replace(walk, truth=replace(truth, attitude_WB=truth.attitude_WB * R_TB.inv()))
     fit = fit_truth(turned)
     assert (fit.R_TB.inv() * R_TB).magnitude() < np.radians(1.0)
     assert fit.axes() is None  # no permutation is close
+    lean = Rotation.from_rotvec([np.radians(5.0), 0.0, 0.0])
+    leaning = replace(walk, truth=replace(truth, attitude_WB=lean * truth.attitude_WB))
+    assert np.degrees(fit_truth(leaning).tilt) == pytest.approx(5.0, abs=1.0)
+    accel = walk.accel.copy()
+    accel[3000] = [1e4, 0.0, 0.0]  # a spike does not tilt it
+    assert fit_truth(replace(walk, accel=accel)).tilt < np.radians(1.5)
 
 
 @pytest.mark.parametrize(
@@ -62,16 +68,6 @@ def test_axes_are_named_despite_a_clock_offset(walk, turned, corrected):
     truth = walk.truth
     late = replace(walk, truth=replace(truth, time=truth.time + 1.0))
     assert fit_truth(with_axes(late, turned)).axes() == corrected
-
-
-def test_a_tilted_world_is_detected(walk):
-    truth = walk.truth
-    lean = Rotation.from_rotvec([np.radians(5.0), 0.0, 0.0])
-    leaning = replace(walk, truth=replace(truth, attitude_WB=lean * truth.attitude_WB))
-    assert np.degrees(fit_truth(leaning).tilt) == pytest.approx(5.0, abs=1.0)
-    accel = walk.accel.copy()
-    accel[3000] = [1e4, 0.0, 0.0]  # a spike does not tilt it
-    assert fit_truth(replace(walk, accel=accel)).tilt < np.radians(1.5)
 
 
 def test_a_truth_of_another_recording_or_time_is_not_taken_for_right(walk):

@@ -50,15 +50,18 @@ def test_pressure_is_read_in_the_unit_of_its_title_or_else_of_its_size(
     assert_pressure(pressure_of(tmp_path / "p"), TIME, HPA)
 
 
-def test_pressure_without_titles_is_read(walk, tmp_path):
+def test_pressure_without_titles_is_read_but_a_walk_through_a_bar_is_none(walk, tmp_path):
     export("prefixed", tmp_path / "p", walk)
     stamps = [f"{1606391908305 + 1e3 * t:.18e}" for t in TIME]
     rows = [f"{t} {p:.18e}" for t, p in zip(stamps, HPA, strict=True)]
     (tmp_path / "p/Eight_bar.csv").write_text("\n".join(rows) + "\n")
     assert_pressure(pressure_of(tmp_path / "p"), TIME, HPA)
+    for sensor, values in (("gyr", walk.gyro), ("acc", walk.accel)):
+        save(tmp_path / f"bar_{sensor}.csv", "time (s),x,y,z", walk.time, values)
+    assert read_recording(tmp_path / "bar_gyr.csv").barometer is None
 
 
-def test_sensor_loggers_pressure_is_on_the_sensors_clock(walk, tmp_path):
+def test_pressure_is_on_the_sensors_clock_and_read_once_where_every_row_repeats_it(walk, tmp_path):
     export("sensor_logger", tmp_path / "s", walk)
     time = np.append(-3.0, TIME)  # delivered before the first sample of the others
     stamps = [START_NS + round(t * 1e9) for t in time]
@@ -66,9 +69,6 @@ def test_sensor_loggers_pressure_is_on_the_sensors_clock(walk, tmp_path):
     columns = [stamps, time, np.zeros(13), np.append(1013.0, HPA)]
     save(tmp_path / "s/Barometer.csv", header, *columns)
     assert_pressure(pressure_of(tmp_path / "s"), TIME, HPA)
-
-
-def test_pressure_repeated_in_every_row_of_a_wide_file_is_read_once(walk, tmp_path):
     names = [f"{sensor} {axis}" for sensor in ("ACCELEROMETER", "GYROSCOPE") for axis in "XYZ"]
     header = ",".join(["time (s)", *names, "ATMOSPHERIC PRESSURE (hPa)"])
     held = 1013.0 - 0.01 * np.floor(walk.time)
@@ -96,12 +96,6 @@ def test_what_is_no_pressure_is_named_in_one_line(walk, tmp_path, title, values,
     assert read_recording(tmp_path / "p").barometer is None
     [line] = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert re.search(words, line)
-
-
-def test_a_walk_through_a_bar_is_no_pressure(walk, tmp_path):
-    for sensor, values in (("gyr", walk.gyro), ("acc", walk.accel)):
-        save(tmp_path / f"bar_{sensor}.csv", "time (s),x,y,z", walk.time, values)
-    assert read_recording(tmp_path / "bar_gyr.csv").barometer is None
 
 
 def test_lines_of_pressure_satellites_and_floors_are_read(walk, tmp_path):
