@@ -114,14 +114,11 @@ def test_a_damaged_file_is_refused(model, damage, words):
     assert words in refusal(model)
 
 
-def test_an_intact_copy_loads_and_a_model_prints_what_it_is(model):
+def test_an_intact_copy_loads_prints_what_it_is_and_its_folder_is_refused(model):
     assert load_model(model).name == "StarIO"
     assert load_model(str(model)).name == "StarIO"
-    model = load_model("default")
-    assert repr(model) == f"DisplacementModel(StarIO, sha256 {model.card.sha256[:12]})"
-
-
-def test_the_folder_of_a_run_is_refused_with_the_file_in_it(model):
+    loaded = load_model("default")
+    assert repr(loaded) == f"DisplacementModel(StarIO, sha256 {loaded.card.sha256[:12]})"
     with pytest.raises(WeightsError, match=r"a folder, .*model\.safetensors"):
         load_model(model.parent)
 

@@ -333,7 +333,7 @@ def test_acceleration_integrates_to_the_displacement():
     assert (moved - displacement[:, 0]).abs().max() < 2e-3
 
 
-def test_rate_and_acceleration_belong_to_one_rotation():
+def test_rate_and_acceleration_belong_to_one_rotation_and_recorded_rates_turn_with_it():
     """Centripetal and tangential parts: accel . r = -|omega x r|^2 for a rigid arm."""
     swing = draw_swing(64)
     imu, _ = apply_swing(at_rest(64), torch.zeros(64, 1, 3, dtype=torch.float64), swing)
@@ -342,10 +342,7 @@ def test_rate_and_acceleration_belong_to_one_rotation():
     gyro, accel = imu[:, 0, :3], imu[:, 0, 3:] - torch.tensor([0.0, 0.0, STANDARD_GRAVITY])
     velocity = torch.linalg.cross(gyro, lever)
     assert torch.allclose((accel * lever).sum(1), -(velocity**2).sum(1), atol=1e-5)
-
-
-def test_a_swing_turns_the_rates_that_were_recorded():
-    """Rate of the device in the world: its own, turned with it, and that of the swing."""
+    # Rate of the device in the world: its own, turned with it, and that of the swing.
     swing, imu = draw_swing(8), at_rest(8)
     imu[..., :3] = torch.tensor([0.3, -0.2, 0.5])
     alone, _ = apply_swing(at_rest(8), torch.zeros(8, 1, 3, dtype=torch.float64), swing)

@@ -61,12 +61,15 @@ def test_a_last_stage_starts_from_weights_and_adopts_a_calibration(model, tmp_pa
     assert again.card.trained_on == ["swings", *inherited]
 
 
-def test_errors_on_learned_recordings_are_named_so_and_the_recipes_dropout_is_used(tmp_path):
+def test_errors_on_recordings_that_were_learned_are_named_so(tmp_path):
     """A last stage trains on the validation recordings, too."""
     everything = TrainingData([*STREAMS, *VALIDATION])
     once = replace(TINY, epochs=1, epoch_windows=16)
     path = train(once, everything, HELD_OUT, tmp_path)
     assert list(load_model(path).card.figures) == ["validation_mse_m2_after_it_was_learned"]
+
+
+def test_the_recipes_dropout_replaces_the_networks_own(tmp_path):
     once = replace(TINY, epochs=1, epoch_windows=16)
     none, most = (
         load_model(run(tmp_path / str(share), replace(once, dropout=share))).training_form

@@ -96,7 +96,7 @@ def test_a_way_back_differs_from_the_way_out_in_brightness_and_width():
     assert width[-1] < 0.5 * width[0]
 
 
-def test_arrows_point_along_the_walk_its_ends_have_times_and_positions_lie_below(tracks):
+def test_arrows_point_along_the_walk_and_its_ends_have_times():
     t = np.arange(0.0, 125.0, 0.1)
     x = np.interp(t, [0.0, 40.0, 70.0, 125.0], [0.0, 40.0, 40.0, 95.0])  # a stop of 30 s
     along = Trajectory(t, np.outer(x, [0.6, -0.8, 0.0]), Rotation.identity(len(t)))
@@ -107,6 +107,9 @@ def test_arrows_point_along_the_walk_its_ends_have_times_and_positions_lie_below
         step = np.subtract(arrow.xy, arrow.xyann)
         np.testing.assert_allclose(step / np.linalg.norm(step), [0.6, -0.8], atol=1e-6)
     assert {"0:00", "2:05"} <= {text.get_text() for text in axes.texts}
+
+
+def test_positions_are_drawn_below_the_tracks_and_waypoints_above(tracks):
     ekf = tracks["track"]
     for kind, above in (("positions", False), ("waypoints", True)):
         known = PositionTrack(ekf.time, ekf.position_W[:, :2], kind=kind)

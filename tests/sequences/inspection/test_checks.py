@@ -38,17 +38,14 @@ def test_walks_pass_and_their_wrong_units_are_named(carry):
     assert "record the raw accelerometer" in refusal(without_gravity(walk).without_truth())
 
 
-def test_a_hard_shaken_device_passes_but_not_without_gravity():
+def test_a_hard_shaken_device_and_a_swinging_pocket_pass_but_not_without_gravity():
     """The median norm of its samples exceeds 12.5 m/s^2, yet their average is gravity."""
     style = WalkStyle(carry="swinging", preferred_speed=2.0)
     shaken = simulate_imu(generate_walk(1, 10.0, style=style), 200.0, PHONE_IMU, 1)
     assert np.median(np.linalg.norm(shaken.accel, axis=1)) > 12.5
     check_units(shaken)
     assert "--gravity removed" in refusal(without_gravity(shaken))
-
-
-def test_the_unit_is_not_asked_of_a_phone_that_swings_in_a_pocket():
-    """Its average force is as large in either unit, but not since it turned about the vertical."""
+    # Its average force is as large in either unit, but not since it turned about the vertical.
     style = WalkStyle(carry="pocket", preferred_speed=1.4)
     swung = simulate_imu(generate_walk(0, 30.0, style=style), 100.0, PHONE_IMU).without_truth()
     assert np.percentile(np.linalg.norm(swung.gyro, axis=1), 95) > 3.0

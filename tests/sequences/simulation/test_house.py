@@ -99,16 +99,13 @@ def test_errors_of_satellites_last_and_are_larger_between_houses():
         assert kept == pytest.approx(share, abs=0.15)
 
 
-def test_a_receiver_indoors_repeats_its_last_position(walk):
+def test_a_receiver_agrees_on_where_north_is_and_repeats_its_last_position_indoors(walk):
     found, entered = walk.sequence.satellites, walk.stays[0].stop
     indoors = found.time > entered
     assert 30 < indoors.sum() < len(found) - 20
     assert (found.latlon_deg[indoors] == found.latlon_deg[~indoors][-1]).all()
     assert (found.radius_m[indoors] == 9.0).all()
     assert (np.diff(found.latlon_deg[~indoors], axis=0) != 0.0).all()
-
-
-def test_doppler_velocity_and_positions_agree_on_where_north_is(walk):
     truth, entered = walk.sequence.truth, walk.stays[0].stop
     there = Georeference(48.0, 11.0, yaw=-0.4)
     found = simulate_satellites(truth, there, sigma=0.0).slice(1.0, entered - 1.0)
